@@ -91,7 +91,7 @@ class DriverConformance(Conformance):
             return
         began = time.monotonic()
         try:
-            self.plugin.function(*self._models(), params=self.unreachable).close()
+            self.plugin.function(**self._models(), params=self.unreachable).close()
         except DeviceError as error:
             require_one_line(error)
         else:
@@ -99,9 +99,9 @@ class DriverConformance(Conformance):
         took = time.monotonic() - began
         require(took < PATIENCE + LATE, f"it took {took:.1f} s to say so, at most {PATIENCE:g} s")
 
-    def _models(self) -> list[Any]:
+    def _models(self) -> dict[str, Any]:
         values = {**self._cell(), **self.context()}
-        return [self._value(values, name, need) for name, need in self.plugin.needs.items()]
+        return {name: self._value(values, name, need) for name, need in self.plugin.needs.items()}
 
 
 class RobotConformance(DriverConformance):

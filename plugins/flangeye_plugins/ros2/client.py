@@ -13,9 +13,10 @@ import time
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from flangeye.devices import Device, DeviceError
+from flangeye.errors import StageError
 from flangeye.files.children import python_command
 from flangeye.files.load import busy
 from flangeye.files.machine import find_named, settings_file
@@ -36,7 +37,7 @@ ANSWERING = 2.5
 """Longest time for an answer; finding a service takes the most, a second, and on a busy machine
 listing the topics [s]."""
 
-DISCOVERY = 2.5
+DISCOVERY = 2.0
 """After its start a node knows what runs; on an idle machine it does after half a second [s]."""
 
 LEAVING = 0.5
@@ -64,6 +65,7 @@ class Message(NamedTuple):
 
 
 Take = Callable[[Message], None]
+Found = TypeVar("Found")
 
 
 class Bridge(Device):
@@ -126,6 +128,13 @@ class Bridge(Device):
         """Return until when it is worth to wait for something, by ``time.monotonic`` [s]."""
         return max(self._began + DISCOVERY, time.monotonic() + MATCHING)
 
+    def awaited(self, look: Callable[[], Found]) -> Found:
+        """Return what there is, as soon as there is something and as long as it may appear."""
+        until = self.until_known()
+        while not (found := look()) and time.monotonic() < until:
+            time.sleep(0.05)
+        return found
+
     def wait_until_known(self) -> None:
         """Return when all that runs is known."""
         time.sleep(max(self._began + DISCOVERY - time.monotonic(), 0.0))
@@ -146,11 +155,8 @@ class Bridge(Device):
         """
         if take:
             self._takers[topic] = take
-        until = self.until_known()
-        while not self._ask("follow", topic=topic, type=kind, always=always):
-            if time.monotonic() > until:
-                raise DeviceError(f"{self.asker}: nobody publishes {topic}; {self._others(kind)}")
-            time.sleep(0.05)
+        if not self.awaited(lambda: self._ask("follow", topic=topic, type=kind, always=always)):
+            raise DeviceError(f"{self.asker}: nobody publishes {topic}; {self._others(kind)}")
 
     def newest(self, topic: str) -> Message | None:
         """Return the newest message of a topic that is followed.
@@ -309,7 +315,8 @@ class Bridge(Device):
                 self._newest[topic] = message
                 self._news.notify_all()
             if topic in self._takers:
-                self._takers[topic](message)
+                with contextlib.suppress(StageError):  # damaged: as if it had not come
+                    self._takers[topic](message)
         elif "triggered" in said:
             self._triggered.put(said)
         else:

@@ -20,6 +20,10 @@ STALE = 0.25
 20 Hz unless it is told otherwise [s]."""
 
 
+UNIT = 0.01
+"""A quaternion whose norm is off by more is none, and tf2 leaves such a transform out as well."""
+
+
 class Frame(NamedTuple):
     """A frame: its parent, its pose there (4, 4), and when that came; never for one that stands."""
 
@@ -114,8 +118,9 @@ class Frames:
     def _take(self, message: Message, received_ns: int | None) -> None:
         for each in decoded(message.data, TF_TYPE).transforms:
             turn, move = each.transform.rotation, each.transform.translation
-            xyzw = np.array([turn.x, turn.y, turn.z, turn.w])
-            rotation = rotation_from_quaternion(xyzw / np.linalg.norm(xyzw))
-            pose = rigid(rotation, np.array([move.x, move.y, move.z]))
+            xyzw, place = [turn.x, turn.y, turn.z, turn.w], [move.x, move.y, move.z]
+            if not (abs(np.linalg.norm(xyzw) - 1.0) < UNIT and np.isfinite(place).all()):
+                continue
+            pose = rigid(rotation_from_quaternion(np.array(xyzw)), place)
             parent, child = (n.lstrip("/") for n in (each.header.frame_id, each.child_frame_id))
             self.frames[child] = Frame(parent, pose, received_ns)

@@ -61,7 +61,7 @@ class Ros2Graph(Device):
         self._bridge.close()
 
     def topics(self) -> list[Topic]:
-        """Return the topics that run, by name, 2.5 s after joining: then all are known."""
+        """Return the topics that run, by name, 2 s after joining: then all are known."""
         self._bridge.wait_until_known()
         known = self._bridge.topics()
         return [known[n] for n in sorted(known) if known[n].publishers or known[n].subscribers]

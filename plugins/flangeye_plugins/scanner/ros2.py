@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ from pydantic import Field, model_validator
 
 from flangeye.devices import PATIENCE, DeviceError, FrameDropped, Scan, Scanner
 from flangeye.errors import StageError
+from flangeye.models.graph import Topic
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import Params, part
 from flangeye.types import Floats, Image
@@ -41,6 +43,10 @@ TRIGGER_MESSAGE = b"\x00\x01\x00\x00\x00"
 
 EARLY = 0.1
 """A stamp so long after the message came is of another clock [s]."""
+
+TICK = 20_000_000
+"""Simulated time stands still between two messages of /clock, at 100 Hz or more; a stamp may be of
+the one before [ns]. The arm has stood for longer."""
 
 PINHOLES = ("", "plumb_bob", "rational_polynomial")
 """Distortion models of CameraInfo that OpenCV's coefficients mean."""
@@ -116,14 +122,13 @@ class Ros2Scanner(OpenScanner):
             DeviceError: Nobody publishes, or what is needed does not come.
         """
         self._bridge, self._params = bridge, params
-        topics = bridge.topics()
         self._kinds: dict[str, str] = {}
         for topic, kinds in (
             (params.cloud, [CLOUD]), (params.depth, [IMAGE]), (params.image, [IMAGE, COMPRESSED]),
         ):  # fmt: skip
             if topic:
-                runs = topics[topic].type if topic in topics else kinds[0]
-                self._kinds[topic] = runs if runs in kinds else kinds[0]
+                runs = bridge.awaited(partial(_running, bridge, topic))
+                self._kinds[topic] = runs.type if runs and runs.type in kinds else kinds[0]
                 bridge.follow(topic, self._kinds[topic], always=False)
         self._camera = None if params.cloud and not params.image else self._read_camera()
         self._calls = bool(params.trigger) and self._find_trigger(str(params.trigger))
@@ -177,21 +182,21 @@ class Ros2Scanner(OpenScanner):
         Raises:
             DeviceError: It is neither.
         """
-        services = self._bridge.services()
-        if trigger in services:
+        found = self._bridge.awaited(
+            lambda: self._bridge.services().get(trigger) or _running(self._bridge, trigger)
+        )
+        if found == TRIGGER:
             self._bridge.find(trigger)
             return True
-        runs = self._bridge.topics().get(trigger)
-        if runs is None or runs.type != EMPTY:
-            known = sorted(s for s, kind in services.items() if kind == TRIGGER)
+        if not isinstance(found, Topic) or found.type != EMPTY:
+            services = self._bridge.services().items()
+            known = sorted(name for name, kind in services if kind == TRIGGER)
             raise DeviceError(
                 f"{NAME}: {trigger} is neither a service nor a topic of {EMPTY} that runs; "
                 f"services of type {TRIGGER}: {', '.join(known) or 'none'}"
             )
         self._bridge.offer(trigger, EMPTY)
-        until = time.monotonic() + self._params.timeout
-        while not self._bridge.listeners(trigger) and time.monotonic() < until:
-            time.sleep(0.05)
+        self._bridge.awaited(lambda: self._bridge.listeners(trigger))
         return False
 
     def _facts(self) -> dict[str, str]:
@@ -220,7 +225,7 @@ class Ros2Scanner(OpenScanner):
                     f"{NAME}: {topic} is stamped {early:.2f} s after "
                     "it came: set the clocks of both computers (NTP), or sim_time"
                 )
-            if stamp >= started:
+            if stamp >= started - TICK * self._params.sim_time:
                 return message
             late.append(1e-9 * (started - stamp))
             count = self._bridge.want(topic)
@@ -272,3 +277,7 @@ class Ros2Scanner(OpenScanner):
         return Image(
             np.ascontiguousarray(pixels[..., ::-1] if pixels.ndim == 3 else pixels), *camera[:2]
         )
+
+
+def _running(bridge: Bridge, topic: str) -> Topic | None:
+    return bridge.topics().get(topic)

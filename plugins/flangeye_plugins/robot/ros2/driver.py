@@ -194,16 +194,13 @@ class Ros2Arm(Listener):
         self._began = np.inf  # it did set off
 
     def _require_listener(self) -> None:
-        until = self._bridge.until_known()
-        while not self._bridge.listeners(self._topic):
-            if time.monotonic() > until:
-                topics = self._bridge.topics().values()
-                others = [t.name for t in topics if t.type == TRAJECTORY and t.subscribers]
-                raise DeviceError(
-                    f"{self.name}: no controller listens to {self._topic}; topics of this type "
-                    f"that one listens to: {', '.join(others) or 'none'}: is the controller active?"
-                )
-            time.sleep(0.05)
+        if not self._bridge.awaited(lambda: self._bridge.listeners(self._topic)):
+            topics = self._bridge.topics().values()
+            others = [t.name for t in topics if t.type == TRAJECTORY and t.subscribers]
+            raise DeviceError(
+                f"{self.name}: no controller listens to {self._topic}; topics of this type "
+                f"that one listens to: {', '.join(others) or 'none'}: is the controller active?"
+            )
 
     def _publish(self, points: list[pieces.Point]) -> None:
         time_type, header = "builtin_interfaces/msg/Time", "std_msgs/msg/Header"

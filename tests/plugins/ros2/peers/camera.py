@@ -31,7 +31,7 @@ from flangeye_emulators.world.scene import CellScene, Stance
 from flangeye_plugins.acquire.camera import image_of_cloud
 from tests.plugins.ros2.peers.node import SENSOR, rclpy, say, serve
 
-BOARD = Board("charuco", 6, 5, 0.018, 0.013, "DICT_4X4_50")
+BOARD = Board("charuco", 6, 5, 0.018, 0.013, "4X4_50")
 FLANGE_T_BOARD = rigid(np.eye(3), np.array([-0.05, -0.04, 0.01]))
 LENS = BoardCamera(
     np.array([[1400.0, 0, 639.5], [0, 1400.0, 511.5], [0, 0, 1]]),

@@ -48,7 +48,7 @@ def _transform(given):
     found = TransformStamped(child_frame_id=child)
     found.header.frame_id = parent
     move, turn = found.transform.translation, found.transform.rotation
-    move.x, move.y, move.z, turn.x, turn.y, turn.z, turn.w = numbers
+    move.x, move.y, move.z, turn.x, turn.y, turn.z, turn.w = map(float, numbers)
     return found
 
 

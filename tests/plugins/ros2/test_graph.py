@@ -1,0 +1,157 @@
+"""Graphs as they are: the kit, namespaces, tf, simulated time, markers; in realtime."""
+
+import numpy as np
+import pytest
+
+from flangeye.devices import DeviceError
+from flangeye.maths.geometry import quaternion_from_rotation
+from flangeye.maths.kinematics import Arm
+from flangeye.models.loading import load_model
+from flangeye.testing import RobotConformance, ScannerConformance
+from flangeye_plugins.robot.ros2.driver import (
+    FreedriveParams,
+    Ros2Params,
+    robot_ros2,
+    robot_ros2_freedrive,
+)
+from flangeye_plugins.ros2.graph import Ros2Graph
+from flangeye_plugins.scanner.ros2 import Ros2Params as Topics
+from flangeye_plugins.scanner.ros2 import scanner_ros2
+from tests.plugins.ros2 import installed
+from tests.plugins.ros2.cell import (
+    FACING,
+    TOWARDS,
+    Camera,
+    Controller,
+    Frames,
+    Terminal,
+    peers,
+)
+
+pytestmark = [pytest.mark.realtime, pytest.mark.ros2]
+
+ARM, EYE = load_model("robots", "ur5e"), load_model("scanners", "phoxi-m")
+JOINTS = tuple(f"joint_{i}" for i in range(1, 7))
+
+
+@pytest.fixture(scope="class")
+def cell():
+    installed.require()
+    given = installed.environment(installed.free_domain())
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in given.items():
+            patch.setenv(name, value)
+        with peers(Controller(given), Camera(given, "phoxi")):
+            yield
+
+
+@pytest.mark.usefixtures("cell")
+class TestRobot(RobotConformance):
+    part = robot_ros2
+    params = Ros2Params(joints=JOINTS, trajectory=Controller.topic)
+
+    def context(self):
+        return {bool: False}
+
+
+@pytest.mark.usefixtures("cell")
+class TestScanner(ScannerConformance):
+    part = scanner_ros2
+    params = Topics(cloud="/camera/points", trigger="/camera/capture")
+
+
+def test_the_pose_may_come_from_tf_and_is_lost_with_it(env):
+    installed.tf2_msgs()
+    flange = Arm(ARM).flange(np.radians(FACING))
+    numbers = [*flange[:3, 3], *quaternion_from_rotation(flange[:3, :3])]
+    tree = Frames(env, [["rail", "base_link", [0, 0, 1, 0, 0, 0, 1]]],
+                  [["base_link", "tool0", [float(n) for n in numbers]]])  # fmt: skip
+    with peers(Controller(env, controller=None), tree) as (arm, tree):
+        params = FreedriveParams(joints=tuple(arm.joints), tf={})
+        with robot_ros2_freedrive.function(ARM, params) as robot:
+            assert np.allclose(robot.state().base_T_flange.matrix, flange, atol=1e-6)
+            tree.kill()
+            with pytest.raises(DeviceError, match="tf has not told of tool0 for"):
+                for _ in range(100):
+                    robot.wait_cycle()
+                    robot.state()
+        lost = FreedriveParams(joints=tuple(arm.joints), tf={"flange": "gripper"})
+        with pytest.raises(DeviceError, match=r"nobody publishes /tf;|does not join base_link"):
+            robot_ros2_freedrive.function(ARM, lost)
+
+
+def test_simulated_time_drives_arm_and_camera(env):
+    with peers(Controller(env, sim_time=True), Camera(env, "zivid", sim_time=True)) as (arm, _):
+        params = Ros2Params(joints=tuple(arm.joints), trajectory=arm.topic, sim_time=True)
+        with robot_ros2.function(ARM, params) as robot:
+            goal = robot.state().joints + 0.1
+            robot.move_joints(goal, 0.5, 2.0)
+            while robot.state().mode != "ready":
+                robot.wait_cycle()
+            assert np.abs(robot.state().joints - goal).max() < 1e-3
+        topics = Topics(cloud="/camera/points", trigger="/camera/capture", sim_time=True)
+        with scanner_ros2.function(EYE, topics) as eye:
+            assert eye.expose()().cloud.xyz.ndim == 3
+        wall = Ros2Params(joints=tuple(arm.joints), trajectory=arm.topic)
+        with pytest.raises(DeviceError, match="sim_time: true where stamps are of /clock"):
+            robot_ros2.function(ARM, wall)
+
+
+def test_a_compressed_image_shows_a_marker_with_its_camera(env):
+    with peers(Controller(env), Camera(env, "image")):
+        with scanner_ros2.function(None, Topics(image="/camera/image_raw/compressed",
+                                                camera_info="/camera/camera_info")) as eye:  # fmt: skip
+            image = eye.expose()().image
+            assert image.pixels.shape[:2] == (1024, 1280)
+            assert np.allclose(np.diag(image.camera_matrix), [1400, 1400, 1])
+        with pytest.raises(DeviceError, match="carries sensor_msgs/msg/CompressedImage, sensor_ms"):
+            scanner_ros2.function(None, Topics(depth="/camera/image_raw/compressed",
+                                               camera_info="/camera/camera_info"))  # fmt: skip
+
+
+def test_a_graph_of_two_cells_is_told_apart(env, tmp_path):
+    cells = [
+        peer
+        for side, towards in (("left", FACING), ("right", TOWARDS))
+        for peer in (
+            Controller(env, namespace=f"/{side}", prefix=f"{side}_", joints=towards,
+                       controller="arm_controller"),
+            Camera(env, "realsense", namespace=f"/{side}/eye", prefix=f"{side}_"),
+        )
+    ]  # fmt: skip
+    asked = {}
+    chosen = {"robot": "/right/robot_description", "scans": "/right/eye/points"}
+
+    def ask(flag, question, default, example=""):
+        asked[flag] = default
+        return chosen.get(flag) or default or "/right/arm_controller/joint_trajectory"
+
+    with peers(*cells), Ros2Graph() as graph:
+        names = {topic.name: topic for topic in graph.topics()}
+        assert names["/left/eye/points"].publishers == ("camera",)
+        found = graph.cell(ask, "cell")
+    assert asked == {"robot": None, "scans": None, "trajectory": None}
+    assert found.robot["base"] == "right_base_link"
+    assert found.robot["driver"]["ros2"]["joint_states"] == "/right/joint_states"
+    assert found.scanner["driver"]["ros2"] == {"cloud": "/right/eye/points"}
+    assert np.allclose(found.flange, Arm(ARM).flange(np.radians(TOWARDS)), atol=1e-3)
+    assert found.steps[0]["export.ros2_launch"]["child"] == "right_optical_frame"
+
+
+@pytest.mark.parametrize(
+    ("peer", "words", "said"),
+    [
+        (None, (), "which robot_description (none runs)"),
+        ({"controller": None}, (), "which topic has the scans ()"),
+        ({"joints": TOWARDS}, ("--scans", "/none"), "nobody publishes clouds or depth images on /"),
+        ({"joints": TOWARDS}, ("--robot", "none.urdf"), "none.urdf"),
+    ],
+)
+def test_what_init_cannot_see_is_one_line(env, tmp_path, peer, words, said):
+    with peers(*([Controller(env, **peer)] if peer else [])):
+        _, wrong = Terminal(tmp_path, env).run(
+            "init", "--ros2", "--scanner", "phoxi-m", "--yes", *words, expect=2
+        )
+    assert said in wrong
+    assert len(wrong.splitlines()) == 1
+    assert not [*tmp_path.iterdir()]
