@@ -1,6 +1,7 @@
 """From a terminal in which ROS 2 runs to a verified matrix on the graph; in realtime."""
 
 import itertools
+import json
 import signal
 
 import numpy as np
@@ -68,23 +69,34 @@ def test_two_commands_lead_to_a_verified_matrix_and_a_third_to_the_graph(termina
         assert "published until Ctrl-C" in said
 
 
-def test_an_arm_without_a_controller_is_calibrated_without_permission_to_move(terminal):
-    env = terminal.env
-    poses = leaning()
+def test_an_arm_that_others_move_is_calibrated_and_then_watched(terminal):
+    poses, eye = leaning(), {"layout": "phoxi", "resolution": 0.4, "namespace": "/cell/eye"}
+    check = ("monitor", "run", "--live", "--scans", "2")
     with peers(
-        Controller(env, controller=None, joints=TOWARDS, prefix="left_", namespace="/cell"),
-        Camera(env, "phoxi", resolution=0.4, namespace="/cell/eye"),
-    ) as (arm, camera):
+        Controller(terminal.env, controller=None, joints=TOWARDS, prefix="left_",
+                   namespace="/cell"), Camera(terminal.env, **eye),
+    ) as (arm, camera):  # fmt: skip
         terminal.run("init", "--ros2", "--scanner", "phoxi-m", "--yes",
                      "--trigger", "/cell/eye/capture")  # fmt: skip
-        told = []
-        with terminal.start("run", "recipe.yaml", "--out", "run", *FEW) as run:
-            for line in run.stderr:
-                told.append(line)
-                if line.startswith("Move the flange on"):
-                    arm.tell(hand=next(poses).tolist(), seconds=1.0)
-        assert run.returncode == 0, told
+        by_hand(terminal, arm, poses, 0, "run", "recipe.yaml", "--out", "run", *FEW)
         require_near(found(terminal), camera.pose())
+        assert by_hand(terminal, arm, poses, 0, *check)["state"] == "OK"
+        camera.kill()
+        with peers(Camera(terminal.env, **eye, moved=[0.005, 0.0, 0.0])):
+            assert by_hand(terminal, arm, poses, 2, *check)["state"] == "MOVED"
+
+
+def by_hand(terminal, arm, poses, code, *words):
+    """Run a command, move the arm whenever it asks for it, and return the JSON it printed, if any."""
+    told = []
+    with terminal.start(*words) as run:
+        for line in run.stderr:
+            told.append(line)
+            if line.startswith("Move the flange on"):
+                arm.tell(hand=next(poses).tolist(), seconds=1.0)
+        said = run.stdout.read()
+    assert run.returncode == code, told
+    return json.loads(said) if said.startswith("{") else None
 
 
 def leaning():
