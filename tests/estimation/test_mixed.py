@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flangeye.estimation.mixed import fit, left_out, without
+from flangeye.estimation.mixed import fit, left_out
 from tests.estimation import foreign
 from tests.estimation.sessions import estimated, robot, score
 
@@ -38,8 +38,6 @@ def test_leaving_one_out_in_closed_form_is_leaving_it_out(found) -> None:
     others = fit(model.weighted(shares), mode.sizes)
     expected = (model.residuals - model.design @ others.mean)[3]
     assert left_out(model, everyone)[0][3] == pytest.approx(expected, rel=1e-5, abs=1e-10)
-    fold = shares == 0
-    assert without(everyone, model, fold) == pytest.approx(others.mean, rel=1e-4, abs=1e-9)
 
 
 def test_a_pose_that_belongs_elsewhere_is_set_aside() -> None:

@@ -22,7 +22,7 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import cho_solve, cholesky
 
-from flangeye.types import Floats, Mask
+from flangeye.types import Floats
 
 FREE = 1e-10
 """Information of each unknown before anything is seen, as a share of what is most: none, but what
@@ -126,8 +126,6 @@ class Fit:
         weights: (N, 6, 6) inverse covariances of the noise, each by its share.
         cost: -2 log of the restricted likelihood, but for a constant.
         gradient: (S,) of it by the logarithm of each size.
-        information: (P + K, P + K) of the sightings and the prior.
-        right: (P + K,) right side of the normal equations.
     """
 
     sizes: Floats
@@ -136,8 +134,6 @@ class Fit:
     weights: Floats
     cost: float
     gradient: Floats
-    information: Floats
-    right: Floats
 
 
 def fit(model: Model, sizes: Floats, with_gradient: bool = True) -> Fit:
@@ -172,7 +168,7 @@ def fit(model: Model, sizes: Floats, with_gradient: bool = True) -> Fit:
         + np.einsum("na,nab,nb->", left, weights, left)
         + prior @ mean**2
     )
-    found = Fit(sizes, mean, covariance, weights, cost, np.zeros(len(sizes)), information, right)
+    found = Fit(sizes, mean, covariance, weights, cost, np.zeros(len(sizes)))
     if not with_gradient:
         return found
     return replace(found, gradient=_gradient(model, sizes, found, (h, left, bare, prior)))
@@ -285,7 +281,11 @@ def posterior(model: Model, mode: Floats | None = None) -> Posterior:
 
 
 def _laplace(model: Model, z: Floats) -> Floats:
-    """Return (Z, Z) a root of the covariance of the sizes about their mode."""
+    """Return (Z, Z) the root of the covariance of the sizes about their mode.
+
+    The symmetric one: eigenvectors have no sign of their own, and draws are to be the same for
+    sessions that differ by rounding.
+    """
     step, prior = 0.05, model.sizes
 
     def slope(at: Floats) -> Floats:
@@ -295,7 +295,7 @@ def _laplace(model: Model, z: Floats) -> Floats:
     curvature = 0.5 * (np.array(rows) + np.array(rows).T)
     values, vectors = np.linalg.eigh(curvature)
     # A size that nothing shows has the prior's curvature, one.
-    return np.asarray(vectors / np.sqrt(np.maximum(values, 0.25)))
+    return np.asarray(vectors / np.sqrt(np.maximum(values, 0.25)) @ vectors.T)
 
 
 def _draws(count: int, samples: int) -> Floats:
@@ -322,15 +322,3 @@ def left_out(model: Model, found: Fit) -> tuple[Floats, Floats]:
     full = np.linalg.inv(np.eye(6) - leverage @ found.weights)
     predicted = full @ leverage
     return (full @ left[..., None])[..., 0], predicted
-
-
-def without(found: Fit, model: Model, fold: Mask) -> Floats:
-    """Return (P + K,) the mean without some sightings, by the same normal equations less theirs."""
-    h, w = model.design[fold], found.weights[fold]
-    r = (model.projectors[fold] @ model.residuals[fold][..., None])[..., 0]
-    count = h.shape[2]
-    weighted = (w @ h).reshape(-1, count)
-    information = found.information - h.reshape(-1, count).T @ weighted
-    right = found.right - weighted.T @ r.ravel()
-    scaled, scale = _scaled(information)
-    return np.asarray(np.linalg.solve(scaled, right / scale) / scale)

@@ -150,7 +150,7 @@ def test_moving_the_base_moves_the_answer_and_nothing_else(seed: int) -> None:
     ]
     here, there = solve(observations), solve(moved)
     expected = motion @ here.base_T_camera.transform
-    np.testing.assert_allclose(there.base_T_camera.transform.matrix, expected.matrix, atol=1e-4)
+    np.testing.assert_allclose(there.base_T_camera.transform.matrix, expected.matrix, atol=1e-7)
     assert [p.used for p in here.pairs] == [p.used for p in there.pairs]
 
 
