@@ -55,4 +55,4 @@ def test_what_is_stated_as_reported_is_as_large_as_the_error(kind) -> None:
     assert 0.4 < nees.mean() < 1.7  # 8 sessions of 6 numbers: 99 % of means
     assert 0.6 < np.sqrt(stated.mean() / true.mean()) < 1.7
     if kind == "flange":
-        assert true.mean() < 1.35**2 * np.mean([s.svd for s in scores])  # 1.0 over 100 sessions
+        assert true.mean() < 1.1**2 * np.mean([s.svd for s in scores])

@@ -119,8 +119,8 @@ def session_of(
     Raises:
         StageError: Too few sightings, all the same, those of a mirrored camera, or the pose of
             something that moves is missing.
-        CalibrationRefused: Fewer than half of them agree, nothing gives a start, or a marker has
-            another size than was said.
+        CalibrationRefused: Fewer than half of them agree, nothing gives a start, a clock is off
+            by more than was recorded, or a marker has another size than was said.
     """
     problem = problem_of(observations, cell, asked.normals)
     if len(problem.ends) == 1:
@@ -161,9 +161,8 @@ def _begun(problem: Problem) -> tuple[Problem, Places, Mask, tuple[Note, ...]]:
     """Return places that most sightings agree on, and which do, less normals of another frame."""
     placed = all(problem.frames[target].place is not None for _, target in problem.ends)
     circles = problem.seen.ranks == 5
-    in_line = (
-        spread_of(problem.seen.centres).width < IN_LINE * spread_of(problem.seen.centres).length
-    )
+    spread = spread_of(problem.seen.centres)
+    in_line = spread.width < IN_LINE * spread.length
     bare = problem.without_normals(circles) if placed and not in_line else problem
     places, squares = begin(bare)
     _require_agreement(bare, places, agreeing(bare, squares))
@@ -319,7 +318,11 @@ def _with_bad_normals_left_out(session: Session) -> Session:
 
 
 def _on_one_clock(session: Session) -> Session:
-    """Return the session with the arms where they were when cameras saw them."""
+    """Return the session with the arms where they were when cameras saw them.
+
+    Raises:
+        CalibrationRefused: A clock is further off than what was recorded about each capture.
+    """
     total: dict[str, float] = {}
     moved = session
     for _ in range(CLOCK_STEPS):
@@ -332,8 +335,12 @@ def _on_one_clock(session: Session) -> Session:
         total = {camera: total.get(camera, 0.0) + x for camera, x in left.items()}
         later = delayed(session.observations, session.cell, total)
         if later is None:
-            far = ", ".join(f"{x * 1e3:.1f} ms" for x in total.values())
-            return session.noted(f"clocks seem {far} apart, and no pose was recorded so far away")
+            camera = max(total, key=lambda name: abs(total[name]))
+            raise CalibrationRefused(
+                f"the clock of {camera} seems {total[camera] * 1e3:.1f} ms off, and where the arm "
+                "was then is not in the recording: record more before and after each capture, or "
+                "let the arm stand still"
+            )
         moved = replace(moved.again(later), notes=session.notes)
     sigmas = [float(np.sqrt(cov[0, 0])) for _, _, cov in moved.found.numbers("clock")]
     told = [
