@@ -184,6 +184,11 @@ def moved_only(places):
 
 MISSING = {
     # name: (cell, what moves in it, how it moved instead, who stays unknown, what would tell)
+    "the second arm stood still": (
+        "two arms with a scanner each and one between", "flange2", still,
+        "base2 and hand2 and plate2 are",
+        r"turn flange2 about \S+, \S+, \S+ and .* of base2 by 20 deg",
+    ),
     "the second arm turned about one axis": (
         "two arms with a scanner each and one between", "flange2", lambda x: turned(x, [0, 0, 1]),
         "base2 and hand2 and plate2 are", r"turn flange2 about \(\S+, \S+, \S+\) of base2 by 20 deg",
@@ -212,14 +217,9 @@ def test_the_motion_that_is_missing_is_named_and_is_enough(name: str) -> None:
         solve_graph(given(lame), seen(lame, pairs, np.random.default_rng(0)))
     assert "no sighting" not in str(told.value)
     assert "no motion" not in str(told.value)
-    cured, text = lame, str(told.value)
-    for _ in range(4):  # what is named first may leave one more axis to be named
-        cured = {**cured, mover: replace(cured[mover], place=obeyed(cured[mover].place, text))}
-        try:
-            found = solve_graph(given(cured), seen(cured, pairs, np.random.default_rng(0)))
-            break
-        except CalibrationRefused as error:
-            text = str(error)
+    place = obeyed(lame[mover].place, str(told.value))
+    cured = {**lame, mover: replace(lame[mover], place=place)}
+    found = solve_graph(given(cured), seen(cured, pairs, np.random.default_rng(0)))
     assert {x.transform.child for x in found.transforms.values()} == {*unknown}
 
 

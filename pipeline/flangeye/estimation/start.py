@@ -5,9 +5,8 @@ The loop of one camera and one target is a circle of unknown places U and of wha
 .. math:: U_1 K_1 U_2 K_2 \cdots = 1
 
 Up to three unknowns have closed forms. A loop is solved from all its sightings and from small sets
-of them drawn at random; that answer is taken which explains the better half of the sightings best
-(least median of squares, Rousseeuw 1984). What one loop tells is known in the next. Where no loop
-leads on, descents begin at random places.
+of them drawn at random; that answer is taken which most of them agree with. What one loop tells is
+known in the next. Where no loop leads on, descents begin at random places.
 """
 
 from __future__ import annotations
@@ -100,10 +99,11 @@ def size_of(problem: Problem) -> float:
     places and the size (Andreff et al. 2001). Of small sets of poses that is taken which explains
     the better half of all poses best. Of loops of two unknown places.
     """
-    names, (seen, carried) = circle_of(problem)[0], circle_of(problem)[1][:2]
-    rng, n, least, size = np.random.default_rng(0), len(problem.seen), np.inf, 1.0
+    (names, known), rng = circle_of(problem), np.random.default_rng(0)
+    n, least, size = len(problem.seen), np.inf, 1.0
     if len(names) != 2:
         return size
+    seen, carried = known
     for _ in range(SETS):
         rows = rng.choice(n, min(SIZE_ROWS, n), replace=False)
         with suppress(np.linalg.LinAlgError, CalibrationRefused):
@@ -200,26 +200,34 @@ def _way(problem: Problem, end: str, shared: int) -> list[Floats | str]:
 
 
 def _solved(loop: _Loop, rng: np.random.Generator) -> dict[str, Floats] | None:
-    """Return the places that explain the better half of a loop's sightings best."""
+    """Return the places that most sightings of a loop agree with.
+
+    The better half alone does not tell: where an arm stood still in half of the sightings, places
+    that fit those are many, and only the others say which is right. So it gives the scale, and
+    squares beyond that count alike (MSAC, Torr & Zisserman 2000).
+    """
     form = _form_of(loop)
     if form is None or len(loop.seen) < form.fewest:
         return None
     n = len(loop.seen)
     everyone = np.arange(n) if n <= MOST else rng.choice(n, MOST, replace=False)
-    best, least, of_all = None, np.inf, np.inf
     size = min(form.fewest + (1 if n > form.fewest else 0), n)
+    tried: list[tuple[dict[str, Floats], Floats]] = []
+    least, of_all = np.inf, np.inf
     for draw in range(-1, SETS):
         if draw == FIRST and of_all <= ENOUGH * least:
             break
         chosen = everyone if draw < 0 else rng.choice(n, size, replace=False)
         with suppress(np.linalg.LinAlgError, CalibrationRefused):
-            places = form.solve(chosen, rng, draw < 0)
-            median = float(np.median(distances(loop.problem, places)))
-            if median < least:
-                best, least = places, median
+            places = form.solve(chosen, rng)
+            tried.append((places, distances(loop.problem, places)))
+            least = min(least, float(np.median(tried[-1][1])))
         if draw < 0:
             of_all = least
-    return best
+    floor = (LEVER * NOISE[0]) ** 2 + NOISE[1] ** 2
+    scale = GOOD * max(least, floor)
+    best = min(tried, key=lambda each: float(np.minimum(each[1], scale).sum()), default=None)
+    return None if best is None else best[0]
 
 
 def distances(problem: Problem, places: Places) -> Floats:
@@ -232,20 +240,20 @@ class _Form(NamedTuple):
     """A closed form: how many sightings it needs, and the places by some of them."""
 
     fewest: int
-    solve: Callable[[Indices, np.random.Generator, bool], dict[str, Floats]]
+    solve: Callable[[Indices, np.random.Generator], dict[str, Floats]]
 
 
 def _form_of(loop: _Loop) -> _Form | None:
     """Return the closed form of a loop; None where there is none."""
     whole, count = bool((loop.seen.ranks == 6).all()), len(loop.unknown)
     if whole and count <= 3:
-        return _Form({1: 1, 2: 3, 3: 6}[count], lambda rows, rng, _: _of_poses(loop, rows, rng))
+        return _Form({1: 1, 2: 3, 3: 6}[count], lambda rows, rng: _of_poses(loop, rows, rng))
     if count == 1:
         of_point = loop.unknown[0] == loop.target[-2] if len(loop.target) > 1 else False
-        return _Form(1 if of_point else 3, lambda rows, rng, _: _of_points(loop, rows))
+        return _Form(1 if of_point else 3, lambda rows, rng: _of_points(loop, rows))
     if count == 2 and len(loop.camera) == len(loop.target) == 3:
         fewest = 5 if (loop.seen.ranks >= 5).all() else 8
-        return _Form(fewest, lambda rows, rng, _: _linear(loop, rows))
+        return _Form(fewest, lambda rows, rng: _linear(loop, rows))
     return None
 
 
@@ -271,7 +279,7 @@ def start_of_circles(problem: Problem) -> dict[str, Floats]:
             "which for the flange's own circle is known, or use a marker"
         )
     rows = np.arange(len(loop.seen))
-    return form.solve(rows, np.random.default_rng(0), True)
+    return form.solve(rows, np.random.default_rng(0))
 
 
 # --- closed forms of a loop ----------------------------------------------------------------------
