@@ -97,12 +97,12 @@ def _truth(truth: TruthResult) -> list[str]:
 
 
 def _over(held: HoldoutResult) -> str:
-    """Return what the held-out figures are over, and that of the inliers where it differs."""
+    """Return what the held-out figures are over, and that of all poses where it differs."""
     outliers = int(held.figures.get("outliers", 0))
-    over = f"{held.folds} folds over all poses"
     if not outliers:
-        return over
-    return f"{over}; {_mm(held.figures['rms_inliers'])} rms without {outliers} outliers"
+        return f"{held.folds} folds over all poses"
+    every = _mm(held.figures["rms_all"])
+    return f"{held.folds} folds without {outliers} outliers; {every} rms with them"
 
 
 def _answers(result: Result) -> list[str]:

@@ -7,6 +7,8 @@ and b its least-squares rigid part,
 
 .. math:: p_{reported} = p + A\,\delta, \qquad b = \arg\min \sum_{work} |d - b|^2
 
+over positions and turns, these at a short lever: of work in a line they tell the turn about it.
+
 What is common to all poses cancels, so that it is known far better than the true pose.
 """
 
@@ -24,8 +26,8 @@ from flangeye.types import ExpectedError, Floats
 
 DRAWS = 8
 """Of an error at each pose and each draw of the sizes, for its quantiles."""
-LEVER = 0.1
-"""Turns of a target count like what they do so far from it [m]: the size of tools and markers."""
+LEVER = 0.03
+"""Turns count like what they do so far from the centre [m]: at the rim of a common flange."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,12 +105,14 @@ def _rigid_part(
 ) -> Floats:
     """Return (6, K) the rigid motion, about the arm base's origin, of its displacements."""
     places = np.asarray(work.frames[carrier.frame].place)[work.seen.times, :3, 3]
-    moved = _columns_of_arm(found, work, carrier, without)[:, 3:]
-    motions = np.concatenate(
-        [-hat(places), np.broadcast_to(np.eye(3), (len(places), 3, 3))], axis=2
+    weight = np.repeat([LEVER, 1.0], 3)[:, None]
+    moved = weight * _columns_of_arm(found, work, carrier, without)
+    motions = np.tile(np.eye(6), (len(places), 1, 1))
+    motions[:, 3:, :3] = -hat(places)
+    return np.asarray(
+        np.linalg.pinv((weight * motions).reshape(-1, 6), rcond=1e-6)
+        @ moved.reshape(-1, moved.shape[2])
     )
-    return np.asarray(np.linalg.pinv(motions.reshape(-1, 6), rcond=1e-6)
-                      @ moved.reshape(-1, moved.shape[2]))  # fmt: skip
 
 
 def _world(found: Estimate, work: Problem, without: frozenset[str]) -> Floats:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from flangeye.errors import FlangeyeError
 from flangeye.estimation.answers import Answer, as_reported, expected_error, functional
 from flangeye.estimation.certified import answer_of, certificate_notes, moved_note, verdict_of
 from flangeye.estimation.corrections import CORRECTED, corrections_of
@@ -142,6 +144,22 @@ def calibrate_at(
     )
 
 
+def with_expected_error(
+    calibration: HandEye, cell: Cell, scanner: ScannerModel | None, work: Box | None
+) -> HandEye:
+    """Return a calibration by any method with the error to expect of it at the work.
+
+    As it was, where the model refuses its observations or has unknowns that the method leaves out.
+    """
+    found = {x.transform.name: x.transform.matrix for x in calibration.transforms.values()}
+    observations = [pair.observation for pair in calibration.pairs]
+    with suppress(FlangeyeError, KeyError):
+        places = {name: found[cell.name_of(name)] for name in cell.unknown_frames}
+        answer = calibrate_at(places, observations, cell, scanner, Options(work=work), "")
+        return replace(calibration, expected=answer.expected)
+    return calibration
+
+
 def _at_best(session: Session) -> Session:
     """Return the session where the certificate leads, if that fits better, and say so."""
     found = session.found
@@ -233,15 +251,12 @@ def _estimates(session: Session, answer: Answer, weak: Floats) -> list[Transform
     """
     problem, found = session.found.problem, session.found
     moved = _without(problem, problem.moved(found.places, answer.mean), weak)
-    nothing = np.hstack([weak, meaningless(problem)])
-    out = {}
+    rounds, out = meaningless(problem), {}
     for i, name in enumerate(problem.unknown):
         rows = slice(6 * i, 6 * i + 6)
         transform = Transform.named(session.cell.name_of(name), moved[name])
-        free = nothing[rows].copy()
-        own = meaningless(problem)[rows]
-        if own.any():  # a turn of a round target, about its own axis
-            free = np.hstack([weak[rows], _in_parent(moved[name], own)])
+        # A turn of a round target is about its own axis.
+        free = np.hstack([weak[rows], _in_parent(moved[name], rounds[rows])])
         out[name] = _estimate(
             transform, answer.covariance[rows, rows], _about(session, transform), free
         )

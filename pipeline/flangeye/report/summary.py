@@ -118,8 +118,8 @@ def evidence_of(facts: Facts) -> list[KeyFigure]:
         found.append(KeyFigure("Expected, arm corrected", value, "mm", "rms, with its correction"))
     if held := result.holdout:
         if outliers := held.figures.get("outliers"):
-            value = millimetres(held.figures["rms_inliers"])
-            found.append(KeyFigure("Held-out", value, "mm", f"without {outliers:.0f} outliers"))
+            value = millimetres(held.figures["rms_all"])
+            found.append(KeyFigure("Held-out", value, "mm", f"with {outliers:.0f} outliers"))
         found.append(KeyFigure("Held-out", millimetres(held.median), "mm", "median"))
         found.append(KeyFigure("Held-out", millimetres(held.p95), "mm", "95 % below"))
     if truth := result.truth:

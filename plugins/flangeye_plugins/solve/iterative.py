@@ -19,8 +19,6 @@ from flangeye.estimation.observability import (
 )
 from flangeye.maths.geometry import kabsch, kabsch_covariance, rigid
 from flangeye.maths.statistics import covariance_inflation
-from flangeye.models.robots import RobotModel
-from flangeye.models.scanners import ScannerModel
 from flangeye.models.targets import Flange
 from flangeye.types import (
     BASE,
@@ -37,7 +35,6 @@ from flangeye.units import Length, param
 from flangeye_plugins.solve.observations import (
     centres_of,
     estimate_of,
-    expected_at,
     hand_eye,
     residuals_of,
     tcps_of,
@@ -92,8 +89,6 @@ def solve_iterative(
     views: Views | None,
     flange: Flange | None,
     params: IterativeParams,
-    robot: RobotModel | None = None,
-    scanner: ScannerModel | None = None,
 ) -> HandEye:
     """Algorithm 1: keep a pool of poses; each new pose replaces the one whose removal helps most.
 
@@ -127,8 +122,7 @@ def solve_iterative(
     answer, notes = solve_pool(search.pool), [_stopped(search, params)]
     losers = {**search.losers, **{o.id: "kept from the pool to measure on" for o in kept}}
     estimate = _with_covariance(answer, search.pool, observations.seen)
-    expected = expected_at(estimate, observations.seen, robot, scanner)
-    return hand_eye(observations.seen, estimate, "solve.iterative", losers, notes, expected)
+    return hand_eye(observations.seen, estimate, "solve.iterative", losers, notes)
 
 
 def improve_pool(

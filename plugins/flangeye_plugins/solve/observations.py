@@ -3,20 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 
 import numpy as np
 
-from flangeye import FlangeyeError
 from flangeye.maths.geometry import rigid
-from flangeye.models.cell import cell_of
-from flangeye.models.configuration import DEFAULT
-from flangeye.models.robots import RobotModel
-from flangeye.models.scanners import ScannerModel
 from flangeye.types import (
     BASE,
     CAMERA,
-    ExpectedError,
     Floats,
     HandEye,
     Observation,
@@ -49,32 +42,12 @@ def estimate_of(
     return TransformEstimate(transform, 0.5 * (covariance + covariance.T), about)
 
 
-def expected_at(
-    estimate: TransformEstimate,
-    observations: Sequence[Observation],
-    robot: RobotModel | None,
-    scanner: ScannerModel | None,
-) -> ExpectedError | None:
-    """Return the error to expect at the work of a pose, by the model of ``solve.robust``.
-
-    None where that model refuses the observations.
-    """
-    from flangeye.estimation.calibrate import Options, calibrate_at
-
-    cell = cell_of(DEFAULT, robot)
-    places = {CAMERA: estimate.transform.matrix}
-    with suppress(FlangeyeError):
-        return calibrate_at(places, observations, cell, scanner, Options(), "").expected
-    return None
-
-
 def hand_eye(
     observations: Sequence[Observation],
     estimate: TransformEstimate,
     method: str,
     rejected: Mapping[str, str] | None = None,
     notes: Sequence[str] = (),
-    expected: ExpectedError | None = None,
 ) -> HandEye:
     """Return the calibration with one pair for each observation, in the order given.
 
@@ -84,7 +57,6 @@ def hand_eye(
         method: Name of the stage.
         rejected: Observation id -> why it took no part.
         notes: For the person.
-        expected: The error to expect at the work.
     """
     rejected = rejected or {}
     residuals = residuals_of(
@@ -94,4 +66,4 @@ def hand_eye(
         Pair(o, residual, o.id not in rejected, rejected.get(o.id))
         for o, residual in zip(observations, residuals, strict=True)
     ]
-    return HandEye(estimate, tuple(pairs), method, tuple(notes), expected=expected)
+    return HandEye(estimate, tuple(pairs), method, tuple(notes))

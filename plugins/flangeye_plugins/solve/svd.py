@@ -19,14 +19,11 @@ from flangeye.estimation.observability import (
 )
 from flangeye.maths.geometry import kabsch, kabsch_covariance
 from flangeye.maths.statistics import covariance_inflation
-from flangeye.models.robots import RobotModel
-from flangeye.models.scanners import ScannerModel
 from flangeye.types import Floats, HandEye, Observation, Observations, TransformEstimate
 from flangeye.units import Angle, param
 from flangeye_plugins.solve.observations import (
     centres_of,
     estimate_of,
-    expected_at,
     hand_eye,
     residuals_of,
     tcps_of,
@@ -44,12 +41,7 @@ class SvdParams(Params):
 
 
 @stage("solve.svd")
-def solve_svd(
-    observations: Observations,
-    params: SvdParams,
-    robot: RobotModel | None = None,
-    scanner: ScannerModel | None = None,
-) -> HandEye:
+def solve_svd(observations: Observations, params: SvdParams) -> HandEye:
     """Fit the camera's pose to all centres by equally weighted least squares.
 
     Equations (8) to (10) of the paper with scale one. The noise is taken as equal in every
@@ -66,8 +58,7 @@ def solve_svd(
     residuals = residuals_of(pulled, rotation, translation)
     _require_observable(tcps_of(pulled), residuals, params.rotation_limit)
     estimate = least_squares_estimate(rotation, translation, tcps_of(pulled), residuals)
-    expected = expected_at(estimate, pulled, robot, scanner)
-    return hand_eye(pulled, estimate, "solve.svd", expected=expected)
+    return hand_eye(pulled, estimate, "solve.svd")
 
 
 def check_poses(observations: Sequence[Observation]) -> None:

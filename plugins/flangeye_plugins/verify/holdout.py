@@ -77,11 +77,11 @@ def verify_holdout(  # noqa: PLR0913  what it asks the runner for
 ) -> Verification:
     """k-fold cross-validation over poses: solve without each fold and measure the error on it.
 
-    ``rms``, ``median``, ``p95`` and ``max`` are over the poses that the solver used with all poses
-    given, of the pose for the arm as its controller reports it; ``rms_inliers`` is the same
-    ``rms``, ``outliers`` counts the poses set aside, and ``rms_all`` is over all. Where the solver
-    gave an answer for the corrected arm, ``corrected_rms``, ``corrected_median`` and
-    ``corrected_p95`` are those of the pose and the arm so corrected.
+    ``rms``, ``median``, ``p95`` and ``max`` are over all poses but outliers, of the pose for the
+    arm as its controller reports it; ``rms_all`` is over all. ``outliers`` counts the poses that
+    the solver did not use and that are off by more than the limit. Where the solver gave an answer
+    for the corrected arm, ``corrected_rms``, ``corrected_median`` and ``corrected_p95`` are those
+    of the pose and the arm so corrected.
 
     Figures [m, rad]: these, ``folds``, ``limit``, ``poses``, and ``tilt_rms`` where orientations
     were measured.
@@ -99,13 +99,14 @@ def verify_holdout(  # noqa: PLR0913  what it asks the runner for
     standing = cell or cell_of(configuration or DEFAULT, robot, second.model if second else None)
     used = np.array([pair.used for pair in calibration.pairs])
     held = hold_out(poses, deals, [each.as_reported() for each in solved], standing)
-    figures = {"folds": float(len(deals)), "limit": params.max_rms, **_figures(held, used)}
+    norms = np.linalg.norm(held.errors, axis=1)
+    counted = used | (norms <= params.max_rms)
+    figures = {"folds": float(len(deals)), "limit": params.max_rms, **_figures(held, counted)}
     if calibration.as_corrected():
         answers = [each.as_corrected() or each.as_reported() for each in solved]
-        corrected = _figures(hold_out(poses, deals, answers, standing), used)
+        corrected = _figures(hold_out(poses, deals, answers, standing), counted)
         figures |= {f"corrected_{name}": corrected[name] for name in ("rms", "median", "p95")}
     passed, reason = _judge(figures, params)
-    norms = np.linalg.norm(held.errors, axis=1)
     errors = {o.id: float(norm) for o, norm in zip(poses, norms, strict=True)}
     return Verification(passed, reason, figures, errors)
 
@@ -175,16 +176,15 @@ def _tilt(feature: Feature, turn: Floats) -> float:
     return np.nan if feature.normal is None else float(angle_between(feature.normal, turn[:, 2]))
 
 
-def _figures(held: HeldOut, used: Mask) -> dict[str, float]:
+def _figures(held: HeldOut, counted: Mask) -> dict[str, float]:
     from flangeye.maths.statistics import rms
 
     every = np.linalg.norm(held.errors, axis=1)
-    norms, tilts = every[used], held.tilts[used & np.isfinite(held.tilts)]
+    norms, tilts = every[counted], held.tilts[counted & np.isfinite(held.tilts)]
     figures = {
         "poses": float(len(every)),
-        "outliers": float((~used).sum()),
+        "outliers": float((~counted).sum()),
         "rms": rms(norms),
-        "rms_inliers": rms(norms),
         "rms_all": rms(every),
         "median": float(np.median(norms)),
         "p95": float(np.quantile(norms, 0.95)),

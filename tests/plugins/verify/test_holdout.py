@@ -112,7 +112,7 @@ def test_the_figures_of_isotropic_noise() -> None:
     assert figures["p95"] == pytest.approx(np.quantile(sizes, 0.95))
     assert figures["max"] == max(sizes)
     assert figures["outliers"] == 0
-    assert figures["rms_inliers"] == figures["rms"]
+    assert figures["rms_all"] == figures["rms"]
     assert result.reason == (
         f"held-out error {figures['rms'] * 1e3:.3f} mm rms, within the limit of 1 mm"
     )
@@ -146,7 +146,7 @@ def test_a_solver_that_sets_nothing_aside_answers_for_every_pose() -> None:
     result = verify_holdout(svd(observations), svd, HoldoutParams())
     assert not result.passed
     assert result.figures["outliers"] == 0
-    assert result.figures["rms"] == result.figures["rms_inliers"] > 3 * MM
+    assert result.figures["rms"] == result.figures["rms_all"] > 3 * MM
 
 
 def without_07(observations: Sequence[Observation]) -> HandEye:
