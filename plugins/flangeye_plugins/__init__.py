@@ -46,6 +46,8 @@ STAGES = {
     "segment.sphere": "flangeye_plugins.segment.sphere:segment_sphere",
     "fit.sphere": "flangeye_plugins.fit.sphere:fit_sphere",
     "fit.sphere_profile": "flangeye_plugins.fit.sphere_profile:fit_sphere_profile",
+    "segment.body": "flangeye_plugins.segment.body:segment_body",
+    "fit.body": "flangeye_plugins.fit.body:fit_body",
     "solve.robust": "flangeye_plugins.solve.robust:solve_robust",
     "solve.svd": "flangeye_plugins.solve.svd:solve_svd",
     "solve.iterative": "flangeye_plugins.solve.iterative:solve_iterative",

@@ -131,7 +131,7 @@ def test_a_good_recipe_resolves_to_itself(toy_registry: Registry) -> None:
             STEPS.replace("title: T", "titel: T"),
             ["r.yaml:1: title: is missing",
              "r.yaml:1: titel: unknown key 'titel'; did you mean 'title'? (allowed: title, "
-             "description, robot, second_robot, scanner, configuration, cell, feature, "
+             "description, robot, second_robot, scanner, configuration, cell, feature, target, "
              "workspace, seed, log, steps)"],
         ),
         (

@@ -3,7 +3,7 @@
 ::
 
     title: Plate with a straight V-groove
-    cad: plate.stl            # STL or PLY, beside this file
+    cad: plate.stl            # STL, PLY, OBJ, … beside this file
     unit: mm                  # of the CAD and of the points below; neither says it itself
     seams:
       - name: groove
@@ -19,6 +19,7 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -36,9 +37,11 @@ from flangeye.units import Angle, Length
 
 Vector = tuple[float, float, float]
 
-MESHES = (".stl", ".ply")
+MESHES = (".stl", ".ply", ".obj", ".glb", ".3mf", ".step", ".stp")
 MAX_MESH = 256_000_000
 """Largest CAD file [bytes]: five million triangles."""
+STEP = (".step", ".stp")
+"""Surfaces, which ``cascadio`` of the extra ``cad`` cuts into triangles, in metres."""
 MARGIN = 0.1
 """A seam may be this far outside the CAD's box, as a share of its diagonal."""
 
@@ -57,7 +60,7 @@ class WorkpieceFile(Model):
     """The file."""
 
     title: str
-    cad: str = Field(description="STL or PLY file with triangles, beside this one.")
+    cad: str = Field(description="File with triangles, beside this one: STL, PLY, …")
     unit: LengthUnit = Field(description="Unit of the CAD's coordinates and of the seams' points.")
     seams: tuple[SeamLine, ...] = Field(min_length=1)
     source: str = ""
@@ -134,13 +137,15 @@ def load_workpiece(path: Path) -> Workpiece:
 
 
 def read_mesh(path: Path) -> tuple[Floats, NDArray[np.int32]]:
-    """Return vertices (V, 3), in the file's unit, and triangles (T, 3) of an STL or PLY file.
+    """Return vertices (V, 3), in the file's unit, and triangles (T, 3) of a mesh.
 
     Raises:
         StageError: It is missing, damaged, or holds no triangles.
     """
     if path.suffix.lower() not in MESHES:
         raise StageError(f"{path}: '{path.suffix}' is no CAD; known: {', '.join(MESHES)}")
+    if path.suffix.lower() in (*STEP, ".3mf") and find_spec("cascadio") is None:
+        raise StageError(f"{path}: STEP and 3MF need: pip install 'flangeye[cad]'")
     vertices, triangles = _decoded(path, read_regular(path, MAX_MESH))
     if triangles.ndim != 2 or not len(triangles):
         raise StageError(f"{path}: holds no triangles; is it a mesh, and whole?")

@@ -16,6 +16,7 @@ import numpy as np
 from flangeye import types as t
 from flangeye.devices import RobotDriver, ScannerDriver
 from flangeye.errors import RecipeError
+from flangeye.models.bodies import TargetBody, load_body
 from flangeye.models.cell import Cell
 from flangeye.models.configuration import CARRIERS, LINK, ORIGIN, Configuration, Triple
 from flangeye.models.loading import load_model
@@ -57,6 +58,8 @@ def context_of(header: Header, folder: Path, complain: Complain) -> Context:
     if sphere := header.feature.sphere:
         size = None if sphere.diameter == "unknown" else sphere.diameter / 2
         context[Sphere] = Sphere(size=size, centre_in_flange=sphere.centre)
+    if target := header.target:
+        offer(TargetBody, ("target", "body"), lambda: load_body(target.body, target.unit, folder))
     if (robot := header.robot) and (robot.model or robot.urdf):
         place = ("robot", "model" if robot.model else "urdf")
         offer(RobotModel, place, lambda: _arm(robot, header.feature.standard, folder))
@@ -176,6 +179,19 @@ def _configuration(header: Header, context: Context) -> Configuration:
     section = header.configuration
     cameras, targets = CARRIERS[section.name]
     camera, target = section.camera or cameras[0], section.target or targets[0]
+    stands = _stands(section.place)
+    if body := header.target:
+        if section.place != "known":
+            raise RecipeError("place: where a body is drawn is said once, by target: {at: …}")
+        if body.at == "unknown":
+            stands = None
+        elif body.at not in targets:
+            raise RecipeError(
+                f"{section.name}: the target is carried by {' or '.join(targets)}; "
+                f"target: {{at: …}} is one of them or unknown, not {body.at}"
+            )
+        else:
+            target = body.at
     if LINK in cameras:
         _require_link(camera, context)
     elif camera not in cameras:
@@ -183,7 +199,7 @@ def _configuration(header: Header, context: Context) -> Configuration:
     if target not in targets:
         allowed = " or ".join(targets)
         raise RecipeError(f"{section.name}: the target is carried by {allowed}, not by {target}")
-    return Configuration(section.name, camera, target, _stands(section.place))
+    return Configuration(section.name, camera, target, stands)
 
 
 def _stands(place: Place) -> tuple[Triple, Triple] | None:

@@ -12,6 +12,7 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema
 
+from flangeye.files.clouds import LengthUnit
 from flangeye.plugin.stage import BoundPart, Choose, Params
 from flangeye.units import Acceleration, Angle, AngularSpeed, Length, Speed, param
 
@@ -169,6 +170,24 @@ class FeatureSection(Section):
     )
 
 
+class TargetSection(NamedSection):
+    """A body of known shape that is looked for in the flange's place: what the arm carries."""
+
+    word: ClassVar[str] = "body"
+
+    body: str = Field(
+        description="A mesh beside the recipe (STL, PLY, OBJ, GLB, 3MF, STEP), or a bundled body."
+    )
+    unit: LengthUnit | None = Field(
+        None, description="Of the mesh's coordinates; judged by its size if not given."
+    )
+    at: Literal["flange", "base", "unknown"] = Field(
+        "flange",
+        description="The frame the mesh is drawn in; unknown: fixed to the arm's flange, drawn in "
+        "a frame of its own, and its place is found.",
+    )
+
+
 class PlaceSection(Section):
     """Where the target is, in the frame that carries it."""
 
@@ -293,6 +312,7 @@ class Header(Section):
     configuration: ConfigurationSection = Field(default_factory=ConfigurationSection)
     cell: CellSection | None = None
     feature: FeatureSection = Field(default_factory=FeatureSection)
+    target: TargetSection | None = None
     workspace: WorkspaceSection | None = None
     seed: int = Field(0, ge=0, description="The only source of randomness.")
     log: LogSection = Field(default_factory=LogSection)

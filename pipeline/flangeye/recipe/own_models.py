@@ -11,6 +11,7 @@ from typing import Any
 
 import yaml
 
+from flangeye.models.bodies import TargetBody
 from flangeye.models.cell import Cell
 from flangeye.models.model import Model
 from flangeye.models.robots import RobotModel, SecondRobot
@@ -19,7 +20,7 @@ from flangeye.models.standards import FlangeStandard
 from flangeye.recipe.context import Context
 from flangeye.recipe.header import Header
 
-CARRIED = re.compile(r"models/\w+\.yaml")
+CARRIED = re.compile(r"models/\w+\.(yaml|ply)")
 """Names of such files, beside the log and in it."""
 
 
@@ -48,6 +49,9 @@ def written_out(
     for section, key, name, model in _own(data, context, moves):
         files[f"models/{name}.yaml"] = _text(model)
         section[key] = f"models/{name}.yaml"
+    if header.target and Path(header.target.body).suffix:
+        files["models/body.ply"] = context[TargetBody].as_ply()
+        data["target"] |= {"body": "models/body.ply", "unit": "m"}
     return data, files
 
 

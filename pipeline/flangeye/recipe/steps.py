@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, get_args
 
 from flangeye import types as t
 from flangeye.devices import MotionAllowed, RobotDriver, ScannerDriver
+from flangeye.models.bodies import TargetBody
 from flangeye.models.cell import Cell
 from flangeye.models.configuration import CELL, DEFAULT, Configuration
 from flangeye.models.robots import RobotModel, SecondRobot
@@ -59,6 +60,7 @@ SECTIONS: Mapping[Any, Offer] = {
         ("feature",),
         "feature: {sphere: {diameter: 38.1 mm, centre: [0 mm, 0 mm, 60 mm]}}",
     ),
+    TargetBody: Offer("a body to look for", ("target",), "target: {body: gripper.stl, at: flange}"),
     t.Seed: Offer("a seed", ("seed",), "seed: 0"),
     Configuration: Offer(
         "a configuration",
@@ -141,7 +143,7 @@ class StepOrder:
         self._circles = True
         self._complain = complain
         self._lost = False
-        self._have: set[Any] = {*given, t.ArchivePath, t.Box, t.StageLog, MotionAllowed}
+        self._have: set[Any] = {*given, t.ArchivePath, t.Box, t.Earlier, t.StageLog, MotionAllowed}
         self._rank = 0
         self._kinds: list[str] = []
 

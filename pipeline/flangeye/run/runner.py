@@ -122,6 +122,7 @@ class Runner:
             chain(islice(taken, start.first), self._gathered(), taken), stream.source, stream.total
         )
         self._outcome.seen = solvable.seen
+        self._values[t.Earlier] = t.Earlier(solvable.seen)
         self._values[t.Observations] = solvable
         return truth
 
@@ -193,7 +194,7 @@ class Runner:
     def _may_work_ahead(self, stream: t.Captures) -> bool:
         steps = (*self._steps("segment"), *self._steps("fit"))
         needs = [need for step in steps for need in step.stage.needs.values()]
-        return stream.recorded and cores() > 1 and t.StageLog not in needs
+        return stream.recorded and cores() > 1 and not {t.StageLog, t.Earlier} & {*needs}
 
     def _ahead(self, stream: t.Captures) -> Generator[t.Capture | t.Rejection]:
         """Yield the captures; the next ones are segmented and fitted meanwhile, on all cores."""

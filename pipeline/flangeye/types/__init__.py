@@ -57,7 +57,16 @@ from flangeye.types.frames import (
 from flangeye.types.notes import Note, Warn, records_of, warnings_of
 from flangeye.types.running import ArchivePath, Progress, Resumed, Seed, StageLog
 from flangeye.types.scans import Capture, FlangeCloud, Image, Role, ScanPlace, WorkpieceScan
-from flangeye.types.streams import Captures, Look, Observations, Source, Stream, Truth, Views
+from flangeye.types.streams import (
+    Captures,
+    Earlier,
+    Look,
+    Observations,
+    Source,
+    Stream,
+    Truth,
+    Views,
+)
 from flangeye.types.welding import Seam, WeldReport
 
 __all__ = [
@@ -77,6 +86,7 @@ __all__ = [
     "Captures",
     "CircleFeature",
     "CorrectedArm",
+    "Earlier",
     "ExpectedError",
     "ExportedFile",
     "Feature",

@@ -88,14 +88,18 @@ class FlangeCloud:
         cloud: (N, 3) points in ``camera``, all finite.
         centre: (3,) rough centre of the disc in ``camera`` [m]; a start for fitting.
         normal: (3,) rough unit normal in ``camera``, towards the scanner.
+        camera_T_target: (4, 4) rough pose of a body; None of a circle or a sphere.
     """
 
     cloud: PointCloud
     centre: Array
     normal: Array
+    camera_T_target: Array | None = None
 
     def __post_init__(self) -> None:
         freeze(self, centre=(3,), normal=(3,))
+        if self.camera_T_target is not None:
+            freeze(self, camera_T_target=(4, 4))
 
 
 @dataclass(frozen=True, eq=False)

@@ -89,6 +89,16 @@ class Observations(Stream[Observation]):
     """What a ``solve`` stage takes; an ``acquire`` stage may give it where no clouds exist."""
 
 
+@dataclass(frozen=True)
+class Earlier:
+    """What was observed in this run before the capture at hand, in order.
+
+    A ``segment`` stage that asks for it is given one capture after the other.
+    """
+
+    observations: Sequence[Observation]
+
+
 class Views(list[VerificationView]):
     """The verification views seen so far; they come before the first observation."""
 

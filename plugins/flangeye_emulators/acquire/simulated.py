@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from flangeye.devices import MotionAllowed
+from flangeye.models.bodies import TargetBody
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
 from flangeye.models.targets import Flange, Sphere
@@ -19,6 +20,7 @@ def acquire_simulated(  # noqa: PLR0913  what it asks the runner for
     seed: Seed,
     params: SimulatedParams,
     sphere: Sphere | None = None,
+    body: TargetBody | None = None,
     stage_log: StageLog | None = None,
     motion: MotionAllowed | None = None,
 ) -> Captures:
@@ -26,7 +28,8 @@ def acquire_simulated(  # noqa: PLR0913  what it asks the runner for
 
     The reported poses are the nominal kinematics of the commanded joints; the arm that is scanned
     has joint zeros of its own. Captures for verification come first. Each scan is made when it is
-    asked for. A robot that is asked for its wrist circle carries its own plate.
+    asked for. A robot that is asked for its wrist circle carries its own plate;
+    a body is on the flange, drawn in its frame.
 
     Raises:
         StageError: Fewer than three poses are possible.
@@ -34,4 +37,4 @@ def acquire_simulated(  # noqa: PLR0913  what it asks the runner for
     """
     from flangeye_emulators.acquire.simulation import Setting, simulate
 
-    return simulate(Setting(robot, scanner, flange, sphere), seed, params, stage_log, motion)
+    return simulate(Setting(robot, scanner, flange, sphere, body), seed, params, stage_log, motion)

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel
@@ -16,6 +16,7 @@ from pydantic import BaseModel
 from flangeye.devices import MotionAllowed
 from flangeye.errors import NothingMoved, StageError
 from flangeye.maths.geometry import invert
+from flangeye.models.bodies import TargetBody
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel, middle_of_view
 from flangeye.models.targets import Flange, Sphere, plate_of
@@ -76,6 +77,7 @@ class Setting(NamedTuple):
     scanner: ScannerModel
     flange: Flange
     sphere: Sphere | None
+    body: TargetBody | None
 
 
 def simulate(
@@ -86,7 +88,7 @@ def simulate(
     motion: MotionAllowed | None,
 ) -> Captures:
     """Return the captures of a session; see ``acquire.simulated``."""
-    robot, scanner, flange, sphere = setting
+    robot, scanner, flange, sphere, body = setting
     plate = flange if flange.bore else plate_of(robot)
     planning, checking, errors, noise, later = np.random.SeedSequence([VERSION, seed]).spawn(5)
     base_T_camera = params.camera.base_T_camera
@@ -97,9 +99,9 @@ def simulate(
     if motion and motion.plan_only:
         raise _plan_alone(stops, reach, site)
     unseen = [] if params.arm.is_default else _unseen(stops.plan, site, _rng(checking.spawn(1)[0]))
-    cell = SimulatedCell(robot, plate, stops.plan.centre, stops.plan.size, sphere)
+    cell = SimulatedCell(robot, plate, stops.plan.centre, stops.plan.size, sphere, body)
     session = _session(cell, scanner, stops, unseen, params, errors)
-    source = session.source(_fingerprint(seed, robot, scanner, flange, params, sphere))
+    source = session.source(_fingerprint(seed, robot, scanner, flange, params, sphere, body=body))
     whys = [pose.why for pose in stops.all]
     # A plan that says why is heard before each scan, so nothing is scanned ahead of it.
     ahead = not any(whys)
@@ -184,8 +186,9 @@ def _unseen(plan: Plan, site: Site, rng: np.random.Generator) -> list[Floats]:
     return [pose.joints for pose in poses_near(plan.centre, UNSEEN, site, rng, spread)]
 
 
-def _fingerprint(seed: int, *models: BaseModel | None) -> str:
-    given = [model.model_dump(mode="json") for model in models if model is not None]
+def _fingerprint(seed: int, *models: BaseModel | None, body: TargetBody | None) -> str:
+    given: list[Any] = [model.model_dump(mode="json") for model in models if model is not None]
+    given += [body.digest] if body else []
     text = json.dumps([VERSION, seed, given], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flangeye.maths.geometry import rotation_from_rpy
+from flangeye.models.bodies import TargetBody
 from flangeye.models.robots import RobotModel
 from flangeye.models.targets import Flange, Sphere
 from flangeye.motion.clearance import ArmVolume
@@ -40,6 +41,7 @@ class SimulatedCell:
         centre: (3,) middle of the workspace [m].
         size: (3,) of the workspace [m].
         sphere: What the flange carries besides, if anything.
+        body: The same of a tool, drawn in the flange's frame.
     """
 
     robot: RobotModel
@@ -47,6 +49,7 @@ class SimulatedCell:
     centre: Floats
     size: Floats
     sphere: Sphere | None = None
+    body: TargetBody | None = None
 
     def around(self) -> list[Body]:
         """Return what does not move."""
@@ -80,6 +83,9 @@ class SimulatedCell:
         finish = materials.FINISHES[self.flange.details.finish]
         plate = Body(flange_mesh(self.flange), finish)
         wrist = Body(wrist_mesh(self.flange), materials.PAINTED)
+        if self.body is not None:
+            tool = Mesh(self.body.vertices, self.body.triangles)
+            return [plate, wrist, Body(tool, materials.METAL)]
         if self.sphere is None:
             return [plate, wrist]
         ball = Body(sphere_mesh(self.sphere), materials.MATT)
@@ -90,6 +96,8 @@ class SimulatedCell:
         half, away = 4 * self.flange.outer, 0.06
         if self.sphere is not None:
             away += self.sphere.centre_in_flange[2] + self.sphere.radius
+        if self.body is not None:
+            away += float(self.body.vertices[:, 2].max())
         sheet = Body(box([-half, -half, away], [half, half, away + 0.003]), materials.WALL)
         return sheet.moved(base_T_flange)
 

@@ -1,0 +1,119 @@
+"""A body of known shape that a scan is searched for: a gripper, a torch, a plate, by its CAD."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye.errors import RecipeError, StageError
+from flangeye.files.bundled import bundled
+from flangeye.files.clouds import PER_METRE, LengthUnit
+from flangeye.files.near import nearest
+from flangeye.models.workpiece import MESHES, STEP, read_mesh
+from flangeye.types import Floats
+
+SMALLEST, LARGEST = 0.02, 3.0
+"""Diagonal of a body that an arm carries and a scanner sees [m]; of the robot's base at most."""
+
+IN_METRES = (".glb", *STEP)
+"""Formats that come in metres: glTF by definition (2.0, section 3.4), STEP as it is read."""
+
+
+@dataclass(frozen=True, eq=False)
+class TargetBody:
+    """A body's surface, in the frame of its file.
+
+    Attributes:
+        name: For people.
+        vertices: (V, 3) [m].
+        triangles: (T, 3) indices of vertices.
+        note: How its unit was judged; empty where it was stated.
+    """
+
+    name: str
+    vertices: Floats
+    triangles: NDArray[np.int32]
+    note: str = ""
+
+    @property
+    def size(self) -> float:
+        """Diagonal of the box around it [m]."""
+        return float(np.linalg.norm(np.ptp(self.vertices, axis=0)))
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of its surface: equal bodies, equal digests."""
+        return hashlib.sha256(self.vertices.tobytes() + self.triangles.tobytes()).hexdigest()
+
+    def as_ply(self) -> str:
+        """Return it as an ASCII PLY file in metres, to 0.1 um."""
+        head = (
+            f"ply\nformat ascii 1.0\nelement vertex {len(self.vertices)}\n"
+            "property float x\nproperty float y\nproperty float z\n"
+            f"element face {len(self.triangles)}\nproperty list uchar int vertex_indices\n"
+            "end_header\n"
+        )
+        points = "".join(f"{x:.7f} {y:.7f} {z:.7f}\n" for x, y, z in self.vertices)
+        return head + points + "".join(f"3 {a} {b} {c}\n" for a, b, c in self.triangles)
+
+
+def body_names() -> list[str]:
+    """Return the names of the bundled bodies, sorted."""
+    return sorted(path.stem for path in (bundled("data") / "bodies").glob("*.stl"))
+
+
+def load_body(name: str, unit: LengthUnit | None, near: Path) -> TargetBody:
+    """Return the body ``name``: a bundled one, or a mesh beside the recipe.
+
+    Args:
+        name: A bundled body's name, or a path with the suffix of a mesh.
+        unit: Of the mesh's coordinates; judged by its size if not given.
+        near: Folder of the recipe.
+
+    Raises:
+        RecipeError: There is no such body, its file is damaged, or its size is no tool's.
+    """
+    path = near / name
+    if path.suffix.lower() not in MESHES:
+        path = bundled("data") / "bodies" / f"{name}.stl"
+        if not path.is_file():
+            close = nearest(name, body_names(), n=2) or body_names()
+            raise RecipeError(
+                f"no body '{name}'; known: {', '.join(close)}, or a file ({', '.join(MESHES)})"
+            )
+    try:
+        vertices, triangles = read_mesh(path)
+    except StageError as error:
+        raise RecipeError(str(error)) from None
+    used, note = _unit_of(path, vertices, unit)
+    return TargetBody(path.stem, vertices / PER_METRE[used], triangles, note)
+
+
+def _unit_of(path: Path, vertices: Floats, unit: LengthUnit | None) -> tuple[LengthUnit, str]:
+    """Return the unit of a mesh, and how it was judged; empty where it was stated."""
+    across = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    if unit or path.suffix.lower() in IN_METRES:
+        used: LengthUnit = unit or "m"
+        if not SMALLEST <= across / PER_METRE[used] <= LARGEST:
+            raise RecipeError(
+                f"{path.name}: in {used} it is {across / PER_METRE[used]:.4g} m across, and a body "
+                f"to look for is {SMALLEST * 1e3:g} mm to {LARGEST:g} m; is the unit right?"
+            )
+        return used, ""
+    fitting: list[LengthUnit] = [
+        unit for unit in ("mm", "m") if SMALLEST <= across / PER_METRE[unit] <= LARGEST
+    ]
+    if len(fitting) != 1:
+        raise RecipeError(
+            f"{path.name}: {across:.4g} across in its own unit, which may be "
+            f"{' or '.join(fitting) if fitting else 'none known'}; state it, for example unit: mm"
+        )
+    return fitting[0], (
+        f"{path.name}: taken to be in {fitting[0]}, so {across / PER_METRE[fitting[0]] * 1e3:.0f} "
+        "mm across; state unit: where that is wrong"
+    )

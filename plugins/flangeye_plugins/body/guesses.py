@@ -1,0 +1,85 @@
+"""Where a body may be in a scan, without any guess: edges of the body on edges of the scan.
+
+Where a face ends, its normal and the direction in which it ends are a frame. Every such frame of
+the body is laid on every one of the scan, and a few points of the body rule most of them out.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flangeye.types import Floats, Indices
+from flangeye_plugins.body.looks import LISTED, Looks
+from flangeye_plugins.body.shape import Oriented, thin
+from flangeye_plugins.body.view import View
+
+SCAN_ENDS, BODY_ENDS = 600, 400
+"""Points where faces end that are laid on each other, at most."""
+
+SCAN_SPACING, BODY_SPACING = 1 / 22, 1 / 18
+"""How far those are apart, as shares of the body's size."""
+
+FILTERS = ((4, 0.2), (12, 0.25))
+"""Points of the body by which poses are judged, and share of them that passes."""
+
+SETTLED = 6000
+"""Number of poses that are settled."""
+
+REACH = 0.12
+"""How far settling looks, as a share of the size."""
+
+AT_ONCE = 30_000
+"""Poses judged at once: their points stay in a core's cache."""
+
+
+def guesses(view: View, looks: Looks, most: int) -> Floats:
+    """Return at most so many (K, 4, 4) ``camera_T_body`` that a scan does not speak against."""
+    rng = np.random.default_rng(2)
+    on = _some(view.edges(looks.size), SCAN_ENDS, looks.size * SCAN_SPACING, rng)
+    off = _some(looks.ends, BODY_ENDS, looks.size * BODY_SPACING, rng)
+    poses = _passed(on, off, view, looks)
+    poses = poses[_best_of(looks.rough_scores(poses, view, LISTED), SETTLED)].astype(np.float64)
+    rough = looks.thinned(LISTED)
+    for _ in range(2):
+        poses = rough.settled(poses, view, REACH * looks.size)
+    return np.asarray(poses[_best_of(looks.rough_scores(poses, view, LISTED), most)])
+
+
+def _best_of(scores: Floats, most: int) -> Indices:
+    """Return the numbers of the best, in no order."""
+    every = np.arange(len(scores))
+    return every if len(scores) <= most else np.argpartition(-scores, most)[:most]
+
+
+def _passed(on: Oriented, off: Oriented, view: View, looks: Looks) -> Floats:
+    """Return the better of the poses that lay the body's ends of faces on the scan's."""
+    scan, body = _frames(on), _frames(off)
+    number = np.arange(len(scan) * len(body))
+
+    def posed(number: Indices) -> Floats:
+        reference, anchor = np.divmod(number, max(len(body), 1))
+        out: Floats = np.zeros((len(number), 4, 4), np.float32)
+        out[:, :3, :3], out[:, 3, 3] = scan[reference].transpose(0, 2, 1) @ body[anchor], 1.0
+        moved = np.einsum("nij,nj->ni", out[:, :3, :3], off.points[anchor])
+        out[:, :3, 3] = on.points[reference] - moved
+        return out
+
+    for count, share in FILTERS:
+        scores = [
+            looks.rough_scores(posed(number[k : k + AT_ONCE]), view, count)
+            for k in range(0, max(len(number), 1), AT_ONCE)
+        ]
+        number = number[_best_of(np.concatenate(scores), int(share * len(number)))]
+    return posed(number)
+
+
+def _some(points: Oriented, count: int, spacing: float, rng: np.random.Generator) -> Oriented:
+    """Return so many points spread over all surfaces."""
+    mixed = points.take(rng.permutation(len(points.points)))
+    return mixed.take(rng.permutation(thin(mixed.points, mixed.directions, spacing))[:count])
+
+
+def _frames(ends: Oriented) -> Floats:
+    """Return (N, 3, 3) rotations to frames of the normals and the directions of ends."""
+    third = np.cross(ends.normals, ends.directions)
+    return np.stack([ends.normals, ends.directions, third], axis=1)

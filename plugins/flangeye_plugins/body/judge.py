@@ -1,0 +1,117 @@
+"""Whether a scan shows a body at a pose: ray by ray, everything the scanner saw there."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from flangeye.types import Floats, Mask
+from flangeye_plugins.body.shape import GRAZING, Shape
+from flangeye_plugins.body.view import View
+
+NEAR = 0.1
+"""How far in front of the body a surface contradicts it, as a share of the size: what is nearer to
+the scanner hides it."""
+
+JUMP = 6.0
+"""Widths of a cell by which neighbouring rays differ in depth where the body has an edge."""
+
+OUTLINE = 3
+"""Cells beside the body in which its surface should have ended."""
+
+PENALTY = 10
+"""Rays in favour that one ray against outweighs: of the true pose there are hardly any."""
+
+
+class Verdict(NamedTuple):
+    """What speaks for a body's pose and what against it.
+
+    Attributes:
+        due: Rays that should meet the body, away from its edges.
+        agree: Of these, how many do.
+        against: How many show something that cannot be there: behind the body, or right before it.
+        goes_on: Rays beside it that show its surface where it has ended.
+        beside: Rays beside it that show anything.
+    """
+
+    due: int
+    agree: int
+    against: int
+    goes_on: int
+    beside: int
+
+    @property
+    def shown(self) -> float:
+        """Share of the body's view that is seen as it should be."""
+        return self.agree / max(self.due, 1)
+
+    @property
+    def trusted(self) -> float:
+        """Share of what was seen in its place that is the body."""
+        return self.agree / max(self.agree + self.against, 1)
+
+    @property
+    def score(self) -> float:
+        """What poses are ranked by: rays for it, less those against it."""
+        return self.agree - PENALTY * self.against - self.goes_on
+
+
+def judged(shape: Shape, view: View, pose: Floats, tolerance: float) -> Verdict:
+    """Return what speaks for ``camera_T_body`` and what against it.
+
+    Args:
+        shape: The body.
+        view: What the scanner saw, finely.
+        pose: (4, 4).
+        tolerance: How far off the body's surface the scan may be [m].
+    """
+    from scipy import ndimage
+
+    window = _window(shape, view, pose)
+    rays, scan = view.directions[window], view.xyz[window]
+    if not rays.size:
+        return Verdict(0, 0, 0, 0, 0)
+    depth, normals = _seen_from(shape, rays, pose)
+    hit = np.isfinite(depth)
+    off = np.einsum("ijk,ijk->ij", normals, scan - np.where(hit, depth, 0.0)[..., None] * rays)
+    due = hit & ~_edges(np.where(hit, depth, np.inf), view.angle)
+    due &= np.einsum("ijk,ijk->ij", normals, rays) < -GRAZING * np.linalg.norm(rays, axis=-1)
+    agree = due & (np.abs(off) < tolerance)
+    before = (off > 2 * tolerance) & (scan[..., 2] > depth - NEAR * shape.size)
+    against = due & ((off < -2 * tolerance) | before)
+    beside = ndimage.binary_dilation(hit, iterations=OUTLINE) & ~ndimage.binary_dilation(hit)
+    row, column = ndimage.distance_transform_edt(~hit, return_distances=False, return_indices=True)
+    ended = depth[row, column][..., None] * rays[row, column]
+    on = np.abs(np.einsum("ijk,ijk->ij", normals[row, column], scan - ended)) < 2 * tolerance
+    counts = (due, agree, against, beside & on, beside & np.isfinite(scan[..., 2]))
+    return Verdict(*(int(count.sum()) for count in counts))
+
+
+def _seen_from(shape: Shape, rays: Floats, pose: Floats) -> tuple[Floats, Floats]:
+    """Return (H, W) depth of the body along rays with z = 1, and (H, W, 3) normals in camera."""
+    rotation, origin = pose[:3, :3], -pose[:3, 3] @ pose[:3, :3]
+    met = shape.meet(origin, rays.reshape(-1, 3) @ rotation)
+    return met.depth.reshape(rays.shape[:2]), (met.normals @ rotation.T).reshape(rays.shape)
+
+
+def _edges(depth: Floats, angle: float) -> Mask:
+    """Return (H, W) where neighbouring rays end at different depths."""
+    from scipy import ndimage
+
+    far = np.where(np.isfinite(depth), depth, 1e3)
+    return np.asarray(
+        ndimage.maximum_filter(far, 3) - ndimage.minimum_filter(far, 3) > JUMP * angle * far
+    )
+
+
+def _window(shape: Shape, view: View, pose: Floats) -> tuple[slice, slice]:
+    """Return the rows and columns that a body may be seen in."""
+    corners = shape.vertices[shape.hull] @ pose[:3, :3].T + pose[:3, 3]
+    if (corners[:, 2] <= 0).any():
+        return slice(0, 0), slice(0, 0)
+    at = (corners[:, 1::-1] / corners[:, 2:] - view.low[::-1]) / view.angle
+    most = view.xyz.shape[:2]
+    low = np.clip(np.floor(at.min(axis=0)).astype(int) - OUTLINE, 0, most)
+    high = np.clip(np.ceil(at.max(axis=0)).astype(int) + OUTLINE, low, most)
+    return slice(low[0], high[0]), slice(low[1], high[1])

@@ -1,0 +1,307 @@
+"""What of a body a scanner sees from where, and how well a scan shows it at a pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from itertools import permutations, product
+
+import numpy as np
+
+from flangeye.maths.geometry import rotation_exp, rotation_log
+from flangeye.models.bodies import TargetBody
+from flangeye.types import Floats, Indices, Mask
+from flangeye_plugins.body.shape import GRAZING, Oriented, Shape, spread_directions
+from flangeye_plugins.body.view import View
+
+DIRECTIONS = 128
+"""From which a body is looked at to know what hides what."""
+
+BEYOND = 0.05
+"""How far beyond the end of a face nothing of it should be seen, as a share of the size."""
+
+ROUGH = 0.06
+"""How far off a surface may be while the turn is known to 9 degrees, as a share of the size."""
+
+TOLERANCE = 0.01
+"""How far the scan's surface may be from a pose's, as a share of the size; three sigma of the
+scanner's noise at least."""
+
+STEEP, NEARBY = 3.0, 3.0
+"""Widths of a cell by which a steep surface's depth differs in it, and by which it may be off."""
+
+ALIKE, SIMILAR = 0.5, 0.85
+"""Cosine of the largest angle between a surface of the body and the scan's there: where a
+candidate is on its way, and where it is judged."""
+
+SAME, EVERYWHERE = 0.06, 0.97
+"""How near a symmetric body's points come to each other, as a share of the size: the spacing of the
+samples, and the share of them that must."""
+
+SHOWN = 1e-4
+"""Share of the body's points that show a direction: of facets of a cylinder fewer do."""
+
+QUARTERS = np.array([
+    m for m in (np.array(signs)[:, None] * np.eye(3)[list(order)]
+                for order in permutations(range(3)) for signs in product((1, -1), repeat=3))
+    if np.linalg.det(m) > 0 and np.trace(m) < 3
+])  # fmt: skip
+"""The 23 turns that bring a cube to itself."""
+
+LISTED = 40
+"""Points of the body that stand for what is seen of it from a direction."""
+
+DAMPING = 1e-3
+"""Share of a point's information that holds a candidate where it is."""
+
+
+@dataclass(frozen=True, eq=False)
+class Looks:
+    """What of a body is seen from where.
+
+    Attributes:
+        size: Of the body [m].
+        centre: (3,) [m].
+        surface: Points of it.
+        ends: Points where its faces end.
+        views: (V, 3) directions from the scanner to the body.
+        seen, ends_seen: (V, N) which points are seen from there; of the ends, which end before
+            something that is far behind.
+    """
+
+    size: float
+    centre: Floats
+    surface: Oriented
+    ends: Oriented
+    views: Floats
+    seen: Mask
+    ends_seen: Mask
+
+    @cached_property
+    def beyond(self) -> Floats:
+        """(N, 3) points beside the body, where its faces have ended."""
+        return self.ends.points + BEYOND * self.size * self.ends.directions
+
+    def thinned(self, count: int) -> Looks:
+        """Return so many points of either."""
+        rng = np.random.default_rng(1)
+        on = rng.permutation(len(self.surface.points))[:count]
+        off = rng.permutation(len(self.ends.points))[:count]
+        return replace(
+            self,
+            surface=self.surface.take(on),
+            ends=self.ends.take(off),
+            seen=self.seen[:, on],
+            ends_seen=self.ends_seen[:, off],
+        )
+
+    @cached_property
+    def _listed(self) -> tuple[Indices, Indices]:
+        """(V, LISTED) numbers of surface points and of ends that stand for what is seen."""
+
+        def some(points: Floats, seen: Mask) -> Indices:
+            at = np.flatnonzero(seen)
+            if not len(at):
+                return np.zeros(LISTED, np.int64)
+            out = [0]
+            gap = np.linalg.norm(points[at] - points[at[0]], axis=1)
+            while len(out) < min(LISTED, len(at)):
+                out.append(int(np.argmax(gap)))
+                gap = np.minimum(gap, np.linalg.norm(points[at] - points[at[out[-1]]], axis=1))
+            return np.asarray(at[np.resize(out, LISTED)])
+
+        return (
+            np.array([some(self.surface.points, seen) for seen in self.seen]),
+            np.array([some(self.ends.points, seen) for seen in self.ends_seen]),
+        )
+
+    def rough_scores(self, poses: Floats, view: View, count: int) -> Floats:
+        """Return (K,) how many of so many points are seen, less those that are seen through."""
+        number = self.view_of(poses)
+        # The first are farthest apart.
+        on, off = (listed[number, :count] for listed in self._listed)
+        score = self._surface_score(poses, view, on)
+        if not len(self.ends.points):
+            return score
+        return score + self._ends_score(poses, view, off, beyond=count == LISTED)
+
+    def _surface_score(self, poses: Floats, view: View, at: Indices) -> Floats:
+        placed, facing = _placed(poses, *self._singles[0], at)
+        off, behind, cosine = view.compared(placed, facing)
+        there = (np.abs(off) < ROUGH * self.size) & (cosine > 0.7)
+        there &= np.abs(behind) < 3 * ROUGH * self.size
+        through = behind > 2 * ROUGH * self.size
+        wrong = (np.abs(behind) < 2 * ROUGH * self.size) & ~there
+        return np.asarray(there.sum(axis=1) - through.sum(axis=1) - 0.5 * wrong.sum(axis=1))
+
+    def _ends_score(self, poses: Floats, view: View, at: Indices, beyond: bool) -> Floats:
+        placed, outwards = _placed(poses, *self._singles[1], at)
+        offset, cosine = view.to_end(placed, outwards)
+        there = ((offset**2).sum(axis=-1) < (ROUGH * self.size) ** 2) & (cosine > 0.7)
+        if not beyond:
+            return np.asarray(0.5 * there.sum(axis=1))
+        placed = placed + BEYOND * self.size * outwards
+        facing = self.ends.normals.astype(np.float32)[at] @ poses[:, :3, :3].transpose(0, 2, 1)
+        off, behind, cosine = view.compared(placed, facing)
+        on = (np.abs(off) < ROUGH / 2 * self.size) & (cosine > 0.7)
+        on &= np.abs(behind) < ROUGH * self.size
+        return np.asarray(0.5 * there.sum(axis=1) - 0.5 * on.sum(axis=1))
+
+    @cached_property
+    def _singles(self) -> list[tuple[Floats, Floats]]:
+        """Points and directions of the surface and of the ends, single precision."""
+        return [
+            (part.points.astype(np.float32), part.directions.astype(np.float32))
+            for part in (self.surface, self.ends)
+        ]
+
+    def scores(self, poses: Floats, view: View) -> Floats:
+        """Return (K,) shares of what should be seen that is, less what should not be as it is."""
+        number, tolerance = self.view_of(poses), self.tolerance(view)
+        placed, facing = _placed(poses, self.surface.points, self.surface.directions)
+        off, behind, cosine = view.compared(placed, facing)
+        judged = self.seen[number]
+        near = np.abs(behind) < NEARBY * view.angle * placed[..., 2]
+        there = judged & (np.abs(off) < tolerance) & (cosine > SIMILAR) & near
+        through = judged & (behind > tolerance + STEEP * view.angle * poses[:, None, 2, 3])
+        due = np.maximum(judged.sum(axis=1), 1)
+        score = (there.sum(axis=1) - through.sum(axis=1)) / due
+        if len(self.ends.points):
+            placed, facing = _placed(poses, self.beyond, self.ends.normals)
+            off, behind, cosine = view.compared(placed, facing)
+            judged = self.ends_seen[number]
+            near = np.abs(behind) < NEARBY * view.angle * placed[..., 2]
+            on = judged & (np.abs(off) < tolerance) & (cosine > SIMILAR) & near
+            score -= on.sum(axis=1) / np.maximum(judged.sum(axis=1), 1)
+        return np.asarray(score)
+
+    @cached_property
+    def freedoms(self) -> int:
+        """How many of a pose's six numbers the body shows: a cylinder five, a sphere three."""
+        place = np.concatenate([self.surface.points, self.ends.points]) - self.centre
+        along = np.concatenate([self.surface.directions, self.ends.directions])
+        jacobian = np.hstack([np.cross(place / self.size, along), along])
+        values = np.linalg.eigvalsh(jacobian.T @ jacobian / len(jacobian))
+        return int((values > SHOWN).sum())
+
+    def twins(self, pose: Floats) -> Floats:
+        """Return (K, 4, 4) poses at which a body often looks nearly the same: quarter turns."""
+        middle = self.surface.points.mean(axis=0)
+        out = np.tile(np.eye(4), (len(QUARTERS), 1, 1))
+        out[:, :3, :3] = QUARTERS
+        out[:, :3, 3] = middle - QUARTERS @ middle
+        return np.asarray(pose @ out)
+
+    def apart(self, one: Floats, other: Floats) -> float | None:
+        """Return the angle between two poses [deg]; None where the body looks the same at both.
+
+        It does where every point of its outside lies on its outside as well at the other pose.
+        """
+        from scipy.spatial import cKDTree
+
+        points = self.surface.points
+        moved = np.linalg.inv(one) @ other
+        gap, nearest = cKDTree(points).query(points @ moved[:3, :3].T + moved[:3, 3])
+        normals = self.surface.directions
+        off = np.einsum("ni,ni->n", points @ moved[:3, :3].T + moved[:3, 3] - points[nearest],
+                        normals[nearest])  # fmt: skip
+        turned = np.einsum("ni,ni->n", normals @ moved[:3, :3].T, normals[nearest])
+        same = (gap < SAME * self.size) & (np.abs(off) < TOLERANCE * self.size) & (turned > SIMILAR)
+        if same.mean() > EVERYWHERE:
+            return None
+        return float(np.degrees(np.linalg.norm(rotation_log(moved[None, :3, :3])[0])))
+
+    def tolerance(self, view: View) -> float:
+        """Return how far off the scan may be [m]."""
+        return max(TOLERANCE * self.size, 3 * view.noise)
+
+    def settled(self, poses: Floats, view: View, reach: float) -> Floats:
+        """Return poses (K, 4, 4) moved once towards the scan's surfaces and ends within reach."""
+        number = self.view_of(poses)
+        placed, facing = _placed(poses, self.surface.points, self.surface.directions)
+        offset, normals = view.planes(placed)
+        use = self.seen[number] & (np.einsum("kni,kni->kn", offset, offset) < reach**2)
+        use &= np.einsum("kni,kni->kn", facing, normals) > ALIKE
+        parts = [(placed, normals, offset, use)]
+        if len(self.ends.points):
+            parts.append(self._end_offsets(poses, view, number, reach))
+        placed, along, offset, use = (
+            np.concatenate(columns, axis=1) for columns in zip(*parts, strict=True)
+        )
+        along = np.where(use[..., None], along, 0.0)
+        offset = np.where(use[..., None], offset, 0.0)
+        return self._stepped(poses, placed, along, (along * offset).sum(axis=-1))
+
+    def _end_offsets(
+        self, poses: Floats, view: View, number: Indices, reach: float
+    ) -> tuple[Floats, Floats, Floats, Mask]:
+        """Return where faces end (K, N, 3), in which directions, how far off, and which count."""
+        placed, outwards = _placed(poses, self.ends.points, self.ends.directions)
+        offset, cosine = view.to_end(placed, outwards)
+        use = self.ends_seen[number] & ((offset**2).sum(axis=-1) < reach**2) & (cosine > ALIKE)
+        return placed, outwards, offset, use
+
+    def _stepped(self, poses: Floats, points: Floats, along: Floats, misfit: Floats) -> Floats:
+        centres = poses[:, :3, :3] @ self.centre + poses[:, :3, 3]
+        arms = (points - centres[:, None]) / self.size
+        jacobian = np.concatenate([np.cross(arms, along), along], axis=2)
+        normal = jacobian.transpose(0, 2, 1) @ jacobian
+        count = (along**2).sum(axis=(1, 2))
+        normal += (DAMPING * (count + 1))[:, None, None] * np.eye(6)
+        step = np.linalg.solve(normal, jacobian.transpose(0, 2, 1) @ misfit[..., None])[..., 0]
+        out = poses.copy()
+        out[:, :3, :3] = rotation_exp(step[:, :3] / self.size) @ poses[:, :3, :3]
+        out[:, :3, 3] = centres + step[:, 3:] - np.einsum("kij,j->ki", out[:, :3, :3], self.centre)
+        return out
+
+    def view_of(self, poses: Floats) -> Indices:
+        """Return (K,) from which of the directions poses are looked at."""
+        centres = poses[:, :3, :3] @ self.centre.astype(poses.dtype) + poses[:, :3, 3]
+        towards = np.einsum("kji,kj->ki", poses[:, :3, :3], centres)
+        return np.asarray(np.argmax(towards @ self.views.T.astype(poses.dtype), axis=1))
+
+
+@lru_cache(maxsize=4)
+def prepared(body: TargetBody) -> tuple[Shape, Looks]:
+    """Return a body's shape and looks; computed once."""
+    shape = Shape(body.vertices, body.triangles)
+    return shape, looks_of(shape)
+
+
+def looks_of(shape: Shape) -> Looks:
+    """Return what of a body is seen from where."""
+    views = spread_directions(DIRECTIONS)
+    on, ends = shape.surface, shape.ends
+    away = BEYOND * shape.size
+    beyond = ends._replace(points=ends.points + away * ends.directions)
+    free = ~_before(shape, beyond.points, views, away)
+    return Looks(
+        shape.size, shape.centre, on, ends, views,
+        _seen(shape, on, views), _seen(shape, beyond, views) & free,
+    )  # fmt: skip
+
+
+def _placed(
+    poses: Floats, points: Floats, directions: Floats, at: Indices | None = None
+) -> tuple[Floats, Floats]:
+    """Return points and directions (K, N, 3) at poses; (K, N) says which, where not all."""
+    turned = poses[:, :3, :3].transpose(0, 2, 1)
+    if at is not None:
+        points, directions = points[at], directions[at]
+    return points @ turned + poses[:, None, :3, 3], directions @ turned
+
+
+def _seen(shape: Shape, at: Oriented, views: Floats) -> Mask:
+    """Return (V, N) which points nothing of the body hides, and whose faces face the scanner."""
+    out = at.normals @ views.T < -GRAZING
+    for view, column in zip(views, out.T, strict=True):
+        lifted = at.points - 1e-3 * shape.size * view
+        column &= ~np.isfinite(shape.meet(lifted, np.broadcast_to(-view, lifted.shape)).depth)
+    return out.T
+
+
+def _before(shape: Shape, points: Floats, views: Floats, reach: float) -> Mask:
+    """Return (V, N) which points lie before the body within reach, along some directions."""
+    return np.array([
+        shape.meet(points, np.broadcast_to(view, points.shape)).depth < reach for view in views
+    ]).reshape(len(views), -1)  # fmt: skip

@@ -1,0 +1,137 @@
+"""Where a body is in a scan: guesses, settled and held against all that the scanner saw."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from flangeye.types import Floats, Indices, Singles
+from flangeye_plugins.body.dense import fitted
+from flangeye_plugins.body.guesses import guesses
+from flangeye_plugins.body.judge import Verdict, judged
+from flangeye_plugins.body.looks import Looks
+from flangeye_plugins.body.shape import Shape
+from flangeye_plugins.body.view import View, view_of
+
+GUESSES = 1500
+"""Poses that are settled."""
+
+STEPS = ((100, (0.08, 0.06, 0.05), 300), (400, (0.04, 0.03, 0.02), 80))
+"""Points of the body that settle them, how far from the body the scan is taken for it, move by
+move, as a share of the size, and how many of the poses are kept."""
+
+ACROSS, FINE_ACROSS = 40, 100
+"""Cells across the body in the views that it is searched for and judged in: coarse ones have less
+noise, fine ones show thin parts."""
+
+FINALISTS, THINNED, FINE = 8, 2000, 0.003
+"""Poses that are laid on the scan's own points, how many of these are used, and how far off a cell
+of the view may be afterwards, as a share of the size."""
+
+AROUND = 0.55
+"""How far from the body's middle points are kept, as a share of its size: half reaches its ends."""
+
+TWIN = 0.4
+"""Share of the rays that a turned pose explains as well, from which it is laid on the scan too."""
+
+SAME_TURN, SAME_PLACE = float(np.radians(12.0)), 0.06
+"""Poses are one where they differ by less: in turn, and in place as a share of the size."""
+
+
+class Found(NamedTuple):
+    """A pose that a body may have.
+
+    Attributes:
+        pose: (4, 4) ``camera_T_body``.
+        verdict: What speaks for it and against.
+        weakest: Standard deviation of what the scan shows least of it, in sizes or radians.
+    """
+
+    pose: Floats
+    verdict: Verdict
+    weakest: float
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """One scan that is searched for one body.
+
+    Attributes:
+        points: (N, 3) of the scan, N at least ``FEWEST``, all before the scanner [m].
+        shape: The body.
+        looks: What of it is seen from where.
+    """
+
+    points: Singles
+    shape: Shape
+    looks: Looks
+
+    def everywhere(self) -> list[Found]:
+        """Return distinct poses that the body may have, the best first."""
+        view = view_of(self.points, self.shape.size / ACROSS)
+        poses = guesses(view, self.looks, GUESSES)
+        for count, reaches, left in STEPS:
+            some = self.looks.thinned(count)
+            for reach in reaches:
+                poses = some.settled(poses, view, reach * self.shape.size)
+            poses = poses[distinct(poses, some.scores(poses, view), self.looks)[:left]]
+        found = self.near(poses)
+        return self._distinct(found + self.near(self._twins(found[0]))) if found else []
+
+    def near(self, poses: Floats) -> list[Found]:
+        """Return the best of (K, 4, 4) poses, laid on the scan's own points, the best first."""
+        if not len(poses):
+            return []
+        scores = [judged(self.shape, self._fine, pose, self._rough).score for pose in poses]
+        poses = poses[distinct(poses, np.array(scores), self.looks)[:FINALISTS]]
+        return self._distinct([one for one in map(self._laid, poses) if one])
+
+    @cached_property
+    def _fine(self) -> View:
+        return view_of(self.points, self.shape.size / FINE_ACROSS)
+
+    @cached_property
+    def _rough(self) -> float:
+        return self.looks.tolerance(self._fine)
+
+    def _laid(self, pose: Floats) -> Found | None:
+        fit = fitted(around(self.points, self.shape, pose), self.shape, pose, THINNED)
+        if fit is None:
+            return None
+        tolerance = max(FINE * self.shape.size, 3.5 * self._fine.noise)
+        verdict = judged(self.shape, self._fine, fit.pose, tolerance)
+        return Found(fit.pose, verdict, fit.weakest(self.looks.freedoms))
+
+    def _twins(self, best: Found) -> Floats:
+        """Return quarter turns of a pose that explain the scan nearly as well."""
+        twins, least = self.looks.twins(best.pose), TWIN * best.verdict.agree
+        agree = [judged(self.shape, self._fine, pose, self._rough).agree for pose in twins]
+        return np.asarray(twins[np.array(agree) > least])
+
+    def _distinct(self, found: list[Found]) -> list[Found]:
+        poses = np.array([one.pose for one in found]).reshape(-1, 4, 4)
+        scores = np.array([one.verdict.score for one in found])
+        return [found[k] for k in distinct(poses, scores, self.looks)]
+
+
+def around(points: Singles, shape: Shape, pose: Floats) -> Singles:
+    """Return the points of (N, 3) around a body at a pose."""
+    offset = points - (pose[:3, :3] @ shape.centre + pose[:3, 3]).astype(np.float32)
+    return np.asarray(points[np.einsum("ni,ni->n", offset, offset) < (AROUND * shape.size) ** 2])
+
+
+def distinct(poses: Floats, scores: Floats, looks: Looks) -> Indices:
+    """Return the indices of poses of which none is nearly another, the best first."""
+    order = np.argsort(-scores, kind="stable")
+    centres = poses[order, :3, :3] @ looks.centre + poses[order, :3, 3]
+    near = np.linalg.norm(centres[:, None] - centres, axis=2) < SAME_PLACE * looks.size
+    trace = np.einsum("aij,bij->ab", poses[order, :3, :3], poses[order, :3, :3])
+    near &= trace > 1 + 2 * np.cos(SAME_TURN)
+    free = np.ones(len(order), bool)
+    for k in range(len(order)):
+        if free[k]:
+            free[k + 1 :] &= ~near[k, k + 1 :]
+    return order[free]

@@ -1,0 +1,216 @@
+"""A body as a scanner sees it: where rays meet it, and points on its outside."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye.maths.geometry import basis_of_plane
+from flangeye.types import Floats, Indices, Mask
+
+CREASE = float(np.cos(np.radians(35.0)))
+"""Cosine of the angle between facets beyond which their edge is an edge of the body, and not the
+tessellation of a smooth surface; CAD systems facet at 30 degrees at most."""
+
+VIEWS, ACROSS = 48, 72
+"""Directions from which the outside is sampled, and rays across the body from each."""
+
+GRAZING = 0.25
+"""Cosine of the incidence beyond which a surface counts as not seen."""
+
+SLIVER = 1e-4
+"""Root of the area of a facet, as a share of the size, below which it has no direction."""
+
+SPACINGS = 24
+"""Spacings of the samples that pairs are made of along the body's size."""
+
+
+class Oriented(NamedTuple):
+    """Points with directions.
+
+    Attributes:
+        points: (N, 3) [m].
+        directions: (N, 3) unit normals of surfaces, outwards; at the ends of faces the direction
+            within the face in which it ends.
+        normals: (N, 3) of the face, where it ends too.
+    """
+
+    points: Floats
+    directions: Floats
+    normals: Floats
+
+    def take(self, at: Indices | Mask) -> Oriented:
+        """Return those at some indices."""
+        return Oriented(self.points[at], self.directions[at], self.normals[at])
+
+
+class Met(NamedTuple):
+    """Where rays met a body.
+
+    Attributes:
+        depth: (N,) in lengths of the directions; infinite where a ray passed.
+        normals: (N, 3) of the smooth surface, towards the ray's origin.
+    """
+
+    depth: Floats
+    normals: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """Triangles, in the body's frame.
+
+    Attributes:
+        vertices: (V, 3) [m].
+        triangles: (T, 3) indices of vertices.
+    """
+
+    vertices: Floats
+    triangles: NDArray[np.int32]
+
+    @cached_property
+    def size(self) -> float:
+        """Diagonal of the box around what can be seen [m]."""
+        return float(np.linalg.norm(np.ptp(self.vertices, axis=0)))
+
+    @cached_property
+    def centre(self) -> Floats:
+        """(3,) of that box [m]."""
+        low, high = self.vertices.min(axis=0), self.vertices.max(axis=0)
+        return np.asarray((low + high) / 2)
+
+    @cached_property
+    def hull(self) -> Indices:
+        """(H,) numbers of the vertices of its convex hull."""
+        from scipy.spatial import ConvexHull
+
+        return np.asarray(ConvexHull(self.vertices, qhull_options="QJ").vertices)
+
+    def meet(self, origin: Floats, directions: Floats) -> Met:
+        """Return where rays from points (3,) or (N, 3) along (N, 3) meet the body first."""
+        import open3d as o3d
+
+        rays = np.empty((len(directions), 6), dtype=np.float32)
+        rays[:, :3], rays[:, 3:] = origin, directions
+        found = self._tree.cast_rays(o3d.core.Tensor.from_numpy(rays), nthreads=1)
+        depth = found["t_hit"].numpy().astype(np.float64)
+        facet = np.where(np.isfinite(depth), found["primitive_ids"].numpy(), 0)
+        uv = found["primitive_uvs"].numpy().astype(np.float64)
+        weights = np.column_stack([1 - uv.sum(axis=1), uv])
+        mesh, smooth = self._smooth
+        normals = np.einsum("nk,nkc->nc", weights, smooth[mesh.faces[facet]])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+        away = np.einsum("nc,nc->n", normals, directions) > 0
+        normals[away] *= -1
+        return Met(depth, normals)
+
+    @cached_property
+    def _mesh(self) -> Any:
+        """The triangles with vertices at one place made one, as STL does not have them."""
+        import trimesh
+
+        return trimesh.Trimesh(self.vertices, self.triangles)
+
+    @cached_property
+    def _smooth(self) -> tuple[Any, Floats]:
+        """The triangles with vertices apart at creases, and the smooth surface's (V, 3) normals.
+
+        Weighted by the facets' areas: on a faceted cylinder they are radial, and say nothing about
+        a turn about its axis; on a large flat face beside a fillet they are the face's.
+        """
+        import trimesh
+
+        mesh = trimesh.graph.smooth_shade(self._mesh, np.arccos(CREASE), facet_minarea=None)
+        normals = np.zeros(mesh.vertices.shape)
+        np.add.at(normals, mesh.faces, (mesh.face_normals * mesh.area_faces[:, None])[:, None])
+        return mesh, normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+
+    @cached_property
+    def _tree(self) -> Any:
+        import open3d as o3d
+
+        mesh = self._smooth[0]
+        tree = o3d.t.geometry.RaycastingScene(nthreads=1)
+        tree.add_triangles(
+            o3d.core.Tensor.from_numpy(np.ascontiguousarray(mesh.vertices, np.float32)),
+            o3d.core.Tensor.from_numpy(np.ascontiguousarray(mesh.faces, np.uint32)),
+        )
+        return tree
+
+    @cached_property
+    def surface(self) -> Oriented:
+        """Points on the outside, some spacings apart for each direction of the surface."""
+        points, normals = self._outside
+        keep = thin(points, normals, self.size / SPACINGS)
+        return Oriented(points[keep], normals[keep], normals[keep])
+
+    @cached_property
+    def ends(self) -> Oriented:
+        """Points where faces end at edges of the body that can be seen from outside."""
+        from scipy.spatial import cKDTree
+
+        # A file's facets may be wound either way: the face's side is the one that was looked at.
+        ends, (seen, outwards) = self._edges(), self._outside
+        within = ends.points - ends.directions * self.size / ACROSS
+        gap, nearest = cKDTree(seen).query(within, distance_upper_bound=2 * self.size / ACROSS)
+        ends, nearest = ends.take(np.isfinite(gap)), nearest[np.isfinite(gap)]
+        side = np.einsum("ni,ni->n", ends.normals, outwards[nearest])
+        ends = ends._replace(normals=ends.normals * np.sign(side)[:, None])
+        ends = ends.take(np.abs(side) > CREASE)
+        return ends.take(thin(ends.points, ends.directions, self.size / SPACINGS))
+
+    @cached_property
+    def _outside(self) -> tuple[Floats, Floats]:
+        """(N, 3) points that rays from all around meet, and normals towards them."""
+        radius = self.size / 2
+        grid = np.stack(np.meshgrid(*2 * [np.arange(ACROSS) + 0.5]), axis=-1) / ACROSS * 2 - 1
+        flat = grid.reshape(-1, 2) * radius
+        found: list[tuple[Floats, Floats]] = []
+        for view in spread_directions(VIEWS):
+            origin = self.centre - 1.5 * radius * view + flat @ basis_of_plane(view)[:2]
+            met = self.meet(origin, np.broadcast_to(view, origin.shape))
+            hit = np.isfinite(met.depth) & (met.normals @ view < -GRAZING)
+            found.append((origin[hit] + met.depth[hit, None] * view, met.normals[hit]))
+        return np.concatenate([p for p, _ in found]), np.concatenate([n for _, n in found])
+
+    def _edges(self) -> Oriented:
+        """Return points along edges, where each face beside them ends."""
+        mesh = self._mesh
+        normals, edge, facet = mesh.face_normals, mesh.edges_unique_inverse, mesh.edges_face
+        mean = np.zeros((edge.max() + 1, 3))
+        np.add.at(mean, edge, normals[facet])
+        count = np.bincount(edge)
+        # Of two facets in one plane the mean normal has length one; of an edge less.
+        bent = np.linalg.norm(mean, axis=1) / count < np.cos(np.arccos(CREASE) / 2)
+        sharp = (bent | (count == 1))[edge]
+        sharp &= mesh.area_faces[facet] > (SLIVER * self.size) ** 2
+        a, b = (mesh.vertices[mesh.edges[sharp, k]] for k in range(2))
+        along, normals = b - a, normals[facet[sharp]]
+        length = np.linalg.norm(along, axis=1)
+        outwards = np.cross(along, normals) / length[:, None]
+        many = np.ceil(length / (self.size / ACROSS)).astype(int)
+        which = np.repeat(np.arange(len(a)), many)
+        at = np.arange(len(which)) - np.repeat(np.cumsum(many) - many, many)
+        share = ((at + 0.5) / many[which])[:, None]
+        return Oriented(a[which] + share * along[which], outwards[which], normals[which])
+
+
+def spread_directions(count: int) -> Floats:
+    """Return (count, 3) unit vectors spread evenly over the sphere (Fibonacci's lattice)."""
+    k = np.arange(count) + 0.5
+    z, turn = 1 - 2 * k / count, np.pi * (1 + 5**0.5) * k
+    across = np.sqrt(1 - z**2)
+    return np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=1)
+
+
+def thin(points: Floats, directions: Floats, spacing: float) -> Indices:
+    """Return the indices of one point for each cube of space and sextant of directions."""
+    place = np.floor(points / spacing).astype(np.int64)
+    main = np.argmax(np.abs(directions), axis=1)
+    sign = np.take_along_axis(directions, main[:, None], axis=1)[:, 0] > 0
+    keys = np.column_stack([place, 2 * main + sign])
+    return np.sort(np.unique(keys, axis=0, return_index=True)[1])

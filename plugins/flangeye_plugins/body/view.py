@@ -1,0 +1,285 @@
+"""A scan as a coarse image from the scanner: depth, normals, and where surfaces end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from flangeye.maths.statistics import SIGMA_OF_MAD
+from flangeye.types import Floats, Indices, Mask, Singles
+from flangeye_plugins.body.shape import Oriented
+
+MOST = 500_000
+"""Points that fill the image well."""
+
+SPARSE = 1.6
+"""A cell is at least as many times as wide as points are apart."""
+
+STEP = 3.0
+"""Cells of one surface differ in depth by less than so many widths: steeper ones are not seen."""
+
+COPLANAR = 0.08
+"""How far off a plane its continuation may be seen at the body's size from a place, as a share of
+the size: as far as a normal's error takes it there."""
+
+LAYER = 1.5
+"""Widths behind the nearest point of a cell up to which points belong to its surface."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A coarse image.
+
+    Attributes:
+        xyz: (H, W, 3) mean of the nearest surface in each cell [m]; NaN where none was measured.
+        low: x and y of the first cell's corner, at unit depth.
+        angle: Width of a cell at unit depth.
+    """
+
+    xyz: Floats
+    low: tuple[float, float]
+    angle: float
+
+    @property
+    def depth(self) -> Floats:
+        """(H, W) [m]."""
+        return self.xyz[..., 2]
+
+    @property
+    def directions(self) -> Floats:
+        """(H, W, 3) of the rays through the cells' middles, with z = 1."""
+        rows, columns = self.xyz.shape[:2]
+        x = self.low[0] + (np.arange(columns) + 0.5) * self.angle
+        y = self.low[1] + (np.arange(rows) + 0.5) * self.angle
+        return np.stack([*np.meshgrid(x, y), np.ones((rows, columns))], axis=-1)
+
+    def cells(self, points: Floats) -> tuple[Indices, Mask]:
+        """Return the flat index of the cell that each of (..., 3) points is seen in, and if any."""
+        rows, columns = self.xyz.shape[:2]
+        z = np.maximum(points[..., 2], 1e-6)
+        column = (points[..., 0] / z - self.low[0]) / self.angle
+        row = (points[..., 1] / z - self.low[1]) / self.angle
+        inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+        inside &= points[..., 2] > 0
+        flat = row.astype(np.int64) * columns + column.astype(np.int64)
+        return np.where(inside, flat, 0), inside
+
+    @cached_property
+    def normals(self) -> Floats:
+        """(H, W, 3) unit normals towards the scanner; NaN where there is too little to tell."""
+        down, across = _slope(self.xyz, 0, self.angle), _slope(self.xyz, 1, self.angle)
+        rough = _unit(np.cross(across, down))
+        rough = _facing(rough, self.xyz)
+        return _unit(_smoothed(rough, self.xyz, self.angle))
+
+    @cached_property
+    def ends(self) -> tuple[Mask, Floats]:
+        """Which cells (H, W) lie where a surface ends, and (H, W, 3) in which direction it does.
+
+        The direction points from the middle of the surface's cells around it to the cell.
+        """
+        total, count, open_side = np.zeros_like(self.xyz), np.zeros(self.xyz.shape[:2]), None
+        for shift in _ring(2):
+            other = _shifted(self.xyz, shift)
+            same = np.abs(other[..., 2] - self.depth) < _gate(
+                self.depth, self.angle, max(map(abs, shift))
+            )
+            total += np.where(same[..., None], other - self.xyz, 0.0)
+            count += same
+            if max(map(abs, shift)) == 1:
+                beyond = ~same & ~(other[..., 2] < self.depth)
+                open_side = beyond if open_side is None else open_side | beyond
+        normals = self.normals
+        across = -total / np.maximum(count, 1)[..., None]
+        across -= np.einsum("ijk,ijk->ij", across, normals)[..., None] * normals
+        length = np.linalg.norm(across, axis=-1)
+        found = open_side & (length > 0.25 * self.angle * self.depth) & (count >= 6)
+        return found & np.isfinite(length), _unit(across)
+
+    @cached_property
+    def nearest_end(self) -> Indices:
+        """(H, W) flat index of the cell nearest to each in which a surface ends; else its own."""
+        from scipy.ndimage import distance_transform_edt
+
+        found = self.ends[0]
+        if not found.any():
+            return np.arange(found.size).reshape(found.shape)
+        row, column = distance_transform_edt(~found, return_distances=False, return_indices=True)
+        return np.asarray(row * found.shape[1] + column)
+
+    @cached_property
+    def _to_ends(self) -> Singles:
+        """(H W, 6) where the end nearest to each cell is, and in which direction; NaN without."""
+        found, directions = self.ends
+        both = np.concatenate([self.xyz, directions], axis=-1)
+        both[~found] = np.nan
+        return both.reshape(-1, 6)[self.nearest_end.reshape(-1)].astype(np.float32)
+
+    @cached_property
+    def _surfaces(self) -> Singles:
+        """(H W, 6) of cells and their normals, single precision, for many poses at once."""
+        return np.concatenate([self.xyz, self.normals], axis=-1).reshape(-1, 6).astype(np.float32)
+
+    def to_end(self, placed: Floats, outwards: Floats) -> tuple[Floats, Floats]:
+        """Return how a surface's end is seen where a face should end.
+
+        Args:
+            placed: (..., 3) where [m].
+            outwards: (..., 3) unit directions in which it should.
+
+        Returns:
+            (..., 3) offset of the end nearest in the image [m], and (...) cosine of the angle
+            between its direction and the face's; NaN where there is none.
+        """
+        cell, inside = self.cells(placed)
+        there = self._to_ends[cell]
+        there[~inside] = np.nan
+        cosine = np.einsum("...i,...i->...", there[..., 3:], outwards)
+        return there[..., :3] - placed, cosine
+
+    def planes(self, placed: Floats) -> tuple[Floats, Floats]:
+        """Return (..., 3) offsets of the cells that points are seen in, and their normals."""
+        cell, inside = self.cells(placed)
+        there = self._surfaces[cell]
+        there[~inside] = np.nan
+        return there[..., :3] - placed, np.asarray(there[..., 3:])
+
+    def compared(self, placed: Floats, facing: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return how the scan is where points (..., 3) with normals (..., 3) should be seen.
+
+        Returns:
+            (...) distance of the point from the scan's plane [m], depth of the scan behind it [m],
+            and cosine of the angle between the normals; NaN where nothing was measured.
+        """
+        offset, normals = self.planes(placed)
+        off = np.einsum("...i,...i->...", normals, offset)
+        return off, offset[..., 2], np.einsum("...i,...i->...", normals, facing)
+
+    @cached_property
+    def noise(self) -> float:
+        """Standard deviation of the cells from the planes of their neighbours [m]."""
+        off = np.einsum("ijk,ijk->ij", _shifted(self.xyz, (0, 1)) - self.xyz, self.normals)
+        off = off[np.isfinite(off)]
+        return float(SIGMA_OF_MAD * np.median(np.abs(off)) / np.sqrt(2)) if len(off) else 0.0
+
+    def edges(self, size: float) -> Oriented:
+        """Return where surfaces end, but those that are larger than a body of that size [m].
+
+        Where a plane goes on beyond ``size`` in two of eight directions, it is no face of such a
+        body, but a table or a wall.
+        """
+        found, directions = self.ends
+        found = found & np.isfinite(self.normals[..., 0]) & ~self._goes_on(size)
+        return Oriented(self.xyz[found], directions[found], self.normals[found])
+
+    def _goes_on(self, size: float) -> Mask:
+        """Return in which cells (H, W) the plane is larger than a body of that size [m]."""
+        rows, columns = self.xyz.shape[:2]
+        row, column = np.indices((rows, columns))
+        with np.errstate(invalid="ignore"):
+            reach = size / (self.angle * self.depth)
+        reach = np.where(np.isfinite(reach), reach, 0)
+        count = np.zeros((rows, columns), int)
+        for turn in np.arange(8) * np.pi / 4:
+            y = (row + np.rint(reach * np.sin(turn))).astype(int)
+            x = (column + np.rint(reach * np.cos(turn))).astype(int)
+            inside = (y >= 0) & (y < rows) & (x >= 0) & (x < columns)
+            there = self.xyz[np.where(inside, y, 0), np.where(inside, x, 0)]
+            off = np.abs(np.einsum("ijk,ijk->ij", there - self.xyz, self.normals))
+            count += inside & (off < COPLANAR * size)
+        return count >= 2
+
+
+def view_of(points: Singles, pitch: float) -> View:
+    """Return a scan's view, its cells ``pitch`` wide [m] at the median depth.
+
+    Args:
+        points: (N, 3) before the scanner, one at least [m].
+        pitch: Wider where the points are too sparse to fill the cells.
+    """
+    points = points[:: 1 + len(points) // MOST]
+    z = points[:, 2]
+    u, v = points[:, 0] / z, points[:, 1] / z
+    low = float(u.min()), float(v.min())
+    spacing = _spacing(u, v)
+    angle = max(pitch / float(np.median(z)), SPARSE * spacing)
+    columns = int((u.max() - low[0]) / angle) + 1
+    rows = int((v.max() - low[1]) / angle) + 1
+    cell = ((v - low[1]) / angle).astype(np.int64) * columns + ((u - low[0]) / angle).astype(
+        np.int64
+    )
+    nearest = np.full(rows * columns, np.inf, np.float32)
+    np.minimum.at(nearest, cell, z)
+    near = z < nearest[cell] * (1 + LAYER * angle)
+    cell, points = cell[near], points[near]
+    count = np.bincount(cell, minlength=rows * columns)
+    with np.errstate(invalid="ignore"):
+        mean = np.stack(
+            [np.bincount(cell, points[:, k], minlength=rows * columns) / count for k in range(3)],
+            axis=1,
+        )
+    return View(mean.reshape(rows, columns, 3), low, angle)
+
+
+def _spacing(u: Singles, v: Singles) -> float:
+    """Return how far points are apart at unit depth: the root of seen area over their number."""
+    across = max(float(np.ptp(u)), float(np.ptp(v)), 1e-6) / 64
+    cell = ((u - u.min()) / across).astype(np.int64) * 65 + ((v - v.min()) / across).astype(
+        np.int64
+    )
+    seen = np.count_nonzero(np.bincount(cell))
+    return float(across * np.sqrt(seen / len(u)))
+
+
+def _shifted(image: Floats, shift: tuple[int, int]) -> Floats:
+    """Return the neighbours of each cell (H, W, ...) at so many rows and columns; NaN outside."""
+    out = np.full_like(image, np.nan)
+    rows, columns = image.shape[:2]
+    (dy, dx) = shift
+    out[max(-dy, 0) : rows - max(dy, 0), max(-dx, 0) : columns - max(dx, 0)] = image[
+        max(dy, 0) : rows - max(-dy, 0), max(dx, 0) : columns - max(-dx, 0)
+    ]
+    return out
+
+
+def _ring(reach: int) -> list[tuple[int, int]]:
+    steps = range(-reach, reach + 1)
+    return [(dy, dx) for dy in steps for dx in steps if dy or dx]
+
+
+def _gate(depth: Floats, angle: float, cells: int) -> Floats:
+    return STEP * angle * cells * depth
+
+
+def _slope(xyz: Floats, axis: int, angle: float) -> Floats:
+    """Return the (H, W, 3) mean difference to the neighbours on both sides of one surface."""
+    total, count = np.zeros_like(xyz), np.zeros((*xyz.shape[:2], 1))
+    for side in (-1, 1):
+        other = _shifted(xyz, (side, 0) if axis == 0 else (0, side))
+        same = (np.abs(other[..., 2] - xyz[..., 2]) < _gate(xyz[..., 2], angle, 1))[..., None]
+        total += np.where(same, side * (other - xyz), 0.0)
+        count += same
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def _smoothed(normals: Floats, xyz: Floats, angle: float) -> Floats:
+    """Return sums of the normals over the cells around that lie in the same plane or nearly."""
+    total = np.zeros_like(normals)
+    for shift in [(0, 0), *_ring(1)]:
+        other, there = _shifted(normals, shift), _shifted(xyz, shift)
+        off = np.abs(np.einsum("ijk,ijk->ij", there - xyz, normals))
+        alike = (off < 0.5 * angle * xyz[..., 2]) & np.isfinite(other[..., 0])
+        total += np.where(alike[..., None], other, 0.0)
+    return np.where(np.isfinite(normals), total, np.nan)
+
+
+def _unit(vectors: Floats) -> Floats:
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors / np.where(length > 0, length, np.nan)
+
+
+def _facing(normals: Floats, xyz: Floats) -> Floats:
+    away = np.einsum("ijk,ijk->ij", normals, xyz) > 0
+    return np.where(away[..., None], -normals, normals)

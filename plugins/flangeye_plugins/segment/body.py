@@ -1,0 +1,161 @@
+"""Find a body of known shape in a scan of the whole cell."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from flangeye import Params, stage
+from flangeye.maths.geometry import invert
+from flangeye.models.bodies import TargetBody
+from flangeye.models.configuration import Configuration
+from flangeye.types import (
+    BASE,
+    Capture,
+    Earlier,
+    FlangeCloud,
+    Floats,
+    PointCloud,
+    PoseFeature,
+    Rejected,
+    Singles,
+)
+from flangeye.units import Length, param
+
+if TYPE_CHECKING:
+    from flangeye_plugins.body.looks import Looks
+    from flangeye_plugins.body.search import Found
+
+LEAST_RAYS = 150
+"""Rays, a hundredth of the body's size apart, that show it: fewer fit by chance."""
+
+FIRM = 0.004
+"""Largest standard deviation of what a scan shows least of a body, in its sizes or radians: what
+fits by chance is seldom held in all directions."""
+
+GOES_ON = 0.5
+"""Largest share of the rays beside the body in which its surface goes on: where something is
+fastened to it."""
+
+WIDEST = 1.75
+"""Tangent of 60 degrees: no scanner sees farther to the side, stray points do."""
+
+RECENT = 3
+"""Earlier sightings from which the pose is predicted."""
+
+
+class SegmentBodyParams(Params):
+    """Parameters of ``segment.body``."""
+
+    near: Length = param("100 mm", ge=0, description="Points nearer to the scanner are left out.")
+    far: Length = param("3 m", gt=0, description="Points farther from the scanner are left out.")
+    min_coverage: float = param(
+        0.3, gt=0, le=1, description="Smallest share of the body's view to be seen."
+    )
+    min_trust: float = param(
+        0.99,
+        gt=0,
+        le=1,
+        description="Of what is seen where the body should be, the smallest share that is it.",
+    )
+
+
+@stage("segment.body")
+def segment_body(
+    capture: Capture,
+    body: TargetBody,
+    configuration: Configuration,
+    earlier: Earlier,
+    params: SegmentBodyParams,
+) -> FlangeCloud | Rejected:
+    """Find a body by its shape, without any guess where it is, and cut its surroundings out.
+
+    Edges of the body are laid on edges of the scan; the poses that the scan does not contradict are
+    refined, and then checked ray by ray against everything the scanner saw: the body's surface,
+    points behind it, and surface where the body has ended. Refused: no pose that passes, and two
+    that do. Where the arm's motion since earlier sightings predicts the pose and that passes, it is
+    taken without a search.
+
+    Raises:
+        StageError: The cloud is in millimetres, or otherwise a thousand times off.
+    """
+    from flangeye_plugins.body.dense import FEWEST
+    from flangeye_plugins.body.looks import prepared
+    from flangeye_plugins.body.search import Search, around
+    from flangeye_plugins.segment.scale import check_scale
+
+    points = capture.cloud.points()
+    if len(points):
+        check_scale(points, capture.id)
+    points = _between(points, params.near, params.far)
+    if len(points) < FEWEST:
+        return Rejected("no point between near and far")
+    shape, looks = prepared(body)
+    search, passes = Search(points, shape, looks), partial(_passes, params=params)
+    found = list(filter(passes, search.near(_predicted(capture, configuration, earlier))))[:1]
+    if not found:
+        every = search.everywhere()
+        found = list(filter(passes, every))
+        if why := _why_not(every, found, body, looks):
+            return Rejected(why)
+    pose = found[0].pose
+    centre = pose[:3, :3] @ shape.centre + pose[:3, 3]
+    cloud = PointCloud(capture.cloud.frame, around(points, shape, pose))
+    return FlangeCloud(cloud, centre, -centre / np.linalg.norm(centre), pose)
+
+
+def _between(points: Singles, near: float, far: float) -> Singles:
+    z = points[:, 2]
+    inside = (z > near) & (z < far) & (np.abs(points[:, :2]) < WIDEST * z[:, None]).all(axis=1)
+    return points[inside]
+
+
+def _predicted(capture: Capture, configuration: Configuration, earlier: Earlier) -> Floats:
+    """Return (K, 4, 4) where the arm has carried the body since the last sightings."""
+    place = configuration.place
+    recent = earlier.observations[-RECENT:]
+    if place is None or configuration.camera != BASE or not recent:
+        return np.zeros((0, 4, 4))
+    now = capture.poses[configuration.target].matrix @ place
+    return np.array([
+        one.feature.camera_T_target.matrix
+        @ invert(one.poses[configuration.target].matrix @ place) @ now
+        for one in recent if isinstance(one.feature, PoseFeature)
+    ]).reshape(-1, 4, 4)  # fmt: skip
+
+
+def _passes(found: Found, params: SegmentBodyParams) -> bool:
+    verdict = found.verdict
+    return (
+        verdict.shown >= params.min_coverage
+        and verdict.trusted >= params.min_trust
+        and verdict.agree >= LEAST_RAYS
+        and verdict.goes_on <= GOES_ON * verdict.beside
+        and found.weakest <= FIRM
+    )
+
+
+def _why_not(
+    every: list[Found], passing: list[Found], body: TargetBody, looks: Looks
+) -> str | None:
+    """Return why no pose is taken; None where one is."""
+    if not every:
+        return f"nothing of the size of {body.name} is there"
+    best = every[0].verdict
+    if not passing:
+        return (
+            f"no pose of {body.name} ({body.size * 1e3:.0f} mm across) explains the scan: the best "
+            f"shows {best.shown:.0%} of it in {best.agree} rays, {best.trusted:.1%} of what is "
+            f"seen there fits, and it holds to {every[0].weakest * body.size * 1e3:.1f} mm; is it "
+            "in view, and the mesh's unit and handedness right?"
+        )
+    for other in passing[1:]:
+        turn = looks.apart(passing[0].pose, other.pose)
+        if turn is not None:
+            return (
+                f"two poses of {body.name} {turn:.0f} deg apart explain the scan "
+                f"({passing[0].verdict.agree} and {other.verdict.agree} rays)"
+            )
+    return None

@@ -1,0 +1,249 @@
+"""segment.body and fit.body: bodies of known shape at known poses, and what is refused."""
+
+import re
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from flangeye.errors import RecipeError
+from flangeye.maths.geometry import rigid, rotation_from_rpy, rotation_log
+from flangeye.models.bodies import TargetBody, load_body
+from flangeye.models.configuration import ORIGIN, Configuration
+from flangeye.models.loading import load_model
+from flangeye.plugin.registry import load_registry
+from flangeye.recipe.load import load_recipe, parse_recipe
+from flangeye.types import (
+    BASE,
+    CAMERA,
+    FLANGE,
+    TARGET,
+    Capture,
+    Earlier,
+    FlangeCloud,
+    Observation,
+    PointCloud,
+    PoseFeature,
+    Rejected,
+    Transform,
+)
+from flangeye_emulators.world import materials
+from flangeye_emulators.world.mesh import Mesh, box
+from flangeye_emulators.world.raycast import Body, Scene
+from flangeye_emulators.world.scanner import scanner_of
+from flangeye_plugins.body.looks import prepared
+from flangeye_plugins.fit.body import FitBodyParams, fit_body
+from flangeye_plugins.segment.body import SegmentBodyParams, segment_body
+
+GRIPPER = load_body("gripper", None, Path())
+POSE = rigid(rotation_from_rpy(2.5, 0.6, 0.8), np.array([0.03, -0.02, 0.75]))
+
+
+@cache
+def eye(scanner: str = "phoxi-m", resolution: float = 0.3):
+    model = load_model("scanners", scanner, Path())
+    return scanner_of(model, resolution, 1.0, np.random.default_rng(0))
+
+
+def scan(body: TargetBody, pose=POSE, seed: int = 0) -> Capture:
+    """A simulated scan of a body before a table, with a box beside it."""
+    mesh = Mesh(body.vertices, body.triangles)
+    bodies = [
+        Body(mesh.moved(pose), materials.MATT),
+        Body(box([-1, -1, 1.0], [1, 1, 1.02]), materials.TABLE),
+        Body(box([-0.3, -0.2, 0.8], [-0.2, -0.05, 0.9]), materials.PAINTED),
+    ]
+    xyz = eye().scan(Scene(bodies), np.random.default_rng(seed))
+    return Capture("0000", PointCloud(CAMERA, xyz), {FLANGE: Transform(BASE, FLANGE, pose)})
+
+
+def found(
+    capture: Capture, body: TargetBody = GRIPPER, earlier: tuple[Observation, ...] = ()
+) -> FlangeCloud | Rejected:
+    drawn_in_flange = Configuration(stands=ORIGIN)
+    return segment_body(capture, body, drawn_in_flange, Earlier(earlier), SegmentBodyParams())
+
+
+def is_at(pose, one: FlangeCloud | Rejected) -> bool:
+    assert isinstance(one, FlangeCloud), one
+    assert one.camera_T_target is not None
+    return np.allclose(one.camera_T_target, pose, atol=1e-3)
+
+
+def sighting(pose, true=POSE) -> tuple[Observation, ...]:
+    """A body that was seen at a pose while the arm had it at the true one."""
+    feature = PoseFeature(Transform(CAMERA, TARGET, pose), np.eye(6) * 1e-8, {})
+    return (Observation("before", feature, {FLANGE: Transform(BASE, FLANGE, true)}),)
+
+
+def around(capture: Capture, start) -> FlangeCloud:
+    return FlangeCloud(
+        PointCloud(CAMERA, capture.cloud.points()), start[:3, 3], np.array([0, 0, -1.0]), start
+    )
+
+
+def off(feature: PoseFeature, pose=POSE):
+    """Turn [rad] and shift [m] of a pose from the true one, in the covariance's order."""
+    turn = feature.camera_T_target.rotation @ pose[:3, :3].T
+    return np.r_[rotation_log(turn[None])[0], feature.camera_T_target.translation - pose[:3, 3]]
+
+
+def test_a_gripper_is_found_without_a_guess_and_its_error_is_as_stated() -> None:
+    feature = fit_body(found(scan(GRIPPER)), GRIPPER, FitBodyParams())
+    assert isinstance(feature, PoseFeature), feature
+    error = off(feature)
+    assert np.linalg.norm(error[3:]) < 0.5e-3
+    assert np.degrees(np.linalg.norm(error[:3])) < 0.1
+    assert error @ np.linalg.solve(feature.covariance, error) < 22.5  # 99.9 % of 6 freedoms
+    assert feature.figures["freedoms"] == 6
+
+
+HALF_TURN = rigid(rotation_from_rpy(0.0, 0.0, np.pi), np.zeros(3))
+BEHIND = rigid(rotation_from_rpy(np.pi - 0.5, 0.0, 0.3), np.array([0.02, 0.01, 0.8]))
+"""The gripper's cable gland, all that its half turns differ by, is behind its housing."""
+
+
+def test_two_poses_that_explain_a_scan_alike_are_refused_until_the_arms_motion_tells() -> None:
+    """Nothing was measured where the gland would be seen at the other half turn."""
+    gland = (BEHIND @ HALF_TURN @ [0.020, 0.042, 0.040, 1.0])[:3]
+    xyz = np.array(scan(GRIPPER, BEHIND).cloud.xyz)
+    beside = xyz[..., :2] / xyz[..., 2:] - gland[:2] / gland[2]
+    xyz[np.linalg.norm(beside, axis=-1) < 0.06] = np.nan
+    capture = replace(scan(GRIPPER, BEHIND), cloud=PointCloud(CAMERA, xyz))
+    assert "two poses of gripper 180 deg apart" in found(capture).reason
+    assert is_at(BEHIND, found(capture, earlier=sighting(POSE)))
+
+
+def test_an_earlier_sighting_that_was_wrong_does_no_harm() -> None:
+    wrong = sighting(POSE @ HALF_TURN)
+    assert is_at(POSE, found(scan(GRIPPER), earlier=wrong))
+
+
+def test_a_body_that_is_not_there_is_refused() -> None:
+    absent = found(scan(load_body("torch", None, Path())))
+    assert isinstance(absent, Rejected)
+    assert "gripper" in absent.reason
+
+
+@pytest.mark.parametrize(
+    "change", [np.diag([-1.0, 1.0, 1.0]), 25.4 * np.eye(3), 1.3 * np.eye(3)],
+    ids=["mirrored", "inches", "30 % too large"],
+)  # fmt: skip
+def test_a_model_that_is_not_the_body_is_refused(change) -> None:
+    vertices = load_body("torch", None, Path()).vertices
+    torch = load_body("torch", None, Path())
+    wrong = TargetBody("torch", np.ascontiguousarray(vertices @ change), torch.triangles)
+    assert isinstance(found(scan(torch), wrong), Rejected)
+
+
+def test_a_cylinder_shows_five_numbers_and_a_sphere_three() -> None:
+    meshes = {
+        5: trimesh.creation.cylinder(0.03, 0.12, sections=96),
+        3: trimesh.creation.icosphere(4, 0.04),
+    }
+    for freedoms, mesh in meshes.items():
+        body = TargetBody("round", np.array(mesh.vertices), np.array(mesh.faces, np.int32))
+        assert prepared(body)[1].freedoms == freedoms
+        feature = fit_body(around(scan(body), POSE), body, FitBodyParams())
+        assert isinstance(feature, PoseFeature), feature
+        assert feature.figures["freedoms"] == freedoms
+        information = np.linalg.eigvalsh(np.linalg.inv(feature.covariance[:3, :3]))
+        assert (information > 1e3).sum() == freedoms - 3
+
+
+def test_a_part_that_moves_is_seen_in_what_the_scan_is_off() -> None:
+    """Fingers 20 mm further open than their mesh: the fit stays with what did not move."""
+    moved = GRIPPER.vertices.copy()
+    finger = moved[:, 2] > 0.107
+    moved[finger, 0] += np.where(moved[finger, 0] > 0, 0.01, -0.01)
+    other = TargetBody("open", moved, GRIPPER.triangles)
+    feature = fit_body(around(scan(other), POSE), GRIPPER, FitBodyParams())
+    assert isinstance(feature, PoseFeature), feature
+    assert np.linalg.norm(off(feature)[3:]) < 2e-3
+
+
+def test_fit_body_needs_segment_body() -> None:
+    cloud = FlangeCloud(scan(GRIPPER).cloud, np.zeros(3), np.array([0, 0, -1.0]))
+    assert "segment.body" in fit_body(cloud, GRIPPER, FitBodyParams()).reason
+
+
+def test_the_unit_is_judged_by_the_size_and_refused_where_it_cannot_be(tmp_path: Path) -> None:
+    def written(scale):
+        mesh = trimesh.Trimesh(GRIPPER.vertices * scale, GRIPPER.triangles, process=False)
+        mesh.export(tmp_path / "own.stl")
+
+    written(1e3)
+    judged = load_body("own.stl", None, tmp_path)
+    assert judged.size == pytest.approx(GRIPPER.size, rel=1e-5)
+    assert "taken to be in mm" in judged.note
+    assert load_body("own.stl", "mm", tmp_path).note == ""
+    with pytest.raises(RecipeError, match="is the unit right"):
+        load_body("own.stl", "in", tmp_path)
+    written(1 / 0.0254)
+    with pytest.raises(RecipeError, match="state it, for example unit: mm"):
+        load_body("own.stl", None, tmp_path)
+    assert load_body("own.stl", "in", tmp_path).size == pytest.approx(GRIPPER.size, rel=1e-5)
+    with pytest.raises(RecipeError, match=r"no body 'griper'; known: gripper"):
+        load_body("griper", None, tmp_path)
+
+
+def test_a_body_survives_being_carried_with_a_run(tmp_path: Path) -> None:
+    (tmp_path / "body.ply").write_text(GRIPPER.as_ply())
+    again = load_body("body.ply", "m", tmp_path)
+    assert np.abs(again.vertices - GRIPPER.vertices).max() < 1e-7
+    assert (again.triangles == GRIPPER.triangles).all()
+
+
+RECIPE = "title: T\nrobot: ur5\nscanner: phoxi-m\n{}steps: [acquire.simulated, segment.body, fit.body, solve.robust]\n"
+
+
+@pytest.mark.parametrize(
+    ("sections", "target", "place"),
+    [
+        ("target: gripper\n", "flange", "known"),
+        ("target: {body: gripper, at: unknown}\n", "flange", "unknown"),
+        (
+            "configuration: {name: eye-on-arm, camera: link3}\ntarget: {body: gripper, at: base}\n",
+            "base",
+            "known",
+        ),
+    ],
+)
+def test_a_recipe_says_where_the_body_is_drawn(sections, target, place) -> None:
+    text = RECIPE.format(sections).replace("acquire.simulated", "{acquire.archive: {path: a}}")
+    recipe = parse_recipe(text, "r", load_registry())
+    configuration = recipe.context[Configuration]
+    assert configuration.target == target
+    assert (configuration.place is None) == (place == "unknown")
+    assert recipe.context[TargetBody].name == "gripper"
+
+
+@pytest.mark.parametrize(
+    ("sections", "message"),
+    [
+        ("", "needs a body to look for"),
+        ("target: {body: gripper, at: base}\n", "target: {at: …} is one of them or unknown"),
+        (
+            "configuration: {place: unknown}\ntarget: gripper\n",
+            "where a body is drawn is said once",
+        ),
+    ],
+)
+def test_a_recipe_that_contradicts_itself_is_refused(sections, message) -> None:
+    with pytest.raises(RecipeError, match=re.escape(message)):
+        parse_recipe(RECIPE.format(sections), "r", load_registry())
+
+
+def test_a_mesh_of_ones_own_goes_with_the_run(tmp_path: Path) -> None:
+    (tmp_path / "own.ply").write_text(GRIPPER.as_ply())
+    (tmp_path / "r.yaml").write_text(RECIPE.format("target: own.ply\n"))
+    recipe = load_recipe(tmp_path / "r.yaml", load_registry())
+    for name, text in recipe.files.items():
+        (tmp_path / "run" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "run" / name).write_text(text)
+    (tmp_path / "own.ply").unlink()
+    again = load_recipe(tmp_path / "run" / "recipe.resolved.yaml", load_registry())
+    assert again.context[TargetBody].digest == recipe.context[TargetBody].digest

@@ -1,0 +1,211 @@
+"""How often a body is found without a guess, how often wrongly, and how far off, by simulation.
+
+    python -m tools.study_bodies SCANS [BODY…]
+
+Simulated scans of a PhoXi M at 0.35 of its resolution: the body on a UR5e's flange, turned at random,
+before a table with six other things; in three of ten another body is there. Beside it Open3D's FPFH,
+RANSAC and ICP on the same scans, which have no way to say that a body is absent: each pose of theirs
+that is not the body's counts as wrong.
+"""
+
+import sys
+import time
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flangeye.maths.geometry import rigid, rotation_from_rpy, rotation_log
+from flangeye.models.bodies import load_body
+from flangeye.models.configuration import Configuration
+from flangeye.models.loading import load_model
+from flangeye.models.targets import plate_of
+from flangeye.types import CAMERA, Capture, Earlier, PointCloud, PoseFeature, Rejected
+from flangeye_emulators.world import materials
+from flangeye_emulators.world.flange_mesh import flange_mesh, wrist_mesh
+from flangeye_emulators.world.mesh import Mesh, box, capsule
+from flangeye_emulators.world.raycast import Body, Scene
+from flangeye_emulators.world.scanner import scanner_of
+from flangeye_plugins.body.judge import judged
+from flangeye_plugins.body.looks import prepared
+from flangeye_plugins.body.search import FINE, FINE_ACROSS
+from flangeye_plugins.body.shape import Shape
+from flangeye_plugins.body.view import view_of
+from flangeye_plugins.fit.body import FitBodyParams, fit_body
+from flangeye_plugins.segment.body import SegmentBodyParams, segment_body
+
+BODIES = ("gripper", "torch", "ring-plate")
+
+VISIBLE = 0.3
+"""Share of the body's view that the scan shows where finding it is asked for."""
+
+
+@cache
+def eye():
+    scanner = load_model("scanners", "phoxi-m", Path())
+    return scanner_of(scanner, 0.35, 1.0, np.random.default_rng(0))
+
+
+@cache
+def wrist():
+    plate = plate_of(load_model("robots", "ur5e", Path()))
+    arm = [([0, 0, -0.06], [0, 0.12, -0.07], 0.04), ([0, 0.12, -0.07], [-0.35, 0.15, -0.15], 0.045)]
+    links = [Body(capsule(np.array(a), np.array(b), r), materials.PAINTED) for a, b, r in arm]
+    finish = materials.FINISHES[plate.details.finish]
+    return [Body(flange_mesh(plate), finish), Body(wrist_mesh(plate), materials.PAINTED), *links]
+
+
+def turned(rng):
+    q = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+    return q * np.sign(np.linalg.det(q))
+
+
+def scene(rng, body):
+    rotation = turned(rng)
+    while rotation[2, 2] >= 0.3:
+        rotation = turned(rng)
+    depth = rng.uniform(0.55, 0.85)
+    centre = np.array([rng.uniform(-0.15, 0.15) * depth, rng.uniform(-0.12, 0.12) * depth, depth])
+    pose = rigid(rotation, centre - rotation @ body.centre)
+    own = Body(Mesh(body.vertices, body.triangles), materials.METAL)
+    bodies = [one.moved(pose) for one in [*wrist(), own]]
+    tilt = rotation_from_rpy(rng.uniform(-0.3, 0.3), rng.uniform(-0.3, 0.3), 0.0)
+    table = box([-1, -1, 0], [1, 1, 0.05]).moved(rigid(tilt, [0, 0, rng.uniform(0.95, 1.1)]))
+    bodies.append(Body(table, materials.TABLE))
+    for k in range(6):
+        z = rng.uniform(0.6, 1.0)
+        at = np.array([rng.uniform(-0.4, 0.4) * z, rng.uniform(-0.3, 0.3) * z, z])
+        half, length, radius = (
+            rng.uniform(0.02, 0.09, 3),
+            rng.uniform(0.03, 0.2),
+            rng.uniform(0.01, 0.05),
+        )
+        mesh = (
+            box(-half, half)
+            if k % 2
+            else capsule(np.zeros(3), np.array([0, 0, length]), radius, 32)
+        )
+        if np.linalg.norm(at - centre) > 0.6 * body.size:
+            bodies.append(Body(mesh.moved(rigid(turned(rng), at)), materials.PAINTED))
+    return bodies, pose
+
+
+class Trial(NamedTuple):
+    """One scan: the pose found or why not, its error where the body is there, and CPU time [s]."""
+
+    there: bool
+    visible: bool
+    feature: PoseFeature | None
+    why: str
+    off: np.ndarray
+    seconds: float
+    peer_off: np.ndarray
+    peer_seconds: float
+
+
+def trial(name, seed):
+    """Search one scan for a body; in three of ten another body is in its place."""
+    rng = np.random.default_rng(seed)
+    body, there = load_body(name, None, Path()), seed % 10 >= 3
+    others = [other for other in BODIES if other != name]
+    shown = body if there else load_body(others[seed % 2], None, Path())
+    bodies, pose = scene(rng, Shape(shown.vertices, shown.triangles))
+    capture = Capture(f"{seed:04d}", PointCloud(CAMERA, eye().scan(Scene(bodies), rng)), {})
+    points, shape = capture.cloud.points(), prepared(body)[0]
+    view = view_of(points, body.size / FINE_ACROSS)
+    tolerance = max(FINE * body.size, 3.5 * view.noise)
+    visible = there and judged(shape, view, pose, tolerance).shown > VISIBLE
+    start = time.process_time()
+    found = segment_body(capture, body, Configuration(), Earlier([]), SegmentBodyParams())
+    if not isinstance(found, Rejected):
+        found = fit_body(found, body, FitBodyParams())
+    taken = time.process_time() - start
+    lost = isinstance(found, Rejected)
+    off = error(np.eye(4) if lost else found.camera_T_target.matrix, pose)
+    start = time.process_time()
+    peer_off = error(peer(points, body), pose)
+    return Trial(there, visible, None if lost else found, found.reason if lost else "", off, taken,
+                 peer_off, time.process_time() - start)  # fmt: skip
+
+
+def peer(points, body):
+    """Return the pose by Open3D: FPFH, RANSAC, and point-to-plane ICP."""
+    import open3d as o3d
+
+    registration: Any = o3d.pipelines.registration  # its stubs ask for what is optional
+    o3d.utility.random.seed(0)
+    step = body.size / 40
+
+    def prepare(cloud):
+        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(2 * step, 30))
+        cloud.orient_normals_towards_camera_location()
+        near = o3d.geometry.KDTreeSearchParamHybrid(5 * step, 100)
+        return cloud, registration.compute_fpfh_feature(cloud, near)
+
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points.astype(float)))
+    scan, of_scan = prepare(cloud.voxel_down_sample(step))
+    surface = prepared(body)[0].surface
+    model = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(surface.points))
+    model.normals = o3d.utility.Vector3dVector(surface.normals)
+    near = o3d.geometry.KDTreeSearchParamHybrid(5 * step, 100)
+    of_model = registration.compute_fpfh_feature(model, near)
+    rough = registration.registration_ransac_based_on_feature_matching(
+        model, scan, of_model, of_scan, True, 1.5 * step,
+        registration.TransformationEstimationPointToPoint(False), 3,
+        [registration.CorrespondenceCheckerBasedOnEdgeLength(0.9),
+         registration.CorrespondenceCheckerBasedOnDistance(1.5 * step)],
+        registration.RANSACConvergenceCriteria(400_000, 0.999),
+    )  # fmt: skip
+    fine = registration.registration_icp(
+        model, scan, step, rough.transformation,
+        registration.TransformationEstimationPointToPlane(),
+    )  # fmt: skip
+    return fine.transformation
+
+
+def error(found, pose):
+    """Turn [rad] and shift [m] of a pose from the true one."""
+    turn = found[:3, :3] @ pose[:3, :3].T
+    return np.r_[rotation_log(turn[None])[0], found[:3, 3] - pose[:3, 3]]
+
+
+def right(off, size):
+    """Whether a pose is the body's: within five hundredths of its size."""
+    return np.linalg.norm(off[:3]) * size + np.linalg.norm(off[3:]) < 0.05 * size
+
+
+def summary(name, trials):
+    """How many were found, refused and wrong, and stated over true errors."""
+    size = load_body(name, None, Path()).size
+    seen = [one for one in trials if one.visible]
+    found = [one for one in trials if one.feature is not None]
+    good = [one for one in found if one.there and right(one.off, size)]
+    chi = [one.off @ np.linalg.solve(one.feature.covariance, one.off) / 6 for one in good]
+    off = [1e3 * float(np.linalg.norm(one.off[3:])) for one in good]
+    peers = [one for one in trials if one.there and right(one.peer_off, size)]
+    peer_off = [1e3 * float(np.linalg.norm(one.peer_off[3:])) for one in peers]
+    return (
+        f"{name}, {len(trials)} scans, {len(seen)} with {VISIBLE:.0%} of its view seen, "
+        f"{sum(not one.there for one in trials)} without it\n"
+        f"  flangeye  right {len(good)}, of these visible {sum(one.visible for one in good)}, "
+        f"wrong {len(found) - len(good)}, off {_median(off)} mm, true over stated error "
+        f"{np.sqrt(np.mean(chi)) if chi else np.nan:.2f}, "
+        f"{np.mean([one.seconds for one in trials]):.2f} s CPU\n"
+        f"  FPFH+ICP  right {len(peers)}, of these visible {sum(one.visible for one in peers)}, "
+        f"wrong {len(trials) - len(peers)}, off {_median(peer_off)} mm, "
+        f"{np.mean([one.peer_seconds for one in trials]):.2f} s CPU"
+    )
+
+
+def _median(values):
+    return f"{np.median(values):.2f}" if values else "-"
+
+
+def main(scans, names):
+    for name in names:
+        print(summary(name, [trial(name, seed) for seed in range(scans)]), flush=True)
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]), sys.argv[2:] or BODIES)
