@@ -352,6 +352,24 @@ def never_late(self, twist, acceleration):
     self._mover.go_on(twist, acceleration, 1e6)
 
 
+def taken_up_again(self):
+    """Go on with the last move whenever somebody looks."""
+    if self.goal is not None and np.abs(self.arm.speeds).max() == 0.0:
+        SimulatedRobot.move_joints(self, *self.goal)
+    return SimulatedRobot.state(self)
+
+
+def noted(self, *goal):
+    self.goal = goal
+    SimulatedRobot.move_joints(self, *goal)
+
+
+def unwatched(self):
+    """Move on in silence."""
+    self._looked = self.cycles
+    SimulatedRobot.wait_cycle(self)
+
+
 class Eye:
     """A sensor that is as it should be."""
 

@@ -621,8 +621,22 @@ CASES = [
     ("robot", "test_it_stops_at_once", bad.robot(stop=lambda self: None), "went on to", {}),
     (
         "robot",
+        "test_silence_alone_ends_a_move",
+        bad.robot(wait_cycle=bad.unwatched),
+        r"nobody looked at it for 0\.8 s, and it went on by 0\.09",
+        {},
+    ),
+    (
+        "robot",
+        "test_silence_alone_ends_a_move",
+        bad.robot(goal=None, move_joints=bad.noted, state=bad.taken_up_again),
+        "it moves on as soon as it is looked at",
+        {},
+    ),
+    (
+        "robot",
         "test_a_velocity_ends_without_commands",
-        bad.robot(move_velocity=bad.never_late),
+        bad.robot(move_velocity=bad.never_late, wait_cycle=bad.unwatched),
         "without commands it still goes",
         {},
     ),

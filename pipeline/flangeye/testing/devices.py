@@ -14,6 +14,7 @@ from flangeye import types as t
 from flangeye.devices import (
     GRACE,
     PATIENCE,
+    SILENT,
     Arc,
     DeviceError,
     FrameDropped,
@@ -47,6 +48,9 @@ ACCELERATION = 2.0
 
 STEP = 0.1
 """How far the last joint is turned [rad]."""
+
+RESTS = 0.5
+"""Longest time from the last look at a moving arm until it rests [s]."""
 
 STANDING = 1e-3
 """Of joints, less is standing [rad/s]."""
@@ -151,13 +155,38 @@ class RobotConformance(DriverConformance):
         with self.opened() as robot:
             start = robot.state().joints
             robot.move_joints(start + np.eye(len(start))[-1] * 4 * STEP, SPEED, ACCELERATION)
-            self._cycles(robot, 0.3)
-            require(np.abs(robot.state().joint_speeds).max() > STANDING, "the move has not begun")
+            self._watch(robot, 0.3)
+            require(_fastest(robot.state()) > STANDING, "the move has not begun")
             robot.stop()
             robot.stop()
             _, state = self._until_still(robot)
             gone = abs(state.joints[-1] - start[-1])
             require(gone < 3 * STEP, f"after stop() the joint went on to {gone:.3g} rad")
+            robot.move_joints(start, SPEED, ACCELERATION)
+            self._until_still(robot)
+
+    def test_silence_alone_ends_a_move(self) -> None:
+        """Nobody looks any more: at rest within RESTS, well before the goal, and it stays so.
+
+        The program, its guard or the driver's own processes may be frozen, and then let go of.
+        """
+        with self.opened() as robot:
+            start = robot.state().joints
+            robot.move_joints(start + np.eye(len(start))[-1] * 4 * STEP, SPEED, ACCELERATION)
+            self._watch(robot, 0.3)
+            before = robot.state()
+            require(_fastest(before) > STANDING, "the move has not begun")
+            time.sleep(RESTS)
+            self._cycles(robot, 2 * SILENT)  # the time of an arm that is simulated passes here
+            after = robot.state()
+            gone = float(np.abs(after.joints - before.joints).max())
+            require(
+                _fastest(after) < STANDING and gone < SPEED * RESTS,
+                f"nobody looked at it for {RESTS + 2 * SILENT:.1f} s, and it went on by "
+                f"{gone:.3g} rad, at {_fastest(after):.3g} rad/s now",
+            )
+            self._watch(robot, 0.3)
+            require(_fastest(robot.state()) < STANDING, "it moves on as soon as it is looked at")
             robot.move_joints(start, SPEED, ACCELERATION)
             self._until_still(robot)
 
@@ -167,7 +196,7 @@ class RobotConformance(DriverConformance):
             start = robot.state().joints
             robot.move_velocity(np.array([0.0, 0.0, 0.01, 0.0, 0.0, 0.0]), 0.2)
             self._cycles(robot, GRACE + 1.0)
-            speed = float(np.abs(robot.state().joint_speeds).max())
+            speed = _fastest(robot.state())
             require(speed < STANDING, f"without commands it still goes at {speed:.3g} rad/s")
             robot.move_joints(start, SPEED, ACCELERATION)
             self._until_still(robot)
@@ -176,13 +205,18 @@ class RobotConformance(DriverConformance):
         for _ in range(round(seconds / robot.period)):
             robot.wait_cycle()
 
+    def _watch(self, robot: Robot, seconds: float) -> None:
+        for _ in range(round(seconds / robot.period)):
+            robot.wait_cycle()
+            robot.state()
+
     def _until_still(self, robot: Robot) -> tuple[float, RobotState]:
         """Return the highest joint speed on the way, and where it came to rest."""
         fastest, still = 0.0, 0
         for _ in range(round(10.0 / robot.period)):
             robot.wait_cycle()
             state = robot.state()
-            speed = float(np.abs(state.joint_speeds).max())
+            speed = _fastest(state)
             fastest = max(fastest, speed)
             still = still + 1 if speed < STANDING and state.mode != "moving" else 0
             if still * robot.period > 0.1:
@@ -366,6 +400,10 @@ def _given(ask: Callable[[], _One | None], count: int, things: str) -> list[_One
             found.append(one)
     require(len(found) == count, f"{len(found)} {things} within {PATIENCE:g} s, not {count}")
     return found
+
+
+def _fastest(state: RobotState) -> float:
+    return float(np.abs(state.joint_speeds).max())
 
 
 class _Standing:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flangeye.devices import GRACE, Device, DeviceError, Mode, Robot, RobotState
+from flangeye.devices import GRACE, SILENT, Device, DeviceError, Mode, Robot, RobotState
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.stage import Params, part
 from flangeye.types import BASE, FLANGE, TOOL, Floats, Transform
@@ -57,13 +57,14 @@ class SimulatedRobot(Device):
         limits = np.full(len(joints), params.joint_speed)
         zeros = joint_zeros(model, params.joint_errors)
         self.arm = SimulatedArm(model, limits, params.period, joints, zeros)
-        self.cycles = 0
+        self.cycles = self._looked = 0
         room.enter(self)
         self._mover = Mover(self.arm)
         self._stopped_by = ""
 
     def state(self) -> RobotState:
         """Return the arm as it is in this cycle; time counts from zero."""
+        self._looked = self.cycles
         return RobotState(
             base_T_flange=Transform(BASE, FLANGE, self.arm.stance.base_T_tcp),
             joints=self.arm.stance.joints,
@@ -90,11 +91,14 @@ class SimulatedRobot(Device):
     def move_velocity(self, twist: Floats, acceleration: float) -> None:
         """Go on at a twist (6,); it brakes when the next command is :data:`GRACE` late."""
         self._require_ready()
+        self._looked = self.cycles
         self._mover.go_on(twist, acceleration, GRACE)
 
     def wait_cycle(self) -> None:
-        """Let one cycle pass."""
+        """Let one cycle pass; a motion that nobody looked at for SILENT ends."""
         self.cycles += 1
+        if (self.cycles - self._looked) * self.period > SILENT:
+            self._mover.halt()
         try:
             self._mover.step()
         except MotionFault as fault:
@@ -119,6 +123,7 @@ class SimulatedRobot(Device):
 
     def _begin(self, plan: Plan) -> None:
         self._require_ready()
+        self._looked = self.cycles
         self._mover.halt()
         self._mover.append(plan)
 

@@ -14,6 +14,7 @@ import pytest
 
 from flangeye.devices import DeviceError
 from flangeye.models.loading import load_model
+from flangeye.testing import RobotConformance
 from flangeye_plugins.robot.aubo.client import AuboClient
 from flangeye_plugins.robot.aubo.driver import AuboParams, robot_aubo
 from tests.emulators.controllers.process import Process, free_address
@@ -61,6 +62,19 @@ class TestAubo(DrivesAnArm):
     period = 0.005
     twist_off = 1e-4
     opened = staticmethod(open_aubo)
+
+
+class TestAuboKit(RobotConformance):
+    """What is asked of a vendor's driver, on the loopback."""
+
+    part = robot_aubo
+
+    @pytest.fixture(autouse=True)
+    def here(self, controller: Any) -> None:
+        self.host = controller.host
+
+    def open(self) -> Any:
+        return open_aubo(self.host)
 
 
 def test_the_controller_says_where_it_listens(process: Any) -> None:

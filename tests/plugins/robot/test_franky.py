@@ -2,13 +2,14 @@
 
 import socket
 import sys
+import time
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pytest
 
-from flangeye.devices import DeviceError, Robot
+from flangeye.devices import SILENT, DeviceError, Robot
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye_emulators.controllers.contact import Surface
 from flangeye_plugins.robot.franky.driver import (
@@ -147,6 +148,18 @@ def test_a_motion_of_another_kind_waits_for_the_stop(robot: Any, connection: Sta
     robot.move_joints(start.joints, 0.2, 1.0)
     assert connection.moves == ["CartesianMotion", "CartesianStopMotion", "JointMotion"]
     np.testing.assert_allclose(settle(robot).joints, start.joints, atol=1e-9)
+
+
+def test_a_motion_that_nobody_looks_at_is_stopped_once(robot: Any, connection: StandIn) -> None:
+    start = robot.state().joints
+    robot.move_joints(start + 0.5, 0.2, 0.5)
+    for _ in range(50):
+        robot.state()
+    time.sleep(3 * SILENT)
+    assert connection.moves == ["JointMotion", "JointStopMotion"]
+    assert np.abs(settle(robot).joints - start).max() < 0.1
+    time.sleep(3 * SILENT)
+    assert connection.moves == ["JointMotion", "JointStopMotion"]
 
 
 def test_what_is_touched_is_felt(robot: Any, connection: StandIn) -> None:

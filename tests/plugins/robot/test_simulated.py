@@ -104,6 +104,7 @@ def test_stop_brakes_in_the_next_cycle(robot: Any) -> None:
     robot.move_linear(moved(robot.state().base_T_flange, z=0.2), 0.1, 0.5)
     for _ in range(300):
         robot.wait_cycle()
+        robot.state()
     before = np.abs(robot.state().joint_speeds).max()
     robot.stop()
     robot.wait_cycle()
@@ -116,6 +117,7 @@ def test_a_new_move_begins_where_the_arm_comes_to_rest(robot: Any) -> None:
     robot.move_linear(moved(start, z=0.2), 0.1, 0.5)
     for _ in range(300):
         robot.wait_cycle()
+        robot.state()
     robot.move_linear(start, 0.1, 0.5)
     states = arrive(robot)
     np.testing.assert_allclose(states[-1].base_T_flange.matrix, start.matrix, atol=1e-9)

@@ -13,6 +13,7 @@ import pytest
 
 from flangeye.devices import GRACE, SILENT, DeviceError
 from flangeye.models.loading import load_model
+from flangeye.testing import RobotConformance
 from flangeye_plugins.robot.ur import worker
 from flangeye_plugins.robot.ur.driver import UrRtdeParams, robot_ur_rtde
 from tests.emulators.controllers.process import Process, free_address
@@ -48,6 +49,19 @@ class TestUr(DrivesAnArm):
     period = 0.002
     twist_off = 1e-6
     opened = staticmethod(open_ur)
+
+
+class TestUrKit(RobotConformance):
+    """What is asked of a vendor's driver, on the loopback."""
+
+    part = robot_ur_rtde
+
+    @pytest.fixture(autouse=True)
+    def here(self, controller: Any) -> None:
+        self.host = controller.host
+
+    def open(self) -> Any:
+        return open_ur(self.host)
 
 
 TOOL = {

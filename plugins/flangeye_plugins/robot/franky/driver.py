@@ -7,13 +7,16 @@ against a stand-in for the connection alone; see the README of the drivers.
 
 from __future__ import annotations
 
+import contextlib
+import math
+import threading
 import time
 from typing import Any
 
 import numpy as np
 from pydantic import Field
 
-from flangeye.devices import GRACE, Device, DeviceError, Mode, Robot, RobotState
+from flangeye.devices import GRACE, SILENT, Device, DeviceError, Mode, Robot, RobotState
 from flangeye.maths.pose_formats import CONVENTIONS
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.sdk import load_sdk
@@ -116,13 +119,16 @@ class FrankyRobot(Device):
         """
         self.name, self._sdk, self._robot = name, sdk, connection
         self._stopping: Any = None
+        self._looked, self._commands = time.monotonic(), threading.RLock()
         self.offset = np.array(self._ask(lambda: connection.state.F_T_EE).matrix)
         self.flange_T_tool: Transform | None = Transform(FLANGE, TOOL, self.offset)
         self._tool_T_flange = np.linalg.inv(self.offset)
         self._closed = False
+        threading.Thread(target=self._end_unwatched, daemon=True).start()
 
     def state(self) -> RobotState:
         """Return the newest sample, tool taken off."""
+        self._looked = time.monotonic()
         sample = self._ask(lambda: self._robot.state)
         under_way, trouble = self._motion()
         mode, message = MODES[sample.robot_mode.name]
@@ -184,29 +190,45 @@ class FrankyRobot(Device):
 
     def stop(self) -> None:
         """Brake as the motion under way is made."""
-        if self._stopping is not None and self._motion()[0]:
-            stopping = self._stopping
-            self._ask(lambda: self._robot.move(stopping(), asynchronous=True))
+        with self._commands:
+            if self._stopping is not None and self._motion()[0]:
+                stopping = self._stopping
+                self._ask(lambda: self._robot.move(stopping(), asynchronous=True))
 
     def close(self) -> None:
         """Stop the arm; the library lets go when it is forgotten."""
         if self._closed:
             return
-        try:
-            self.stop()
-        finally:
-            self._closed, self._robot = True, None
+        with self._commands:
+            try:
+                self.stop()
+            finally:
+                self._closed, self._robot = True, None
+
+    def _end_unwatched(self) -> None:
+        """Stop a motion that nobody looked at for SILENT, once.
+
+        The library moves the arm on from a thread of this process. Where the whole process stands,
+        that thread does as well, and the controller stops by itself after 20 lost cycles.
+        """
+        while not self._closed:
+            time.sleep(0.1 * SILENT)
+            with self._commands, contextlib.suppress(DeviceError):
+                if not self._closed and time.monotonic() - self._looked > SILENT:
+                    self.stop()
+                    self._looked = math.inf
 
     def _start(self, motion: Any, stopping: Any) -> None:
         state = self.state()
         if state.message:
             raise DeviceError(f"{self.name}: {state.message}")
-        # A motion of another kind is refused by the library while one goes on.
-        if self._stopping not in (None, stopping):
-            self.stop()
-            self._ask(lambda: self._robot.join_motion(timeout=1.0))
-        self._stopping = stopping
-        self._ask(lambda: self._robot.move(motion, asynchronous=True))
+        with self._commands:
+            # A motion of another kind is refused by the library while one goes on.
+            if self._stopping not in (None, stopping):
+                self.stop()
+                self._ask(lambda: self._robot.join_motion(timeout=1.0))
+            self._stopping = stopping
+            self._ask(lambda: self._robot.move(motion, asynchronous=True))
 
     def _motion(self) -> tuple[bool, str]:
         """Return whether a motion is in progress, and why the last one failed, if it did."""
