@@ -2,10 +2,11 @@
 
 A calibration, or a program that leads the arm as a weld does, runs against a controller on loopback
 through the maker's client. The fault is the controller's, or befalls the run's own processes
-(``tools.strokes``): killed, held for three seconds and let go of, interrupted. It comes while the arm moves, at a random moment. By the
-controller's clock the arm rests within 0.5 s; what was finished is in the log; the program ends
-within 3 s, not counting how long it or its guard, the longer of both, waited for a core of a busy
-machine. Under a fault that hinders nothing (a network late by 20 ms, a wall clock that is set) it may go on
+(``tools.strokes``): killed, held for three seconds and let go of, interrupted at its terminal. It
+comes while the arm moves, at a random moment. By the controller's clock the arm rests within 0.5 s
+and does not move again; what was finished is in the log; the program ends within 3 s, not counting
+how long it or its guard, the longer of both, waited for a core of a busy machine; it says how to go
+on, and after the first of the trials it does go on. Under a fault that hinders nothing (a network late by 20 ms, a wall clock that is set) it may go on
 to its end.
 """
 
@@ -19,24 +20,28 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from flangeye.files.children import python_command
 from tests.live.cell import Cell
 from tests.plugins.ros2.cell import Ros2Cell
-from tools.strokes import HELD, OF_A_BRIDGE, OF_A_CLIENT, SHIFTS, STROKES, environment
+from tools.strokes import (
+    HELD,
+    OF_A_BRIDGE,
+    OF_A_CLIENT,
+    SHIFTS,
+    STROKES,
+    Terminal,
+    environment,
+)
 
-AUBO_FAULTS = ("protective-stop", "emergency-stop", "drop", "die", "freeze", "latency=300 ms")
-FAULTS = (
-    *AUBO_FAULTS, "singularity", "joint-limit", "latency=20 ms", "program-stop",
-    "remote-control-off",
-)  # fmt: skip
+AUBO_FAULTS = Cell.faults[:7]
 ANYWHERE = (*STROKES, *SHIFTS)
 KINDS = {
-    "calibration": (*FAULTS, *ANYWHERE, *OF_A_CLIENT),
-    "leading": (*FAULTS, *ANYWHERE, *OF_A_CLIENT),
+    "calibration": (*Cell.faults, *ANYWHERE, *OF_A_CLIENT),
+    "leading": (*Cell.faults, *ANYWHERE, *OF_A_CLIENT),
     "aubo": (*AUBO_FAULTS, *ANYWHERE),
     "ros2": (*Ros2Cell.faults, *STROKES, *OF_A_BRIDGE),
 }
@@ -63,7 +68,8 @@ def main() -> None:
     parser.add_argument("--fault", nargs="+", default=[])
     asked = parser.parse_args()
     print(
-        "kind         fault                   times  went on  rest [s]  exit [s]  no core [s]  wrong",
+        "kind         fault                   times  went on  rest [s]  exit [s]  no core [s]  "
+        "resumed  wrong",
         flush=True,
     )
     wrong = 0
@@ -93,13 +99,17 @@ class Trial:
     def __init__(self, kind: str, fault: str, chance: random.Random) -> None:
         self.wrong: list[str] = []
         self._kind, self._fault, self._chance = kind, fault, chance
-        self._times = self._went_on = 0
+        self._times = self._went_on = self._resumed = 0
         self._ends = [End(0.0, 0.0, 0.0)]
 
     def once(self) -> None:
         """Start a controller and a program, cause the fault, and look."""
         self._times += 1
-        with tempfile.TemporaryDirectory() as folder, self._cell(Path(folder)) as cell:
+        with (
+            tempfile.TemporaryDirectory() as folder,
+            self._cell(Path(folder)) as cell,
+            closing(Terminal()) as self._terminal,
+        ):
             program = self._start(cell)
             try:
                 self.wrong += self._faults(cell, program)
@@ -120,21 +130,25 @@ class Trial:
         exits, queued = max((end.exits or 0.0, end.queued) for end in self._ends)
         return (
             f"{self._kind:12} {self._fault:23} {self._times:5} {self._went_on:8} {rests:9.2f} "
-            f"{exits:9.2f} {queued:12.2f} {len(self.wrong):6}"
+            f"{exits:9.2f} {queued:12.2f} {self._resumed:8} {len(self.wrong):6}"
         )
 
     def _start(self, cell: Any) -> subprocess.Popen[str]:
-        env = environment(cell.folder)
-        if self._kind == "ros2":
-            return cell.start("run", cell.recipe(), "--move", "--out", "run")
         if self._calibrates:
-            return cell.start(cell.recipe(), "--move", "--out", "run", env=env)
+            return self._run(cell, cell.recipe(), "--out", "run")
         return subprocess.Popen(
             python_command("-c", "import sys; sys.path.insert(0, sys.argv.pop(1)); "
                            "from tests.motion.leader import main; main(sys.argv[1])",
                            str(Path(__file__).parents[1]), cell.controller.host),
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=env,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment(cell.folder),
+            **self._terminal.given,
         )  # fmt: skip
+
+    def _run(self, cell: Any, *words: Any) -> subprocess.Popen[str]:
+        given = self._terminal.given
+        if self._kind == "ros2":
+            return cell.start("run", *words, "--move", **given)
+        return cell.start(*words, "--move", env=environment(cell.folder), **given)
 
     @property
     def _calibrates(self) -> bool:
@@ -143,7 +157,7 @@ class Trial:
     def _cause(self, cell: Any, program: subprocess.Popen[str]) -> None:
         """Let the fault happen."""
         if strike := {**STROKES, **OF_A_CLIENT, **OF_A_BRIDGE}.get(self._fault):
-            strike(program.pid)
+            strike(program.pid, self._terminal)
         elif shift := SHIFTS.get(self._fault):
             (cell.folder / "shift").write_text(shift, "ascii")
         else:
@@ -172,6 +186,26 @@ class Trial:
                 yield (f"the arm rests after {end.rests:.2f} s, the program ends after "
                        f"{end.exits:.2f} s, {end.queued:.2f} s of them without a core")  # fmt: skip
         yield from (f"{lost} is lost" for lost in before - set(cell.finished()))
+        recorded = self._calibrates and (cell.folder / "run" / "run.mcap").exists()
+        if recorded and _over(program) and self._fault not in cell.faults:
+            yield from self._goes_on(cell, program)
+
+    def _goes_on(self, cell: Any, program: subprocess.Popen[str]) -> Iterator[str]:
+        """Yield what is wrong with how a run that was struck says how to go on, and does."""
+        told = program.communicate()[1]
+        if "--resume" not in told and self._fault != "program killed":
+            yield f"it does not say how to go on: {told.splitlines()[-1:]}"
+        if self._resumed:
+            return
+        before, going = len(cell.finished()), self._run(cell, "--resume", "run")
+        try:
+            cell.wait_until(lambda: len(cell.finished()) > before or _over(going), STARTING)
+        finally:
+            going.kill()
+            told = going.communicate()[1]
+        self._resumed += len(cell.finished()) > before
+        if not self._resumed:
+            yield f"it does not go on by --resume: {told.splitlines()[-1:]}"
 
     def _through(self, program: subprocess.Popen[str], moved: float) -> Iterator[str]:
         """Yield what is wrong with a program that went on under a fault."""

@@ -6,12 +6,16 @@ arm must not move again then.
 
 from __future__ import annotations
 
+import fcntl
 import os
+import pty
 import signal
+import termios
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 HELD = 3.0
 """How long a process is held [s]."""
@@ -64,58 +68,94 @@ def worker_of(run: int) -> int:
     return _child(guard_of(run), "worker.py")
 
 
-def _killed(*processes: int) -> None:
-    for process in processes:
-        os.kill(process, signal.SIGKILL)
+class Terminal:
+    """A terminal of its own for a program, to press keys on.
+
+    Attributes:
+        given: What ``subprocess.Popen`` is given to start the program in it.
+    """
+
+    def __init__(self) -> None:
+        self._keys, self._line = pty.openpty()
+        self.given: dict[str, Any] = {
+            "stdin": self._line, "start_new_session": True,
+            "preexec_fn": lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
+        }  # fmt: skip
+
+    def press(self, key: bytes) -> None:
+        """Press a key; the terminal signals to every process of the program's group."""
+        os.write(self._keys, key)
+
+    def close(self) -> None:
+        """Hang up."""
+        os.close(self._keys)
+        os.close(self._line)
 
 
-def _held(*processes: int) -> None:
-    for process in processes:
-        os.kill(process, signal.SIGSTOP)
-    threading.Timer(HELD, _released, processes).start()
+Stroke = Callable[[int, Terminal], None]
+"""Is given the run's process and its terminal."""
 
 
-def _released(*processes: int) -> None:
-    for process in processes:
-        with suppress(ProcessLookupError):
-            os.kill(process, signal.SIGCONT)
+def _killed(find: Callable[[int], int]) -> Stroke:
+    return lambda run, _: os.kill(find(run), signal.SIGKILL)
 
 
-def _interrupted(run: int) -> None:
-    """Press Ctrl-C while the program is held: the terminal sends it to the guard, too."""
-    _held(run)
-    for process in (run, guard_of(run)):
-        os.kill(process, signal.SIGINT)
+def _held(find: Callable[[int], int], signals: Callable[[int, int], None] = os.kill) -> Stroke:
+    """Return what holds a process, or a group of them, and lets go of it later."""
+
+    def stroke(run: int, _: Terminal) -> None:
+        process = find(run)
+        signals(process, signal.SIGSTOP)
+        threading.Timer(HELD, _release, (signals, process)).start()
+
+    return stroke
 
 
-def _suspended(run: int) -> None:
-    """Press Ctrl-Z."""
-    for process in (run, guard_of(run)):
-        os.kill(process, signal.SIGTSTP)
+def _release(signals: Callable[[int, int], None], process: int) -> None:
+    with suppress(ProcessLookupError):
+        signals(process, signal.SIGCONT)
 
 
-STROKES: dict[str, Callable[[int], None]] = {
-    "program killed": _killed,
-    "program held": _held,
-    "guard killed": lambda run: _killed(guard_of(run)),
-    "guard held": lambda run: _held(guard_of(run)),
-    "program and guard held": lambda run: _held(run, guard_of(run)),
-    "Ctrl-Z": _suspended,
+def _itself(run: int) -> int:
+    return run
+
+
+def _interrupted(run: int, terminal: Terminal) -> None:
+    _held(_itself)(run, terminal)
+    terminal.press(b"\x03")
+
+
+STROKES: dict[str, Stroke] = {
+    "program killed": _killed(_itself),
+    "program held": _held(_itself),
+    "guard killed": _killed(guard_of),
+    "guard held": _held(guard_of),
+    "process group held": _held(_itself, os.killpg),
+    "Ctrl-Z": lambda _, terminal: terminal.press(b"\x1a"),
     "program held, Ctrl-C": _interrupted,
 }
-"""By name; each is given the run's process."""
+"""By name."""
 
-OF_A_CLIENT: dict[str, Callable[[int], None]] = {
-    "worker killed": lambda run: _killed(worker_of(run)),
-    "worker held": lambda run: _held(worker_of(run)),
+OF_A_CLIENT: dict[str, Stroke] = {
+    "worker killed": _killed(worker_of),
+    "worker held": _held(worker_of),
 }
 """Those of a driver whose client library has a process of its own."""
 
-OF_A_BRIDGE: dict[str, Callable[[int], None]] = {
-    "arm's bridge killed": lambda run: _killed(_child(guard_of(run), "ros2/bridge")),
-    "arm's bridge held": lambda run: _held(_child(guard_of(run), "ros2/bridge")),
-    "camera's bridge killed": lambda run: _killed(_child(run, "ros2/bridge")),
-    "camera's bridge held": lambda run: _held(_child(run, "ros2/bridge")),
+
+def _bridge_of_arm(run: int) -> int:
+    return _child(guard_of(run), "ros2/bridge")
+
+
+def _bridge_of_camera(run: int) -> int:
+    return _child(run, "ros2/bridge")
+
+
+OF_A_BRIDGE: dict[str, Stroke] = {
+    "arm's bridge killed": _killed(_bridge_of_arm),
+    "arm's bridge held": _held(_bridge_of_arm),
+    "camera's bridge killed": _killed(_bridge_of_camera),
+    "camera's bridge held": _held(_bridge_of_camera),
 }
 """Those of the processes that hold rclpy."""
 

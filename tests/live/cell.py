@@ -40,6 +40,12 @@ steps:
 class Cell:
     """A controller on loopback and a recipe that drives it."""
 
+    faults = (
+        "protective-stop", "emergency-stop", "drop", "die", "freeze", "garbage", "latency=300 ms",
+        "singularity", "joint-limit", "latency=20 ms", "program-stop", "remote-control-off",
+    )  # fmt: skip
+    """What may befall its controller; a controller of AUBO knows the first seven."""
+
     def __init__(self, folder, *arguments, model="ur5e"):
         self.folder, self._model = folder, model
         words = ("--joints", START[model], "--seed", "1")
@@ -57,12 +63,12 @@ class Cell:
         )  # fmt: skip
         return path
 
-    def start(self, *words, command="run", env=None):
+    def start(self, *words, command="run", **terminal):
         """Start a command, ``flangeye run`` unless told otherwise, in the background."""
         return subprocess.Popen(
-            [sys.executable, "-m", "flangeye.cli", command, *map(str, words)],
-            cwd=self.folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-            stdin=subprocess.DEVNULL, env=env,
+            [sys.executable, "-m", "flangeye.cli", command, *map(str, words)], cwd=self.folder,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            **{"stdin": subprocess.DEVNULL, **terminal},
         )  # fmt: skip
 
     def run(self, *words, command="run", patience=150):

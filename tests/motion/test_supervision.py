@@ -151,6 +151,22 @@ def test_what_stands_not_yet_or_not_there_has_not_arrived(change: str) -> None:
     assert watch.judge(at(3.22, GOAL))
 
 
+def test_three_tenths_of_a_second_on_the_way_without_a_move_and_no_longer() -> None:
+    halfway, watch = turned(AT_HOME.joints, j2=0.2), sent()
+    ready = at(1.0, halfway)
+    watch.judge(ready)
+    watch.judge(replace(ready, time_ns=ready.time_ns + 299_000_000))
+    moving_on = replace(ready, time_ns=ready.time_ns + 301_000_000, mode="moving")
+    watch.judge(moving_on)
+    watch.judge(at(1.31, halfway))
+    watch.judge(at(1.609, halfway))
+    with pytest.raises(SafetyFault, match=r"the arm ended its move 11\.5 deg before the goal: its"):
+        watch.judge(at(1.611, halfway))
+    watch.set_off(Leg(GOAL, 0.1, 0.1, 4.0))
+    watch.judge(at(1.7, GOAL))
+    assert watch.judge(at(2.1, GOAL))
+
+
 def test_the_next_leg_begins_where_and_when_the_arm_is() -> None:
     watch = sent()
     watch.judge(at(3.0, GOAL))

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flangeye.devices import RobotState
+from flangeye.devices import SILENT, RobotState
 from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import RobotModel
 from flangeye.motion.limits import MotionLimits
@@ -31,6 +31,9 @@ OFF_ROUTE = np.radians(3.0)
 
 START = 1.0
 """An arm that has not set off after this did not take the command [s]."""
+
+ENDED = 0.3
+"""An arm whose controller has been ready for so long before the goal has ended its move [s]."""
 
 SLACK = 0.003
 """By how much a sample may leave the box before it counts: numerics and braking [m]."""
@@ -71,14 +74,14 @@ class Supervisor:
         self.samples: deque[Sample] = deque()
         self.leg: Leg | None = None
         self._from = np.zeros(self._arm.n)
-        self._since_ns = self._stood_ns = self._halted_ns = 0
+        self._since_ns = self._stood_ns = self._halted_ns = self._ready_ns = 0
         self._led = False
 
     def set_off(self, leg: Leg) -> None:
         """Expect the arm to drive a leg from where it is."""
         newest = self.samples[-1]
         self.leg, self._from, self._led = leg, newest.joints, False
-        self._since_ns, self._stood_ns = newest.time_ns, 0
+        self._since_ns, self._stood_ns, self._ready_ns = newest.time_ns, 0, 0
 
     def halted(self) -> None:
         """Expect the arm to stand, wherever it comes to rest."""
@@ -169,9 +172,23 @@ class Supervisor:
         set_off = np.abs(state.joints - self._from).max() > ARRIVED
         if waited > START and not set_off and np.abs(way).max() > 2 * ARRIVED:
             raise SafetyFault(f"the arm has not set off {START:.0f} s after it was told to")
+        self._keep_going(state, leg, set_off)
         if waited > 2.0 * leg.seconds + 2.0:
             raise SafetyFault(
                 f"the arm has not arrived after {waited:.1f} s; {leg.seconds:.1f} s were expected"
+            )
+
+    def _keep_going(self, state: RobotState, leg: Leg, set_off: bool) -> None:
+        """Doubt an arm that has ended its move: a driver does when nobody looks at it."""
+        short = float(np.abs(state.joints - leg.joints).max())
+        if not set_off or state.mode != "ready" or short < ARRIVED:
+            self._ready_ns = 0
+            return
+        self._ready_ns = self._ready_ns or state.time_ns
+        if (state.time_ns - self._ready_ns) * 1e-9 > ENDED:
+            raise SafetyFault(
+                f"the arm ended its move {np.degrees(short):.1f} deg before the goal: its "
+                f"controller did, or this machine was too busy to watch it for {SILENT} s"
             )
 
     def _settled(self, state: RobotState, leg: Leg) -> bool:

@@ -30,6 +30,7 @@ class FaultInjector:
     * ``drop``: every connection is reset, once.
     * ``die``: connections are reset and nobody answers any more, for good or for a duration.
     * ``freeze``: connections stay open and nothing comes through, for good or for a duration.
+    * ``garbage``: random bytes come in place of what the controller says, for good.
     * ``latency``: every byte comes late by a duration, in both directions.
 
     The arm goes on with what it was doing when the network fails, as a real one does.
@@ -50,12 +51,14 @@ class FaultInjector:
             "drop": Kind(lambda _: network.drop()),
             "die": Kind(self._die, takes_seconds=True),
             "freeze": Kind(self._freeze, takes_seconds=True),
+            "garbage": Kind(lambda _: self._garble(True)),
             "latency": Kind(self._slow_down, takes_seconds=True),
         }
 
     def clear(self) -> None:
-        """End a dead, frozen or slow network."""
+        """End a dead, frozen, garbled or slow network."""
         self._network.latency = 0.0
+        self._garble(False)
         self._network.freeze(False)
         self._revive()
 
@@ -74,6 +77,9 @@ class FaultInjector:
         self._network.freeze(True)
         if seconds is not None:
             asyncio.get_running_loop().call_later(seconds, self._network.freeze, False)
+
+    def _garble(self, garbled: bool) -> None:
+        self._network.garbled = garbled
 
     def _slow_down(self, seconds: float | None) -> None:
         self._network.latency = DEFAULT_LATENCY if seconds is None else seconds

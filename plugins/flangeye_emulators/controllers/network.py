@@ -39,13 +39,14 @@ class Network:
         host: Address of all ports.
         latency: Delay in each direction [s].
         frozen: Whether nothing gets through while connections stay open.
+        garbled: Whether random bytes are sent in place of each answer.
         connections: Those that are open.
     """
 
     def __init__(self, host: str) -> None:
         self.host = host
         self.latency = 0.0
-        self.frozen = False
+        self.frozen = self.garbled = False
         self.connections: set[Connection] = set()
         self._ports: dict[int, Callable[[], Connection]] = {}
         self._servers: list[asyncio.Server] = []
@@ -171,7 +172,7 @@ class Connection(asyncio.Protocol):
 
     def _write(self, data: bytes) -> None:
         if self._transport is not None and not self._transport.is_closing():
-            self._transport.write(data)
+            self._transport.write(os.urandom(len(data)) if self._network.garbled else data)
 
 
 class LineConnection(Connection):

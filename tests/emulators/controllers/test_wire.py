@@ -316,8 +316,8 @@ def loopback(
         (
             ["ur5e", "--fault", "melt"],
             "error: no fault 'melt'; there are protective-stop, singularity, joint-limit, "
-            "emergency-stop, drop, die, freeze, latency, program-stop, remote-control-off, "
-            "inputs-low\n",
+            "emergency-stop, drop, die, freeze, garbage, latency, program-stop, "
+            "remote-control-off, inputs-low\n",
         ),
     ],
 )

@@ -123,11 +123,11 @@ class Terminal:
     def __init__(self, folder, env):
         self.folder, self.env = folder, env
 
-    def start(self, *words):
+    def start(self, *words, **terminal):
         return subprocess.Popen(
             [sys.executable, "-m", "flangeye.cli", *map(str, words)], cwd=self.folder,
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, stdin=subprocess.DEVNULL,
-            env=self.env,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=self.env,
+            **{"stdin": subprocess.DEVNULL, **terminal},
         )  # fmt: skip
 
     def run(self, *words, expect=0, patience=240):
