@@ -53,11 +53,18 @@ class Bar:
         self._footer.set_visibility(True)
         with self._buttons:
             button = ui.button(label, on_click=go).props("no-caps")
-        return button.props("outline" if second else "unelevated").classes("act")
+        weigh(button, second)
+        return button.classes("act")
 
     def lead(self, title: str, label: str) -> ui.button:
         """Return a button that leads to a step."""
         return self.offer(label, lambda: ui.navigate.to(STEPS[title][0]))
+
+
+def weigh(button: ui.button, second: bool) -> None:
+    """Draw a button as the one that leads on, or as one beside it."""
+    plain, filled = "outline", "unelevated"
+    button.props(plain if second else filled, remove=filled if second else plain)
 
 
 @contextmanager

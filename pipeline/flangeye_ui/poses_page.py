@@ -13,7 +13,7 @@ from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
 from flangeye.recipe.load import Recipe
 from flangeye_ui.drawing import base_T_camera_of, box_of
-from flangeye_ui.layout import Bar, code, command_line, mistake, page
+from flangeye_ui.layout import Bar, code, command_line, mistake, page, weigh
 from flangeye_ui.project import Project
 from flangeye_ui.scene import Scene3D
 
@@ -63,6 +63,7 @@ class Planner:
             self._bar.say("Nothing moves while poses are checked.")
         self._check.set_visibility(self._recipe.plans and not checked)
         done = checked or not self._recipe.plans or "Poses" in self._project.done()
+        weigh(self._check, second=done)
         self._next.set_visibility(done)
 
     def _draw(self) -> None:

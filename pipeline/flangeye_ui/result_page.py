@@ -29,7 +29,8 @@ from flangeye_ui.charts import coverage_drawing, residual_chart
 from flangeye_ui.layout import Bar, code, command_line, mistake, page, svg, warning
 from flangeye_ui.project import Project
 from flangeye_ui.scan_view import ScanView
-from flangeye_ui.scene import RIM, Scene3D, outline_of
+from flangeye_ui.scene import CELL, RIM, TAKEN, Scene3D, outline_of, views_of
+from flangeye_ui.touch_box import Touch
 
 LIGHTS = {
     "verified": ("good", "✓", "Can be used"),
@@ -95,6 +96,10 @@ def _show(project: Project, run: Path, facts: Facts, bar: Bar) -> None:
                 ui.label(note).classes("note")
     with ui.expansion("In 3D: fitted rims and residuals").classes("w-full") as in_3d:
         in_3d.on_value_change(lambda e: _in_3d(project, in_3d, facts) if e.value else None)
+    calibration = facts.log.calibration()
+    if calibration is not None and facts.base_T_camera is not None:
+        with ui.expansion("Check it by touch").classes("w-full"):
+            Touch(project, run, calibration)
     with ui.expansion("What would make it better", value=True).classes("w-full"):
         Better(project, run, facts)
     with ui.expansion("Ask the doctor what is wrong").classes("w-full") as box:
@@ -211,7 +216,7 @@ def _matrix(facts: Facts) -> None:
         with ui.row().classes("gap-x-6 gap-y-1"):
             ui.label(f"x, y, z: {', '.join(text.translation)} mm")
             ui.label(f"roll, pitch, yaw: {', '.join(text.rotation)}°")
-        code(text.matrix)
+        code(text.matrix).classes("matrix")
         copy = partial(ui.clipboard.write, text.matrix)
         ui.button("Copy the matrix", icon="content_copy", on_click=copy).props("flat no-caps")
     if not facts.result.transforms:
@@ -226,14 +231,15 @@ def _in_3d(project: Project, box: ui.expansion, facts: Facts) -> None:
         if pose is None:
             ui.label("There is no scanner that stands in the base to draw.")
             return
-        scene = Scene3D(420)
+        places = [each.tcp_in_base for each in facts.measured if each.tcp_in_base]
+        scene = Scene3D(420, views_of(np.array(places)) if places else CELL)
         _cell(project, scene, facts)
         for entry in facts.log.of_kind("fit"):
             scene.cloud(outline_of(entry.value) @ pose[:3, :3].T + pose[:3, 3], RIM, 0.004)
         times = _residuals(scene, facts)
         ui.label(
             f"Fitted rims red, in the base; residuals as arrows, {times:.0f} times their length: "
-            "blue of poses that were used, orange of others."
+            "green of poses that were used, orange of others."
         ).classes("note")
 
 
@@ -253,9 +259,11 @@ def _residuals(scene: Scene3D, facts: Facts) -> float:
     left = [(o.tcp_in_base, o.residual_in_base, o.used) for o in facts.measured]
     arrows = [(np.array(p), np.array(r), used) for p, r, used in left if p and r]
     longest = max((float(np.linalg.norm(r)) for _, r, used in arrows if used), default=0.0)
-    times = float(10.0 ** np.floor(np.log10(ARROW / longest))) if longest else 1.0
+    most = ARROW / longest if longest else 1.0
+    decade = float(10.0 ** np.floor(np.log10(most)))
+    times = decade * max(step for step in (1, 2, 5) if step * decade <= most)
     for place, residual, used in arrows:
-        scene.arrow(place, times * residual, SERIES["used" if used else "unused"])
+        scene.arrow(place, times * residual, TAKEN if used else SERIES["unused"])
     return times
 
 

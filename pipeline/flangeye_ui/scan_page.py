@@ -13,7 +13,7 @@ from nicegui import Client, ui
 from flangeye.errors import StageError
 from flangeye_ui.charts import coverage_drawing, place_chart, residual_chart
 from flangeye_ui.drawing import drawing_of
-from flangeye_ui.layout import Bar, code_from_terminal, command_line, mistake, page, svg
+from flangeye_ui.layout import Bar, code_from_terminal, command_line, mistake, page, svg, weigh
 from flangeye_ui.process import RunProcess
 from flangeye_ui.project import Project
 from flangeye_ui.scene import EARLIER, FLANGE, RIM, SCAN, SCANNED, Scene3D, outline_of
@@ -47,7 +47,7 @@ class Panel:
         self._project, self._me, self._bar = project, client.id, bar
         self._heard, self._shown, self._said = time.monotonic(), tuple[Any, ...](), list[Any]()
         self._shown_run: RunProcess | None = None
-        self._cards: dict[str, tuple[ui.element, Any]] = {}
+        self._cards: dict[str, Shot] = {}
         self._recipe, mistakes = project.check()
         first = self._recipe.steps[0].stage.name if self._recipe else ""
         self._live = first == "acquire.live"
@@ -90,7 +90,9 @@ class Panel:
                 self._worth = ui.column().classes("gap-1 w-full")
         ui.label("Scans").classes("part").props('role="heading" aria-level="2"')
         self._shots = ui.element("div").classes("shots")
-        with ui.expansion("Residuals, places and what was logged").classes("w-full"):
+        self._more = ui.expansion("Residuals, places and what was logged").classes("w-full")
+        self._more.on_value_change(self._tell)
+        with self._more:
             ui.label("Residual of each pose so far").classes("note")
             self._bars = ui.echart(residual_chart({}, {})).classes("w-full h-40")
             ui.label("Where the flange has been, from above (base, mm)").classes("note")
@@ -184,7 +186,7 @@ class Panel:
         said = [*view.rows(), *view.events, run.code, run.outlook]
         if said != self._said:
             self._said = said
-            self._tell(run)
+            self._tell()
             self._judge(run)
         if (run.path, run.arrived) != self._shown:
             self._shown = (run.path, run.arrived)
@@ -192,7 +194,16 @@ class Panel:
         for capture, picture in {**dict.fromkeys(run.set_aside, ""), **run.shots}.items():
             self._shot(run, capture, picture)
 
-    def _tell(self, run: RunProcess) -> None:
+    def _tell(self) -> None:
+        """Show residuals, places and what was logged, while somebody looks at them."""
+        run = self._project.run
+        if run is None or not self._more.value:
+            return
+        residuals = run.outlook.residuals if run.outlook else {}
+        self._bars.options.update(residual_chart(residuals, run.set_aside))
+        self._bars.update()
+        self._map.options.update(place_chart(run.places, set(run.set_aside)))
+        self._map.update()
         self._rows.clear()
         with self._rows:
             for label, text in run.view.rows():
@@ -204,8 +215,6 @@ class Panel:
     def _judge(self, run: RunProcess) -> None:
         """Show what the poses so far are worth, and each scan with its verdict."""
         found = run.outlook
-        self._bars.options.update(residual_chart(found.residuals if found else {}, run.set_aside))
-        self._bars.update()
         self._worth.clear()
         with self._worth:
             for line in [x for x in run.said if run.code and x.startswith("error: ")]:
@@ -221,10 +230,8 @@ class Panel:
             command_line(self._project.command("show", "--outlook", f"runs/{run.path.name}"))
 
     def _draw(self, run: RunProcess) -> None:
-        self._map.options.update(place_chart(run.places, set(run.set_aside)))
-        self._map.update()
         self._scene.wipe()
-        self._scene.cloud(run.cloud[::4], SCAN, 0.006)
+        self._scene.cloud(run.cloud, SCAN, 0.006)
         self._scene.cloud(run.flange, FLANGE, 0.004)
         rims = [outline_of(entry.value) for entry in run.log.of_kind("fit")]
         if rims:
@@ -237,21 +244,14 @@ class Panel:
 
     def _shot(self, run: RunProcess, capture: str, picture: str) -> None:
         """Show one scan with its verdict; when the run has ended, what can be done about it."""
-        tone, verdict = verdict_on(run, capture)
-        state = (tone, verdict, picture, run.code)
-        card, before = self._cards.get(capture, (None, None))
-        if state == before:
-            return
-        if card is None:
+        if capture not in self._cards:
             with self._shots:
-                card = ui.element("div")
-        self._cards[capture] = card, state
-        card.classes(replace=f"shot {tone}").clear()
-        with card:
-            if picture:
-                ui.element("img").props('alt=""').props["src"] = picture
-            ui.label(f"{capture}: {verdict}")
-            if run.code is not None:
+                self._cards[capture] = Shot(capture)
+        card = self._cards[capture]
+        card.show(*verdict_on(run, capture), picture)
+        if run.code is not None and not card.ended:
+            card.ended = True
+            with card:
                 self._offers(run, capture)
 
     def _offers(self, run: RunProcess, capture: str) -> None:
@@ -277,10 +277,37 @@ class Panel:
         return next((s.stage.name for s in steps if s.stage.kind == "solve"), "solve.robust")
 
 
+class Shot(ui.element):
+    """One scan: its small picture and what became of it.
+
+    Attributes:
+        ended: Whether it says what can be done about it, the run being over.
+    """
+
+    def __init__(self, capture: str) -> None:
+        super().__init__("div")
+        self.ended, self._capture, self._shown = False, capture, ("", "", "")
+        with self:
+            self._picture = ui.element("img").props('alt=""')
+            self._verdict = ui.label()
+        self._picture.set_visibility(False)
+
+    def show(self, tone: str, verdict: str, picture: str) -> None:
+        """Show these; only what is new is sent."""
+        if (tone, verdict, picture) == self._shown:
+            return
+        if picture != self._shown[2]:
+            self._picture.props["src"] = picture
+            self._picture.set_visibility(bool(picture))
+        self._shown = (tone, verdict, picture)
+        self.classes(replace=f"shot {tone}")
+        self._verdict.text = f"{self._capture}: {verdict}"
+
+
 def _enlarge(halt: ui.button, moving: bool) -> None:
     """Make the stop button large and red, only while something can move."""
-    large, small = "unelevated color=negative", "outline color=primary"
-    halt.props(large if moving else small, remove="outline" if moving else "unelevated")
+    weigh(halt, second=not moving)
+    halt.props(f"color={'negative' if moving else 'primary'}")
     halt.classes(**({"add": "halt"} if moving else {"remove": "halt"}))
 
 

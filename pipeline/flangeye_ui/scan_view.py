@@ -10,8 +10,6 @@ from flangeye.log.read import RunLog
 from flangeye.report.units import millimetres
 from flangeye_ui.scene import FLANGE, RIM, SCANNED, Scene3D, outline_of
 
-POINTS = 5_000
-
 
 class ScanView:
     """A scene, and a line that says what became of the scan in it.
@@ -43,9 +41,7 @@ class ScanView:
                 self._scene.cloud(outline_of(entry.value), RIM, 0.001)
 
     def _cloud(self, flange: t.FlangeCloud) -> None:
-        xyz = flange.cloud.points()
-        thin = xyz[:: max(1, len(xyz) // POINTS)].astype(np.float64)
-        self._scene.cloud(thin, FLANGE)
+        self._scene.cloud(flange.cloud.points().astype(np.float64), FLANGE)
         at = np.asarray(flange.centre)
         (x, y, z), (to_x, to_y, to_z) = (at - 0.15 * at / np.linalg.norm(at)).tolist(), at.tolist()
         self._scene.move_camera(x, y, z, to_x, to_y, to_z, 0.0, -1.0, 0.0, 0.0)

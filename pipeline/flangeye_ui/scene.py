@@ -39,9 +39,14 @@ SCANNED: dict[str, View] = {
     "From the side": ((0.7, -0.1, 0.8), (0.0, 0.0, 0.8), (0.0, -1.0, 0.0)),
 }
 """Views of a scan in its camera, whose y points down."""
-SCAN, FLANGE, RIM = (0.12, 0.14, 0.18), (0.02, 0.20, 0.75), (0.85, 0.1, 0.1)
-EARLIER = (0.5, 0.6, 0.5)
-"""Colours of clouds: red, green, blue; the rims of earlier scans are pale."""
+SCAN, FLANGE, RIM, EARLIER = "#1f242e", "#0533bf", "#d91a1a", "#809980"
+"""Colours of clouds; the rims of earlier scans are pale."""
+TAKEN, LEFT_OUT = "#2e9e5b", "#d64545"
+"""Colours of poses and of what is left at them."""
+SHAFT, TIP = 0.002, 0.006
+"""Radii of an arrow [m]."""
+SHOWN = 2_500
+"""Points of a cloud that are sent: 20,000 held a browser up for a second on two busy cores."""
 DARK = "body.body--dark .scene canvas {filter: invert(0.88) hue-rotate(180deg)}"
 """At night what is light is dark and colours keep their hue: a scene has one background only."""
 
@@ -58,9 +63,10 @@ class Scene3D(ui.scene):
         """Make one as wide as its column; ``hovered`` hears which named thing is pointed at."""
         ui.add_css(DARK)
         self._hovered, self._last, self._of = hovered, "", views
+        self._floor = views is not SCANNED
         super().__init__(
-            width=640, height=height, fps=20, background_color=LIGHT["panel"],
-            grid=(FLOOR, SQUARES) if views is CELL else False, on_click=self._pointed,
+            width=640, height=height, fps=20 if self._floor else 10, on_click=self._pointed,
+            grid=(FLOOR, SQUARES) if self._floor else False, background_color=LIGHT["panel"],
             click_events=["click", "mousemove"] if hovered else ["click"],
         )  # fmt: skip
         self.classes("w-full scene").style(f"height: {height}px")
@@ -75,7 +81,7 @@ class Scene3D(ui.scene):
         self.look(next(iter(views)))
 
     def _views(self) -> None:
-        scale = f"floor: squares of {1e3 * FLOOR / SQUARES:.0f} mm; " if self._of is CELL else ""
+        scale = f"floor: squares of {1e3 * FLOOR / SQUARES:.0f} mm; " if self._floor else ""
         with ui.row().classes("items-center gap-1 w-full"):
             for name in self._of:
                 button = ui.button(name, on_click=lambda name=name: self.look(name))
@@ -132,18 +138,21 @@ class Scene3D(ui.scene):
 
     def arrow(self, place: Floats, along: Floats, colour: str) -> None:
         """Draw an arrow from a place [m]."""
-        self.lines(np.stack([place, place + along]), colour)
         across, other, tip = basis_of_plane(along)
-        if np.isfinite(tip).all():
-            with self:
-                cone = self.cylinder(0.0, 0.006, 0.018).move(*(place + along).tolist())
-                cone.rotate_R(np.column_stack([across, tip, -other]).tolist()).material(colour)
+        if not np.isfinite(tip).all():
+            return
+        turn, length = np.column_stack([across, tip, -other]).tolist(), float(np.linalg.norm(along))
+        with self:
+            shaft = self.cylinder(SHAFT, SHAFT, length).move(*(place + along / 2).tolist())
+            cone = self.cylinder(0.0, TIP, 3 * TIP).move(*(place + along).tolist())
+        for part in (shaft, cone):
+            part.rotate_R(turn).material(colour)
 
     def pose(self, place: Sequence[float], taken: bool, name: str) -> None:
         """Draw a pose of the flange, green where it is taken and red where it is left out."""
         with self:
             ball = self.sphere(0.014).move(*place).with_name(name)
-            ball.material("#2e9e5b" if taken else "#d64545")
+            ball.material(TAKEN if taken else LEFT_OUT)
 
     def say(self, text: str, place: Sequence[float]) -> None:
         """Write in the picture, in place of what was written last."""
@@ -154,11 +163,20 @@ class Scene3D(ui.scene):
                 x, y, z = place
                 shown.with_name("said").move(x, y, z + 0.05)
 
-    def cloud(self, points: Floats, colour: tuple[float, ...], size: float = 0.002) -> None:
-        """Draw a cloud in one colour, its points of a size [m]."""
+    def cloud(self, points: Floats, colour: str, size: float = 0.002) -> None:
+        """Draw a cloud, thinned and to 0.1 mm, in one colour, its points of a size [m]."""
+        few = np.round(points[:: 1 + len(points) // SHOWN], 4)
         with self:
-            colours = np.tile(colour, (len(points), 1))
-            self.point_cloud(points.tolist(), colours.tolist(), point_size=size)
+            self.point_cloud(few.tolist(), point_size=size).material(colour)
+
+
+def views_of(places: Floats) -> dict[str, View]:
+    """Return views of a cell, at first from near the places (N, 3) that matter [m]."""
+    middle = (places.min(axis=0) + places.max(axis=0)) / 2
+    away = 1.4 * max(float(np.ptp(places, axis=0).max()), AXES)
+    eye = middle + away * np.array([0.75, -0.75, 0.45])
+    (x, y, z), (to_x, to_y, to_z) = eye.tolist(), middle.tolist()
+    return {"Near": ((x, y, z), (to_x, to_y, to_z), (0.0, 0.0, 1.0)), **CELL}
 
 
 def outline_of(feature: Feature) -> Floats:

@@ -34,6 +34,9 @@ PAGES = (
     cell_page, poses_page, scan_page, result_page, use_page, watch_page, archive_page, shapes,
 )  # fmt: skip
 OPENS = "<!doctype html><meta http-equiv=refresh content='0;url={}'><title>flangeye</title>"
+RECONNECT = 15.0
+"""For how long a page may be away [s]. NiceGUI takes a page for dead that leaves a ping unanswered
+for 0.4 of it: longer than ``scan_page.SILENCE``, which alone decides whether a page lives."""
 
 
 def serve(folder: Path, registry: Registry, host: str, port: int, browser: bool) -> None:
@@ -67,7 +70,7 @@ def serve(folder: Path, registry: Registry, host: str, port: int, browser: bool)
             app.on_startup(lambda: threading.Thread(target=show, args=(file,), daemon=True).start())
         ui.run(
             host=host, port=port, reload=False, show=False, show_welcome_message=False,
-            title="flangeye", dark=None, reconnect_timeout=10.0,
+            title="flangeye", dark=None, reconnect_timeout=RECONNECT,
         )  # fmt: skip
 
 

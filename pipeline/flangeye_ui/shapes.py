@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import cache, lru_cache
+from importlib.metadata import PackageNotFoundError, files
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,12 +16,22 @@ from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model, model_names
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
+from flangeye.models.urdf import robot_from_urdf
 from flangeye.report.still import Scene, rods, still
 from flangeye.types import Floats
 from flangeye_ui.project import Project
 
 ROUND = 24
 """Faces round a capsule."""
+PUBLISHED = {
+    "ur3": "ur_description/urdf/ur3_robot.urdf", "ur5": "ur_description/urdf/ur5_robot.urdf",
+    "ur10": "ur_description/urdf/ur10_robot.urdf",
+    "franka-panda": "panda_description/urdf/panda.urdf",
+}  # fmt: skip
+"""URDFs of the package ``example-robot-data`` that have the meshes of an arm, by model."""
+ALIKE = 5e-3
+"""An arm whose flange stands farther than this from the published one's is not drawn by its meshes:
+ten times what a correction of an arm's lengths changes [m]."""
 KEPT = {"cache-control": "private, max-age=3600"}
 
 
@@ -63,14 +75,36 @@ def _picture(kind: str, name: str) -> str:
 
 
 def _mesh(robot: RobotModel, joints: Floats) -> bytes:
-    """Return the arm as STL, in the base: by its URDF's meshes, or else by its capsules."""
+    """Return the arm as STL, in the base: by meshes, its own or published, or else by capsules."""
     import trimesh
 
-    frames = Arm(robot).frames(joints)
-    parts = [body.apply_transform(frames[index]) for index, body in robot.meshes()]
-    parts = parts or [_capsule(radius, ends) for radius, ends in rods(robot, joints)]
+    drawn = next((arm for arm in (robot, _published(robot, joints)) if arm and arm.meshes()), None)
+    if drawn is None:
+        parts = [_capsule(radius, ends) for radius, ends in rods(robot, joints)]
+    else:
+        frames = Arm(drawn).frames(joints)
+        parts = [body.apply_transform(frames[index]) for index, body in drawn.meshes()]
     whole: Any = trimesh.util.concatenate(parts)
     return bytes(trimesh.exchange.stl.export_stl(whole))
+
+
+def _published(robot: RobotModel, joints: Floats) -> RobotModel | None:
+    """Return the arm of ``example-robot-data`` that stands as this one does, if there is one."""
+    found = _published_arm(robot.model)
+    if found is None or len(found.joints) != len(robot.joints):
+        return None
+    apart = Arm(found).flange(joints) - Arm(robot).flange(joints)
+    return found if np.linalg.norm(apart[:3, 3]) < ALIKE else None
+
+
+@cache
+def _published_arm(model: str) -> RobotModel | None:
+    try:
+        names = (files("example-robot-data") or ()) if model in PUBLISHED else ()
+    except PackageNotFoundError:
+        return None
+    urdf = next((name for name in names if f"{name}".endswith(f"/{PUBLISHED[model]}")), None)
+    return robot_from_urdf(Path(str(urdf.locate()))) if urdf else None
 
 
 def _capsule(radius: float, ends: Floats) -> Any:

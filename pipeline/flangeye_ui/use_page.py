@@ -163,9 +163,7 @@ class Certificate:
         self._line.text = self._project.command(*self._words())
         given = {key: box.value or "" for key, box in self._boxes.items()}
         try:
-            warm, spread = (
-                float(given[k]) if given[k] else None for k in ("temperature", "spread")
-            )
+            warm, spread = (_number(key, given[key]) for key in ("temperature", "spread"))
             conditions = Conditions(warm, spread, given["place"], given["operator"])
             page = await asyncio.to_thread(render, self._facts, conditions)
         except (ValueError, FlangeyeError) as error:
@@ -179,3 +177,11 @@ class Certificate:
             ui.notify(said, type="negative")
             return
         self._link.set_visibility(True)
+
+
+def _number(key: str, text: str) -> float | None:
+    """Return what was typed as a number, None where nothing was; raises ValueError otherwise."""
+    try:
+        return float(text) if text else None
+    except ValueError:
+        raise ValueError(f"{ASKED[key]}: '{text}' is no number") from None

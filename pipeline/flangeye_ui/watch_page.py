@@ -38,6 +38,7 @@ def add(project: Project) -> None:
                 ui.label("A later scan of the flange says whether a calibration still holds:")
                 newest = f"runs/{stored[0].name}"
                 command_line(project.command("monitor", newest, "--archive", "NEW"))
+                bar.lead("Scan", "Scan again")
             else:
                 bar.lead("Cell", "Go to step 1: cell")
 

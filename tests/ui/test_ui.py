@@ -35,6 +35,7 @@ from flangeye_ui import scan_page, server
 from flangeye_ui.permission import MoveCodes
 from flangeye_ui.poses_page import plan_in
 from flangeye_ui.project import Project, _mistake
+from flangeye_ui.scene import RIM, TAKEN
 from flangeye_ui.server import require_free
 from tests.doctor.sessions import clean
 from tests.doctor.test_cures import write
@@ -593,7 +594,7 @@ def test_the_pages_death_stops_the_arm_and_a_new_page_goes_on(browser: Any, tmp_
             page.get_by_text("The arm will move.").wait_for()
             assert cell.standing()
             move(page, served)
-            page.get_by_text("fitted 0000").wait_for(timeout=120_000)
+            page.locator(".shot img").first.wait_for(timeout=120_000)
             cell.wait_until(cell.moving, patience=60)
             page.close()
             cell.wait_until(cell.standing, patience=5)
@@ -611,3 +612,102 @@ def test_the_pages_death_stops_the_arm_and_a_new_page_goes_on(browser: Any, tmp_
             page.get_by_text("Done.", exact=True).wait_for(timeout=120_000)
         finally:
             ended(served)
+
+
+def coloured(page: Any, colour: str) -> int:
+    """Return how many pixels of the last scene have about the hue of a colour of the figures."""
+    image = page.locator(".scene canvas").last.screenshot()
+    seen = cv2.imdecode(np.frombuffer(image, np.uint8), 1)
+    assert seen is not None
+    pixels = cv2.cvtColor(seen, cv2.COLOR_BGR2HSV)
+    wanted = np.array([[[int(colour[i : i + 2], 16) for i in (5, 3, 1)]]], np.uint8)
+    hue = int(cv2.cvtColor(wanted, cv2.COLOR_BGR2HSV)[0, 0, 0])
+    off = np.abs(pixels[..., 0].astype(int) - hue)
+    return int(((np.minimum(off, 180 - off) < 8) & (pixels[..., 1] > 90)).sum())
+
+
+@pytest.mark.slow
+def test_residuals_are_arrows_in_3d(browser: Any, served: Served, finished: Path) -> None:
+    page = opened(browser, served)
+    page.goto(f"{page.url}result?run={finished.name}")
+    page.get_by_text("In 3D: fitted rims and residuals").click()
+    note = page.get_by_text("Fitted rims red, in the base; residuals as arrows, ")
+    note.wait_for()
+    facts = Project(served.folder, load_registry(), MoveCodes(print)).read(finished)
+    longest = max(
+        float(np.linalg.norm(each.residual_in_base))
+        for each in facts.measured
+        if each.residual_in_base and each.used
+    )
+    times = float(re.search(r"arrows, (\d+) times", note.inner_text())[1])  # type: ignore[index]
+    assert 0.1 <= times * longest <= 0.3
+    page.locator(".scene").last.evaluate("box => box.scrollIntoView({block: 'center'})")
+    page.wait_for_timeout(2000)
+    shot(page, "residuals")
+    assert coloured(page, TAKEN) > 300  # nothing else in the picture is green but the y axis
+    assert coloured(page, RIM) > 300
+    assert page.problems == []
+
+
+@pytest.mark.slow
+def test_the_certificate_is_previewed(browser: Any, served: Served, finished: Path) -> None:
+    page = opened(browser, served)
+    page.goto(f"{page.url}use?run={finished.name}")
+    page.get_by_text("Certificate: who").click()
+    page.get_by_label("Where it was done").fill("Hall 7 <b>")
+    page.get_by_label("Temperature of the air, °C").fill("21")
+    page.get_by_label("Temperature of the air, °C").press("Tab")
+    inside = page.frame_locator("iframe.preview")
+    inside.get_by_text("Hall 7 <b>").wait_for()
+    inside.get_by_text("SIMULATED").first.wait_for()
+    frame = page.locator("iframe.preview")
+    assert frame.get_attribute("sandbox") == ""
+    frame.evaluate("box => box.scrollIntoView({block: 'start'})")
+    shot(page, "certificate")
+    page.get_by_label("Temperature of the air, °C").fill("warm")
+    page.get_by_label("Temperature of the air, °C").press("Tab")
+    page.get_by_text("Temperature of the air, °C: 'warm' is no number").wait_for()
+    assert page.problems == []
+
+
+@pytest.mark.slow
+def test_a_point_is_checked_by_touch(browser: Any, served: Served, finished: Path) -> None:
+    page = opened(browser, served)
+    write_recipe(page, SMALL)
+    page.get_by_text("The recipe is valid.").wait_for()
+    page.goto(f"{page.url}result?run={finished.name}")
+    page.get_by_text("Check it by touch").click()
+    calibration = Project(served.folder, load_registry(), MoveCodes(print)).read(finished)
+    pose = calibration.base_T_camera
+    assert pose is not None
+    seen = np.array([0.05, -0.04, 0.7])
+    base = pose[:3, :3] @ seen + pose[:3, 3]
+    page.get_by_label("A point in the camera, from a scan").fill("50 mm, -40 mm")
+    page.get_by_label("A point in the camera, from a scan").press("Tab")
+    page.get_by_text("a point has 3 coordinates, not 2").wait_for()
+    page.get_by_label("A point in the camera, from a scan").fill("50 mm, -40 mm, 700 mm")
+    page.get_by_label("A point in the camera, from a scan").press("Tab")
+    there = ", ".join(f"{1e3 * x:.1f}" for x in base)
+    page.get_by_text(f"It lies at {there} mm in the base.").wait_for()
+    # A tool of 150 mm that points down, its tip 0.5 mm to the side of the point.
+    flange = base + [0.0005, 0.0, 0.15]
+    for label, text in (
+        ("The tool's tip in the flange", "0 mm, 0 mm, 150 mm"),
+        ("The flange by the pendant", ", ".join(f"{1e3 * x:.4f} mm" for x in flange)),
+        ("Its roll, pitch, yaw", "180 deg, 0 deg, 0 deg"),
+    ):
+        page.get_by_label(label).fill(text)
+        page.get_by_label(label).press("Tab")
+    page.get_by_text(
+        "1 touched points are 0.50 mm off at most, within the limit of 1 mm"
+    ).wait_for()
+    page.get_by_text("--seen='50 mm, -40 mm, 700 mm'").or_(
+        page.get_by_text("'--seen=50 mm, -40 mm, 700 mm'")
+    ).wait_for()
+    page.get_by_text("Check it by touch").evaluate("box => box.scrollIntoView({block: 'start'})")
+    shot(page, "touch")
+    page.get_by_role("button", name="Add this point to the recipe").click()
+    page.get_by_text("The recipe has the point: verify.touch, 1 in all.").wait_for()
+    recipe, mistakes = Project(served.folder, load_registry(), MoveCodes(print)).check()
+    assert recipe is not None and mistakes == []
+    assert recipe.steps[-1].stage.name == "verify.touch"
