@@ -89,12 +89,15 @@ class FlangeCloud:
         centre: (3,) rough centre of the disc in ``camera`` [m]; a start for fitting.
         normal: (3,) rough unit normal in ``camera``, towards the scanner.
         camera_T_target: (4, 4) rough pose of a body; None of a circle or a sphere.
+        ratio: Logarithm of how much likelier its edge is the flange's rim than another disc's;
+            None where that was not asked.
     """
 
     cloud: PointCloud
     centre: Array
     normal: Array
     camera_T_target: Array | None = None
+    ratio: float | None = None
 
     def __post_init__(self) -> None:
         freeze(self, centre=(3,), normal=(3,))

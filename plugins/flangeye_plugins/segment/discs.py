@@ -13,6 +13,8 @@ from flangeye.types import Floats
 from flangeye_plugins.segment.parts import Part
 
 SECTORS = 48
+ROUNDS, FEWEST = 8, 6
+"""Fits of a circle to an edge, each to the points near the last; points of the edge at least."""
 
 SMALLEST = 0.25
 """Width of a piece that can belong to the face, in radii of its rim: between holes and recesses
@@ -48,6 +50,7 @@ class Disc(NamedTuple):
         seen: Mean share of rim and bore with an edge where there should be one.
         flaw: Why it is not the flange, or None.
         rank: How far the comparison got before the flaw showed.
+        ratio: Logarithm of how much likelier the edge is the flange's rim than another disc's.
     """
 
     plane: Plane
@@ -57,6 +60,7 @@ class Disc(NamedTuple):
     seen: float
     flaw: str | None
     rank: int
+    ratio: float = 0.0
 
 
 def of_size(part: Part, cell: tuple[int, int], pitch: float, flange: Flange) -> Disc:
@@ -90,9 +94,11 @@ def compare(
     """
     start = disc.plane.flatten(disc.centre[None])[0]
     centre, shares = ring_shares(disc.plane.flatten(around), start, pitch, flange)
-    disc = disc._replace(centre=disc.plane.lift(centre), seen=float(np.mean(shares)))
+    ratio, other = rim_ratio(disc.plane.flatten(around), centre, pitch, flange.rim)
+    seen = float(np.mean(shares))
+    disc = disc._replace(centre=disc.plane.lift(centre), seen=seen, ratio=ratio)
     flaws = (
-        _missing_ring(disc, shares, flange, limits),
+        _of_other_size(disc, other, flange) or _missing_ring(disc, shares, flange, limits),
         _missing_plate(disc, nearby, flange),
         _too_steep(disc, limits),
     )
@@ -112,6 +118,15 @@ def _missing_ring(
                 f"{2e3 * radius:.1f} mm, at least {limits.coverage:.0%} is needed"
             )
     return None
+
+
+def _of_other_size(disc: Disc, other: float | None, flange: Flange) -> str | None:
+    if other is None or disc.ratio > 0:
+        return None
+    return (
+        f"a disc {disc.across * 1e3:.0f} mm across has a rim of {2e3 * other:.1f} mm rather than "
+        f"{2e3 * flange.rim:.1f} mm (log likelihood ratio {disc.ratio:.0f})"
+    )
 
 
 def _missing_plate(disc: Disc, nearby: Floats, flange: Flange) -> str | None:
@@ -151,6 +166,58 @@ def width(flat: Floats) -> float:
 def incidence(centre: Floats, normal: Floats) -> float:
     """Return the angle between a disc's normal and the line of sight to the scanner [rad]."""
     return float(np.arccos(np.clip(-(normal @ centre) / np.linalg.norm(centre), -1, 1)))
+
+
+def rim_ratio(
+    flat: Floats, centre: Floats, pitch: float, radius: float
+) -> tuple[float, float | None]:
+    """Return how much likelier an edge is a rim than another disc's, and that disc's radius [m].
+
+    In each sector the edge lies on the circle, within the tolerance, or anywhere. The other disc is
+    the circle that fits the edge best; the ratio is against no disc at all where that is the rim.
+
+    Args:
+        flat: (N, 2) points in the disc's plane [m].
+        centre: (2,) of the rim, as :func:`ring_shares` finds it [m].
+        pitch: Typical distance of neighbours [m].
+        radius: Of the rim [m].
+    """
+    edge = flat[edge_points(flat, centre, SECTORS)] - centre
+    tolerance = 1e-3 + pitch
+    on_rim = _log_likelihood(np.abs(distances(edge) - radius), tolerance, radius)
+    other = _circle_of(edge, tolerance)
+    if other is None or abs(other[1] - radius) < 2 * tolerance:
+        return on_rim, None
+    off = np.abs(distances(edge - other[0]) - other[1])
+    return on_rim - _log_likelihood(off, tolerance, radius), other[1]
+
+
+def _log_likelihood(off: Floats, tolerance: float, spread: float) -> float:
+    """Return by how much sectors say that an edge is a circle, rather than anywhere.
+
+    Args:
+        off: (n,) distances of the edge from the circle, at most one for each sector [m].
+        tolerance: Within which it is on the circle [m].
+        spread: Width over which an edge may lie that is on no circle [m].
+    """
+    share = min(float((off < tolerance).sum()) / SECTORS, 1.0 - 0.5 / SECTORS)
+    on_it = np.log(share * spread / (2 * tolerance) + 1.0 - share)
+    return float(SECTORS * (share * on_it + (1.0 - share) * np.log(1.0 - share)))
+
+
+def _circle_of(edge: Floats, tolerance: float) -> tuple[Floats, float] | None:
+    """Return centre (2,) and radius [m] of the circle by least squares through most of an edge."""
+    kept = np.ones(len(edge), dtype=bool)
+    centre, radius = np.zeros(2), 0.0
+    for _ in range(ROUNDS):
+        if kept.sum() < FEWEST:
+            return None
+        rows = np.column_stack([2 * edge[kept], np.ones(kept.sum())])
+        x, y, square = np.linalg.lstsq(rows, (edge[kept] ** 2).sum(axis=1), rcond=None)[0]
+        centre, radius = np.array([x, y]), float(np.sqrt(max(square + x * x + y * y, 0.0)))
+        off = np.abs(distances(edge - centre) - radius)
+        kept = off < max(tolerance, 1.5 * float(np.median(off[kept])))
+    return centre, radius
 
 
 def ring_shares(

@@ -48,8 +48,9 @@ def segment_flange(
 
     The steps of the paper's section 2.1.4, on a coarse view of the scan: pass-through, removal
     of stray points and clustering (smooth, connected pieces), plane, size, incidence. What is
-    left is compared with the flange's rim and bore, and, where two discs or a blank one are
-    left, with its holes. Only then the full resolution is touched, around the one disc found.
+    left is compared with the flange's rim and bore, by likelihood with a disc of any other size,
+    and, where two discs or a blank one are left, with its holes. Only then the full resolution is
+    touched, around the one disc found.
 
     Raises:
         StageError: The cloud is in millimetres, or otherwise a thousand times off.
@@ -75,7 +76,8 @@ def segment_flange(
     if isinstance(found, str):
         return Rejected(found)
     disc, points = found
-    return FlangeCloud(PointCloud(capture.cloud.frame, points), disc.centre, disc.plane.normal)
+    cloud = PointCloud(capture.cloud.frame, points)
+    return FlangeCloud(cloud, disc.centre, disc.plane.normal, ratio=disc.ratio)
 
 
 def _pass_through(view: Grid, params: SegmentParams) -> Grid | None:

@@ -19,6 +19,7 @@ from flangeye_plugins.segment.discs import (
     compare,
     incidence,
     of_size,
+    rim_ratio,
     ring_shares,
     width,
 )
@@ -104,6 +105,23 @@ def test_the_rims_centre_and_what_is_seen_of_it_and_of_the_bore(arc: float, shar
     assert shares == [1.0, 0.0]
     _, shares = ring_shares(ring(BORE, UR5.rim - 8 * PITCH)[:, :2], 0 * start, PITCH, UR5)
     assert shares[0] < 0.3
+
+
+def test_a_disc_of_another_size_is_told_by_its_likelihood() -> None:
+    """30 % of its edge may lie on the flange's rim about some centre; all of it on its own."""
+    start = np.zeros(2)
+    ratio, other = rim_ratio(ring(BORE, UR5.rim)[:, :2], start, PITCH, UR5.rim)
+    assert other is None and ratio > 50
+    flat = ring(BORE, 0.8 * UR5.rim)[:, :2]
+    aside = np.array([0.2 * UR5.rim, 0.0])  # where the flange's rim touches it
+    ratio, other = rim_ratio(flat, aside, PITCH, UR5.rim)
+    assert other == pytest.approx(0.8 * UR5.rim, abs=PITCH)
+    assert ratio < -50
+    found = compared(ring(BORE, 0.8 * UR5.rim), coverage=0.01)
+    assert found.rank == 1 and found.flaw is not None
+    assert "has a rim of 48.6 mm rather than 61.0 mm (log likelihood ratio -" in found.flaw
+    half = rim_ratio(ring(BORE, UR5.rim, arc=0.7 * np.pi)[:, :2], start, PITCH, UR5.rim)
+    assert half[0] > 5
 
 
 def test_what_fits_has_no_flaw_and_got_farthest() -> None:
