@@ -66,6 +66,9 @@ Reader = Annotated[
 Ros2 = Annotated[
     bool, typer.Option("--ros2", help="Look at the arm and the camera that run under ROS 2.")
 ]
+FlangeLink = Annotated[
+    Answer, typer.Option("--flange", help="With --ros2: the flange's link, where no name says it.")
+]
 Trajectory = Annotated[
     Answer, typer.Option(help="With --ros2: topic of the controller that moves the arm, or none.")
 ]
@@ -106,6 +109,7 @@ def init(  # noqa: PLR0913  one for each option
     target_pose: TargetPose = None,
     reader: Reader = None,
     ros2: Ros2 = False,
+    flange: FlangeLink = None,
     trajectory: Trajectory = None,
     scans: Scans = None,
     trigger: Trigger = None,
@@ -130,7 +134,8 @@ def init(  # noqa: PLR0913  one for each option
         "angle": angle, "pose": pose, "target-columns": target_columns,
         "target-rotation": target_rotation, "target-length": target_length,
         "target-angle": target_angle, "target-pose": target_pose, "reader": reader,
-        "trajectory": trajectory, "scans": scans, "trigger": trigger, "view": view, "box": box,
+        "flange": flange, "trajectory": trajectory, "scans": scans, "trigger": trigger,
+        "view": view, "box": box,
     }  # fmt: skip
     questions = Questions(given, None if yes else _prompt)
     draft = (_of_what_runs if ros2 else _of_folder)(folder, out, questions, registry)

@@ -360,21 +360,26 @@ def _base(urdf: Urdf, asked: str | None, to_flange: list[ET.Element]) -> str:
     return named[0] if len(named) == 1 else end_of(moving[0], "parent")
 
 
-def _flange(urdf: Urdf, asked: str | None) -> str:
-    """Return the flange: as asked, by a name that makers use, or the only end of the arm."""
-    if asked is not None:
-        return _known(urdf, asked, "flange")
+def flange_links(urdf: Urdf) -> list[str]:
+    """Return the link that is the flange by a name that makers use, or all ends of the arm."""
     for ending in FLANGES:
         named = [name for name in urdf.links if name.endswith(ending)]
         if len(named) == 1:
-            return named[0]
+            return named
     parents = {end_of(joint, "parent") for joint in urdf.above.values()}
-    ends = [name for name in urdf.moved() if name not in parents]
-    if len(ends) == 1:
-        return ends[0]
+    return [name for name in urdf.moved() if name not in parents]
+
+
+def _flange(urdf: Urdf, asked: str | None) -> str:
+    """Return the flange: as asked, or the only link that may be it."""
+    if asked is not None:
+        return _known(urdf, asked, "flange")
+    links = flange_links(urdf)
+    if len(links) == 1:
+        return links[0]
     raise RecipeError(
         f"{urdf.path}: which link is the flange, its origin in the plate's face and z outwards? "
-        f"write flange: {' or '.join(ends[:NAMED]) or 'NAME'}"
+        f"write flange: {' or '.join(links[:NAMED]) or 'NAME'}"
     )
 
 

@@ -71,12 +71,12 @@ class Ros2Graph(Device):
 
         Raises:
             DeviceError: No arm or no camera runs.
-            RecipeError: The URDF does not tell which links are base and flange.
+            RecipeError: The URDF does not tell which link is the base.
         """
         topics = self.topics()
         path = Path(f"{name}.urdf")
         text = self._description(topics, ask)
-        found, section = described_arm(text, path)
+        found, section = described_arm(text, path, ask)
         heard = self._listen(topics)
         states, angles = states_of(heard, found.joints)
         scans = scans_of(heard, ask)

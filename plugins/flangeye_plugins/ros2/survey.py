@@ -12,7 +12,7 @@ import numpy as np
 
 from flangeye.devices import DeviceError
 from flangeye.models.graph import Ask, Topic
-from flangeye.models.urdf import UrdfArm, arm_of, parse_urdf
+from flangeye.models.urdf import NAMED, UrdfArm, arm_of, flange_links, parse_urdf
 from flangeye.types import Floats
 from flangeye_plugins.ros2.client import Message
 from flangeye_plugins.ros2.messages import CLOUD, IMAGE, JOINT_STATE, TRAJECTORY, decoded, frame_of
@@ -45,14 +45,18 @@ class Heard(NamedTuple):
         return f"{name}: {kind}, {often}{frame}, by {' and '.join(self.topic.publishers)}"
 
 
-def described_arm(text: str, path: Path) -> tuple[UrdfArm, dict[str, Any]]:
+def described_arm(text: str, path: Path, ask: Ask) -> tuple[UrdfArm, dict[str, Any]]:
     """Return the arm of a URDF that is to be saved at ``path``, and its section of a recipe.
 
     Raises:
-        RecipeError: It is none, or does not tell which links are base and flange.
+        RecipeError: It is none, or does not tell which link is the base.
     """
-    packages = packages_of(text)
-    found = arm_of(parse_urdf(text, path), packages=packages)
+    packages, urdf, flange = packages_of(text), parse_urdf(text, path), None
+    links = flange_links(urdf)
+    if len(links) > 1:  # of a gripper, or of a camera that the arm carries
+        question = f"which link is the flange, z outwards ({', '.join(links[:NAMED])})"
+        flange = ask("flange", question, None, links[0])
+    found = arm_of(urdf, flange=flange, packages=packages)
     section: dict[str, Any] = {"urdf": path.name, "base": found.base, "flange": found.flange}
     if packages:
         section["packages"] = {name: str(folder) for name, folder in packages.items()}

@@ -71,6 +71,7 @@ class Controller(Peer):
         given = {
             "robot": "ur5e", "joints": FACING, "prefix": "", "namespace": "", "seed": None,
             "controller": "arm_controller", "latency": 0.01, "lag": 0.02, "sim_time": False,
+            "ends": ["tool0"],
         }  # fmt: skip
         super().__init__("controller", given | options, env)
         self.joints = [f"{options.get('prefix', '')}joint_{i}" for i in range(1, 7)]

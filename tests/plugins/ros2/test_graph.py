@@ -1,5 +1,7 @@
 """Graphs as they are: the kit, namespaces, tf, simulated time, markers; in realtime."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -15,6 +17,7 @@ from flangeye_plugins.robot.ros2.driver import (
     robot_ros2_freedrive,
 )
 from flangeye_plugins.ros2.graph import Ros2Graph
+from flangeye_plugins.ros2.survey import described_arm
 from flangeye_plugins.scanner.ros2 import Ros2Params as Topics
 from flangeye_plugins.scanner.ros2 import scanner_ros2
 from tests.plugins.ros2 import installed
@@ -27,6 +30,7 @@ from tests.plugins.ros2.cell import (
     Terminal,
     peers,
 )
+from tests.plugins.ros2.urdf import urdf_of
 
 pytestmark = [pytest.mark.realtime, pytest.mark.ros2]
 
@@ -138,6 +142,17 @@ def test_a_graph_of_two_cells_is_told_apart(env, tmp_path):
     assert found.steps[0]["export.ros2_launch"]["child"] == "right_optical_frame"
 
 
+def test_a_flange_that_no_name_tells_is_asked_for() -> None:
+    def ask(flag, question, default, example=""):
+        assert (flag, default, example) == ("flange", None, "plate")
+        return "eye"
+
+    text = urdf_of(ARM, ends=["plate", "eye"])
+    found, section = described_arm(text, Path("cell.urdf"), ask)
+    assert section == {"urdf": "cell.urdf", "base": "base_link", "flange": "eye"}
+    assert found.flange == "eye"
+
+
 @pytest.mark.parametrize(
     ("peer", "words", "said"),
     [
@@ -145,6 +160,8 @@ def test_a_graph_of_two_cells_is_told_apart(env, tmp_path):
         ({"controller": None}, (), "which topic has the scans ()"),
         ({"joints": TOWARDS}, ("--scans", "/none"), "nobody publishes clouds or depth images on /"),
         ({"joints": TOWARDS}, ("--robot", "none.urdf"), "none.urdf"),
+        ({"ends": ["plate", "eye"]}, (), "which link is the flange, z outwards (plate, eye)"),
+        ({"ends": ["plate", "eye"]}, ("--flange", "tool0"), "no link 'tool0'"),
     ],
 )
 def test_what_init_cannot_see_is_one_line(env, tmp_path, peer, words, said):

@@ -9,8 +9,8 @@ def names_of(model, prefix=""):
     return [f"{prefix}joint_{i + 1}" for i in range(len(model.joints))]
 
 
-def urdf_of(model, prefix=""):
-    """Links base_link, link_1 … and tool0 of an arm with standard Denavit-Hartenberg parameters."""
+def urdf_of(model, prefix="", ends=("tool0",)):
+    """Links base_link, link_1 … and ends of an arm with standard Denavit-Hartenberg parameters."""
     names, parts = names_of(model, prefix), []
     parts.append(_link(f"{prefix}base_link", [v for v in model.volumes if v.link == 0]))
     before, parent = np.eye(4), f"{prefix}base_link"
@@ -29,10 +29,11 @@ def urdf_of(model, prefix=""):
         parts.append(_link(child, [v for v in model.volumes if v.link == i], before))
         parent = child
     end = before @ model.link_T_flange
-    parts.append(
-        f'<joint name="{prefix}flange" type="fixed">{_origin(end)}<parent link="{parent}"/>'
-        f'<child link="{prefix}tool0"/></joint><link name="{prefix}tool0"/>'
-    )
+    parts += [
+        f'<joint name="{prefix}to_{name}" type="fixed">{_origin(end)}<parent link="{parent}"/>'
+        f'<child link="{prefix}{name}"/></joint><link name="{prefix}{name}"/>'
+        for name in ends
+    ]
     return f'<robot name="{model.model}">{"".join(parts)}</robot>'
 
 

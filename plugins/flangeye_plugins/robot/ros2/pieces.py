@@ -8,6 +8,7 @@ on between points it was given, and not from a measured place, which is always a
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import deque
 from typing import NamedTuple
 
@@ -59,7 +60,7 @@ class Point(NamedTuple):
     after: float
 
 
-class Motion:
+class Motion(ABC):
     """What is driven in pieces.
 
     Attributes:
@@ -90,17 +91,17 @@ class Motion:
             self._past.popleft()
         return [p._replace(after=p.after - self._elapsed) for p in self._past]
 
+    @abstractmethod
     def _go_on(self, joints: Floats, seconds: float) -> None:
         """Let time pass."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _point(self, after: float) -> Point:
         """Return where the motion is going to be."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _ahead(self) -> list[Point]:
         """Return the points up to where the piece brakes."""
-        raise NotImplementedError
 
     def _deceleration(self) -> float:
         return BRISK

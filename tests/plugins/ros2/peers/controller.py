@@ -53,7 +53,7 @@ class Controller:
         self.states = node.create_publisher(JointState, f"{space}/joint_states", 10)
         self.truth = node.create_publisher(JointState, "/truth", 10)
         self.about = node.create_publisher(String, f"{space}/robot_description", LATCHED)
-        self.about.publish(String(data=urdf_of(model, options["prefix"])))
+        self.about.publish(String(data=urdf_of(model, options["prefix"], options["ends"])))
         self.ticks = node.create_publisher(Clock, "/clock", 10) if options["sim_time"] else None
         if options["controller"]:
             topic = f"{space}/{options['controller']}/joint_trajectory"
