@@ -6,6 +6,10 @@ the body is laid on every one of the scan, and a few points of the body rule mos
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
 import numpy as np
 
 from flangeye.types import Floats, Indices
@@ -35,9 +39,9 @@ AT_ONCE = 30_000
 def guesses(view: View, looks: Looks, most: int) -> Floats:
     """Return at most so many (K, 4, 4) ``camera_T_body`` that a scan does not speak against."""
     rng = np.random.default_rng(2)
-    on = _some(view.edges(looks.size), SCAN_ENDS, looks.size * SCAN_SPACING, rng)
-    off = _some(looks.ends, BODY_ENDS, looks.size * BODY_SPACING, rng)
-    poses = _passed(on, off, view, looks)
+    scan = view.edges(looks.size)
+    on = scan.take(_some(scan, SCAN_ENDS, looks.size * SCAN_SPACING, rng))
+    poses = _passed(on, _some(looks.ends, BODY_ENDS, looks.size * BODY_SPACING, rng), view, looks)
     poses = poses[_best_of(looks.rough_scores(poses, view, LISTED), SETTLED)].astype(np.float64)
     rough = looks.thinned(LISTED)
     for _ in range(2):
@@ -51,32 +55,43 @@ def _best_of(scores: Floats, most: int) -> Indices:
     return every if len(scores) <= most else np.argpartition(-scores, most)[:most]
 
 
-def _passed(on: Oriented, off: Oriented, view: View, looks: Looks) -> Floats:
-    """Return the better of the poses that lay the body's ends of faces on the scan's."""
+def _passed(on: Oriented, at: Indices, view: View, looks: Looks) -> Floats:
+    """Return the better of the poses that lay the body's ends at some indices on the scan's."""
+    off = looks.ends.take(at)
     scan, body = _frames(on), _frames(off)
-    number = np.arange(len(scan) * len(body))
 
     def posed(number: Indices) -> Floats:
-        reference, anchor = np.divmod(number, max(len(body), 1))
+        reference, anchor = np.divmod(number, max(len(at), 1))
         out: Floats = np.zeros((len(number), 4, 4), np.float32)
         out[:, :3, :3], out[:, 3, 3] = scan[reference].transpose(0, 2, 1) @ body[anchor], 1.0
         moved = np.einsum("nij,nj->ni", out[:, :3, :3], off.points[anchor])
         out[:, :3, 3] = on.points[reference] - moved
         return out
 
+    def unhidden(number: Indices) -> Indices:
+        return number[looks.ends_seen[looks.view_of(posed(number)), at[number % max(len(at), 1)]]]
+
+    def scored(number: Indices, count: int) -> Floats:
+        return looks.rough_scores(posed(number), view, count)
+
+    number = _chunked(np.arange(len(scan) * len(body)), unhidden)
     for count, share in FILTERS:
-        scores = [
-            looks.rough_scores(posed(number[k : k + AT_ONCE]), view, count)
-            for k in range(0, max(len(number), 1), AT_ONCE)
-        ]
-        number = number[_best_of(np.concatenate(scores), int(share * len(number)))]
+        scores = _chunked(number, partial(scored, count=count))
+        number = number[_best_of(scores, int(share * len(number)))]
     return posed(number)
 
 
-def _some(points: Oriented, count: int, spacing: float, rng: np.random.Generator) -> Oriented:
-    """Return so many points spread over all surfaces."""
-    mixed = points.take(rng.permutation(len(points.points)))
-    return mixed.take(rng.permutation(thin(mixed.points, mixed.directions, spacing))[:count])
+def _chunked(number: Indices, work: Callable[[Indices], Any]) -> Any:
+    """Return what the work gives for some numbers at once, one after the other."""
+    chunks = range(0, max(len(number), 1), AT_ONCE)
+    return np.concatenate([work(number[k : k + AT_ONCE]) for k in chunks])
+
+
+def _some(points: Oriented, count: int, spacing: float, rng: np.random.Generator) -> Indices:
+    """Return the indices of so many points spread over all surfaces."""
+    mixed = rng.permutation(len(points.points))
+    kept = thin(points.points[mixed], points.directions[mixed], spacing)
+    return np.asarray(mixed[rng.permutation(kept)[:count]])
 
 
 def _frames(ends: Oriented) -> Floats:
