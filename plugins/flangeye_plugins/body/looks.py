@@ -78,7 +78,7 @@ class Looks:
     ends_seen: Mask
 
     @cached_property
-    def beyond(self) -> Floats:
+    def _beyond(self) -> Floats:
         """(N, 3) points beside the body, where its faces have ended."""
         return self.ends.points + BEYOND * self.size * self.ends.directions
 
@@ -120,10 +120,8 @@ class Looks:
         number = self.view_of(poses)
         # The first are farthest apart.
         on, off = (listed[number, :count] for listed in self._listed)
-        score = self._surface_score(poses, view, on)
-        if not len(self.ends.points):
-            return score
-        return score + self._ends_score(poses, view, off, beyond=count == LISTED)
+        ends = self._ends_score(poses, view, off, beyond=count == LISTED)
+        return self._surface_score(poses, view, on) + ends
 
     def _surface_score(self, poses: Floats, view: View, at: Indices) -> Floats:
         placed, facing = _placed(poses, *self._singles[0], at)
@@ -166,14 +164,12 @@ class Looks:
         through = judged & (behind > tolerance + STEEP * view.angle * poses[:, None, 2, 3])
         due = np.maximum(judged.sum(axis=1), 1)
         score = (there.sum(axis=1) - through.sum(axis=1)) / due
-        if len(self.ends.points):
-            placed, facing = _placed(poses, self.beyond, self.ends.normals)
-            off, behind, cosine = view.compared(placed, facing)
-            judged = self.ends_seen[number]
-            near = np.abs(behind) < NEARBY * view.angle * placed[..., 2]
-            on = judged & (np.abs(off) < tolerance) & (cosine > SIMILAR) & near
-            score -= on.sum(axis=1) / np.maximum(judged.sum(axis=1), 1)
-        return np.asarray(score)
+        placed, facing = _placed(poses, self._beyond, self.ends.normals)
+        off, behind, cosine = view.compared(placed, facing)
+        judged = self.ends_seen[number]
+        near = np.abs(behind) < NEARBY * view.angle * placed[..., 2]
+        on = judged & (np.abs(off) < tolerance) & (cosine > SIMILAR) & near
+        return np.asarray(score - on.sum(axis=1) / np.maximum(judged.sum(axis=1), 1))
 
     @cached_property
     def freedoms(self) -> int:
@@ -222,9 +218,7 @@ class Looks:
         offset, normals = view.planes(placed)
         use = self.seen[number] & (np.einsum("kni,kni->kn", offset, offset) < reach**2)
         use &= np.einsum("kni,kni->kn", facing, normals) > ALIKE
-        parts = [(placed, normals, offset, use)]
-        if len(self.ends.points):
-            parts.append(self._end_offsets(poses, view, number, reach))
+        parts = (placed, normals, offset, use), self._end_offsets(poses, view, number, reach)
         placed, along, offset, use = (
             np.concatenate(columns, axis=1) for columns in zip(*parts, strict=True)
         )

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from flangeye import Params, stage
+from flangeye.errors import StageError
 from flangeye.maths.geometry import invert
 from flangeye.models.bodies import TargetBody
 from flangeye.models.configuration import Configuration
@@ -79,7 +80,8 @@ def segment_body(
     taken without a search.
 
     Raises:
-        StageError: The cloud is in millimetres, or otherwise a thousand times off.
+        StageError: The cloud is in millimetres, or otherwise a thousand times off; or the body has
+            no edges.
     """
     from flangeye_plugins.body.dense import FEWEST
     from flangeye_plugins.body.looks import prepared
@@ -93,6 +95,8 @@ def segment_body(
     if len(points) < FEWEST:
         return Rejected("no point between near and far")
     shape, looks = prepared(body)
+    if not len(looks.ends.points):
+        raise StageError(f"{body.name}: no edges to find it by; segment.sphere finds a ball")
     search, passes = Search(points, shape, looks), partial(_passes, params=params)
     found = list(filter(passes, search.near(_predicted(capture, configuration, earlier))))[:1]
     if not found:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from flangeye.errors import RecipeError
+from flangeye.errors import RecipeError, StageError
 from flangeye.maths.geometry import rigid, rotation_from_rpy, rotation_log
 from flangeye.models.bodies import TargetBody, load_body
 from flangeye.models.configuration import ORIGIN, Configuration
@@ -152,6 +152,13 @@ def test_a_cylinder_shows_five_numbers_and_a_sphere_three() -> None:
         assert feature.figures["freedoms"] == freedoms
         information = np.linalg.eigvalsh(np.linalg.inv(feature.covariance[:3, :3]))
         assert (information > 1e3).sum() == freedoms - 3
+
+
+def test_a_body_without_edges_is_for_another_stage() -> None:
+    ball = trimesh.creation.icosphere(4, 0.04)
+    body = TargetBody("ball", np.array(ball.vertices), np.array(ball.faces, np.int32))
+    with pytest.raises(StageError, match=r"segment\.sphere finds a ball"):
+        found(scan(GRIPPER), body)
 
 
 def test_a_part_that_moves_is_seen_in_what_the_scan_is_off() -> None:
