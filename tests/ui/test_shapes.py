@@ -46,13 +46,13 @@ def test_published_meshes_stand_where_the_arm_does(name: str) -> None:
         apart = Arm(published).flange(joints)[:3, 3] - Arm(robot).flange(joints)[:3, 3]
         assert np.linalg.norm(apart) < 1e-9
     mesh = drawn(robot, draws[0])
-    assert len(mesh.faces) > 10_000
+    assert 1_000 < len(mesh.faces) < 50_000  # a browser without a GPU draws them
     base_T_flange = Arm(robot).flange(draws[0])
     along = (mesh.vertices - base_T_flange[:3, 3]) @ base_T_flange[:3, 2]
     aside = np.linalg.norm(
         np.cross(mesh.vertices - base_T_flange[:3, 3], base_T_flange[:3, 2]), axis=1
     )
-    face = along[(aside < 0.03) & (np.abs(along) < 0.05)]
+    face = along[(aside < 0.06) & (np.abs(along) < 0.05)]
     assert face.max() == pytest.approx(0.0, abs=2e-3)
 
 
