@@ -145,9 +145,14 @@ class Ros2Arm(Listener):
             self._renew()
 
     def stop(self) -> None:
-        """Publish a hold: the controller brakes from where the arm is on its motion."""
+        """Publish a hold: the controller brakes from where the arm is on its motion.
+
+        Of a motion that was not renewed for SILENT the last piece has ended, or is about to: a hold
+        at a place where the arm was would set it moving again.
+        """
         if self._motion is not None:
-            self._publish(self._motion.stop())
+            if time.monotonic() - self._renewed <= SILENT:
+                self._publish(self._motion.stop())
             self._motion, self._ended = None, time.monotonic() + pieces.STOPPING
 
     def close(self) -> None:
