@@ -154,8 +154,9 @@ def test_the_first_paint_comes_within_a_second(browser: Any, tmp_path: Path) -> 
         for _ in range(5):  # the best of five: other work on the machine costs time
             page.reload()
             page.get_by_role("heading", name="Cell").wait_for()
-            script = "performance.getEntriesByName('first-contentful-paint')[0].startTime"
-            paints.append(page.evaluate(script))
+            painted = "performance.getEntriesByName('first-contentful-paint')[0]"
+            page.wait_for_function(painted)  # a browser that is busy says it later than it did
+            paints.append(page.evaluate(f"{painted}.startTime"))
         assert min(paints) < 1000 * crowd(), paints
     finally:
         ended(served)
