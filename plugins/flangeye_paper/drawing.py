@@ -31,8 +31,6 @@ AXIS_COLOURS = {
     "roll": "#d97706", "pitch": "#1d4ed8", "yaw": "#15803d",
 }  # fmt: skip
 
-DOTS_PER_INCH = 100
-
 
 @dataclass(frozen=True)
 class Sheet:
@@ -48,7 +46,7 @@ class Sheet:
 
     def save(self, path: Path) -> None:
         """Write a PNG that is the same for the same numbers."""
-        self.figure.savefig(path, dpi=DOTS_PER_INCH, metadata={"Software": None})
+        self.figure.savefig(path, dpi=100, metadata={"Software": None})
 
 
 def sheet(rows: int, columns: int, width: float, height: float) -> Sheet:

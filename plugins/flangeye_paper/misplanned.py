@@ -10,9 +10,6 @@ from flangeye.models.workpiece import WorkpiecePath, load_workpiece
 from flangeye.types import CAMERA, Floats, PointCloud, Seam, Seed, VerifiedHandEye, WorkpieceScan
 from flangeye.units import Angle, Length, param
 
-SPACING = 1e-3
-"""Between two points of a seam [m]."""
-
 
 class LaidParams(Params):
     """Parameters of ``scan.as_laid``."""
@@ -67,5 +64,6 @@ def seam_misplanned(hand_eye: VerifiedHandEye, seed: Seed, params: MisplannedPar
 
 def _dense(points: Floats) -> Floats:
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    ticks = np.linspace(0.0, along[-1], round(along[-1] / SPACING) + 1)
+    # Between two points of a seam [m]
+    ticks = np.linspace(0.0, along[-1], round(along[-1] / 1e-3) + 1)
     return np.stack([np.interp(ticks, along, axis) for axis in points.T], axis=1)

@@ -22,9 +22,6 @@ from flangeye.types import ArchivePath, Floats, HandEye, Verification
 PER_METRE = {"aubo": 1.0, "ur5": 1e3, "franka": 1e3}
 """Unit of the stored matrices; the stored translations are all in millimetres."""
 
-DEGREE = 3.14 / 180
-"""As the authors' scripts have it."""
-
 
 class StoredParams(Params):
     """Parameters of ``verify.stored_results_as_in_paper``."""
@@ -64,7 +61,8 @@ def stored_results(root: Path, robot: str) -> tuple[Floats, Floats]:
     """Return the (50, 4, 4) stored base_T_camera [m] and the (50, 4, 4) ICP motions [m]."""
     file = stored_file(root, robot)
     shifts = read_npz(file, "arr_1", (None, None, 3))[:, -1] * 1e-3
-    angles = read_npz(file, "arr_2", (None, None, 3))[:, -1] * DEGREE
+    # As the authors' scripts have it
+    angles = read_npz(file, "arr_2", (None, None, 3))[:, -1] * (3.14 / 180)
     matrices = read_npz(file, "arr_3", (None, 4, 4))
     matrices[:, :3, 3] /= PER_METRE[robot]
     motions = [

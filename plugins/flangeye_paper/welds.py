@@ -15,11 +15,6 @@ from flangeye_paper.tables import SessionRow
 BEYOND = 0.2
 """The true seam is extended straight by this much, for what happens before and after it [m]."""
 
-NEAR = 0.4e-3
-"""A torch this near to the seam is back on it [m]."""
-
-LEAVING = 20e-3
-"""Where the seam's end begins to matter [m]."""
 
 STEP = 0.1
 """A lateral step is what happens across the seam within this time [s]."""
@@ -59,7 +54,8 @@ class SeenWeld:
         """How far the tip went until the torch was near the seam for good [m]."""
         _, off = self._seen(self.torch)
         tip, _ = self._seen(self.report.robot)
-        away = np.flatnonzero(np.abs(off) > NEAR)
+        # A torch this near to the seam is back on it [m]
+        away = np.flatnonzero(np.abs(off) > 0.4e-3)
         return float(tip[away[-1]] - tip[0]) if len(away) else 0.0
 
     @property
@@ -69,7 +65,8 @@ class SeenWeld:
         A weld that never came there has none.
         """
         along, _ = self._seen(self.report.robot)
-        leaving = along > _arc_length(self.truth)[-1] - LEAVING
+        # Where the seam's end begins to matter [m]
+        leaving = along > _arc_length(self.truth)[-1] - 20e-3
         time = self.report.time[leaving]
         if not len(time):
             return 0.0

@@ -35,17 +35,10 @@ CONNECT_SECONDS = 5.0
 AHEAD = 3
 """Chunks that the scheduler is to know of for each worker."""
 
-REFILL = 0.7
-"""It is told of further ones when it knows of less than so much of that."""
-
-WINDOW = 256
-"""Sessions that a scheduler elsewhere is to know of at least: its workers may only be starting."""
 
 CHUNK_SECONDS, MOST = 5.0, 500
 """How long a worker is to be busy with a chunk [s], and how many sessions it has at most."""
 
-WORKERS_SECONDS = 5.0
-"""How long a count of the workers is believed [s]."""
 
 SINGLE_THREADED = {
     name: 1
@@ -231,7 +224,8 @@ class Pace:
 
     def workers(self) -> int:
         """Return how many workers there are, or were some seconds ago; at least one."""
-        if time.monotonic() > self._asked + WORKERS_SECONDS:
+        # How long a count of the workers is believed [s]
+        if time.monotonic() > self._asked + 5.0:
             self._workers, self._asked = worker_count(self._client), time.monotonic()
         return max(1, self._workers)
 
@@ -247,7 +241,9 @@ class Pace:
         """Return whether the scheduler is to know of more than so much, or than a share of it."""
         if chunks < share * AHEAD * self.workers():
             return True
-        return self._client.cluster is None and sessions < share * WINDOW
+        # Sessions that a scheduler elsewhere is to know of at least: its workers may only be
+        # starting
+        return self._client.cluster is None and sessions < share * 256
 
     def cut(self, sessions: Iterable[tuple[int, BatchSession]]) -> Iterator[Chunk]:
         """Yield chunks, as long as is right when each is asked for."""
@@ -289,7 +285,8 @@ def run_all(
 
     def submit() -> None:
         held = sum(len(chunk.sessions) for chunk in waiting.values())
-        if not pace.asks(len(waiting), held, REFILL):
+        # It is told of further ones when it knows of less than so much of that
+        if not pace.asks(len(waiting), held, 0.7):
             return  # many at once cost the scheduler less than one after the other
         some: list[Chunk] = []
         while pace.asks(len(waiting) + len(some), held):

@@ -13,8 +13,6 @@ from flangeye.batch.dataset import Row
 
 Drawing = dict[str, Any]
 
-MANY_POINTS = 2000
-"""From so many on, points are drawn by the graphics card."""
 COLOURS = (
     "#3a7ebf", "#d9822b", "#3f9b57", "#b8485f", "#7d62b5", "#8a6d3b", "#c06fa8", "#5b6474",
 )  # fmt: skip
@@ -107,8 +105,9 @@ def _layout(x: str, names: bool, y: str, colour: str | None) -> Drawing:
 
 
 def _points(x: Sequence[Any], y: Sequence[float], names: Sequence[str], unit: str) -> Drawing:
+    # From so many on, points are drawn by the graphics card
     return {
-        "type": "scattergl" if len(x) > MANY_POINTS else "scatter",
+        "type": "scattergl" if len(x) > 2000 else "scatter",
         "mode": "markers",
         "x": list(x),
         "y": list(y),

@@ -18,9 +18,6 @@ from flangeye.plugin.stage import BoundPart, Params
 from flangeye.recipe.load import Recipe
 from flangeye.result import sha256
 
-SMALL = 65_536
-"""Files up to so many bytes are told apart by content, larger ones by size and time of change."""
-
 
 class Fingerprints:
     """Fingerprints of files and folders, each looked at once."""
@@ -91,7 +88,9 @@ def _paths(value: Any) -> Iterator[Path]:
 def _state(file: Path) -> str:
     try:
         stat = file.stat()
-        if stat.st_size <= SMALL:
+        # Files up to so many bytes are told apart by content, larger ones by size and time of
+        # change
+        if stat.st_size <= 65_536:
             return hashlib.sha256(file.read_bytes()).hexdigest()
         return f"{stat.st_size} {stat.st_mtime_ns}"
     except OSError as error:

@@ -51,9 +51,6 @@ READY = f"{STARTS}/ready"
 LIBRARY = "plotly.js"
 """What all reports of a batch share, beside their folders."""
 
-TOLD = 11
-"""Sessions of a chunk without a calibration that are told at once; the rows have all."""
-
 
 @dataclass(frozen=True)
 class Job:
@@ -125,7 +122,8 @@ def write_rows(job: Job, chunk: Chunk, outcomes: Sequence[SessionOutcome]) -> Ch
     part = f"{job.start}-{chunk.sessions[0].number}"
     Dataset(job.place, job.columns).write_part(chunk.block, part, rows)
     bad = [(session.id, o) for session, o in pairs if o.status not in ACCEPTED]
-    return ChunkTold(Counter(o.status for o in outcomes), bad[:TOLD], 0.0)
+    # Sessions of a chunk without a calibration that are told at once; the rows have all
+    return ChunkTold(Counter(o.status for o in outcomes), bad[:11], 0.0)
 
 
 class Recipes:

@@ -7,14 +7,12 @@ import os
 
 from flangeye.cli.console import end_in_words
 
-ONE_THREAD = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-"""Captures are worked on side by side and matrices are small: more threads in one product only
-wait for each other, which costs a run twice its seconds. Read when numpy is imported."""
-
 
 def main() -> None:
     """Run the command line; every foreseen mistake is one line and an exit code."""
-    for name in ONE_THREAD:
+    # Captures are worked on side by side and matrices are small: more threads in one product only
+    # wait for each other, which costs a run twice its seconds. Read when numpy is imported
+    for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     end_in_words(_command)
 

@@ -13,8 +13,6 @@ from flangeye.result import Result, expected_error, status_of
 if TYPE_CHECKING:
     from rich.console import Console
 
-UNLIMITED = 100
-"""Columns of a line that goes to a file or another program, whose width nobody knows."""
 COLOURS = {"verified": "bold green", "unverified": "bold yellow", "refused": "bold red"}
 
 
@@ -131,4 +129,5 @@ def wrapped(console: Console, text: str, indent: int = 2) -> str:
 
 def width(console: Console) -> int:
     """Return how many columns a line may have."""
-    return console.width if console.is_terminal else UNLIMITED
+    # Columns of a line that goes to a file or another program, whose width nobody knows
+    return console.width if console.is_terminal else 100

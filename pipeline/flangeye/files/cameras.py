@@ -20,8 +20,6 @@ from flangeye.files.regular import read_text
 from flangeye.files.tables.documents import KINDS, document_of
 from flangeye.types import Floats
 
-LARGEST = 1_000_000
-"""A file that is larger [bytes] holds recordings, and is not looked into."""
 MATRICES = (
     "camera_matrix", "cameramatrix", "intrinsic_matrix", "intrinsics", "intrinsic", "mtx", "matrix",
     "k", "m1",
@@ -51,10 +49,6 @@ CORNER = 0.5
 """In COLMAP the centre of the first pixel is at this [px]; in OpenCV at 0."""
 OTHER_LENSES = ("equidistant", "fisheye", "kannala", "fov", "inverse", "omni", "ds", "eucm")
 """In the name of a model whose coefficients are not OpenCV's."""
-
-
-NUMBERED = 3
-"""Files that are named alike but for a number hold a pose each."""
 
 
 class CameraFile(NamedTuple):
@@ -91,9 +85,11 @@ def cameras_in(folder: Path) -> list[CameraFile]:
     """
     names = (*KINDS, ".txt")
     inside = (p for p in (*folder.glob("*"), *folder.glob("*/*")) if p.suffix.lower() in names)
-    files = sorted(p for p in inside if p.is_file() and p.stat().st_size <= LARGEST)
+    # A file that is larger [bytes] holds recordings, and is not looked into
+    files = sorted(p for p in inside if p.is_file() and p.stat().st_size <= 1_000_000)
     alike = Counter(re.sub(r"\d+", "*", str(path)) for path in files)
-    found = (camera_in(p) for p in files if alike[re.sub(r"\d+", "*", str(p))] < NUMBERED)
+    # Files that are named alike but for a number hold a pose each
+    found = (camera_in(p) for p in files if alike[re.sub(r"\d+", "*", str(p))] < 3)
     return [camera for camera in found if camera is not None]
 
 

@@ -24,9 +24,6 @@ LATER = (".pcd", ".ply", ".npy", ".xyz", ".csv", ".txt", ".png", ".jpg", ".jpeg"
          ".tiff")  # fmt: skip
 """Endings of scans and images."""
 
-SMALL = 1_000_000
-"""Files up to so many bytes are fetched at once, whatever they are."""
-
 
 def is_url(place: str) -> bool:
     """Return whether a place is a URL, not a path."""
@@ -163,7 +160,8 @@ class _StandIn:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.touch()
             self._names[path] = about["name"]
-            if path.suffix.lower() in LATER and (about.get("size") or 0) > SMALL:
+            # Files up to so many bytes are fetched at once, whatever they are
+            if path.suffix.lower() in LATER and (about.get("size") or 0) > 1_000_000:
                 self.later[path] = about
             else:
                 self.fetch(path)

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-LONGEST = 200
-"""Of a word from a file, what is compared [characters]: it takes time with their product."""
-
 
 def nearest(word: str, known: Iterable[str], n: int = 3, cutoff: float = 0.6) -> list[str]:
     """Return the known words that are nearest to one, the nearest first.
@@ -19,4 +16,5 @@ def nearest(word: str, known: Iterable[str], n: int = 3, cutoff: float = 0.6) ->
     """
     from difflib import get_close_matches  # a command without mistakes does not wait for it
 
-    return get_close_matches(word[:LONGEST], list(known), n, cutoff)
+    # Of a word from a file, what is compared [characters]: it takes time with their product
+    return get_close_matches(word[:200], list(known), n, cutoff)

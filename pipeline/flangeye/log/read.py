@@ -49,9 +49,6 @@ MAX_TOLD = 10
 
 Value = TypeVar("Value")
 
-MAGIC = b"\x89MCAP0\r\n"
-"""How every MCAP file begins; the name of the program that wrote it follows."""
-
 
 class _CaptureFacts(TypedDict):
     """What ``/capture`` says."""
@@ -336,7 +333,8 @@ def is_log(path: Path) -> bool:
         return False
     with path.open("rb") as file:
         head = file.read(64)
-    return not head.startswith(MAGIC) or b"flangeye" in head
+    # How every MCAP file begins; the name of the program that wrote it follows
+    return not head.startswith(b"\x89MCAP0\r\n") or b"flangeye" in head
 
 
 def read_run(path: Path) -> RunLog:

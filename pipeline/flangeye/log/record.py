@@ -59,7 +59,6 @@ from flangeye.log.scans import pack
 from flangeye.plugin.hookspecs import hookimpl
 
 PREVIEW_POINTS = 40_000
-IN_BASE_POINTS = 4_000
 
 _ADAPTERS: dict[Any, TypeAdapter[Any]] = {}
 
@@ -225,7 +224,7 @@ class Recorder:
     def _mirror(self, capture: str | None, value: Any) -> None:
         now = time.time_ns()
         if isinstance(value, t.FlangeCloud) and capture is not None:
-            self._flanges[capture] = t.PointCloud(t.CAMERA, _thinned(value.cloud, IN_BASE_POINTS))
+            self._flanges[capture] = t.PointCloud(t.CAMERA, _thinned(value.cloud, 4_000))
         if isinstance(value, t.CircleFeature) and capture is not None:
             self._proto("/scene", foxglove.circle_scene(capture, value, now))
             self._proto("/circle", foxglove.circle_points(value, now))

@@ -13,8 +13,6 @@ from flangeye.types import FLANGE, ArmCorrection, Floats, Mask, Observation, Ver
 
 REACHED = 1e-9
 """Joint angles belong to a pose when they reach it this closely [rad, m]."""
-SUBSTITUTIONS = 4
-"""Each leaves about a hundredth of the error before it."""
 STEPS, LONGEST_STEP = 200, 0.2
 """Newton steps at most, and the most that a joint moves in each [rad]."""
 
@@ -102,7 +100,8 @@ def reported_flange(base_T_flange: Floats, correction: ArmCorrection, arm: Arm |
     """
     of_arm = replace(correction, tool_offset=np.zeros(3))
     commanded = np.array(base_T_flange)
-    for _ in range(SUBSTITUTIONS):
+    # Each leaves about a hundredth of the error before it
+    for _ in range(4):
         joints = None
         if arm is not None and of_arm.joints is not None:
             joints = follow(arm, commanded, of_arm.joints)  # commands stay on the known branch

@@ -9,9 +9,6 @@ import numpy as np
 from flangeye.maths.geometry import basis_of_plane
 from flangeye.types import Floats
 
-ROUNDS = 2000
-"""Steps towards the smallest circle; its radius is then too large by a thousandth at most."""
-
 
 class Capsule(NamedTuple):
     """All points within ``radius`` of a segment.
@@ -69,7 +66,8 @@ def _along(points: Floats, direction: Floats) -> Capsule:
 def _middle(flat: Floats) -> Floats:
     """Return nearly the centre of the smallest circle about (N, 2) points (Badoiu, Clarkson)."""
     centre = (flat.min(axis=0) + flat.max(axis=0)) / 2
-    for step in range(1, ROUNDS):
+    # Steps towards the smallest circle; its radius is then too large by a thousandth at most
+    for step in range(1, 2000):
         farthest = flat[((flat - centre) ** 2).sum(axis=1).argmax()]
         centre = centre + (farthest - centre) / (step + 1)
     return np.asarray(centre)

@@ -21,10 +21,6 @@ class Undecomposed(ArithmeticError):
     """EAIK met a pose that its decomposition of the arm does not solve."""
 
 
-CLOSE = 5e-3
-"""Axes of a calibrated arm that were meant to meet or to be in line do so within this [m]."""
-
-
 def closed_form(directions: Floats, points: Floats, flange: Floats) -> ClosedForm | None:
     """Return the closed form of an arm, or of the nominal one it differs from a little.
 
@@ -57,7 +53,8 @@ def _snapped(directions: Floats, points: Floats) -> Floats:
     snapped = points.copy()
     for i, k in np.argwhere(directions == 0):  # along its axis a point may be anywhere
         others = snapped[:i][directions[:i, k] == 0, k]
-        near = np.abs(others - points[i, k]) < CLOSE
+        # Axes of a calibrated arm that were meant to meet or to be in line do so within this [m]
+        near = np.abs(others - points[i, k]) < 5e-3
         snapped[i, k] = others[near][0] if near.any() else points[i, k]
     return snapped
 

@@ -12,9 +12,6 @@ from flangeye.types import Floats
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-NEAR_HALF_A_TURN = -0.9
-"""Cosine below which a rotation's axis is read off its quaternion."""
-
 
 def hat(vectors: ArrayLike) -> Floats:
     """Return the (..., 3, 3) cross-product matrices of (..., 3) vectors: ``hat(a) @ b = a x b``."""
@@ -59,7 +56,8 @@ def rotation_log(rotation: Floats) -> Floats:
     sines = 0.5 * _skew_part(r)
     length = np.sqrt((sines**2).sum(axis=-1, keepdims=True))
     cosine = 0.5 * (np.trace(r, axis1=-2, axis2=-1)[..., None] - 1.0)
-    if (cosine < NEAR_HALF_A_TURN).any():
+    # Cosine below which a rotation's axis is read off its quaternion
+    if (cosine < -0.9).any():
         return _rotation_log_anywhere(r)
     ratio = np.arctan2(length, cosine) / np.maximum(length, 1e-300)
     return np.asarray(sines * np.where(length < 1e-12, 1.0, ratio))

@@ -25,20 +25,9 @@ SOLVED = 1e-9
 SAME_BRANCH = 1e-3
 """Two solutions are one when every joint agrees to this [rad or m]."""
 
-POLISH = 8
-"""Iterations from a closed form; a calibrated arm takes about five."""
-
-CLOSE = 0.1
-"""Farther from a pose than this [rad, m], what a closed form gives is no start towards it."""
 
 HELD = 8
 """Angles at which a redundant joint is held, spread over its range."""
-
-TRIED = 8
-"""Poses by which the joint to hold is chosen."""
-
-LONGEST_STEP = 0.5
-"""Largest change of a joint in one iteration [rad or m]; linearisation means nothing beyond."""
 
 
 class JointAxis(Protocol):
@@ -268,7 +257,9 @@ class Arm:
         solved = error < SOLVED
         if solved.all() or (solved.any() and not each):
             return self._distinct(self._within_limits(joints[solved]))
-        return self.inverse_near(base_T_flange, joints[error < CLOSE], POLISH)
+        # Iterations from a closed form; a calibrated arm takes about five
+        # Farther from a pose than this [rad, m], what a closed form gives is no start towards it
+        return self.inverse_near(base_T_flange, joints[error < 0.1], 8)
 
     def inverse_near(self, base_T_flange: Floats, joints: Floats, iterations: int = 40) -> Floats:
         """Return the solutions that starting points (M, n) lead to, (K, n); see :meth:`inverse`.
@@ -334,7 +325,8 @@ class Arm:
         if form is None:
             return 0
         solved = 0
-        for pose in self.flange(self._starting_points(TRIED)):
+        # Poses by which the joint to hold is chosen
+        for pose in self.flange(self._starting_points(8)):
             joints = _solutions([form], pose)
             if joints is None:
                 continue
@@ -472,4 +464,5 @@ def _damped_steps(jacobian: Floats, error: Floats) -> Floats:
     normal = transposed @ jacobian + damping[:, None, None] * np.eye(n)
     steps = np.linalg.solve(normal, transposed @ error[..., None])[..., 0]
     longest = np.abs(steps).max(axis=-1, keepdims=True)
-    return np.asarray(steps * np.minimum(1.0, LONGEST_STEP / np.maximum(longest, 1e-300)))
+    # Largest change of a joint in one iteration [rad or m]; linearisation means nothing beyond
+    return np.asarray(steps * np.minimum(1.0, 0.5 / np.maximum(longest, 1e-300)))

@@ -29,20 +29,9 @@ SAMPLES = 128
 FINER = 16
 """Samples for one, where a root may hide."""
 
-CLOSER = 3
-"""How often the samples are spaced, more closely each time."""
 
 STEPS = 12
 """Steps from a bracket to a root at most; most take two."""
-
-NEAR = 1e-7
-"""So near to a root the next step is the last."""
-
-DIP = 0.25
-"""Two roots may hide where the equation comes this near to zero, in its second differences."""
-
-END = 2.0
-"""Where the reach ends, the equation may change by this, times the root of the pitch [rad]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +127,8 @@ class OffsetWrist:
         ways, starts, pitch, row = np.arange(4), np.array([-np.pi]), _PITCH, _COARSE
         doubts = np.zeros(0)
         found = []
-        for _ in range(CLOSER):
+        # How often the samples are spaced, more closely each time
+        for _ in range(3):
             angles = starts[:, None] + pitch * row
             values = self._posture(orbits, angles, ways[:, None])[0]
             angles = np.broadcast_to(angles, values.shape)
@@ -146,7 +136,9 @@ class OffsetWrist:
             i, k = np.nonzero(here * after <= 0)
             places = angles[i, k + 1]
             found.append(np.array([ways[i], places, places + pitch, here[i, k], after[i, k]]))
-            i, k = np.nonzero(_doubtful(values, END * np.sqrt(pitch)))
+            # Where the reach ends, the equation may change by this, times the root of the pitch
+            # [rad]
+            i, k = np.nonzero(_doubtful(values, 2.0 * np.sqrt(pitch)))
             ways, doubts = ways[i], angles[i, k + 1]
             if not len(ways):
                 break
@@ -169,7 +161,8 @@ class OffsetWrist:
             ab, bc, ca = fa - fb, fb - fc, fc - fa
             at = (a * fb * fc * bc + b * fc * fa * ca + c * fa * fb * ab) / -(ab * bc * ca)
             at = np.where((at - a) * (at - b) <= 0, at, (a + b) / 2)
-            if np.abs(value).max(initial=0.0) < NEAR:
+            # So near to a root the next step is the last
+            if np.abs(value).max(initial=0.0) < 1e-7:
                 break
         return np.asarray(at)
 
@@ -255,7 +248,8 @@ def _doubtful(values: Floats, change: float) -> Floats:
     """
     before, here, after = values[:, :-2], values[:, 1:-1], values[:, 2:]
     size, bent, slope = np.abs(here), before - 2 * here + after, after - before
-    dips = (size < DIP * np.abs(bent)) & (np.abs(slope) < 2 * np.abs(bent)) & (here * bent > 0)
+    # Two roots may hide where the equation comes this near to zero, in its second differences
+    dips = (size < 0.25 * np.abs(bent)) & (np.abs(slope) < 2 * np.abs(bent)) & (here * bent > 0)
     dips &= (here * before > 0) & (here * after > 0)
     return np.asarray(dips | (np.isnan(slope) & (size < change)))
 

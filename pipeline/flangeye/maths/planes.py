@@ -27,8 +27,6 @@ RESTLESS = 0.01
 ENOUGH = 2000
 """Points that tell one plane from another."""
 
-THINNEST = 1e-6
-"""Half thickness of a slab about points that lie on one plane exactly [m]."""
 
 PRODUCTS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 """Pairs of coordinates, whose mean products are the scatter about an origin."""
@@ -231,7 +229,8 @@ def _opened(rows: _Rows, slabs: _Slabs, sigmas: float, restless: float) -> None:
         rows = rows.some(slabs.found)
     chosen, off = np.zeros_like(rows.there), slabs.off(rows, going)
     for _ in range(ROUNDS):
-        near = rows.there & _within(off, np.maximum(slabs.halves[going], THINNEST))
+        # Half thickness of a slab about points that lie on one plane exactly [m]
+        near = rows.there & _within(off, np.maximum(slabs.halves[going], 1e-6))
         counts = _counts(near)
         slabs.found[going] = enough = counts >= 3
         changed = enough & _differ(near, chosen, restless * counts)

@@ -15,14 +15,10 @@ from flangeye.types import Floats, Motion
 
 STILL_DISTANCE = 0.5e-3
 STILL_ANGLE = np.radians(0.1)
-STILL_TIME = 0.3
-"""An arm stands still while it stays so near to one pose [m, rad], for so long at least [s]."""
 LARGEST_OFFSET = 2.0
 """Of two clocks [s]: further apart than this, nothing is looked for."""
 PASSED, PASSED_STEP = 10, 0.02
 """How many poses before and after a moment are kept of a stream, and how far apart [s]."""
-CLEAR_CORRELATION = 0.7
-"""Of two signals of motion, below which their best shift means nothing."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +40,8 @@ def standstills(times: Floats, poses: Floats) -> list[Span]:
     first = 0
     while first < len(times):
         last = _still_until(times, poses, first)
-        if times[last] - times[first] >= STILL_TIME:
+        # An arm stands still while it stays so near to one pose [m, rad], for so long at least [s]
+        if times[last] - times[first] >= 0.3:
             found.append(Span(float(times[first]), float(times[last])))
             first = last + 1
         else:
@@ -177,7 +174,8 @@ def clock_offset(
     wanted = np.interp(grid, *first)
     alike = np.array([_correlation(wanted, grid, second, shift) for shift in shifts])
     best = int(np.argmax(alike))
-    if alike[best] < CLEAR_CORRELATION or best in (0, len(shifts) - 1):
+    # Of two signals of motion, below which their best shift means nothing
+    if alike[best] < 0.7 or best in (0, len(shifts) - 1):
         return 0.0, 0.0
     left, middle, right = alike[best - 1 : best + 2]
     bend = left - 2 * middle + right

@@ -13,9 +13,6 @@ from flangeye.types import Floats
 TICKS = 720
 """Half a degree: 0.2 mm on the pitch circle of the most common flange."""
 
-FEWEST = 5
-"""Points a place that is no hole must hold, for an empty place to mean anything."""
-
 
 class HoleMatch(NamedTuple):
     """The rotation at which the empty places of a face are most like the flange's holes.
@@ -89,7 +86,8 @@ def emptiness(flat: Floats, pitch: float, half_width: float) -> Floats | None:
     for reach in range(2, max(3, int(half_width / pitch * TICKS / (2 * np.pi)) + 1)):
         smooth = sum(np.roll(count, k) for k in range(-reach, reach + 1))
         usual = float(np.percentile(smooth, 75))
-        if usual >= FEWEST:
+        # Points a place that is no hole must hold, for an empty place to mean anything
+        if usual >= 5:
             return np.asarray(np.clip(1.0 - smooth / usual, 0.0, 1.0))
     return None
 

@@ -16,8 +16,6 @@ Grey = NDArray[np.uint8]
 
 FEWEST_CHARUCO = 6
 """Corners of a ChArUco board below which too little of it is seen."""
-LEAST_CONTRAST = 0.3
-"""Between a square and those beside it, over that between black and white."""
 
 FAMILIES = tuple(name for name in DICTIONARIES if not name.endswith(("_50", "_100", "_1000")))
 """One of each kind: the first markers of 4X4_250 are those of 4X4_50, and few prints need more."""
@@ -191,7 +189,8 @@ def _wrong_squares(corners: Corners, board: Board, grey: Grey) -> int:
     beside = [around[:-2, 1:-1], around[2:, 1:-1], around[1:-1, :-2], around[1:-1, 2:]]
     contrast = float(np.ptp(np.percentile(values, [20, 80])))
     differs = sense * (values - np.nanmean(beside, axis=0))
-    return int((differs < LEAST_CONTRAST * contrast).sum())
+    # Between a square and those beside it, over that between black and white
+    return int((differs < 0.3 * contrast).sum())
 
 
 def _upright(pixels: Floats, grey: Grey) -> Floats:

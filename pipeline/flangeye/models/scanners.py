@@ -11,9 +11,6 @@ from flangeye.models.model import Model
 from flangeye.types import Floats
 from flangeye.units import Angle, Length, param
 
-ANY_RANGE = (0.1, 10.0)
-"""What the 3D scanners of work cells see at all [m]."""
-
 
 class ScannerData(Model):
     """What reading an archive needs of a scanner: what to call it and, if known, its range."""
@@ -31,7 +28,8 @@ class ScannerData(Model):
     @property
     def range(self) -> tuple[float, float]:
         """Nearest and farthest it sees [m]; any 3D scanner's, where its own is not known."""
-        near, far = ANY_RANGE
+        # What the 3D scanners of work cells see at all [m]
+        near, far = (0.1, 10.0)
         return (near if self.near is None else self.near, far if self.far is None else self.far)
 
 
@@ -63,11 +61,8 @@ class ScannerModel(ScannerData):
     source: str
 
 
-WORKING_DISTANCE = 0.7
-"""From the scanner to the middle of the workspace, where its range allows: the paper's [m]."""
-
-
 def middle_of_view(scanner: ScannerModel, base_T_camera: Floats) -> Floats:
     """Return (3,) in ``base`` [m]: ahead of the scanner, at its working distance."""
-    distance = min(WORKING_DISTANCE, (scanner.near + scanner.far) / 2)
+    # From the scanner to the middle of the workspace, where its range allows: the paper's [m]
+    distance = min(0.7, (scanner.near + scanner.far) / 2)
     return np.asarray(base_T_camera[:3, 3] + distance * base_T_camera[:3, 2])

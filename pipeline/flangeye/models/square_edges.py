@@ -16,16 +16,8 @@ ENDS = 0.12
 """Share of a side at each end that is left out: there the next side is near."""
 ACROSS = 4.0
 """Half the length of the profiles across a side [px]."""
-BORDER = 0.07
-"""The same as a share of the side, at most: the border of a marker is a tenth of it."""
-SHORTEST = 1.5
-"""Profiles shorter than this [px] are steep all along."""
-SAMPLES = 33
-"""Grey values along a profile."""
 PROFILES = 60
 """Profiles along a side."""
-STRAY = 0.5
-"""An edge further from its side's line than this is not that side's [px]."""
 
 
 def corners_of_square(grey: NDArray[np.uint8], rough: Floats, image: Image) -> Floats:
@@ -74,8 +66,10 @@ def _side(grey: NDArray[np.uint8], start: Floats, end: Floats, image: Image) -> 
     """Return the line (3,) of a side, homogeneous and undistorted; None with too few edges."""
     along = end - start
     length = float(np.linalg.norm(along))
-    reach = min(ACROSS, BORDER * length)
-    if reach < SHORTEST:
+    # The same as a share of the side, at most: the border of a marker is a tenth of it
+    reach = min(ACROSS, 0.07 * length)
+    # Profiles shorter than this [px] are steep all along
+    if reach < 1.5:
         return None
     across = np.array([-along[1], along[0]]) / length * reach
     edges = _straight(_edges(grey, start, along, across), image)
@@ -85,7 +79,8 @@ def _side(grey: NDArray[np.uint8], start: Floats, end: Floats, image: Image) -> 
         middle = edges.mean(axis=0)
         direction = np.linalg.svd(edges - middle)[2][0]
         normal = np.array([-direction[1], direction[0]])
-        edges = edges[np.abs((edges - middle) @ normal) < STRAY]
+        # An edge further from its side's line than this is not that side's [px]
+        edges = edges[np.abs((edges - middle) @ normal) < 0.5]
     return np.array([*normal, -normal @ middle])
 
 
@@ -94,7 +89,8 @@ def _edges(grey: NDArray[np.uint8], start: Floats, along: Floats, across: Floats
     import cv2
 
     shares = np.linspace(ENDS, 1 - ENDS, PROFILES)
-    steps = np.linspace(-1.0, 1.0, SAMPLES)
+    # Grey values along a profile
+    steps = np.linspace(-1.0, 1.0, 33)
     places = start + shares[:, None, None] * along + steps[None, :, None] * across
     x, y = (places[..., i].astype(np.float32) for i in (0, 1))
     profiles = cv2.remap(grey, x, y, cv2.INTER_LINEAR).astype(np.float64)

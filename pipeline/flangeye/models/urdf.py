@@ -36,8 +36,6 @@ FLANGES = ("tool0", "flange", "link8", "link_ee", "ee_link", "end_effector", "to
 """Ends of the names that makers give the flange's frame, z outwards; the surest first."""
 NAMED = 8
 """Links that a message names."""
-OUTWARDS = np.radians(5.0)
-"""A flange's z is along the last axis; beyond this angle [rad] it is another frame of the link."""
 ARCHIVES = (
     "recordings with the flange's poses need no kinematics: robot: {flange: ISO 9409-1-50-4-M6}"
 )
@@ -331,7 +329,8 @@ def _sideways(urdf: Urdf, robot: RobotModel, flange: str) -> Warn | None:
     seen = end[:3, :3].T @ axis * (-1.0 if along < 0 else 1.0)
     known = abs(along) > 1e-3
     off = np.arccos(np.clip(seen[2] if known else abs(seen[2]), -1, 1))
-    if off < OUTWARDS or joint.slides:
+    # A flange's z is along the last axis; beyond this angle [rad] it is another frame of the link
+    if off < np.radians(5.0) or joint.slides:
         return None
     rpy = " ".join(f"{angle:.6g}" for angle in rpy_from_rotation(basis_of_plane(seen).T))
     name = f"{flange}_face"

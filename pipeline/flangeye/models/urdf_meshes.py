@@ -18,7 +18,6 @@ from flangeye.maths.capsules import Capsule, fit_capsule
 from flangeye.models.urdf_numbers import numbers_of
 from flangeye.types import Floats
 
-MAX_BYTES = 200_000_000
 MESHES = (".stl", ".obj", ".dae", ".ply")
 
 
@@ -128,7 +127,7 @@ def _loaded(path: Path) -> Any:
     kind = path.suffix.lower()
     if kind not in MESHES:
         raise RecipeError(f"{path}: '{kind}' is no mesh that is read; known: {', '.join(MESHES)}")
-    raw = read_regular(path, MAX_BYTES, RecipeError)
+    raw = read_regular(path, 200_000_000, RecipeError)
     if kind == ".dae" and (b"<!DOCTYPE" in raw or b"<!ENTITY" in raw):
         raise RecipeError(f"{path}: declares a document type or entities, which are not read")
     try:

@@ -38,12 +38,8 @@ from flangeye.units import Angle, Length
 Vector = tuple[float, float, float]
 
 MESHES = (".stl", ".ply", ".obj", ".glb", ".3mf", ".step", ".stp")
-MAX_MESH = 256_000_000
-"""Largest CAD file [bytes]: five million triangles."""
 STEP = (".step", ".stp")
 """Surfaces, which ``cascadio`` of the extra ``cad`` cuts into triangles, in metres."""
-MARGIN = 0.1
-"""A seam may be this far outside the CAD's box, as a share of its diagonal."""
 
 
 class SeamLine(Model):
@@ -146,7 +142,8 @@ def read_mesh(path: Path) -> tuple[Floats, NDArray[np.int32]]:
         raise StageError(f"{path}: '{path.suffix}' is no CAD; known: {', '.join(MESHES)}")
     if path.suffix.lower() in (*STEP, ".3mf") and find_spec("cascadio") is None:
         raise StageError(f"{path}: STEP and 3MF need: pip install 'flangeye[cad]'")
-    vertices, triangles = _decoded(path, read_regular(path, MAX_MESH))
+    # Largest CAD file [bytes]: five million triangles
+    vertices, triangles = _decoded(path, read_regular(path, 256_000_000))
     if triangles.ndim != 2 or not len(triangles):
         raise StageError(f"{path}: holds no triangles; is it a mesh, and whole?")
     if not np.isfinite(vertices).all():
@@ -185,7 +182,8 @@ def _check_on_part(path: Path, name: str, seam: CadSeam, vertices: Floats) -> No
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     outside = np.maximum(np.maximum(low - seam.points, seam.points - high), 0.0)
     off = float(np.linalg.norm(outside, axis=1).max())
-    if off > MARGIN * np.linalg.norm(high - low):
+    # A seam may be this far outside the CAD's box, as a share of its diagonal
+    if off > 0.1 * np.linalg.norm(high - low):
         raise StageError(
             f"{path}: seam '{name}' is {off * 1e3:.4g} mm outside its CAD; both must be in one "
             "frame and one unit"

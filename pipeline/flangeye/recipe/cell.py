@@ -25,7 +25,6 @@ from flangeye.recipe.header import (
 from flangeye.types import BASE, Floats
 
 Complain = Callable[[Sequence[Hashable], str], None]
-GROUPS = ("arms", "rails", "positioners", "cameras", "targets")
 INSTEAD = ("robot", "second_robot", "configuration")
 """Sections of a recipe with one camera and one target."""
 
@@ -138,7 +137,7 @@ def _at_one_place(section: CellSection) -> Iterator[Mistake]:
 
 
 def _entries(section: CellSection) -> Iterator[tuple[str, str, Any]]:
-    for group in GROUPS:
+    for group in ("arms", "rails", "positioners", "cameras", "targets"):
         yield from ((group, name, each) for name, each in getattr(section, group).items())
 
 

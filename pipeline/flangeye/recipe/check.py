@@ -14,8 +14,6 @@ if TYPE_CHECKING:
 
 FREEDOMS = 6
 """Joints that reach a pose in any orientation."""
-SHARES = (0.3, 0.45, 0.6)
-"""Of each joint's range: poses that are looked for again, away from the middle's singular ones."""
 
 
 def describe_recipe(path: Path, registry: Registry, overrides: Sequence[str] = ()) -> str:
@@ -60,7 +58,8 @@ def _require_reached(path: Path, robot: RobotModel) -> None:
             f"{FREEDOMS}; record poses by hand and read them: robot: {{flange: ISO 9409-1-50-4-M6}}"
         )
     low, high = np.maximum(arm.lower, -np.pi), np.minimum(arm.upper, np.pi)
-    poses = [arm.flange(low + share * (high - low)) for share in SHARES]
+    # Of each joint's range: poses that are looked for again, away from the middle's singular ones
+    poses = [arm.flange(low + share * (high - low)) for share in (0.3, 0.45, 0.6)]
     if not any(len(arm.inverse(pose)) for pose in poses):
         raise RecipeError(
             f"{path}: robot: no joint angles of {robot.model} were found for {len(poses)} poses of "

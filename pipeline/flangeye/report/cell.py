@@ -26,12 +26,8 @@ from flangeye.report.plot import (
 from flangeye.report.space import Drawing, in_words, mapped, target_centres
 from flangeye.types import Floats
 
-FLANGE_POINTS = 3_000
-SCAN_POINTS = 3_000
 AXES = 0.2
 """Length of the axes of base and camera [m]."""
-TARGET_AXES = 0.06
-"""Of those of a marker, drawn at every pose [m]."""
 
 
 def cell_drawing(facts: Facts) -> Drawing | None:
@@ -112,9 +108,8 @@ def _marker_poses(facts: Facts) -> dict[str, Floats]:
 
 def _targets(poses: list[Floats]) -> list[Trace]:
     """Return the axes of a target at every pose, small; the first axis names them."""
-    axes = [
-        [np.stack([m[:3, 3], m[:3, 3] + TARGET_AXES * m[:3, i]]) for m in poses] for i in range(3)
-    ]
+    # Of those of a marker, drawn at every pose [m]
+    axes = [[np.stack([m[:3, 3], m[:3, 3] + 0.06 * m[:3, i]]) for m in poses] for i in range(3)]
     named = [
         lines(parts, colour, 2, name="its axes", showlegend=i == 0)
         for i, (parts, colour) in enumerate(zip(axes, COLOURS, strict=True))
@@ -132,7 +127,7 @@ def _flanges(facts: Facts, pose: Floats) -> list[Trace]:
     entries = [e.value for e in facts.log.of_kind("segment") if isinstance(e.value, t.FlangeCloud)]
     if not entries:
         return []
-    each = max(1, FLANGE_POINTS // len(entries))
+    each = max(1, 3_000 // len(entries))
     xyz = np.concatenate([thinned(flange.cloud.xyz, each) for flange in entries])
     return [points(mapped(pose, xyz), USED, 1.5, name="flange clouds")]
 
@@ -142,6 +137,6 @@ def _first_scan(facts: Facts, pose: Floats) -> list[Trace]:
     first = next(facts.log.captures(), None)
     if first is None:
         return []
-    xyz = thinned(first.cloud.points(), SCAN_POINTS)
+    xyz = thinned(first.cloud.points(), 3_000)
     name = f"scan {plain(first.id, 40)}"
     return [points(mapped(pose, xyz), NEUTRAL, 1.2, name=name)] if len(xyz) else []

@@ -26,9 +26,6 @@ from flangeye.report.plot import (
 from flangeye.report.units import millimetres, percent
 from flangeye.types import Floats
 
-CLOUD_POINTS = 4_000
-"""Points of one panel; three panels and the cell together stay below 20,000."""
-
 
 @dataclass(frozen=True)
 class Panel:
@@ -117,7 +114,8 @@ def _telling(ranked: list[FittedFeature], name: str) -> list[tuple[FittedFeature
 
 
 def _panel(fit: FittedFeature, why: str, limit: float, facts: Facts) -> Panel:
-    shown = thinned(fit.xyz, CLOUD_POINTS)
+    # Points of one panel; three panels and the cell together stay below 20,000
+    shown = thinned(fit.xyz, 4_000)
     figure = figure3d([_cloud(shown, limit), *_fitted(fit)], eye=(1.1, -1.3, 1.3))
     figure["layout"]["showlegend"] = False
     figure["layout"]["scene"]["domain"] = {"y": [0.2, 1.0]}  # room for the colour bar

@@ -33,8 +33,6 @@ from flangeye.report.plot import (
 from flangeye.report.space import Drawing, mapped
 from flangeye.types import BASE, Floats, Observation, Transform
 
-SCAN_POINTS = 3_000
-"""Of a scan that is drawn."""
 AXES = 0.2
 """Length of the axes of the root and of cameras [m]."""
 
@@ -101,7 +99,8 @@ def _scans(facts: Facts, seen: Sequence[Observation], ends: Ends) -> list[Trace]
     first: dict[str, Trace] = {}
     for capture in facts.log.captures():
         if capture.id in at and capture.camera not in first:
-            xyz = mapped(at[capture.id], thinned(capture.cloud.points(), SCAN_POINTS))
+            # Of a scan that is drawn
+            xyz = mapped(at[capture.id], thinned(capture.cloud.points(), 3_000))
             name = f"scan {plain(capture.id, 40)}"
             first[capture.camera] = points(xyz, NEUTRAL, 1.2, name=name)
     return [*first.values()]

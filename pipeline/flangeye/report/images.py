@@ -13,13 +13,6 @@ from flangeye.report.facts import Facts
 from flangeye.report.plot import round_up
 from flangeye.types import Floats
 
-MARGIN = 0.25
-"""Around the corners, over their extent."""
-LONGEST = 0.1
-"""Of the lines drawn for what the pose misses, over the width of the view."""
-WIDEST = 900
-"""Columns of the picture in the page [px]."""
-
 
 @dataclass(frozen=True)
 class ImageView:
@@ -79,7 +72,8 @@ def _view(name: str, image: t.Image, found: dict[str, t.PoseFeature]) -> ImageVi
     at, misses = corners[:, :2], corners[:, 2:]
     x, y, width, height = _around(at, image)
     sizes = np.hypot(*misses.T)
-    scale = round_up(LONGEST * width / max(float(sizes.max()), 1e-6)) / 2
+    # Of the lines drawn for what the pose misses, over the width of the view
+    scale = round_up(0.1 * width / max(float(sizes.max()), 1e-6)) / 2
     ends = at + scale * misses
     of_each = [rms(f.corners[:, 2:]) for f in found.values()]
     summary = (
@@ -103,7 +97,8 @@ def _view(name: str, image: t.Image, found: dict[str, t.PoseFeature]) -> ImageVi
 def _around(at: Floats, image: t.Image) -> tuple[int, int, int, int]:
     """Return (x, y, width, height) of what is to be shown [px]."""
     low, high = at.min(axis=0), at.max(axis=0)
-    margin = MARGIN * float((high - low).max()) + 10
+    # Around the corners, over their extent
+    margin = 0.25 * float((high - low).max()) + 10
     size = np.array(image.pixels.shape[1::-1])
     start = np.clip(np.floor(low - margin), 0, size - 1).astype(int)
     stop = np.clip(np.ceil(high + margin), start + 1, size).astype(int)
@@ -115,7 +110,8 @@ def data_uri(pixels: t.Pixels) -> str:
     """Return a picture as a data URI, not wider than a page."""
     import cv2
 
-    step = min(1.0, WIDEST / pixels.shape[1])
+    # Columns of the picture in the page [px]
+    step = min(1.0, 900 / pixels.shape[1])
     small = cv2.resize(pixels, None, fx=step, fy=step, interpolation=cv2.INTER_AREA)
     colour = small[..., ::-1] if small.ndim == 3 else small
     _, data = cv2.imencode(".jpg", np.ascontiguousarray(colour), [cv2.IMWRITE_JPEG_QUALITY, 88])

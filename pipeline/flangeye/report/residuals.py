@@ -16,10 +16,6 @@ from flangeye.report.facts import Facts
 from flangeye.report.plot import HELD_OUT, UNUSED, USED, Figure, Trace, plain
 from flangeye.report.units import millimetres
 
-LABEL_CHARACTERS = 12
-CLIP_FACTOR = 2.0
-"""Bars longer than this times the longest that counts are cut off, so that the rest can be read."""
-
 
 @dataclass(frozen=True)
 class Errors:
@@ -54,7 +50,9 @@ class Errors:
         every = [*self.residuals.items(), *held]
         longest = max(error for _, error in every)
         kept = max((error for i, error in every if i not in unused), default=longest)
-        return 1.2 * (longest if longest <= CLIP_FACTOR * kept else kept) or 1e-6
+        # Bars longer than this times the longest that counts are cut off, so that the rest can be
+        # read
+        return 1.2 * (longest if longest <= 2.0 * kept else kept) or 1e-6
 
     @property
     def summary(self) -> str:
@@ -145,7 +143,7 @@ def _hover(capture: str, errors: Errors) -> str:
 
 def _labels(ids: list[str]) -> dict[str, str]:
     """Return a label for each id, short where that leaves them different."""
-    short = {i: plain(i, LABEL_CHARACTERS) for i in ids}
+    short = {i: plain(i, 12) for i in ids}
     return short if len(set(short.values())) == len(ids) else {i: escape(i) for i in ids}
 
 

@@ -27,10 +27,6 @@ from flangeye.report.plot import (
 from flangeye.report.units import millimetres
 from flangeye.types import Floats
 
-CLOUD_POINTS = 8_000
-ARROWS = 9
-TORCH = 0.03
-"""Length of the lines that point at the torch [m]."""
 RINGS, WIDE = 60, 0.01
 """Circles of the tube, and roughly how wide the tube is drawn [m]."""
 
@@ -73,14 +69,15 @@ def seam_view(facts: Facts) -> SeamView | None:
 def _cloud(seam: t.Seam) -> list[Trace]:
     if seam.cloud is None or not len(seam.cloud.points()):
         return []
-    return [points(thinned(seam.cloud.points(), CLOUD_POINTS), NEUTRAL, 1.4, name="scan")]
+    return [points(thinned(seam.cloud.points(), 8_000), NEUTRAL, 1.4, name="scan")]
 
 
 def _drawn(seam: t.Seam) -> list[Trace]:
     line, openings = seam.points_in_base, seam.openings_in_base
-    at = np.linspace(0, len(line) - 1, ARROWS).round().astype(int)
+    at = np.linspace(0, len(line) - 1, 9).round().astype(int)
     scale = 0.5 * round_up(WIDE / max(float(tube_radii(seam).max()), 1e-9))
-    arrows = [np.stack([line[i], line[i] + TORCH * openings[i]]) for i in at]
+    # Length of the lines that point at the torch [m]
+    arrows = [np.stack([line[i], line[i] + 0.03 * openings[i]]) for i in at]
     return [
         lines(_widened(seam, scale), USED, 2, name=f"tube, 95 % × {scale:g}"),
         lines([line], CIRCLE, 5, name="planned seam"),

@@ -27,9 +27,6 @@ from flangeye.report.plot import (
 from flangeye.report.units import millimetres
 from flangeye.types import Floats
 
-GRID = 5
-"""Points along each edge of the workspace box."""
-
 
 @dataclass(frozen=True)
 class Drawing:
@@ -47,7 +44,8 @@ def workspace_drawing(facts: Facts) -> Drawing | None:
         return None
     name, estimate = found
     frame = name.partition("_T_")[0]
-    grid = t.Box(box.centre, box.size).grid(GRID)  # type: ignore[arg-type]
+    # Points along each edge of the workspace box
+    grid = t.Box(box.centre, box.size).grid(5)  # type: ignore[arg-type]
     covariances = covariance_at(np.array(estimate.covariance), np.array(estimate.about), grid)
     sigma = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
     traces = [

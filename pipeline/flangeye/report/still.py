@@ -26,18 +26,12 @@ AZIMUTH, ELEVATION = np.radians(-62.0), np.radians(20.0)
 """Where the picture is taken from, about the base: it shows an arm that reaches along x."""
 SQUARE = 0.25
 """Edge of a square of the floor [m]."""
-THIN = 0.045
-"""Radius of the links of an arm whose capsules nobody has written down [m]."""
 PLATE = 0.032
 """Radius of the smallest flange plate of ISO 9409-1 that arms of this size carry [m]."""
-EDGE = 0.012
-"""Width of the dark edge round the arm [m]."""
 PIXELS = 'vector-effect="non-scaling-stroke"'
 """For a line whose width is in pixels, whatever the picture's scale."""
 MARGIN = 0.08
 """Round the picture [m]."""
-TILT = 0.25
-"""Of the flange from level, in the arm that is ready to be scanned [rad]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +66,8 @@ def _ready(model: str) -> tuple[float, ...]:
     arm, reach = Arm(robot), robot.length
     for far, high in ((0.45, 0.30), (0.35, 0.35), (0.30, 0.20)):
         flange = np.array([far * reach, 0.0, high * reach])
-        found = arm.inverse(rigid(rotation_from_rpy(0.0, TILT, 0.0), flange))
+        # Of the flange from level, in the arm that is ready to be scanned [rad]
+        found = arm.inverse(rigid(rotation_from_rpy(0.0, 0.25, 0.0), flange))
         if len(found):
             heights = [arm.frames(q)[:, 2, 3].min() + arm.frames(q)[:, 2, 3].mean() for q in found]
             return tuple(found[int(np.argmax(heights))])
@@ -173,7 +168,8 @@ def rods(robot: RobotModel, joints: Floats) -> list[tuple[float, Floats]]:
         for v, at in ((v, frames[v.link]) for v in robot.filled().volumes)
     ]
     origins = frames[:, :3, 3]
-    found = found or [(THIN, np.stack(pair)) for pair in pairwise(origins)]
+    # Radius of the links of an arm whose capsules nobody has written down [m]
+    found = found or [(0.045, np.stack(pair)) for pair in pairwise(origins)]
     return [*found, (PLATE, flange[:3, 3] - np.outer([0.03, PLATE], flange[:3, 2]))]
 
 
@@ -188,7 +184,8 @@ def _arm(scene: Scene) -> list[_Line]:
     lines = []
     for radius, ends in placed:
         lines.append(_Line(ends, edge, 2 * radius))
-        lines.append(_Line(ends, fill, 2 * radius - EDGE))
+        # Width of the dark edge round the arm [m]
+        lines.append(_Line(ends, fill, 2 * radius - 0.012))
     flange = Arm(scene.robot).flange(joints)
     return [
         *lines,

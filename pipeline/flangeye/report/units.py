@@ -46,7 +46,6 @@ LENGTHS = (
     "error",
     "limit",
 )
-ANGLES = ("tilt", "angle", "rotation", "turn")
 
 
 def figure(name: str, value: float) -> str:
@@ -57,7 +56,7 @@ def figure(name: str, value: float) -> str:
     words = name.split("_")
     if float(value).is_integer():
         return f"{value:.0f}"
-    if any(word in ANGLES for word in words):
+    if any(word in ("tilt", "angle", "rotation", "turn") for word in words):
         return f"{degrees(value)}\N{NO-BREAK SPACE}\N{DEGREE SIGN}"
     if any(word in LENGTHS for word in words):
         return f"{millimetres(value)}\N{NO-BREAK SPACE}mm"

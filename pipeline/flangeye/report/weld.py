@@ -63,10 +63,6 @@ def weld_drawing(facts: Facts) -> WeldDrawing | None:
     )  # fmt: skip
 
 
-LARGEST_BAND = 5e-3
-"""A band that is wider is drawn so wide: it says that nothing is known [m]."""
-
-
 class _View:
     """The paths in the plane: x along the plan as a whole, y to the left."""
 
@@ -175,7 +171,8 @@ def _deviation(view: _View, truth: Floats | None) -> Figure:
     if len(weld.refined) > 1 and len(weld.band) == len(weld.torch):
         along, _, beside = _beside(view, weld.refined, weld.torch)
         for sign, name in ((1.0, "95 % band"), (-1.0, "95 % band, right")):
-            edge = sign * np.minimum(weld.band[beside], LARGEST_BAND) * 1e3
+            # A band that is wider is drawn so wide: it says that nothing is known [m]
+            edge = sign * np.minimum(weld.band[beside], 5e-3) * 1e3
             traces.append(curve(along * 1e3, edge, name, UNUSED, dash="dot"))
     return {"data": traces, "layout": layout2d("along the seam [mm]", "torch to the left [mm]")}
 

@@ -9,8 +9,6 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from flangeye.types import Transform
 
-PARTLY = 0.01
-"""An axis with a larger share in a direction that was not measured has no deviation of its own."""
 Vector = list[float]
 Matrix = list[list[float]]
 
@@ -52,8 +50,10 @@ class TransformResult(_Part):
     def sigma(self) -> list[float | None]:
         """Deviations about and along the parent's axes [rad, m]; None where not measured."""
         free = [max(map(abs, column)) for column in zip(*(self.unobservable or []), strict=True)]
+        # An axis with a larger share in a direction that was not measured has no deviation of its
+        # own
         return [
-            None if free and free[i] > PARTLY else math.sqrt(max(row[i], 0.0))
+            None if free and free[i] > 0.01 else math.sqrt(max(row[i], 0.0))
             for i, row in enumerate(self.covariance)
         ]
 

@@ -30,8 +30,6 @@ DEPTH = 0.7
 WALL = 1.1
 """Depth of the wall behind it [m]."""
 
-PIXEL = 0.5e-3
-"""Distance of neighbouring points on the flange [m]."""
 
 HALF = 160
 """Rows and columns on either side of the middle."""
@@ -134,7 +132,8 @@ def sphere_scene(sphere: Sphere) -> Scene:
 
 def _rays() -> Floats:
     """Return (H, W, 3) directions with z = 1."""
-    steps = np.arange(-HALF, HALF + 1) * PIXEL / DEPTH
+    # Distance of neighbouring points on the flange [m]
+    steps = np.arange(-HALF, HALF + 1) * 0.5e-3 / DEPTH
     x, y = np.meshgrid(steps, steps)
     return np.stack([x, y, np.ones_like(x)], axis=-1)
 

@@ -30,10 +30,6 @@ UPRIGHT = np.radians([0, -90, 90, -90, -90, 0])
 """Joints of an arm of which nothing is said."""
 GRID = (-1.0, 0.0, 1.0)
 """Values of each joint on a grid, in shares of the spread."""
-CANDIDATES = 100
-"""Moments that are compared for each camera and target."""
-FEWEST = 3
-"""Sightings that each camera and each target takes part in, at least."""
 
 
 class CellSessionParams(Params):
@@ -159,7 +155,8 @@ class NextBest:
     def _in_view(self, like: Observation, found: Rough) -> list[Observation]:
         """Return moments drawn, at which its camera sees its target by what is known so far."""
         moments = self._planned.moments
-        drawn = self._rng.choice(DRAWS, CANDIDATES, replace=False)
+        # Moments that are compared for each camera and target
+        drawn = self._rng.choice(DRAWS, 100, replace=False)
         reported = [
             replace(like, id=str(i), poses=moments.poses(i), arm_joints=moments.joints_at(i))
             for i in map(int, drawn)
@@ -374,7 +371,8 @@ def _apart(cell: Cell, pair: tuple[str, str]) -> bool:
 def _require_seen(cell: Cell, chosen: list[Sighting], wanted: int) -> None:
     count = Counter(end for _, camera, target in chosen for end in (camera, target))
     for end in (*cell.cameras, *cell.targets):
-        if count[end] < FEWEST:
+        # Sightings that each camera and each target takes part in, at least
+        if count[end] < 3:
             what = "sees" if end in cell.cameras else "is seen in"
             raise StageError(
                 f"a simulated cell: '{end}' {what} {count[end]} of {DRAWS} moments drawn; "

@@ -25,8 +25,6 @@ from flangeye_emulators.acquire.planned_session import (
 from flangeye_emulators.world.session import View, seen_from
 
 IN_THE_HAND = {"position": ("60 mm", "0 mm", "40 mm"), "rpy": ("0 deg", "0 deg", "90 deg")}
-DRAWS = 60_000
-"""Joint vectors tried: a laser passes a small sphere at few of them."""
 
 PASSES = (0.5, 0.95)
 """How far beside the sphere's centre the laser passes, in radii."""
@@ -94,7 +92,8 @@ def acquire_simulated_profiles(
     """
     rng = np.random.default_rng([VERSION, seed])
     seen = params.distance, params.near, params.far, (params.fan, 0.0), params.facing
-    view = ProfileView(*seen, DRAWS, sphere.radius)
+    # Joint vectors tried: a laser passes a small sphere at few of them
+    view = ProfileView(*seen, 60_000, sphere.radius)
     session = plan_session(robot, None, configuration, (params, view), rng)
     up = session.actual.camera[:, :3, :3] @ session.places.x[:3, :3]
 

@@ -51,20 +51,9 @@ from flangeye_emulators.world.structured_light import StructuredLight
 from flangeye_emulators.world.time_of_flight import TimeOfFlight
 from flangeye_plugins.acquire.plan_rows import as_plan, left_out, row_at
 
-EPOCH_NS = 1_704_067_200_000_000_000
-"""When simulated runs begin: 2024-01-01, 00:00 UTC."""
-
-INTERVAL_NS = 4_000_000_000
-"""From one exposure to the next."""
-
 FEWEST = 3
 """Poses without which no camera pose can be found."""
 
-UNSEEN_TILT = 0.3
-"""Largest roll, pitch and yaw of poses that show what a calibration is worth [rad]."""
-
-AT_ONCE = 4
-"""Scans that are made at once at most: each holds 160 MB while it is."""
 
 VERSION = 1
 """Raised whenever the same parameters would give other captures."""
@@ -105,7 +94,8 @@ def simulate(
     whys = [pose.why for pose in stops.all]
     # A plan that says why is heard before each scan, so nothing is scanned ahead of it.
     ahead = not any(whys)
-    scans = session.captures(noise, min(cores(), AT_ONCE) if ahead else 1)
+    # Scans that are made at once at most: each holds 160 MB while it is
+    scans = session.captures(noise, min(cores(), 4) if ahead else 1)
     look = partial(session.look, rng=_rng(later))
     captures = _explained(scans, whys, stage_log)
     return Captures(captures, source, len(whys), look, recorded=ahead)
@@ -182,7 +172,8 @@ def _checks(plan: Plan, site: Site, count: int, rng: np.random.Generator) -> lis
 
 def _unseen(plan: Plan, site: Site, rng: np.random.Generator) -> list[Floats]:
     """Return joints of poses all over the workspace that take no part."""
-    spread = plan.size / 2, UNSEEN_TILT
+    # Largest roll, pitch and yaw of poses that show what a calibration is worth [rad]
+    spread = plan.size / 2, 0.3
     return [pose.joints for pose in poses_near(plan.centre, UNSEEN, site, rng, spread)]
 
 
@@ -275,12 +266,14 @@ class _Session:
 
     def _capture(self, index: int, xyz: Image, base_T_flange: Floats) -> Capture:
         role: Role = "verification" if index < len(self.stops.checks) else "calibration"
+        # When simulated runs begin: 2024-01-01, 00:00 UTC
+        # From one exposure to the next
         return Capture(
             id=f"{index:04d}",
             cloud=PointCloud(CAMERA, xyz),
             poses=by_frame(Transform(BASE, FLANGE, base_T_flange)),
             joints=self.joints[index],
-            time_ns=EPOCH_NS + (index + 1) * INTERVAL_NS,
+            time_ns=1_704_067_200_000_000_000 + (index + 1) * 4_000_000_000,
             role=role,
         )
 

@@ -17,18 +17,6 @@ BRAKES = 10.0
 """Deceleration of the joints in a stop nobody planned [rad/s^2]. The maker measures 0.16 to 0.53 s
 from 3.2 rad/s (UR5 manual, stop category 0): 6 to 20 rad/s^2."""
 
-HOLD_TIME = 0.1
-"""Time in which a pause or a protective stop takes the arm from full speed to none, on its path."""
-
-SLIDER_TIME = 0.4
-"""Time in which the speed slider's full range takes effect."""
-
-SPEED_MARGIN = 1.05
-"""A joint that should move faster than its limit, and this much, stops the arm."""
-
-HISTORY = 1.0
-"""How far back joint angles and forces are kept [s]."""
-
 
 class MotionFault(Exception):
     """Why the arm had to stop by itself; it is braking already."""
@@ -64,7 +52,8 @@ class SimulatedArm:
         self.force_mode: ForceMode | None = None
         self.slider, self.held = 1.0, False
         self._tare = np.zeros(6)
-        self.history: deque[tuple[Floats, Floats]] = deque(maxlen=round(HISTORY / cycle))
+        # How far back joint angles and forces are kept [s]
+        self.history: deque[tuple[Floats, Floats]] = deque(maxlen=round(1.0 / cycle))
         self._fraction = 1.0
         self._motion: ControllerMotion | None = None
         self._braking = False
@@ -144,7 +133,10 @@ class SimulatedArm:
         """Move the speed share towards what is wanted: fast to a halt, slower otherwise."""
         if self._braking:
             return 1.0
-        wanted, time = (0.0, HOLD_TIME) if self.held else (self.slider, SLIDER_TIME)
+        # Time in which a pause or a protective stop takes the arm from full speed to none, on its
+        # path
+        # Time in which the speed slider's full range takes effect
+        wanted, time = (0.0, 0.1) if self.held else (self.slider, 0.4)
         step = self.cycle / time
         self._fraction += min(max(wanted - self._fraction, -step), step)
         return self._fraction
@@ -181,7 +173,8 @@ class SimulatedArm:
             raise MotionFault(f"joint {i} is at its limit, {np.degrees(joints[i]):.1f} deg")
         share = np.abs(joints - self.stance.joints) / (self.cycle * self.speed_limits)
         i = int(share.argmax())
-        if share[i] > SPEED_MARGIN:
+        # A joint that should move faster than its limit, and this much, stops the arm
+        if share[i] > 1.05:
             speed = np.degrees(share[i] * self.speed_limits[i])
             raise MotionFault(
                 f"joint {i} would turn at {speed:.0f} deg/s, limit "

@@ -11,16 +11,6 @@ from flangeye.models.robots import RobotModel
 from flangeye.types import Floats
 from flangeye_emulators.controllers.poses import inverse_pose, twist_between
 
-REACHED = 1e-10
-"""A pose is reached when translation [m] and rotation [rad] are this close; the robot's own
-repeatability is 30 um."""
-
-ITERATIONS = 12
-"""Newton converges in two from the cycle before, in about six across a quarter of a turn."""
-
-LONGEST_STEP = 0.5
-"""Largest change of a joint in one iteration [rad]."""
-
 
 class UnreachableError(ValueError):
     """No joint angles reach the pose from where the arm is."""
@@ -77,9 +67,12 @@ class Chain:
             UnreachableError: Newton's iteration does not arrive: out of reach, or singular.
         """
         stance = near
-        for _ in range(ITERATIONS):
+        # Newton converges in two from the cycle before, in about six across a quarter of a turn
+        for _ in range(12):
             error = twist_between(stance.base_T_tcp, base_T_tcp)
-            if np.abs(error).max() < REACHED:
+            # A pose is reached when translation [m] and rotation [rad] are this close; the robot's
+            # own repeatability is 30 um
+            if np.abs(error).max() < 1e-10:
                 return stance
             stance = self.stance(stance.joints + _newton_step(stance.jacobian, error))
         raise UnreachableError("no joint angles reach this pose from where the arm is")
@@ -109,4 +102,5 @@ def _newton_step(jacobian: Floats, error: Floats) -> Floats:
             step = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T, error)
     except np.linalg.LinAlgError:
         raise UnreachableError("the arm is in a singular position") from None
-    return np.asarray(step * min(1.0, LONGEST_STEP / max(np.abs(step).max(), 1e-300)))
+    # Largest change of a joint in one iteration [rad]
+    return np.asarray(step * min(1.0, 0.5 / max(np.abs(step).max(), 1e-300)))

@@ -7,10 +7,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-CATCH_UP = 0.05
-"""Cycles missed for less than this [s] are made up for at once; after a longer gap (the process was
-stopped) the clock starts again from now, and the gap is counted."""
-
 KEPT = 60_000
 """Lateness is kept for so many cycles: two minutes at 500 Hz."""
 
@@ -47,7 +43,9 @@ class ControllerClock:
     def _advance(self, now: float) -> None:
         late = now - self._due
         self._lateness[self.ticks % KEPT] = late
-        if late > CATCH_UP:
+        # Cycles missed for less than this [s] are made up for at once; after a longer gap (the
+        # process was stopped) the clock starts again from now, and the gap is counted
+        if late > 0.05:
             self.gaps += 1
             self._due = now
         self.ticks += 1

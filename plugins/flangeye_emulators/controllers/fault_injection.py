@@ -8,9 +8,6 @@ from typing import Protocol
 from flangeye_emulators.controllers.faults import Kind
 from flangeye_emulators.controllers.network import Network
 
-DEFAULT_LATENCY = 0.1
-"""[s]"""
-
 
 class Stoppable(Protocol):
     """A controller that can stop by itself."""
@@ -82,4 +79,4 @@ class FaultInjector:
         self._network.garbled = garbled
 
     def _slow_down(self, seconds: float | None) -> None:
-        self._network.latency = DEFAULT_LATENCY if seconds is None else seconds
+        self._network.latency = 0.1 if seconds is None else seconds

@@ -8,8 +8,6 @@ from typing import NamedTuple
 from flangeye.errors import StageError
 from flangeye.units import parse_quantity
 
-MOVING = "moving"
-
 
 class Fault(NamedTuple):
     """Something that will go wrong.
@@ -46,7 +44,7 @@ def parse_fault(text: str, kinds: dict[str, Kind]) -> Fault:
     if amount and not kinds[name].takes_seconds:
         raise StageError(f"the fault '{name}' takes no duration")
     seconds = _seconds(amount, text) if amount else None
-    after = None if when.strip() == MOVING else _seconds(when, text) if when else 0.0
+    after = None if when.strip() == "moving" else _seconds(when, text) if when else 0.0
     return Fault(name, seconds, after)
 
 

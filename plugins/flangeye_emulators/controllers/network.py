@@ -9,9 +9,6 @@ from collections.abc import Callable
 
 from flangeye.errors import StageError
 
-CLOGGED = 256 * 1024
-"""Bytes a client may leave unread before stream data is dropped."""
-
 
 class DelayLine:
     """Hands things on in order, each after the delay that held when it came."""
@@ -143,7 +140,8 @@ class Connection(asyncio.Protocol):
 
     def stream(self, data: bytes) -> None:
         """Send what is out of date tomorrow; while the wire is frozen or clogged it is lost."""
-        clogged = self._transport is None or self._transport.get_write_buffer_size() > CLOGGED
+        # Bytes a client may leave unread before stream data is dropped
+        clogged = self._transport is None or self._transport.get_write_buffer_size() > 256 * 1024
         if not (self._network.frozen or clogged):
             self._outgoing.push(data, self._network.latency)
 

@@ -15,9 +15,6 @@ TURN_LENGTH = 0.25
 """A turn of one radian counts as this many metres [m/rad]: a wrist turns about as fast as a tool
 moves at such a distance. Where a move is mostly a turn, its speed limits the turn."""
 
-SAMPLES = 33
-"""Points at which a rounded corner is measured."""
-
 
 class Space(Protocol):
     """Where straight lines are drawn: joint angles (n,), or poses (4, 4)."""
@@ -144,7 +141,8 @@ def _corner(
     def curve(u: float) -> Floats:
         return space.between(space.between(enter, middle, u), space.between(middle, leave, u), u)
 
-    samples = np.linspace(0.0, 1.0, SAMPLES)
+    # Points at which a rounded corner is measured
+    samples = np.linspace(0.0, 1.0, 33)
     steps = [space.distance(a, b) for a, b in pairwise([curve(u) for u in samples])]
     places = np.concatenate([[0.0], np.cumsum(steps)])
     limit = min(speed, _grip_speed(space.distance(enter, leave), radius, grip))

@@ -18,7 +18,6 @@ MODULES = 8
 TEXELS = 40
 """To a module of the texture."""
 
-OVERSAMPLING = 2
 
 BACKGROUND = 90.0
 """What is behind the tag [grey levels]."""
@@ -130,7 +129,7 @@ class FingerCamera:
         """Return the paper as seen in some columns and rows, each pixel the mean of four."""
         import cv2
 
-        k = OVERSAMPLING
+        k = 2
         moved = np.array([[1.0, 0.0, -x.start], [0.0, 1.0, -y.start], [0.0, 0.0, 1.0]])
         fine = np.diag([k, k, 1.0]) @ _half_pixel(k) @ moved @ sheet
         width, height = x.stop - x.start, y.stop - y.start

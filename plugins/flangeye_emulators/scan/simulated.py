@@ -9,9 +9,6 @@ from flangeye.models.workpiece import load_workpiece
 from flangeye.types import Look, Seed, WorkpieceScan
 from flangeye_emulators.world.bench import BenchParams, bench_with
 
-BENCH = 7
-"""Tells this use of the recipe's seed from others."""
-
 
 class SimulatedScanParams(BenchParams):
     """Parameters of ``scan.simulated``."""
@@ -30,7 +27,8 @@ def scan_simulated(look: Look | None, seed: Seed, params: SimulatedScanParams) -
             "simulates none; use acquire.simulated, or scan.file"
         )
     workpiece = load_workpiece(params.workpiece)
-    rng = np.random.default_rng([BENCH, seed])
+    # Tells this use of the recipe's seed from others
+    rng = np.random.default_rng([7, seed])
     bodies = bench_with(workpiece, params.base_T_part, params.clutter, params.covered, rng)
     note = f"workpiece: {workpiece.title}, simulated, with {params.clutter} things about it"
     truth = params.true_seams(workpiece)

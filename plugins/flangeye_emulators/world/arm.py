@@ -12,12 +12,6 @@ from flangeye.plugin.stage import Params
 from flangeye.types import Floats
 from flangeye.units import Angle, Length, param
 
-REPEATABILITY = 3.6
-"""Data sheets give the mean plus three standard deviations of the distance from the mean position
-(ISO 9283): 3.6 times the deviation along one axis, when all three are alike."""
-DOWN = (0.0, 0.0, -1.0)
-"""Where things fall, in ``base``."""
-
 
 class ErrorSizes(NamedTuple):
     """How large an arm's errors are; what is drawn has these standard deviations [rad, m]."""
@@ -106,7 +100,9 @@ class ImperfectArm:
 
         sizes = ErrorSizes(*(scale * np.array((errors or ArmErrors()).sizes(robot))))
         self._believed = Arm(robot)
-        self._scatter = scale * robot.repeatability / REPEATABILITY
+        # Data sheets give the mean plus three standard deviations of the distance from the mean
+        # position (ISO 9283): 3.6 times the deviation along one axis, when all three are alike
+        self._scatter = scale * robot.repeatability / 3.6
         n, turns = self._believed.n, ~self._believed.slides
         self.zeros = sizes.zeros * rng.standard_normal(n) * turns
         self.zeros[0] = 0.0
@@ -161,7 +157,8 @@ class ImperfectArm:
         n = self._actual.n
         carried = [frames[:, i + 1 :, :3, 3].mean(axis=1) - origins[:, i] for i in range(n)]
         falling = np.cross(axes, np.stack(carried, axis=1))
-        return np.asarray(falling @ DOWN)
+        # Where things fall, in `base`
+        return np.asarray(falling @ (0.0, 0.0, -1.0))
 
 
 def _as_built(robot: RobotModel, sizes: ErrorSizes, rng: np.random.Generator) -> RobotModel:

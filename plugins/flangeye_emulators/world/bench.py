@@ -17,10 +17,6 @@ from flangeye_emulators.world.raycast import Body
 
 MARGIN = 0.25
 """From the workpiece's box to the edge of the bench, to each side [m]."""
-THICKNESS = 0.04
-NEAREST = 0.045
-"""From a seam to the middle of anything that lies about: it may touch the part, not the groove."""
-ATTEMPTS = 200
 
 
 class BenchParams(Params):
@@ -74,7 +70,7 @@ def bench_with(
     part = Mesh(workpiece.vertices, workpiece.triangles).moved(base_T_part)
     low, high = part.vertices.min(axis=0), part.vertices.max(axis=0)
     top = float(low[2])
-    bench = box([*(low[:2] - MARGIN), top - THICKNESS], [*(high[:2] + MARGIN), top])
+    bench = box([*(low[:2] - MARGIN), top - 0.04], [*(high[:2] + MARGIN), top])
     bodies = [Body(bench, materials.TABLE), Body(part, materials.METAL)]
     seams = [
         s.points @ base_T_part[:3, :3].T + base_T_part[:3, 3] for s in workpiece.seams.values()
@@ -86,11 +82,13 @@ def bench_with(
 
 def _free_place(low: Floats, high: Floats, seams: list[Floats], rng: np.random.Generator) -> Floats:
     """Return (2,) a place around the workpiece that is not over a seam."""
-    for _ in range(ATTEMPTS):
+    for _ in range(200):
         place = rng.uniform(low[:2] - MARGIN / 2, high[:2] + MARGIN / 2)
         flat = [seam * [1.0, 1.0, 0.0] for seam in seams]
         at = np.array([[*place, 0.0]])
-        if all(distances_to_line(at, seam)[0] > NEAREST for seam in flat):
+        # From a seam to the middle of anything that lies about: it may touch the part, not the
+        # groove
+        if all(distances_to_line(at, seam)[0] > 0.045 for seam in flat):
             break
     return np.asarray(place)
 

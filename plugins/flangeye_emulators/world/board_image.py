@@ -14,12 +14,8 @@ PER_SQUARE = 120
 """Pixels of the print along a square; more than any camera resolves of it."""
 FINE = 2
 """Rays a pixel along each axis: what it averages over."""
-COARSE = 8
-"""Samples between places at which the lens is asked: 2e-4 px off where it bends most."""
 GROUND = 90
 """Grey behind the paper."""
-COVER = 25
-"""Grey of what lies over the board."""
 MARGIN = 1.0
 """White paper around the board, in squares."""
 
@@ -128,7 +124,8 @@ def _seen(
         camera_T_target[:3, 3]
     )
     if cover is not None:
-        seen[cover.hides(board, across, down)] = COVER
+        # Grey of what lies over the board
+        seen[cover.hides(board, across, down)] = 25
     height, width = rows.stop - rows.start, columns.stop - columns.start
     return np.asarray(seen.reshape(height, FINE, width, FINE).mean(axis=(1, 3)))
 
@@ -187,7 +184,8 @@ def _rays(u: Floats, v: Floats, camera: BoardCamera) -> Floats:
         k = camera.camera_matrix
         x, y = (u - k[0, 2]) / k[0, 0], (v - k[1, 2]) / k[1, 1]
         return np.stack([x, y, np.ones_like(x)], axis=-1)
-    few = [max(length // COARSE, 2) for length in u.shape]
+    # Samples between places at which the lens is asked: 2e-4 px off where it bends most
+    few = [max(length // 8, 2) for length in u.shape]
     across, down = np.linspace(u[0, 0], u[0, -1], few[1]), np.linspace(v[0, 0], v[-1, 0], few[0])
     pixels = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 1, 2)
     straight = cv2.undistortPoints(pixels, camera.camera_matrix, camera.distortion)

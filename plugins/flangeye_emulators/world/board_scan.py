@@ -14,9 +14,6 @@ from flangeye_emulators.world.board_image import MARGIN, BoardCamera, Cover
 from flangeye_emulators.world.mesh import box
 from flangeye_emulators.world.raycast import Body, Pixels
 
-THICKNESS = 4e-3
-"""Of the sheet that carries the print [m]."""
-
 
 def camera_of(pixels: Pixels, camera: BoardCamera) -> BoardCamera:
     """Return a camera whose pixels are those of a scanner."""
@@ -30,7 +27,8 @@ def camera_of(pixels: Pixels, camera: BoardCamera) -> BoardCamera:
 def sheet_of(board: Board) -> Body:
     """Return the sheet with the print on its front, in ``target``; the print's black is as matt."""
     half = np.array(board.size) / 2 + MARGIN * board.square
-    low, high = [*-half, -THICKNESS], [*half, 0.0]
+    # Of the sheet that carries the print [m]
+    low, high = [*-half, -4e-3], [*half, 0.0]
     return Body(box(low, high), materials.MATT)
 
 

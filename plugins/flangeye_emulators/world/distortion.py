@@ -13,10 +13,6 @@ from flangeye_emulators.world.raycast import Image, Pixels, bands
 DEGREE = 3
 """Highest total degree of the polynomials: bends of the volume, no ripples."""
 
-SIDEWAYS = 1 / 3
-"""Error across the view over error along it: depth comes from the small angle between camera and
-projector, and so is worse than the camera's own directions."""
-
 
 class Distortion:
     """A low-order polynomial field over the scanner's volume.
@@ -42,7 +38,9 @@ class Distortion:
         self._terms = [
             (down @ coefficients[:, :, k] @ across.T).astype(np.float32) for k in range(DEGREE + 1)
         ]
-        sideways = [_drawn(rms * SIDEWAYS / self._middle, rng, depth=False) for _ in "xy"]
+        # Error across the view over error along it: depth comes from the small angle between camera
+        # and projector, and so is worse than the camera's own directions
+        sideways = [_drawn(rms * (1 / 3) / self._middle, rng, depth=False) for _ in "xy"]
         for flat, direction in zip(sideways, (pixels.x, pixels.y[:, None]), strict=True):
             shift = down @ flat[:, :, 0] @ across.T
             self._terms.append((direction + shift).astype(np.float32))

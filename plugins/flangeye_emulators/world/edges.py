@@ -16,20 +16,6 @@ STEP = 5.0
 """A step is a change of depth between neighbours of more than this many widths of a pixel: a
 surface seen at less than 79 degrees to its normal changes less."""
 
-BEND = 0.2
-"""A bend is a second difference of depth of more than this many widths of a pixel: a crease of
-12 degrees, or a radius of five pixels."""
-
-PASSES = 2
-"""Averages, one after the other; two of them round a chamfer of 1 mm as published scans show it."""
-
-ROUGHNESS = 0.5
-"""Standard deviation of the line along which points are lost [px]; published scans of a rim are
-rough by 0.16 to 0.25 mm at 0.2 to 0.3 mm a pixel."""
-
-FLYING = 0.06
-"""Share of the surviving points beside a step that lie between its two sides."""
-
 
 def steps(depth: Image, width: Image) -> Mask:
     """Return which pixels of (H, W) have a neighbour beyond a step in depth.
@@ -93,7 +79,9 @@ def lost(distance: Indices | Image, loss: float, grain: Image) -> Mask:
         loss: Mean width of what is given up [px].
         grain: Standard normal values, correlated as the scanner's noise is.
     """
-    return np.asarray(distance + 0.5 < loss + ROUGHNESS * grain)
+    # Standard deviation of the line along which points are lost [px]; published scans of a rim are
+    # rough by 0.16 to 0.25 mm at 0.2 to 0.3 mm a pixel
+    return np.asarray(distance + 0.5 < loss + 0.5 * grain)
 
 
 def rounded(depth: Image, width: Image, blur: float) -> Image:
@@ -112,7 +100,9 @@ def rounded(depth: Image, width: Image, blur: float) -> Image:
 
     if blur < 0.2:  # narrower than the pixel itself
         return depth
-    bends = _beyond(lambda part: cv2.Laplacian(part, cv2.CV_32F), depth, BEND, width)
+    # A bend is a second difference of depth of more than this many widths of a pixel: a crease of
+    # 12 degrees, or a radius of five pixels
+    bends = _beyond(lambda part: cv2.Laplacian(part, cv2.CV_32F), depth, 0.2, width)
     bends = cv2.dilate(bends.view(np.uint8), np.ones((9, 9), np.uint8)) > 0
     # The average looks two pixels to each side; the image ends there.
     bends[:2], bends[-2:], bends[:, :2], bends[:, -2:] = False, False, False, False
@@ -120,7 +110,8 @@ def rounded(depth: Image, width: Image, blur: float) -> Image:
     out, wide = depth.copy(), width.ravel()
     # What stays in a core's cache at once.
     some = np.array_split(at, 1 + len(at) // 8192)
-    for _ in range(PASSES):
+    # Averages, one after the other; two of them round a chamfer of 1 mm as published scans show it
+    for _ in range(2):
         means = [_local_average(out, part, wide.take(part), blur) for part in some]
         out.ravel()[at] = np.concatenate(means)
     return out
@@ -152,7 +143,8 @@ def fly(depth: Image, beside: Mask, rng: np.random.Generator) -> None:
         rng: Draws them.
     """
     at = np.flatnonzero(beside)
-    at = at[rng.random(len(at)) < FLYING]
+    # Share of the surviving points beside a step that lie between its two sides
+    at = at[rng.random(len(at)) < 0.06]
     around = _neighbours(depth, at)
     near, far, own = around.min(axis=0), around.max(axis=0), depth.ravel()[at]
     other = np.where(own - near < far - own, far, near)

@@ -30,10 +30,6 @@ SQUARES = ((0, 0), (0, 1), (1, 0), (1, 1))
 """Row and column of the pixels that a sample stands for, itself first."""
 
 
-BAND = 1 << 16
-"""Pixels that are worked on at once: the images of as many stay in a core's cache."""
-
-
 @dataclass(frozen=True, eq=False)
 class Body:
     """A thing in the cell: its surface, in some frame, and what it is made of."""
@@ -223,7 +219,8 @@ class Scene:
 
 def bands(shape: tuple[int, ...]) -> Iterator[slice]:
     """Yield the rows of an (H, W) image, some at a time."""
-    height = max(BAND // shape[1], 1)
+    # Pixels that are worked on at once: the images of as many stay in a core's cache
+    height = max((1 << 16) // shape[1], 1)
     for start in range(0, shape[0], height):
         yield slice(start, start + height)
 

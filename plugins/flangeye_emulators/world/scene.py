@@ -18,9 +18,6 @@ from flangeye_emulators.world.scanner import before_camera
 from flangeye_emulators.world.structured_light import StructuredLight
 from flangeye_emulators.world.time_of_flight import TimeOfFlight
 
-STILL = 1e-6
-"""Of an arm that stands, no entry of its flange's pose changes by more [m, 1]."""
-
 
 class Stance(NamedTuple):
     """Where an arm really is: (n,) joint angles [rad], and (4, 4) its flange's pose."""
@@ -84,6 +81,7 @@ class CellScene:
 def _distinct(stances: Sequence[Stance]) -> list[Stance]:
     kept = [stances[0]]
     for stance in stances[1:]:
-        if np.abs(stance.base_T_flange - kept[-1].base_T_flange).max() > STILL:
+        # Of an arm that stands, no entry of its flange's pose changes by more [m, 1]
+        if np.abs(stance.base_T_flange - kept[-1].base_T_flange).max() > 1e-6:
             kept.append(stance)
     return kept

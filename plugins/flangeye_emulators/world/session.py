@@ -21,8 +21,6 @@ from flangeye_emulators.world.arm import ImperfectArm
 
 DRAWS = 4000
 """Joint vectors tried, unless the view is a narrow one."""
-FIELD = 0.75
-"""Share of the field of view, to either side, in which the target's centre stays."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +50,8 @@ class View:
     def sees(self, poses: Floats) -> NDArray[np.bool_]:
         """Return which of (N, 4, 4) camera_T_target are in view."""
         x, y, z = poses[:, :3, 3].T
-        half = np.tan(np.asarray(self.field) / 2) * FIELD
+        # Share of the field of view, to either side, in which the target's centre stays
+        half = np.tan(np.asarray(self.field) / 2) * 0.75
         away = np.linalg.norm(poses[:, :3, 3], axis=1)
         cosine = -(poses[:, :3, 2] * poses[:, :3, 3]).sum(axis=1) / np.maximum(away, 1e-9)
         inside = (np.abs(x) < half[0] * z) & (np.abs(y) < half[1] * z)

@@ -23,9 +23,6 @@ HIGHLIGHT = float(np.radians(6.0))
 GRAZING = float(np.cos(np.radians(80.0)))
 """Cosine of the incidence beyond which no scanner decodes its pattern."""
 
-EDGE_NOISE = 1.5
-"""What a step adds to the noise beside it, as a share of it; it fades within a pixel."""
-
 
 @dataclass(frozen=True, eq=False)
 class _View:
@@ -180,7 +177,8 @@ class StructuredLight:
         sigma *= (view.depth / self._middle) ** 2 / np.maximum(view.cosine, np.float32(0.1))
         close = np.flatnonzero(distance < 3)
         near = distance.ravel().take(close)
-        sigma.ravel()[close] *= 1 + np.float32(EDGE_NOISE) * np.exp(-near)
+        # What a step adds to the noise beside it, as a share of it; it fades within a pixel
+        sigma.ravel()[close] *= 1 + np.float32(1.5) * np.exp(-near)
         return np.asarray(sigma)
 
 

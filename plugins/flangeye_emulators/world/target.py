@@ -13,9 +13,6 @@ from flangeye_emulators.world.mesh import COARSE, Mesh, capsule, lathe
 SEGMENTS = 360
 """Of the sphere's circles: at a radius of 20 mm its facets are within 1 um of its surface."""
 
-STUB = 0.25
-"""Radius of the stub over that of the sphere."""
-
 
 @lru_cache(maxsize=8)
 def sphere_mesh(sphere: Sphere) -> Mesh:
@@ -30,4 +27,5 @@ def sphere_mesh(sphere: Sphere) -> Mesh:
 def stub_mesh(sphere: Sphere) -> Mesh:
     """Return the rod that holds the sphere: along z, from the flange's face into the sphere."""
     x, y, z = sphere.centre_in_flange
-    return capsule(np.array([x, y, 0.0]), np.array([x, y, z]), STUB * sphere.radius, COARSE)
+    # Radius of the stub over that of the sphere
+    return capsule(np.array([x, y, 0.0]), np.array([x, y, z]), 0.25 * sphere.radius, COARSE)

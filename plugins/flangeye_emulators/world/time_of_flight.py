@@ -14,22 +14,10 @@ from flangeye_emulators.world.raycast import Hits, Image, Scene, pixels_of
 FLOOR = 0.3
 """Share of the noise that does not depend on the distance; the rest grows with its square."""
 
-WIGGLE = 0.1874
-"""Period of the systematic error in distance [m]: half the wavelength of light modulated at
-400 MHz, an overtone of the highest of the frequencies such cameras measure at."""
-
-MULTIPATH = 4e-3
-"""Error beside a step on bare metal, from light that took a longer way [m]; a published scan of a
-metal flange is off by this much around its holes."""
-
-MULTIPATH_REACH = 6.0
-"""Distance from the step over which that error fades [px]."""
 
 MIXING = 0.6
 """Standard deviation of the spot that one pixel sees [px]: what makes pixels fly at edges."""
 
-FAINTEST = 0.01
-"""Least share of the light of a white surface at mid range that still gives a phase."""
 
 HIGHLIGHT = float(np.radians(3.0))
 """Half width of the mirror image of the lamp, which saturates pixels."""
@@ -79,7 +67,8 @@ class TimeOfFlight:
         self, scene: Scene, hits: Hits, cosine: Image, strength: Image, grain: Image
     ) -> Mask:
         out = (hits.depth >= self.scanner.near) & (hits.depth <= self.scanner.far)
-        out &= strength > FAINTEST
+        # Least share of the light of a white surface at mid range that still gives a phase
+        out &= strength > 0.01
         angle = np.arccos(np.minimum(cosine, 1.0))
         # The lamp is beside the lens: a mirror returns its light where it faces the camera.
         dazzled = scene.figure("gloss", hits.body) * np.exp(-((angle / HIGHLIGHT) ** 2))
@@ -92,10 +81,15 @@ class TimeOfFlight:
     ) -> Image:
         """Return what every scan of the same scene is wrong by, along the ray (H, W) [m]."""
         swing = np.float32(self.noise * self.scanner.calibration_error * np.sqrt(2) / 3)
-        wiggle = swing * np.sin(2 * np.pi / np.float32(WIGGLE) * depth * self._length)
+        # Period of the systematic error in distance [m]: half the wavelength of light modulated at
+        # 400 MHz, an overtone of the highest of the frequencies such cameras measure at
+        wiggle = swing * np.sin(2 * np.pi / np.float32(0.1874) * depth * self._length)
         gloss = scene.figure("gloss", hits.body)
-        multipath = np.float32(self.noise * MULTIPATH) * (gloss / max(float(gloss.max()), 1e-6))
-        multipath *= np.exp(-distance / np.float32(MULTIPATH_REACH))
+        # Error beside a step on bare metal, from light that took a longer way [m]; a published scan
+        # of a metal flange is off by this much around its holes
+        multipath = np.float32(self.noise * 4e-3) * (gloss / max(float(gloss.max()), 1e-6))
+        # Distance from the step over which that error fades [px]
+        multipath *= np.exp(-distance / np.float32(6.0))
         return np.asarray(wiggle + multipath + self._distortion.depth_error(depth))
 
     def _sigma(self, scene: Scene, hits: Hits, depth: Image, strength: Image) -> Image:

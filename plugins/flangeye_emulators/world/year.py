@@ -20,7 +20,6 @@ from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
 from flangeye.types import Floats
 
-EXPANSION = 23e-6
 ABOUT = np.array([0.45, 0.0, 0.35])
 CORNERS = 0.15 * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 
@@ -121,7 +120,8 @@ def _seen(
     arm, joints, check, truth = cell
     warm = _temperature(year, rng)[check]
     flanges = arm.flange(joints + happening.joints(check))
-    flanges[:, :3, 3] *= 1 + EXPANSION * warm[:, None]
+    # Expansion of aluminium [1/K].
+    flanges[:, :3, 3] *= 1 + 23e-6 * warm[:, None]
     flanges[:, :3, 3] += np.einsum("nij,nj->ni", flanges[:, :3, :3], happening.tool(check))
     flanges[:, :3, 3] += rng.normal(0, year.arm_noise, (len(check), 3))
     cameras = np.array([_moved(truth, m, truth[:3, 3]) for m in happening.motion(check)])

@@ -26,14 +26,8 @@ ALIKE = (
     "they are too alike; tilt the board by 20 deg and more to both sides, or write focal_length: "
     "[fx, fy] and principal_point: [cx, cy]"
 )
-CONTRADICTED = 0.02
-"""By what share of itself a focal length may be off before a calibration is another camera's."""
 FIRST = 8
 """Images that are looked at first: a set that shows the board in half of its images passes."""
-OUTLYING = 4.0
-"""Times the median reprojection error beyond which a view takes no part."""
-COEFFICIENTS = ("k1", "k2", "p1", "p2")
-"""What is found of the lens; more is not told by as many views as a calibration of an arm has."""
 
 Grey = NDArray[np.uint8]
 
@@ -90,7 +84,8 @@ class Lens(NamedTuple):
     def against(self, known: Floats) -> Warn | None:
         """Return a warning where the views contradict a camera's matrix (3, 3) [px]."""
         stated, found = known[0, 0], self.matrix[0, 0]
-        if abs(stated / found - 1) < max(CONTRADICTED, 5 * self.deviations[0] / found):
+        # By what share of itself a focal length may be off before a calibration is another camera's
+        if abs(stated / found - 1) < max(0.02, 5 * self.deviations[0] / found):
             return None
         return Warn(
             f"the camera's calibration says a focal length of {stated:.0f} px, {self.views} views "
@@ -103,7 +98,8 @@ class Lens(NamedTuple):
         """Return what to tell of it."""
         (fx, _, cx), (_, fy, cy), _ = self.matrix
         s = self.deviations
-        named = zip(COEFFICIENTS, self.distortion, s[4:], strict=True)
+        # The views of an arm's calibration determine these coefficients and no others.
+        named = zip(("k1", "k2", "p1", "p2"), self.distortion, s[4:], strict=True)
         lens = ", ".join(f"{name} {value:.4f} +- {sigma:.4f}" for name, value, sigma in named)
         left = f"; without {', '.join(self.left_out)}" if self.left_out else ""
         return (
@@ -179,7 +175,8 @@ def _require_views(seen: int, looked: Mapping[str, Corners | Rejected]) -> None:
 
 
 def _outlies(error: float, errors: Floats) -> bool:
-    return error > OUTLYING * float(np.median(errors))
+    # Times the median reprojection error beyond which a view takes no part
+    return error > 4.0 * float(np.median(errors))
 
 
 def camera_of(

@@ -28,12 +28,10 @@ def _declared(
 
     export.__doc__ = meaning
     export.__annotations__["params"] = params
-    serves = (CELL,) if name in OF_CELLS else ()
+    # Formats that carry every transform of a cell
+    serves = (CELL,) if name in ("ros2_command", "ros2_launch", "urdf") else ()
     return stage(f"export.{name}", serves=serves)(export)
 
-
-OF_CELLS = ("ros2_command", "ros2_launch", "urdf")
-"""Formats that carry every transform of a cell."""
 
 _WRITERS: tuple[tuple[Callable[..., ExportedFile], type[NamedParams]], ...] = (
     (documents.ros2_command, FramesParams),

@@ -26,10 +26,6 @@ from flangeye_plugins.fit.planar import (
 
 CERTAIN = float(np.log(1000))
 """Logarithm of how many times likelier than the other the better of two poses must be."""
-SIZE_SIGMAS = 5.0
-SIZE_ERROR = 5e-3
-"""Share by which a print may be off and nobody needs to know."""
-FEWEST_POINTS = 4
 NO_IMAGE = "there is no image; printed targets are found in the scanner's image"
 
 
@@ -212,11 +208,12 @@ def _by_depth(corners: Corners, capture: Capture, board: Board) -> PlanarPose | 
         return None
     measured = points_of(corners, capture.cloud)
     known = np.isfinite(measured).all(axis=1)
-    if known.sum() < FEWEST_POINTS:
+    if known.sum() < 4:
         return None
     points, measured = corners.points[known], measured[known]
     scale, sigma = scale_of(points, measured)
-    if abs(scale - 1) > max(SIZE_SIGMAS * sigma, SIZE_ERROR):
+    # Share by which a print may be off and nobody needs to know
+    if abs(scale - 1) > max(5.0 * sigma, 5e-3):
         return Rejected(
             f"by the scanner's depth the target is {scale:.4f} times as large as the recipe says: "
             f"{board.square * 1e3:.4g} mm is {board.square * scale * 1e3:.4g} mm; measure the print"

@@ -10,9 +10,6 @@ from numpy.typing import NDArray
 from flangeye.maths.circles import distances
 from flangeye.types import Floats
 
-DAMPING = 1e-9
-"""Keeps a circle without points where it is; beside the points of another it is nothing."""
-
 
 class Circles(NamedTuple):
     """Concentric circles.
@@ -75,7 +72,8 @@ def fit_concentric(
 
 def _step(jacobian: Floats, slope: Floats, bend: Floats) -> Floats:
     """Return the step down the loss's slope where its residuals' curvatures are ``bend`` (N,)."""
-    damping = DAMPING * np.eye(len(slope))
+    # Keeps a circle without points where it is; beside the points of another it is nothing
+    damping = 1e-9 * np.eye(len(slope))
     return np.asarray(-np.linalg.solve((jacobian.T * bend) @ jacobian + damping, slope))
 
 

@@ -16,9 +16,6 @@ from flangeye_plugins.fit.rings import Rings, find_rings
 from flangeye_plugins.fit.uncertainty import plane_covariance
 
 FEWEST_POINTS = 100
-OUTSIDE_PLATE = 0.85
-"""Where the plate has ended, in radii of a wrist circle: of the robots known, wrists are 75 to
-90 mm across and plates 63."""
 
 EDGE = 1e-3
 """How far from an edge a point is beyond its influence [m]."""
@@ -51,7 +48,9 @@ def face_and_rings(
 
 def _ring_of(flange: Flange) -> tuple[float, float]:
     # Before a wrist circle's plane stands the plate; only what is outside it is in the plane.
-    return (OUTSIDE_PLATE * flange.rim if flange.bore is None else 0.0, 1.5 * flange.outer)
+    # Where the plate has ended, in radii of a wrist circle: of the robots known, wrists are 75 to
+    # 90 mm across and plates 63
+    return (0.85 * flange.rim if flange.bore is None else 0.0, 1.5 * flange.outer)
 
 
 def _on_face(face: Plane, points: Floats, params: RimParams) -> Mask:

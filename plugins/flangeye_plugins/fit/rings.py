@@ -23,12 +23,6 @@ ROUNDS, NEAR, SETTLED = 12, 1e-4, 1e-7
 """Rounds of choosing edge points and fitting, at most, and the last one's step [m]: with a few of
 the points, and with all."""
 
-FRINGE = 1e-3
-"""How deep behind an edge its points are kept while the circles settle [m]."""
-
-SEARCHED = ((0.8, 1.1), (0.75, 1.3))
-"""Where the edges of rim and bore are sought, in nominal radii."""
-
 
 class Rings(NamedTuple):
     """Rim, and bore if there is one, with the edge points they were fitted to.
@@ -83,7 +77,8 @@ def find_rings(flat: Floats, nominal: Floats, start: Floats, scale: float) -> Ri
     if len(few) < len(flat):
         circles = _settled(few, circles, nominal, bins, scale, NEAR).circles
         bins = _sectors_for(flat, nominal)
-        flat, _ = _edges_near(flat, circles.centre, nominal, bins, FRINGE)
+        # How deep behind an edge its points are kept while the circles settle [m]
+        flat, _ = _edges_near(flat, circles.centre, nominal, bins, 1e-3)
     return _settled(flat, circles, nominal, bins, scale, SETTLED)
 
 
@@ -124,7 +119,8 @@ def _edges_near(
     offsets = flat - centre
     reach = distances(offsets)
     found = []
-    for k, (low, high) in enumerate(SEARCHED[: len(nominal)]):
+    # Where the edges of rim and bore are sought, in nominal radii
+    for k, (low, high) in enumerate(((0.8, 1.1), (0.75, 1.3))[: len(nominal)]):
         inside = (reach > low * nominal[k]) & (reach < high * nominal[k])
         near, outer, count = flat.T.compress(inside, axis=1).T, k == 0, int(bins[k])
         found.append(

@@ -21,9 +21,6 @@ FEWEST_POINTS = 50
 RINGS = 3
 """Rings about the line of sight in which, with the sectors, neighbouring points err together."""
 
-CURVED = 2.0
-"""By how much more than the distortion a free radius moves the centre along the view: a cap seen to
-60 degrees is half a radius deep, so what bends its edge against its middle counts twice."""
 
 LEAST_SCALE = 1e-6
 """Noise below which points are exact [m]."""
@@ -219,5 +216,8 @@ def _covariance(fit: SphereFit, held: bool, params: SphereParams) -> Floats:
         moved = np.linalg.lstsq(weighted.T @ jacobian, weighted.sum(axis=0), rcond=None)[0]
         found = found + params.radius_error**2 * np.outer(moved, moved)
     else:
-        found = found + (CURVED * params.scanner_error) ** 2 * np.outer(along, along)
+        # By how much more than the distortion a free radius moves the centre along the view: a cap
+        # seen to 60 degrees is half a radius deep, so what bends its edge against its middle counts
+        # twice
+        found = found + (2.0 * params.scanner_error) ** 2 * np.outer(along, along)
     return np.asarray(found + params.scanner_error**2 * np.eye(3))

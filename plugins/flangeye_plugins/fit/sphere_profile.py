@@ -28,11 +28,6 @@ FEWEST_POINTS = 20
 SAMPLES = 2000
 """Triples of points that are tried."""
 
-OFF_PLANE = 1e-4
-"""How far from its plane a profile's points may be written [m]."""
-
-LEAST_SCALE = 1e-6
-"""Noise below which points are exact [m]."""
 
 STEPS = 72
 """Sectors in which the seen share of a circle is counted, 5 degrees each."""
@@ -127,7 +122,8 @@ def _why_no_profile(xyz: Floats) -> str | None:
     if len(xyz) < FEWEST_POINTS:
         return f"{len(xyz)} points, at least {FEWEST_POINTS} are needed"
     off = float(np.abs(xyz[:, 1]).max())
-    if off > OFF_PLANE:
+    # How far from its plane a profile's points may be written [m]
+    if off > 1e-4:
         return (
             f"no profile: points lie up to {off * 1e3:.3g} mm off the plane y = 0; a profile has "
             "x along the line and z away from the scanner (a whole scan wants fit.sphere)"
@@ -185,7 +181,8 @@ def _refined(points: Floats, centre: Floats, radius: float, tolerance: float) ->
         ring = np.zeros(len(on_arc), dtype=np.intp)
         circles = fit_concentric(on_arc, ring, circles, scale)
         residuals = circle_residuals(circles, on_arc, ring)
-        scale = max(2 * SIGMA_OF_MAD * float(np.median(np.abs(residuals))), LEAST_SCALE)
+        # Noise below which points are exact [m]
+        scale = max(2 * SIGMA_OF_MAD * float(np.median(np.abs(residuals))), 1e-6)
     return Arc(circles, on_arc, scale)
 
 

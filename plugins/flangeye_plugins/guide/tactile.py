@@ -30,22 +30,13 @@ from flangeye_plugins.weld.settings import WeldTactileParams
 from flangeye_plugins.weld.touch.calibration import Held, calibrate
 from flangeye_plugins.weld.touch.tag_observation import TagDetector, TagReading
 
-AT_REST = 40
-"""Readings of the undeformed finger."""
-
 EACH = 5
 """Readings at each place with the tip held."""
 
 STROKE = 2e-3
 """How far the robot moves, to both sides and down [m]."""
 
-SPEED = 5e-3
-"""Of these moves [m/s]."""
 
-PATIENT = 10.0
-"""Longest wait for the readings of one place [s]."""
-
-FREE = "Let the finger hang free, so that its tip touches nothing"
 HOLD = "Set the tip into a punch mark or a cone, so that it cannot slide; then keep clear"
 
 
@@ -102,8 +93,9 @@ def _guided(
                 # The person has moved the arm meanwhile: it is watched from where it stands now.
                 return Readings(Executor(robot, model, limits, latest.tell), sensor, finger)
 
-            ask(FREE)
-            rest = readings(robot).take(AT_REST)
+            ask("Let the finger hang free, so that its tip touches nothing")
+            # Readings of the undeformed finger
+            rest = readings(robot).take(40)
             ask(HOLD)
         with arm.moving() as robot:
             held = list(readings(robot).held())
@@ -185,7 +177,8 @@ class Readings:
         """Return new readings where the arm now stands, as many as come in time."""
         found: list[TagReading] = []
         began = self._drive.tick().time_ns
-        while self._drive.tick().time_ns - began < PATIENT * 1e9 and len(found) < count:
+        # Longest wait for the readings of one place [s]
+        while self._drive.tick().time_ns - began < 10.0 * 1e9 and len(found) < count:
             frame = self._sensor.frame()
             # An image that was exposed before the arm stood still says nothing of this place.
             if frame is not None and frame.time_ns >= began:
@@ -210,7 +203,8 @@ class Readings:
 
     def _go(self, start: Transform, by: Floats) -> None:
         target = Transform(BASE, FLANGE, rigid(start.rotation, start.translation + by))
-        self._drive.shift(target, SPEED)
+        # Of these moves [m/s]
+        self._drive.shift(target, 5e-3)
 
 
 def _strokes() -> Iterator[Floats]:

@@ -18,9 +18,6 @@ from flangeye_plugins.plan.grid import Point
 PRIOR = np.array([0.2, 0.2, 0.2, 0.1, 0.1, 0.1])
 """What is known before the first pose: standard deviations, rotation [rad], translation [m]."""
 
-BEYOND = 1.6
-"""Edges of the region that poses are chosen from, over the work's: levers are long there."""
-
 
 class NextBestParams(Params):
     """Parameters of ``plan.next_best``."""
@@ -75,7 +72,8 @@ class Chooser:
         self, site: Site, rng: np.random.Generator, params: NextBestParams, work: Box
     ) -> None:
         self._site, self._rng, self._params, self._work = site, rng, params, work
-        region = BEYOND * work.size if params.region is None else np.asarray(params.region)
+        # Edges of the region that poses are chosen from, over the work's: levers are long there
+        region = 1.6 * work.size if params.region is None else np.asarray(params.region)
         self._region = Box(work.centre, region)
         self._moved_by = levers(work.grid(3) - work.centre)
         self._visited: list[Floats] = []

@@ -31,8 +31,6 @@ from flangeye.units import Duration, Length, param
 LONGEST = 4096
 """A line is no longer [bytes]."""
 
-WAITING = 0.2
-"""Longest wait for data, before it is looked whether to go on [s]."""
 
 UNITS = {"m": 1.0, "mm": 1e-3, "um": 1e-6}
 
@@ -83,7 +81,8 @@ class TcpProfiler(Device):
             raise DeviceError(
                 f"{self.name}: cannot be reached ({error}); is it on, and does it send there?"
             ) from None
-        self._socket.settimeout(WAITING)
+        # Longest wait for data, before it is looked whether to go on [s]
+        self._socket.settimeout(0.2)
         self._thread = threading.Thread(target=self._read, name=self.name, daemon=True)
         self._thread.start()
 

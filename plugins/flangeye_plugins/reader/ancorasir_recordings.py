@@ -21,8 +21,6 @@ from flangeye_plugins.reader.poses import (
 )
 
 MM = 1e-3
-SAME_TCP = 1e-6
-"""A centre belongs to the pose whose position [m] its column of p_robot_mat repeats this well."""
 
 _HEADING = "p_robot 6-DoF index:"
 _AUBO_VERIFICATION = "5"
@@ -225,7 +223,9 @@ def _centres(folder: Path, poses: Poses, unit: float) -> dict[str, Floats]:
     for column, (tcp, centre) in enumerate(zip(tcps, centres, strict=True)):
         distances = np.linalg.norm(places - tcp, axis=1)
         nearest = int(np.argmin(distances))
-        if not distances[nearest] < SAME_TCP:
+        # A centre belongs to the pose whose position [m] its column of p_robot_mat repeats this
+        # well
+        if not distances[nearest] < 1e-6:
             raise StageError(f"{files[0]}: column {column} is the position of no pose that is left")
         if not np.isfinite(centre).all():
             raise StageError(f"{files[1]}: column {column} is not finite")

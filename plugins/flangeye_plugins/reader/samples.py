@@ -28,7 +28,6 @@ from flangeye.files.recording import Archive, NotThisLayout
 from flangeye.files.tables import Table, document_of, files_at, read_table
 from flangeye_plugins.reader.table import TableParams, table
 
-SUFFIXES = (".yaml", ".yml", ".samples", ".json")
 QUATERNION = ("translation.x", "translation.y", "translation.z",
               "rotation.x", "rotation.y", "rotation.z", "rotation.w")  # fmt: skip
 METRES = {"rotation": "xyzw", "length": "m"}
@@ -116,7 +115,7 @@ def _tables(path: Path) -> Iterator[tuple[Path, Table]]:
     """Yield the tables of a file, or of the documents of a folder; what is none is no error."""
     files = [path] if path.is_file() else sorted(path.glob("*"), key=lambda p: natural(p.name))
     for file in files:
-        if file.suffix in SUFFIXES:
+        if file.suffix in (".yaml", ".yml", ".samples", ".json"):
             try:
                 yield file, read_table(file.parent, file.name)
             except StageError:

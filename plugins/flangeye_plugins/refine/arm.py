@@ -35,19 +35,12 @@ from flangeye.types import (
 )
 from flangeye.units import Angle, Length, param
 
-LARGEST_MODEL_ERROR = 5e-3
-"""Further from the controller's poses than this [m], the arm is another one."""
 FOLDS, HELPFUL = 5, 0.95
 """The arm's error is kept when it brings the error on poses held out to this share or less."""
 CANDIDATES, SPREAD = 300, 0.6
 """Poses looked at for the next session, and their joints' largest change from the last [rad]."""
 NAMES = ("zero", "a", "d", "alpha")
 UNITS = (("mrad", 1e3), ("mm", 1e3), ("mm", 1e3), ("mrad", 1e3))
-ENOUGH = 6
-"""An arm of more joints reaches a pose in any number of ways."""
-UNLIKELY = 0.01
-"""Probability of a branch that does not count among those that fit alike."""
-ONE_ORIENTATION = np.radians(10.0)
 
 
 class ArmParams(Params):
@@ -155,9 +148,11 @@ def _best(calibration: HandEye, arm: Arm, prior: Floats) -> _Found:
     shares = _shares(found, prior)
     off = np.array([each.fit.parameters - best.fit.parameters for each in found])
     apart = np.sqrt(np.einsum("b,bij->ij", shares, off**2))
-    if arm.n > ENOUGH and any(o.joints is None for o in observations):
+    # An arm of more joints reaches a pose in any number of ways
+    if arm.n > 6 and any(o.joints is None for o in observations):
         apart = np.full_like(apart, np.inf)  # the ways that were looked at are a few of a continuum
-    likely = [each for each, share in zip(found, shares, strict=True) if share > UNLIKELY]
+    # Probability of a branch that does not count among those that fit alike
+    likely = [each for each, share in zip(found, shares, strict=True) if share > 0.01]
     alike = len({id(each.session.joints) for each in likely})
     return replace(best, alike=alike, apart=apart)
 
@@ -211,7 +206,8 @@ def _branches(observations: Sequence[Observation], arm: Arm) -> Iterator[Floats]
     if len(given) == len(observations):
         joints = np.array(given)
         apart = np.linalg.norm((arm.flange(joints) - poses)[:, :3, 3], axis=1).max()
-        if apart < LARGEST_MODEL_ERROR:
+        # Further from the controller's poses than this [m], the arm is another one
+        if apart < 5e-3:
             yield joints
         return
     for first in arm.inverse(poses[0], starts=96):
@@ -263,7 +259,7 @@ def _identifiability(known: Mask, combined: int, found: _Found) -> str:
     widest = np.arccos(np.clip(cosine, -1, 1))
     one = (
         f" (one orientation: they turn by {np.degrees(widest):.1f} deg at most)"
-        if widest < ONE_ORIENTATION
+        if widest < np.radians(10.0)
         else ""
     )
     if known.any():

@@ -20,9 +20,6 @@ from flangeye_plugins.weld.execution import touch_of
 from flangeye_plugins.weld.finger_camera import Reader
 from flangeye_plugins.weld.resuming import LoggedWeld
 
-SAME = 1e-9
-"""Commands that differ by less are the same [m/s, rad/s]; other processors round otherwise."""
-
 
 @part("replay.tactile")
 def replay_tactile(log: FilePath, step: str) -> ReplayedStep:
@@ -60,9 +57,10 @@ class WeldReplay(LoggedWeld):
 
     def account(self) -> ReplayedStep:
         """Return how what was decided again compares."""
+        # Commands that differ by less are the same [m/s, rad/s]; other processors round otherwise
         return ReplayedStep(
             what=f"{self.cycles} cycles from {len(self.felt)} images",
-            same=max(self._worst_command, self._worst_feeling) <= SAME,
+            same=max(self._worst_command, self._worst_feeling) <= 1e-9,
             figures={
                 "largest difference of a displacement [m]": self._worst_feeling,
                 "largest difference of a command [m/s, rad/s]": self._worst_command,

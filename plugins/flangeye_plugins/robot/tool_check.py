@@ -13,13 +13,6 @@ from flangeye.plugin.stage import Params
 from flangeye.types import Floats
 from flangeye.units import Angle, Length, param
 
-SAME_TOOL = (1e-4, 1e-3)
-"""Largest difference of two tool offsets [m, rad]; pendants show 0.01 mm."""
-
-SAME_ARM = (0.01, 0.03)
-"""Largest distance of the controller's flange from where the model puts it [m, rad]. Arms differ
-from their nominal kinematics by a few millimetres; another arm, or base, by more."""
-
 
 class ToolOffset(Params):
     """The tool the controller is meant to have set, from the flange."""
@@ -49,7 +42,8 @@ def require_tool(
     Raises:
         DeviceError: They differ.
     """
-    if _differ(offset, expected, SAME_TOOL):
+    # Largest difference of two tool offsets [m, rad]; pendants show 0.01 mm
+    if _differ(offset, expected, (1e-4, 1e-3)):
         raise DeviceError(
             f"{name}: the controller's tool is set to {shown.text(offset)}, the recipe says "
             f"{shown.text(expected)}: poses are the flange's, so set the tool at the pendant, or "
@@ -69,7 +63,9 @@ def require_model(name: str, state: RobotState, model: RobotModel) -> None:
             "is robot.model the right one?"
         )
     expected = Arm(model).flange(state.joints)
-    if _differ(state.base_T_flange.matrix, expected, SAME_ARM):
+    # Largest distance of the controller's flange from where the model puts it [m, rad]. Arms differ
+    # from their nominal kinematics by a few millimetres; another arm, or base, by more
+    if _differ(state.base_T_flange.matrix, expected, (0.01, 0.03)):
         off = np.linalg.norm(state.base_T_flange.translation - expected[:3, 3])
         raise DeviceError(
             f"{name}: its flange is {off * 1e3:.0f} mm from where a {model.model} has it at these "

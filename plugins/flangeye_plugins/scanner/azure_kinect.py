@@ -37,8 +37,6 @@ INSTALL = (
     '"/whole/path/to/kinect/bin/python" under [programs] in '
 )
 
-STARTING = 20.0
-"""Longest time in which the camera starts: a cold one loads its depth engine [s]."""
 
 PER_METRE = 1000.0
 """Depths come in the SDK's format DEPTH16, whose unit is the millimetre."""
@@ -78,7 +76,8 @@ def scanner_azure_kinect(model: ScannerModel | None, params: AzureKinectParams) 
         raise DeviceError(f"{NAME}: no recording at {params.recording}")
     pipe = _host(params)
     try:
-        facts = _answer(pipe, STARTING)["facts"]
+        # Longest time in which the camera starts: a cold one loads its depth engine [s]
+        facts = _answer(pipe, 20.0)["facts"]
     except DeviceError:
         pipe.close()
         raise

@@ -13,10 +13,6 @@ import sys
 import time
 from typing import Any, BinaryIO
 
-FRESH_NS = 50_000_000
-"""A frame of the running camera is a new one when it came so long after it was asked for: one
-frame's period at 30 Hz, and the longest exposure."""
-
 
 class NoDepthError(Exception):
     """A capture came without a depth image."""
@@ -81,7 +77,9 @@ def _device(asked: dict[str, Any]) -> tuple[Any, dict[str, str]]:
             capture = camera.get_capture(timeout=asked["timeout_ms"])
             if capture.depth is None:
                 raise NoDepthError
-            if capture.depth_system_timestamp_nsec - began > FRESH_NS:
+            # A frame of the running camera is a new one when it came so long after it was asked
+            # for: one frame's period at 30 Hz, and the longest exposure
+            if capture.depth_system_timestamp_nsec - began > 50_000_000:
                 return capture
 
     return fresh, {"serial": camera.serial, "depth mode": asked["depth_mode"]}

@@ -16,7 +16,6 @@ from flangeye.units import Duration, param
 from flangeye_plugins.scanner.opened import OpenScanner
 
 NAME = "scanner.mech_eye"
-INSTALL = "pip install 'flangeye[mech_eye]'"
 
 
 class MechEyeParams(Params):
@@ -39,7 +38,7 @@ def scanner_mech_eye(model: ScannerModel | None, params: MechEyeParams) -> Scann
     Raises:
         DeviceError: No SDK, no camera, or it does not connect.
     """
-    api = load_sdk("mecheye.area_scan_3d_camera", NAME, INSTALL)
+    api = load_sdk("mecheye.area_scan_3d_camera", NAME, "pip install 'flangeye[mech_eye]'")
     camera, patience = api.Camera(), round(params.timeout * 1e3)
     address = params.address or _only_camera(api, patience)
     _require(camera.connect(address, patience), f"{NAME}: {address}")

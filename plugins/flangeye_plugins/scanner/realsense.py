@@ -20,16 +20,6 @@ from flangeye.units import Duration, param
 from flangeye_plugins.scanner.opened import OpenScanner
 
 NAME = "scanner.realsense"
-INSTALL = "pip install 'flangeye[realsense]'"
-
-STALE = 2
-"""Frames of a running camera that may have been exposed before they were asked for."""
-
-RUN_OUT_MS = 200
-"""A recording that gives no frame for so long has ended [ms]."""
-
-SAME_UNIT = 1e-6
-"""Largest relative difference of two reports of one unit, in single precision."""
 
 
 class RealsenseParams(Params):
@@ -53,7 +43,7 @@ def scanner_realsense(model: ScannerModel | None, params: RealsenseParams) -> Sc
     Raises:
         DeviceError: No SDK, no camera, or no recording.
     """
-    rs = load_sdk("pyrealsense2", NAME, INSTALL)
+    rs = load_sdk("pyrealsense2", NAME, "pip install 'flangeye[realsense]'")
     pipeline, config = rs.pipeline(), rs.config()
     if params.recording is not None:
         if not params.recording.is_file():
@@ -111,7 +101,8 @@ class Realsense(OpenScanner):
     def expose(self) -> Callable[[], Scan]:
         """Take a new frame; the arm waits until it is here."""
         started = time.monotonic_ns()
-        for _ in range(0 if self._params.recording else STALE):
+        # Frames of a running camera that may have been exposed before they were asked for
+        for _ in range(0 if self._params.recording else 2):
             self._frames()
         frames = self._frames()
         times = started, time.monotonic_ns()
@@ -130,7 +121,8 @@ class Realsense(OpenScanner):
         limit = time.monotonic() + PATIENCE
         with contextlib.suppress(RuntimeError):
             while time.monotonic() < limit:
-                self._pipeline.wait_for_frames(RUN_OUT_MS)
+                # A recording that gives no frame for so long has ended [ms]
+                self._pipeline.wait_for_frames(200)
 
     def _facts(self, profile: Any) -> dict[str, str]:
         depth = profile.get_stream(self._rs.stream.depth).as_video_stream_profile()
@@ -152,7 +144,8 @@ class Realsense(OpenScanner):
     def _coordinates(self, depth: Any) -> Any:
         """Return (H, W, 3) in metres, zero where nothing was measured."""
         unit, rows, columns = depth.get_units(), depth.get_height(), depth.get_width()
-        if abs(unit - self._unit) > SAME_UNIT * self._unit:
+        # Largest relative difference of two reports of one unit, in single precision
+        if abs(unit - self._unit) > 1e-6 * self._unit:
             raise DeviceError(
                 f"{self.name}: a frame in units of {unit:.6g} m, but the sensor says "
                 f"{self._unit:.6g} m"

@@ -25,9 +25,6 @@ from flangeye_plugins.scanner.opened import OpenScanner
 
 NAME = "scanner.watched_folder"
 
-LOOK_AGAIN = 0.1
-"""Between two looks into the folder [s]."""
-
 
 class WatchedFolderParams(Params):
     """Parameters of ``scanner.watched_folder``."""
@@ -105,7 +102,8 @@ class WatchedFolder(OpenScanner):
                     incomplete = f": {error}"
                     break  # files are taken in order: those after it must wait for it
                 return self._take(path, cloud)
-            if self._closed.wait(LOOK_AGAIN):
+            # Between two looks into the folder [s]
+            if self._closed.wait(0.1):
                 raise DeviceError(f"{self.name}: is closed")
         raise DeviceError(
             f"{self.name}: no whole new cloud within {self._params.timeout:g} s{incomplete}; "

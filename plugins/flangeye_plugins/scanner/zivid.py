@@ -17,7 +17,6 @@ from flangeye.plugin.stage import Params, part
 from flangeye_plugins.scanner.opened import OpenScanner
 
 NAME = "scanner.zivid"
-INSTALL = "install the Zivid SDK, then pip install 'flangeye[zivid]'"
 
 PER_METRE = 1000.0
 """The SDK's points are millimetres; nothing in it says so at run time."""
@@ -46,7 +45,7 @@ def scanner_zivid(model: ScannerModel | None, params: ZividParams) -> Scanner:
     Raises:
         DeviceError: No SDK, no camera, or settings that cannot be read.
     """
-    zivid = load_sdk("zivid", NAME, INSTALL)
+    zivid = load_sdk("zivid", NAME, "install the Zivid SDK, then pip install 'flangeye[zivid]'")
     for path in (params.settings, params.file_camera):
         if path is not None and not path.is_file():
             raise DeviceError(f"{NAME}: no file {path}")

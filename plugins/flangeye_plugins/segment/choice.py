@@ -15,9 +15,6 @@ BLANK = 0.2
 """A face without holes scores near 0, the published faces with five holes 0.77 and more, one
 with large recesses besides its holes 0.35."""
 
-CLEARLY = 0.6
-"""A disc that scores less than this share of another's is not mistaken for it."""
-
 
 def choose(
     discs: list[Disc], cut: Callable[[Disc], Singles], flange: Flange
@@ -38,7 +35,8 @@ def choose(
         _hole_score(disc, points, flange) if flange.holes else disc.seen
         for disc, points in zip(fitting, cuts, strict=True)
     ]
-    enough = max(BLANK, CLEARLY * max(scores))
+    # A disc that scores less than this share of another's is not mistaken for it
+    enough = max(BLANK, 0.6 * max(scores))
     marked = [k for k, score in enumerate(scores) if score >= enough]
     if not marked:
         return f"a disc {fitting[0].across * 1e3:.0f} mm across with a bore has no threaded holes"

@@ -16,9 +16,6 @@ SECTORS = 48
 ROUNDS, FEWEST = 8, 6
 """Fits of a circle to an edge, each to the points near the last; points of the edge at least."""
 
-SMALLEST = 0.25
-"""Width of a piece that can belong to the face, in radii of its rim: between holes and recesses
-little of it is left."""
 
 PLATE_SHOWS, PLATE_ENDS = (0.5, 0.65), 0.85
 """Where a plate's face is sure to be within a wrist circle, and where it is sure to have ended,
@@ -74,7 +71,9 @@ def of_size(part: Part, cell: tuple[int, int], pitch: float, flange: Flange) -> 
     """
     points = part.points.astype(np.float64)
     across = width(part.plane.flatten(points))
-    fits = SMALLEST * flange.rim < across < 2 * flange.outer + 4 * pitch
+    # Width of a piece that can belong to the face, in radii of its rim: between holes and recesses
+    # little of it is left
+    fits = 0.25 * flange.rim < across < 2 * flange.outer + 4 * pitch
     flaw = None if fits else f"{across * 1e3:.0f} mm across"
     return Disc(part.plane, cell, points.mean(axis=0), across, 0.0, flaw, 0)
 

@@ -19,12 +19,6 @@ SAMPLE = 50_000
 WIDEST = 1.75
 """Tangent of 60 degrees: no scanner sees farther to the side, stray points do."""
 
-SPARE = 1.5
-"""Rows and columns may differ in distance by as much, twice over."""
-
-ROOMY = 4.0
-"""Points for each cell that unorganised scans are thinned to."""
-
 
 class Grid(NamedTuple):
     """Points whose neighbours in the array are neighbours in the scanner's view.
@@ -55,7 +49,8 @@ class Grid(NamedTuple):
         rows, columns = (1, 1) if image is None or self.strides is None else self.strides
         # What is nearer to the scanner takes up more of the view.
         nearest = max(centre[2] - reach, centre[2] / 4)
-        half = int(np.ceil(SPARE * reach / (self.angle * nearest))) + 2
+        # Rows and columns may differ in distance by as much, twice over
+        half = int(np.ceil(1.5 * reach / (self.angle * nearest))) + 2
         top, left = max(cell[0] - half, 0), max(cell[1] - half, 0)
         window = np.s_[
             top * rows : (cell[0] + half) * rows, left * columns : (cell[1] + half) * columns
@@ -101,7 +96,8 @@ def range_image(points: Singles, pitch: float) -> Grid | None:
         return None
     wanted = pitch / float(median(few[:, 2]))
     spacing = _typical_angle(few[:, 0] / few[:, 2], few[:, 1] / few[:, 2]) * np.sqrt(share)
-    enough = min(1.0, ROOMY * (spacing / wanted) ** 2)
+    # Points for each cell that unorganised scans are thinned to
+    enough = min(1.0, 4.0 * (spacing / wanted) ** 2)
     angle = max(wanted, 1.6 * spacing / np.sqrt(enough))
     drawn = _before_scanner(_drawn(points, lot, enough))
     return project(drawn if len(drawn) else few, angle)  # all of them may be at one place

@@ -11,12 +11,6 @@ from flangeye.maths.planes import Plane, fit_plane, robust_planes, thinned
 from flangeye.types import Floats, Indices, Singles
 from flangeye_plugins.segment.grid import cells
 
-FLAT_ENOUGH = 0.7
-"""Share of a piece's points on one plane above which the piece is flat as a whole."""
-
-PATCHES = 60
-"""Patches of a bent piece that are tried: a face fills at least one of the flattest."""
-
 ENOUGH, AROUND = 600, 300
 """Points that settle the plane of a piece and of what is around a patch; a table has a hundred
 times as many."""
@@ -131,7 +125,8 @@ def _whole(pieces: list[SurfacePiece], scatter: float) -> tuple[list[Part], list
         if plane is not None:
             off = _off(plane, piece.points)
             members = np.flatnonzero(off <= _thickness(plane))
-            if len(members) > FLAT_ENOUGH * len(rest):
+            # Share of a piece's points on one plane above which the piece is flat as a whole
+            if len(members) > 0.7 * len(rest):
                 parts.append(Part.of(piece, plane, members))
                 rest = np.flatnonzero(off > 3 * scatter + SEARCHED)
         bent.append(rest)
@@ -169,7 +164,8 @@ def _flattest(piece: SurfacePiece, rest: Indices) -> Iterator[Patch]:
     points = piece.points.take(order, axis=0) - middle
     means, variances, normals = _principal(points, starts, sizes)
     full = np.flatnonzero(sizes >= max(np.median(sizes) / 2, 6))
-    for k in full[np.argsort(variances[full], kind="stable")][:PATCHES]:
+    # Patches of a bent piece that are tried: a face fills at least one of the flattest
+    for k in full[np.argsort(variances[full], kind="stable")][:60]:
         place = means[k] + middle
         normal = -normals[k] if normals[k] @ place > 0 else normals[k]
         members = order[starts[k] : starts[k] + sizes[k]]

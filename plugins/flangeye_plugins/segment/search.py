@@ -14,12 +14,6 @@ from flangeye_plugins.segment.grid import Grid, cells
 from flangeye_plugins.segment.parts import Part, SurfacePiece, flat_parts
 from flangeye_plugins.segment.surfaces import NOISE_GATE, connected_pieces, smooth_surface
 
-LEAST_SLAB = 3e-4
-"""Half thickness of a face: scanners round its edges by more than their noise [m]."""
-
-UNEVEN = 3e-4
-"""Scatter about a plane that a scanner's distortion may add to noise on something flat [m]."""
-
 
 def find_discs(view: Grid, flange: Flange, limits: DiscLimits) -> list[Disc]:
     """Return every flat part of the scene as a disc, with what keeps it from being the flange."""
@@ -53,7 +47,8 @@ def _scatter(flange: Flange, noise: float) -> float:
     lets through, plate and circle are one piece, as rough as the step is high.
     """
     hidden = flange.bore is None and flange.details.thickness < NOISE_GATE * np.sqrt(6) * noise
-    return max(3 * noise, UNEVEN) + (flange.details.thickness if hidden else 0.0)
+    # Scatter about a plane that a scanner's distortion may add to noise on something flat [m]
+    return max(3 * noise, 3e-4) + (flange.details.thickness if hidden else 0.0)
 
 
 def _compared(discs: list[Disc], view: Grid, flange: Flange, limits: DiscLimits) -> list[Disc]:
@@ -71,7 +66,8 @@ def _compared(discs: list[Disc], view: Grid, flange: Flange, limits: DiscLimits)
     for disc, near, plane in zip(right, nearby, planes, strict=True):
         if plane is not None:
             points = near.astype(np.float64)
-            near_it = np.abs(plane.heights(points)) < max(3 * plane.sigma, LEAST_SLAB)
+            # Half thickness of a face: scanners round its edges by more than their noise [m]
+            near_it = np.abs(plane.heights(points)) < max(3 * plane.sigma, 3e-4)
             around = points.compress(near_it, axis=0)
             pitch = view.angle * float(disc.plane.point[2])
             disc = compare(disc._replace(plane=plane), around, points, pitch, flange, limits)

@@ -17,14 +17,10 @@ from flangeye_plugins.segment.scale import check_scale
 ACROSS = 16
 """Coarse points across the sphere."""
 
-CELL = 0.15
-"""Width of a voting cell, in radii: several times what noise does to a proposed centre."""
 
 CANDIDATES = 6
 """Places with the most votes that are looked at more closely."""
 
-ROUNDS = 10
-"""Times that a candidate is moved to fit the points near its surface."""
 
 UNKNOWN_SIZES = np.geomspace(75e-3, 8e-3, 14)
 """Radii that are looked for where the size is unknown; each finds spheres up to 10 % off [m]."""
@@ -114,7 +110,8 @@ def find_spheres(
     votes = votes[np.isfinite(votes[:, 0])]
     if not len(votes):
         return []
-    starts = most_voted(votes, CELL * radius, 2 * radius)
+    # Width of a voting cell, in radii: several times what noise does to a proposed centre
+    starts = most_voted(votes, 0.15 * radius, 2 * radius)
     points = points[np.isfinite(points[:, 2])]
     found = [_settled(start, points, view.angle, radius, tolerance, sized) for start in starts]
     return _apart(sorted(found, key=lambda c: -c.seen))
@@ -184,7 +181,8 @@ def _settled(
         radius,
         points[np.linalg.norm(points - start, axis=1) < 1.5 * radius],
     )
-    for gate in np.geomspace(max(0.3 * radius, tolerance), tolerance, ROUNDS):
+    # Times that a candidate is moved to fit the points near its surface
+    for gate in np.geomspace(max(0.3 * radius, tolerance), tolerance, 10):
         offsets = near - centre
         distance = np.maximum(np.linalg.norm(offsets, axis=1), 1e-9)
         on_surface = np.abs(distance - size) < gate

@@ -16,9 +16,6 @@ NOISE_GATE = 5.0
 SAMPLE = 40_000
 """Second differences that settle what is typical, to one percent."""
 
-STEEPEST = 1.7
-"""Tangent of the steepest incidence at which a surface is still followed, 60 degrees."""
-
 
 def smooth_surface(grid: Grid, bend: float) -> tuple[Mask, float]:
     """Return where the surface is smooth, (H, W), and the standard deviation of depth [m].
@@ -47,7 +44,8 @@ def smooth_surface(grid: Grid, bend: float) -> tuple[Mask, float]:
         # Beside a missing point only the step to the other neighbour can be judged.
         lone = np.flatnonzero(smooth & np.isnan(near))
         here, step = depth.ravel().take(lone), _step(depth, lone, axis)
-        smooth.ravel()[lone] = step <= limit + STEEPEST * grid.angle * here
+        # Tangent of the steepest incidence at which a surface is still followed, 60 degrees
+        smooth.ravel()[lone] = step <= limit + 1.7 * grid.angle * here
     return smooth, noise
 
 

@@ -14,8 +14,6 @@ HEADER_BYTES = 65536
 """Headers seen in the wild have 200 to 1,000 bytes; nothing longer is read as a header."""
 LFS = b"version https://git-lfs.github.com/spec/"
 """How the stand-in of a file begins that Git Large File Storage keeps elsewhere."""
-MAX_DIGITS = 18
-"""Counts stay below 2^63."""
 
 
 def refuse(path: Path | str, what: str) -> NoReturn:
@@ -79,6 +77,7 @@ def count_of(path: Path, what: str, text: str) -> int:
     Raises:
         StageError: It is not a whole number from 0 on, of a size a file can have.
     """
-    if not (text.isascii() and text.isdigit() and len(text) <= MAX_DIGITS):
+    # Counts stay below 2^63
+    if not (text.isascii() and text.isdigit() and len(text) <= 18):
         refuse(path, f"its header says {what} '{text[:24]}', which is not a count")
     return int(text)

@@ -10,8 +10,6 @@ SAMPLE = 4096
 """Points among which such a number is looked for."""
 SHARE = 0.01
 """Of the points at least: measured points are not equal to the last bit so often."""
-FEWEST = 100
-"""Points at least: fewer do no harm, and small tables may repeat what was measured."""
 FARTHER = 3.0
 """How many times farther than all others points of one depth are, whose x and y differ."""
 
@@ -31,7 +29,8 @@ def mark_missing(xyz: Points) -> str:
     some = xyz[:: max(1, len(xyz) // SAMPLE)]
     some = some[np.isfinite(some).all(axis=1)]
     depths, counts = np.unique(some[:, 2], return_counts=True)
-    if not len(depths) or counts.max() < max(SHARE * len(some), FEWEST):
+    # Points at least: fewer do no harm, and small tables may repeat what was measured
+    if not len(depths) or counts.max() < max(SHARE * len(some), 100):
         return ""
     depth = depths[counts.argmax()]
     alike, others = some[some[:, 2] == depth], some[some[:, 2] != depth]

@@ -20,8 +20,6 @@ from flangeye.files.clouds.table import Points, PointTable, Shape, TextTable
 HEADER_ERRORS = (ValueError, TypeError, SyntaxError, TokenError)
 """What NumPy raises at a header that is none: it parses a Python literal."""
 
-WIDEST = 16
-"""Columns of an array of points: x, y, z, then normals, colours, intensity."""
 NUMBERS = "fiu"
 """Kinds of NumPy's types that are numbers."""
 
@@ -37,7 +35,8 @@ def open_npy(path: Path) -> PointTable:
     if fields:
         axes_of(path, fields)
         return NpyTable(path, shape, tuple(fields))
-    if len(shape) not in (2, 3) or not 3 <= shape[-1] <= WIDEST:
+    # Columns of an array of points: x, y, z, then normals, colours, intensity
+    if len(shape) not in (2, 3) or not 3 <= shape[-1] <= 16:
         refuse(path, f"has shape {shape}; a point cloud is (N, 3) or (H, W, 3)")
     return NpyTable(path, shape[:-1])
 

@@ -22,13 +22,9 @@ from flangeye.files.regular import read_regular, read_text
 from flangeye.files.yaml_lines import MAX_BYTES, parse_yaml
 from flangeye.types import Floats
 
-MAX_MATLAB = 1_000_000
-"""Longest .mat file [bytes]."""
 HDF5 = b"\x89HDF\r\n"
 MATRICES = ((4, 4), (3, 3), (3, 4))
 """Shapes of a pose, of its rotation, and of a pose without its last row."""
-WIDEST = 16
-"""Numbers of the longest row that is a pose; a wider array of few rows holds a pose a column."""
 _OPENCV = re.compile(r"\A%YAML[^\n]*\n(?:---[^\n]*\n)?|!!opencv(?:-nd)?-matrix")
 
 
@@ -116,7 +112,8 @@ def _numpy(file: Path) -> Document:
 def _matlab(file: Path) -> Document:
     """Return the arrays of a .mat file: its parser, which damage can crash, has its own process."""
     command = python_command(matlab_parser.__file__)
-    content = read_regular(file, MAX_MATLAB)
+    # Longest .mat file [bytes]
+    content = read_regular(file, 1_000_000)
     if content.startswith(b"MATLAB 7.3") or content.startswith(HDF5):
         raise StageError(
             f"{file}: is a MATLAB 7.3 file (HDF5), which is not read; in MATLAB, write it anew: "
@@ -169,5 +166,6 @@ def _poses_first(array: Floats) -> Floats:
     shape = array.shape
     if len(shape) == 3 and shape[:2] in MATRICES and shape[1:] not in MATRICES:
         return np.moveaxis(array, 2, 0)
-    wide = len(shape) == 2 and shape[0] in (3, 6, 7, 12, 16) and shape[1] > WIDEST
+    # Numbers of the longest row that is a pose; a wider array of few rows holds a pose a column
+    wide = len(shape) == 2 and shape[0] in (3, 6, 7, 12, 16) and shape[1] > 16
     return array.T if wide else array

@@ -11,11 +11,6 @@ import numpy as np
 
 from flangeye.files.tables.table import Row, Rows, number_of
 
-FEWEST = 3
-"""Rows of a block; fewer between blank lines are a pose each."""
-ROUNDED = 2e-3
-"""By how much rows of a written rotation may differ from unit length, and from right angles."""
-
 
 @dataclass
 class Block:
@@ -103,7 +98,8 @@ def _with_matrices(block: Block) -> Block:
         stack = numbers.reshape(-1, lines, width)
         gram = stack[:, :3, :3] @ stack[:, :3, :3].swapaxes(1, 2)
         last = lines == 3 or bool((stack[:, 3] == [0, 0, 0, 1]).all())
-        if last and np.abs(gram - np.eye(3)).max() < ROUNDED:
+        # By how much rows of a written rotation may differ from unit length, and from right angles
+        if last and np.abs(gram - np.eye(3)).max() < 2e-3:
             rows = [block.rows[i : i + lines] for i in range(0, len(block.rows), lines)]
             block.rows = [(r[0][0], tuple(c for _, cells in r for c in cells)) for r in rows]
             return block
@@ -118,7 +114,8 @@ def _or_nan(cell: str | float) -> float:
 def _merged(blocks: list[Block]) -> list[Block]:
     """Return blocks of one table as one: short ones, and those that only a comment parts."""
     sections: list[Block] = []
-    short = [block for block in blocks if len(block.rows) < FEWEST]
+    # Rows of a block; fewer between blank lines are a pose each
+    short = [block for block in blocks if len(block.rows) < 3]
     all_titled = all(block.title for block in blocks)
     alike = len({(len(block.rows), block.width) for block in blocks}) == 1
     for block in blocks:

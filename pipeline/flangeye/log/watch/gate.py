@@ -18,9 +18,6 @@ from contextlib import closing, contextmanager, suppress
 from functools import partial
 
 HERE = "127.0.0.1"
-FOXGLOVE = "https://app.foxglove.dev"
-LONGEST = 16_384
-"""Longest first request [bytes]: that of a browser has about 500."""
 PATIENCE = 10.0
 """How long to wait for it [s]."""
 REFUSAL = b"HTTP/1.1 403 Forbidden\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
@@ -57,7 +54,8 @@ async def _serve(
                 writer.write(REFUSAL)
 
     ended = asyncio.Event()
-    server = await asyncio.start_server(enter, sock=door, limit=LONGEST)
+    # Longest first request [bytes]: that of a browser has about 500
+    server = await asyncio.start_server(enter, sock=door, limit=16_384)
     opened.set_result(partial(asyncio.get_running_loop().call_soon_threadsafe, ended.set))
     await ended.wait()
     server.close()
@@ -69,7 +67,7 @@ def may_look(head: bytes) -> bool:
     told = [
         v.strip() for k, _, v in (line.partition(":") for line in lines) if k.lower() == "origin"
     ]
-    return all(o in (FOXGLOVE, "file://") for o in told)
+    return all(o in ("https://app.foxglove.dev", "file://") for o in told)
 
 
 def hidden_address() -> tuple[str, int]:

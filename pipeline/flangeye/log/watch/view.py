@@ -15,9 +15,6 @@ from flangeye.log.records import Message, reason_of
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-LINES = 6
-"""Latest events that are shown."""
-
 
 @dataclass
 class View:
@@ -100,7 +97,8 @@ class View:
         self.arm = [row[3] for row in base_T_flange["matrix"][:3]], when
 
     def _say(self, *lines: str) -> None:
-        self.events = [*self.events, *map(str, lines)][-LINES:]
+        # Latest events that are shown
+        self.events = [*self.events, *map(str, lines)][-6:]
 
     def rendered(self) -> RenderableType:
         """Return the view for the terminal."""

@@ -29,8 +29,6 @@ from flangeye.recipe.draft.numbers import FARTHEST, TURN, poses_by_number
 from flangeye.recipe.draft.questions import Questions, one_of
 from flangeye.types import Floats
 
-COMMON = ("vector", "ZYX", "xyz", "XYZ", "ZYZ")
-"""What three numbers of a rotation mean on the arms that are sold."""
 NAME_THE_ARM = "name the arm: --robot NAME ('flangeye robots' lists them), or its .urdf"
 WAYS = {"": ("base_T_flange", "flange_T_base"), "target-": ("camera_T_target", "target_T_camera")}
 
@@ -352,7 +350,8 @@ def _writings(
     if pose.rotations == JOINTS:
         return joints
     usual = usual_of(robot.maker if robot else None)
-    named = [given] if given else list(pose.rotations or COMMON)
+    # What three numbers of a rotation mean on the arms that are sold
+    named = [given] if given else list(pose.rotations or ("vector", "ZYX", "xyz", "XYZ", "ZYZ"))
     if not given and usual and (not pose.rotations or usual in pose.rotations):
         named = [usual, *named]
     length = questions.given.get(f"{prefix}length") or _length(numbers, pose)

@@ -15,7 +15,6 @@ from flangeye.recipe.draft.frames import frames_in, role_in
 POSITION = ("x", "y", "z")
 JOINTS = ("joints",)
 """In place of a rotation: joint angles."""
-LISTED = ("qx", "qy", "qz", "qw")
 _LENGTHS, _ANGLES, _TIMES = ("m", "mm"), ("rad", "deg"), ("s", "ms", "us", "ns")
 _PLACES = (
     "position",
@@ -43,7 +42,6 @@ _VECTORS = {
 _OPENCV = ("rvec", "rvecs", "tvec", "tvecs")
 """What OpenCV calls the pose of what a camera sees."""
 _SCANS = ("cloud", "scan", "file", "filename", "image", "img", "name", "path")
-_CLOCKS = ("time", "timestamp", "stamp", "secs", "sec", "t")
 _POSES: Mapping[int, str | None] = {6: None, 7: "xyzw", 12: "matrix", 16: "matrix"}
 """Numbers of a list that is a whole pose, and what they are if no name says more."""
 _JOINT = re.compile(
@@ -242,7 +240,7 @@ def _time(words: Sequence[str]) -> tuple[bool, str | None]:
     words = [word.lower() for word in words]
     unit = words[-1] if words[-1] in _TIMES and len(words) > 1 else None
     called = [word for word in words if word != unit]
-    return called[-1] in _CLOCKS, unit
+    return called[-1] in ("time", "timestamp", "stamp", "secs", "sec", "t"), unit
 
 
 def _put(groups: dict[str, Group], name: str, words: list[str], listed: bool) -> None:
@@ -302,6 +300,6 @@ def _pose(table: Table, group: Group) -> PoseColumns | None:
     if names is None:
         return PoseColumns(table, tuple(place), ("point",), *stated)
     known = (table.convention,) if table.convention else ROTATIONS[names]
-    if not group.ordered and names == LISTED:
+    if not group.ordered and names == ("qx", "qy", "qz", "qw"):
         known = ("quaternion_xyzw", "quaternion_wxyz")
     return PoseColumns(table, (*place, *(group.columns[n] for n in names)), known, *stated)

@@ -34,8 +34,6 @@ from flangeye.recipe.load import parse_recipe
 PLATE = "ISO 9409-1-50-4-M6"
 """What most small arms carry."""
 POSES_LINE = "x_mm,y_mm,z_mm,rx_rad,ry_rad,rz_rad"
-BINARY = (".mat", ".npz")
-"""Files of arrays that hold nothing else."""
 PRINTED = ("charuco", "checkerboard", "circles", "aruco")
 NONE = "none"
 CLOSED = (".parquet", ".feather", ".pkl", ".pickle", ".xlsx", ".xls", ".ods")
@@ -161,7 +159,8 @@ def _missing(survey: FolderSurvey, reason: StageError) -> str:
     """Say what is missing, and the line that would bring it."""
     if not isinstance(reason, NotThisLayout):
         return f"{reason}; flangeye init takes such lines as --reader '{{…}}' and --robot NAME"
-    for path in survey.of(BINARY):
+    # Files of arrays that hold nothing else
+    for path in survey.of((".mat", ".npz")):
         try:
             tables_in(path.parent, path.name)
         except StageError as error:

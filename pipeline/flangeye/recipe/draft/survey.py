@@ -19,8 +19,6 @@ from flangeye.recipe.draft.headings import list_name, list_sizes
 TABLES = (".csv", ".txt", ".dat", ".tsv", ".tum", ".log", ".mod", ".src", ".ls", ".script", *KINDS)
 FEWEST = 3
 """Rows of a table of poses, and files that are named alike under one pattern."""
-LARGEST = 10_000_000
-"""A file that is larger [bytes] holds scans, and is not looked into."""
 _PART = re.compile(r"(?<![a-z])(r|rot|rotations?|rvecs?|t|trans|translations?|tvecs?|pos)(?![a-z])")
 
 
@@ -81,7 +79,8 @@ def places(folder: Path, files: Sequence[Path]) -> Iterator[tuple[str, list[Path
     """Yield files as a recipe names them, those that are named alike under one pattern."""
     groups: dict[str, list[Path]] = defaultdict(list)
     for file in files:
-        if file.suffix.lower() in TABLES and file.stat().st_size <= LARGEST:
+        # A file that is larger [bytes] holds scans, and is not looked into
+        if file.suffix.lower() in TABLES and file.stat().st_size <= 10_000_000:
             alike = re.sub(r"\d+(?=\D*$)", "*", file.stem) + file.suffix
             groups[str(file.relative_to(folder).with_name(alike))].append(file)
     single = [file for files in groups.values() if len(files) < FEWEST for file in files]

@@ -28,11 +28,8 @@ from flangeye.models.scanners import ScannerModel
 from flangeye.result import ObservationResult, Result, TransformResult
 from flangeye.types import Floats
 
-PROBABILITY = 0.95
 EXPANSION = 23e-6
 """Of aluminium, of which most arms are made, per kelvin: larger than that of steel."""
-NAMED = 0.3
-"""Correlations larger than this are named."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +114,7 @@ class Budget:
     @property
     def coverage(self) -> Floats:
         """(3,) coverage factors k for 95 % along x, y, z."""
-        return np.array([coverage_factor(f, PROBABILITY) for f in self.freedom])
+        return np.array([coverage_factor(f, 0.95) for f in self.freedom])
 
     @property
     def expanded(self) -> Floats:
@@ -130,7 +127,8 @@ class Budget:
         names = [c.name for c in self.contributions]
         pairs = zip(*np.triu_indices(len(names), 1), strict=True)
         found = [(names[i], names[j], float(self.correlation[i, j])) for i, j in pairs]
-        return sorted((x for x in found if abs(x[2]) >= NAMED), key=lambda x: -abs(x[2]))
+        # Correlations larger than this are named
+        return sorted((x for x in found if abs(x[2]) >= 0.3), key=lambda x: -abs(x[2]))
 
     @property
     def _standard(self) -> Floats:

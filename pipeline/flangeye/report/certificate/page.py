@@ -35,8 +35,6 @@ from flangeye.result import expected_error, result_of_camera, status_of
 
 LEAST_LENGTH = 1e-6
 """Smallest uncertainty that is printed as a number [m]; the page shows three decimals of a mm."""
-LEAST_ANGLE = 1.75e-6
-"""Smallest uncertainty that is printed as a number [rad]: 0.0001 degrees."""
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 
 
@@ -107,7 +105,8 @@ def render(facts: Facts, conditions: Conditions) -> str:
 def standard_text(row: Contribution | Share) -> str:
     """Return a standard uncertainty with its unit; one that is only bounded says so."""
     angle = isinstance(row, Contribution) and row.unit == "rad"
-    shown, least = (degrees, LEAST_ANGLE) if angle else (millimetres, LEAST_LENGTH)
+    # Smallest uncertainty that is printed as a number [rad]: 0.0001 degrees
+    shown, least = (degrees, 1.75e-6) if angle else (millimetres, LEAST_LENGTH)
     bound = row.standard < least or row.bound
     return f"{'below ' if bound else ''}{shown(max(row.standard, least))}{'°' if angle else ' mm'}"
 

@@ -18,8 +18,6 @@ from flangeye_emulators.controllers.mover import Mover
 POSE = CONVENTIONS["rpy"]
 """Poses are (x, y, z, rx, ry, rz) [m, rad], turned about fixed axes."""
 
-CYCLE = 0.005
-"""``RobotConfig.getCycletime`` of an i5 [s]."""
 
 FASTEST = np.radians([150.0, 150.0, 150.0, 180.0, 180.0, 180.0])
 """Largest joint speeds [rad/s]: data sheet of the i5."""
@@ -45,7 +43,8 @@ class AuboController:
 
     def __init__(self, robot: RobotModel, joints: Floats, zeros: Floats) -> None:
         """Switch on, with the arm standing at ``joints`` (n,) [rad]."""
-        self.cycle = CYCLE
+        # `RobotConfig.getCycletime` of an i5 [s]
+        self.cycle = 0.005
         limits = np.resize(FASTEST, len(joints))
         self.arm = SimulatedArm(robot, limits, self.cycle, joints, zeros)
         self.robot_mode, self.safety = "Running", "Normal"

@@ -12,10 +12,7 @@ from flangeye_emulators.controllers.network import Connection, Network
 
 PORT = 30004
 MARK = b"SOF\x01"
-LOGIN = b"__login__"
 
-LONGEST = 1 << 20
-"""Bytes of a body after which a client is cut off."""
 
 UNKNOWN_METHOD, WRONG_PARAMS = -32601, -32602
 """JSON-RPC 2.0, section 5.1."""
@@ -37,7 +34,8 @@ class RpcSession(Connection):
         self._buffer += data
         while len(self._buffer) >= _HEADER:
             (length,) = _LENGTH.unpack_from(self._buffer, len(MARK))
-            if not self._buffer.startswith(MARK) or length > LONGEST:
+            # Bytes of a body after which a client is cut off
+            if not self._buffer.startswith(MARK) or length > 1 << 20:
                 self.abort()
                 return
             if len(self._buffer) < _HEADER + length:
@@ -54,7 +52,7 @@ def frame(body: bytes) -> bytes:
 
 def answer(box: AuboController, body: bytes) -> bytes:
     """Return the answer to one request, after doing what it says."""
-    if body.startswith(LOGIN):
+    if body.startswith(b"__login__"):
         # The client takes any answer.
         return b"OK"
     try:

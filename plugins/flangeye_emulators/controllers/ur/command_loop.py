@@ -12,7 +12,6 @@ from flangeye_emulators.controllers.ur.program import Thread
 from flangeye_emulators.controllers.ur.script import ControlScript
 
 READY, DONE = 1, 2
-STOP_SCRIPT = 255
 
 
 class CommandLoop(ControlScript):
@@ -25,7 +24,7 @@ class CommandLoop(ControlScript):
         executed = False
         while True:
             code = self.integer(0) or self._take_internal()
-            if code == STOP_SCRIPT:
+            if code == 255:  # stop script
                 return
             if code == 0:
                 executed = False

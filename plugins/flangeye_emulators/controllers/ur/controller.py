@@ -19,9 +19,6 @@ from flangeye_emulators.controllers.ur.state import Registers, RobotMode, Runtim
 FORCE_LIMIT = 150.0
 """Force on the tool that stops the arm [N]: the safety limit e-Series arms are shipped with."""
 
-UNLOCK_AFTER = 5.0
-"""A protective stop cannot be unlocked earlier [s]: the dashboard server's manual."""
-
 
 class RefusedError(Exception):
     """The controller does not do what it was asked; the words are the dashboard's."""
@@ -60,7 +57,8 @@ class URController:
         self.robot_mode, self.safety = RobotMode.RUNNING, SafetyMode.NORMAL
         self.runtime = Runtime.STOPPED
         self.remote_control = True
-        self.unlock_after = UNLOCK_AFTER
+        # A protective stop cannot be unlocked earlier [s]: the dashboard server's manual
+        self.unlock_after = 5.0
         self.digital_outputs, self.wired = 0, True
         self.analog_outputs = [0.0, 0.0]
         self.payload: tuple[float, Floats] = (0.0, np.zeros(3))

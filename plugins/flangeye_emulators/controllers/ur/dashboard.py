@@ -10,7 +10,6 @@ from flangeye_emulators.controllers.ur.models import dashboard_name_of
 from flangeye_emulators.controllers.ur.state import Runtime
 
 PORT = 29999
-BANNER = "Connected: Universal Robots Dashboard Server"
 SERIAL_NUMBER = "20245500001"
 PROGRAM_NAME = "loopback.urp"
 
@@ -26,7 +25,7 @@ class DashboardSession(LineConnection):
 
     def opened(self) -> None:
         """Greet."""
-        self.say(BANNER)
+        self.say("Connected: Universal Robots Dashboard Server")
 
     def line(self, text: str) -> None:
         """Answer one command."""

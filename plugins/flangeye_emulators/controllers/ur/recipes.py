@@ -14,8 +14,6 @@ from flangeye_emulators.controllers.ur.variables import (
     write_inputs,
 )
 
-OUTPUT_ID = 1
-
 
 class OutputRecipe:
     """Variables that are sent to a client again and again.
@@ -35,7 +33,7 @@ class OutputRecipe:
 
     def pack(self, box: URController) -> bytes:
         """Return the body of one data package."""
-        values: list[float] = [OUTPUT_ID]
+        values: list[float] = [1]  # the one recipe's id
         for values_of in self._values:
             values.extend(values_of(box))
         return self._packing.pack(*values)

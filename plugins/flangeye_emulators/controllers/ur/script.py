@@ -12,8 +12,6 @@ from flangeye_emulators.controllers.ur.orders import Orders
 from flangeye_emulators.controllers.ur.program import Program, Thread
 from flangeye_emulators.controllers.ur.urscript import Move
 
-PROGRESS_REGISTER = 2
-
 
 class ControlScript(Program):
     """The control script as its commands see it: arguments, answers, progress, threads.
@@ -48,6 +46,7 @@ class ControlScript(Program):
 
     def give_integer(self, value: int) -> None:
         """Answer with an integer."""
+        # The third register of the script's own reports progress.
         self.box.registers.output_int[self.offset + 1] = int(value)
 
     def give_numbers(self, values: Floats) -> None:
@@ -66,7 +65,7 @@ class ControlScript(Program):
         word = self._writes << 16 | self._operation << 24
         if value is not None:
             word |= 1 << 15 | min(value, 0x7FFF)
-        self.box.registers.output_int[self.offset + PROGRESS_REGISTER] = word
+        self.box.registers.output_int[self.offset + 2] = word
 
     def in_background(self, operation: Thread) -> Thread:
         """Wrap a thread so that its progress shows."""

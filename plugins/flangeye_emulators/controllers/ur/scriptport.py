@@ -16,9 +16,6 @@ from flangeye_emulators.controllers.ur.urscript import (
 
 PORT = 30003
 
-LONGEST = 1 << 20
-"""Bytes without the end of a program after which a client is cut off."""
-
 
 class ScriptSession(Connection):
     """One client; every whole program it sends takes the place of the one that runs."""
@@ -35,7 +32,8 @@ class ScriptSession(Connection):
         while source is not None:
             run_program(self._box, source)
             source, self._buffer = take_program(self._buffer)
-        if len(self._buffer) > LONGEST:
+        # Bytes without the end of a program after which a client is cut off
+        if len(self._buffer) > 1 << 20:
             self.abort()
 
 

@@ -21,7 +21,6 @@ _MOVE = re.compile(
 )
 _OPTION = re.compile(rf"([avr])=({_NUMBER})")
 _OFFSET = re.compile(r"reg_offset_int = # int register offset\s*(\d+)")
-_PATH_BEGINS = "# inject move path\n"
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +68,7 @@ def register_offset(program: str) -> int:
 
 def injected_path(program: str) -> list[Move]:
     """Return the moves ur_rtde wrote into its control script; empty when there are none."""
-    _, begins, rest = program.partition(_PATH_BEGINS)
+    _, begins, rest = program.partition("# inject move path\n")
     if not begins:
         return []
     body = re.split(r"^\s*end\b", rest, maxsplit=1, flags=re.M)[0]

@@ -8,8 +8,6 @@ from typing import Any, TypeVar
 from flangeye.devices import DeviceError
 
 PORT = 30004
-PATIENCE_MS = 500
-"""Longest wait for one answer [ms]; the library then raises, it never hangs."""
 
 CODES = {
     1: "the controller is not in a state for it",
@@ -50,7 +48,8 @@ class AuboClient:
         self._failure = sdk.AuboException
         self._rpc = sdk.RpcClient()
         self._rpc.setLogHandler(_say_nothing)
-        self._rpc.setRequestTimeout(PATIENCE_MS)
+        # Longest wait for one answer [ms]; the library then raises, it never hangs
+        self._rpc.setRequestTimeout(500)
         if self.ask("connect", lambda: self._rpc.connect(host, PORT)) != 0:
             raise DeviceError(
                 f"{name}: nothing answers at {host}:{PORT}: is the controller on, is {host} its "

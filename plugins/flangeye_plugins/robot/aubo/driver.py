@@ -35,8 +35,6 @@ SHOWN = POSE.in_units("mm", "deg")
 STALE = 0.1
 """Reading the arm takes a millisecond; where it takes longer than this, the network is lost [s]."""
 
-BEGUN = 0.3
-"""A move that has not begun after this has ended already [s]."""
 
 STOP = 4.0
 """Deceleration of a stop [m/s^2, rad/s^2]."""
@@ -272,7 +270,8 @@ class AuboRobot(Device):
 
     def _arrive(self, move: Callable[[], int]) -> None:
         """Let the controller make the last bit, and expect it to begin."""
-        self._begins = time.monotonic() + BEGUN
+        # A move that has not begun after this has ended already [s]
+        self._begins = time.monotonic() + 0.3
         self._client.command("move", move)
 
     def _in_space(self, base_T_goal: Floats) -> Callable[[RobotState], tuple[Floats, float]]:

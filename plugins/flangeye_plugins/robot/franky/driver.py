@@ -33,8 +33,6 @@ from flangeye_plugins.robot.tool_check import (
 
 SHOWN = CONVENTIONS["rpy"].in_units("mm", "deg")
 
-SLOWEST = 1e-3
-"""Smallest share of the arm's limits that the library is asked for."""
 
 MODES: dict[str, tuple[Mode, str]] = {
     "Idle": ("ready", ""),
@@ -248,7 +246,8 @@ class FrankyRobot(Device):
 
     def _factor(self, speed: float, acceleration: float) -> Any:
         """Return shares of the arm's limits; jerk follows the acceleration."""
-        shares = np.clip([speed, acceleration, acceleration], SLOWEST, 1.0)
+        # Smallest share of the arm's limits that the library is asked for
+        shares = np.clip([speed, acceleration, acceleration], 1e-3, 1.0)
         return self._sdk.RelativeDynamicsFactor(*(float(share) for share in shares))
 
     def _ask(self, question: Any) -> Any:

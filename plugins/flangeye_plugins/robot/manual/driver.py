@@ -20,7 +20,6 @@ from flangeye_plugins.robot.manual.plausibility import Tolerance, fault
 PERIOD = 0.05
 """Between two looks at the input [s]."""
 
-YES = ("y", "yes")
 
 STOPPED = "it was stopped on its way, and nobody has said where it stands"
 
@@ -168,7 +167,7 @@ class ManualRobot(Device):
             self._take(line)
 
     def _take(self, line: str) -> None:
-        if self._faulted is not None and line.lower() in YES:
+        if self._faulted is not None and line.lower() in ("y", "yes"):
             self._arrive(*self._faulted)
             return
         try:

@@ -11,12 +11,6 @@ from flangeye.maths.geometry import rotation_log
 from flangeye.maths.pose_formats import CONVENTIONS, AngleUnit, LengthUnit, PoseConvention
 from flangeye.types import Floats
 
-REACH_MARGIN = 1.1
-"""A pose this much farther than the arm is long is not the arm's."""
-
-TOOL_ALONG = 0.02
-"""How far from the flange's axis a tool's tip is looked for [m]."""
-
 
 class Tolerance(NamedTuple):
     """How near to the pose asked for a pose has to be.
@@ -57,7 +51,8 @@ def fault(
         )
         return _with_hint(complaint, _meant(numbers, convention, asked, tolerance))
     distance = float(np.linalg.norm(pose[:3, 3]))
-    if distance > REACH_MARGIN * reach:
+    # A pose this much farther than the arm is long is not the arm's
+    if distance > 1.1 * reach:
         complaint = f"that is {distance:.4g} m from the base, and the arm is {reach:.2f} m long"
         return _with_hint(complaint, _unit(convention))
     if distance < reach / 200:
@@ -118,7 +113,8 @@ def _tool(pose: Floats, asked: Floats, tolerance: Tolerance) -> str | None:
     """Return a hint where only a tool can lie between the pose and the flange."""
     off = _apart(asked, pose)
     in_flange = asked[:3, :3].T @ (pose[:3, 3] - asked[:3, 3])
-    along_axis = np.hypot(in_flange[0], in_flange[1]) < TOOL_ALONG and in_flange[2] > 0
+    # How far from the flange's axis a tool's tip is looked for [m]
+    along_axis = np.hypot(in_flange[0], in_flange[1]) < 0.02 and in_flange[2] > 0
     if off.angle <= tolerance.angle and along_axis:
         return f"is a tool of {in_flange[2] * 1e3:.0f} mm set; the flange's pose is asked for"
     return None

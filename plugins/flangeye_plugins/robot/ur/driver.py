@@ -30,8 +30,6 @@ from flangeye_plugins.robot.ur.status import condition_of
 SHOWN = CONVENTIONS["ur"]
 POSE = SHOWN.in_units("m", "rad")
 
-OPENING = 2.6
-"""Longest time until the client library is connected, first questions included [s]."""
 
 STALE = 0.1
 """A sample older than this is no news of the arm [s]."""
@@ -67,7 +65,8 @@ def robot_ur_rtde(model: RobotModel, params: UrRtdeParams, reads_only: bool = Fa
     name = f"{model.model} at {params.host}"
     began = time.monotonic()
     facts = dashboard.facts_of(name, params.host, to_drive=not reads_only)
-    patience = OPENING - (time.monotonic() - began)
+    # Longest time until the client library is connected, first questions included [s]
+    patience = 2.6 - (time.monotonic() - began)
     link = Link(name, params.host, facts.period, patience, reads_only)
     expected = params.tool.flange_T_tool(SHOWN)
     try:

@@ -22,9 +22,6 @@ from flangeye.files.children import python_command
 from flangeye.types import Floats
 from flangeye_plugins.robot.ur import worker
 
-ANSWERING = 0.8
-"""Longest time until a command is answered [s]; the library answers within a few cycles."""
-
 VECTORS = worker.SAMPLE.size - 4 * 6 * 8
 """Where a sample's vectors begin."""
 
@@ -138,7 +135,8 @@ class Link:
             self._line.send(json.dumps({"do": what, **arguments}).encode())
         except OSError:
             self._give_up(self._loss())
-        return self._answer(what, ANSWERING)
+        # Longest time until a command is answered [s]; the library answers within a few cycles
+        return self._answer(what, 0.8)
 
     def close(self, hopeless: bool = False) -> None:
         """Let the process stop arm and program, and end it; safe to call twice.

@@ -11,8 +11,6 @@ from flangeye_plugins.robot.ur.link import Sample
 
 RUNNING = 7
 NORMAL, REDUCED = 1, 2
-STANDING = 2e-3
-"""A joint that is slower than this stands [rad/s]; a standing arm's noise is half of it."""
 
 REMOTE = "it is in local control: choose Remote Control at the top right of the pendant"
 PROGRAM = (
@@ -75,5 +73,6 @@ def condition_of(sample: Sample, commanded: bool) -> Condition:
         return Condition("not ready", REMOTE)
     if sample.runtime != 2:
         return Condition("not ready", PROGRAM)
-    moves = commanded or sample.busy or bool(np.abs(sample.joint_speeds).max() > STANDING)
+    # A joint that is slower than this stands [rad/s]; a standing arm's noise is half of it
+    moves = commanded or sample.busy or bool(np.abs(sample.joint_speeds).max() > 2e-3)
     return Condition("moving" if moves else "ready")

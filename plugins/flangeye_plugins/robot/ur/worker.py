@@ -36,16 +36,10 @@ LOOK = struct.Struct("<d")
 behind the sample."""
 
 MEMORY = SIZE + LOOK.size
-DASHBOARD = 29999
 PLAYING = 2
 LOST = 17
 """Exit code: the connection to the controller has ended."""
 
-WATCHDOG = 5.0
-"""The controller stops the program when it hears less often from this process [Hz]."""
-
-KICK = 0.02
-"""Longest silence towards the controller [s]."""
 
 GRACE = 0.1
 """A velocity ends when the next command is this late [s]; :data:`flangeye.devices.GRACE`."""
@@ -53,22 +47,6 @@ GRACE = 0.1
 SILENT = 0.15
 """A motion ends when nobody looked for so long [s]; :data:`flangeye.devices.SILENT`."""
 
-BEGUN = 0.5
-"""A move that has not begun after this has ended already [s]."""
-
-STOP = 4.0
-"""Deceleration of a stop: [m/s^2] along a straight way, [rad/s^2] in joints."""
-
-DRIFT = 0.02
-"""How fast a delay that stays is taken for the clock's own. A clock drifts a thousand times less;
-but a controller on loopback stands still while its machine is too busy, and its clock with it. A
-network that becomes slow by 400 ms still shows for fifteen seconds."""
-
-TAKEN = 1.0
-"""How long to try for registers that another client still has [s]."""
-
-LAST_TRY = 0.3
-"""Longest time for stopping the arm before the process ends [s]."""
 
 ASKING = 0.2
 """Between two questions whether the control is remote [s]."""
@@ -90,7 +68,10 @@ class SampleClock:
 
     def sampled(self, controller: float, arrived: float) -> float:
         """Return when a sample of the controller's time ``controller`` was taken [s]."""
-        allowed = self._offset + DRIFT * abs(controller - self._last)
+        # How fast a delay that stays is taken for the clock's own. A clock drifts a thousand times
+        # less; but a controller on loopback stands still while its machine is too busy, and its
+        # clock with it. A network that becomes slow by 400 ms still shows for fifteen seconds
+        allowed = self._offset + 0.02 * abs(controller - self._last)
         self._offset, self._last = min(allowed, arrived - controller), controller
         return controller + self._offset
 
@@ -170,7 +151,8 @@ class Commander:
         if now < self._velocity_until:
             return True
         status = self._control.getAsyncOperationProgressEx()
-        begins = status.operationId() == self._operation and now < self._commanded + BEGUN
+        # A move that has not begun after this has ended already [s]
+        begins = status.operationId() == self._operation and now < self._commanded + 0.5
         return begins or status.isAsyncOperationRunning()
 
     def move_joints(self, joints: Sequence[float], speed: float, acceleration: float) -> None:
@@ -195,7 +177,8 @@ class Commander:
         """Brake, if there is anything to brake; the next command finds the arm at rest."""
         if self.busy() or self._velocity_until > -math.inf:
             self._velocity_until = -math.inf
-            self._stopping(STOP)
+            # Deceleration of a stop: [m/s^2] along a straight way, [rad/s^2] in joints
+            self._stopping(4.0)
         self._commanded = -math.inf
 
     def tool(self) -> list[float]:
@@ -230,7 +213,8 @@ class Commander:
         """End the process, after a last try to stop the arm; its watchdog is the one after."""
         last_try = threading.Thread(target=self.end, daemon=True)
         last_try.start()
-        last_try.join(LAST_TRY)
+        # Longest time for stopping the arm before the process ends [s]
+        last_try.join(0.3)
         os._exit(0)
 
     def _begin(self, stopping: Callable[[float], Any]) -> None:
@@ -289,7 +273,7 @@ def ask_dashboard(host: str, patience: float = 1.0) -> Any:
         OSError: It does not answer.
     """
     with (
-        socket.create_connection((host, DASHBOARD), timeout=patience) as line,
+        socket.create_connection((host, 29999), timeout=patience) as line,
         line.makefile("r", encoding="utf-8", errors="replace") as answers,
     ):
         answers.readline()
@@ -312,7 +296,8 @@ def read_remote(answer: str) -> int:
 def serve(line: socket.socket, commander: Commander | Onlooker) -> None:
     """Do what comes through the socket until it ends."""
     while True:
-        ready, _, _ = select.select([line], [], [], KICK)
+        # Longest silence towards the controller [s]
+        ready, _, _ = select.select([line], [], [], 0.02)
         if not ready:
             commander.idle()
             continue
@@ -351,7 +336,8 @@ def connect(host: str) -> Any:
     """
     import rtde_control
 
-    until = time.monotonic() + TAKEN
+    # How long to try for registers that another client still has [s]
+    until = time.monotonic() + 1.0
     while True:
         try:
             control = rtde_control.RTDEControlInterface(host)
@@ -361,7 +347,8 @@ def connect(host: str) -> Any:
             if "already in use" not in str(error) or time.monotonic() > until:
                 raise
             time.sleep(0.1)
-    if not control.setWatchdog(WATCHDOG):
+    # The controller stops the program when it hears less often from this process [Hz]
+    if not control.setWatchdog(5.0):
         raise Refused("the controller did not take the watchdog")
     return control
 

@@ -17,12 +17,8 @@ from flangeye_emulators.controllers.ur.program import ProgramError, Thread
 if TYPE_CHECKING:
     from flangeye_emulators.controllers.ur.script import ControlScript
 
-SHORTEST_LOOKAHEAD = 0.03
-"""[s]"""
 
 TOOL_FEATURE, CUSTOM_FEATURE = 1, 2
-JOG_STOP = 1.2
-"""Deceleration at the end of jogging [m/s^2]."""
 
 
 def order_speed(script: ControlScript, in_space: bool) -> None:
@@ -72,7 +68,7 @@ def servo_in_space(script: ControlScript) -> None:
 
 
 def _order_servo(script: ControlScript, target: np.ndarray) -> None:
-    lookahead = max(script.number(9), SHORTEST_LOOKAHEAD)
+    lookahead = max(script.number(9), 0.03)
     script.orders.servo = ServoOrder(target, lookahead, script.number(10))
     if not script.runs("servo"):
         script.start("servo", _follow(script))
@@ -120,7 +116,8 @@ def start_jog(script: ControlScript) -> None:
 def stop_jog(script: ControlScript) -> Thread:
     """42, jogStop."""
     script.kill("jog")
-    yield from script.stop_in_space(JOG_STOP)
+    # Deceleration at the end of jogging [m/s^2]
+    yield from script.stop_in_space(1.2)
 
 
 COMMANDS: dict[int, Callable[[ControlScript], Thread | None]] = {

@@ -18,18 +18,8 @@ if TYPE_CHECKING:
     from flangeye_emulators.controllers.ur.script import ControlScript
 
 
-CONTACT_FORCE = 5.0
-"""Force against the direction that counts as contact [N]; the sensor's precision is 3.5 N."""
-
-FIRST_TOUCH = 0.2
-"""Force at which a contact is taken to have begun [N]."""
-
-CONTACT_STOP = 3.0
-"""Deceleration after a contact [m/s^2], and how the tool goes back to it: the script's numbers."""
 BACK_SPEED, BACK_ACCELERATION = 0.25, 1.2
 
-FORCE_STOP = 10.0
-"""Deceleration at the end of force mode [m/s^2]."""
 
 PLAIN_FRAME = 2
 """Force mode type: the frame is taken as it is given."""
@@ -62,7 +52,8 @@ def stop_force_mode(script: ControlScript) -> Thread:
     script.kill("force")
     script.arm.force_mode = None
     script.critical = True
-    yield from script.stop_in_space(FORCE_STOP)
+    # Deceleration at the end of force mode [m/s^2]
+    yield from script.stop_in_space(10.0)
     script.critical = False
 
 
@@ -87,11 +78,13 @@ def steps_since_contact(history: Sequence[tuple[Floats, Floats]], direction: Flo
     if length == 0.0:
         return 0
     ahead = direction / length
-    if -float(history[-1][1][:3] @ ahead) < CONTACT_FORCE:
+    # Force against the direction that counts as contact [N]; the sensor's precision is 3.5 N
+    if -float(history[-1][1][:3] @ ahead) < 5.0:
         return 0
     steps = 0
     for _, wrench in reversed(history):
-        if -float(wrench[:3] @ ahead) < FIRST_TOUCH:
+        # Force at which a contact is taken to have begun [N]
+        if -float(wrench[:3] @ ahead) < 0.2:
             break
         steps += 1
     return max(steps, 1)
@@ -123,7 +116,8 @@ def go_back_to_contact(script: ControlScript, steps: int) -> Thread:
     arm = script.arm
     joints = arm.history[-min(steps + 1, len(arm.history))][0]
     contact = arm.chain.stance(joints).base_T_tcp
-    yield from script.stop_in_space(CONTACT_STOP)
+    # Deceleration after a contact [m/s^2], and how the tool goes back to it: the script's numbers
+    yield from script.stop_in_space(3.0)
     yield from script.complete(lambda: to_pose(arm, contact, BACK_SPEED, BACK_ACCELERATION))
 
 
