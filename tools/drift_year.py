@@ -16,7 +16,7 @@ from flangeye.estimation.watch.drift import (
     information_of,
     verdict,
 )
-from flangeye_emulators.world.year import (
+from tools.checked_year import (
     ABOUT,
     CORNERS,
     Happening,

@@ -10,7 +10,7 @@ from flangeye.plugin.registry import load_registry
 from flangeye.recipe.load import parse_recipe
 from flangeye.types import CAMERA, Capture, FlangeCloud, PointCloud
 from flangeye_plugins.acquire.opening import SIMULATED
-from flangeye_plugins.reader.folder import write_folder
+from tools.folder_archive import write_folder
 
 FOLDER = Path(__file__).parents[1] / "data" / "samples" / "ur5_phoxi-m"
 REACH = 0.07

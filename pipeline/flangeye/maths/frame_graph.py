@@ -40,20 +40,6 @@ def chain(frames: Mapping[str, Frame], name: str) -> list[str]:
     return path
 
 
-def root_of(frames: Mapping[str, Frame]) -> str:
-    """Return what everything stands on.
-
-    Raises:
-        StageError: A frame stands on nothing that leads to the root, or the graph has two roots.
-    """
-    roots = sorted({frames[chain(frames, name)[0]].parent for name in frames})
-    if len(roots) != 1:
-        raise StageError(
-            f"the frames stand on {' and '.join(roots)}, which nothing connects; give each a parent"
-        )
-    return roots[0]
-
-
 def composed(frames: Mapping[str, Frame], name: str) -> Floats:
     """Return root_T_frame, (4, 4) or (M, 4, 4); every place on the way is known.
 

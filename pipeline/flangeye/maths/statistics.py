@@ -67,31 +67,6 @@ def covariance_inflation(freedom: float, parameters: int = 6, probability: float
     return honest / chi2_quantile(probability, parameters)
 
 
-def mixture_inflation(squares: Floats, weights: Floats, probability: float = 0.95) -> float:
-    """Return the factor on a covariance that makes its region hold its share of a mixture.
-
-    The squared distance of a case is taken for a scaled chi-square variable of the same mean and
-    variance (Satterthwaite 1946): errors of one case may lie along few axes.
-
-    Args:
-        squares: (G, 2) traces of the covariance in each case and of its square, in units of the
-            covariance that is to be scaled.
-        weights: (G,) of the cases, one together.
-        probability: The region's.
-    """
-    from scipy.special import chdtr
-
-    parameters = round(float(weights @ squares[:, 0]))
-    scales = squares[:, 1] / np.maximum(squares[:, 0], 1e-300)
-    freedoms = squares[:, 0] / np.maximum(scales, 1e-300)
-    edge, low, high = chi2_quantile(probability, parameters), 0.0, float(squares[:, 0].max())
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        inside = float(weights @ chdtr(freedoms, edge * middle / scales))
-        low, high = (middle, high) if inside < probability else (low, middle)
-    return high
-
-
 def excess_variance(errors: Floats, covariances: Floats) -> float:
     """Return the isotropic variance [m^2] that errors show beyond their own covariances, robustly.
 
@@ -118,12 +93,6 @@ def excess_variance(errors: Floats, covariances: Floats) -> float:
         middle = 0.5 * (low + high)
         low, high = (middle, high) if too_small(middle) else (low, middle)
     return high
-
-
-def squared_distances(errors: Floats, covariances: Floats) -> Floats:
-    """Return the (N,) squared Mahalanobis distances of (N, k) errors, covariances (N, k, k)."""
-    solved = np.linalg.solve(covariances, errors[:, :, None])[:, :, 0]
-    return np.asarray(np.einsum("ni,ni->n", errors, solved))
 
 
 def corners_of(centre: Floats, size: Floats) -> Floats:

@@ -26,21 +26,19 @@ There the second arm's pose is ``second:``, with a position and a rotation of it
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
 from flangeye import Params, StageError, part
-from flangeye.files.clouds import PER_METRE, LengthUnit, write_cloud
+from flangeye.files.clouds import PER_METRE, LengthUnit
 from flangeye.files.recording import Archive, NotThisLayout, Recording
 from flangeye.files.scans import IMAGES, with_companion
-from flangeye.maths.geometry import quaternion_from_rotation
-from flangeye.types import FLANGE, FLANGE2, Capture, Floats, Transform
-from flangeye_plugins.reader.folder_poses import SECOND, ArmPose, PoseRow, read_poses
+from flangeye.types import FLANGE, FLANGE2, Floats
+from flangeye_plugins.reader.folder_poses import ArmPose, PoseRow, read_poses
 from flangeye_plugins.reader.poses import pose_from_quaternion, pose_from_rotation_vector
 
 POSE_FILES = ("poses.csv", "poses.yaml", "poses.yml", "poses.json")
@@ -70,41 +68,6 @@ def folder(path: Path, params: FolderParams) -> Archive:
         _refuse_unpaired(file, recordings)
     layout = f"folder, {file.name}"
     return Archive(layout, file.parent, recordings, [file], cloud_unit=poses.cloud_unit)
-
-
-def write_folder(path: Path, captures: Iterable[Capture]) -> None:
-    """Write captures as such a folder: binary PCD clouds and ``poses.csv``, all in metres.
-
-    Args:
-        path: Folder to write into; it is made.
-        captures: At least one; with or without joint angles and a second arm, all of them alike.
-    """
-    path.mkdir(parents=True, exist_ok=True)
-    rows: list[dict[str, Any]] = []
-    for capture in captures:
-        write_cloud(path / f"{capture.id}.pcd", capture.cloud)
-        rows.append(_row_of(capture))
-    with (path / "poses.csv").open("w", encoding="utf-8", newline="") as file:
-        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
-
-
-def _row_of(capture: Capture) -> dict[str, Any]:
-    joints = [] if capture.joints is None else capture.joints.tolist()
-    second = capture.poses.get(FLANGE2)
-    return {
-        "cloud": f"{capture.id}.pcd", "id": capture.id, "role": capture.role,
-        "time_ns": capture.time_ns, **_cells_of(capture.base_T_flange),
-        **{f"j{i}_rad": angle for i, angle in enumerate(joints, 1)},
-        **({} if second is None else _cells_of(second, SECOND)),
-    }  # fmt: skip
-
-
-def _cells_of(pose: Transform, prefix: str = "") -> dict[str, float]:
-    numbers = [*pose.translation.tolist(), *quaternion_from_rotation(pose.rotation).tolist()]
-    names = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
-    return {prefix + name: number for name, number in zip(names, numbers, strict=True)}
 
 
 _ADVICE = "; 'flangeye init FOLDER' writes a recipe for other tables"

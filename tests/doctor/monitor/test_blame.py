@@ -12,7 +12,7 @@ from flangeye.estimation.watch.blame import _noise, blame, explained, suspects
 from flangeye.estimation.watch.drift import Information, Sightings, allowance
 from flangeye.maths.geometry import hat
 from flangeye.types import Floats
-from flangeye_emulators.world.year import ABOUT, Happening, Year, watch
+from tools.checked_year import ABOUT, Happening, Year, watch
 
 DAILY = 3e-5
 WATCHED = watch(Year(checks=3), Happening(), np.random.default_rng(0))

@@ -33,8 +33,8 @@ from flangeye.estimation.watch.drift import (
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.maths.statistics import chi2_quantile, f_quantile
 from flangeye.types import Floats
-from flangeye_emulators.world.year import CORNERS, Happening, Year, watch
 from tools import drift_year
+from tools.checked_year import CORNERS, Happening, Year, watch
 
 
 def test_the_days_motion_is_marginalised_as_an_unknown_would_be() -> None:
@@ -209,7 +209,7 @@ def test_a_scanner_knocked_by_millimetres_is_found_at_once_and_named() -> None:
 
 def test_a_joint_re_mastered_is_named() -> None:
     from flangeye.estimation.watch.blame import blame, suspects
-    from flangeye_emulators.world.year import ABOUT, step_at
+    from tools.checked_year import ABOUT, step_at
 
     wrong = step_at(40, np.array([0, 0, 2e-3, 0, 0, 0]))
     watched = watch(Year(checks=46), Happening(joints=wrong), np.random.default_rng(3))

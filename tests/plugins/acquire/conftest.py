@@ -10,7 +10,7 @@ import pytest
 from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.models.loading import load_model
 from flangeye.types import CAMERA, Capture, PointCloud, Transform, by_frame
-from flangeye_plugins.reader.folder import write_folder
+from tools.folder_archive import write_folder
 
 
 @pytest.fixture

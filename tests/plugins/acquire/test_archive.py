@@ -19,7 +19,7 @@ from flangeye_plugins.acquire import archive as module
 from flangeye_plugins.acquire.archive import ArchiveParams, acquire_archive
 from flangeye_plugins.acquire.camera import CameraParams
 from flangeye_plugins.reader.auto import auto
-from flangeye_plugins.reader.folder import write_folder
+from tools.folder_archive import write_folder
 
 
 @pytest.fixture

@@ -24,7 +24,8 @@ from flangeye.types import (
 )
 from flangeye_plugins.acquire.archive import ArchiveParams, acquire_archive
 from flangeye_plugins.reader.auto import auto
-from flangeye_plugins.reader.folder import FolderParams, folder, write_folder
+from flangeye_plugins.reader.folder import FolderParams, folder
+from tools.folder_archive import write_folder
 
 SECOND = {"position": [500.0, -20.0, 300.0], "rotation_vector_rad": [0.1, 0.0, 0.2]}
 

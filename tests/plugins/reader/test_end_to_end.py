@@ -14,7 +14,7 @@ from flangeye.maths.pose_formats import PoseConvention
 from flangeye.models.boards import Board
 from flangeye.types import Capture, Transform, by_frame
 from flangeye_emulators.world.board_image import BoardCamera, render_board, scan_board
-from flangeye_plugins.reader.folder import write_folder
+from tools.folder_archive import write_folder
 
 CAMERA = BoardCamera(np.array([[700.0, 0, 320], [0, 700, 240], [0, 0, 1]]), (640, 480))
 FLANGE_T_CAMERA = rigid(rotation_exp(np.array([0.02, -0.03, 0.5])), np.array([0.06, 0.01, 0.04]))

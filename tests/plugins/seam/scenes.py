@@ -9,7 +9,7 @@ from flangeye.models.loading import load_model
 from flangeye.types import BASE, CAMERA, PointCloud, Transform, TransformEstimate, VerifiedHandEye
 from flangeye_emulators.scan.simulated import SimulatedScanParams, scan_simulated
 from flangeye_emulators.world.scanner import CameraPose, before_camera, scanner_of
-from flangeye_emulators.world.workpiece import Plate, _description, write_stl
+from tools.workpieces import Plate, _description, write_stl
 
 BASE_T_CAMERA = Transform(BASE, CAMERA, CameraPose().base_T_camera)
 RESOLUTION = 0.3

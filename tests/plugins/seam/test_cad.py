@@ -15,9 +15,9 @@ from flangeye.models.loading import load_model
 from flangeye.models.workpiece import load_workpiece
 from flangeye.types import CAMERA, Box, PointCloud, Seed, WorkpieceScan
 from flangeye_emulators.scan.simulated import SimulatedScanParams
-from flangeye_emulators.world.workpiece import PLATES, _description
 from flangeye_plugins.seam.cad import CadParams, seam_cad
 from tests.plugins.seam.scenes import BASE_T_CAMERA, hand_eye, scanned, write_plate
+from tools.workpieces import PLATES, _description
 
 MM = 1e-3
 PHOXI = load_model("scanners", "phoxi-m")

@@ -11,7 +11,6 @@ from flangeye.maths.statistics import (
     excess_variance,
     f_quantile,
     largest_error_quantile,
-    squared_distances,
 )
 
 
@@ -39,13 +38,6 @@ def test_errors_within_their_covariances_have_no_excess() -> None:
     errors = 1e-5 * np.random.default_rng(0).standard_normal((50, 3))
     assert excess_variance(errors, np.array([np.eye(3) * 1e-8] * 50)) == 0.0
     assert excess_variance(np.zeros((5, 3)), np.zeros((5, 3, 3))) == 0.0
-
-
-def test_squared_distances() -> None:
-    covariances = np.array([np.diag([1.0, 4.0]), np.eye(2)])
-    np.testing.assert_allclose(
-        squared_distances(np.array([[1.0, 2.0], [3.0, 4.0]]), covariances), [2.0, 25.0]
-    )
 
 
 def test_a_pure_shift_is_as_likely_in_every_corner() -> None:

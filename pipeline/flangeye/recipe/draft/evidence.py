@@ -131,14 +131,6 @@ def _apart(one: Floats, other: Floats) -> float:
     return float(np.median(np.abs(one - other))) / min(max(size, 1e-6), 1.0)
 
 
-def turn_alike(arm: Floats, target: Floats) -> bool:
-    """Return whether poses (N, 4, 4) of arm and target turn by the same angles."""
-    one, other = _turned(arm), _turned(target)
-    if one is None or other is None or len(arm) < FEWEST or len(arm) != len(target):
-        return False
-    return bool(np.median(np.abs(one - other)) < ALIKE)
-
-
 def _turned(poses: Floats | None) -> Floats | None:
     """Return the angles [rad] between poses one and two apart."""
     if poses is None or len(poses) < 3:

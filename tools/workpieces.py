@@ -1,6 +1,6 @@
 """The sample workpieces: plates with a V-groove, straight and curved, and the files they ship as.
 
-``python -m flangeye_emulators.world.workpiece data/workpieces`` makes the files again.
+``python -m tools.workpieces data/workpieces`` makes the files again.
 """
 
 from __future__ import annotations
@@ -174,7 +174,7 @@ def _description(plate: Plate) -> str:
         "cad": f"{plate.name}.stl",
         "unit": "mm",
         "seams": [seam],
-        "source": "made by python -m flangeye_emulators.world.workpiece",
+        "source": "made by python -m tools.workpieces",
     }
     return yaml.safe_dump(described, sort_keys=False, default_flow_style=None, width=100)
 
