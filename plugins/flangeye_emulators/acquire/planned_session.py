@@ -51,6 +51,9 @@ from flangeye_emulators.world.session import (
 
 VERSION = 1
 """Raised whenever the same parameters would give other captures."""
+REPORTED = float(np.radians(0.0115)), 0.05e-3
+"""Standard deviation of a reported pose about and along each axis [rad, m]: half of what the data
+sheet of a UR5 gives for repeatability, 0.1 mm."""
 UNSEEN = 60
 """Poses that take no part and show what a calibration is worth, where the arm is not as it says."""
 HOME = ("0 deg", "-90 deg", "90 deg", "-90 deg", "-90 deg", "0 deg")
@@ -75,9 +78,6 @@ class SessionParams(Params):
 
     poses: int = Field(20, ge=3, description="Number of captures.")
     home: tuple[Angle, ...] = param(HOME, description="Joints of the first arm at the first pose.")
-    second_home: tuple[Angle, ...] = param(
-        HOME, description="Joints of the second arm at the first pose."
-    )
     spread: Angle = param("17 deg", gt=0, description="Largest change of a joint from there.")
     distance: Length = param(
         "650 mm", gt=0, description="Distance from camera to target at the first pose."
@@ -94,14 +94,6 @@ class SessionParams(Params):
     )
     facing: Angle = param(
         "50 deg", gt=0, description="Largest angle between the target's z and the view."
-    )
-    robot_rotation: Angle = param(
-        "0.0115 deg",
-        ge=0,
-        description="Standard deviation of a reported rotation about each axis; 0.2 mrad.",
-    )
-    robot_position: Length = param(
-        "0.05 mm", ge=0, description="Standard deviation of a reported position along each axis."
     )
     arm: ArmErrors = Field(
         default_factory=ArmErrors,
@@ -197,7 +189,7 @@ def plan_session(
     closed_by_arm = camera is not None and known is not None and other is None
     if closed_by_arm and camera is not None:
         home = home_of(cast.first, place @ invert(camera @ view.first()))
-    poses = draw_arm_poses(cast, (home, np.asarray(params.second_home)), params.spread, rng)
+    poses = draw_arm_poses(cast, (home, np.asarray(SessionParams().home)), params.spread, rng)
     places = close_loop(poses, view, configuration, camera, place)
     if closed_by_arm and camera is not None:
         places = Places(camera, np.eye(4), place)
@@ -209,11 +201,7 @@ def plan_session(
         other_drawn = ImperfectArm(second.model, 1.0, draw, params.arm) if second else None
         return _as_built(planned, (drawn, other_drawn), params, rng)
     session = planned.where(np.arange(params.poses))
-    return replace(session, actual=with_noise(session.actual, configuration, _noise(params), rng))
-
-
-def _noise(params: SessionParams) -> tuple[float, float]:
-    return params.robot_rotation, params.robot_position
+    return replace(session, actual=with_noise(session.actual, configuration, REPORTED, rng))
 
 
 def _as_built(
@@ -227,7 +215,7 @@ def _as_built(
     every = planned.where(np.arange(min(count + UNSEEN, len(planned.reported.camera))))
     built = replace(every, actual=as_built(every.reported, configuration, arms))
     session = built.where(np.arange(count))
-    shaken = with_noise(session.actual, configuration, _noise(params), rng)
+    shaken = with_noise(session.actual, configuration, REPORTED, rng)
     return replace(session, actual=shaken, unseen=built.noise_free()[count:])
 
 

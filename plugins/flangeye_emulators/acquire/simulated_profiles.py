@@ -14,7 +14,7 @@ from flangeye.models.robots import RobotModel
 from flangeye.models.targets import Sphere
 from flangeye.plugin.stage import stage
 from flangeye.types import CAMERA, Capture, Captures, Floats, PointCloud, Seed
-from flangeye.units import Angle, Length, param
+from flangeye.units import Length, param
 from flangeye_emulators.acquire.planned_session import (
     VERSION,
     PlaceParams,
@@ -26,6 +26,8 @@ from flangeye_emulators.world.session import View, seen_from
 
 IN_THE_HAND = {"position": ("60 mm", "0 mm", "40 mm"), "rpy": ("0 deg", "0 deg", "90 deg")}
 
+FAN = float(np.radians(28.0))
+"""Full angle of the laser's fan [rad]."""
 PASSES = (0.5, 0.95)
 """How far beside the sphere's centre the laser passes, in radii."""
 
@@ -42,13 +44,7 @@ class ProfilesParams(SessionParams):
     )
     near: Length = param("190 mm", gt=0, description="Nearest that the scanner sees.")
     far: Length = param("290 mm", gt=0, description="Farthest that the scanner sees.")
-    fan: Angle = param("28 deg", gt=0, description="Full angle of the laser's fan.")
     points: int = Field(1280, ge=50, description="Number of points in a profile.")
-    receiver: Length = param(
-        "-90 mm",
-        description="Where the receiver is beside the laser's plane, along y; from there the "
-        "sphere hides what is behind it.",
-    )
     noise: Length = param(
         "0.03 mm", ge=0, description="Standard deviation of a point along its ray."
     )
@@ -91,7 +87,7 @@ def acquire_simulated_profiles(
         StageError: The laser cuts the sphere at too few poses.
     """
     rng = np.random.default_rng([VERSION, seed])
-    seen = params.distance, params.near, params.far, (params.fan, 0.0), params.facing
+    seen = params.distance, params.near, params.far, (FAN, 0.0), params.facing
     # Joint vectors tried: a laser passes a small sphere at few of them
     view = ProfileView(*seen, 60_000, sphere.radius)
     session = plan_session(robot, None, configuration, (params, view), rng)
@@ -119,13 +115,14 @@ def profile_of(
         params: The scanner.
         rng: Draws its noise.
     """
-    x = np.linspace(-1, 1, params.points) * np.tan(params.fan / 2)
+    x = np.linspace(-1, 1, params.points) * np.tan(FAN / 2)
     rays = np.stack([x, np.zeros_like(x), np.ones_like(x)], axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         table = ((centre - params.table * up) @ up) / (rays @ up)
     depth = np.fmin(_sphere_depth(rays, centre, radius), np.where(table > 0, table, np.nan))
     points = rays * depth[:, None]
-    eye = np.array([0.0, params.receiver, 0.0])
+    # The receiver stands beside the laser's plane; the sphere hides from it what is behind.
+    eye = np.array([0.0, -90e-3, 0.0])
     seen = (depth > params.near) & (depth < params.far) & ~_hidden(points, eye, centre, radius)
     noisy = points + rays * (params.noise * rng.standard_normal(len(x)))[:, None]
     return noisy[seen].astype(np.float32)

@@ -29,7 +29,7 @@ from flangeye.types import (
     Seed,
     Transform,
 )  # fmt: skip
-from flangeye.units import Angle, Length, param
+from flangeye.units import Angle, param
 from flangeye_emulators.acquire.planned_session import (
     VERSION,
     PlannedSession,
@@ -53,12 +53,6 @@ class MarkerParams(SessionParams):
 
     field: tuple[Angle, Angle] = param(
         ("50 deg", "40 deg"), description="Horizontal and vertical field of view."
-    )
-    marker_rotation: Angle = param(
-        "0.05 deg", gt=0, description="Standard deviation of the marker's rotation about each axis."
-    )
-    marker_position: Length = param(
-        "0.1 mm", gt=0, description="Standard deviation of its position along each axis."
     )
     outliers: float = Field(
         0.0, ge=0, lt=1, description="Share of captures with a wrong marker pose."
@@ -86,7 +80,8 @@ def acquire_simulated_marker(
     view = View(params.distance, 0.3, 2.0, params.field, params.facing)
     session = plan_session(robot, second, configuration, (params, view), rng)
     seen = seen_from(session.actual, session.places)
-    noise = np.repeat([params.marker_rotation, params.marker_position], 3)
+    # Of a marker's measured pose, about and along each axis [rad, m].
+    noise = np.repeat([np.radians(0.05), 0.1e-3], 3)
     errors = noise * rng.standard_normal((len(seen), 6))
     wrong = rng.permutation(len(seen))[: round(params.outliers * len(seen))]
     errors[wrong] += np.repeat([0.5, 0.1], 3) * rng.standard_normal((len(wrong), 6))

@@ -17,7 +17,7 @@ from flangeye.models.scanners import ScannerModel
 from flangeye.models.workpiece import load_workpiece
 from flangeye.plugin.stage import part
 from flangeye.types import CAMERA, Array, Floats, PointCloud
-from flangeye.units import Angle, Length, param
+from flangeye.units import Length, param
 from flangeye_emulators.world import room
 from flangeye_emulators.world.bench import BenchParams, bench_with
 from flangeye_emulators.world.scanner import ScannerQuality, before_camera, scanner_of
@@ -30,15 +30,12 @@ class MountedParams(ScannerQuality, BenchParams):
     mount: tuple[Length, Length, Length] = param(
         ("60 mm", "0 mm", "40 mm"), description="The scanner's true position in ``flange``."
     )
-    mount_rpy: tuple[Angle, Angle, Angle] = param(
-        ("0 deg", "0 deg", "90 deg"), description="Its roll, pitch, yaw there."
-    )
     seed: int = Field(0, ge=0, description="Draws noise, distortion and what lies about.")
 
     @property
     def flange_T_camera(self) -> Floats:
-        """(4, 4), translation in [m]."""
-        return rigid(rotation_from_rpy(*self.mount_rpy), np.asarray(self.mount))
+        """(4, 4), translation in [m]; the scanner is turned by a quarter about the flange's z."""
+        return rigid(rotation_from_rpy(0.0, 0.0, np.pi / 2), np.asarray(self.mount))
 
 
 @part("scanner.mounted")

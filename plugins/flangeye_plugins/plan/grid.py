@@ -30,13 +30,11 @@ class GridParams(Params):
     facing: Angle = param(
         "35 deg", gt=0, description="Largest angle between the flange's normal and the view."
     )
-    shuffled: bool = Field(True, description="Whether to visit the grid in random order.")
-    attempts: int = Field(25, ge=1, description="Orientations tried per grid point.")
 
 
 @part("plan.grid")
 def grid(site: Site, rng: np.random.Generator, params: GridParams) -> Plan:
-    """Visit a grid of points, each in a random orientation facing the scanner.
+    """Visit a grid of points in random order, each in a random orientation facing the scanner.
 
     The paper's plan (section 3.1: 5 x 5 x 3 points over 0.3 x 0.3 x 0.2 m; roll, pitch and yaw
     below 0.3 rad in 3.2.1). A grid point where no orientation is possible is left out.
@@ -48,9 +46,7 @@ def grid(site: Site, rng: np.random.Generator, params: GridParams) -> Plan:
     """
     centre = site.centre if params.centre is None else np.asarray(params.centre)
     size = np.asarray(params.size)
-    nodes = centre + size * _unit_grid(params.counts)
-    if params.shuffled:
-        nodes = rng.permutation(nodes)
+    nodes = rng.permutation(centre + size * _unit_grid(params.counts))
     facing = site.facing(centre)
     found = [] if facing is None else [_pose_at(n, facing, site, rng, params) for n in nodes]
     return Plan([pose for pose in found if pose is not None], len(nodes), centre, size)
@@ -64,7 +60,7 @@ def _unit_grid(counts: tuple[int, int, int]) -> Floats:
 def _pose_at(
     place: Floats, facing: Floats, site: Site, rng: np.random.Generator, params: GridParams
 ) -> PlannedPose | None:
-    for _ in range(params.attempts):
+    for _ in range(25):
         pose = tilted(place, facing, params.tilt, rng)
         if angle_between(pose[:3, 2], site.eye - place) > params.facing:
             continue

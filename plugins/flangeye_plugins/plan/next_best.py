@@ -29,9 +29,6 @@ class NextBestParams(Params):
         ("300 mm", "300 mm", "200 mm"),
         description="Edges of the work along the base's axes: where the matrix has to be right.",
     )
-    region: Point | None = Field(
-        None, description="Edges of the box that poses are chosen from; 1.6 times the work's."
-    )
     tilt: Angle = param(
         "0.3 rad", ge=0, description="Largest roll, pitch and yaw away from facing the scanner."
     )
@@ -44,9 +41,6 @@ class NextBestParams(Params):
         "0.15 mm",
         gt=0,
         description="Expected standard deviation of a centre per axis: scanner, fit and arm.",
-    )
-    normal_noise: Angle = param(
-        "0.1 deg", gt=0, description="Expected standard deviation of a normal."
     )
 
 
@@ -72,9 +66,8 @@ class Chooser:
         self, site: Site, rng: np.random.Generator, params: NextBestParams, work: Box
     ) -> None:
         self._site, self._rng, self._params, self._work = site, rng, params, work
-        # Edges of the region that poses are chosen from, over the work's: levers are long there
-        region = 1.6 * work.size if params.region is None else np.asarray(params.region)
-        self._region = Box(work.centre, region)
+        # Poses are chosen beyond the work too: levers are long there.
+        self._region = Box(work.centre, 1.6 * work.size)
         self._moved_by = levers(work.grid(3) - work.centre)
         self._visited: list[Floats] = []
 
@@ -144,7 +137,7 @@ class Chooser:
         of_normal = np.concatenate([-hat(axes), np.zeros((len(axes), 3, 3))], axis=2)
         return np.asarray(
             np.einsum("mai,maj->mij", of_centre, of_centre) / self._params.noise**2
-            + np.einsum("mai,maj->mij", of_normal, of_normal) / self._params.normal_noise**2
+            + np.einsum("mai,maj->mij", of_normal, of_normal) / np.radians(0.1) ** 2
         )
 
 

@@ -33,7 +33,7 @@ from flangeye.types import (
     Observation,
     TransformEstimate,
 )
-from flangeye.units import Angle, Length, param
+from flangeye.units import Angle, param
 
 FOLDS, HELPFUL = 5, 0.95
 """The arm's error is kept when it brings the error on poses held out to this share or less."""
@@ -48,16 +48,6 @@ class ArmParams(Params):
 
     zeros: Angle = param(
         "5 mrad", gt=0, description="Expected standard deviation of a joint's zero."
-    )
-    lengths: Length = param(
-        "0.5 mm",
-        ge=0,
-        description="Expected standard deviation of a link length or offset; 0: joint zeros only.",
-    )
-    twists: Angle = param(
-        "1 mrad",
-        ge=0,
-        description="Expected standard deviation of a link's twist; 0: not estimated.",
     )
     propose: int = Field(
         6, ge=0, description="Number of further poses to propose for identifying the arm."
@@ -107,7 +97,8 @@ def refine_arm(calibration: HandEye, params: ArmParams, robot: RobotModel) -> Ha
         StageError: There are too few poses, or the robot's model does not reach them.
     """
     before, arm = calibration.as_reported(), Arm(robot)
-    prior = deviations(arm.n, params.zeros, params.lengths, params.twists)
+    # Expected of link lengths and offsets [m], and of twists [rad], of a calibrated arm.
+    prior = deviations(arm.n, params.zeros, 0.5e-3, 1e-3)
     found = _best(before, arm, prior)
     errors = _held_out(before, arm, found, prior)
     known = identified(found.fit, prior, found.apart)
