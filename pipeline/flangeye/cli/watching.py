@@ -13,6 +13,7 @@ from flangeye.cli.console import say
 
 if TYPE_CHECKING:
     from flangeye.doctor.monitor import Check, StoredCalibration
+    from flangeye.estimation.watch.drift import DriftTest
     from flangeye.plugin.registry import Registry
 
 
@@ -32,6 +33,20 @@ HistoryFile = Annotated[
     Path | None,
     typer.Option(help="History file; default monitor.jsonl beside the calibration's log."),
 ]
+FalseAlarms = Annotated[
+    float, typer.Option(min=1e-9, max=0.05, help="Probability of a false alarm per check.")
+]
+Limit = Annotated[str, typer.Option(help="Smallest slow drift reported as MOVED.")]
+OpcUa = Annotated[
+    str | None, typer.Option(metavar="URL,NODE", help="Write the state to an OPC UA node.")
+]
+OpcUaSecurity = Annotated[
+    str | None,
+    typer.Option(
+        metavar="POLICY,MODE,CERTIFICATE,KEY",
+        help="OPC UA security for a server on another machine; none for an open connection.",
+    ),
+]
 
 
 @app.command()
@@ -49,21 +64,10 @@ def monitor(  # noqa: PLR0913  one argument an option
     move: Move = False,
     overrides: Overrides = None,
     history: HistoryFile = None,
-    false_alarms: Annotated[
-        float, typer.Option(min=1e-9, max=0.05, help="Probability of a false alarm per check.")
-    ] = 2e-4,
-    limit: Annotated[str, typer.Option(help="Smallest slow drift reported as MOVED.")] = "0.4 mm",
-    opcua: Annotated[
-        str | None,
-        typer.Option(metavar="URL,NODE", help="Write the state to an OPC UA node."),
-    ] = None,
-    opcua_security: Annotated[
-        str | None,
-        typer.Option(
-            metavar="POLICY,MODE,CERTIFICATE,KEY",
-            help="OPC UA security for a server on another machine; none for an open connection.",
-        ),
-    ] = None,
+    false_alarms: FalseAlarms = 2e-4,
+    limit: Limit = "0.4 mm",
+    opcua: OpcUa = None,
+    opcua_security: OpcUaSecurity = None,
 ) -> None:
     """Check whether a calibration still holds.
 
@@ -82,16 +86,11 @@ def monitor(  # noqa: PLR0913  one argument an option
     )
     from flangeye.doctor.monitor.opcua import write_state
     from flangeye.errors import StageError
-    from flangeye.estimation.watch.drift import DriftTest
-    from flangeye.units import parse_quantity
 
     archive = [*(archive or ()), *(more or ())]
     if live == bool(archive):
         raise StageError("name later scans with --archive, or let the arm take them with --live")
-    try:
-        test = DriftTest(false_alarms=false_alarms, limit=parse_quantity(limit, "length"))
-    except ValueError as error:
-        raise StageError(f"--limit: {error}") from None
+    test = _drift_test(false_alarms, limit)
     url, node = _opcua_node(opcua, opcua_security) if opcua else ("", "")
     stored = stored_calibration(calibration)
     place = history or stored.path.parent / "monitor.jsonl"
@@ -107,6 +106,17 @@ def monitor(  # noqa: PLR0913  one argument an option
     if opcua:
         write_state(url, node, kept.findings[-1], opcua_security)
     raise typer.Exit(CODES[kept.findings[-1].state])
+
+
+def _drift_test(false_alarms: float, limit: str) -> DriftTest:
+    from flangeye.errors import StageError
+    from flangeye.estimation.watch.drift import DriftTest
+    from flangeye.units import parse_quantity
+
+    try:
+        return DriftTest(false_alarms=false_alarms, limit=parse_quantity(limit, "length"))
+    except ValueError as error:
+        raise StageError(f"--limit: {error}") from None
 
 
 def _checks(

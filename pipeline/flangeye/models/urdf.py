@@ -350,9 +350,11 @@ def _axis_name(direction: Floats) -> str:
 
 
 def _base(urdf: Urdf, asked: str | None, to_flange: list[ET.Element]) -> str:
-    """Return the base: as asked, the frame ROS-Industrial calls ``base``, or where the first
-    moving joint stands.
-    """  # noqa: D205
+    """Return the base's link.
+
+    As asked, else the frame that ROS-Industrial calls ``base``, else where the first moving joint
+    stands.
+    """
     if asked is not None:
         return _known(urdf, asked, "base")
     prefixes = [name.removesuffix("base_link") for name in urdf.links if name.endswith("base_link")]

@@ -64,14 +64,13 @@ class AzureKinectParams(Params):
 
 @part("scanner.azure_kinect")
 def scanner_azure_kinect(model: ScannerModel | None, params: AzureKinectParams) -> Scanner:
-    """Scan with an Azure Kinect, or play its recording: depth, and colour as the depth camera
-    would see it.
+    """Scan with an Azure Kinect, or play its recording: depth, and colour mapped to it.
 
     A scan far out of the model's range is refused.
 
     Raises:
         DeviceError: No SDK, no camera, or no recording.
-    """  # noqa: D205
+    """
     if params.recording is not None and not params.recording.is_file():
         raise DeviceError(f"{NAME}: no recording at {params.recording}")
     pipe = _host(params)

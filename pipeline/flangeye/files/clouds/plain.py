@@ -25,12 +25,13 @@ NUMBERS = "fiu"
 
 
 def open_npy(path: Path) -> PointTable:
-    """Return the points of an array (N, 3) or (H, W, 3), of more columns the first three, or of
-    records with x, y and z.
+    """Return the points of an array.
+
+    It is (N, 3) or (H, W, 3), of more columns the first three, or has records with x, y and z.
 
     Raises:
         StageError: It is not such an array.
-    """  # noqa: D205
+    """
     shape, fields = _npy_header(path, records=True)
     if fields:
         axes_of(path, fields)
@@ -81,9 +82,10 @@ def _npy_header(path: Path, records: bool = False) -> tuple[Shape, tuple[str, ..
 def _shape_in(
     path: Path | str, file: IO[bytes], size: int, records: bool = False
 ) -> tuple[Shape, tuple[str, ...]]:
-    """Return the shape that a header states, held against the size of the whole [bytes], and the
-    names of the fields, where records of numbers are taken too.
-    """  # noqa: D205
+    """Return the shape that a header states, and the names of the fields of records.
+
+    The shape is held against the size of the whole [bytes].
+    """
     try:
         shape, kind = _header(file)
         found = size - file.tell()

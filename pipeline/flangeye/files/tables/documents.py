@@ -145,9 +145,11 @@ KINDS: Mapping[str, Callable[[Path], Document]] = {
 
 
 def _plain(value: Any) -> Any:
-    """Return data with matrices as arrays: those that state their rows and columns (OpenCV, ROS,
-    ViSP), and stacks with a pose for each last index (MATLAB), turned so that poses come first.
-    """  # noqa: D205
+    """Return data with matrices as arrays.
+
+    Matrices state their rows and columns (OpenCV, ROS, ViSP). Stacks with a pose for each last
+    index (MATLAB) are turned so that poses come first.
+    """
     if isinstance(value, np.ndarray):
         return _poses_first(value)
     if isinstance(value, list):

@@ -192,9 +192,10 @@ def _residuals_by_twins(
 
 
 def _residual(carried: Floats, seen: Floats) -> float | None:
-    """Return the median distance [m] of the target's places from one another; None where the
-    motions tell nothing.
-    """  # noqa: D205
+    """Return the median distance of the target's places from one another [m].
+
+    None where the motions do not determine it.
+    """
     try:
         motions = motions_of(carried, seen)
         turn = park_martin(motions)[:3, :3]

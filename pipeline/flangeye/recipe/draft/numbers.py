@@ -126,9 +126,10 @@ def _of_seven(table: Table, part: list[int], numbers: Floats, told: str) -> Pose
 
 
 def _of_six(table: Table, part: list[int], numbers: Floats, told: str) -> PoseColumns:
-    """Return which three of six numbers are the position: the only ones beyond any angle, else the
-    first.
-    """  # noqa: D205
+    """Return which three of six numbers are the position.
+
+    They are the only ones that exceed any angle, otherwise the first three.
+    """
     if "joint" in table.name.lower():
         return PoseColumns(table, tuple(part), JOINTS, guess=told)
     first, second = (float(np.nanmax(np.abs(numbers[:, at]))) for at in ([0, 1, 2], [3, 4, 5]))

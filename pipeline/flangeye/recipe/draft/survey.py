@@ -110,9 +110,10 @@ def _holds_numbers(table: Table) -> bool:
 
 
 def _whole(folder: Path, tables: Sequence[Table]) -> list[Table]:
-    """Return tables with rotations joined to the positions that are named as they are; points
-    without as many poses beside them are left out.
-    """  # noqa: D205
+    """Return tables with rotations joined to the positions that are named as they are.
+
+    Points without as many poses beside them are left out.
+    """
     keys = {table.name: _key(table.name) for table in tables if _width(table) in (3, 9)}
     joined: list[Table] = []
     used: set[str] = set()
