@@ -22,7 +22,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from flangeye.batch.scratch import PREFIX
+from flangeye.batch.cluster import PREFIX
 from flangeye.doctor.monitor import History, stored_calibration
 from flangeye.errors import FlangeyeError
 from flangeye.files.children import python_command

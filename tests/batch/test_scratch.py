@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from flangeye.batch.scratch import PREFIX, remove_forgotten, scratch
+from flangeye.batch.cluster import PREFIX, remove_forgotten, scratch
 
 
 @pytest.fixture(autouse=True)

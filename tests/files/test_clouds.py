@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as hnp
 
 from flangeye import StageError
 from flangeye.files.clouds import check_cloud_file, read_cloud, write_cloud
-from flangeye.files.clouds.lzf import LzfError, decompress
+from flangeye.files.clouds.table import LzfError, decompress
 from flangeye.types import CAMERA, PointCloud
 
 QUICK = settings(

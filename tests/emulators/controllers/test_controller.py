@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from flangeye_emulators.controllers.ur.dashboard import answer
-from flangeye_emulators.controllers.ur.scriptport import run_program
+from flangeye_emulators.controllers.ur.server import run_program
 from flangeye_emulators.controllers.ur.state import RobotMode, Runtime, SafetyMode
 from flangeye_emulators.controllers.ur.urscript import ScriptSource
 from tests.emulators.controllers.desk import Desk, away

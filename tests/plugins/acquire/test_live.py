@@ -7,8 +7,7 @@ import pytest
 
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.motion.supervision import Sample
-from flangeye_plugins.acquire.idle import Idle
-from flangeye_plugins.acquire.live import movement, within
+from flangeye_plugins.acquire.live import Idle, movement, within
 
 
 def samples(*times, move=0.0, turn=0.0):

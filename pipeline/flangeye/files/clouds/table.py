@@ -14,7 +14,54 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flangeye.files.clouds.header import refuse
-from flangeye.files.clouds.lzf import MAX_EXPANSION, LzfError, decompress
+
+MAX_EXPANSION = 88
+"""A token of three bytes writes 264 at most: more than that is no LZF stream."""
+
+
+class LzfError(ValueError):
+    """The stream is damaged."""
+
+
+def decompress(data: bytes, wanted: int) -> bytearray:
+    """Return the first ``wanted`` bytes that ``data`` stands for; the rest is not decoded.
+
+    Raises:
+        LzfError: The stream ends early, or refers to what was never written.
+    """
+    out = bytearray()
+    at = 0
+    try:
+        while len(out) < wanted:
+            control = data[at]
+            at += 1
+            if control < 32:
+                out += data[at : at + control + 1]
+                at += control + 1
+                continue
+            length = control >> 5
+            if length == 7:
+                length += data[at]
+                at += 1
+            start = len(out) - ((control & 31) << 8) - data[at] - 1
+            at += 1
+            _repeat(out, start, length + 2)
+    except IndexError:
+        raise LzfError("it ends early") from None
+    del out[wanted:]
+    return out
+
+
+def _repeat(out: bytearray, start: int, length: int) -> None:
+    """Append ``length`` bytes from ``start`` on; the source may reach into what is appended."""
+    if start < 0:
+        raise LzfError("it refers to bytes before its beginning")
+    period = len(out) - start
+    if period >= length:
+        out += out[start : start + length]
+    else:
+        out += (out[start:] * (length // period + 1))[:length]
+
 
 Shape = tuple[int, ...]
 Points = NDArray[np.float32]

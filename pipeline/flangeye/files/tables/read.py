@@ -8,6 +8,7 @@ document that have as many entries as ``arm``. Several names are tables side by 
 from __future__ import annotations
 
 import re
+from bisect import bisect
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,10 +18,27 @@ from flangeye.files.pairs import natural
 from flangeye.files.printable import reason_of
 from flangeye.files.regular import read_text
 from flangeye.files.tables.documents import document_of
-from flangeye.files.tables.programs import program_rows
 from flangeye.files.tables.records import record_of, rows_of
 from flangeye.files.tables.table import Row, Rows, Table
 from flangeye.files.tables.text import row_of, text_rows
+from flangeye.maths.pose_formats import CONVENTIONS
+
+
+def program_rows(file: Path, text: str) -> Rows | None:
+    """Return the positions in a text, a row each, with the convention they are in; None if none."""
+    for name, convention in CONVENTIONS.items():
+        found = list(re.finditer(convention.program, text)) if convention.program else []
+        if found:
+            ends = [end.start() for end in re.finditer("\n", text)]
+            rows = [
+                (f"{file}:{bisect(ends, match.start()) + 1}", match.groups()) for match in found
+            ]
+            own = convention.in_units(convention.program_length, convention.angle)
+            labels = zip(own.labels, own.units, strict=True)
+            heading = tuple("_".join(filter(None, pair)).lower() for pair in labels)
+            return Rows(heading, rows, convention=name)
+    return None
+
 
 _SHARE = re.compile(r"([1-9]\d?)/([1-9]\d?)")
 """A part of a file's rows: the first of so many equal ones."""

@@ -3,12 +3,130 @@
 from __future__ import annotations
 
 from flangeye.models.emulator import EmulatorOptions
-from flangeye_emulators.controllers.network import Network
+from flangeye_emulators.controllers.fault_injection import FaultInjector
+from flangeye_emulators.controllers.faults import Kind
+from flangeye_emulators.controllers.network import Connection, Network
 from flangeye_emulators.controllers.server import Server, run_server
 from flangeye_emulators.controllers.start import joint_zeros, starting_joints
-from flangeye_emulators.controllers.ur import dashboard, rtde, scriptport
-from flangeye_emulators.controllers.ur.controller import URController
-from flangeye_emulators.controllers.ur.faults import URFaultInjector
+from flangeye_emulators.controllers.ur import dashboard, rtde
+from flangeye_emulators.controllers.ur.commands import COMMANDS, STREAMED
+from flangeye_emulators.controllers.ur.controller import RefusedError, URController
+from flangeye_emulators.controllers.ur.custom import CustomProgram
+from flangeye_emulators.controllers.ur.program import Thread
+from flangeye_emulators.controllers.ur.script import ControlScript
+from flangeye_emulators.controllers.ur.urscript import (
+    CONTROL_SCRIPT,
+    ScriptSource,
+    injected_path,
+    register_offset,
+    take_program,
+)
+
+
+class URFaultInjector(FaultInjector):
+    """Causes three more faults.
+
+    * ``program-stop``: somebody stops the program at the pendant.
+    * ``remote-control-off``: somebody takes local control.
+    * ``inputs-low``: what the digital outputs started does not run any more.
+    """
+
+    def __init__(self, box: URController, network: Network) -> None:
+        super().__init__(box, network)
+        self._box = box
+        self.kinds["program-stop"] = Kind(lambda _: box.stop_program("at the pendant"))
+        self.kinds["remote-control-off"] = Kind(self._go_local)
+        self.kinds["inputs-low"] = Kind(lambda _: setattr(box, "wired", False))
+
+    def clear(self) -> None:
+        """End local control too, and wire the inputs again."""
+        super().clear()
+        self._box.remote_control = self._box.wired = True
+
+    def _go_local(self, seconds: float | None) -> None:
+        del seconds
+        self._box.remote_control = False
+
+
+READY, DONE = 1, 2
+
+
+class CommandLoop(ControlScript):
+    """Takes commands from the input registers, cycle by cycle."""
+
+    def main(self) -> Thread:
+        """Take commands until one ends the script."""
+        self.show_progress(None)
+        self._signal(READY)
+        executed = False
+        while True:
+            code = self.integer(0) or self._take_internal()
+            if code == 255:  # stop script
+                return
+            if code == 0:
+                executed = False
+                self._signal(READY)
+            elif code in STREAMED:
+                yield from self._process(code)
+                self._signal(READY)
+            elif not executed:
+                self.box.note(f"command {code}")
+                yield from self._process(code)
+                self._signal(DONE)
+                executed = True
+            yield
+
+    def _process(self, code: int) -> Thread:
+        handler = COMMANDS.get(code)
+        if handler is None:
+            self.box.note(f"command {code} is not simulated")
+            return
+        thread = handler(self)
+        if thread is not None:
+            yield from thread
+
+    def _take_internal(self) -> int:
+        code, self.internal = self.internal, 0
+        return code
+
+    def _signal(self, state: int) -> None:
+        self.box.registers.output_int[self.offset] = state
+
+
+SCRIPT_PORT = 30003
+
+
+class ScriptSession(Connection):
+    """One client; every whole program it sends takes the place of the one that runs."""
+
+    def __init__(self, network: Network, box: URController) -> None:
+        super().__init__(network)
+        self._box = box
+        self._buffer = ""
+
+    def received(self, data: bytes) -> None:
+        """Run each whole program."""
+        self._buffer += data.decode("utf-8", "replace")
+        source, self._buffer = take_program(self._buffer)
+        while source is not None:
+            run_program(self._box, source)
+            source, self._buffer = take_program(self._buffer)
+        # Bytes without the end of a program after which a client is cut off
+        if len(self._buffer) > 1 << 20:
+            self.abort()
+
+
+def run_program(box: URController, source: ScriptSource) -> None:
+    """Run a program; a controller that is not ready ignores it, as the robot does."""
+    program: CommandLoop | CustomProgram
+    if source.name == CONTROL_SCRIPT:
+        program = CommandLoop(box, register_offset(source.text), injected_path(source.text))
+    else:
+        program = CustomProgram(box, source.text)
+    try:
+        box.load(program, source.name)
+    except RefusedError as error:
+        box.note(f"program {source.name} ignored: {error}")
 
 
 def serve(options: EmulatorOptions) -> None:
@@ -21,7 +139,7 @@ def serve(options: EmulatorOptions) -> None:
     box = URController(options.robot, starting_joints(options.robot, options.joints), zeros)
     network = Network(options.host)
     stream = rtde.RtdePort(network, box)
-    network.offer(scriptport.PORT, lambda: scriptport.ScriptSession(network, box))
+    network.offer(SCRIPT_PORT, lambda: ScriptSession(network, box))
     network.offer(dashboard.PORT, lambda: dashboard.DashboardSession(network, box))
-    ports = {"RTDE": rtde.PORT, "script": scriptport.PORT, "dashboard": dashboard.PORT}
+    ports = {"RTDE": rtde.PORT, "script": SCRIPT_PORT, "dashboard": dashboard.PORT}
     run_server(Server(options, box, network, URFaultInjector(box, network), ports), stream.publish)
