@@ -178,12 +178,14 @@ def _length(function, lines):
 
 
 def _constants(node):
-    """Names in capitals that a statement of a module assigns."""
+    """Names in capitals that a statement of a module assigns; type variables are none."""
     if isinstance(node, ast.Assign):
         targets = node.targets
     elif isinstance(node, ast.AnnAssign):
         targets = [node.target]
     else:
+        return []
+    if isinstance(node.value, ast.Call) and ast.unparse(node.value.func) == "TypeVar":
         return []
     names = [n.id for target in targets for n in ast.walk(target) if isinstance(n, ast.Name)]
     return [name for name in names if name.isupper()]

@@ -27,27 +27,17 @@ class BatchProgress:
     """A progress bar of sessions; those without a calibration are named as they end."""
 
     def __init__(self, console: Console, total: int) -> None:
-        from rich.progress import (
-            BarColumn,
-            MofNCompleteColumn,
-            Progress,
-            TextColumn,
-            TimeElapsedColumn,
-            TimeRemainingColumn,
-        )
+        from rich import progress
 
         self._console = console
         self._counts: Counter[Status] = Counter()
         self._told = 0
-        self._progress = Progress(
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.description}"),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-            console=console,
-            transient=True,
-        )
+        self._progress = progress.Progress(
+            progress.BarColumn(), progress.MofNCompleteColumn(),
+            progress.TextColumn("{task.description}"),
+            progress.TimeElapsedColumn(), progress.TimeRemainingColumn(),
+            console=console, transient=True,
+        )  # fmt: skip
         self._task = self._progress.add_task("sessions", total=total)
 
     def __enter__(self) -> BatchProgress:

@@ -23,25 +23,18 @@ class RunProgress:
 
     def __init__(self, console: Console, steps: Iterable[str]) -> None:
         """Make a bar for a recipe whose steps have these labels."""
-        from rich.progress import (
-            BarColumn,
-            MofNCompleteColumn,
-            Progress,
-            TextColumn,
-            TimeElapsedColumn,
-            TimeRemainingColumn,
-        )
+        from rich import progress
 
         self.said: list[str] = []
         self._console = console
         self._once = list(steps)
         # 60 columns at most: the name, a bar of 12, the count, and both times.
-        self._progress = Progress(
-            TextColumn("{task.description:<16.16}", markup=False),
-            BarColumn(bar_width=12),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(compact=True),
+        self._progress = progress.Progress(
+            progress.TextColumn("{task.description:<16.16}", markup=False),
+            progress.BarColumn(bar_width=12),
+            progress.MofNCompleteColumn(),
+            progress.TimeElapsedColumn(),
+            progress.TimeRemainingColumn(compact=True),
             console=console,
             transient=True,
             disable=not console.is_terminal,

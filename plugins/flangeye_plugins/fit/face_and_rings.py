@@ -30,10 +30,11 @@ def face_and_rings(
     """Return the circle of a flange's rim, or why there is none; see ``fit.rim``."""
     points = cloud.cloud.xyz.astype(np.float64, order="F")
     rough = Plane(cloud.centre, cloud.normal)
-    face = disc_face(points, rough, _ring_of(flange), params.plane_gate)
+    # The face is sought within 3 mm of the rough plane.
+    face = disc_face(points, rough, _ring_of(flange), 3e-3)
     if face is None:
         return Rejected(f"fewer than 3 of {len(points)} points lie on a common plane")
-    flat = face.flatten(chosen(points, _on_face(face, points, params)))
+    flat = face.flatten(chosen(points, _on_face(face, points)))
     if len(flat) < FEWEST_POINTS:
         return Rejected(f"{len(flat)} points on the face, at least {FEWEST_POINTS} are needed")
     start = face.flatten(cloud.centre[None])[0]
@@ -53,9 +54,10 @@ def _ring_of(flange: Flange) -> tuple[float, float]:
     return (0.85 * flange.rim if flange.bore is None else 0.0, 1.5 * flange.outer)
 
 
-def _on_face(face: Plane, points: Floats, params: RimParams) -> Mask:
+def _on_face(face: Plane, points: Floats) -> Mask:
     heights, sigma = face.heights(points), max(face.sigma, LEAST_NOISE)
-    return np.asarray((heights > -params.behind * sigma) & (heights < params.before * sigma))
+    # Chamfers and mixed pixels lie behind the face; before it there is nothing but noise.
+    return np.asarray((heights > -2.5 * sigma) & (heights < 6.0 * sigma))
 
 
 def _why_not(rings: Rings, flange: Flange, params: RimParams) -> str | None:

@@ -26,20 +26,6 @@ class RimParams(Params):
         description="Largest difference of a fitted radius from the flange's: room for chamfers "
         "and for what the scanner wears off an edge.",
     )
-    plane_gate: Length = param(
-        "3 mm",
-        gt=0,
-        description="Half thickness of the slab about the rough plane in which the face is sought.",
-    )
-    behind: float = Field(
-        2.5,
-        gt=0,
-        description="How far behind the face a point of its edge may lie, in standard deviations "
-        "of the face's noise: farther back are chamfers and mixed pixels.",
-    )
-    before: float = Field(
-        6.0, gt=0, description="The same before the face, where there is nothing but noise."
-    )
     scanner_error: Length = param(
         "0.06 mm",
         ge=0,

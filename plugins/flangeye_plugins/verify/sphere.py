@@ -26,6 +26,10 @@ class Bar(Params):
     length: Length = Field(gt=0, description="Calibrated distance of the centres.")
 
 
+FEWEST_PAIRS = 10
+"""Pairs of the arm's poses: the 95 % quantile of fewer is their largest."""
+
+
 class SphereParams(Params):
     """Parameters of ``verify.sphere``."""
 
@@ -38,7 +42,6 @@ class SphereParams(Params):
         "1 mm", gt=0, description="Largest error of a distance that passes, 95 % of the pairs."
     )
     shortest: Length = param("50 mm", gt=0, description="Pairs closer than this are not used.")
-    fewest: int = Field(10, ge=3, description="Smallest number of pairs of the arm's poses.")
 
 
 @stage("verify.sphere")
@@ -99,10 +102,10 @@ def _of_poses(calibration: HandEye, params: SphereParams, arm: Arm | None) -> tu
     first, second = np.triu_indices(len(used), 1)
     lengths = np.linalg.norm(driven[first] - driven[second], axis=1)
     apart = lengths >= params.shortest
-    if apart.sum() < params.fewest:
+    if apart.sum() < FEWEST_PAIRS:
         raise StageError(
             f"verify.sphere: {int(apart.sum())} pairs of poses are {params.shortest * 1e3:g} mm or "
-            f"more apart, {params.fewest} are needed: take poses that lie further apart"
+            f"more apart, {FEWEST_PAIRS} are needed: take poses that lie further apart"
         )
     return np.linalg.norm(seen[first] - seen[second], axis=1)[apart], lengths[apart]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from flangeye import Params, StageError, stage
 from flangeye.maths.arm_correction import corrected_view
@@ -22,7 +21,6 @@ class StitchParams(Params):
     """Parameters of ``verify.stitch``."""
 
     max_spread: Length = param("0.5 mm", gt=0, description="Largest spread that passes, rms.")
-    fewest: int = Field(5, ge=1, description="Smallest number of points of a view in a cell.")
 
 
 @stage("verify.stitch")
@@ -53,7 +51,7 @@ def verify_stitch(
             "mark captures as verification captures"
         )
     clouds = _in_flange(calibration, views, Arm(robot) if robot else None)
-    spread = _spread(clouds, params.fewest)
+    spread = _spread(clouds, fewest=5)
     seen = spread[np.isfinite(spread)]
     if not len(seen):
         raise StageError("verify.stitch: no place of the flange was seen in two views")

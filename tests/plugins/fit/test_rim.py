@@ -201,8 +201,8 @@ def test_points_well_before_or_behind_the_face_are_no_edge() -> None:
     ("name", "refused", "taken"),
     [
         ("inlier", "0 mm", "1 um"), ("min_coverage", 0, 0.01), ("min_coverage", 1.01, 1),
-        ("radius_tolerance", "0 mm", "1 um"), ("plane_gate", "0 mm", "1 um"), ("behind", 0, 0.5),
-        ("before", 0, 0.5), ("scanner_error", "-1 um", "0 mm"), ("edge_bias", "-1 um", "0 mm"),
+        ("radius_tolerance", "0 mm", "1 um"),
+        ("scanner_error", "-1 um", "0 mm"), ("edge_bias", "-1 um", "0 mm"),
         ("flatness", "-1 um", "0 mm"),
     ],
 )  # fmt: skip

@@ -266,10 +266,8 @@ def test_pairs_of_poses_are_counted_once_if_they_are_far_enough_apart() -> None:
     ("model", "given", "name", "refused", "taken"),
     [
         (StitchParams, {}, "max_spread", "0 mm", "1 um"),
-        (StitchParams, {}, "fewest", 0, 1),
         (SphereParams, {}, "max_error", "0 mm", "1 um"),
         (SphereParams, {}, "shortest", "0 mm", "1 um"),
-        (SphereParams, {}, "fewest", 2, 3),
         (Bar, {"first": _m(CENTRE), "second": _m(TIP)}, "length", "0 mm", "1 um"),
         (TouchParams, {"tip": _m(TIP)}, "touches", [], touches(1).touches),
         (TouchParams, {"tip": _m(TIP), "touches": touches(1).touches}, "accuracy", "0 mm", "1 um"),
