@@ -19,11 +19,16 @@ from flangeye.maths.frame_graph import Frame, chain, composed
 from flangeye.maths.geometry import invert
 from flangeye.models.cell import Axis, Cell
 from flangeye.models.robots import RobotModel
-from flangeye.plugin.stage import Params
 from flangeye.types import Floats, Mask, Observation, Poses, Source, Transform, Truth
 from flangeye.units import Angle, Length, param
-from flangeye_emulators.acquire.planned_session import UNSEEN, VERSION, PlaceParams, noise_free
-from flangeye_emulators.world.arm import ArmErrors, ImperfectArm
+from flangeye_emulators.acquire.planned_session import (
+    UNSEEN,
+    VERSION,
+    ArmsParams,
+    PlaceParams,
+    noise_free,
+)
+from flangeye_emulators.world.arm import ImperfectArm
 from flangeye_emulators.world.session import DRAWS, View, disturbed
 
 UPRIGHT = np.radians([0, -90, 90, -90, -90, 0])
@@ -32,7 +37,7 @@ GRID = (-1.0, 0.0, 1.0)
 """Values of each joint on a grid, in shares of the spread."""
 
 
-class CellSessionParams(Params):
+class CellSessionParams(ArmsParams):
     """What simulated sessions of cells have in common."""
 
     sightings: int = Field(
@@ -62,9 +67,6 @@ class CellSessionParams(Params):
         "moment of its own.",
     )
     spread: Angle = param("30 deg", gt=0, description="Largest change of a joint from there.")
-    facing: Angle = param(
-        "50 deg", gt=0, description="Largest angle between a target's z and the view."
-    )
     joints: bool = Field(
         True,
         description="Whether the arms report their joint angles; a camera on a link needs them.",
@@ -76,11 +78,6 @@ class CellSessionParams(Params):
     )
     robot_position: Length = param(
         "0.05 mm", ge=0, description="Standard deviation of its position along each axis."
-    )
-    arm: ArmErrors = Field(
-        default_factory=ArmErrors,
-        description="How far the arms are from what their controllers say; by default by the "
-        "noise of the pose alone.",
     )
 
 

@@ -73,7 +73,20 @@ class PlaceParams(Params):
         return rigid(rotation_from_rpy(*self.rpy), np.asarray(self.position))
 
 
-class SessionParams(Params):
+class ArmsParams(Params):
+    """What all simulated sessions say of the arms and of what cameras can see."""
+
+    facing: Angle = param(
+        "50 deg", gt=0, description="Largest angle between a target's z and the view."
+    )
+    arm: ArmErrors = Field(
+        default_factory=ArmErrors,
+        description="How far the arms are from what their controllers say; by default by the "
+        "noise of the pose alone.",
+    )
+
+
+class SessionParams(ArmsParams):
     """What simulated sessions have in common."""
 
     poses: int = Field(20, ge=3, description="Number of captures.")
@@ -91,14 +104,6 @@ class SessionParams(Params):
         default_factory=PlaceParams,
         description="The target's true place in what carries it, where the recipe does not know "
         "it; with camera it follows from the first pose.",
-    )
-    facing: Angle = param(
-        "50 deg", gt=0, description="Largest angle between the target's z and the view."
-    )
-    arm: ArmErrors = Field(
-        default_factory=ArmErrors,
-        description="How far the arms are from what their controllers say; by default by the "
-        "noise of the pose alone.",
     )
     four_axes: bool = Field(
         False,
