@@ -273,6 +273,7 @@ def ask_dashboard(host: str, patience: float = 1.0) -> Any:
         OSError: It does not answer.
     """
     with (
+        # The dashboard server.
         socket.create_connection((host, 29999), timeout=patience) as line,
         line.makefile("r", encoding="utf-8", errors="replace") as answers,
     ):
