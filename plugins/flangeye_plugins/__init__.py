@@ -104,6 +104,8 @@ PARTS = {
     "check.repeated": "flangeye_plugins.check.stale:repeated",
     "check.units": "flangeye_plugins.check.units:units",
     "check.direction": "flangeye_plugins.check.pose_conventions:direction",
+    "check.mirrored": "flangeye_plugins.check.pose_conventions:mirrored",
+    "check.exchanged": "flangeye_plugins.check.pose_conventions:exchanged",
     "check.convention": "flangeye_plugins.check.pose_conventions:convention",
     "check.order": "flangeye_plugins.check.order:order",
     "check.clock": "flangeye_plugins.check.order:clock",

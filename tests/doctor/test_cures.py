@@ -1,5 +1,6 @@
 """The line that a finding gives, put into the recipe, cures: the calibration is as if nothing was."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from flangeye.run.runner import Runner
 from flangeye.types import ArchivePath
 from flangeye_plugins.check import CHECKS
 from tests.doctor.sessions import clean
+from tools import injected
 
 REGISTRY = load_registry()
 N = 24
@@ -96,7 +98,9 @@ FAULTS = {
         "moved target", on_rows(np.arange(14, N), centres=lambda c: c + [0.02, 0.0, 0.01]),
     ),
 }  # fmt: skip
-HARMLESS = {"identities of the marker", "identities of the robot", "an outlier", "flips"}
+HARMLESS = {
+    "identities of the marker", "identities of the robot", "an outlier", "flips", "a moved target",
+}  # fmt: skip
 """Those that the solver sets aside by itself."""
 
 
@@ -114,7 +118,7 @@ def write(path, session: RecordedSession):
 
 
 def recipe_with(path, step):
-    path.write_text(yaml.safe_dump({**RECIPE, "steps": [step, RECIPE["steps"][1]]}))
+    path.write_text(json.dumps({**RECIPE, "steps": [step, RECIPE["steps"][1]]}))
     return load_recipe(path, REGISTRY)
 
 
@@ -199,3 +203,21 @@ def test_centres_of_an_unknown_place_are_solved_by_what_a_refusal_names(tmp_path
     assert told[1].refused is None
     found = np.array(told[1].transforms["flange_T_target"].matrix)[:3, 3]
     assert found == pytest.approx(-offset, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("fault", "kind"),
+    [("robot's degrees as radians", "marker"), ("both inverted", "hand"),
+     ("marker's y negated", "marker"), ("marker's rpy as vector", "hand")],
+)  # fmt: skip
+def test_a_fault_in_tables_is_named_and_its_line_cures(fault: str, kind: str) -> None:
+    cells = [cell.strip() for cell in injected.row(fault, kind, 1).split("|")[1:-1]]
+    status, finding, cured = cells[2], cells[5], cells[6]
+    assert status != "verified"
+    assert finding in ("pose convention", "pose direction", "mirrored axis")
+    assert cured.startswith("verified") and float(cured.split()[1]) < 1.0
+
+
+def test_a_set_without_a_fault_gives_no_finding() -> None:
+    cells = [cell.strip() for cell in injected.row("none", "hand", 2).split("|")[1:-1]]
+    assert (cells[2], cells[5]) == ("verified", "nothing")

@@ -100,11 +100,11 @@ def test_the_base_in_the_flange(kind: Any, carried: Any) -> None:
     finding = only(session.with_poses(inverted(session.poses)))
     assert "the poses are flange_T_base" in finding.what
     step = "- acquire.archive: {reader: {corrected: {reader: auto, inverted: true}}}"
-    mounted = {"target": "eye-in-hand", "camera": "eye-on-base"}[carried]
     marker = "- acquire.archive: {reader: {corrected: {reader: auto, target_inverted: true}}}"
-    other = f"configuration: {{name: {mounted}, place: unknown}}"
-    exchanged = {"marker": [other, step, marker], "point": [other, step]}
-    assert finding.choices == exchanged.get(kind, [step])
+    other = "configuration: {name: eye-on-base, place: unknown}"
+    alike = {"marker": [other, step, marker], "point": [other, step]}
+    # A camera a metre from the base is not in the hand; one near the hand may be near the base.
+    assert finding.choices == (alike.get(kind, [step]) if carried == "camera" else [step])
 
 
 @pytest.mark.parametrize("carried", ["target", "camera"])

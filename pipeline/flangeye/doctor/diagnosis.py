@@ -65,6 +65,8 @@ class RecordedSession:
         marks_open: Whether the recipe's solver marks translations that the motion cannot show.
         remarks: Mistakes that opening the archive has shown already, mended here.
         damage: What of the log could not be read or was changed, a line each.
+        again: Gives the session as read with other parameters: the reader's, and its target's.
+            None where the reader's own numbers are not what is looked at.
     """
 
     ids: tuple[str, ...]
@@ -87,6 +89,7 @@ class RecordedSession:
     marks_open: bool = False
     remarks: tuple[Finding, ...] = ()
     damage: tuple[str, ...] = ()
+    again: ReadAgain | None = field(default=None, repr=False)
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -145,7 +148,8 @@ class RecordedSession:
         """Return the session with the samples of a mask left out by the recipe."""
         names = [name for name, gone in zip(self.ids, mask, strict=True) if gone]
         earlier = self.changes.get("leave_out", [])
-        return self.where(~mask).with_changes(leave_out=[*earlier, *names])
+        kept = replace(self.where(~mask), again=None)
+        return kept.with_changes(leave_out=[*earlier, *names])
 
     def with_changes(self, **changes: Any) -> RecordedSession:
         """Return the session as the acquire step gives it with other parameters."""
@@ -154,7 +158,8 @@ class RecordedSession:
     def read_with(self, **correction: Any) -> RecordedSession:
         """Return the session as ``reader.corrected`` with a correction would give it."""
         stated = {name: value for name, value in correction.items() if (name, value) != _DEFAULT}
-        return replace(self, reader={"corrected": {"reader": self.reader, **stated}})
+        reader = {"corrected": {"reader": self.reader, **stated}}
+        return replace(self, reader=reader, again=None)
 
     def corrected(self, change: Change, arms: Arms = "both", **correction: Any) -> RecordedSession:
         """Return the session with changed poses, as ``reader.corrected`` reads them.
@@ -248,6 +253,7 @@ class Finding:
 
 
 Findings = Iterable[Finding]
+ReadAgain = Callable[[Mapping[str, Any], Mapping[str, Any]], RecordedSession]
 Change = Callable[[Floats], Floats]
 """Gives poses (N, 4, 4) as they should be."""
 

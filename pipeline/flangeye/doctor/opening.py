@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 
 from flangeye import types as t
 from flangeye.doctor.as_recorded import State, in_configuration
-from flangeye.doctor.diagnosis import USUAL_LIMIT, Finding, Reader, RecordedSession
+from flangeye.doctor.diagnosis import USUAL_LIMIT, Finding, ReadAgain, Reader, RecordedSession
 from flangeye.doctor.finding import found_in
 from flangeye.errors import StageError
 from flangeye.files.recording import Archive, NotThisLayout, Recording, check_ids
@@ -97,8 +98,18 @@ def _of_log(path: Path, registry: Registry, recipe: Recipe | None) -> RecordedSe
     times = {meta["id"]: int(meta["time_ns"]) for meta in calibration}
     session = replace(_session({**given, **poses}, found, times), damage=tuple(log.notes))
     states = {meta["id"]: _state_of(meta) for meta in calibration}
-    session = session if recipe is None else _as_recipe(session, recipe, states)
+    if recipe is not None:
+        session = replace(_as_recipe(session, recipe, states), again=_archive_again(recipe, found))
     return replace(session, remarks=(*session.remarks, *_set_aside(log)))
+
+
+def _archive_again(recipe: Recipe, found: Mapping[str, t.Feature]) -> ReadAgain | None:
+    """Return how to read a log's own archive again, where the recipe says which it was."""
+    params = recipe.steps[0].params
+    path, reader = getattr(params, "path", None), getattr(params, "reader", None)
+    if path is None or not isinstance(reader, BoundPart) or not Path(path).exists():
+        return None
+    return partial(_read_again, Path(path), recipe, found)
 
 
 def _set_aside(log: RunLog) -> Iterator[Finding]:
@@ -149,9 +160,42 @@ def _of_recipe(path: Path, registry: Registry, recipe: Recipe) -> RecordedSessio
     check_ids(archive)
     found, remark = found_in(archive, first, recipe, registry)
     kept = _kept(archive, first)
-    states = {r.id: State(r.joints, r.poses.get(t.FLANGE2)) for r in kept.recordings}
-    session = _as_recipe(_of_archive(kept, found), recipe, states)
-    return session if remark is None else _in_other_unit(session, *remark)
+    session = _of_recordings(kept, found, recipe)
+    if remark is not None:
+        return _in_other_unit(session, *remark)
+    return replace(session, again=partial(_read_again, path, recipe, found))
+
+
+def _read_again(
+    path: Path,
+    recipe: Recipe,
+    found: Mapping[str, t.Feature],
+    arm: Mapping[str, Any],
+    target: Mapping[str, Any],
+) -> RecordedSession:
+    """Return an archive's session by its reader with other parameters; see RecordedSession."""
+    first = recipe.steps[0]
+    reader: BoundPart = getattr(first.params, "reader")  # noqa: B009  a stage's own parameter
+    bound = _bound_with(reader, arm, target)
+    archive = _kept(bound(path), first)
+    session = _of_recordings(archive, _ready_made(archive) or found, recipe)
+    return replace(session, reader=_written(bound))
+
+
+def _of_recordings(
+    archive: Archive, found: Mapping[str, t.Feature], recipe: Recipe
+) -> RecordedSession:
+    states = {r.id: State(r.joints, r.poses.get(t.FLANGE2)) for r in archive.recordings}
+    return _as_recipe(_of_archive(archive, found), recipe, states)
+
+
+def _bound_with(reader: BoundPart, arm: Mapping[str, Any], target: Mapping[str, Any]) -> BoundPart:
+    """Return a reader with other parameters of its own, and of its target's."""
+    changed: dict[str, Any] = dict(arm)
+    of_target = getattr(reader.params, "target", None)
+    if target and of_target is not None:
+        changed["target"] = of_target.model_copy(update=target)
+    return replace(reader, params=reader.params and reader.params.model_copy(update=changed))
 
 
 def _in_other_unit(session: RecordedSession, unit: str, why: str) -> RecordedSession:

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from flangeye.types import Floats, Mask
 
 
-def scaled(poses: Floats, factor: float) -> Floats:
-    """Return the poses with their positions times ``factor``: other units."""
+def scaled(poses: Floats, factor: float | Floats) -> Floats:
+    """Return the poses with their positions times ``factor``: other units, or one of each axis."""
     out = np.array(poses)
     out[..., :3, 3] *= factor
     return out

@@ -4,7 +4,7 @@ from flangeye_plugins.check.changes import moved, tool
 from flangeye_plugins.check.motion import motion
 from flangeye_plugins.check.order import clock, order
 from flangeye_plugins.check.outliers import flips, outlier
-from flangeye_plugins.check.pose_conventions import convention, direction
+from flangeye_plugins.check.pose_conventions import convention, direction, exchanged, mirrored
 from flangeye_plugins.check.rounding import rounding
 from flangeye_plugins.check.size import size
 from flangeye_plugins.check.stale import identity, repeated
@@ -16,6 +16,8 @@ CHECKS = (
     units,
     direction,
     convention,
+    exchanged,
+    mirrored,
     order,
     clock,
     flips,

@@ -3,19 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from flangeye import part
-from flangeye.doctor.diagnosis import OR_ELSE, Change, Finding, Findings, RecordedSession
+from flangeye import StageError, part
+from flangeye.doctor.diagnosis import (
+    OR_ELSE,
+    Change,
+    Finding,
+    Findings,
+    NotApplicable,
+    RecordedSession,
+)
 from flangeye.maths.pose_corrections import inverted, reread, transposed
-from flangeye.maths.pose_formats import CONVENTIONS, EULER_ORDERS, PLAIN
+from flangeye.maths.pose_formats import CONVENTIONS, EULER_ORDERS, PLAIN, written
+from flangeye.models.configuration import looks_exchanged
 from flangeye_plugins.check.as_recorded import fit_of, named
 from flangeye_plugins.check.equations import equations_of
 from flangeye_plugins.check.fitting import fit
-from flangeye_plugins.check.held_out import helps
+from flangeye_plugins.check.held_out import explained, helps
 from flangeye_plugins.check.significance import Significance, best_of
 
 QUATERNIONS = ("xyzw", "wxyz")
@@ -43,13 +52,60 @@ class Reading(NamedTuple):
 def convention(session: RecordedSession) -> Findings:
     """The rotations fit far better when their numbers are read in another convention."""
     session.require_poses()
-    tried = [*_of_arms(session), *_of_markers(session)]
+    tried = [*_written_otherwise(session)] or [*_of_arms(session), *_of_markers(session)]
     evidence = best_of(fit_of(session), fit(equations_of(*(each.session for each in tried))))
     found = tried[evidence.which]
     if evidence.probability < 1 and helps(session, found.session):
-        read, fits = _name(found.read_as), _name(found.written_as)
-        what = f"{found.whose} were read as {read}, and fit as {fits}"
+        what = f"{found.whose} were read as {found.read_as}, and fit as {found.written_as}"
         yield evidence.finding("pose convention", what, found.session)
+
+
+def _written_otherwise(session: RecordedSession) -> Iterator[Reading]:
+    """Give the recordings read again, their numbers as written taken in another convention."""
+    if session.again is None:
+        return
+    arm, target = _said(session), _said(session, "target")
+    whose: list[tuple[str, Convention | None, bool, bool]] = [
+        ("the robot's rotations", arm, True, False),
+        ("the markers' rotations", target, False, True),
+        ("the rotations of robot and markers", arm if arm == target else None, True, True),
+    ]
+    for name, said, of_arm, of_target in whose:
+        for other in _conventions(*said) if said else ():
+            changes = {"rotation": other[0], "angle": other[1]}
+            with suppress(StageError):  # the numbers are no poses in it
+                read = session.again(changes if of_arm else {}, changes if of_target else {})
+                if read.ids == session.ids:
+                    yield Reading(read, name, _spelt(said or other), _spelt(other))
+
+
+Convention = tuple[str, str | None]
+"""Of rotations: how they are written, and in which unit of angle, where that matters."""
+
+
+def _said(session: RecordedSession, of: str | None = None) -> Convention | None:
+    """Return how the recipe says that rotations are written; None where it does not, or not so."""
+    if isinstance(session.reader, str):
+        return None
+    ((_, params),) = session.reader.items()
+    stated = params.get(of) if params and of else params
+    rotation = stated.get("rotation") if isinstance(stated, Mapping) else None
+    return (str(rotation), stated.get("angle")) if rotation in (*CONVENTIONS, *PLAIN) else None
+
+
+def _conventions(rotation: str, angle: str | None) -> Iterator[Convention]:
+    """Give what as many numbers may be, in either unit."""
+    if written(rotation, "m", "rad").is_quaternion:
+        yield from ((other, None) for other in QUATERNIONS if other != rotation)
+        return
+    for other in ("vector", *EULER_ORDERS):
+        yield from ((other, unit) for unit in ("rad", "deg") if (other, unit) != (rotation, angle))
+
+
+def _spelt(convention: Convention) -> str:
+    rotation, angle = convention
+    plain = CONVENTIONS[rotation].rotation if rotation in CONVENTIONS else rotation
+    return _name(plain) + {"rad": " in radians", "deg": " in degrees"}.get(angle or "", "")
 
 
 def _of_arms(session: RecordedSession) -> Iterator[Reading]:
@@ -59,7 +115,7 @@ def _of_arms(session: RecordedSession) -> Iterator[Reading]:
             reread_session = session.corrected(
                 _rereading(read_as, written_as), arms, read_as=read_as, written_as=written_as
             )
-            yield Reading(reread_session, f"{whose} rotations", read_as, written_as)
+            yield Reading(reread_session, f"{whose} rotations", _name(read_as), _name(written_as))
 
 
 def _of_markers(session: RecordedSession) -> Iterator[Reading]:
@@ -71,13 +127,13 @@ def _of_markers(session: RecordedSession) -> Iterator[Reading]:
         change = _rereading(read_as, written_as)
         told = {"target_read_as": read_as, "target_written_as": written_as}
         alone = _with_markers(session, change).read_with(**told)
-        yield Reading(alone, "the markers' rotations", read_as, written_as)
+        yield Reading(alone, "the markers' rotations", _name(read_as), _name(written_as))
         if stated == _stated(session):
             both = _with_markers(session, change).corrected(
                 change, "both", read_as=read_as, written_as=written_as, **told
             )
             whose = "the rotations of robot and markers"
-            yield Reading(both, whose, read_as, written_as)
+            yield Reading(both, whose, _name(read_as), _name(written_as))
 
 
 def _has_ready_made_markers(session: RecordedSession) -> bool:
@@ -137,13 +193,69 @@ def direction(session: RecordedSession) -> Findings:
     corrected_session, whose, way = tried[evidence.which]
     if evidence.probability == 1 or not helps(session, corrected_session):
         return
-    if way == "inverted" and _marker_rather(session):
+    if way == "inverted" and _marker_rather(session, corrected_session):
         yield _inverted_marker(session, evidence)
         return
     what, fix = f"{whose} {_WAYS[way][1]}", corrected_session.step()
     if way == "inverted" and _may_be_mounted_otherwise(session):
-        what, fix = _of_exchanged(session, fix)
+        what, fix = _of_exchanged(session, corrected_session)
     yield evidence.finding("pose direction", what, corrected_session, fix)
+
+
+@part("check.exchanged")
+def exchanged(session: RecordedSession) -> Findings:
+    """The recordings fit as well with robot's and markers' poses both inverted, and rather so."""
+    session.require_poses()
+    if not np.isfinite(session.rotations).any() or not _may_be_mounted_otherwise(session):
+        raise NotApplicable("camera and target cannot stand for each other")
+    carried, standing = _distances(session)
+    other = _with_markers(session, inverted).corrected(
+        inverted, inverted=True, target_inverted=True
+    )
+    if not looks_exchanged(carried, standing) or not explained(session) or _unseen(other):
+        return
+    what = (
+        f"as they are read, the arm carries the {_CARRIED[session.carried][0]} "
+        f"{carried:.2f} m from its flange, and the {_CARRIED[session.carried][1]} stands "
+        f"{standing:.2f} m from its base: the poses of robot and markers are both the other way "
+        "round, which fits as well"
+    )
+    misfit = fit_of(session).misfit()
+    yield Finding("pose direction", what, other.step(), (), misfit, misfit, corrected_session=other)
+
+
+@part("check.mirrored")
+def mirrored(session: RecordedSession) -> Findings:
+    """One axis of what was seen has the wrong sign."""
+    session.require_samples()
+    tried = [replace(session, centres=session.centres * sign) for sign in 1 - 2 * np.eye(3)]
+    evidence = best_of(fit_of(session), fit(equations_of(*tried)))
+    found, axis = tried[evidence.which], "xyz"[evidence.which]
+    if evidence.probability == 1 or not helps(session, found):
+        return
+    what = f"the {axis} of the target's positions is negated: they fit with its sign changed"
+    if session.acquire == "acquire.archive":
+        fix = f"write the scans with their {axis} the other way round: they are mirrored"
+        yield evidence.finding("mirrored axis", what, found, fix)
+    else:
+        yield evidence.finding("mirrored axis", what, found.read_with(target_mirrored=axis))
+
+
+_CARRIED = {"target": ("marker", "camera"), "camera": ("camera", "marker")}
+
+
+def _distances(session: RecordedSession) -> tuple[float, float]:
+    """Return how far from the flange the one is, and from the base the other [m]."""
+    found = fit_of(session).unknowns
+    near, far = found.place[0].mean(axis=0), found.position[0]
+    if session.carried == "camera":
+        near, far = far, near
+    return float(np.linalg.norm(near)), float(np.linalg.norm(far))
+
+
+def _unseen(session: RecordedSession) -> bool:
+    """Whether a target lies beside or behind the camera."""
+    return _off_axis(session) > np.pi / 2
 
 
 def _turned_round(session: RecordedSession) -> Iterator[tuple[RecordedSession, str, str]]:
@@ -163,8 +275,8 @@ def _transposed_markers(session: RecordedSession) -> Iterator[tuple[RecordedSess
     yield both, "robot's and markers'", "transposed"
 
 
-LENS = np.radians(35)
-"""No lens sees a target further from its axis."""
+LENS = np.radians(60)
+"""No lens of a scanner or depth camera sees further from its axis; Azure Kinect's, wide."""
 _MOUNTED_OTHERWISE: Mapping[str, tuple[str, str]] = {
     "target": ("in the hand", "eye-in-hand"),
     "camera": ("beside the robot", "eye-on-base"),
@@ -178,20 +290,34 @@ def _may_be_mounted_otherwise(session: RecordedSession) -> bool:
     return session.links is None and session.seconds is None and unknown
 
 
-def _of_exchanged(session: RecordedSession, inverted: str) -> tuple[str, str]:
-    """Return what may be wrong, and the lines to choose from: the samples fit each of them."""
+def _of_exchanged(session: RecordedSession, turned: RecordedSession) -> tuple[str, str]:
+    """Return what may be wrong, and the lines to choose from, the likeliest first.
+
+    The samples fit each of three: with the arm's poses inverted camera and target are as far from
+    flange and base as they are from base and flange with another mounting, or inverted markers.
+    """
     held, name = _MOUNTED_OTHERWISE[session.carried]
-    what = f"the camera is {held}, or the poses are flange_T_base"
-    lines = [f"configuration: {{name: {name}, place: unknown}}", inverted]
-    if np.isfinite(session.rotations).any():
-        what += ", or the target's are target_T_camera"
-        lines.append(_marker_inverted(session).step())
-    return f"{what}: the samples fit each", OR_ELSE.join(lines)
+    mounted = f"the camera is {held}", f"configuration: {{name: {name}, place: unknown}}"
+    choices = [mounted, ("the poses are flange_T_base", turned.step())]
+    if looks_exchanged(*_distances(turned)):
+        choices = [mounted]
+    elif looks_exchanged(*reversed(_distances(turned))):
+        choices = [choices[1]]
+    if np.isfinite(session.rotations).any() and mounted in choices:
+        other = _marker_inverted(session)
+        rather = len(choices) == 1 and _off_axis(other) < _off_axis(session)
+        at = 0 if rather else len(choices)
+        choices.insert(at, ("the target's poses are target_T_camera", other.step()))
+    what = ", or ".join(each for each, _ in choices)
+    fits = ": the samples fit each" if len(choices) > 1 else ""
+    return what + fits, OR_ELSE.join(line for _, line in choices)
 
 
-def _marker_rather(session: RecordedSession) -> bool:
+def _marker_rather(session: RecordedSession, turned: RecordedSession) -> bool:
     """Whether targets lie where no lens sees them, and do not the other way round."""
     if not np.isfinite(session.rotations).any() or not _may_be_mounted_otherwise(session):
+        return False
+    if looks_exchanged(*reversed(_distances(turned))):
         return False
     return bool(_off_axis(session) > LENS >= _off_axis(_marker_inverted(session)))
 

@@ -37,6 +37,8 @@ def size(session: RecordedSession) -> Findings:
     if p < 1 and explained(corrected_session):
         what = f"the marker is {factor:.4f} times as large as the recipe says"
         fix = f"measure it after printing: its lengths in the fit step times {factor:.4f}"
+        if session.acquire == "acquire.samples":
+            fix = session.read_with(target_scale=float(f"{factor:.4f}")).step()
         evidence = evidence._replace(probability=p)
         yield evidence.finding("target size", what, corrected_session, fix)
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -63,6 +63,9 @@ class CorrectedParams(Params):
         1.0,
         gt=0,
         description="Factor for the positions of ready-made centres and markers.",
+    )
+    target_mirrored: Literal["x", "y", "z"] | None = Field(
+        None, description="Axis of the camera along which their positions have the wrong sign."
     )
     inverted: bool = Field(False, description="The poses are flange_T_base.")
     target_inverted: bool = Field(False, description="Markers' poses are target_T_camera.")
@@ -125,9 +128,15 @@ def _alone(recording: Recording, params: CorrectedParams) -> Recording:
         recording,
         motion=motion,
         poses=poses,
-        centre_in_camera=None if centre is None else centre * params.target_scale,
+        centre_in_camera=None if centre is None else centre * _factors(params),
         camera_T_target=target,
     )
+
+
+def _factors(params: CorrectedParams) -> Floats:
+    """Return (3,) factors of the target's positions."""
+    sign = [-1.0 if axis == params.target_mirrored else 1.0 for axis in "xyz"]
+    return params.target_scale * np.array(sign)
 
 
 def _corrected_target(poses: Floats, params: CorrectedParams) -> Floats:
@@ -138,7 +147,7 @@ def _corrected_target(poses: Floats, params: CorrectedParams) -> Floats:
         poses = transposed(poses)
     if params.target_inverted:
         poses = inverted(poses)
-    return scaled(poses, params.target_scale)
+    return scaled(poses, _factors(params))
 
 
 def _corrected(poses: Floats, params: CorrectedParams) -> Floats:

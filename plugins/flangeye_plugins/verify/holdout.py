@@ -16,10 +16,12 @@ from flangeye.models.configuration import (
     DEFAULT,
     EVERY,
     Configuration,
+    looks_exchanged,
     mapped_and_expected,
 )
 from flangeye.models.robots import RobotModel, SecondRobot
 from flangeye.types import (
+    FLANGE,
     Feature,
     Floats,
     HandEye,
@@ -78,7 +80,8 @@ def verify_holdout(  # noqa: PLR0913  what it asks the runner for
     """k-fold cross-validation over poses: solve without each fold and measure the error on it.
 
     ``rms``, ``median``, ``p95`` and ``max`` are over all poses but outliers, of the pose for the
-    arm as its controller reports it; ``rms_all`` is over all. ``outliers`` counts the poses that
+    arm as its controller reports it; ``rms_inliers`` is the same
+    ``rms``, ``rms_all`` is over all. ``outliers`` counts the poses that
     the solver did not use and that are off by more than the limit. Where the solver gave an answer
     for the corrected arm, ``corrected_rms``, ``corrected_median`` and ``corrected_p95`` are those
     of the pose and the arm so corrected.
@@ -107,6 +110,8 @@ def verify_holdout(  # noqa: PLR0913  what it asks the runner for
         corrected = _figures(hold_out(poses, deals, answers, standing), counted)
         figures |= {f"corrected_{name}": corrected[name] for name in ("rms", "median", "p95")}
     passed, reason = _judge(figures, params)
+    if passed and (why := _exchanged(calibration, standing)):
+        passed, reason = False, why
     errors = {o.id: float(norm) for o, norm in zip(poses, norms, strict=True)}
     return Verification(passed, reason, figures, errors)
 
@@ -185,12 +190,34 @@ def _figures(held: HeldOut, counted: Mask) -> dict[str, float]:
         "poses": float(len(every)),
         "outliers": float((~counted).sum()),
         "rms": rms(norms),
+        "rms_inliers": rms(norms),
         "rms_all": rms(every),
         "median": float(np.median(norms)),
         "p95": float(np.quantile(norms, 0.95)),
         "max": float(norms.max()),
     }
     return {**figures, "tilt_rms": rms(tilts)} if len(tilts) else figures
+
+
+def _exchanged(calibration: HandEye, cell: Cell) -> str | None:
+    """Return why camera and marker of one arm seem to stand for each other; None if they do not."""
+    markers = any(isinstance(pair.observation.feature, PoseFeature) for pair in calibration.pairs)
+    if not markers or len(cell.unknown_frames) != 2 or len(cell.movers) != 1 or cell.links:
+        return None
+    found = {x.transform.parent: x.transform for x in calibration.transforms.values()}
+    if len(found) != 2 or FLANGE not in found:
+        return None
+    carried = float(np.linalg.norm(found.pop(FLANGE).translation))
+    ((_, other),) = found.items()
+    standing = float(np.linalg.norm(other.translation))
+    if not looks_exchanged(carried, standing):
+        return None
+    return (
+        f"the arm would carry the one {carried:.2f} m from its flange, the other would stand "
+        f"{standing:.2f} m from its base: the poses of robot and markers are probably both the "
+        "other way round, which fits as well; if they are right, say where the target is "
+        "(configuration: {place: …})"
+    )
 
 
 def _judge(figures: dict[str, float], params: HoldoutParams) -> tuple[bool, str]:

@@ -112,7 +112,7 @@ def test_the_figures_of_isotropic_noise() -> None:
     assert figures["p95"] == pytest.approx(np.quantile(sizes, 0.95))
     assert figures["max"] == max(sizes)
     assert figures["outliers"] == 0
-    assert figures["rms_all"] == figures["rms"]
+    assert figures["rms_inliers"] == figures["rms_all"] == figures["rms"]
     assert result.reason == (
         f"held-out error {figures['rms'] * 1e3:.3f} mm rms, within the limit of 1 mm"
     )
