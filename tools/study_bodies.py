@@ -135,7 +135,7 @@ def peer(points, body):
 
     registration: Any = o3d.pipelines.registration  # its stubs ask for what is optional
     o3d.utility.random.seed(0)
-    step = body.size / 40
+    step = body.size / 50
 
     def prepare(cloud):
         cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(2 * step, 30))
@@ -145,13 +145,14 @@ def peer(points, body):
 
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points.astype(float)))
     scan, of_scan = prepare(cloud.voxel_down_sample(step))
-    surface = prepared(body)[0].surface
-    model = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(surface.points))
-    model.normals = o3d.utility.Vector3dVector(surface.normals)
+    outside, normals = prepared(body)[0].outside
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(outside))
+    cloud.normals = o3d.utility.Vector3dVector(normals)
+    model = cloud.voxel_down_sample(step)
     near = o3d.geometry.KDTreeSearchParamHybrid(5 * step, 100)
     of_model = registration.compute_fpfh_feature(model, near)
     rough = registration.registration_ransac_based_on_feature_matching(
-        model, scan, of_model, of_scan, True, 1.5 * step,
+        model, scan, of_model, of_scan, False, 1.5 * step,
         registration.TransformationEstimationPointToPoint(False), 3,
         [registration.CorrespondenceCheckerBasedOnEdgeLength(0.9),
          registration.CorrespondenceCheckerBasedOnDistance(1.5 * step)],

@@ -144,7 +144,7 @@ class Shape:
     @cached_property
     def surface(self) -> Oriented:
         """Points on the outside, some spacings apart for each direction of the surface."""
-        points, normals = self._outside
+        points, normals = self.outside
         keep = thin(points, normals, self.size / SPACINGS)
         return Oriented(points[keep], normals[keep], normals[keep])
 
@@ -154,7 +154,7 @@ class Shape:
         from scipy.spatial import cKDTree
 
         # A file's facets may be wound either way: the face's side is the one that was looked at.
-        ends, (seen, outwards) = self._edges(), self._outside
+        ends, (seen, outwards) = self._edges(), self.outside
         within = ends.points - ends.directions * self.size / ACROSS
         gap, nearest = cKDTree(seen).query(within, distance_upper_bound=2 * self.size / ACROSS)
         ends, nearest = ends.take(np.isfinite(gap)), nearest[np.isfinite(gap)]
@@ -164,7 +164,7 @@ class Shape:
         return ends.take(thin(ends.points, ends.directions, self.size / SPACINGS))
 
     @cached_property
-    def _outside(self) -> tuple[Floats, Floats]:
+    def outside(self) -> tuple[Floats, Floats]:
         """(N, 3) points that rays from all around meet, and normals towards them."""
         radius = self.size / 2
         grid = np.stack(np.meshgrid(*2 * [np.arange(ACROSS) + 0.5]), axis=-1) / ACROSS * 2 - 1
