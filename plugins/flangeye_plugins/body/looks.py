@@ -8,7 +8,7 @@ from itertools import permutations, product
 
 import numpy as np
 
-from flangeye.maths.geometry import rotation_exp, rotation_log
+from flangeye.maths.geometry import rotation_exp
 from flangeye.models.bodies import TargetBody
 from flangeye.types import Floats, Indices, Mask
 from flangeye_plugins.body.shape import GRAZING, Oriented, Shape, spread_directions
@@ -33,10 +33,6 @@ STEEP, NEARBY = 3.0, 3.0
 ALIKE, SIMILAR = 0.5, 0.85
 """Cosine of the largest angle between a surface of the body and the scan's there: where a
 candidate is on its way, and where it is judged."""
-
-SAME, EVERYWHERE = 0.06, 0.97
-"""How near a symmetric body's points come to each other, as a share of the size: the spacing of the
-samples, and the share of them that must."""
 
 SHOWN = 1e-4
 """Share of the body's points that show a direction: of facets of a cylinder fewer do."""
@@ -187,25 +183,6 @@ class Looks:
         out[:, :3, :3] = QUARTERS
         out[:, :3, 3] = middle - QUARTERS @ middle
         return np.asarray(pose @ out)
-
-    def apart(self, one: Floats, other: Floats) -> float | None:
-        """Return the angle between two poses [deg]; None where the body looks the same at both.
-
-        It does where every point of its outside lies on its outside as well at the other pose.
-        """
-        from scipy.spatial import cKDTree
-
-        points = self.surface.points
-        moved = np.linalg.inv(one) @ other
-        gap, nearest = cKDTree(points).query(points @ moved[:3, :3].T + moved[:3, 3])
-        normals = self.surface.directions
-        off = np.einsum("ni,ni->n", points @ moved[:3, :3].T + moved[:3, 3] - points[nearest],
-                        normals[nearest])  # fmt: skip
-        turned = np.einsum("ni,ni->n", normals @ moved[:3, :3].T, normals[nearest])
-        same = (gap < SAME * self.size) & (np.abs(off) < TOLERANCE * self.size) & (turned > SIMILAR)
-        if same.mean() > EVERYWHERE:
-            return None
-        return float(np.degrees(np.linalg.norm(rotation_log(moved[None, :3, :3])[0])))
 
     def tolerance(self, view: View) -> float:
         """Return how far off the scan may be [m]."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from flangeye import Params, stage
 from flangeye.errors import StageError
-from flangeye.maths.geometry import invert
+from flangeye.maths.geometry import invert, rotation_log
 from flangeye.models.bodies import TargetBody
 from flangeye.models.configuration import Configuration
 from flangeye.types import (
@@ -26,7 +26,6 @@ from flangeye.types import (
 from flangeye.units import Length, param
 
 if TYPE_CHECKING:
-    from flangeye_plugins.body.looks import Looks
     from flangeye_plugins.body.search import Found
 
 LEAST_RAYS = 150
@@ -42,6 +41,9 @@ fastened to it."""
 
 WIDEST = 1.75
 """Tangent of 60 degrees: no scanner sees farther to the side, stray points do."""
+
+ALL = 6
+"""Freedoms of a pose; a round body shows fewer."""
 
 RECENT = 3
 """Earlier sightings from which the pose is predicted."""
@@ -80,8 +82,8 @@ def segment_body(
     taken without a search.
 
     Raises:
-        StageError: The cloud is in millimetres, or otherwise a thousand times off; or the body has
-            no edges.
+        StageError: The cloud is in millimetres, or otherwise a thousand times off; or the body is
+            round.
     """
     from flangeye_plugins.body.dense import FEWEST
     from flangeye_plugins.body.looks import prepared
@@ -95,14 +97,17 @@ def segment_body(
     if len(points) < FEWEST:
         return Rejected("no point between near and far")
     shape, looks = prepared(body)
-    if not len(looks.ends.points):
-        raise StageError(f"{body.name}: no edges to find it by; segment.sphere finds a ball")
+    if looks.freedoms < ALL:
+        raise StageError(
+            f"{body.name}: it looks the same however it is turned about an axis, so that a scan "
+            "does not show its pose; segment.sphere finds a ball"
+        )
     search, passes = Search(points, shape, looks), partial(_passes, params=params)
     found = list(filter(passes, search.near(_predicted(capture, configuration, earlier))))[:1]
     if not found:
         every = search.everywhere()
         found = list(filter(passes, every))
-        if why := _why_not(every, found, body, looks):
+        if why := _why_not(every, found, body):
             return Rejected(why)
     pose = found[0].pose
     centre = pose[:3, :3] @ shape.centre + pose[:3, 3]
@@ -141,9 +146,7 @@ def _passes(found: Found, params: SegmentBodyParams) -> bool:
     )
 
 
-def _why_not(
-    every: list[Found], passing: list[Found], body: TargetBody, looks: Looks
-) -> str | None:
+def _why_not(every: list[Found], passing: list[Found], body: TargetBody) -> str | None:
     """Return why no pose is taken; None where one is."""
     if not every:
         return f"nothing of the size of {body.name} is there"
@@ -155,11 +158,10 @@ def _why_not(
             f"seen there fits, and it holds to {every[0].weakest * body.size * 1e3:.1f} mm; is it "
             "in view, and the mesh's unit and handedness right?"
         )
-    for other in passing[1:]:
-        turn = looks.apart(passing[0].pose, other.pose)
-        if turn is not None:
-            return (
-                f"two poses of {body.name} {turn:.0f} deg apart explain the scan "
-                f"({passing[0].verdict.agree} and {other.verdict.agree} rays)"
-            )
+    if len(passing) > 1:
+        turn = rotation_log((passing[0].pose.T @ passing[1].pose)[None, :3, :3])[0]
+        return (
+            f"two poses of {body.name} {np.degrees(np.linalg.norm(turn)):.0f} deg apart explain "
+            f"the scan ({passing[0].verdict.agree} and {passing[1].verdict.agree} rays)"
+        )
     return None

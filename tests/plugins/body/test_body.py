@@ -154,9 +154,18 @@ def test_a_cylinder_shows_five_numbers_and_a_sphere_three() -> None:
         assert (information > 1e3).sum() == freedoms - 3
 
 
-def test_a_body_without_edges_is_for_another_stage() -> None:
-    ball = trimesh.creation.icosphere(4, 0.04)
-    body = TargetBody("ball", np.array(ball.vertices), np.array(ball.faces, np.int32))
+def test_a_body_whose_half_turn_looks_the_same_is_refused() -> None:
+    mesh = trimesh.creation.box((0.16, 0.1, 0.05))
+    block = TargetBody("block", np.array(mesh.vertices), np.array(mesh.faces, np.int32))
+    assert "two poses of block" in found(scan(block), block).reason
+
+
+@pytest.mark.parametrize(
+    "mesh",
+    [trimesh.creation.icosphere(4, 0.04), trimesh.creation.cylinder(0.03, 0.12, sections=96)],
+)
+def test_a_round_body_has_no_pose_to_be_found(mesh) -> None:
+    body = TargetBody("round", np.array(mesh.vertices), np.array(mesh.faces, np.int32))
     with pytest.raises(StageError, match=r"segment\.sphere finds a ball"):
         found(scan(GRIPPER), body)
 
