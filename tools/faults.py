@@ -197,12 +197,13 @@ class Trial:
             yield f"it does not say how to go on: {told.splitlines()[-1:]}"
         if self._resumed:
             return
-        going = self._run(cell, "--resume", "run")
+        before, going = len(cell.finished()), self._run(cell, "--resume", "run", "--out", "again")
         try:
-            _, told = going.communicate(timeout=WHOLE)
+            cell.wait_until(lambda: len(cell.finished("again")) > before or _over(going), STARTING)
         finally:
             going.kill()
-        self._resumed += going.returncode in (0, 1)
+            _, told = going.communicate()
+        self._resumed += len(cell.finished("again")) > before
         if not self._resumed:
             yield f"it does not go on by --resume: {told.splitlines()[-1:]}"
 

@@ -92,10 +92,10 @@ class Cell:
     def log(self, run="run"):
         return read_run(self.folder / run / "run.mcap")
 
-    def finished(self):
+    def finished(self, run="run"):
         """Return the captures that have gone through so far; none while there is no log yet."""
         try:
-            return self.log().finished
+            return self.log(run).finished
         except StageError:
             return []
 

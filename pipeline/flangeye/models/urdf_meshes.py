@@ -20,6 +20,9 @@ from flangeye.types import Floats
 
 MESHES = (".stl", ".obj", ".dae", ".ply")
 
+SHOWN = 300
+"""Characters of a name that a message shows."""
+
 
 class MissingMesh(RecipeError):
     """A mesh is not where the URDF says."""
@@ -91,19 +94,31 @@ def _find(name: str, urdf: Path, packages: Mapping[str, Path]) -> Path:
     """Return the file of ``package://NAME/…``, ``file://…`` or a path beside the URDF."""
     if not name.startswith("package://"):
         path = urdf.parent / name.removeprefix("file://")
-        if path.is_file():
+        if _is_file(path):
             return path
-        raise MissingMesh(f"{urdf}: mesh '{name}' is not at {path}")
+        raise MissingMesh(f"{urdf}: mesh '{_short(name)}' is not at {_short(str(path))}")
     package, _, below = name.removeprefix("package://").partition("/")
     folders = [packages[package]] if package in packages else _nearby(urdf, package)
     for folder in folders:
-        if (folder / below).is_file():
+        if _is_file(folder / below):
             return folder / below
-    looked = ", ".join(map(str, folders)) or f"any folder '{package}' above {urdf.parent}"
+    named, holds = _short(package), _short(below.partition("/")[0])
+    looked = ", ".join(map(str, folders)) or f"any folder '{named}' above {urdf.parent}"
     raise MissingMesh(
-        f"{urdf}: mesh '{name}' was not found in {looked}; write "
-        f"robot: {{packages: {{{package}: FOLDER}}}}, where FOLDER holds {below.partition('/')[0]}/"
+        f"{urdf}: mesh '{_short(name)}' was not found in {looked}; write "
+        f"robot: {{packages: {{{named}: FOLDER}}}}, where FOLDER holds {holds}/"
     )
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a name longer than any file may have
+        return False
+
+
+def _short(name: str) -> str:
+    return name if len(name) <= SHOWN else f"{name[:SHOWN]}…"
 
 
 def _nearby(urdf: Path, package: str) -> list[Path]:

@@ -174,9 +174,9 @@ class Ros2Cell(Terminal):
     def fault(self, name):
         self.arm.tell(**self.faults[name])
 
-    def finished(self):
+    def finished(self, run="run"):
         """Return the captures that have gone through so far."""
-        log = self.folder / "run" / "run.mcap"
+        log = self.folder / run / "run.mcap"
         return read_run(log).finished if log.exists() else []
 
     def wait_until(self, condition, patience):
