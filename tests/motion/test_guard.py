@@ -468,6 +468,24 @@ def test_a_guard_that_was_held_or_hears_nothing_of_the_program_stops_for_good(wh
     assert "arrived" not in [r.what for r in wire.heard]
 
 
+def test_what_was_asked_before_a_guard_was_held_is_not_done_after_it() -> None:
+    reading, writing = os.pipe()
+    robot, now = StandIn(), [0.0]
+    joints = robot.arm.stance.joints
+    way = Router(MODEL, LIMITS, joints).route(joints, turned(joints, j1=0.8))
+    wire: Any = Wire(robot, [(0, ("close", None))])
+    guard = Watchdog(robot, wire, Charge(lambda: robot, MODEL, LIMITS, alarm=reading))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(time, "monotonic", lambda: now[0])
+        guard._turned = guard._heard = 0.0
+        now[0] = 3.0
+        guard._command("go", way)
+    (report,) = [r for r in wire.heard if r.what == "fault"]
+    assert report.content.startswith("the guard was held for 3.00 s")
+    assert not guard._legs
+    os.close(writing)
+
+
 @pytest.mark.parametrize("what", ["guard", "program"])
 def test_a_short_silence_is_borne(what: str) -> None:
     _, wire, _ = held(what, 0.14)

@@ -163,15 +163,18 @@ class Watchdog:
         Raises:
             SafetyFault: Who was silent, and for how long.
         """
-        now = time.monotonic()
+        turned, self._turned = self._turned, time.monotonic()
+        self._require_since("guard", turned)
+        self._require_since("program", self._heard)
+
+    def _require_since(self, who: str, last: float) -> None:
+        silent = time.monotonic() - last
         allowed = SILENT if self._supervisor.under_way else AT_REST
-        held, self._turned = now - self._turned, now
-        for who, silent in (("guard", held), ("program", now - self._heard)):
-            if self._charge.alarm is not None and silent > allowed:
-                raise SafetyFault(
-                    f"the {who} was held for {silent:.2f} s, at most {allowed} s are allowed (it "
-                    "was suspended, or the machine is too busy): the arm was stopped"
-                )
+        if self._charge.alarm is not None and silent > allowed:
+            raise SafetyFault(
+                f"the {who} was held for {silent:.2f} s, at most {allowed} s are allowed (it "
+                "was suspended, or the machine is too busy): the arm was stopped"
+            )
 
     def _tell_cycle(self, state: RobotState) -> None:
         """Answer who waits for the next cycle: never unasked, a full wire would hold the guard."""
@@ -258,6 +261,7 @@ class Watchdog:
     def _command(self, request: str, content: Any) -> None:
         """Move the arm as asked, in any of the three ways."""
         try:
+            self._require_since("guard", self._turned)  # nothing asked before a pause is done
             if request == "go":
                 self._legs, self._led_ns = list(content.legs), None
                 self._set_off()
@@ -269,8 +273,8 @@ class Watchdog:
                 self._supervisor.led()
                 self._led_ns = None
                 self._robot.move_linear(*content)
-        except DeviceError as lost:
-            self._bar(str(lost))
+        except (SafetyFault, DeviceError) as fault:
+            self._bar(str(fault))
         self._turned = time.monotonic()  # a command may wait until the arm rests
 
     def _tell_samples(self) -> None:
