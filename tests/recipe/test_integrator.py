@@ -99,10 +99,9 @@ def test_a_wrong_convention_is_refused_with_the_right_one(
     assert command("init", "cell", *words)[0] == 0
     code, said, _ = command("run", "cell.yaml", "--out", "first")
     assert code == 1
-    assert "the rotations were read as a rotation vector, and fit as roll, pitch, yaw" in " ".join(
-        said.split()
-    )
-    assert "written_as: xyz" in said
+    read = "the robot's rotations were read as a rotation vector in degrees, and fit as roll, pitch"
+    assert read in " ".join(said.split())
+    assert "rotation: xyz" in said
 
 
 @pytest.mark.parametrize("table", [None, "X,Y,Z,A,B,C\n1,2,3,4,5,6\n"])

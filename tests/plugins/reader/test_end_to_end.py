@@ -116,7 +116,9 @@ def test_the_doctor_tells_the_wrong_type_of_samples(
         flangeye(monkeypatch, "doctor", samples, "--recipe", recipe(tmp_path, "eye_on_base")) == 1
     )
     told = capsys.readouterr().out
-    assert "the camera is beside the robot, or the poses are flange_T_base" in told
+    assert "1. pose direction: the poses are flange_T_base" in told  # the reader turned them round
+    assert told.rstrip().endswith("inverted: true}}}")
+    assert "configuration:" not in told  # the distances tell that the camera is in the hand
     assert "reader: {easy_handeye: {calibration: eye_on_base}}, inverted: true" in told
 
 
