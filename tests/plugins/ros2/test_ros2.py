@@ -118,7 +118,13 @@ def test_an_arm_that_others_move_is_ready_when_it_stands_elsewhere(env):
     [
         ("zivid", {"cloud": "/camera/points", "trigger": "/camera/capture"}, 3, NO_SERVICE),
         ("phoxi", {"cloud": "/camera/points", "trigger": "/camera/capture"}, 3, NO_SERVICE),
-        ("realsense", {"cloud": "/camera/points"}, 2, "nothing came on"),
+        pytest.param(
+            "realsense",
+            {"cloud": "/camera/points"},
+            2,
+            "nothing came on",
+            marks=pytest.mark.slow,  # a cloud at 30 Hz does not always come within 2.5 s on two cores
+        ),
         ("empty", {"cloud": "/camera/points", "trigger": "/camera/trigger"}, 3, "nothing came on"),
         ("depth", {"depth": "/camera/image_rect_raw"}, 3, "nothing came on"),
     ],
