@@ -109,7 +109,7 @@ def _archive_again(recipe: Recipe, found: Mapping[str, t.Feature]) -> ReadAgain 
     path, reader = getattr(params, "path", None), getattr(params, "reader", None)
     if path is None or not isinstance(reader, BoundPart) or not Path(path).exists():
         return None
-    return partial(_read_again, Path(path), recipe, found)
+    return partial(_read_again, Path(path), (reader, recipe), found)
 
 
 def _set_aside(log: RunLog) -> Iterator[Finding]:
@@ -163,21 +163,20 @@ def _of_recipe(path: Path, registry: Registry, recipe: Recipe) -> RecordedSessio
     session = _of_recordings(kept, found, recipe)
     if remark is not None:
         return _in_other_unit(session, *remark)
-    return replace(session, again=partial(_read_again, path, recipe, found))
+    return replace(session, again=partial(_read_again, path, (reader, recipe), found))
 
 
 def _read_again(
     path: Path,
-    recipe: Recipe,
+    by: tuple[BoundPart, Recipe],
     found: Mapping[str, t.Feature],
     arm: Mapping[str, Any],
     target: Mapping[str, Any],
 ) -> RecordedSession:
     """Return an archive's session by its reader with other parameters; see RecordedSession."""
-    first = recipe.steps[0]
-    reader: BoundPart = getattr(first.params, "reader")  # noqa: B009  a stage's own parameter
+    reader, recipe = by
     bound = _bound_with(reader, arm, target)
-    archive = _kept(bound(path), first)
+    archive = _kept(bound(path), recipe.steps[0])
     session = _of_recordings(archive, _ready_made(archive) or found, recipe)
     return replace(session, reader=_written(bound))
 

@@ -71,12 +71,14 @@ def _written_otherwise(session: RecordedSession) -> Iterator[Reading]:
         ("the rotations of robot and markers", arm if arm == target else None, True, True),
     ]
     for name, said, of_arm, of_target in whose:
-        for other in _conventions(*said) if said else ():
+        if said is None:
+            continue
+        for other in _conventions(*said):
             changes = {"rotation": other[0], "angle": other[1]}
             with suppress(StageError):  # the numbers are no poses in it
                 read = session.again(changes if of_arm else {}, changes if of_target else {})
                 if read.ids == session.ids:
-                    yield Reading(read, name, _spelt(said or other), _spelt(other))
+                    yield Reading(read, name, _spelt(said), _spelt(other))
 
 
 Convention = tuple[str, str | None]
