@@ -14,9 +14,9 @@ import numpy as np
 import typer
 
 from flangeye.errors import StageError
-from flangeye_emulators.weld_world.bench import try_condition
-from flangeye_emulators.weld_world.conditions import CONDITIONS, Condition
-from flangeye_emulators.weld_world.trial import Trial
+from tools.weld_bench import try_condition
+from tools.weld_conditions import CONDITIONS, Condition
+from tools.weld_trial import Trial
 
 COLUMNS = ("condition", "welds", "rms mm", "largest mm", "done", "otherwise")
 

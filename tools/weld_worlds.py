@@ -9,15 +9,200 @@ Prints what was reported, the welds beyond their stated bound, and how often the
 from __future__ import annotations
 
 import json
+import math
 from collections import Counter
+from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict
-from typing import Annotated
+from dataclasses import asdict, dataclass
+from typing import Annotated, Any
 
 import numpy as np
 import typer
 
-from flangeye_emulators.weld_world.worlds import WorldScore, judged
+from flangeye.errors import StageError
+from tools.weld_bench import DISTANCE, try_condition
+from tools.weld_conditions import Condition
+from tools.weld_trial import Trial
+
+LENGTH = 0.1
+"""Of the seam that is welded in each world [m]."""
+
+PERIOD = 16e-3
+"""Of a cycle [s]: a world takes a second or two."""
+
+OFTEN = 0.4
+"""Each of some thirty things that the weld can measure is wrong at most so often; how often is a
+world's own: in some little is wrong, in others much."""
+
+STATED = (0.02e-3, 0.12e-3)
+"""Between these a world's files state what nothing at the weld can measure, one sigma [m]."""
+
+
+@dataclass(frozen=True)
+class WorldScore:
+    """A weld in one world.
+
+    Attributes:
+        seed: Seed of the world.
+        status: ``done``; ``stopped``, after the arc was struck; ``refused``, before.
+        reason: Why it was not done.
+        share_welded: Share of the true seam on which the torch welded within its bound.
+        over_bound: Largest of the torch's true distances over its stated bound; 0 without an arc.
+        largest: Largest of those distances [m].
+        rms: Their root mean square [m].
+        inside: Share of the seam on which the torch was within its 95 % band.
+    """
+
+    seed: int
+    status: str
+    reason: str = ""
+    share_welded: float = 0.0
+    over_bound: float = 0.0
+    largest: float = 0.0
+    rms: float = 0.0
+    inside: float = 1.0
+
+    @property
+    def silent(self) -> bool:
+        """Whether the torch was beyond its stated bound, in a weld that was done or stopped."""
+        return self.over_bound > 1.0
+
+
+class _Draw:
+    """Draws what is wrong in one world, which has a frequency of its own for that."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.rng, self._often = rng, float(rng.uniform(0.0, OFTEN))
+
+    def happens(self) -> bool:
+        return bool(self.rng.uniform() < self._often)
+
+    def some(self, most: float) -> float:
+        """Return nothing in most worlds, otherwise up to ``most``."""
+        return float(self.rng.uniform(0.0, most)) if self.happens() else 0.0
+
+    def either(self, most: float) -> float:
+        """Return the same, to either side."""
+        return self.some(most) * float(self.rng.choice([-1.0, 1.0]))
+
+    def between(self, low: float, high: float) -> float:
+        return float(self.rng.uniform(low, high))
+
+    def normal(self, sigma: float) -> float:
+        return sigma * float(self.rng.standard_normal())
+
+    def gaps(self) -> list[Mapping[str, Any]]:
+        if not self.happens():
+            return []
+        start, length = self.between(0.02, 0.04), self.between(5e-3, 50e-3)
+        side = int(self.rng.choice([-1, 1]))
+        return [{"start": _mm(start), "length": _mm(length), "side": side}]
+
+    def tacks(self) -> list[Mapping[str, Any]]:
+        height = self.between(0.5e-3, 2e-3)
+        return [{"start": "30 mm", "height": _mm(height)}] if self.happens() else []
+
+    def hidden(self) -> list[str] | None:
+        start, lasts = self.between(8.0, 20.0), self.between(0.1, 1.2)
+        return [_ms(start), _ms(start + lasts)] if self.happens() else None
+
+
+def drawn(seed: int) -> Condition:
+    """Return a random world.
+
+    What the weld can measure (finger, clock, response of the arm, workpiece) is wrong in some
+    worlds, by up to twice the envelope. What it cannot (torch, tip, yaw, path of the arm, heat) is
+    always wrong, normally distributed about the files with the sigma that they state.
+    """
+    rng = np.random.default_rng([seed, 14])
+    draw = _Draw(rng)
+    torch, arm, heat = np.exp(rng.uniform(math.log(STATED[0]), math.log(STATED[1]), 3)).tolist()
+    along, tip_sigma = draw.between(0.1e-3, 0.5e-3), draw.between(0.1e-3, 0.6e-3)
+    world = {
+        "arm": _arm(draw, arm),
+        "tool": _tool(draw, tip_sigma, along, torch),
+        "finger": _finger(draw),
+        "clock": {
+            "latency": _ms(draw.some(0.2)), "stamp": _ms(draw.either(0.1)),
+            "jitter": _ms(draw.some(0.03)), "dropped": draw.some(0.6), "hidden": draw.hidden(),
+        },
+        "workpiece": _workpiece(draw),
+        "heat": {"local": _mm(draw.normal(heat))},
+    }  # fmt: skip
+    settings = {
+        "speed": f"{rng.choice([5, 10, 20])} mm/s", "max_error": f"{rng.choice([1, 2])} mm",
+        "arm_sigma": _mm(arm), "distortion": _mm(heat),
+    }  # fmt: skip
+    belief = {"torch_sigma": torch, "along_sigma": along, "tip_sigma": tip_sigma}
+    return Condition(world, settings, (draw.some(12e-3), draw.some(0.1)), belief)
+
+
+def _arm(draw: _Draw, sigma: float) -> dict[str, Any]:
+    return {
+        "lag": _ms(draw.some(0.4)), "dead_time": _ms(draw.some(0.2)),
+        "wave": _mm(abs(draw.normal(sigma))), "wave_length": _mm(draw.between(40e-3, 200e-3)),
+        "backlash": _mm(draw.some(2 * sigma)), "repeatability": _mm(draw.some(sigma / 2)),
+        "scale": draw.either(sigma / DISTANCE), "sag": _mm(draw.some(0.5e-3)),
+    }  # fmt: skip
+
+
+def _tool(draw: _Draw, tip: float, along: float, across: float) -> dict[str, Any]:
+    off = [draw.normal(tip) for _ in range(3)]
+    turned = draw.between(0.0, 1.0)  # the share of the yaw in how far the torch is aside
+    # What the files state of the torch is where it is relative to the tip.
+    torch = (off[0] + draw.normal(along), off[1] + draw.normal(across * np.sqrt(1.0 - turned)))
+    yaw = np.degrees(draw.normal(across * np.sqrt(turned)) / DISTANCE)
+    return {"tip": [_mm(x) for x in off], "torch": [_mm(x) for x in torch], "yaw": f"{yaw} deg"}
+
+
+def _finger(draw: _Draw) -> dict[str, Any]:
+    return {
+        "lateral": float(np.exp(draw.either(0.8))), "axial": float(np.exp(draw.either(0.8))),
+        "gain": draw.either(0.4), "drift": draw.either(0.2),
+        "rest": [_mm(draw.either(0.4e-3)) for _ in range(3)], "play": _mm(draw.some(0.6e-3)),
+        "hysteresis": draw.some(0.2), "creep": draw.some(0.06),
+        "friction": draw.between(0.0, 0.3), "noise": _mm(10 ** draw.between(-5.3, -3.7)),
+    }  # fmt: skip
+
+
+def _workpiece(draw: _Draw) -> dict[str, Any]:
+    return {
+        "wave": _mm(draw.some(2e-3)), "wave_length": _mm(draw.between(8e-3, 60e-3)),
+        "bow": _mm(draw.either(4e-3)), "half_angle": f"{draw.either(25.0)} deg",
+        "half_angle_wave": f"{draw.some(10.0)} deg", "root_gap": _mm(draw.some(2e-3)),
+        "spatter": _mm(draw.some(0.1e-3)), "gaps": draw.gaps(), "tacks": draw.tacks(),
+    }  # fmt: skip
+
+
+def judged(seed: int, **settings: Any) -> WorldScore:
+    """Weld in a random world, with its settings and these; compare the bound with the truth."""
+    condition = drawn(seed)
+    condition = condition._replace(settings={**condition.settings, **settings})
+    try:
+        trial = try_condition(condition, seed, LENGTH, PERIOD)
+    except StageError as refusal:
+        return WorldScore(seed, "refused", str(refusal))
+    errors = trial.errors
+    reason = "" if trial.done else trial.controller.reason or "not in time"
+    if not len(errors):
+        return WorldScore(seed, "refused", reason)
+    return WorldScore(
+        seed, "done" if trial.done else "stopped", reason, trial.share_welded,
+        float((errors / _stated(trial, "bound")).max()), float(errors.max()),
+        float(np.sqrt(np.mean(errors**2))), float(np.mean(errors <= _stated(trial, "band"))),
+    )  # fmt: skip
+
+
+def _stated(trial: Trial, name: str) -> Any:
+    return trial.column(name)[trial.beside]
+
+
+def _mm(metres: float) -> str:
+    return f"{metres * 1e3} mm"
+
+
+def _ms(seconds: float) -> str:
+    return f"{seconds * 1e3} ms"
 
 
 def worlds(

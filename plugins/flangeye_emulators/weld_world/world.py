@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from flangeye.motion.seam_following import ToolPose
+from flangeye.motion.seam_following import ToolPose, turned
 from flangeye.types import Floats
 from flangeye_emulators.weld_world.arm import ArmError
-from flangeye_emulators.weld_world.finger import TrueFinger
-from flangeye_emulators.weld_world.groove import Contact, Groove, Section, Tip
-from flangeye_emulators.weld_world.heat import Distortion
-from flangeye_emulators.weld_world.settings import WorldParams
-from flangeye_emulators.weld_world.tool import TrueTool
-from flangeye_emulators.weld_world.workpiece import true_groove
+from flangeye_emulators.weld_world.groove import TICK, Contact, Gap, Groove, Relief, Section, Tip
+from flangeye_emulators.weld_world.settings import (
+    FingerTruth,
+    HeatTruth,
+    ToolTruth,
+    WorkpieceTruth,
+    WorldParams,
+)
+from flangeye_plugins.weld.body import leaning
+from flangeye_plugins.weld.path import Path
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,3 +91,132 @@ class WeldWorld:
 def _true_tip(tip: Tip, truth: WorldParams) -> Tip:
     finger = truth.finger
     return Tip(tip.radius, tip.lateral * finger.lateral, tip.axial * finger.axial, finger.friction)
+
+
+class Distortion:
+    """The seam's motion to the left, at a place, while the torch is at another."""
+
+    def __init__(self, truth: HeatTruth, length: float) -> None:
+        self._truth, self._length = truth, length
+
+    def at(self, s: float, torch: float) -> float:
+        """Return how far the seam at ``s`` has moved, the torch being at ``torch`` [m]."""
+        truth = self._truth
+        if torch <= 0.0:
+            return 0.0
+        whole = truth.shift * min(torch / self._length, 1.0)
+        near = (s - torch) / truth.radius
+        return whole + truth.local * math.exp(-0.5 * near**2)
+
+
+class TrueTool:
+    """Tip and torch of a tool whose file is wrong."""
+
+    def __init__(self, truth: ToolTruth, torch: Floats) -> None:
+        """Take the world file's torch (3,) from the tip, in the tool's axes [m]."""
+        self._tip = turned(np.asarray(truth.tip, dtype=np.float64), truth.yaw)
+        aside = np.array([*truth.torch, truth.tip[2]])
+        self._leans = leaning(truth.work, truth.travel)
+        self._torch = turned(self._leans @ torch + aside, truth.yaw)
+
+    def axes(self, pose: ToolPose, level_R_tool: Floats) -> Floats:
+        """Return the finger's axes (3, 3) in the plane's."""
+        c, s = np.cos(pose.angle), np.sin(pose.angle)
+        heading = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        return np.asarray(heading @ level_R_tool @ self._leans)
+
+    def rest(self, pose: ToolPose, level_R_tool: Floats) -> Floats:
+        """Return where the undeformed tip is (3,)."""
+        return pose.position + turned(level_R_tool @ self._tip, pose.angle)
+
+    def torch(self, pose: ToolPose, level_R_tool: Floats) -> Floats:
+        """Return where the torch is (3,)."""
+        return pose.position + turned(level_R_tool @ self._torch, pose.angle)
+
+
+HYSTERESIS_WIDTH = 1e-3
+"""Displacement over which the lagging share comes along [m]."""
+
+
+class TrueFinger:
+    """Play, hysteresis, creep and a gain that drifts, one after the other."""
+
+    def __init__(self, truth: FingerTruth) -> None:
+        self._truth = truth
+        self._played, self._lagging, self._crept = (np.zeros(3) for _ in range(3))
+        self._time: float | None = None
+        self._age = 0.0
+
+    def shown(self, time: float, displacement: Floats) -> Floats:
+        """Return the displacement (3,) that the tag speaks of, when the tip's is ``displacement``.
+
+        All along the tool's axes [m]; to be called in the order of time [s].
+        """
+        truth = self._truth
+        elapsed = 0.0 if self._time is None else time - self._time
+        self._time, self._age = time, self._age + elapsed
+        self._played = _follow(self._played, displacement, truth.play / 2)
+        self._lagging = _follow(self._lagging, self._played, HYSTERESIS_WIDTH)
+        moved = self._played + truth.hysteresis * (self._lagging - self._played)
+        share = 1.0 - math.exp(-elapsed / truth.creep_time)
+        self._crept = self._crept + share * (moved - self._crept)
+        gain = 1.0 + truth.gain + truth.drift * self._age / 60.0
+        return np.asarray(truth.rest) + gain * (moved + truth.creep * self._crept)
+
+
+def _follow(behind: Floats, ahead: Floats, half: float) -> Floats:
+    """Return what is dragged along by ``ahead``, with a dead band of ``half`` to both sides."""
+    return np.clip(behind, ahead - half, ahead + half)
+
+
+VARIES = 60e-3
+"""Period with which the half angle varies along the seam [m]."""
+
+GRAIN = 1e-3
+"""Correlation length of spatter along the seam [m]."""
+
+
+def true_groove(
+    points: Floats, section: Section, truth: WorkpieceTruth, rng: np.random.Generator
+) -> Groove:
+    """Return the groove that is really there.
+
+    Args:
+        points: (N, 3) of the CAD's seam in the plane of the work, with its height [m].
+        section: The CAD's.
+        truth: What differs.
+        rng: Draws spatter, and where waves begin.
+    """
+    root = _wandered(Path(points), truth, rng.uniform(0.0, 2 * np.pi))
+    real = Section(section.half_angle + truth.half_angle, section.depth, section.lean + truth.lean)
+    gaps = tuple(Gap(gap.start, gap.start + gap.length, gap.side) for gap in truth.gaps)
+    return Groove(root, real, gaps, _relief(root.length, real, truth, rng))
+
+
+def _wandered(path: Path, truth: WorkpieceTruth, phase: float) -> Path:
+    if not (truth.wave or truth.bow):
+        return path
+    s = np.linspace(0.0, path.length, len(path.points))
+    aside = truth.wave * np.sin(2 * np.pi * s / truth.wave_length + phase)
+    aside += truth.bow * np.sin(np.pi * s / path.length)
+    points = path.points.copy()
+    points[:, :2] += aside[:, None] * np.stack([-path.tangents[:, 1], path.tangents[:, 0]], axis=1)
+    return Path(points)
+
+
+def _relief(
+    length: float, section: Section, truth: WorkpieceTruth, rng: np.random.Generator
+) -> Relief:
+    s = np.arange(0.0, length + TICK, TICK)
+    fill = _grains(s, truth.spatter, rng) - truth.root_gap / 2 / np.tan(section.half_angle)
+    for tack in truth.tacks:
+        inside = np.clip(np.minimum(s - tack.start, tack.start + tack.length - s) / GRAIN, 0.0, 1.0)
+        fill = fill + tack.height * inside
+    wider = truth.half_angle_wave * np.sin(2 * np.pi * s / VARIES + rng.uniform(0.0, 2 * np.pi))
+    aside = _grains(s, truth.spatter, rng)
+    return Relief(tuple(fill.tolist()), tuple(aside.tolist()), tuple(wider.tolist()))
+
+
+def _grains(s: Floats, sigma: float, rng: np.random.Generator) -> Floats:
+    knots = np.arange(0.0, s[-1] + 2 * GRAIN, GRAIN)
+    return np.interp(s, knots, sigma * rng.standard_normal(len(knots)))

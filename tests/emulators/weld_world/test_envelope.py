@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from flangeye.errors import StageError
-from flangeye_emulators.weld_world import trial as trials
-from flangeye_emulators.weld_world.bench import try_condition
-from flangeye_emulators.weld_world.conditions import CONDITIONS, Condition
-from flangeye_emulators.weld_world.worlds import drawn, judged
 from flangeye_plugins.weld.follower import Follower
-from tools.weld_worlds import summary
+from tools import weld_trial as trials
+from tools.weld_bench import try_condition
+from tools.weld_conditions import CONDITIONS, Condition
+from tools.weld_worlds import drawn, judged, summary
 
 SHORT = 0.07
 
@@ -153,7 +152,7 @@ def test_nothing_of_the_world_is_reachable_from_the_controller(
             del controller.step
 
     trials_run = trials.run_trial
-    monkeypatch.setattr("flangeye_emulators.weld_world.bench.run_trial", spy)
+    monkeypatch.setattr("tools.weld_bench.run_trial", spy)
     found = try_condition(Condition(), 0, SHORT, 16e-3)
     ours = [*_reachable(found.controller), *_reachable(given[-200:])]
     modules = {type(each).__module__ for each in ours}

@@ -5,12 +5,8 @@ import pytest
 
 from flangeye.motion.seam_following import Command, ToolPose
 from flangeye_emulators.weld_world.arm import ArmError, ArmResponse
-from flangeye_emulators.weld_world.bench import SECTION, try_condition
 from flangeye_emulators.weld_world.clock import Shutter
-from flangeye_emulators.weld_world.conditions import CONDITIONS, Condition
-from flangeye_emulators.weld_world.finger import TrueFinger
 from flangeye_emulators.weld_world.groove import Contact, Groove, Tip
-from flangeye_emulators.weld_world.heat import Distortion
 from flangeye_emulators.weld_world.settings import (
     ArmTruth,
     ClockTruth,
@@ -20,9 +16,10 @@ from flangeye_emulators.weld_world.settings import (
     WorkpieceTruth,
     WorldParams,
 )
-from flangeye_emulators.weld_world.tool import TrueTool
-from flangeye_emulators.weld_world.workpiece import true_groove
+from flangeye_emulators.weld_world.world import Distortion, TrueFinger, TrueTool, true_groove
 from flangeye_plugins.weld.path import Path
+from tools.weld_bench import SECTION, try_condition
+from tools.weld_conditions import CONDITIONS, Condition
 
 LINE = np.array([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0]])
 TORCH = np.array([-40e-3, 0.0, 0.0])

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from flangeye.errors import StageError
-from flangeye_emulators.weld_world.bench import curved, try_condition
-from flangeye_emulators.weld_world.conditions import Condition
 from flangeye_plugins.weld.belief import Belief
 from flangeye_plugins.weld.bound import check_bound, predicted
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following
 from tests.plugins.weld.bench import straight
+from tools.weld_bench import curved, try_condition
+from tools.weld_conditions import Condition
 
 BEND, DISTANCE = 0.05, 0.04
 

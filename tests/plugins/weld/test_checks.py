@@ -14,7 +14,6 @@ from flangeye.maths.seam_geometry import tube_radii
 from flangeye.models.finger import Finger
 from flangeye.plugin.stage import BoundPart
 from flangeye.types import Seam
-from flangeye_emulators.weld_world.bench import FINGER
 from flangeye_plugins.weld.belief import Belief
 from flangeye_plugins.weld.bounds import Bounds
 from flangeye_plugins.weld.checks import (
@@ -32,6 +31,7 @@ from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.reachability import _nearest, flange_speed
 from flangeye_plugins.weld.report import _at, _figures, _loop, _stated
 from flangeye_plugins.weld.settings import Following
+from tools.weld_bench import FINGER
 
 STIFF = {
     "rest": ["0 mm"] * 3, "rotation": ["0 deg"] * 3, "gain": np.eye(3).tolist(),

@@ -9,11 +9,8 @@ from numpy.typing import NDArray
 
 from flangeye.errors import StageError
 from flangeye.types import Seam
-from flangeye_emulators.weld_world.bench import built_for, known, start_at
-from flangeye_emulators.weld_world.conditions import LAP, Condition
 from flangeye_emulators.weld_world.groove import Tip
 from flangeye_emulators.weld_world.settings import WorldParams
-from flangeye_emulators.weld_world.trial import run_trial
 from flangeye_emulators.weld_world.world import Nominal
 from flangeye_plugins.weld.checks import check_seam
 from flangeye_plugins.weld.corners import ARC, corners_of, leg_of
@@ -21,6 +18,9 @@ from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.resuming import controller_of
 from flangeye_plugins.weld.settings import Following, WeldTactileParams
 from tests.plugins.weld import bench, cell
+from tools.weld_bench import built_for, known, start_at
+from tools.weld_conditions import LAP, Condition
+from tools.weld_trial import run_trial
 
 Points = NDArray[np.float64]
 

@@ -9,9 +9,9 @@ from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.models.finger import Finger
 from flangeye.motion.seam_following import STILL
 from flangeye.types import BASE, FLANGE, Transform
-from flangeye_emulators.weld_world.bench import FINGER
 from flangeye_plugins.weld.body import body_from
 from flangeye_plugins.weld.frame import Tool, WorkPlane
+from tools.weld_bench import FINGER
 
 TURN = rotation_exp(np.array([0.2, -0.1, 0.5]))
 MIDDLE = np.array([0.4, -0.2, 0.1])

@@ -8,8 +8,6 @@ import pytest
 from flangeye.errors import StageError
 from flangeye.maths.geometry import rotation_from_rpy
 from flangeye.models.finger import Finger
-from flangeye_emulators.weld_world.bench import FINGER, try_condition
-from flangeye_emulators.weld_world.conditions import CONDITIONS
 from flangeye_emulators.weld_world.groove import Contact, Groove, Section, Tip
 from flangeye_plugins.weld.belief import belief_of
 from flangeye_plugins.weld.body import body_from, body_of, leaning
@@ -18,6 +16,8 @@ from flangeye_plugins.weld.joint import WeldJoint, edges_half_angle, joint_of
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following
 from tests.plugins.weld import cell
+from tools.weld_bench import FINGER, try_condition
+from tools.weld_conditions import CONDITIONS
 
 SHORT = 0.07
 RADIUS = 1.5e-3

@@ -15,8 +15,6 @@ from flangeye.plugin.stage import BoundPart
 from flangeye.run.replay import replay_steps
 from flangeye.types import Seed
 from flangeye_emulators.finger.profiler import profiler_simulated
-from flangeye_emulators.weld_world.bench import try_condition
-from flangeye_emulators.weld_world.conditions import CONDITIONS, Condition
 from flangeye_emulators.weld_world.settings import LookTruth
 from flangeye_plugins.weld.camera_process import CameraProcess
 from flangeye_plugins.weld.finger_camera import CameraJob
@@ -26,6 +24,8 @@ from flangeye_plugins.weld.settings import WeldTactileParams
 from tests.plugins.weld.cell import planned, run
 from tests.plugins.weld.test_camera_process import Camera, first_sight, state
 from tests.plugins.weld.test_touch import FINGER
+from tools.weld_bench import try_condition
+from tools.weld_conditions import CONDITIONS, Condition
 
 ASIDE = {"tool": {"torch": ["0 mm", "0.3 mm"]}}
 LOOK = BoundPart(profiler_simulated, LookTruth.model_validate({"behind": "10 mm"}))

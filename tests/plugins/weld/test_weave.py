@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from flangeye.errors import StageError
-from flangeye_emulators.weld_world.bench import curved, misplanned, try_condition
-from flangeye_emulators.weld_world.conditions import CONDITIONS, Condition
 from flangeye_plugins.weld.checks import check_weave
 from flangeye_plugins.weld.passes import Passes
 from flangeye_plugins.weld.resuming import controller_from, follower_of
 from flangeye_plugins.weld.settings import Following
 from flangeye_plugins.weld.weave import STRAIGHT, Weave
+from tools.weld_bench import curved, misplanned, try_condition
+from tools.weld_conditions import CONDITIONS, Condition
 
 SHORT, PERIOD = 0.08, 16e-3
 

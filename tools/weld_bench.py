@@ -10,9 +10,7 @@ import numpy as np
 from flangeye.models.finger import Finger
 from flangeye.motion.seam_following import Controller
 from flangeye.types import Floats
-from flangeye_emulators.weld_world.conditions import Condition
 from flangeye_emulators.weld_world.groove import Section, Tip
-from flangeye_emulators.weld_world.trial import Start, Trial, run_trial
 from flangeye_emulators.weld_world.world import Nominal
 from flangeye_plugins.weld.belief import Belief, belief_of
 from flangeye_plugins.weld.body import Body, body_from
@@ -21,6 +19,8 @@ from flangeye_plugins.weld.checks import check_tool
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.resuming import controller_of
 from flangeye_plugins.weld.settings import Following
+from tools.weld_conditions import Condition
+from tools.weld_trial import Start, Trial, run_trial
 
 DISTANCE = 40e-3
 SECTION = Section(np.deg2rad(40.0), 10e-3)
