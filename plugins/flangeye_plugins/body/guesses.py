@@ -13,24 +13,22 @@ from typing import Any
 import numpy as np
 
 from flangeye.types import Floats, Indices
-from flangeye_plugins.body.looks import LISTED, Looks
+from flangeye_plugins.body.looks import Looks
 from flangeye_plugins.body.shape import Oriented, thin
 from flangeye_plugins.body.view import View
 
-SCAN_ENDS, BODY_ENDS = 600, 400
+SCAN_ENDS, BODY_ENDS = 800, 400
 """Points where faces end that are laid on each other, at most."""
 
 SCAN_SPACING, BODY_SPACING = 1 / 22, 1 / 18
 """How far those are apart, as shares of the body's size."""
 
-FILTERS = ((4, 0.2), (12, 0.25))
-"""Points of the body by which poses are judged, and share of them that passes."""
+FILTERS = ((4, 30_000), (12, 6_000))
+"""Points of the body by which poses are judged, and how many of them pass."""
 
-SETTLED = 6000
-"""Number of poses that are settled."""
-
-REACH = 0.12
-"""How far settling looks, as a share of the size."""
+LAST, ROUGH = 40, 0.06
+"""Points by which the best are chosen, and how far off a surface may be while the turn is known to
+9 degrees, as a share of the size."""
 
 AT_ONCE = 30_000
 """Poses judged at once: their points stay in a core's cache."""
@@ -42,11 +40,7 @@ def guesses(view: View, looks: Looks, most: int) -> Floats:
     scan = view.edges(looks.size)
     on = scan.take(_some(scan, SCAN_ENDS, looks.size * SCAN_SPACING, rng))
     poses = _passed(on, _some(looks.ends, BODY_ENDS, looks.size * BODY_SPACING, rng), view, looks)
-    poses = poses[_best_of(looks.rough_scores(poses, view, LISTED), SETTLED)].astype(np.float64)
-    rough = looks.thinned(LISTED)
-    for _ in range(2):
-        poses = rough.settled(poses, view, REACH * looks.size)
-    return np.asarray(poses[_best_of(looks.rough_scores(poses, view, LISTED), most)])
+    return poses[_best_of(looks.scores(poses, view, LAST, ROUGH), most)].astype(np.float64)
 
 
 def _best_of(scores: Floats, most: int) -> Indices:
@@ -72,12 +66,12 @@ def _passed(on: Oriented, at: Indices, view: View, looks: Looks) -> Floats:
         return number[looks.ends_seen[looks.view_of(posed(number)), at[number % max(len(at), 1)]]]
 
     def scored(number: Indices, count: int) -> Floats:
-        return looks.rough_scores(posed(number), view, count)
+        return looks.scores(posed(number), view, count, ROUGH)
 
     number = _chunked(np.arange(len(scan) * len(body)), unhidden)
-    for count, share in FILTERS:
+    for count, left in FILTERS:
         scores = _chunked(number, partial(scored, count=count))
-        number = number[_best_of(scores, int(share * len(number)))]
+        number = number[_best_of(scores, left)]
     return posed(number)
 
 

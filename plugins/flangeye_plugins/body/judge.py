@@ -20,6 +20,10 @@ JUMP = 6.0
 OUTLINE = 3
 """Cells beside the body in which its surface should have ended."""
 
+ENDED, BEHIND = 0.03, 0.05
+"""Smallest share of the body's outline that is seen to end before something farther, and how far
+behind it that is, as a share of the size: without, any face of a box is a plate."""
+
 PENALTY = 10
 """Rays in favour that one ray against outweighs: of the true pose there are hardly any."""
 
@@ -33,6 +37,8 @@ class Verdict(NamedTuple):
         against: How many show something that cannot be there: behind the body, or right before it.
         goes_on: Rays beside it that show its surface where it has ended.
         beside: Rays beside it that show anything.
+        ended: Rays beside it that show something behind it.
+        outline: All rays beside it.
     """
 
     due: int
@@ -40,6 +46,15 @@ class Verdict(NamedTuple):
     against: int
     goes_on: int
     beside: int
+    ended: int
+    outline: int
+
+    @property
+    def bounded(self) -> bool:
+        """Whether the body is seen to end, or nothing at all is seen around it."""
+        return (
+            self.ended >= ENDED * self.outline or self.beside < ENDED * self.outline
+        ) and self.outline > 0
 
     @property
     def shown(self) -> float:
@@ -54,7 +69,8 @@ class Verdict(NamedTuple):
     @property
     def score(self) -> float:
         """What poses are ranked by: rays for it, less those against it."""
-        return self.agree - PENALTY * self.against - self.goes_on
+        held = self.agree if self.bounded else 0
+        return held - PENALTY * self.against - self.goes_on
 
 
 def judged(shape: Shape, view: View, pose: Floats, tolerance: float) -> Verdict:
@@ -71,7 +87,7 @@ def judged(shape: Shape, view: View, pose: Floats, tolerance: float) -> Verdict:
     window = _window(shape, view, pose)
     rays, scan = view.directions[window], view.xyz[window]
     if not rays.size:
-        return Verdict(0, 0, 0, 0, 0)
+        return Verdict(*[0] * 7)
     depth, normals = _seen_from(shape, rays, pose)
     hit = np.isfinite(depth)
     off = np.einsum("ijk,ijk->ij", normals, scan - np.where(hit, depth, 0.0)[..., None] * rays)
@@ -79,12 +95,15 @@ def judged(shape: Shape, view: View, pose: Floats, tolerance: float) -> Verdict:
     due &= np.einsum("ijk,ijk->ij", normals, rays) < -GRAZING * np.linalg.norm(rays, axis=-1)
     agree = due & (np.abs(off) < tolerance)
     before = (off > 2 * tolerance) & (scan[..., 2] > depth - NEAR * shape.size)
-    against = due & ((off < -2 * tolerance) | before)
+    # A single ray may be a mixed one, at an edge of the body.
+    against = ndimage.binary_opening(due & ((off < -2 * tolerance) | before))
     beside = ndimage.binary_dilation(hit, iterations=OUTLINE) & ~ndimage.binary_dilation(hit)
     row, column = ndimage.distance_transform_edt(~hit, return_distances=False, return_indices=True)
     ended = depth[row, column][..., None] * rays[row, column]
     on = np.abs(np.einsum("ijk,ijk->ij", normals[row, column], scan - ended)) < 2 * tolerance
-    counts = (due, agree, against, beside & on, beside & np.isfinite(scan[..., 2]))
+    measured = beside & np.isfinite(scan[..., 2])
+    ended_there = beside & (scan[..., 2] > depth[row, column] + BEHIND * shape.size)
+    counts = (due, agree, against, beside & on, measured, ended_there, beside)
     return Verdict(*(int(count.sum()) for count in counts))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import permutations, product
 
@@ -20,17 +20,17 @@ DIRECTIONS = 128
 BEYOND = 0.05
 """How far beyond the end of a face nothing of it should be seen, as a share of the size."""
 
-ROUGH = 0.06
-"""How far off a surface may be while the turn is known to 9 degrees, as a share of the size."""
+STEEPEST = 0.4
+"""Cosine of the incidence beyond which a coarse view often lacks a surface."""
+
+AGAINST = 2.0
+"""Points for it that outweigh one that is seen through, or a face that goes on beyond its end."""
 
 TOLERANCE = 0.01
 """How far the scan's surface may be from a pose's, as a share of the size; three sigma of the
 scanner's noise at least."""
 
-STEEP, NEARBY = 3.0, 3.0
-"""Widths of a cell by which a steep surface's depth differs in it, and by which it may be off."""
-
-ALIKE, SIMILAR = 0.5, 0.85
+ALIKE, SIMILAR = 0.5, 0.7
 """Cosine of the largest angle between a surface of the body and the scan's there: where a
 candidate is on its way, and where it is judged."""
 
@@ -44,7 +44,7 @@ QUARTERS = np.array([
 ])  # fmt: skip
 """The 23 turns that bring a cube to itself."""
 
-LISTED = 40
+LISTED = 160
 """Points of the body that stand for what is seen of it from a direction."""
 
 DAMPING = 1e-3
@@ -74,29 +74,11 @@ class Looks:
     ends_seen: Mask
 
     @cached_property
-    def _beyond(self) -> Floats:
-        """(N, 3) points beside the body, where its faces have ended."""
-        return self.ends.points + BEYOND * self.size * self.ends.directions
-
-    def thinned(self, count: int) -> Looks:
-        """Return so many points of either."""
-        rng = np.random.default_rng(1)
-        on = rng.permutation(len(self.surface.points))[:count]
-        off = rng.permutation(len(self.ends.points))[:count]
-        return replace(
-            self,
-            surface=self.surface.take(on),
-            ends=self.ends.take(off),
-            seen=self.seen[:, on],
-            ends_seen=self.ends_seen[:, off],
-        )
-
-    @cached_property
     def _listed(self) -> tuple[Indices, Indices]:
         """(V, LISTED) numbers of surface points and of ends that stand for what is seen."""
 
-        def some(points: Floats, seen: Mask) -> Indices:
-            at = np.flatnonzero(seen)
+        def some(part: Oriented, seen: Mask, view: Floats) -> Indices:
+            points, at = part.points, np.flatnonzero(seen & (part.normals @ view < -STEEPEST))
             if not len(at):
                 return np.zeros(LISTED, np.int64)
             out = [0]
@@ -106,40 +88,50 @@ class Looks:
                 gap = np.minimum(gap, np.linalg.norm(points[at] - points[at[out[-1]]], axis=1))
             return np.asarray(at[np.resize(out, LISTED)])
 
-        return (
-            np.array([some(self.surface.points, seen) for seen in self.seen]),
-            np.array([some(self.ends.points, seen) for seen in self.ends_seen]),
+        on, ends = (
+            np.array([some(part, *one) for one in zip(seen, self.views, strict=True)])
+            for part, seen in ((self.surface, self.seen), (self.ends, self.ends_seen))
         )
+        return on, ends
 
-    def rough_scores(self, poses: Floats, view: View, count: int) -> Floats:
-        """Return (K,) how many of so many points are seen, less those that are seen through."""
-        number = self.view_of(poses)
+    def scores(self, poses: Floats, view: View, count: int, tolerance: float) -> Floats:
+        """Return (K,) shares of so many points that are seen as they should be, less the others.
+
+        Args:
+            poses: (K, 4, 4).
+            view: The scan.
+            count: Of surface points, and of ends of faces.
+            tolerance: How far off the scan may be, as a share of the size.
+        """
+        number, reach = self.view_of(poses), tolerance * self.size
         # The first are farthest apart.
         on, off = (listed[number, :count] for listed in self._listed)
-        ends = self._ends_score(poses, view, off, beyond=count == LISTED)
-        return self._surface_score(poses, view, on) + ends
+        return self._surface_score(poses, view, on, reach) + self._ends_score(
+            poses, view, off, reach
+        )
 
-    def _surface_score(self, poses: Floats, view: View, at: Indices) -> Floats:
+    def _surface_score(self, poses: Floats, view: View, at: Indices, reach: float) -> Floats:
         placed, facing = _placed(poses, *self._singles[0], at)
         off, behind, cosine = view.compared(placed, facing)
-        there = (np.abs(off) < ROUGH * self.size) & (cosine > 0.7)
-        there &= np.abs(behind) < 3 * ROUGH * self.size
-        through = behind > 2 * ROUGH * self.size
-        wrong = (np.abs(behind) < 2 * ROUGH * self.size) & ~there
-        return np.asarray(there.sum(axis=1) - through.sum(axis=1) - 0.5 * wrong.sum(axis=1))
+        there = (np.abs(off) < reach) & (cosine > SIMILAR) & (np.abs(behind) < 3 * reach)
+        through, wrong = behind > 2 * reach, (np.abs(behind) < 2 * reach) & ~there
+        return np.asarray(
+            there.mean(axis=1) - AGAINST * through.mean(axis=1) - 0.5 * wrong.mean(axis=1)
+        )
 
-    def _ends_score(self, poses: Floats, view: View, at: Indices, beyond: bool) -> Floats:
+    def _ends_score(self, poses: Floats, view: View, at: Indices, reach: float) -> Floats:
         placed, outwards = _placed(poses, *self._singles[1], at)
         offset, cosine = view.to_end(placed, outwards)
-        there = ((offset**2).sum(axis=-1) < (ROUGH * self.size) ** 2) & (cosine > 0.7)
-        if not beyond:
-            return np.asarray(0.5 * there.sum(axis=1))
+        there = (np.einsum("kni,kni->kn", offset, offset) < reach**2) & (cosine > SIMILAR)
         placed = placed + BEYOND * self.size * outwards
-        facing = self.ends.normals.astype(np.float32)[at] @ poses[:, :3, :3].transpose(0, 2, 1)
+        facing = self._end_normals[at] @ poses[:, :3, :3].transpose(0, 2, 1)
         off, behind, cosine = view.compared(placed, facing)
-        on = (np.abs(off) < ROUGH / 2 * self.size) & (cosine > 0.7)
-        on &= np.abs(behind) < ROUGH * self.size
-        return np.asarray(0.5 * there.sum(axis=1) - 0.5 * on.sum(axis=1))
+        on = (np.abs(off) < reach / 2) & (cosine > SIMILAR) & (np.abs(behind) < reach)
+        return np.asarray(there.mean(axis=1) - AGAINST * on.mean(axis=1))
+
+    @cached_property
+    def _end_normals(self) -> Floats:
+        return self.ends.normals.astype(np.float32)
 
     @cached_property
     def _singles(self) -> list[tuple[Floats, Floats]]:
@@ -148,24 +140,6 @@ class Looks:
             (part.points.astype(np.float32), part.directions.astype(np.float32))
             for part in (self.surface, self.ends)
         ]
-
-    def scores(self, poses: Floats, view: View) -> Floats:
-        """Return (K,) shares of what should be seen that is, less what should not be as it is."""
-        number, tolerance = self.view_of(poses), self.tolerance(view)
-        placed, facing = _placed(poses, self.surface.points, self.surface.directions)
-        off, behind, cosine = view.compared(placed, facing)
-        judged = self.seen[number]
-        near = np.abs(behind) < NEARBY * view.angle * placed[..., 2]
-        there = judged & (np.abs(off) < tolerance) & (cosine > SIMILAR) & near
-        through = judged & (behind > tolerance + STEEP * view.angle * poses[:, None, 2, 3])
-        due = np.maximum(judged.sum(axis=1), 1)
-        score = (there.sum(axis=1) - through.sum(axis=1)) / due
-        placed, facing = _placed(poses, self._beyond, self.ends.normals)
-        off, behind, cosine = view.compared(placed, facing)
-        judged = self.ends_seen[number]
-        near = np.abs(behind) < NEARBY * view.angle * placed[..., 2]
-        on = judged & (np.abs(off) < tolerance) & (cosine > SIMILAR) & near
-        return np.asarray(score - on.sum(axis=1) / np.maximum(judged.sum(axis=1), 1))
 
     @cached_property
     def freedoms(self) -> int:
@@ -188,29 +162,24 @@ class Looks:
         """Return how far off the scan may be [m]."""
         return max(TOLERANCE * self.size, 3 * view.noise)
 
-    def settled(self, poses: Floats, view: View, reach: float) -> Floats:
+    def settled(self, poses: Floats, view: View, count: int, reach: float) -> Floats:
         """Return poses (K, 4, 4) moved once towards the scan's surfaces and ends within reach."""
         number = self.view_of(poses)
-        placed, facing = _placed(poses, self.surface.points, self.surface.directions)
+        on, off = (listed[number, :count] for listed in self._listed)
+        placed, facing = _placed(poses, *self._singles[0], on)
         offset, normals = view.planes(placed)
-        use = self.seen[number] & (np.einsum("kni,kni->kn", offset, offset) < reach**2)
+        use = np.einsum("kni,kni->kn", offset, offset) < reach**2
         use &= np.einsum("kni,kni->kn", facing, normals) > ALIKE
-        parts = (placed, normals, offset, use), self._end_offsets(poses, view, number, reach)
+        ends, outwards = _placed(poses, *self._singles[1], off)
+        to_end, cosine = view.to_end(ends, outwards)
+        use_end = (np.einsum("kni,kni->kn", to_end, to_end) < reach**2) & (cosine > ALIKE)
+        parts = (placed, normals, offset, use), (ends, outwards, to_end, use_end)
         placed, along, offset, use = (
             np.concatenate(columns, axis=1) for columns in zip(*parts, strict=True)
         )
         along = np.where(use[..., None], along, 0.0)
         offset = np.where(use[..., None], offset, 0.0)
         return self._stepped(poses, placed, along, (along * offset).sum(axis=-1))
-
-    def _end_offsets(
-        self, poses: Floats, view: View, number: Indices, reach: float
-    ) -> tuple[Floats, Floats, Floats, Mask]:
-        """Return where faces end (K, N, 3), in which directions, how far off, and which count."""
-        placed, outwards = _placed(poses, self.ends.points, self.ends.directions)
-        offset, cosine = view.to_end(placed, outwards)
-        use = self.ends_seen[number] & ((offset**2).sum(axis=-1) < reach**2) & (cosine > ALIKE)
-        return placed, outwards, offset, use
 
     def _stepped(self, poses: Floats, points: Floats, along: Floats, misfit: Floats) -> Floats:
         centres = poses[:, :3, :3] @ self.centre + poses[:, :3, 3]

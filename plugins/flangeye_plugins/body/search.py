@@ -19,11 +19,11 @@ from flangeye_plugins.body.view import View, view_of
 GUESSES = 1500
 """Poses that are settled."""
 
-STEPS = ((100, (0.08, 0.06, 0.05), 300), (400, (0.04, 0.03, 0.02), 80))
+STEPS = ((40, (0.08, 0.06, 0.05), 0.03, 300), (160, (0.04, 0.03, 0.02), 0.02, 80))
 """Points of the body that settle them, how far from the body the scan is taken for it, move by
-move, as a share of the size, and how many of the poses are kept."""
+move, and how far off it may be where it is judged, as shares of the size, and how many are kept."""
 
-ACROSS, FINE_ACROSS = 40, 100
+ACROSS, FINE_ACROSS = 60, 100
 """Cells across the body in the views that it is searched for and judged in: coarse ones have less
 noise, fine ones show thin parts."""
 
@@ -73,11 +73,11 @@ class Search:
         """Return distinct poses that the body may have, the best first."""
         view = view_of(self.points, self.shape.size / ACROSS)
         poses = guesses(view, self.looks, GUESSES)
-        for count, reaches, left in STEPS:
-            some = self.looks.thinned(count)
+        for count, reaches, tolerance, left in STEPS:
             for reach in reaches:
-                poses = some.settled(poses, view, reach * self.shape.size)
-            poses = poses[distinct(poses, some.scores(poses, view), self.looks)[:left]]
+                poses = self.looks.settled(poses, view, count, reach * self.shape.size)
+            scores = self.looks.scores(poses, view, count, tolerance)
+            poses = poses[distinct(poses, scores, self.looks)[:left]]
         found = self.near(poses)
         return self._distinct(found + self.near(self._twins(found[0]))) if found else []
 

@@ -24,6 +24,10 @@ COPLANAR = 0.08
 """How far off a plane its continuation may be seen at the body's size from a place, as a share of
 the size: as far as a normal's error takes it there."""
 
+ALONG, TURNED, FLAT = 3.5, 0.7, 0.9
+"""Cells apart up to which ends lie on one edge, and the cosines between their directions and
+between their normals."""
+
 LAYER = 1.5
 """Widths behind the nearest point of a cell up to which points belong to its surface."""
 
@@ -172,7 +176,7 @@ class View:
         """
         found, directions = self.ends
         found = found & np.isfinite(self.normals[..., 0]) & ~self._goes_on(size)
-        return Oriented(self.xyz[found], directions[found], self.normals[found])
+        return _along(Oriented(self.xyz[found], directions[found], self.normals[found]), self.angle)
 
     def _goes_on(self, size: float) -> Mask:
         """Return in which cells (H, W) the plane is larger than a body of that size [m]."""
@@ -221,6 +225,28 @@ def view_of(points: Singles, pitch: float) -> View:
             axis=1,
         )
     return View(mean.reshape(rows, columns, 3), low, angle)
+
+
+def _along(ends: Oriented, angle: float) -> Oriented:
+    """Return ends whose directions are means over the neighbours along the same edge.
+
+    Of a single one the raster alone is off by 10 degrees.
+    """
+    from scipy.spatial import cKDTree
+
+    if not len(ends.points):
+        return ends
+    reach = ALONG * angle * float(np.median(ends.points[:, 2]))
+    one, other = cKDTree(ends.points).query_pairs(reach, output_type="ndarray").T
+    directions, normals = ends.directions, ends.normals
+    same = np.einsum("ni,ni->n", directions[one], directions[other]) > TURNED
+    same &= np.einsum("ni,ni->n", normals[one], normals[other]) > FLAT
+    one, other = one[same], other[same]
+    total = directions.copy()
+    np.add.at(total, one, directions[other])
+    np.add.at(total, other, directions[one])
+    total -= np.einsum("ni,ni->n", total, normals)[:, None] * normals
+    return ends._replace(directions=_unit(total))
 
 
 def _spacing(u: Singles, v: Singles) -> float:

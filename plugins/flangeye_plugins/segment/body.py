@@ -141,6 +141,7 @@ def _passes(found: Found, params: SegmentBodyParams) -> bool:
         verdict.shown >= params.min_coverage
         and verdict.trusted >= params.min_trust
         and verdict.agree >= LEAST_RAYS
+        and verdict.bounded
         and verdict.goes_on <= GOES_ON * verdict.beside
         and found.weakest <= FIRM
     )
