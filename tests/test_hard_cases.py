@@ -153,7 +153,7 @@ def test_every_child_is_started_so(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_plugin_of_the_current_folder_is_not_loaded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from flangeye.plugin.installed import installed_plugins
+    from flangeye.plugin.registry import installed_plugins
 
     info = tmp_path / "evil-1.dist-info"
     info.mkdir()

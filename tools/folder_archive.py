@@ -8,7 +8,7 @@ from typing import Any
 from flangeye.files.clouds import write_cloud
 from flangeye.maths.geometry import quaternion_from_rotation
 from flangeye.types import FLANGE2, Capture, Transform
-from flangeye_plugins.reader.folder_poses import SECOND
+from flangeye_plugins.reader.folder import SECOND
 
 
 def write_folder(path: Path, captures: Iterable[Capture]) -> None:

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from flangeye import FlangeyeError
-from flangeye_paper import fig9, fig10, fig11, fig13, heldout, page, table1, table2
+from flangeye_paper import fig9, fig10, fig11, fig13, heldout, table1, table2
+from flangeye_paper.tables import read_csv
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__)
 
 Batches = Annotated[Path, typer.Argument(help="Folder of the study's batches.")]
 Archive = Annotated[Path, typer.Option(help="The authors' published folder.")]
 Out = Annotated[Path, typer.Option(help="Folder for CSV files and pictures.")]
+
+
+_BLOCK = re.compile(
+    r"<!-- begin (?P<file>[\w.-]+\.csv)(?P<options>[^>]*) -->\n.*?<!-- end -->", re.DOTALL
+)
 
 
 @app.command("fig9")
@@ -62,7 +69,7 @@ def _heldout(batches: Batches, archive: Archive, out: Out = Path()) -> None:
 @app.command("page")
 def _page(readme: Annotated[Path, typer.Argument(help="The page to renew.")]) -> None:
     """Put the tables of the CSV files into the page beside them."""
-    readme.write_text(page.refreshed(readme.read_text("utf-8"), readme.parent), "utf-8")
+    readme.write_text(refreshed(readme.read_text("utf-8"), readme.parent), "utf-8")
 
 
 def main() -> None:
@@ -76,3 +83,24 @@ def main() -> None:
 
 if __name__ == "__main__":
     main()
+
+
+def refreshed(text: str, folder: Path) -> str:
+    """Return a page with the table between ``<!-- begin X.csv -->`` and ``<!-- end -->`` renewed.
+
+    ``<!-- begin X.csv: a | b -->`` shows the columns a and b only.
+    """
+
+    def table(match: re.Match[str]) -> str:
+        wanted = [c.strip() for c in match["options"].lstrip(": ").split("|") if c.strip()]
+        rows = read_csv(folder / match["file"])
+        head = f"<!-- begin {match['file']}{match['options']} -->"
+        return f"{head}\n{markdown(rows, wanted or list(rows[0]))}\n<!-- end -->"
+
+    return _BLOCK.sub(table, text)
+
+
+def markdown(rows: list[dict[str, str]], columns: list[str]) -> str:
+    """Return rows as a Markdown table."""
+    lines = [columns, ["---"] * len(columns), *([row[c] for c in columns] for row in rows)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)

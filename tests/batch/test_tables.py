@@ -14,10 +14,9 @@ import pytest
 
 from flangeye.batch.command import _tell
 from flangeye.batch.dataset import Dataset, Kind, Ledger, columns_of, row_of
-from flangeye.batch.figures import drawings_of
 from flangeye.batch.outcome import SessionOutcome
+from flangeye.batch.page import drawings_of, write_page
 from flangeye.batch.page import render as rendered
-from flangeye.batch.page import write_page
 from flangeye.batch.plan import BatchSession
 from flangeye.batch.software import Software
 from flangeye.batch.tally import Tally

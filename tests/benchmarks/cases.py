@@ -265,7 +265,7 @@ def finger() -> tuple[Work, Work]:
     from flangeye.files.bundled import bundled
     from flangeye.models.finger import Finger
     from flangeye.models.model import read_model
-    from flangeye_emulators.finger.render import FingerCamera, Optics, typical_compliance
+    from flangeye_emulators.finger.sensor import FingerCamera, Optics, typical_compliance
     from flangeye_plugins.weld.finger_camera import Reader
 
     model = read_model(bundled("data") / "fingers" / "srm.yaml", Finger)

@@ -27,7 +27,7 @@ from flangeye.types import (
     Transform,
     by_frame,
 )
-from flangeye_plugins.acquire.intrinsics import camera_of
+from flangeye_plugins.acquire.images import camera_of
 from flangeye_plugins.fit.planar import moved_by_camera, poses_from_pixels
 from flangeye_plugins.verify.holdout import HoldoutParams, verify_holdout
 from tests.estimation.cells import answer

@@ -14,8 +14,8 @@ from flangeye.maths.kinematics import Arm
 from flangeye.maths.pose_formats import CONVENTIONS
 from flangeye.models.loading import load_model
 from flangeye.types import CAMERA, PointCloud
+from flangeye_emulators.scanner.loopback import CellScene, Stance
 from flangeye_emulators.world.scanner import CameraPose, scanner_of
-from flangeye_emulators.world.scene import CellScene, Stance
 
 pytestmark = [pytest.mark.realtime, pytest.mark.slow]
 

@@ -8,7 +8,7 @@ from multiprocessing.connection import Connection
 
 import pytest
 
-from flangeye.motion.keyboard import keys
+from flangeye.motion.arm import keys
 from flangeye.motion.watchdog import Charge, Watchdog
 from tests.motion.stand_in import LIMITS, MODEL, StandIn
 

@@ -10,8 +10,8 @@ import pytest
 
 from flangeye import FlangeyeError
 from flangeye_paper import fig9, fig10, fig11, heldout, table1, table2
+from flangeye_paper.__main__ import refreshed
 from flangeye_paper.drawing import METHODS
-from flangeye_paper.page import refreshed
 from flangeye_paper.printed import AXES
 from flangeye_paper.tables import read_csv, read_sessions, write_csv
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from flangeye_paper.page import refreshed
+from flangeye_paper.__main__ import refreshed
 
 FOLDER = Path(__file__).parents[2] / "recipes" / "paper"
 README = FOLDER / "README.md"

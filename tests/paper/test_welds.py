@@ -12,6 +12,7 @@ from flangeye import FlangeyeError
 from flangeye.log.record import Recorder
 from flangeye.types import CAMERA, PointCloud, Seam, WeldReport, WorkpieceScan
 from flangeye_paper import fig13
+from flangeye_paper.fig13 import SeenWeld, seen
 from flangeye_paper.misplanned import (
     LaidParams,
     MisplannedParams,
@@ -19,7 +20,6 @@ from flangeye_paper.misplanned import (
     seam_misplanned,
 )
 from flangeye_paper.tables import SessionRow, read_csv, read_sessions
-from flangeye_paper.welds import SeenWeld, seen
 
 UP = np.array([0.0, 0.0, 1.0])
 TRUTH = np.column_stack([np.linspace(0, 0.2, 201), np.zeros(201), np.zeros(201)])

@@ -18,7 +18,7 @@ from flangeye.cli.commands import app
 from flangeye.errors import StageError
 from flangeye.maths.geometry import rigid
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.draft.frames import frames_in
+from flangeye.recipe.draft.headings import frames_in
 from flangeye.recipe.load import load_recipe
 from flangeye.types import ArchivePath
 from tests.plugins.reader.bags import joint_state, point_cloud, stops, tf, write_bag

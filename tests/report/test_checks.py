@@ -9,9 +9,8 @@ import numpy as np
 from flangeye import types as t
 from flangeye.log.read import read_notes, read_run
 from flangeye.log.record import Recorder
-from flangeye.report.checks import drawings_of
 from flangeye.report.facts import facts_of
-from flangeye.report.page import render
+from flangeye.report.page import drawings_of, render
 from tests.conftest import TOY_RECIPE
 
 

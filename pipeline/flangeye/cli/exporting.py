@@ -130,7 +130,7 @@ def _exported(
     run: Path, to: str, values: list[str], anyway: bool, camera: str | None
 ) -> ExportedFile:
     from flangeye.errors import StageError
-    from flangeye.recipe.given import params_given
+    from flangeye.recipe.overrides import params_given
 
     registry = load_plugins()
     name = _format_named(to, registry.exports())

@@ -1,9 +1,15 @@
 """``flangeye doctor``: names what is wrong with an archive, instead of giving a bad number."""
 
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
 from flangeye.doctor.cells import examine_cell
+from flangeye.doctor.diagnosis import Finding, Misfit
 from flangeye.doctor.examine import Diagnosis, examine
 from flangeye.doctor.opening import open_cell, open_session
-from flangeye.doctor.text import as_json, as_text, fix_lines
 
 __all__ = [
     "Diagnosis",
@@ -15,3 +21,85 @@ __all__ = [
     "open_cell",
     "open_session",
 ]
+
+
+LISTED = 8
+"""Names of samples that are written out; of more, the rest is counted."""
+
+
+def as_text(diagnosis: Diagnosis) -> str:
+    """Return what was found, a few lines for each finding."""
+    session = diagnosis.session
+    head = f"{int(session.seen.sum())} of {len(session)} samples have a target in them"
+    lines = [f"{head}; {len(diagnosis.checks)} checks", *_idle(diagnosis)]
+    for number, finding in enumerate(diagnosis.findings, 1):
+        lines += ["", f"{number}. {finding.name}: {finding.what}", *_details(finding)]
+    for note in diagnosis.notes:
+        lines += ["", f"note: {note.name}: {note.what}", *fix_lines(note, "   ")]
+    if not diagnosis.findings:
+        lines += ["", "nothing found"]
+    return "\n".join(lines)
+
+
+def _idle(diagnosis: Diagnosis) -> list[str]:
+    """Return a line for each reason why checks do not apply, with their names."""
+    reasons: dict[str, list[str]] = {}
+    for name, why in diagnosis.idle.items():
+        reasons.setdefault(why, []).append(name.partition(".")[2])
+    return [f"not applicable: {', '.join(names)} ({why})" for why, names in reasons.items()]
+
+
+def _details(finding: Finding) -> list[str]:
+    lines = []
+    if finding.samples:
+        shown = ", ".join(finding.samples[:LISTED])
+        more = len(finding.samples) - LISTED
+        lines.append(f"   samples: {shown}" + (f" and {more} more" if more > 0 else ""))
+    if finding.before is not None and finding.after is not None:
+        error = f"error {_error(finding.before)} before, {_error(finding.after)} after"
+        lines.append(f"   evidence: {error}; by chance {_chance(finding.probability)}")
+    return [*lines, *fix_lines(finding, "   ")]
+
+
+def fix_lines(finding: Finding, indent: str) -> list[str]:
+    """Return what to do, a line for each choice."""
+    first, *others = finding.choices
+    return [f"{indent}fix: {first}", *(f"{indent}or:  {other}" for other in others)]
+
+
+def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
+    """Return what was found as plain data, SI units."""
+    return {
+        "damage": list(diagnosis.session.damage),
+        "samples": len(diagnosis.session),
+        "seen": int(diagnosis.session.seen.sum()),
+        "checks": list(diagnosis.checks),
+        "not_applicable": dict(diagnosis.idle),
+        "findings": [_plain(finding) for finding in diagnosis.findings],
+        "notes": [_plain(note) for note in diagnosis.notes],
+    }
+
+
+def _plain(finding: Finding) -> dict[str, Any]:
+    return {
+        "name": finding.name,
+        "what": finding.what,
+        "samples": list(finding.samples),
+        "error_before": _errors(finding.before),
+        "error_after": _errors(finding.after),
+        "probability": finding.probability,
+        "fix": finding.fix,
+    }
+
+
+def _errors(misfit: Misfit | None) -> dict[str, float | None] | None:
+    return None if misfit is None else misfit._asdict()
+
+
+def _error(misfit: Misfit) -> str:
+    position = f"{misfit.position * 1e3:.4g} mm"
+    return position if misfit.angle is None else f"{position}, {np.degrees(misfit.angle):.3g} deg"
+
+
+def _chance(probability: float) -> str:
+    return "less than 1e-15" if probability < 1e-15 else f"{probability:.1e}"

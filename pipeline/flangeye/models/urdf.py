@@ -24,8 +24,7 @@ from flangeye.maths.geometry import (
     rpy_from_rotation,
 )
 from flangeye.models.robots import FlangeDetails, Joint, Placement, RobotModel, Volume
-from flangeye.models.urdf_meshes import capsule_of, mesh_of
-from flangeye.models.urdf_numbers import numbers_of
+from flangeye.models.urdf_meshes import capsule_of, mesh_of, numbers_of
 from flangeye.types import Floats, Note, Warn
 from flangeye.units import SI
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import itertools
+import math
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,7 +16,6 @@ from flangeye.errors import RecipeError
 from flangeye.files.printable import reason_of
 from flangeye.files.regular import read_regular
 from flangeye.maths.capsules import Capsule, fit_capsule
-from flangeye.models.urdf_numbers import numbers_of
 from flangeye.types import Floats
 
 MESHES = (".stl", ".obj", ".dae", ".ply")
@@ -153,3 +153,29 @@ def _loaded(path: Path) -> Any:
     if not len(points) or not np.isfinite(points).all():
         raise RecipeError(f"{path}: has no vertices, or some that are not finite")
     return mesh
+
+
+def numbers_of(
+    urdf: Path, element: ET.Element | None, name: str, default: str, count: int = 3
+) -> list[float]:
+    """Return the numbers of an attribute.
+
+    Args:
+        urdf: The file, for the message.
+        element: What has it; None is as without it.
+        name: Of the attribute.
+        default: Its text where there is none.
+        count: How many they are.
+
+    Raises:
+        RecipeError: They are others, or not finite.
+    """
+    text = default if element is None else element.get(name, default)
+    try:
+        numbers = [float(word) for word in text.split()]
+    except ValueError:
+        numbers = []
+    if len(numbers) != count or not all(map(math.isfinite, numbers)):
+        words = {1: "one finite number", 3: "three finite numbers"}
+        raise RecipeError(f'{urdf}: {name}="{text[:80]}" is not {words[count]}')
+    return numbers

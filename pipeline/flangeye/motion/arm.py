@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -17,7 +18,6 @@ from flangeye.errors import RunStopped
 from flangeye.files.children import keep_current_folder_out
 from flangeye.files.load import busy
 from flangeye.models.robots import RobotModel
-from flangeye.motion.keyboard import keys
 from flangeye.motion.limits import MotionLimits
 from flangeye.motion.precedence import LEADING, take_precedence
 from flangeye.motion.route import Route
@@ -269,3 +269,21 @@ def _take_beats(over: threading.Event) -> None:
 
 def _nothing(*_: object) -> None:
     """Do nothing: the handler in C has written to the alarm already."""
+
+
+@contextmanager
+def keys() -> Iterator[int | None]:
+    """Let single keys be read from the terminal: its file descriptor, or None without one."""
+    if not sys.stdin.isatty():
+        yield None
+        return
+    import termios
+    import tty
+
+    keyboard = sys.stdin.fileno()
+    before = termios.tcgetattr(keyboard)
+    tty.setcbreak(keyboard)
+    try:
+        yield keyboard
+    finally:
+        termios.tcsetattr(keyboard, termios.TCSADRAIN, before)

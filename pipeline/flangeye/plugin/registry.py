@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import importlib
+import sys
 from collections.abc import Iterator, Mapping, MutableMapping
 from dataclasses import dataclass, field
-from importlib.metadata import Distribution, EntryPoint
+from functools import cache
+from importlib.metadata import Distribution, EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -15,7 +17,7 @@ from flangeye.errors import FlangeyeError
 from flangeye.files.near import nearest
 from flangeye.models.robots import RobotModel
 from flangeye.plugin import hookspecs
-from flangeye.plugin.installed import installed_plugins
+from flangeye.plugin.hookspecs import NAME
 from flangeye.plugin.stage import Part, Plugin, Siblings, Stage
 
 
@@ -245,3 +247,32 @@ def _load(registry: Registry, entry_point: EntryPoint) -> None:
 
 def _builtin_first(entry_point: EntryPoint) -> tuple[bool, str]:
     return (entry_point.name != "builtin", entry_point.name)
+
+
+def installed_plugins() -> list[EntryPoint]:
+    """Return the entry points of the group ``flangeye``, sorted by name.
+
+    Python finds packages in the current folder too, where it stands first in the search path; a
+    folder that somebody hands on must not bring code along.
+    """
+    found = [plugin for plugin in _found(tuple(sys.path)) if not _of_current_folder(plugin)]
+    return sorted(found, key=lambda plugin: plugin.name)
+
+
+@cache
+def _found(_: tuple[str, ...]) -> tuple[EntryPoint, ...]:
+    """Return the plugins on a search path; to look reads the metadata of every package there."""
+    return tuple(entry_points(group=NAME))
+
+
+def _of_current_folder(plugin: EntryPoint) -> bool:
+    if plugin.dist is None:
+        return False
+    place = Path(str(plugin.dist.locate_file(""))).resolve()
+    return place == Path.cwd() and place not in _libraries()
+
+
+def _libraries() -> set[Path]:
+    import sysconfig
+
+    return {Path(sysconfig.get_path(name)).resolve() for name in ("purelib", "platlib")}

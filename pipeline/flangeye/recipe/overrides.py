@@ -5,9 +5,13 @@ from __future__ import annotations
 from collections.abc import Hashable, Sequence
 from typing import Any
 
+from pydantic import ValidationError
+
 from flangeye.errors import RecipeError
+from flangeye.files.validation import sentence
 from flangeye.files.yaml_lines import parse_value
-from flangeye.plugin.stage import KINDS
+from flangeye.plugin.registry import Lookup, Registry
+from flangeye.plugin.stage import KINDS, Params, Plugin
 
 Keys = tuple[Hashable, ...]
 
@@ -101,3 +105,28 @@ def _exchange(steps: list[Any], index: int, value: Any, path: str) -> None:
         )
     if value != _name(steps[index]):
         steps[index] = value
+
+
+def params_given(plugin: Plugin, values: Sequence[str], registry: Registry) -> Params | None:
+    """Return a plugin's parameters from ``name=value`` texts; None where it takes none.
+
+    Raises:
+        RecipeError: Names every mistake.
+    """
+    data: dict[Hashable, Any] = {}
+    for value in values:
+        apply_override(data, value)
+    if plugin.params is None:
+        if data:
+            raise RecipeError(f"{plugin.name} takes no parameters")
+        return None
+    try:
+        return plugin.params.model_validate(data, context=Lookup(registry))
+    except ValidationError as error:
+        model = plugin.params
+        raise RecipeError(
+            "\n".join(
+                f"--set {'.'.join(map(str, e['loc']))}: {sentence(e, model, e['input'])}"
+                for e in error.errors()
+            )
+        ) from None

@@ -9,8 +9,7 @@ import numpy as np
 from flangeye.models.robots import RobotModel
 from flangeye.types import Floats
 from flangeye_emulators.controllers.chain import Chain, Stance, UnreachableError
-from flangeye_emulators.controllers.compliance import ForceMode
-from flangeye_emulators.controllers.contact import Surface
+from flangeye_emulators.controllers.compliance import ForceMode, Surface
 from flangeye_emulators.controllers.motion import ControllerMotion, stop
 
 BRAKES = 10.0

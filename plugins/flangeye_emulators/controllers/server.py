@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import gc
+import json
 import os
 import selectors
 import signal
@@ -16,18 +17,19 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from flangeye.errors import FlangeyeError
 from flangeye.files.elsewhere import is_this_machine
 from flangeye.models.emulator import EmulatorOptions
 from flangeye.types import Floats
-from flangeye_emulators.controllers import control
 from flangeye_emulators.controllers.arm import SimulatedArm
 from flangeye_emulators.controllers.client import PORT
-from flangeye_emulators.controllers.clock import ControllerClock
-from flangeye_emulators.controllers.contact import Surface
-from flangeye_emulators.controllers.fault_injection import FaultInjector
-from flangeye_emulators.controllers.faults import Schedule, parse_fault
-from flangeye_emulators.controllers.network import Network
+from flangeye_emulators.controllers.compliance import Surface
+from flangeye_emulators.controllers.fault_injection import FaultInjector, Schedule, parse_fault
+from flangeye_emulators.controllers.network import LineConnection, Network
 from flangeye_emulators.controllers.start import starting_joints
+
+KEPT = 60_000
+"""Lateness is kept for so many cycles: two minutes at 500 Hz."""
 
 
 class ControllerBox(Protocol):
@@ -117,11 +119,11 @@ class Server:
         # The control channel has a wire of its own, to which nothing happens. Whoever reaches it
         # moves the arm and causes faults: it does not leave this machine.
         self._behind = Network(options.host if is_this_machine(options.host) else "127.0.0.1")
-        self._behind.offer(PORT, lambda: control.ControlSession(self._behind, self._actions))
+        self._behind.offer(PORT, lambda: ControlSession(self._behind, self._actions))
         self._schedule = Schedule(self._fault_injector.kinds)
         self._clock = ControllerClock(box.cycle, self._step)
         self._cycle = 0
-        self._actions: dict[str, control.Action] = {
+        self._actions: dict[str, Action] = {
             "truth": self._tell_truth,
             "state": self._tell_state,
             "log": lambda _: {"lines": list(self._box.log)},
@@ -235,3 +237,92 @@ class Server:
 
     def _set_unlock(self, request: Mapping[str, Any]) -> None:
         self._box.unlock_after = float(request["seconds"])
+
+
+class ControllerClock:
+    """Calls a step once per cycle.
+
+    Attributes:
+        ticks: Steps made.
+        made_up: Steps that were made late, right after another.
+        gaps: Times the clock had to start again.
+    """
+
+    def __init__(self, cycle: float, step: Callable[[], None]) -> None:
+        self._cycle, self._step = cycle, step
+        self.ticks = self.made_up = self.gaps = 0
+        self._lateness = np.zeros(KEPT, dtype=np.float32)
+        self._due = 0.0
+
+    def start(self) -> None:
+        """Begin now."""
+        loop = asyncio.get_running_loop()
+        self._due = loop.time() + self._cycle
+        loop.call_at(self._due, self._tick)
+
+    def _tick(self) -> None:
+        loop = asyncio.get_running_loop()
+        self._advance(loop.time())
+        while (now := loop.time()) >= self._due:
+            self.made_up += 1
+            self._advance(now)
+        loop.call_at(self._due, self._tick)
+
+    def _advance(self, now: float) -> None:
+        late = now - self._due
+        self._lateness[self.ticks % KEPT] = late
+        # Cycles missed for less than this [s] are made up for at once; after a longer gap (the
+        # process was stopped) the clock starts again from now, and the gap is counted
+        if late > 0.05:
+            self.gaps += 1
+            self._due = now
+        self.ticks += 1
+        self._due += self._cycle
+        self._step()
+
+    def figures(self) -> dict[str, float]:
+        """Return how punctual the steps were; times in [s]."""
+        late = self._lateness[: min(self.ticks, KEPT)]
+        if not len(late):
+            return {"ticks": 0}
+        median, high = np.percentile(late, [50, 99])
+        return {
+            "ticks": self.ticks,
+            "made_up": self.made_up,
+            "gaps": self.gaps,
+            "late_median": float(median),
+            "late_p99": float(high),
+            "late_max": float(late.max()),
+        }
+
+
+Action = Callable[[Mapping[str, Any]], Mapping[str, Any] | None]
+
+
+class ControlSession(LineConnection):
+    """One client of the control channel."""
+
+    def __init__(self, network: Network, actions: Mapping[str, Action]) -> None:
+        super().__init__(network)
+        self._actions = actions
+
+    def line(self, text: str) -> None:
+        """Answer one request."""
+        self.say(json.dumps(self._answer(text)))
+
+    def _answer(self, text: str) -> dict[str, Any]:
+        try:
+            request = json.loads(text)
+            name = request["do"]
+            action = self._actions.get(name)
+            if action is None:
+                return _refusal(f"cannot do '{name}'; can do {', '.join(self._actions)}")
+            return {"ok": True, **(action(request) or {})}
+        except FlangeyeError as error:
+            return _refusal(str(error))
+        except (ValueError, KeyError, TypeError) as error:
+            return _refusal(f"not a request: {type(error).__name__}: {error}")
+
+
+def _refusal(why: str) -> dict[str, Any]:
+    return {"ok": False, "error": why}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import bisect
+
 import numpy as np
 
 from flangeye.devices import Device, Profiler, StateSource, TactileSensor, WeldProfile
@@ -9,8 +11,9 @@ from flangeye.errors import StageError
 from flangeye.plugin.stage import part
 from flangeye.types import Seed
 from flangeye_emulators.finger.sensor import SimulatedFinger
-from flangeye_emulators.weld_world.look import LookBehind
+from flangeye_emulators.weld_world.clock import Shutter
 from flangeye_emulators.weld_world.settings import LookTruth
+from flangeye_emulators.weld_world.world import WeldWorld
 
 
 class SimulatedProfiler(Device):
@@ -49,3 +52,41 @@ def profiler_simulated(
             f"profiler.simulated sees the weld of sensor.simulated_finger, not of {sensor.name}"
         )
     return SimulatedProfiler(sensor, robot, seed, params)
+
+
+class LookBehind:
+    """Sees the bead that the torch has laid, and nothing of what a controller takes it for."""
+
+    def __init__(self, truth: LookTruth, rng: np.random.Generator) -> None:
+        self._truth, self._rng = truth, rng
+        self._shutter: Shutter[float] = Shutter(truth.clock, rng)
+        self._along: list[float] = []
+        self._off: list[float] = []
+        self._began: float | None = None
+
+    def watch(self, time: float, world: WeldWorld) -> None:
+        """See the world as it is now [s]: a bead is laid where the torch is beside the seam."""
+        s = world.torch_s
+        if 0.0 < s < world.groove.root.length:
+            again = bisect.bisect_left(self._along, s)  # where it was before, it is molten again
+            del self._along[again:], self._off[again:]
+            self._along.append(s)
+            self._off.append(world.off)
+        self._began = time if self._began is None else self._began
+        age = time - self._began
+        seen = self._bead(s - self._truth.behind)
+        if self._shutter.due(age) and seen is not None:
+            noise = self._truth.noise * float(self._rng.standard_normal())
+            self._shutter.expose(time, age, seen + noise)
+
+    def profile(self, time: float) -> WeldProfile | None:
+        """Return the next look that has arrived at a time [s], if any."""
+        seen = self._shutter.arrived(time)
+        if seen is None:
+            return None
+        return WeldProfile(seen.item, self._truth.noise, round(seen.stamp * 1e9))
+
+    def _bead(self, s: float) -> float | None:
+        """Return how far the bead is to the left of the joint at an arc length, if there is one."""
+        after = bisect.bisect_right(self._along, s)
+        return None if after == 0 else self._off[after - 1]

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 
-from flangeye.motion.seam_following import ToolPose, turned
+from flangeye.motion.seam_following import Command, ToolPose, turned
 from flangeye.types import Floats
-from flangeye_emulators.weld_world.arm import ArmError
 from flangeye_emulators.weld_world.groove import TICK, Contact, Gap, Groove, Relief, Section, Tip
 from flangeye_emulators.weld_world.settings import (
+    ArmTruth,
     FingerTruth,
     HeatTruth,
     ToolTruth,
@@ -20,6 +21,15 @@ from flangeye_emulators.weld_world.settings import (
 )
 from flangeye_plugins.weld.body import leaning
 from flangeye_plugins.weld.path import Path
+
+HYSTERESIS_WIDTH = 1e-3
+"""Displacement over which the lagging share comes along [m]."""
+
+VARIES = 60e-3
+"""Period with which the half angle varies along the seam [m]."""
+
+GRAIN = 1e-3
+"""Correlation length of spatter along the seam [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,10 +144,6 @@ class TrueTool:
         return pose.position + turned(level_R_tool @ self._torch, pose.angle)
 
 
-HYSTERESIS_WIDTH = 1e-3
-"""Displacement over which the lagging share comes along [m]."""
-
-
 class TrueFinger:
     """Play, hysteresis, creep and a gain that drifts, one after the other."""
 
@@ -167,13 +173,6 @@ class TrueFinger:
 def _follow(behind: Floats, ahead: Floats, half: float) -> Floats:
     """Return what is dragged along by ``ahead``, with a dead band of ``half`` to both sides."""
     return np.clip(behind, ahead - half, ahead + half)
-
-
-VARIES = 60e-3
-"""Period with which the half angle varies along the seam [m]."""
-
-GRAIN = 1e-3
-"""Correlation length of spatter along the seam [m]."""
 
 
 def true_groove(
@@ -220,3 +219,53 @@ def _relief(
 def _grains(s: Floats, sigma: float, rng: np.random.Generator) -> Floats:
     knots = np.arange(0.0, s[-1] + 2 * GRAIN, GRAIN)
     return np.interp(s, knots, sigma * rng.standard_normal(len(knots)))
+
+
+class ArmError:
+    """Truth minus report, for one pose after the other."""
+
+    def __init__(self, truth: ArmTruth, rng: np.random.Generator) -> None:
+        self._truth, self._rng = truth, rng
+        self._phase = rng.uniform(0.0, 2 * np.pi, 2)
+        self._origin: Floats | None = None
+        self._slack = 0.0
+
+    def true_pose(self, reported: ToolPose) -> ToolPose:
+        """Return where the tool really is."""
+        truth, position = self._truth, reported.position
+        self._origin = position.copy() if self._origin is None else self._origin
+        way = position - self._origin
+        turns = 2 * np.pi * way[:2] / truth.wave_length + self._phase
+        wave = truth.wave * np.array([math.sin(turns[1]), math.sin(turns[0])])
+        error = np.array([*(wave + truth.scale * way[:2]), -truth.sag * float(way[0]) / 0.1])
+        error[1] += self._lost(float(way[1]))
+        if truth.repeatability:
+            error += truth.repeatability * self._rng.standard_normal(3)
+        return ToolPose(reported.time, position + error, reported.angle)
+
+    def _lost(self, way: float) -> float:
+        """Return the part of a way that the gears have not passed on yet."""
+        half = self._truth.backlash / 2
+        self._slack = min(max(self._slack, way - half), way + half)
+        return self._slack - way
+
+
+class ArmResponse:
+    """An arm in the plane of the work that follows velocities late and lagging."""
+
+    def __init__(self, truth: ArmTruth, pose: ToolPose, period: float) -> None:
+        """Stand still at a pose for ``period`` [s]."""
+        self.pose = pose
+        self._period = period
+        self._commands: deque[Floats] = deque([np.zeros(4)] * round(truth.dead_time / period))
+        self._share = 1.0 - math.exp(-period / truth.lag) if truth.lag else 1.0
+        self._speed = np.zeros(4)
+
+    def go(self, command: Command) -> None:
+        """Let one cycle pass under a command."""
+        self._commands.append(np.array([*command.velocity, command.turn]))
+        self._speed = self._speed + self._share * (self._commands.popleft() - self._speed)
+        step, pose = self._speed * self._period, self.pose
+        self.pose = ToolPose(
+            pose.time + self._period, pose.position + step[:3], pose.angle + float(step[3])
+        )

@@ -8,7 +8,7 @@ from flangeye.models.scanners import ScannerModel
 from flangeye.types import Mask
 from flangeye_emulators.world import edges
 from flangeye_emulators.world.distortion import Distortion
-from flangeye_emulators.world.grain import correlated_normal, normal_quantile
+from flangeye_emulators.world.edges import correlated_normal, normal_quantile
 from flangeye_emulators.world.raycast import Hits, Image, Scene, pixels_of
 
 FLOOR = 0.3

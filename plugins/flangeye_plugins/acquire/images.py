@@ -2,19 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any, NamedTuple, Self
 
 import numpy as np
-from pydantic import Field
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
 
-from flangeye import StageError, stage
+from flangeye import Params, StageError, stage
 from flangeye.files.cameras import CameraFile, camera_in, cameras_in
 from flangeye.files.clouds import LengthUnit, read_cloud
 from flangeye.files.recording import Recording, check_poses, digests_of
-from flangeye.types import CAMERA, ArchivePath, Capture, Captures, Floats, Image, PointCloud
+from flangeye.models.boards import Board, Dictionary, Kind
+from flangeye.models.corners import Corners, board_seen, find_corners
+from flangeye.types import (
+    CAMERA,
+    ArchivePath,
+    Capture,
+    Captures,
+    Floats,
+    Image,
+    PointCloud,
+    Rejected,
+    Warn,
+)
+from flangeye.units import Length, param
 from flangeye_plugins.acquire.camera import pinhole, read_image
-from flangeye_plugins.acquire.intrinsics import SeenBoardParams, lens_of
 from flangeye_plugins.acquire.opening import (
     OpeningParams,
     archive_path,
@@ -23,6 +37,244 @@ from flangeye_plugins.acquire.opening import (
     skipped_note,
     source_of,
 )
+
+FEWEST_VIEWS = 6
+"""Views below which distortion and principal point are not told apart from tilts."""
+LEAST_TILT = 0.02
+"""How much the board's depth, as a share of it, has to change across it otherwise between views:
+the root mean square of it along the direction in which it changes most."""
+LARGEST_ERROR = 0.01
+"""Standard deviation of the focal length, as a share of it, beyond which nothing is believed."""
+ALIKE = (
+    "they are too alike; tilt the board by 20 deg and more to both sides, or write focal_length: "
+    "[fx, fy] and principal_point: [cx, cy]"
+)
+FIRST = 8
+"""Images that are looked at first: a set that shows the board in half of its images passes."""
+
+Grey = NDArray[np.uint8]
+
+
+class SeenBoardParams(Params):
+    """The board whose views calibrate the camera, as the fit step configures it."""
+
+    kind: Kind = Field("charuco", description="charuco, checkerboard, or circles.")
+    columns: int = Field(ge=3, description="Squares, or circles of a row, from left to right.")
+    rows: int = Field(ge=3, description="Squares, or rows of circles, from top to bottom.")
+    square: Length = param(gt=0, description="Edge of a square, or distance of rows of circles.")
+    marker: Length = param("0 mm", ge=0, description="Edge of a ChArUco board's markers.")
+    dictionary: Dictionary = Field("4X4_50", description="Family of the markers.")
+
+    @model_validator(mode="after")
+    def _is_whole(self) -> Self:
+        if self.kind == "marker":
+            raise ValueError("four corners do not tell a camera; use a board")
+        if self.kind == "charuco" and not 0 < self.marker < self.square:
+            raise ValueError("marker: a ChArUco board's markers are smaller than its squares")
+        return self
+
+    @property
+    def board(self) -> Board:
+        """The print."""
+        size = self.columns, self.rows, self.square
+        return Board(self.kind, *size, self.marker, self.dictionary)
+
+
+class Lens(NamedTuple):
+    """A camera calibrated from views of a board.
+
+    Attributes:
+        matrix: (3, 3) [px].
+        distortion: (4,) k1, k2, p1, p2.
+        covariance: (8, 8) of fx, fy, cx, cy [px] and of the coefficients.
+        error: Root mean square of a corner's reprojection error [px].
+        views: How many were used.
+        left_out: Those that were not: no board in them, or beside the others.
+    """
+
+    matrix: Floats
+    distortion: Floats
+    covariance: Floats
+    error: float
+    views: int
+    left_out: tuple[str, ...]
+
+    @property
+    def deviations(self) -> Floats:
+        """(8,) standard deviations."""
+        return np.sqrt(np.diag(self.covariance))
+
+    def against(self, known: Floats) -> Warn | None:
+        """Return a warning where the views contradict a camera's matrix (3, 3) [px]."""
+        stated, found = known[0, 0], self.matrix[0, 0]
+        # By what share of itself a focal length may be off before a calibration is another camera's
+        if abs(stated / found - 1) < max(0.02, 5 * self.deviations[0] / found):
+            return None
+        return Warn(
+            f"the camera's calibration says a focal length of {stated:.0f} px, {self.views} views "
+            f"of the board say {found:.0f} +- {self.deviations[0]:.0f} px, which was taken",
+            "calibrate the camera anew, or give the calibration of these images: another camera, "
+            "lens or image size has another one",
+        )
+
+    def note(self) -> str:
+        """Return what to tell of it."""
+        (fx, _, cx), (_, fy, cy), _ = self.matrix
+        s = self.deviations
+        # The views of an arm's calibration determine these coefficients and no others.
+        named = zip(("k1", "k2", "p1", "p2"), self.distortion, s[4:], strict=True)
+        lens = ", ".join(f"{name} {value:.4f} +- {sigma:.4f}" for name, value, sigma in named)
+        left = f"; without {', '.join(self.left_out)}" if self.left_out else ""
+        return (
+            f"camera by {self.views} views of the board: focal length {fx:.2f}, {fy:.2f} +- "
+            f"{s[0]:.2f}, {s[1]:.2f} px, principal point {cx:.2f}, {cy:.2f} +- {s[2]:.2f}, "
+            f"{s[3]:.2f} px, {lens}; corners fit to {self.error:.3f} px{left}"
+        )
+
+
+def lens_of(images: Mapping[str, Grey], board: Board, start: Image | None = None) -> Lens:
+    """Return the camera that saw a board, by least squares over all corners and poses (Zhang 2000).
+
+    Args:
+        images: (H, W) each, by name.
+        board: What they show.
+        start: A camera to begin with, refined; None for one that is not known at all.
+
+    Raises:
+        StageError: Too few show the board, or they are too alike to tell the camera.
+    """
+    sizes = {pixels.shape[::-1] for pixels in images.values()}
+    if len(sizes) > 1:
+        raise StageError(f"images of {len(sizes)} sizes are not one camera's")
+    (size,) = sizes
+    looked = _looked(images, board)
+    seen = {name: found for name, found in looked.items() if isinstance(found, Corners)}
+    _require_views(len(seen), looked)
+    _require_tilted(seen)
+    lens = camera_of(seen, size, start)
+    kept = {
+        n: c for (n, c), e in zip(seen.items(), lens[1], strict=True) if not _outlies(e, lens[1])
+    }
+    if len(kept) < len(seen):
+        _require_views(len(kept), looked)
+        lens = camera_of(kept, size, start)
+    left_out = tuple(name for name in images if name not in kept)
+    found = lens[0]._replace(left_out=left_out)
+    _require_certain(found)
+    return found
+
+
+def _looked(images: Mapping[str, Grey], board: Board) -> dict[str, Corners | Rejected]:
+    """Return what is seen of a board in each image.
+
+    Raises:
+        StageError: The first to be looked at, spread over all, do not show it.
+    """
+    views = {name: Image(pixels, np.eye(3)) for name, pixels in images.items()}
+    if len(views) <= FIRST:
+        return {name: find_corners(board, view) for name, view in views.items()}
+    first = [list(views)[i] for i in np.linspace(0, len(views) - 1, FIRST).astype(int)]
+    early = {name: find_corners(board, views[name], thorough=False) for name in first}
+    early |= {n: find_corners(board, views[n]) for n in first[:2] if isinstance(early[n], Rejected)}
+    why = [found.reason for found in early.values() if isinstance(found, Rejected)]
+    if len(why) == len(early):
+        instead = why[0] if board.kind == "charuco" else board_seen(views[first[0]])
+        raise StageError(
+            f"none of {len(early)} of the {len(images)} images, spread over all, shows the board "
+            f"({board.kind}, {board.columns} x {board.rows}); {first[0]}: {instead}"
+        )
+    seen = {name: found for name, found in early.items() if isinstance(found, Corners)}
+    return {name: seen.get(name) or find_corners(board, view) for name, view in views.items()}
+
+
+def _require_views(seen: int, looked: Mapping[str, Corners | Rejected]) -> None:
+    if seen < FEWEST_VIEWS:
+        missed = {n: found.reason for n, found in looked.items() if isinstance(found, Rejected)}
+        why = next((f"; {name}: {reason}" for name, reason in missed.items()), "")
+        raise StageError(
+            f"{seen} of {len(looked)} images show the board, {FEWEST_VIEWS} are needed to tell the "
+            f"camera; take more, or write focal_length: [fx, fy] and principal_point: [cx, cy]{why}"
+        )
+
+
+def _outlies(error: float, errors: Floats) -> bool:
+    # Times the median reprojection error beyond which a view takes no part
+    return error > 4.0 * float(np.median(errors))
+
+
+def camera_of(
+    seen: Mapping[str, Corners], size: tuple[int, ...], start: Image | None
+) -> tuple[Lens, Floats]:
+    """Return the camera, and each view's reprojection error, rms [px]."""
+    import cv2
+
+    points = [corners.points.astype(np.float32) for corners in seen.values()]
+    pixels = [corners.pixels.astype(np.float32) for corners in seen.values()]
+    flags = cv2.CALIB_FIX_K3 | (cv2.CALIB_USE_INTRINSIC_GUESS if start else 0)
+    matrix = np.eye(3) if start is None else np.array(start.camera_matrix)
+    lens = np.zeros(5) if start is None else np.resize(np.append(start.distortion, np.zeros(5)), 5)
+    _, found_matrix, found_lens, turns, moves, _, _, errors = cv2.calibrateCameraExtended(
+        points, pixels, size, matrix, lens, flags=flags
+    )
+    errors = np.asarray(errors, dtype=np.float64).ravel()
+    counts = np.array([len(each) for each in pixels])
+    squares = (errors**2 * counts).sum()
+    # OpenCV's errors are of points, ours of a coordinate.
+    total = float(np.sqrt(squares / counts.sum() / 2))
+    freedom = max(2 * counts.sum() - 6 * len(points) - 8, 1)
+    views = zip(points, turns, moves, strict=True)
+    found = Lens(
+        np.asarray(found_matrix, dtype=np.float64),
+        np.asarray(found_lens, dtype=np.float64).ravel()[:4],
+        squares / freedom * _spread(views, found_matrix, found_lens), total, len(seen), (),
+    )  # fmt: skip
+    return found, errors
+
+
+def _spread(views: Iterable[tuple[Any, Any, Any]], matrix: Any, lens: Any) -> Floats:
+    """Return the (8, 8) covariance of the camera for corners known to a pixel, all poses free."""
+    import cv2
+
+    information = np.zeros((8, 8))
+    for points, turn, move in views:
+        jacobian = np.asarray(cv2.projectPoints(points, turn, move, matrix, lens)[1])
+        pose, camera = jacobian[:, :6], jacobian[:, 6:14]
+        told = camera - pose @ np.linalg.lstsq(pose, camera, rcond=None)[0]
+        information += told.T @ told
+    return np.asarray(np.linalg.inv(information))
+
+
+def _require_tilted(seen: Mapping[str, Corners]) -> None:
+    """Refuse parallel boards: the lens is not observable, which least squares does not show."""
+    changes = np.array([_depth_change(corners) for corners in seen.values()])
+    spread = np.linalg.norm(changes - changes.mean(axis=0), ord=2) / np.sqrt(len(changes))
+    if spread < LEAST_TILT:
+        raise StageError(
+            f"the {len(seen)} views do not tell the focal length: {ALIKE} (depth changes by "
+            f"{spread:.1%} across the board between them, {LEAST_TILT:.0%} is needed)"
+        )
+
+
+def _depth_change(corners: Corners) -> Floats:
+    """Return by how much of itself the board's depth changes across it, to the right and up (2,).
+
+    The last row of the homography is the depth, up to scale, whatever the camera.
+    """
+    import cv2
+
+    plane = corners.points[:, :2] / np.ptp(corners.points[:, :2], axis=0).max()
+    homography = np.asarray(cv2.findHomography(plane, corners.pixels)[0], dtype=np.float64)
+    return np.asarray(homography[2, :2] / homography[2, 2])
+
+
+def _require_certain(lens: Lens) -> None:
+    share = float(lens.deviations[0] / lens.matrix[0, 0])
+    if not share <= LARGEST_ERROR:
+        raise StageError(
+            f"the {lens.views} views tell the focal length to {share:.1%} only (at most "
+            f"{LARGEST_ERROR:.0%} is allowed): {ALIKE}"
+        )
+
 
 Camera = tuple[Floats, Floats] | tuple[Floats, Floats, Floats]
 """Matrix (3, 3) [px], OpenCV's distortion and, where it was found, their covariance (8, 8)."""

@@ -10,8 +10,7 @@ from flangeye.maths.geometry import hat
 from flangeye.types import Floats
 from flangeye_plugins.check.as_recorded import fit_of
 from flangeye_plugins.check.equations import equations_of
-from flangeye_plugins.check.fitting import VariantFits, fit
-from flangeye_plugins.check.rotations import log_of
+from flangeye_plugins.check.fitting import VariantFits, fit, log_of
 
 TURN = np.radians(2.0)
 """Uncertainty of the camera's rotation that is no answer (one sigma) [rad]."""

@@ -11,22 +11,246 @@ Six recordings in one repository, each in a layout of its own::
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
+import numpy as np
 from pydantic import Field
 
 from flangeye import Params, StageError, part
-from flangeye.files.recording import Archive, NotThisLayout
-from flangeye_plugins.reader.ancorasir_recordings import (
-    read_aubo,
-    read_franka,
-    read_kinect,
-    read_sample_2019,
-    read_ur,
+from flangeye.files.arrays import read_npy, read_npz, read_table
+from flangeye.files.recording import Archive, NotThisLayout, Recording
+from flangeye.files.regular import read_text
+from flangeye.types import FLANGE, Floats
+from flangeye_plugins.reader.poses import (
+    pose_from_matrix,
+    pose_from_quaternion,
+    pose_from_rotation_vector,
 )
+
+MM = 1e-3
+
+_HEADING = "p_robot 6-DoF index:"
+_AUBO_VERIFICATION = "5"
+# Hard-coded in the authors' calibration_ransac_circle_aubo.py: position [m], quaternion xyzw.
+_AUBO_POSITION = (0.27704067625331485, -0.573055166920657, 0.26205388882758757)
+_AUBO_QUATERNION = (
+    -0.08580920098798522, -0.3893105864494028, 0.9148593368686363, 0.06408152657751885,
+)  # fmt: skip
+
+Poses = Mapping[str, Floats]
+
+_POSES = "calibration_robot_pose_data"
+
+
+def read_aubo(folder: Path) -> Archive:
+    """Read the Aubo i5 before a PhoXi S: ``data.txt``, and a cloud for most of its poses."""
+    poses_file = folder / "data.txt"
+    poses = _aubo_poses(poses_file)
+    clouds = _clouds(folder)
+    recordings = _with_centres(folder, poses, clouds, unit=1.0)
+    if _AUBO_VERIFICATION in clouds and _AUBO_VERIFICATION not in poses:
+        pose = pose_from_quaternion("tool0_5.pcd", _AUBO_POSITION, _AUBO_QUATERNION)
+        cloud = clouds.pop(_AUBO_VERIFICATION)
+        recordings = [
+            Recording(_AUBO_VERIFICATION, {FLANGE: pose}, cloud, role="verification"),
+            *recordings,
+        ]
+    _refuse_unpaired(clouds, poses, poses_file)
+    files = [poses_file, *_centre_files(folder)]
+    return Archive("ancorasir aubo", folder, recordings, files, cloud_unit="m")
+
+
+def read_ur(folder: Path) -> Archive:
+    """Read the UR5 or UR10e before a PhoXi M: poses as matrices, centres in millimetres."""
+    poses_file = folder / "calibration_robot_pose_data.npz"
+    matrices = read_npz(poses_file, "arr_0", (None, 4, 4))
+    poses = {
+        str(i): pose_from_matrix(f"{poses_file}: pose {i}", matrix)
+        for i, matrix in enumerate(matrices)
+    }
+    clouds = _clouds(folder)
+    _refuse_unpaired(clouds, poses, poses_file)
+    recordings = _with_centres(folder, poses, clouds, MM)
+    files = [poses_file, *_centre_files(folder)]
+    return Archive(f"ancorasir {folder.name}", folder, recordings, files, cloud_unit="mm")
+
+
+def read_franka(folder: Path) -> Archive:
+    """Read the Franka before a PhoXi M: poses it was sent to, centres in millimetres."""
+    poses_file = folder / "calibration_robot_pose_data.npy"
+    rows = read_npy(poses_file, (None, 7))
+    poses = {
+        str(i): pose_from_quaternion(f"{poses_file}: pose {i}", row[:3], row[3:])
+        for i, row in enumerate(rows)
+    }
+    clouds = _clouds(folder)
+    _refuse_unpaired(clouds, poses, poses_file)
+    recordings = _with_centres(folder, poses, clouds, MM)
+    notes = ["the Franka's poses are those it was sent to, not those it measured"]
+    files = [poses_file, *_centre_files(folder)]
+    return Archive("ancorasir franka", folder, recordings, files, "mm", notes)
+
+
+def read_kinect(folder: Path) -> Archive:
+    """Read the UR10e before an Azure Kinect: centres and TCPs row by row, all in millimetres."""
+    poses_file, centres_file = folder / "readRobot.txt", folder / "measureRobot.txt"
+    rows, centres = read_table(poses_file, 6), read_table(centres_file, 3)
+    _same_count(poses_file, len(rows), centres_file, len(centres))
+    recordings = [
+        Recording(
+            str(i),
+            {FLANGE: pose_from_rotation_vector(f"{poses_file}: row {i}", row[:3] * MM, row[3:])},
+            centre_in_camera=centre * MM,
+        )
+        for i, (row, centre) in enumerate(zip(rows, centres, strict=True))
+    ]
+    files = [poses_file, centres_file]
+    verification = folder / "new.txt"
+    if verification.is_file():
+        recordings.insert(0, _kinect_verification(verification, folder / "flange.pcd"))
+        files.append(verification)
+    return Archive("ancorasir kinect", folder, recordings, files, cloud_unit="mm")
+
+
+def _kinect_verification(file: Path, cloud: Path) -> Recording:
+    centre = read_table(file, 3, slice(0, 1))[0]
+    row = read_table(file, 6, slice(1, 2))[0]
+    pose = pose_from_rotation_vector(f"{file}: row 2", row[:3] * MM, row[3:])
+    return Recording(
+        "new", {FLANGE: pose}, cloud if cloud.is_file() else None, centre * MM, role="verification"
+    )
+
+
+def read_sample_2019(folder: Path) -> Archive:
+    """Read the sample of 2019: a Franka's six segmented clouds, the i-th at the i-th pose."""
+    poses_file = folder / "calib_data.json"
+    entries = _json_object(poses_file)
+    clouds = _sample_clouds(folder)
+    _same_count(poses_file, len(entries), folder / "NN_tool.ply", len(clouds))
+    recordings = [
+        _sample_recording(f"{poses_file}: '{key}'", key, entries[key], cloud)
+        for key, cloud in zip(sorted(entries, key=int), clouds, strict=True)
+    ]
+    return Archive("ancorasir sample-2019", folder, recordings, [poses_file], cloud_unit="mm")
+
+
+def _sample_recording(where: str, key: str, entry: Any, cloud: Path) -> Recording:
+    try:
+        pose = np.array(entry["robot_pose"], dtype=np.float64)
+        centre = np.array(entry["p_cam"], dtype=np.float64) * MM
+    except (KeyError, TypeError, ValueError) as error:
+        raise StageError(f"{where}: robot_pose or p_cam is missing or wrong ({error})") from None
+    if pose.shape != (7,) or centre.shape not in ((0,), (3,)):
+        raise StageError(f"{where}: robot_pose has {pose.size} numbers (7), p_cam {centre.size}")
+    w, *xyz = pose[3:]
+    matrix = pose_from_quaternion(where, pose[:3], [*xyz, w])
+    return Recording(key, {FLANGE: matrix}, cloud, centre if centre.size else None)
+
+
+def _sample_clouds(folder: Path) -> list[Path]:
+    """Return one cloud a number; the coloured copies hold the same points in another order."""
+    chosen: dict[str, Path] = {}
+    for ending in ("_tool.ply", "_tool_valid.pcd", "_tool_valid.ply"):
+        for path in folder.glob(f"*{ending}"):
+            chosen.setdefault(path.name.removesuffix(ending), path)
+    return [chosen[number] for number in sorted(chosen)]
+
+
+def _json_object(path: Path) -> dict[str, Any]:
+    try:
+        data = json.loads(read_text(path))
+    except (ValueError, RecursionError) as error:
+        raise StageError(f"{path}: is not JSON: {error}") from None
+    if not isinstance(data, dict) or not data or not all(key.isdigit() for key in data):
+        raise StageError(f'{path}: expected an object of numbered poses, {{"0": {{…}}, …}}')
+    return data
+
+
+def _aubo_poses(path: Path) -> dict[str, Floats]:
+    """Parse the blocks ``p_robot 6-DoF index:<id>`` and the list of seven numbers after each."""
+    lines = read_text(path).splitlines()
+    poses: dict[str, Floats] = {}
+    for number, (line, following) in enumerate(zip(lines, [*lines[1:], ""], strict=True), 1):
+        if not line.startswith(_HEADING):
+            continue
+        name = line.removeprefix(_HEADING).strip()
+        if name in poses:
+            raise StageError(f"{path}:{number}: pose '{name}' is given twice")
+        values = _seven(f"{path}:{number + 1}", following)
+        poses[name] = pose_from_quaternion(f"{path}: pose '{name}'", values[:3], values[3:])
+    if not poses:
+        raise StageError(f"{path}: holds no poses (no line '{_HEADING}<id>')")
+    return poses
+
+
+def _seven(where: str, text: str) -> list[float]:
+    try:
+        values = [float(word) for word in text.strip().strip("[]").split(",")]
+    except ValueError:
+        values = []
+    if len(values) != 7:
+        raise StageError(f"{where}: expected [x, y, z, qx, qy, qz, qw], found '{text[:60]}'")
+    return values
+
+
+def _clouds(folder: Path) -> dict[str, Path]:
+    return {p.stem.removeprefix("tool0_"): p for p in sorted(folder.glob("tool0_*.pcd"))}
+
+
+def _refuse_unpaired(clouds: Mapping[str, Path], poses: Poses, poses_file: Path) -> None:
+    for name, cloud in clouds.items():
+        if name not in poses:
+            raise StageError(
+                f"{cloud}: {poses_file.name} has no pose '{name}'; add it, or move the cloud away"
+            )
+
+
+def _centre_files(folder: Path) -> list[Path]:
+    names = ("p_robot_mat.npy", "p_camera_mat.npy")
+    return [folder / name for name in names if (folder / name).is_file()]
+
+
+def _with_centres(
+    folder: Path, poses: Poses, clouds: Mapping[str, Path], unit: float
+) -> list[Recording]:
+    centres = _centres(folder, poses, unit)
+    return [
+        Recording(name, {FLANGE: pose}, clouds.get(name), centres.get(name))
+        for name, pose in poses.items()
+    ]
+
+
+def _centres(folder: Path, poses: Poses, unit: float) -> dict[str, Floats]:
+    """Return the published centres [m] by pose: the pose a column's TCP was copied from."""
+    files = _centre_files(folder)
+    if len(files) < 2:
+        return {}
+    tcps, centres = (read_npy(file, (3, None)).T * unit for file in files)
+    _same_count(files[0], len(tcps), files[1], len(centres))
+    names, places = list(poses), np.array([pose[:3, 3] for pose in poses.values()])
+    found: dict[str, Floats] = {}
+    for column, (tcp, centre) in enumerate(zip(tcps, centres, strict=True)):
+        distances = np.linalg.norm(places - tcp, axis=1)
+        nearest = int(np.argmin(distances))
+        # A centre belongs to the pose whose position [m] its column of p_robot_mat repeats this
+        # well
+        if not distances[nearest] < 1e-6:
+            raise StageError(f"{files[0]}: column {column} is the position of no pose that is left")
+        if not np.isfinite(centre).all():
+            raise StageError(f"{files[1]}: column {column} is not finite")
+        found[names[nearest]] = centre
+        places[nearest] = np.inf  # each pose once
+    return found
+
+
+def _same_count(one: Path, n: int, other: Path, m: int) -> None:
+    if n != m:
+        raise StageError(f"{one}: counts differ: {one.name} has {n}, {other.name} has {m}")
+
 
 Robot = Literal["aubo", "ur5", "ur10e", "franka", "kinect", "sample-2019"]
 
@@ -40,7 +264,6 @@ class _Place:
     read: Callable[[Path], Archive]
 
 
-_POSES = "calibration_robot_pose_data"
 _PLACES: Mapping[str, _Place] = {
     "aubo": _Place(PurePosixPath("data/aubo"), "data.txt", read_aubo),
     "ur5": _Place(PurePosixPath("data/ur5"), f"{_POSES}.npz", read_ur),

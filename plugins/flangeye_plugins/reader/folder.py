@@ -26,24 +26,44 @@ There the second arm's pose is ``second:``, with a position and a rotation of it
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import csv
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, Self, TypeVar
 
 import numpy as np
-from pydantic import Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from flangeye import Params, StageError, part
+from flangeye import Params, RecipeError, StageError, part
 from flangeye.files.clouds import PER_METRE, LengthUnit
 from flangeye.files.recording import Archive, NotThisLayout, Recording
+from flangeye.files.regular import read_text
 from flangeye.files.scans import IMAGES, with_companion
-from flangeye.types import FLANGE, FLANGE2, Floats
-from flangeye_plugins.reader.folder_poses import ArmPose, PoseRow, read_poses
+from flangeye.files.yaml_lines import read_yaml
+from flangeye.types import FLANGE, FLANGE2, Floats, Role
 from flangeye_plugins.reader.poses import pose_from_quaternion, pose_from_rotation_vector
 
 POSE_FILES = ("poses.csv", "poses.yaml", "poses.yml", "poses.json")
 UNPAIRED_SUFFIXES = (".pcd", ".ply", ".npy", ".xyz")
 """A file that ends so and that no pose names is a scan somebody forgot."""
+
+
+_ADVICE = "; 'flangeye init FOLDER' writes a recipe for other tables"
+
+_POSITIONS: Mapping[LengthUnit | None, tuple[str, ...]] = {
+    "m": ("x_m", "y_m", "z_m"),
+    "mm": ("x_mm", "y_mm", "z_mm"),
+    None: ("x", "y", "z"),
+}
+_QUATERNION = ("qx", "qy", "qz", "qw")
+_VECTOR = ("rx_rad", "ry_rad", "rz_rad")
+_OTHERS = ("cloud", "image", "id", "role", "time_ns")
+
+SECOND = "second_"
+"""What the columns of a second arm's pose begin with."""
+
+_JOINT = re.compile(r"j[1-9]\d?_rad")
 
 
 class FolderParams(Params):
@@ -68,9 +88,6 @@ def folder(path: Path, params: FolderParams) -> Archive:
         _refuse_unpaired(file, recordings)
     layout = f"folder, {file.name}"
     return Archive(layout, file.parent, recordings, [file], cloud_unit=poses.cloud_unit)
-
-
-_ADVICE = "; 'flangeye init FOLDER' writes a recipe for other tables"
 
 
 def _poses_file(path: Path) -> Path:
@@ -127,3 +144,181 @@ def _refuse_unpaired(file: Path, recordings: Iterable[Recording]) -> None:
             raise StageError(
                 f"{path}: {file.name} has no pose for it; add it, or move the cloud away"
             )
+
+
+Triple = tuple[float, float, float]
+
+
+class ArmPose(BaseModel):
+    """Where an arm's flange was."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, defer_build=True)
+
+    position: Triple
+    quaternion_xyzw: tuple[float, float, float, float] | None = None
+    rotation_vector_rad: Triple | None = None
+
+    @model_validator(mode="after")
+    def _one_rotation(self) -> Self:
+        if (self.quaternion_xyzw is None) == (self.rotation_vector_rad is None):
+            raise ValueError("needs a quaternion or a rotation vector, one of the two")
+        return self
+
+
+class PoseRow(ArmPose):
+    """One pose, as ``poses.yaml`` has it; ``second`` is that of a second arm, in its own base."""
+
+    cloud: str | None = Field(None, min_length=1)
+    image: str | None = Field(None, min_length=1)
+    id: str | None = None
+    second: ArmPose | None = None
+    role: Role = "calibration"
+    time_ns: int = Field(0, ge=0)
+    joints_rad: tuple[float, ...] | None = None
+
+    @model_validator(mode="after")
+    def _one_scan(self) -> Self:
+        if self.cloud is None and self.image is None:
+            raise ValueError("names no scan; it needs 'cloud' or 'image', a file beside this one")
+        return self
+
+
+class PosesFile(BaseModel):
+    """The whole file, as ``poses.yaml`` has it."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
+
+    unit: LengthUnit | None = None
+    cloud_unit: LengthUnit | None = None
+    poses: tuple[PoseRow, ...]
+
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def read_poses(file: Path) -> tuple[PosesFile, list[int]]:
+    """Return the poses of a file, and the line of each.
+
+    Raises:
+        StageError: It cannot be read, or says something that is not a pose; names the line.
+    """
+    return _from_csv(file) if file.suffix == ".csv" else _from_yaml(file)
+
+
+def _from_yaml(file: Path) -> tuple[PosesFile, list[int]]:
+    try:
+        document = read_yaml(file)
+    except RecipeError as error:
+        raise StageError(str(error)) from None
+    poses = _checked(PosesFile, document.data, file, document.line)
+    return poses, [document.line(("poses", i)) for i in range(len(poses.poses))]
+
+
+def _from_csv(file: Path) -> tuple[PosesFile, list[int]]:
+    heading, table = _cells(file)
+    unit = _unit_of(file, heading)
+    joints = sorted((n for n in heading if _JOINT.fullmatch(n)), key=lambda n: int(n[1:-4]))
+    rows, lines = [], []
+    for line, cells in table:
+        if len(cells) != len(heading):
+            raise StageError(
+                f"{file}:{line}: has {len(cells)} cells, but the heading has {len(heading)}"
+            )
+        named = {name: cell for name, cell in zip(heading, cells, strict=True) if cell}
+        rows.append(_row(named, unit, joints))
+        lines.append(line)
+    poses = _checked(PosesFile, {"unit": unit, "poses": rows}, file, lambda loc: lines[loc[1]])
+    return poses, lines
+
+
+def _cells(file: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """Return the heading, and the cells of every other row that is not blank with its line."""
+    text = read_text(file)
+    try:
+        mark = ";" if ";" in text.partition("\n")[0] else ","
+        reader = csv.reader(text.splitlines(), delimiter=mark, strict=True)
+        rows = [(reader.line_num, [cell.strip() for cell in row]) for row in reader if any(row)]
+    except csv.Error as error:
+        raise StageError(f"{file}: cannot be read: {error}") from None
+    if not rows:
+        raise StageError(f"{file}: is empty")
+    return rows[0][1], rows[1:]
+
+
+def _unit_of(file: Path, heading: Sequence[str]) -> LengthUnit | None:
+    _refuse_unknown(file, heading)
+    unit = _unit_stated(heading)
+    if unit == "none":
+        raise StageError(f"{file}:1: the columns x_m, y_m, z_m (or x_mm, y_mm, z_mm) are missing")
+    second = [name.removeprefix(SECOND) for name in heading if name.startswith(SECOND)]
+    if second and _unit_stated(second) != unit:
+        wanted = ", ".join(SECOND + name for name in _POSITIONS[unit])
+        raise StageError(
+            f"{file}:1: the second arm's columns {wanted} are missing; they have the first's unit"
+        )
+    return unit
+
+
+def _refuse_unknown(file: Path, heading: Sequence[str]) -> None:
+    of_pose = [*sum(_POSITIONS.values(), ()), *_QUATERNION, *_VECTOR]
+    known = [*_OTHERS, *of_pose]
+    for name in heading:
+        if heading.count(name) > 1:
+            raise StageError(f"{file}:1: column '{name}' comes twice")
+        of_second = name.startswith(SECOND) and name.removeprefix(SECOND) in of_pose
+        if name not in known and not of_second and not _JOINT.fullmatch(name):
+            raise StageError(
+                f"{file}:1: column '{name}' is not known; known: {', '.join(known)}, j1_rad, …, "
+                f"{SECOND}x_m, …; 'flangeye init FOLDER' writes a recipe for other columns"
+            )
+
+
+def _unit_stated(heading: Sequence[str]) -> LengthUnit | Literal["none"] | None:
+    """Return the unit that position columns name, ``none`` where there are no such columns."""
+    for unit, names in _POSITIONS.items():
+        if set(names) <= set(heading):
+            return unit
+    return "none"
+
+
+def _row(
+    cells: Mapping[str, str], unit: LengthUnit | None, joints: Sequence[str]
+) -> dict[str, Any]:
+    """Return a CSV row, its empty cells left out, in the shape a YAML entry has."""
+    row: dict[str, Any] = {name: cells[name] for name in _OTHERS if name in cells}
+    row |= _grouped(cells, {**_columns_of_pose(unit), "joints_rad": joints})
+    second = {n.removeprefix(SECOND): c for n, c in cells.items() if n.startswith(SECOND)}
+    if second:
+        row["second"] = _grouped(second, _columns_of_pose(unit))
+    return row
+
+
+def _columns_of_pose(unit: LengthUnit | None) -> dict[str, Sequence[str]]:
+    return {
+        "position": _POSITIONS[unit], "quaternion_xyzw": _QUATERNION,
+        "rotation_vector_rad": _VECTOR,
+    }  # fmt: skip
+
+
+def _grouped(
+    cells: Mapping[str, str], several: Mapping[str, Sequence[str]]
+) -> dict[str, list[str]]:
+    """Return the cells of columns that belong together, under the name YAML has for them."""
+    return {
+        key: [cells.get(name, "") for name in names]
+        for key, names in several.items()
+        if any(name in cells for name in names)
+    }
+
+
+def _checked(
+    model: type[Model], data: Any, file: Path, line_of: Callable[[tuple[Any, ...]], int]
+) -> Model:
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = f"{file}:{line_of(first['loc'])}"
+        name = ".".join(map(str, first["loc"]))
+        message = first["msg"].removeprefix("Value error, ")
+        raise StageError(f"{where}: {name + ': ' if name else ''}{message}") from None

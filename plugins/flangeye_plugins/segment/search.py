@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from flangeye.maths.planes import robust_planes, thinned
-from flangeye.maths.statistics import median
+from flangeye.maths.statistics import SIGMA_OF_MAD, median
 from flangeye.models.targets import Flange
-from flangeye.types import Indices, Singles
+from flangeye.types import Indices, Mask, Singles
 from flangeye_plugins.segment.crop import in_box
 from flangeye_plugins.segment.discs import Disc, DiscLimits, compare, of_size
 from flangeye_plugins.segment.grid import Grid, cells
 from flangeye_plugins.segment.parts import Part, SurfacePiece, flat_parts
-from flangeye_plugins.segment.surfaces import NOISE_GATE, connected_pieces, smooth_surface
+
+NOISE_GATE = 5.0
+"""Robust standard deviations of the grid's own bending above which a point is not smooth."""
+
+SAMPLE = 40_000
+"""Second differences that settle what is typical, to one percent."""
 
 
 def find_discs(view: Grid, flange: Flange, limits: DiscLimits) -> list[Disc]:
@@ -79,3 +86,87 @@ def _near(disc: Disc, view: Grid, reach: float) -> Singles:
     """Return the (n, 3) points of the view within ``reach`` of a disc along every axis."""
     about = view.about(disc.cell, disc.centre, reach)
     return in_box(about, disc.centre, reach)
+
+
+def smooth_surface(grid: Grid, bend: float) -> tuple[Mask, float]:
+    """Return where the surface is smooth, (H, W), and the standard deviation of depth [m].
+
+    Steps in depth, creases, mixed pixels and stray points are not smooth: depth does not change
+    evenly there from one neighbour to the next. On a plane it does, however tilted.
+
+    Args:
+        grid: Points in the order of the scanner's view.
+        bend: Second difference of depth that is a crease at least [m].
+    """
+    depth = np.ascontiguousarray(grid.xyz[..., 2])
+    # The second difference of independent values has six times their variance.
+    bent = [_bending(depth, axis, 1) for axis in (0, 1)]
+    noise = max(_typical(near) for near in bent) / np.sqrt(6)
+    if NOISE_GATE * np.sqrt(6) * noise > bend:
+        depth = _averaged(depth)
+        bent = [_bending(depth, axis, 1) for axis in (0, 1)]
+    smooth = np.isfinite(depth)
+    for axis, near in enumerate(bent):
+        wide = _bending(depth, axis, 2)
+        limit = max(bend, NOISE_GATE * _typical(wide))
+        # A crease of little slope, or one softened by the scanner, shows over two points.
+        for bending in (near, wide):
+            smooth &= ~(np.abs(bending, out=bending) > limit)
+        # Beside a missing point only the step to the other neighbour can be judged.
+        lone = np.flatnonzero(smooth & np.isnan(near))
+        here, step = depth.ravel().take(lone), _step(depth, lone, axis)
+        # Tangent of the steepest incidence at which a surface is still followed, 60 degrees
+        smooth.ravel()[lone] = step <= limit + 1.7 * grid.angle * here
+    return smooth, noise
+
+
+def _averaged(depth: Singles) -> Singles:
+    """Return the mean of each point and its neighbours that are there; missing stays missing."""
+    import cv2
+
+    there = np.isfinite(depth)
+    total = cv2.blur(np.where(there, depth, np.float32(0)), (3, 3), borderType=cv2.BORDER_CONSTANT)
+    share = cv2.blur(there.astype(np.float32), (3, 3), borderType=cv2.BORDER_CONSTANT)
+    return np.where(there, total / np.maximum(share, np.float32(0.1)), np.float32(np.nan))
+
+
+def _bending(depth: Singles, axis: int, reach: int) -> Singles:
+    """Return the second difference of depth over ``reach`` points, NaN where one is missing."""
+    out = np.full_like(depth, np.nan)
+    view, target = np.moveaxis(depth, axis, 0), np.moveaxis(out, axis, 0)
+    inner = target[reach:-reach]
+    np.add(view[2 * reach :], view[: -2 * reach], out=inner)
+    inner -= 2 * view[reach:-reach]
+    return out
+
+
+def _step(depth: Singles, at: Indices, axis: int) -> Singles:
+    """Return the larger step of depth to the neighbours along an axis; missing ones are none."""
+    flat, along = depth.ravel(), cells(at, depth.shape[1])[axis]
+    to_next = (depth.shape[1], 1)[axis]
+    before, after = at - to_next * (along > 0), at + to_next * (along < depth.shape[axis] - 1)
+    steps = [np.abs(flat.take(beside) - flat.take(at)) for beside in (before, after)]
+    return np.asarray(np.fmax(np.fmax(*steps), np.float32(0)))
+
+
+def _typical(values: Singles) -> float:
+    """Return the robust standard deviation of second differences."""
+    sample = np.abs(values.ravel()[:: 1 + values.size // SAMPLE])
+    sample = sample[np.isfinite(sample)]
+    return SIGMA_OF_MAD * float(median(sample)) if sample.size else 0.0
+
+
+def connected_pieces(mask: Mask, fewest: int) -> Iterator[Indices]:
+    """Yield the flat indices of each connected piece of a mask, the largest first.
+
+    Neighbours share a side: a crease that runs diagonally still separates.
+    """
+    import cv2
+
+    # OpenCV's own statistics take three times as long as the components.
+    count, image = cv2.connectedComponents(mask.view(np.uint8), connectivity=4)
+    labels = image.ravel()
+    sizes = np.bincount(labels, minlength=count)
+    large = [k for k in range(1, count) if sizes[k] >= fewest]
+    for piece in sorted(large, key=lambda k: (-sizes[k], k)):
+        yield np.flatnonzero(labels == piece)

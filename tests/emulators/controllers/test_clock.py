@@ -5,9 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye_emulators.controllers.clock import ControllerClock
 from flangeye_emulators.controllers.network import DelayLine
-from flangeye_emulators.controllers.server import _precise_loop
+from flangeye_emulators.controllers.server import ControllerClock, _precise_loop
 
 
 def run(coroutine):

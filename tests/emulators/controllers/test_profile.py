@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flangeye_emulators.controllers.profile import Profile
+from flangeye_emulators.controllers.motion import Profile
 
 pieces = st.lists(st.tuples(st.floats(1e-6, 2.0), st.floats(1e-3, 3.0)), min_size=1, max_size=6)
 

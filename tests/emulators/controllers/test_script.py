@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from flangeye_emulators.controllers.poses import pose_matrix, pose_vector
-from flangeye_emulators.controllers.ur.custom import CustomProgram
-from flangeye_emulators.controllers.ur.server import run_program
+from flangeye_emulators.controllers.ur.server import CustomProgram, run_program
 from flangeye_emulators.controllers.ur.state import Runtime
 from flangeye_emulators.controllers.ur.urscript import (
     ScriptSource,

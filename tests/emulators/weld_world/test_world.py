@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from flangeye.motion.seam_following import Command, ToolPose
-from flangeye_emulators.weld_world.arm import ArmError, ArmResponse
 from flangeye_emulators.weld_world.clock import Shutter
 from flangeye_emulators.weld_world.groove import Contact, Groove, Tip
 from flangeye_emulators.weld_world.settings import (
@@ -16,7 +15,14 @@ from flangeye_emulators.weld_world.settings import (
     WorkpieceTruth,
     WorldParams,
 )
-from flangeye_emulators.weld_world.world import Distortion, TrueFinger, TrueTool, true_groove
+from flangeye_emulators.weld_world.world import (
+    ArmError,
+    ArmResponse,
+    Distortion,
+    TrueFinger,
+    TrueTool,
+    true_groove,
+)
 from flangeye_plugins.weld.path import Path
 from tools.weld_bench import SECTION, try_condition
 from tools.weld_conditions import CONDITIONS, Condition

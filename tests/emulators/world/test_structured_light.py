@@ -8,7 +8,7 @@ import pytest
 from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye_emulators.world import edges, materials
 from flangeye_emulators.world.distortion import Distortion
-from flangeye_emulators.world.grain import correlated_normal, normal_quantile
+from flangeye_emulators.world.edges import correlated_normal, normal_quantile
 from flangeye_emulators.world.mesh import box
 from flangeye_emulators.world.raycast import Body, Scene, pixels_of
 from flangeye_emulators.world.structured_light import StructuredLight

@@ -15,8 +15,7 @@ from flangeye.models.corners import find_corners
 from flangeye.types import ArchivePath, Image
 from flangeye.units import SI
 from flangeye_emulators.world.board_image import BoardCamera, render_board
-from flangeye_plugins.acquire.images import ImagesParams, acquire_images
-from flangeye_plugins.acquire.intrinsics import SeenBoardParams, lens_of
+from flangeye_plugins.acquire.images import ImagesParams, SeenBoardParams, acquire_images, lens_of
 
 MATRIX = np.array([[1000.0, 0, 407], [0, 1003, 295], [0, 0, 1]])
 LENS = np.array([-0.12, 0.05, 0.001, -0.0005, 0.0])
@@ -107,7 +106,7 @@ def test_a_board_that_is_in_no_image_ends_early_and_the_one_that_is_seen_is_name
         looked.append(thorough)
         return find_corners(board, image, thorough)
 
-    monkeypatch.setattr("flangeye_plugins.acquire.intrinsics.find_corners", counted)
+    monkeypatch.setattr("flangeye_plugins.acquire.images.find_corners", counted)
     with pytest.raises(StageError, match="none of 8 of the 12 images, spread over all") as refused:
         lens_of(seen, Board("checkerboard", 10, 7, 0.02))
     assert said in str(refused.value)

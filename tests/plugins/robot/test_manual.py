@@ -19,8 +19,13 @@ from flangeye.maths.pose_formats import CONVENTIONS, AngleUnit
 from flangeye.models.loading import load_model
 from flangeye.types import Transform
 from flangeye_emulators.controllers.start import starting_joints
-from flangeye_plugins.robot.manual.driver import ManualParams, ManualRobot, OperatorConsole
-from flangeye_plugins.robot.manual.plausibility import Tolerance, fault
+from flangeye_plugins.robot.manual.driver import (
+    ManualParams,
+    ManualRobot,
+    OperatorConsole,
+    Tolerance,
+    fault,
+)
 from tests.plugins.robot.cell import UR5E, moved
 
 ARM = Arm(UR5E)

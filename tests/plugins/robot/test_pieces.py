@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from flangeye.devices import SILENT
-from flangeye_plugins.robot import pieces
-from flangeye_plugins.robot.pieces import NEAR, Ride
+from flangeye_plugins.robot.aubo import client as pieces
+from flangeye_plugins.robot.aubo.client import NEAR, Ride
 
 SPEED, ACCELERATION, TICK = 0.2, 1.0, 0.01
 

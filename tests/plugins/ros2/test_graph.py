@@ -16,8 +16,7 @@ from flangeye_plugins.robot.ros2.driver import (
     robot_ros2,
     robot_ros2_freedrive,
 )
-from flangeye_plugins.ros2.graph import Ros2Graph
-from flangeye_plugins.ros2.survey import described_arm
+from flangeye_plugins.ros2.graph import Ros2Graph, described_arm
 from flangeye_plugins.scanner.ros2 import Ros2Params as Topics
 from flangeye_plugins.scanner.ros2 import scanner_ros2
 from tests.plugins.ros2 import installed

@@ -10,8 +10,7 @@ from flangeye.devices import DeviceError
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
 from flangeye_emulators.scanner import loopback
-from flangeye_emulators.scanner.loopback import LoopbackParams, scanner_loopback
-from flangeye_emulators.world.scene import CellScene, Stance
+from flangeye_emulators.scanner.loopback import CellScene, LoopbackParams, Stance, scanner_loopback
 
 PHOXI = load_model("scanners", "phoxi-m")
 JOINTS = np.array([0.1, -1.2, 1.4, -1.7, -1.5, 0.3])

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye_plugins.segment import surfaces
+from flangeye_plugins.segment import search as surfaces
 from flangeye_plugins.segment.grid import Grid
-from flangeye_plugins.segment.surfaces import (
+from flangeye_plugins.segment.search import (
     NOISE_GATE,
     _averaged,
     connected_pieces,

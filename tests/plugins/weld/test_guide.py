@@ -18,7 +18,7 @@ from flangeye.models.model import read_model
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.find import find_recipe
 from flangeye.recipe.load import load_recipe
-from flangeye_emulators.finger.render import typical_compliance
+from flangeye_emulators.finger.sensor import typical_compliance
 from flangeye_emulators.robot.simulated import SimulatedParams, SimulatedRobot
 from flangeye_plugins.guide import tactile
 from flangeye_plugins.guide.tactile import guide_tactile

@@ -14,7 +14,7 @@ from flangeye.maths.geometry import rotation_exp
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
 from flangeye.types import Image
-from flangeye_emulators.finger.render import FingerCamera, Optics, typical_compliance
+from flangeye_emulators.finger.sensor import FingerCamera, Optics, typical_compliance
 from flangeye_plugins.sensor.opencv import OpenCVParams, sensor_opencv
 from flangeye_plugins.sensor.recorded import (
     ImageFolderParams,

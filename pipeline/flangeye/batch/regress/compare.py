@@ -7,18 +7,21 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
+
+from pydantic import Field
 
 from flangeye.batch.command import run_sessions
 from flangeye.batch.dataset import Dataset, Ledger, columns_of
 from flangeye.batch.outcome import SessionOutcome
 from flangeye.batch.plan import BatchSession, plan
-from flangeye.batch.regress.manifest import Expected, Manifest
 from flangeye.batch.request import Request
 from flangeye.batch.software import software_of
 from flangeye.doctor import examine, open_session
 from flangeye.errors import FlangeyeError, RecipeError
 from flangeye.files.place import place_at
+from flangeye.models.model import Model, read_model
+from flangeye.units import Length
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -163,3 +166,55 @@ def _findings(run: Path, registry: Registry) -> list[str]:
         return [f.name for f in examine(open_session(run, registry, None), checks).findings]
     except FlangeyeError as error:
         return [f"not examined: {error}"]
+
+
+class Expected(Model):
+    """What a run of the recording came to when it was last believed."""
+
+    status: Literal["verified", "unverified", "refused"] = "verified"
+    closure: Length | None = Field(None, description="Median held-out error.")
+    tolerance: Length | None = Field(None, description="How far the closure may be from that.")
+    findings: tuple[str, ...] | None = Field(
+        None,
+        description="Names of what flangeye doctor finds, in any order; not asked if not given.",
+    )
+
+
+class Manifest(Model):
+    """One recording."""
+
+    title: str = Field(description="One line for people.")
+    recording: str = Field(
+        description="The folder or file, from the manifest's folder, or from ~; skipped if absent."
+    )
+    recipe: str = Field(description="A bundled recipe, or a file, from the manifest's folder.")
+    reader: Any = Field(
+        None, description="The reader and its conventions, as a recipe has them; the recipe's own "
+        "if not given.",
+    )  # fmt: skip
+    overrides: tuple[str, ...] = Field((), description="As --set: fit.rim.inlier=0.2 mm.")
+    expected: Expected
+    source: str = Field(description="Where others find the recording.")
+    licence: str = Field(description="Under which licence, or that none is stated.")
+
+
+def read_manifests(folder: Path) -> dict[Path, Manifest]:
+    """Return the manifests of a folder by their files.
+
+    Raises:
+        RecipeError: There are none, or one is wrong: names the line.
+    """
+    files = sorted(p for p in folder.glob("*.y*ml") if p.is_file())
+    if not files:
+        raise RecipeError(
+            f"{folder}: holds no manifests; one is a .yaml file with title, recording, recipe, "
+            "expected, source and licence"
+        )
+    return {file: _checked(file) for file in files}
+
+
+def _checked(file: Path) -> Manifest:
+    manifest = read_model(file, Manifest)
+    if (manifest.expected.closure is None) != (manifest.expected.tolerance is None):
+        raise RecipeError(f"{file}: expected.closure and expected.tolerance go together")
+    return manifest

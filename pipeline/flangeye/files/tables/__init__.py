@@ -4,9 +4,26 @@ A new kind of file is a function in :mod:`~flangeye.files.tables.documents` and 
 pattern in :data:`~flangeye.maths.pose_formats.CONVENTIONS`.
 """
 
+from __future__ import annotations
+
+import csv
+import re
+from bisect import bisect
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from flangeye.errors import StageError
+from flangeye.files.pairs import natural
+from flangeye.files.printable import reason_of
+from flangeye.files.regular import read_text
 from flangeye.files.tables.documents import KINDS, document_of
-from flangeye.files.tables.read import files_at, read_table, tables_in
-from flangeye.files.tables.table import Cell, Column, Table, number_of
+from flangeye.files.tables.records import record_of, rows_of
+from flangeye.files.tables.table import Cell, Column, Row, Rows, Table, number_of
+from flangeye.maths.pose_formats import CONVENTIONS
 
 __all__ = [
     "KINDS",
@@ -19,3 +36,321 @@ __all__ = [
     "read_table",
     "tables_in",
 ]
+
+
+_SHARE = re.compile(r"([1-9]\d?)/([1-9]\d?)")
+"""A part of a file's rows: the first of so many equal ones."""
+
+
+def program_rows(file: Path, text: str) -> Rows | None:
+    """Return the positions in a text, a row each, with the convention they are in; None if none."""
+    for name, convention in CONVENTIONS.items():
+        found = list(re.finditer(convention.program, text)) if convention.program else []
+        if found:
+            ends = [end.start() for end in re.finditer("\n", text)]
+            rows = [
+                (f"{file}:{bisect(ends, match.start()) + 1}", match.groups()) for match in found
+            ]
+            own = convention.in_units(convention.program_length, convention.angle)
+            labels = zip(own.labels, own.units, strict=True)
+            heading = tuple("_".join(filter(None, pair)).lower() for pair in labels)
+            return Rows(heading, rows, convention=name)
+    return None
+
+
+def files_at(folder: Path, name: str) -> list[Path]:
+    """Return the file of a name, or those of a pattern, ``*.json`` or ``*/pose.json``, in order.
+
+    Raises:
+        StageError: No file can have such a name, or the pattern would look through all folders.
+    """
+    try:
+        for whole in (name, name.partition(":")[0]):
+            if (folder / whole).is_file():
+                return [folder / whole]
+        found = folder.glob(whole) if "*" in whole and not Path(whole).is_absolute() else ()
+        if found and "**" in whole:
+            raise ValueError("** is not known; write */ for each folder between")
+        return sorted((p for p in found if p.is_file()), key=lambda path: natural(str(path)))
+    except (OSError, ValueError, NotImplementedError) as error:
+        raise StageError(f"{name[:80]!a}: is no name of a file: {reason_of(error)}") from None
+
+
+def read_table(folder: Path, name: str | Sequence[str]) -> Table:
+    """Read a table by its name, or tables side by side by several.
+
+    Raises:
+        StageError: A file cannot be read, the part is not there, it has several and none is named,
+            the columns of two files differ, or tables side by side are not of one length.
+    """
+    if not isinstance(name, str):
+        return _beside([read_table(folder, each) for each in name])
+    files = files_at(folder, name)
+    if len(files) > 1 or "*" in name.partition(":")[0]:
+        return _of_files(folder, name, files)
+    file = files[0] if files else folder / name
+    part = name.partition(":")[2] if not (folder / name).is_file() else ""
+    return _table(name, file, _part(file, sources(file), part))
+
+
+def tables_in(folder: Path, name: str) -> list[Table]:
+    """Return every table of a file, under the name that :func:`read_table` takes for it.
+
+    Raises:
+        StageError: It cannot be read.
+    """
+    file = folder / name
+    found = sources(file)
+    if len(found) == 1:
+        return [_table(name, file, found[0])]
+    parts = [f"{name}:{rows.part.split(',')[0]}" for rows in found]
+    return [_table(n, file, rows) for n, rows in zip(parts, found, strict=True)]
+
+
+def sources(file: Path) -> list[Rows]:
+    """Return the tables of a file: of a document, of a robot program, or of a text's blocks.
+
+    Raises:
+        StageError: It cannot be read.
+    """
+    document = document_of(file)
+    if document is not None:
+        return rows_of(file, document)
+    text = read_text(file)
+    program = program_rows(file, text)
+    return [program] if program else text_rows(file, text)
+
+
+def _of_files(folder: Path, name: str, files: Sequence[Path]) -> Table:
+    """Return files with a row each as one table."""
+    tables = [_single(file) for file in files]
+    for file, rows in zip(files, tables, strict=True):
+        if rows.heading != tables[0].heading:
+            raise StageError(f"{file}: its columns are not those of {files[0].name}")
+    joined = [row for rows in tables for row in rows.rows]
+    apart = len({file.parent for file in files}) == len(files)
+    names = [file.parent.name if apart else file.stem for file in files]
+    named = names if len(joined) == len(files) else []
+    rows = Rows(tables[0].heading if tables else (), joined, "", named)
+    return _table(name, folder / name, rows, files)
+
+
+def _single(file: Path) -> Rows:
+    document = document_of(file)
+    if document is not None:
+        return record_of(file, document)
+    text = read_text(file)
+    return program_rows(file, text) or row_of(file, text) or Rows((), [])
+
+
+def _table(name: str, file: Path, rows: Rows, files: Sequence[Path] = ()) -> Table:
+    return Table(
+        name, file, rows.heading, tuple(rows.rows), tuple(files or (file,)), tuple(rows.names),
+        rows.convention,
+    )  # fmt: skip
+
+
+def _part(file: Path, found: Sequence[Rows], part: str) -> Rows:
+    if not found:
+        return Rows((), [])
+    share = _SHARE.fullmatch(part)
+    if share is not None and len(found) == 1:
+        return _share(file, found[0], int(share[1]), int(share[2]))
+    if not part and len(found) == 1:
+        return found[0]
+    for rows in found:
+        if part and part in (rows.part, *rows.part.split(",")):
+            return rows
+    if part and len(found) == 1 and found[0].part == "":
+        raise StageError(f"{file}: has one table only, not '{part}'; write {file.name}")
+    known = ", ".join(f"{file.name}:{rows.part.split(',')[0]}" for rows in found)
+    what = f"has no part '{part}'" if part else f"holds {len(found)} tables"
+    raise StageError(f"{file}: {what}; name one of {known}")
+
+
+def _share(file: Path, rows: Rows, which: int, of: int) -> Rows:
+    count = len(rows.rows)
+    if count % of or which > of:
+        raise StageError(f"{file}: has {count} rows, which are not {of} parts of equal length")
+    size = count // of
+    kept = slice((which - 1) * size, which * size)
+    return rows._replace(rows=rows.rows[kept], names=rows.names[kept])
+
+
+def _beside(tables: Sequence[Table]) -> Table:
+    """Return tables of one length as one; columns without names are called as their file."""
+    counts = {len(table.rows) for table in tables}
+    if len(counts) > 1:
+        told = ", ".join(f"{table.name} {len(table.rows)}" for table in tables)
+        raise StageError(
+            f"{tables[0].file}: tables side by side have different numbers of rows: {told}"
+        )
+    headings = [table.heading or _counted(table) for table in tables]
+    known = Counter(name for heading in headings for name in heading)
+    names = [
+        name if known[name] == 1 else f"{table.files[0].stem}.{name}"
+        for table, heading in zip(tables, headings, strict=True)
+        for name in heading
+    ]
+    rows: list[Row] = [
+        (each[0][0], tuple(cell for _, cells in each for cell in cells))
+        for each in zip(*(table.rows for table in tables), strict=True)
+    ]
+    files = dict.fromkeys(file for table in tables for file in table.files)
+    name = ", ".join(table.name for table in tables)
+    return Table(name, tables[0].file, tuple(names), tuple(rows), tuple(files), tables[0].names)
+
+
+def _counted(table: Table) -> tuple[str, ...]:
+    stem = re.sub(r"\W*\*\W*", "", table.files[0].stem if len(table.files) == 1 else
+                  str(Path(table.name).with_suffix("")).replace("/", "_"))  # fmt: skip
+    return tuple(f"{stem}.{i}" for i in range(len(table.rows[0][1]) if table.rows else 0))
+
+
+@dataclass
+class Block:
+    """Rows without a blank line, a comment or a title between them.
+
+    Attributes:
+        rows: Of each row, where it stands and its cells.
+        heading: Names of its columns.
+        title: The last line of words above it.
+        after_blank: Whether a blank line or a title stands above it, not a comment alone.
+        marked: Whether a mark, not blanks, stands between the cells.
+    """
+
+    rows: list[Row] = field(default_factory=list)
+    heading: tuple[str, ...] = ()
+    title: str = ""
+    after_blank: bool = False
+    marked: bool = False
+
+    @property
+    def width(self) -> int:
+        """Columns of the first row."""
+        return len(self.rows[0][1])
+
+
+def text_rows(file: Path, text: str) -> list[Rows]:
+    """Return the blocks of a text, mostly one.
+
+    ``#`` and ``%`` begin a comment, of which the last before the numbers may be the heading. Blank
+    lines and titles part blocks of three rows and more, and so do comments between blocks of one
+    length. Matrices that stand line by line are a row each.
+    """
+    blocks = [_with_matrices(block) for block in _blocks(file, text.splitlines())]
+    merged = _merged(blocks)
+    names = [block.title for block in merged]
+    distinct = len(set(names)) == len(names) > 1 and all(names)
+    return [
+        Rows(block.heading, block.rows, (block.title if distinct else f"{n}") if merged[1:] else "",
+             _names(block, blocks))
+        for n, block in enumerate(merged, 1)
+    ]  # fmt: skip
+
+
+def row_of(file: Path, text: str) -> Rows | None:
+    """Return all numbers of a text as one row; a heading stays if there is one row under it."""
+    blocks = text_rows(file, text)
+    if not blocks:
+        return None
+    if len(blocks) == 1 and len(blocks[0].rows) == 1:
+        return blocks[0]
+    cells = tuple(cell for block in blocks for _, row in block.rows for cell in row)
+    return Rows((), [(str(file), cells)])
+
+
+def _blocks(file: Path, lines: Sequence[str]) -> Iterator[Block]:
+    split = _splitter([line for line in lines if line.strip() and line.strip()[0] not in "#%"])
+    block = Block(after_blank=True, marked=split.mark != " ")
+    for n, line in enumerate(map(str.strip, lines), 1):
+        comment = line[:1] in ("#", "%")
+        cells = split(line.lstrip("#% ") if comment else line) if line else ()
+        if cells and not comment and any(number_of(cell) is not None for cell in cells):
+            block.rows.append((f"{file}:{n}", cells))
+            continue
+        if block.rows:
+            yield block
+            block = Block(marked=block.marked)
+        block.after_blank |= not comment
+        if any(cells):
+            block.heading, block.title = cells, line.lstrip("#% ").rstrip(" :")
+    if block.rows:
+        yield block
+
+
+def _with_matrices(block: Block) -> Block:
+    """Return a block whose matrices, line by line, are a row of numbers each."""
+    widths = {len(cells) for _, cells in block.rows}
+    if not (len(block.heading) in widths or (block.marked and len(block.heading) > 2)):
+        block.heading = ()
+    else:
+        block.title = ""
+    for lines, width in ((4, 4), (3, 4), (3, 3)):
+        if block.heading or widths != {width} or len(block.rows) % lines:
+            continue
+        numbers = np.array([[_or_nan(cell) for cell in cells] for _, cells in block.rows])
+        stack = numbers.reshape(-1, lines, width)
+        gram = stack[:, :3, :3] @ stack[:, :3, :3].swapaxes(1, 2)
+        last = lines == 3 or bool((stack[:, 3] == [0, 0, 0, 1]).all())
+        # By how much rows of a written rotation may differ from unit length, and from right angles
+        if last and np.abs(gram - np.eye(3)).max() < 2e-3:
+            rows = [block.rows[i : i + lines] for i in range(0, len(block.rows), lines)]
+            block.rows = [(r[0][0], tuple(c for _, cells in r for c in cells)) for r in rows]
+            return block
+    return block
+
+
+def _or_nan(cell: str | float) -> float:
+    number = number_of(cell)
+    return float("nan") if number is None else number
+
+
+def _merged(blocks: list[Block]) -> list[Block]:
+    """Return blocks of one table as one: short ones, and those that only a comment parts."""
+    sections: list[Block] = []
+    # Rows of a block; fewer between blank lines are a pose each
+    short = [block for block in blocks if len(block.rows) < 3]
+    all_titled = all(block.title for block in blocks)
+    alike = len({(len(block.rows), block.width) for block in blocks}) == 1
+    for block in blocks:
+        last = sections[-1] if sections else None
+        same = last is not None and block.width == last.width and not block.heading
+        begins = block.after_blank or alike
+        if short:
+            begins = bool(block.title) and not all_titled
+        if last is None or not same or begins:
+            sections.append(Block(list(block.rows), block.heading, block.title))
+        else:
+            last.rows += block.rows
+    return sections
+
+
+def _names(block: Block, blocks: Sequence[Block]) -> list[str]:
+    """Return the titles of rows that each have one."""
+    titles = [each.title for each in blocks if each.rows[0] in block.rows]
+    return titles if len(titles) == len(block.rows) > 1 and all(titles) else []
+
+
+class _splitter:  # noqa: N801  a function with a memory
+    """Splits lines at the mark that the first of them shows."""
+
+    def __init__(self, lines: Sequence[str]) -> None:
+        # Where blanks separate, every comma is a decimal one: "1,5 2,0 3,25".
+        blanks = all(len(line.split()) > 2 and _plain(line) for line in lines[-3:])
+        marks = ";\t" if blanks else ";\t,"
+        shown = next(iter(lines), "")
+        self.mark = next((m for m in marks if m in shown or m in "".join(lines[-1:])), " ")
+
+    def __call__(self, line: str) -> tuple[str, ...]:
+        if self.mark == " ":
+            return tuple(line.strip("[](){}").replace(", ", " ").split())
+        (cells,) = csv.reader([line], delimiter=self.mark, skipinitialspace=True)
+        cells = [cell.strip(" []{}()") for cell in cells]
+        # A mark at the line's end makes an empty last cell.
+        return tuple(cells[:-1] if cells and not cells[-1] else cells)
+
+
+def _plain(line: str) -> bool:
+    """Return whether each word but the first, split at blanks, is a number by itself."""
+    return all(number_of(word) is not None for word in line.split()[1:])

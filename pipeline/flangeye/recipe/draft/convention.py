@@ -23,14 +23,24 @@ from flangeye.maths.pose_formats import (
 from flangeye.maths.pose_formats import convention_of_maker as usual_of
 from flangeye.models.robots import RobotModel
 from flangeye.recipe.draft.evidence import Writing, mounting_of, writing_of
-from flangeye.recipe.draft.frames import is_inverse
-from flangeye.recipe.draft.headings import JOINTS, Headings, PoseColumns, as_joints, poses_by_name
+from flangeye.recipe.draft.headings import (
+    JOINTS,
+    Headings,
+    PoseColumns,
+    as_joints,
+    is_inverse,
+    poses_by_name,
+)
 from flangeye.recipe.draft.numbers import FARTHEST, TURN, poses_by_number
 from flangeye.recipe.draft.questions import Questions, one_of
 from flangeye.types import Floats
 
 NAME_THE_ARM = "name the arm: --robot NAME ('flangeye robots' lists them), or its .urdf"
 WAYS = {"": ("base_T_flange", "flange_T_base"), "target-": ("camera_T_target", "target_T_camera")}
+
+
+_FIRST = ("kuka", "quaternion_xyzw", "xyzw")
+"""Of conventions with equal names, what most files hold: A, B, C; quaternions without names."""
 
 
 def poses_of(table: Table) -> tuple[list[PoseColumns], Headings]:
@@ -421,10 +431,6 @@ def _rotation(pose: PoseColumns, questions: Questions, prefix: str, maker: str |
     question = f"how the rotation in columns {shown} is written ({known})"
     others = ("point", "joints", MATRIX, APART)
     return questions.ask(key, question, usual, "vector", one_of(*CONVENTIONS, *PLAIN, *others))
-
-
-_FIRST = ("kuka", "quaternion_xyzw", "xyzw")
-"""Of conventions with equal names, what most files hold: A, B, C; quaternions without names."""
 
 
 def _length(numbers: Floats, pose: PoseColumns) -> str:

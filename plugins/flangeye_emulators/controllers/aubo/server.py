@@ -2,13 +2,32 @@
 
 from __future__ import annotations
 
+import json
+import struct
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
 from flangeye.models.emulator import EmulatorOptions
-from flangeye_emulators.controllers.aubo import rpc
-from flangeye_emulators.controllers.aubo.controller import AuboController
+from flangeye.types import Floats
+from flangeye_emulators.controllers.aubo.controller import OK, POSE, AuboController
 from flangeye_emulators.controllers.fault_injection import FaultInjector
-from flangeye_emulators.controllers.network import Network
+from flangeye_emulators.controllers.network import Connection, Network
 from flangeye_emulators.controllers.server import Server, run_server
 from flangeye_emulators.controllers.start import joint_zeros, starting_joints
+
+PORT = 30004
+MARK = b"SOF\x01"
+
+UNKNOWN_METHOD, WRONG_PARAMS = -32601, -32602
+"""JSON-RPC 2.0, section 5.1."""
+
+_LENGTH = struct.Struct(">I")
+_HEADER = len(MARK) + _LENGTH.size
+ROBOT = "rob1"
+VERSION = "0.24.1"
+VERSION_CODE = 24001
 
 
 def serve(options: EmulatorOptions) -> None:
@@ -20,5 +39,136 @@ def serve(options: EmulatorOptions) -> None:
     zeros = joint_zeros(options.robot, options.seed)
     box = AuboController(options.robot, starting_joints(options.robot, options.joints), zeros)
     network = Network(options.host)
-    network.offer(rpc.PORT, lambda: rpc.RpcSession(network, box))
-    run_server(Server(options, box, network, FaultInjector(box, network), {"JSON-RPC": rpc.PORT}))
+    network.offer(PORT, lambda: RpcSession(network, box))
+    run_server(Server(options, box, network, FaultInjector(box, network), {"JSON-RPC": PORT}))
+
+
+class RpcSession(Connection):
+    """One client."""
+
+    def __init__(self, network: Network, box: AuboController) -> None:
+        super().__init__(network)
+        self._box = box
+        self._buffer = b""
+
+    def received(self, data: bytes) -> None:
+        """Answer each whole frame."""
+        self._buffer += data
+        while len(self._buffer) >= _HEADER:
+            (length,) = _LENGTH.unpack_from(self._buffer, len(MARK))
+            # Bytes of a body after which a client is cut off
+            if not self._buffer.startswith(MARK) or length > 1 << 20:
+                self.abort()
+                return
+            if len(self._buffer) < _HEADER + length:
+                return
+            body = self._buffer[_HEADER : _HEADER + length]
+            self._buffer = self._buffer[_HEADER + length :]
+            self.send(frame(answer(self._box, body)))
+
+
+def frame(body: bytes) -> bytes:
+    """Return a body with its mark and length."""
+    return MARK + _LENGTH.pack(len(body)) + body
+
+
+def answer(box: AuboController, body: bytes) -> bytes:
+    """Return the answer to one request, after doing what it says."""
+    if body.startswith(b"__login__"):
+        # The client takes any answer.
+        return b"OK"
+    try:
+        request = json.loads(body)
+        said = {"id": request["id"], **_outcome(box, request)}
+    except (ValueError, KeyError, TypeError):
+        said = {"id": None, **_error(-32600, "not a request")}
+    return json.dumps({"jsonrpc": "2.0", **said}).encode()
+
+
+def _outcome(box: AuboController, request: dict[str, Any]) -> dict[str, Any]:
+    name = str(request["method"]).removeprefix(f"{ROBOT}.")
+    method = METHODS.get(name)
+    if method is None:
+        return _error(UNKNOWN_METHOD, f"{name} is not simulated")
+    try:
+        return {"result": method(box, request.get("params", {}))}
+    except (KeyError, TypeError, ValueError) as error:
+        return _error(WRONG_PARAMS, f"{name}: {type(error).__name__}: {error}")
+
+
+def _error(code: int, message: str) -> dict[str, Any]:
+    return {"error": {"code": code, "message": message}}
+
+
+Method = Callable[[AuboController, Mapping[str, Any]], Any]
+
+
+def _numbers(values: Any) -> Floats:
+    return np.array(values, dtype=np.float64)
+
+
+def _tell(value: Callable[[AuboController], Any]) -> Method:
+    return lambda box, params: value(box)
+
+
+def _flange(box: AuboController) -> Floats:
+    return box.arm.chain.flange(box.arm.stance.joints)
+
+
+def _pose(matrix: Floats) -> list[float]:
+    return [float(number) for number in POSE.numbers(matrix)]
+
+
+def _set_tool(box: AuboController, params: Mapping[str, Any]) -> int:
+    box.arm.set_tool(POSE.matrix(params["offset"]))
+    return OK
+
+
+def _move_joint(box: AuboController, params: Mapping[str, Any]) -> int:
+    return box.move_joint(_numbers(params["q"]), params["a"], params["v"])
+
+
+def _move_line(box: AuboController, params: Mapping[str, Any]) -> int:
+    return box.move_line(_numbers(params["pose"]), params["a"], params["v"])
+
+
+def _speed_line(box: AuboController, params: Mapping[str, Any]) -> int:
+    return box.speed_line(_numbers(params["xd"]), params["a"], params["t"])
+
+
+def _speed_joint(box: AuboController, params: Mapping[str, Any]) -> int:
+    return box.speed_joint(_numbers(params["qd"]), params["a"], params["t"])
+
+
+METHODS: dict[str, Method] = {
+    "getRobotNames": _tell(lambda box: [ROBOT]),
+    "getAxisNames": _tell(lambda box: []),
+    "SystemInfo.getInterfaceVersionCode": _tell(lambda box: VERSION_CODE),
+    "SystemInfo.getControlSoftwareFullVersion": _tell(lambda box: f"{VERSION} (loopback)"),
+    "RobotConfig.getCycletime": _tell(lambda box: box.cycle),
+    "RobotConfig.getDof": _tell(lambda box: len(box.arm.speeds)),
+    "RobotConfig.getTcpOffset": _tell(lambda box: _pose(box.arm.chain.flange_T_tcp)),
+    "RobotConfig.setTcpOffset": _set_tool,
+    "RobotState.getActualTcpOffset": _tell(lambda box: _pose(box.arm.chain.flange_T_tcp)),
+    "RobotState.getRobotModeType": _tell(lambda box: box.robot_mode),
+    "RobotState.getSafetyModeType": _tell(lambda box: box.safety),
+    "RobotState.isPowerOn": _tell(lambda box: box.robot_mode == "Running"),
+    "RobotState.isSteady": _tell(lambda box: box.arm.standing),
+    "RobotState.getJointPositions": _tell(lambda box: box.arm.stance.joints.tolist()),
+    "RobotState.getJointSpeeds": _tell(lambda box: box.arm.speeds.tolist()),
+    "RobotState.getTcpPose": _tell(lambda box: _pose(box.arm.stance.base_T_tcp)),
+    "RobotState.getToolPose": _tell(lambda box: _pose(_flange(box))),
+    "RobotState.getTcpSpeed": _tell(lambda box: box.arm.twist.tolist()),
+    "RobotState.getTcpForce": _tell(lambda box: box.arm.felt.tolist()),
+    "MotionControl.moveJoint": _move_joint,
+    "MotionControl.moveLine": _move_line,
+    "MotionControl.speedLine": _speed_line,
+    "MotionControl.speedJoint": _speed_joint,
+    "MotionControl.stopLine": lambda box, p: box.halt(p["acc"], in_space=True),
+    "MotionControl.stopJoint": lambda box, p: box.halt(p["acc"], in_space=False),
+    "MotionControl.getExecId": _tell(lambda box: box.exec_id),
+    "MotionControl.getQueueSize": _tell(lambda box: box.queue_size),
+    "RobotManage.poweroff": _tell(AuboController.power_off),
+    "RobotManage.setUnlockProtectiveStop": _tell(AuboController.unlock),
+}
+"""By name, those of a robot without the robot's name in front."""

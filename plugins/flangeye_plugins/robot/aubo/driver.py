@@ -17,8 +17,7 @@ from flangeye.models.robots import RobotModel
 from flangeye.plugin.sdk import load_sdk
 from flangeye.plugin.stage import Params, part
 from flangeye.types import BASE, FLANGE, TOOL, Floats, Transform
-from flangeye_plugins.robot.aubo.client import AuboClient
-from flangeye_plugins.robot.pieces import STANDING, Ride
+from flangeye_plugins.robot.aubo.client import STANDING, AuboClient, Ride
 from flangeye_plugins.robot.tool_check import (
     ToolOffset,
     require_model,

@@ -24,8 +24,8 @@ from flangeye_plugins.robot.tool_check import (
     wrench_at_flange,
 )
 from flangeye_plugins.robot.ur import dashboard
+from flangeye_plugins.robot.ur.dashboard import condition_of
 from flangeye_plugins.robot.ur.link import Link, Sample
-from flangeye_plugins.robot.ur.status import condition_of
 
 SHOWN = CONVENTIONS["ur"]
 POSE = SHOWN.in_units("m", "rad")

@@ -11,8 +11,8 @@ import numpy as np
 from flangeye_emulators.controllers.motion import Servo, Speed
 from flangeye_emulators.controllers.poses import rotation_matrix
 from flangeye_emulators.controllers.ur.commands.moves import joints_at
-from flangeye_emulators.controllers.ur.orders import ServoOrder, SpeedOrder
 from flangeye_emulators.controllers.ur.program import ProgramError, Thread
+from flangeye_emulators.controllers.ur.script import ServoOrder, SpeedOrder
 
 if TYPE_CHECKING:
     from flangeye_emulators.controllers.ur.script import ControlScript
