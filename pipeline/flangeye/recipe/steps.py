@@ -215,7 +215,7 @@ class StepOrder:
         rank = list(KINDS).index(kind)
         if kind == "export":  # done after verifying, wherever it stands behind the solver
             return
-        if kind in self._kinds and kind not in ("refine", "verify"):
+        if kind in self._kinds and kind not in ("refine", "verify", "seam"):
             self._complain(at, f"a recipe has one {kind} step, and this is the second")
         elif rank < self._rank:
             later = list(KINDS)[self._rank]

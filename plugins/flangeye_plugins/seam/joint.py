@@ -1,0 +1,408 @@
+"""Find a welded joint in the scan, near a rough line: its cross-section is fitted along it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from flangeye import CalibrationRefused, StageError, stage
+from flangeye.maths.seam_geometry import distances_to_line
+from flangeye.models.robots import RobotModel
+from flangeye.models.scanners import ScannerModel
+from flangeye.types import Box, Floats, Seam, VerifiedHandEye, WorkpieceScan
+from flangeye.units import Length, param
+from flangeye_plugins.seam.course import Course, course
+from flangeye_plugins.seam.ends import face_ends, seam_end, surfaces
+from flangeye_plugins.seam.planned import (
+    SeamParams,
+    answer_for,
+    cloud_around,
+    for_the_controller,
+    refuse_outside,
+)
+from flangeye_plugins.seam.points import facing_camera
+from flangeye_plugins.seam.rough import Place, rough_path
+from flangeye_plugins.seam.stitched import PlacedScan, seen_in_base
+from flangeye_plugins.seam.sweep import WIDE, Spline, Swept, fitted, swept_from
+from flangeye_plugins.seam.template import EDGES, FACES, JOINTS, Joint
+
+STAGE = "seam.joint"
+MOST = 120_000
+"""Points that are fitted to; of more, every second, third, ..."""
+FEWEST = 300
+REFITS = 3
+"""The second and third time along the line that the first has found."""
+UNSHARED = 0.15
+"""Of a pixel, what an edge may be off for how pixels there are measured."""
+LOOSE = 0.5e-3
+"""Ends of surfaces that are known less well are not taken for the same [m]."""
+CELL = 3e-3
+"""Lengths of the seam that are seen or not [m]."""
+PLANE = 0.95
+"""What explains this share of the points of a joint is as good as the joint."""
+EQUAL = 0.8
+"""A joint that explains this share of what the best one explains is its equal."""
+
+
+class JointParams(SeamParams):
+    """Parameters of ``seam.joint``."""
+
+    joint: Literal["vee", "bevel", "butt", "lap", "fillet", "corner"] = Field(
+        description="vee and bevel: a V-groove or half of one; butt: square edges with a gap; "
+        "corner: an outside corner, open or closed."
+    )
+    line: tuple[tuple[Length, Length, Length], ...] | None = Field(
+        None,
+        min_length=2,
+        description="Rough points along the seam in base, in welding order; else an earlier seam.",
+    )
+    closed: bool = Field(False, description="The line comes back to its first point.")
+    reach: Length = param(
+        "15 mm", gt=0, description="Largest distance of the seam and its ends from the line."
+    )
+    max_residual: Length = param(
+        "0.5 mm", gt=0, description="Largest distance of points from the joint's surfaces, median."
+    )
+    max_deviation: Length = param(
+        "0.5 mm", gt=0, description="Largest standard deviation of the seam across it, in the scan."
+    )
+    min_explained: float = Field(
+        0.6, gt=0, lt=1, description="Smallest share of the points about the seam on the joint."
+    )
+    min_coverage: float = Field(
+        0.6, gt=0, lt=1, description="Smallest share of the seam's length where both plates show."
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A joint in ``camera``.
+
+    Attributes:
+        course: Frames along it.
+        swept: Its section, beside these.
+        local: (N, 3) points about it.
+        pitch: Distance between neighbouring points [m].
+        ends: Where along the course it starts and ends [m].
+        deviations: Of both ends [m]; infinite where an end was not seen.
+    """
+
+    course: Course
+    swept: Swept
+    local: Floats
+    pitch: float
+    ends: tuple[float, float] = (0.0, 0.0)
+    deviations: tuple[float, float] = (np.inf, np.inf)
+
+    @property
+    def inside(self) -> Floats:
+        """(M, 3) those of the points that are between the ends."""
+        s = self.local[:, 0]
+        return self.local[(s > self.ends[0]) & (s < self.ends[1])]
+
+    def again(self, points: Floats, reach: float) -> Found:
+        """Return the same beside frames along the line that was found."""
+        line = self.course.moved(*self.swept.spline.at(self.course.s).T)
+        flat = Spline.through(line.length, line.closed, line.s, np.zeros((len(line.s), 3)))
+        local = line.local(points, reach)[1]
+        return replace(self, course=line, swept=replace(self.swept, spline=flat), local=local)
+
+
+@stage(STAGE)
+def seam_joint(  # noqa: PLR0913  what it asks the runner for
+    calibration: VerifiedHandEye,
+    scan: WorkpieceScan,
+    params: JointParams,
+    seam: Seam | None = None,
+    workspace: Box | None = None,
+    scanner: ScannerModel | None = None,
+    robot: RobotModel | None = None,
+) -> Seam:
+    """Fit a joint's cross-section to the scan along a rough line.
+
+    The line is the step's own or that of an earlier seam step. The seam is where the joint's
+    surfaces meet, or the middle of a gap; it begins and ends where the plates do.
+
+    Figures [m]: ``residual`` of the points on the joint; ``registration``, the largest standard
+    deviation of the line in the scan; ``start`` and ``end``, those of both ends along it, where
+    they were seen; ``explained`` and ``coverage`` as the parameters have them; of a scan from
+    several places ``apart``.
+
+    Raises:
+        StageError: There is no line, or too few points about it.
+        CalibrationRefused: The joint is not there, or is not known well enough, or two are.
+    """
+    answer = answer_for(STAGE, calibration, params)
+    seen = seen_in_base(STAGE, scan, answer, robot)
+    found = _found(seen, _rough(seen, params, seam), params)
+    figures = _judged(found, params)
+    line, openings, covariances = _line(found, params.spacing)
+    covariances = covariances + seen.of_scanner(line, scanner)
+    mapped, covariance = seen.in_base(line, covariances)
+    refuse_outside(STAGE, mapped, workspace)
+    section = found.swept.section
+    planned = Seam(
+        mapped,
+        openings @ seen.base_T_camera.rotation.T,
+        covariance,
+        half_angle=section.half_angle,
+        half_width=_half_width(found.swept),
+        source=f"{params.joint} in {scan.source}",
+        figures=figures if seen.apart is None else {**figures, "apart": seen.apart},
+        notes=_notes(found, params),
+        cloud=cloud_around(seen.points, line, seen.base_T_camera),
+    )
+    return for_the_controller(planned, answer, robot, params)
+
+
+def _rough(seen: PlacedScan, params: JointParams, seam: Seam | None) -> Course:
+    """Return frames along the rough line, in ``camera``."""
+    if params.line is None and seam is None:
+        raise StageError(f"{STAGE}: knows no rough line; write line:, or put a seam step before it")
+    given = np.array(params.line) if params.line else seam.points_in_base  # type: ignore[union-attr]
+    if not (np.linalg.norm(np.diff(given, axis=0), axis=1) > 0).all():
+        raise StageError(f"{STAGE}: line has the same point twice in a row")
+    line = seen.base_T_camera.inverse().apply(given)
+    return course(line, seen.eyes, params.closed, params.reach)
+
+
+def _found(seen: PlacedScan, rough: Course, params: JointParams) -> Found:
+    """Return the joint and its ends."""
+    box = params.reach + WIDE + 10e-3
+    at, local = rough.local(seen.points, box)
+    if len(at) < FEWEST:
+        raise StageError(f"{STAGE}: {len(at)} points are near the line; {FEWEST} are needed")
+    pitch, points = _solid(seen.points[at[:: -(-len(at) // MOST)]])
+    at, local = rough.local(points, box)
+    points = points[at]
+    places = _placed(rough, local, points, params)
+    swept = swept_from(places, rough.length, rough.closed)
+    line = rough
+    found = Found(line, swept, local, pitch, (0.0, line.length))
+    for k in range(REFITS):
+        found = found.again(points, box) if k else found
+        edges = face_ends(found.swept, found.inside, pitch, params.max_residual)
+        swept = fitted(found.swept, found.local, pitch, params.max_residual, edges)
+        found = _with_ends(replace(found, swept=swept))
+    return found
+
+
+def _solid(points: Floats) -> tuple[float, Floats]:
+    """Return the distance between neighbouring points [m], and those that have enough of them.
+
+    A pixel that sees two surfaces shows a point between them with few neighbours; on a
+    surface 19 are within two and a half spacings.
+    """
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(points)
+    some = points[:: max(1, len(points) // 2000)]
+    pitch = float(np.median(tree.query(some, k=5)[0][:, 1:].mean(axis=1)))
+    counts = tree.query_ball_point(points, 2.5 * pitch, return_length=True)
+    return pitch, points[counts > 3]
+
+
+def _placed(rough: Course, local: Floats, points: Floats, params: JointParams) -> list[Place]:
+    """Return the joint's way along the rough line."""
+    joint = JOINTS[params.joint]
+    joints: tuple[Joint, ...] = (joint,)
+    if joint.mirrored() != joint and params.joint != "fillet":
+        joints = (joint, joint.mirrored())
+    normals = facing_camera(points).normals
+    turned = np.einsum("nij,nj->ni", rough.at(local[:, 0])[1], normals)
+    ways = rough_path(local, turned, joints, params.max_residual, params.reach)
+    if not ways:
+        raise CalibrationRefused(
+            f"{STAGE}: no {params.joint} joint within {params.reach * 1e3:g} mm of the line "
+            "(reach); is it the right joint, and seen?"
+        )
+    scores = [sum(place.score for place in way) for way in ways]
+    if len(ways) > 1 and scores[1] > EQUAL * scores[0]:
+        raise CalibrationRefused(
+            f"{STAGE}: ambiguous: a second {params.joint} joint is as good, "
+            f"{_between(ways[0], ways[1]) * 1e3:.0f} mm beside the first; move the line nearer to "
+            "one of them and lower 'reach'"
+        )
+    return ways[0]
+
+
+def _between(first: list[Place], second: list[Place]) -> float:
+    line = np.array([[p.s, *p.q] for p in first])
+    return float(np.median(distances_to_line(np.array([[p.s, *p.q] for p in second]), line)))
+
+
+def _with_ends(found: Found) -> Found:
+    """Return the joint between its ends: it ends where the first of its surfaces does."""
+    if found.course.closed:
+        return replace(found, ends=(0.0, found.course.length), deviations=(0.0, 0.0))
+    swept, local = found.swept, found.local
+    q = swept.in_section(local)
+    across = np.linalg.norm(q, axis=1) * np.sign(q[:, 0])
+    start, stop = (
+        _soonest(
+            [
+                seam_end(local[on, 0], across[on], found.pitch, sign)
+                for on in surfaces(swept, local, 4 * swept.sigma).values()
+            ],
+            sign,
+        )
+        for sign in (-1, 1)
+    )
+    low, high = 2 * found.pitch, found.course.length - 2 * found.pitch
+    return replace(
+        found,
+        ends=(max(start[0], 0.0), min(stop[0], found.course.length)),
+        deviations=(
+            start[1] if start[0] > low else np.inf,
+            stop[1] if stop[0] < high else np.inf,
+        ),
+    )
+
+
+def _soonest(ends: list[tuple[float, float]], sign: int) -> tuple[float, float]:
+    """Return the end that a seam comes to first, from those of its surfaces, and its deviation.
+
+    Surfaces that end there as well, for all that is known, tell its place together.
+    """
+    values, deviations = np.array(ends).T
+    k = int(np.argmin(sign * values))
+    sharp = (deviations < LOOSE) & (deviations[k] < LOOSE)
+    same = sharp & (np.abs(values - values[k]) <= 3 * np.hypot(deviations, deviations[k]))
+    same[k] = True
+    weights = deviations[same] ** -2.0
+    return float(weights @ values[same] / weights.sum()), float(weights.sum() ** -0.5)
+
+
+def _line(found: Found, spacing: float) -> tuple[Floats, Floats, Floats]:
+    """Return the seam (N, 3), its openings (N, 3) and its covariances (N, 3, 3), in ``camera``."""
+    start, stop = found.ends
+    count = max(2, round((stop - start) / spacing) + 1)
+    s = np.linspace(start, stop, count)
+    origin, axes = found.course.at(s)
+    y, z, roll = found.swept.spline.at(s).T
+    line = origin + y[:, None] * axes[:, 1] + z[:, None] * axes[:, 2]
+    turned = roll + found.swept.section.opening
+    openings = np.sin(turned)[:, None] * axes[:, 1] + np.cos(turned)[:, None] * axes[:, 2]
+    floor = (UNSHARED * found.pitch) ** 2
+    across = found.swept.line_covariance(s) + floor * np.eye(2)
+    covariance = np.einsum("nai,nab,nbj->nij", axes[:, 1:], across, axes[:, 1:])
+    for k, deviation in zip((0, -1), found.deviations, strict=True):
+        if np.isfinite(deviation):
+            covariance[k] += deviation**2 * np.outer(axes[k, 0], axes[k, 0])
+    return line, openings, covariance
+
+
+def _half_width(swept: Swept) -> float | None:
+    """Return how far a face's end is from the opening through the seam, on average [m]."""
+    section = swept.section
+    if section.joint.gap:
+        return float(section.shape[6] / 2)
+    ends = [v for v in section.vertices if np.linalg.norm(v) > 1e-4]
+    aside = np.array([np.cos(section.opening), -np.sin(section.opening)])
+    return float(np.mean(np.abs(np.array(ends) @ aside))) if len(ends) == 2 else None
+
+
+def _judged(found: Found, params: JointParams) -> dict[str, float]:
+    """Return the figures, or refuse what is not known.
+
+    Raises:
+        CalibrationRefused: Says which figure, and its limit.
+    """
+    explained, coverage = _shares(found)
+    start, stop = found.ends
+    s = np.linspace(start, stop, 50)
+    deviation = float(np.sqrt(np.linalg.eigvalsh(found.swept.line_covariance(s)).max()))
+    limits = [
+        (found.swept.sigma, params.max_residual, "points are {} from the joint", "max_residual"),
+        (deviation, params.max_deviation, "the seam is known to {} (1 sigma)", "max_deviation"),
+    ]
+    for value, limit, what, name in limits:
+        if not value <= limit:
+            told = what.format(f"{value * 1e3:.2g} mm")
+            raise CalibrationRefused(f"{STAGE}: {told}, limit {limit * 1e3:g} mm ({name})")
+    _refuse_plane(found)
+    leaning = np.abs(found.swept.section.shape[:4]) - 3 * np.radians(JOINTS[params.joint].spread)
+    if leaning.max() > 0:
+        raise CalibrationRefused(
+            f"{STAGE}: this is no {params.joint} joint: an angle between its surfaces is off by "
+            f"{np.degrees(np.abs(found.swept.section.shape[:4]).max()):.0f} deg"
+        )
+    shares = [
+        (
+            explained,
+            params.min_explained,
+            "of the points about the line are on it",
+            "min_explained",
+        ),
+        (coverage, params.min_coverage, "of its length show both plates", "min_coverage"),
+    ]
+    for value, limit, what, name in shares:
+        if value < limit:
+            raise CalibrationRefused(
+                f"{STAGE}: this is no {params.joint} joint: {value:.0%} {what}, at least "
+                f"{limit:.0%} are needed ({name})"
+            )
+    ends = dict(zip(("start", "end"), found.deviations, strict=True))
+    return {
+        "residual": found.swept.sigma,
+        "registration": deviation,
+        "explained": explained,
+        "coverage": coverage,
+        **{name: value for name, value in ends.items() if np.isfinite(value)},
+    }
+
+
+def _refuse_plane(found: Found) -> None:
+    """Refuse what a plane explains as well; between plates in one plane, a gap that is not seen."""
+    section, pitch, tolerance = found.swept.section, found.pitch, 5 * found.swept.sigma
+    q = found.swept.in_section(found.inside)
+    q = q[np.linalg.norm(q, axis=1) < WIDE / 2 + section.shape[4:].max()]
+    beyond = q @ np.nan_to_num(section.normals).T - section.heights
+    on = np.abs(section.distances(q)[0]) < tolerance
+    level = np.abs(beyond[:, list(FACES)]) < tolerance
+    if not section.joint.gap:
+        if level[on].mean(axis=0).max(initial=0.0) > PLANE:
+            raise CalibrationRefused(
+                f"{STAGE}: no joint is seen: one plane explains {PLANE:.0%} of the points as well"
+            )
+        return
+    gap, length = section.shape[6], found.ends[1] - found.ends[0]
+    within = level[:, 0] & (beyond[:, list(EDGES)] > 0).all(axis=1)
+    filled = min(float(within.sum() * pitch**2 / max(gap * length, 1e-12)), 1.0)
+    if gap < 2 * pitch or filled > 1 / 3:
+        raise CalibrationRefused(
+            f"{STAGE}: no gap is seen: {gap * 1e3:.2f} mm, {filled:.0%} of it filled, with points "
+            f"{pitch * 1e3:.2f} mm apart; scan nearer, or take another joint"
+        )
+
+
+def _shares(found: Found) -> tuple[float, float]:
+    """Return the share of points about the seam that are on it, and of its length that is seen."""
+    swept, local = found.swept, found.local
+    q = swept.in_section(local)
+    away, _ = swept.section.distances(q)
+    inside = (local[:, 0] > found.ends[0]) & (local[:, 0] < found.ends[1])
+    near = inside & (np.linalg.norm(q, axis=1) < WIDE / 2 + swept.section.shape[4:].max())
+    explained = float((np.abs(away[near]) < 5 * swept.sigma).mean()) if near.any() else 0.0
+    cells = np.arange(found.ends[0], found.ends[1], CELL)
+    groups = surfaces(swept, local, 5 * swept.sigma).values()
+    counts = [np.histogram(local[on, 0], cells)[0] for on in groups]
+    seen = np.all(np.array(counts) >= 4, axis=0)
+    return explained, float(np.mean(seen)) if len(cells) > 1 else 0.0
+
+
+def _notes(found: Found, params: JointParams) -> tuple[str, ...]:
+    open_ends = [
+        name
+        for name, value in zip(("start", "end"), found.deviations, strict=True)
+        if not np.isfinite(value)
+    ]
+    if not open_ends:
+        return ()
+    return (
+        f"the joint goes on beyond {params.reach * 1e3:g} mm from the line's "
+        f"{' and '.join(open_ends)} (reach): the seam ends there, not at the joint's end",
+    )

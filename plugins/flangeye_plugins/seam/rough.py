@@ -1,0 +1,251 @@
+"""Where a joint roughly is: lines in short slabs of the scan, matched to its half-planes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+
+from flangeye.types import Floats
+from flangeye_plugins.seam.template import EDGES, FACES, OFFSETS, Joint, Section
+
+SLAB = 10e-3
+"""Along the line [m]: a rough line that is 3 deg askew smears an edge by half a millimetre."""
+LINES, TRIED, MOST = 6, 150, 700
+"""Lines of a slab, hypotheses of each, and points that are looked at."""
+ALIKE = np.cos(np.radians(25))
+SHORTEST = 2.5e-3
+"""Of a line in a section [m]."""
+AROUND = 12e-3
+"""From the seam, what of a slab must be explained [m]."""
+KEPT = 6
+"""Places in a slab that are followed on to the next."""
+BESIDE = 2e-3
+"""Standard deviation of a rough line's error from one slab to the next [m]."""
+SKIPPED = 5
+
+
+class Line(NamedTuple):
+    """``n(angle) @ q = offset``; a face's line comes with the (N,) points on it."""
+
+    angle: float
+    offset: float
+    on: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """Where a joint may be in a slab: at (2,) q, rolled, of some shape; its score is at most 1."""
+
+    s: float
+    q: Floats
+    roll: float
+    shape: Floats
+    score: float
+    joint: Joint
+
+
+def rough_path(
+    local: Floats, normals: Floats, joints: tuple[Joint, ...], tolerance: float, reach: float
+) -> list[list[Place]]:
+    """Return the best ways of a joint along the line, each a place in most slabs; the best first.
+
+    Args:
+        local: (N, 3) the scan along, across and out of the rough line [m].
+        normals: (N, 3) in the same axes.
+        joints: The joint, and its mirror image.
+        tolerance: Largest distance from a surface [m].
+        reach: Largest distance of the seam from the rough line [m].
+    """
+    slabs = (local[:, 0] // SLAB).astype(int)
+    order = np.argsort(slabs, kind="stable")
+    bounds = np.searchsorted(slabs[order], np.arange(slabs.max() + 2))
+    spots: list[list[Place]] = []
+    for k in range(slabs.max() + 1):
+        at = order[bounds[k] : bounds[k + 1]]
+        at = at[:: max(1, len(at) // MOST)]
+        q, normal = local[at, 1:3], normals[at]
+        lines = list(_lines(q, normal, tolerance))
+        found = [
+            place
+            for joint in joints
+            for place in _places((k + 0.5) * SLAB, q, lines, joint, tolerance, reach)
+        ]
+        spots.append(_apart(found))
+    return _ways(spots)
+
+
+def _lines(q: Floats, normals: Floats, tolerance: float) -> Iterator[Line]:
+    """Yield the lines with the most points; every point with its normal is a hypothesis of one."""
+    flat = normals[:, 1:]
+    size = np.linalg.norm(flat, axis=1)
+    q, flat = q[size > 0.8], flat[size > 0.8] / size[size > 0.8, None]
+    for _ in range(LINES):
+        if len(q) < 12:
+            return
+        tried = slice(None, None, max(1, len(q) // TRIED))
+        offsets = np.einsum("ni,ni->n", flat[tried], q[tried])
+        on = np.abs(flat[tried] @ q.T - offsets[:, None]) < tolerance
+        on &= flat[tried] @ flat.T > ALIKE
+        best = on[on.sum(axis=1).argmax()]
+        middle = q[best].mean(axis=0)
+        spread, axes = np.linalg.eigh(np.cov((q[best] - middle).T))
+        if best.sum() < 12 or 3.4 * np.sqrt(spread[1]) < SHORTEST:
+            return
+        normal = axes[:, 0] * np.sign(axes[:, 0] @ flat[best].mean(axis=0))
+        away = q @ normal - normal @ middle
+        yield Line(float(np.arctan2(*normal)), float(normal @ middle), q[np.abs(away) < tolerance])
+        left = (np.abs(away) > tolerance) | (flat @ normal < ALIKE)
+        q, flat = q[left], flat[left]
+
+
+def _ends(face: Line, right: bool) -> list[Line]:
+    """Return edges, upright on a face, where its points end: half a millimetre has none."""
+    along = np.array([np.cos(face.angle), -np.sin(face.angle)])
+    at = np.sort(face.on @ along)
+    bins = np.arange(at[0], at[-1] + 1e-9, 0.25e-3)
+    counts = np.histogram(at, bins)[0] if len(bins) > 3 else np.ones(1)
+    full = np.concatenate([[False], counts > 0.3 * np.median(counts[counts > 0]), [False, False]])
+    if right:
+        last = np.flatnonzero(full[:-2] & ~full[1:-1] & ~full[2:])
+        edges = bins[np.minimum(last, len(bins) - 1)] if len(bins) > 3 else at[-1:]
+        return [Line(face.angle + np.pi / 2, float(e), face.on[:0]) for e in edges]
+    full = np.concatenate([[False, False], counts > 0.3 * np.median(counts[counts > 0]), [False]])
+    first = np.flatnonzero(full[2:] & ~full[1:-1] & ~full[:-2])
+    edges = bins[np.minimum(first, len(bins) - 1)] if len(bins) > 3 else at[:1]
+    return [Line(face.angle - np.pi / 2, -float(e), face.on[:0]) for e in edges]
+
+
+def _places(
+    s: float, q: Floats, lines: list[Line], joint: Joint, tolerance: float, reach: float
+) -> Iterator[Place]:
+    """Yield where in a slab the lines fit the joint's half-planes."""
+    present = [k for k in range(4) if joint.present[k]]
+    for first, second in product(lines, lines):
+        faces = {0: first, 2: second}
+        choices = [
+            [faces[k]]
+            if k in FACES
+            else lines + (_ends(faces[k - 1], k == 1) if k in joint.unseen else [])
+            for k in present
+        ]
+        if not _agree(joint, [0, 2], [first, second]):
+            continue
+        for chosen in product(*choices):
+            if _agree(joint, present, chosen):
+                place = _placed(s, q, joint, present, chosen, tolerance)
+                if place is not None and np.abs(place.q).max() <= reach:
+                    yield place
+
+
+def _agree(joint: Joint, which: list[int], lines: tuple[Line, ...] | list[Line]) -> bool:
+    """Return whether lines have the angles between each other that the joint's half-planes have."""
+    off = [line.angle - np.radians(joint.angles[k]) for line, k in zip(lines, which, strict=True)]
+    allowed = [np.radians(2 * joint.spread[k] + 4) for k in which]
+    turned = np.angle(np.exp(1j * (np.array(off) - off[0])))
+    return bool((np.abs(turned) <= np.array(allowed) + allowed[0]).all())
+
+
+def _placed(
+    s: float,
+    q: Floats,
+    joint: Joint,
+    present: list[int],
+    lines: tuple[Line, ...],
+    tolerance: float,
+) -> Place | None:
+    """Return the joint whose half-planes are these lines, or None where that is no joint."""
+    nominal, spread = (np.radians([x[k] for k in present]) for x in (joint.angles, joint.spread))
+    off = np.array([line.angle for line in lines]) - nominal
+    weights = 1 / spread**2
+    roll = float(np.angle(weights @ np.exp(1j * off)))
+    angles = np.full(4, 0.0)
+    angles[present] = np.angle(np.exp(1j * (off - roll)))
+    turned = roll + nominal + angles[present]
+    heights = joint.free[4:]
+    design = np.column_stack([np.sin(turned), np.cos(turned), OFFSETS[present][:, heights]])
+    # Heights are nearer to nothing than to anything else, where lines leave them open.
+    ridge = 1e-6 * np.eye(design.shape[1])
+    solved = np.linalg.solve(
+        design.T @ design + ridge, design.T @ np.array([line.offset for line in lines])
+    )
+    lengths = np.zeros(3)
+    lengths[heights] = solved[2:]
+    if not (lengths >= -tolerance).all() or (joint.gap and lengths[2] < 2 * tolerance / 3):
+        return None
+    section = Section(joint, np.concatenate([angles, np.maximum(lengths, 0.0)]))
+    score = explained(section, turn(q - solved[:2], roll), tolerance)
+    return None if score is None else Place(s, solved[:2], roll, section.shape, score, joint)
+
+
+def turn(q: Floats, roll: Floats | float) -> Floats:
+    """Return (N, 2) section points in axes that are rolled (N,) from theirs: z towards y."""
+    c, s = np.cos(roll), np.sin(roll)
+    return np.stack([c * q[:, 0] - s * q[:, 1], s * q[:, 0] + c * q[:, 1]], axis=1)
+
+
+def explained(section: Section, q: Floats, tolerance: float) -> float | None:
+    """Return the share of the points (N, 2) about a seam that a section explains, less the rest.
+
+    None where one of its faces, or an edge that should be seen, has too few of them.
+    """
+    away, active = section.distances(q)
+    near = np.linalg.norm(q, axis=1) < AROUND + section.shape[4:6].max()
+    good = near & (np.abs(away) < tolerance)
+    counts = np.bincount(active[good], minlength=4)
+    needed = [k for k in FACES if section.joint.present[k]]
+    needed += [k for k in EDGES if section.joint.present[k] and k not in section.joint.unseen]
+    if min(counts[needed]) < max(12, 0.04 * near.sum()):
+        return None
+    return float(2 * good.sum() / max(near.sum(), 1) - 1)
+
+
+def _apart(places: list[Place]) -> list[Place]:
+    """Return the best few places that are not the same."""
+    kept: list[Place] = []
+    for place in sorted(places, key=lambda p: -p.score):
+        if all(np.linalg.norm(place.q - other.q) > BESIDE for other in kept):
+            kept.append(place)
+        if len(kept) == KEPT:
+            break
+    return kept
+
+
+def _ways(spots: list[list[Place]]) -> list[list[Place]]:
+    """Return ways through the slabs, by dynamic programming; none shares a place with a better."""
+    nodes = [(k, place) for k, places in enumerate(spots) for place in places]
+    best: list[tuple[float, int | None]] = []
+    for k, place in nodes:
+        score, before = max(
+            (
+                (best[j][0] - _jump(other, place, k - i), j)
+                for j, (i, other) in enumerate(nodes[: len(best)])
+                if 0 < k - i <= SKIPPED
+            ),
+            default=(0.0, None),
+        )
+        best.append((place.score + max(score, 0.0), before if score > 0 else None))
+    ways: list[list[Place]] = []
+    used: set[int] = set()
+    for j in np.argsort([-score for score, _ in best], kind="stable"):
+        way: list[int] = []
+        at: int | None = int(j)
+        while at is not None and at not in used:
+            way.append(at)
+            at = best[at][1]
+        used.update(way)
+        if len(way) >= 3:
+            ways.append([nodes[k][1] for k in reversed(way)])
+    return ways
+
+
+def _jump(first: Place, second: Place, slabs: int) -> float:
+    away = np.linalg.norm(first.q - second.q) / BESIDE
+    rolled = np.angle(np.exp(1j * (first.roll - second.roll))) / np.radians(8)
+    other = np.abs(first.shape[4:] - second.shape[4:]).max() / BESIDE
+    return float(
+        0.3 * (away**2 + rolled**2 + other**2) / slabs + 10 * (first.joint is not second.joint)
+    )

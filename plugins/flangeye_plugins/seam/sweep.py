@@ -1,0 +1,239 @@
+"""Fit one cross-section, swept along a smooth line, to all points about a seam at once.
+
+Minimise ``sum rho(f_i / sigma)`` of the signed distances f over cubic B-splines y(s), z(s) and
+roll(s) and the section's shape, by Gauss-Newton with Tukey's weights. Shape and splines share
+weak priors, so that a stretch without points is bridged and its covariance grows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from flangeye.maths.statistics import SIGMA_OF_MAD
+from flangeye.types import Floats, Indices
+from flangeye_plugins.seam.rough import Place, turn
+from flangeye_plugins.seam.template import OFFSETS, Section
+
+KNOTS = 30e-3
+"""Between the knots of the line [m]."""
+BEND = np.array([1e-3, 1e-3, 0.05])
+"""Standard deviations of second differences of coefficients: across, out [m], and roll [rad]."""
+TUKEY = 4.685
+WIDE = 18e-3
+"""From a face's end, what of it takes part [m]: plates are flat so far."""
+ROUNDS = 12
+GRAZING = 0.14
+"""Sine of the angle to the line of sight below which a surface is not seen: 8 deg. Pixels that see
+both sides of a jump in depth look like one."""
+BLOCK = 5e-3
+"""Points so near along the seam may share their error [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Spline:
+    """Cubic B-splines of y, z and roll over a line.
+
+    Attributes:
+        length: Of the line [m].
+        closed: Whether it comes back to its start.
+        values: (m, 3) coefficients.
+    """
+
+    length: float
+    closed: bool
+    values: Floats
+
+    @classmethod
+    def through(cls, length: float, closed: bool, s: Floats, values: Floats) -> Spline:
+        """Return the smooth line nearest to values (N, 3) at s [m]."""
+        count = max(round(length / KNOTS), 8 if closed else 1) + (0 if closed else 3)
+        empty = cls(length, closed, np.zeros((count, 3)))
+        design = empty.basis(s).toarray()
+        bends = empty.bends()
+        normal = design.T @ design + 0.01 * bends.T @ bends + 1e-9 * np.eye(count)
+        return replace(empty, values=np.linalg.solve(normal, design.T @ values))
+
+    def basis(self, s: Floats) -> Any:
+        """Return the sparse (N, m) basis at s [m]."""
+        from scipy import sparse
+        from scipy.interpolate import BSpline
+
+        count = len(self.values)
+        pieces = count if self.closed else count - 3
+        knots = np.arange(-3, pieces + 4) * (self.length / pieces)
+        inside = np.clip(s, 0.0, self.length * (1 - 1e-12))
+        design = BSpline.design_matrix(inside, knots, 3)
+        if not self.closed:
+            return design
+        fold = sparse.eye(pieces + 3, format="lil")[:, :pieces]
+        for k in range(3):
+            fold[pieces + k, k] = 1.0
+        return design @ fold.tocsr()
+
+    def bends(self) -> Floats:
+        """(k, m) second differences of the coefficients."""
+        count = len(self.values)
+        if self.closed:
+            eye = np.eye(count)
+            return np.asarray(np.roll(eye, 1, 0) - 2 * eye + np.roll(eye, -1, 0))
+        return np.asarray(np.diff(np.eye(count), 2, axis=0))
+
+    def at(self, s: Floats) -> Floats:
+        """(N, 3) y, z [m] and roll [rad] at s."""
+        return np.asarray(self.basis(s) @ self.values)
+
+
+@dataclass(frozen=True, eq=False)
+class Swept:
+    """A section, swept along a line.
+
+    Attributes:
+        spline: The line, and how the section is rolled along it.
+        section: The section.
+        sigma: Of the points that are on it [m].
+        covariance: (3m + k, 3m + k) of the coefficients and what is free of the shape.
+    """
+
+    spline: Spline
+    section: Section
+    sigma: float
+    covariance: Floats
+
+    def in_section(self, local: Floats) -> Floats:
+        """(N, 2) places of (N, 3) local points in the section's own axes."""
+        line = self.spline.at(local[:, 0])
+        return turn(local[:, 1:3] - line[:, :2], line[:, 2])
+
+    def line_covariance(self, s: Floats) -> Floats:
+        """(N, 2, 2) of the seam's y and z at s [m^2]."""
+        basis, m = self.spline.basis(s).toarray(), len(self.spline.values)
+        blocks = self.covariance[: 2 * m, : 2 * m].reshape(2, m, 2, m)
+        return np.asarray(np.einsum("ni,aibj,nj->nab", basis, blocks, basis))
+
+
+def swept_from(places: list[Place], length: float, closed: bool) -> Swept:
+    """Return a start for the fit from places along the line."""
+    s = np.array([p.s for p in places])
+    values = np.column_stack([[p.q for p in places], np.unwrap([p.roll for p in places])])
+    shape = np.median([p.shape for p in places], axis=0)
+    spline = Spline.through(length, closed, s, values)
+    return Swept(spline, Section(places[0].joint, shape), np.nan, np.zeros((0, 0)))
+
+
+def fitted(
+    start: Swept, local: Floats, pitch: float, tolerance: float, edges: tuple[Floats, Indices]
+) -> Swept:
+    """Return the best fit.
+
+    Args:
+        start: Near to it.
+        local: (N, 3) points about the seam [m].
+        pitch: Distance between neighbouring points [m]: nearer than one to where the boundary
+            bends, pixels see both sides.
+        tolerance: Largest distance from a surface, to begin with [m].
+        edges: (K, 3) places where faces end, and the (K,) edges there: they are on these.
+    """
+    swept, sigma = start, tolerance / 2
+    points = np.vstack([local, edges[0]])
+    basis = start.spline.basis(points[:, 0])
+    for k in range(ROUNDS):
+        swept, spread = _step(swept, points, edges[1], basis, pitch, sigma)
+        if k > 1:
+            done, sigma = spread > 0.99 * sigma, max(min(spread, sigma), 1e-5)
+            if done:
+                break
+    return swept
+
+
+def _step(
+    swept: Swept, points: Floats, edges: Any, basis: Any, pitch: float, sigma: float
+) -> tuple[Swept, float]:
+    """Take one step of Gauss and Newton; return it and the spread of what is on the surface.
+
+    The last points are on the given edges; the others on whatever is nearest to them.
+    """
+    line = basis @ swept.spline.values
+    q = turn(points[:, 1:3] - line[:, :2], line[:, 2])
+    residual, which = swept.section.distances(q)
+    first = len(points) - len(edges)
+    which[first:] = edges
+    normals = swept.section.normals[edges]
+    residual[first:] = np.einsum("ni,ni->n", normals, q[first:]) - swept.section.heights[edges]
+    size = np.where(np.arange(len(points)) < first, sigma, 0.5 * pitch)
+    weight = np.maximum(1 - (residual / (TUKEY * size)) ** 2, 0.0) ** 2
+    sight = np.einsum("ni,ni->n", swept.section.normals[which], turn(points[:, 3:], line[:, 2]))
+    usable = _usable(swept.section, q, pitch) & (sight > GRAZING)
+    weight[:first][~usable[:first]] = 0.0
+    used = weight > 0
+    spread = SIGMA_OF_MAD * float(np.median(np.abs(residual[:first][used[:first]])))
+    rows = _design(swept, basis[used], line[used], q[used], which[used])
+    residual, weight = residual[used], (weight / size**2)[used]
+    prior, pull = _prior(swept)
+    normal = (rows.T @ rows.multiply(weight[:, None])).toarray() + prior
+    step = np.linalg.solve(normal, -(rows.T @ (weight * residual)) - pull)
+    shared = _shared(points[used, 0], which[used], weight * residual * size[used])
+    covariance = shared * np.linalg.inv(normal)
+    return replace(_moved(swept, step), sigma=spread, covariance=covariance), spread
+
+
+def _usable(section: Section, q: Floats, pitch: float) -> Any:
+    """Return which points are on one surface alone, and near enough to the seam."""
+    far = np.linalg.norm(q, axis=1) < WIDE + section.shape[4:].max()
+    for vertex in section.vertices:
+        far &= np.linalg.norm(q - vertex, axis=1) > pitch
+    return far
+
+
+def _design(swept: Swept, basis: Any, line: Floats, q: Floats, which: Any) -> Any:
+    """Return the sparse (N, 3m + k) derivatives of the signed distances."""
+    from scipy import sparse
+
+    angle = swept.section.angles[which]
+    turned = angle + line[:, 2]
+    lever = np.cos(angle) * q[:, 0] - np.sin(angle) * q[:, 1]
+    ways = (-np.sin(turned), -np.cos(turned), lever)
+    shape = np.zeros((len(q), 7))
+    shape[np.arange(len(q)), which] = lever
+    shape[:, 4:] = -OFFSETS[which]
+    free = swept.section.joint.free
+    return sparse.hstack(
+        [basis.multiply(way[:, None]) for way in ways] + [sparse.csr_matrix(shape[:, free])],
+        format="csr",
+    )
+
+
+def _prior(swept: Swept) -> tuple[Floats, Floats]:
+    """Return the priors' normal matrix and their pull at the present values."""
+    joint, values = swept.section.joint, swept.spline.values
+    bends = swept.spline.bends()
+    m, free = len(values), joint.free
+    size = 3 * m + int(free.sum())
+    normal, present = np.zeros((size, size)), np.zeros(size)
+    for k in range(3):
+        at = slice(k * m, (k + 1) * m)
+        normal[at, at] = bends.T @ bends / BEND[k] ** 2 + 1e-6 * np.eye(m)
+        present[at] = values[:, k]
+    spread = np.concatenate([np.radians(joint.spread), np.ones(3)])[free]
+    normal[3 * m :, 3 * m :] = np.diag(spread**-2.0)
+    present[3 * m :] = swept.section.shape[free]
+    return normal, normal @ present
+
+
+def _moved(swept: Swept, step: Floats) -> Swept:
+    values, joint = swept.spline.values, swept.section.joint
+    m = len(values)
+    shape = swept.section.shape.copy()
+    shape[joint.free] += step[3 * m :]
+    shape[4:] = np.maximum(shape[4:], 0.0)
+    spline = replace(swept.spline, values=values + step[: 3 * m].reshape(3, m).T)
+    return replace(swept, spline=spline, section=Section(joint, shape))
+
+
+def _shared(s: Floats, which: Any, scores: Floats) -> float:
+    """Return by how much neighbours' errors, which are alike, raise the variance."""
+    blocks = (s / BLOCK).astype(int) * 4 + which
+    sums = np.bincount(blocks, scores)
+    return max(float((sums**2).sum() / max((scores**2).sum(), 1e-300)), 1.0)
