@@ -21,9 +21,9 @@ from flangeye import types as t
 from flangeye.devices import DeviceError
 from flangeye.errors import RecipeError, StageError
 from flangeye.files.arrays import read_npz
-from flangeye.files.bundled import bundled
-from flangeye.files.children import keep_current_folder_out, python_command
 from flangeye.files.clouds import read_cloud
+from flangeye.files.paths import bundled
+from flangeye.files.processes import keep_current_folder_out, python_command
 from flangeye.files.regular import open_regular
 from flangeye.files.written import write_whole
 from flangeye.log import records

@@ -24,7 +24,7 @@ from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from flangeye.files.children import python_command
+from flangeye.files.processes import python_command
 from tests.live.cell import Cell
 from tests.plugins.ros2.cell import Ros2Cell
 from tools.strokes import (

@@ -27,7 +27,7 @@ if "--coverage" in sys.argv:
     # For good, and before anything of ours is imported, in each child too.
     atheris.instrument_imports(include=["flangeye", "flangeye_plugins"]).__enter__()
 
-from flangeye.files.children import keep_current_folder_out
+from flangeye.files.processes import keep_current_folder_out
 from tests.fuzz.damage import damaged
 from tests.fuzz.targets import SEEDS, TARGETS, Target, survives
 

@@ -25,7 +25,7 @@ from typing import NamedTuple
 from flangeye.batch.cluster import PREFIX
 from flangeye.doctor.monitor import History, stored_calibration
 from flangeye.errors import FlangeyeError
-from flangeye.files.children import python_command
+from flangeye.files.processes import python_command
 from flangeye.log.read import read_run
 from tests.doctor.monitor.cell import part_of_sample
 

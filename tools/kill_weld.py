@@ -24,7 +24,7 @@ import numpy as np
 import typer
 
 from flangeye.errors import FlangeyeError
-from flangeye.files.children import python_command
+from flangeye.files.processes import python_command
 from flangeye.log.read import read_notes
 from tests.emulators.controllers.process import Process
 

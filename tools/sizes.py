@@ -7,7 +7,7 @@ import numpy as np
 
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model, model_names
-from flangeye.models.standards import known_standards
+from flangeye.models.targets import known_standards
 
 IMAGES = Path("docs/images")
 

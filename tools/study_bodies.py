@@ -23,8 +23,7 @@ from flangeye.models.loading import load_model
 from flangeye.models.targets import plate_of
 from flangeye.types import CAMERA, Capture, Earlier, PointCloud, PoseFeature, Rejected
 from flangeye_emulators.world import materials
-from flangeye_emulators.world.flange_mesh import flange_mesh, wrist_mesh
-from flangeye_emulators.world.mesh import Mesh, box, capsule
+from flangeye_emulators.world.mesh import Mesh, box, capsule, flange_mesh, wrist_mesh
 from flangeye_emulators.world.raycast import Body, Scene
 from flangeye_emulators.world.scanner import scanner_of
 from flangeye_plugins.body.judge import judged

@@ -10,9 +10,8 @@ import numpy as np
 from flangeye.motion.seam_following import Command, Controller, ToolPose, Touch
 from flangeye.types import Floats
 from flangeye_emulators.finger.profiler import LookBehind
-from flangeye_emulators.weld_world.clock import Shutter
 from flangeye_emulators.weld_world.settings import LookTruth, WorldParams
-from flangeye_emulators.weld_world.world import ArmResponse, Nominal, WeldWorld
+from flangeye_emulators.weld_world.world import ArmResponse, Nominal, Shutter, WeldWorld
 from flangeye_plugins.weld.follower import Follower
 
 

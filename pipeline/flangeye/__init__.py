@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from flangeye.errors import CalibrationRefused, FlangeyeError, RecipeError, StageError
-    from flangeye.files.bundled import VERSION as __version__  # noqa: N811
+    from flangeye.files.paths import VERSION as __version__  # noqa: N811
     from flangeye.files.paths import RecipePath
     from flangeye.plugin.hookspecs import hookimpl
     from flangeye.plugin.stage import BoundPart, Choose, Params, part, stage
@@ -45,7 +45,7 @@ _PLACES = {
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
-        return importlib.import_module("flangeye.files.bundled").VERSION
+        return importlib.import_module("flangeye.files.paths").VERSION
     if name not in _PLACES:
         raise AttributeError(f"module 'flangeye' has no attribute '{name}'")
     return getattr(importlib.import_module(f"flangeye.{_PLACES[name]}"), name)

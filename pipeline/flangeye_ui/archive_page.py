@@ -17,7 +17,7 @@ from flangeye_ui.charts import FAINT, USED
 from flangeye_ui.foreign import address_of
 from flangeye_ui.layout import command_line, mistake, page
 from flangeye_ui.project import Project
-from flangeye_ui.scan_view import ScanView
+from flangeye_ui.scene import ScanView
 
 COLUMNS = [
     {"name": key, "label": label, "field": key, "align": "left", "sortable": True}

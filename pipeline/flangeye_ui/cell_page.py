@@ -10,14 +10,14 @@ from typing import Any, get_args
 import yaml
 from nicegui import ui
 
-from flangeye.files.bundled import bundled
+from flangeye.files.paths import bundled
 from flangeye.files.yaml_lines import read_yaml
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import Stage
 from flangeye.recipe.find import find_recipe, recipe_names
-from flangeye_ui.drawing import drawing_of
 from flangeye_ui.layout import Bar, command_line, mistake, page, svg
 from flangeye_ui.project import Mistake, Project, at
+from flangeye_ui.scene import drawing_of
 
 WORDS = {
     "acquire.simulated": "Take simulated scans", "acquire.live": "Move the arm and scan",
@@ -37,6 +37,25 @@ OPTION = """
   <q-item-section>{{{{ props.opt.label }}}}</q-item-section>
 </q-item>"""
 """One line of a list of arms or scanners, with its picture."""
+
+
+PAIRS = ("pixels", "field")
+"""Options of two values."""
+
+PRINCIPLES = get_args(ScannerModel.model_fields["principle"].annotation)
+
+SCANNER: Boxes = {
+    "near": ("Nearest that it measures, such as 300 mm", ui.input),
+    "far": ("Farthest, such as 900 mm; archives need no more", ui.input),
+    "principle": ("Principle", lambda label: ui.select(list(PRINCIPLES), label=label)),
+    "pixels": ("Columns and rows, such as 1032, 772", ui.input),
+    "field": ("Field of view, such as 60 deg, 45 deg", ui.input),
+    "noise": ("Noise of a pixel in the middle, such as 0.1 mm", ui.input),
+    "error": ("Smooth distortion, such as 0.1 mm", ui.input),
+}
+
+_EVENTS: dict[type, str] = {ui.input: "change", ui.select: "update:model-value"}
+"""What says that a person has chosen, or has left the box."""
 
 
 def add(project: Project) -> None:
@@ -288,22 +307,10 @@ class Import:
 
 Boxes = Mapping[str, tuple[str, Callable[[str], Any]]]
 """By option of a command: what its box is called, and what it is."""
-PAIRS = ("pixels", "field")
-"""Options of two values."""
-PRINCIPLES = get_args(ScannerModel.model_fields["principle"].annotation)
 ARM: Boxes = {
     "urdf": ("Its URDF file, in this folder", ui.input),
     "joint": ("Or its joints, a line each: d: 89.159 mm, alpha: 90 deg", ui.textarea),
     "standard": ("Plate", lambda label: ui.select(_standards(), label=label)),
-}
-SCANNER: Boxes = {
-    "near": ("Nearest that it measures, such as 300 mm", ui.input),
-    "far": ("Farthest, such as 900 mm; archives need no more", ui.input),
-    "principle": ("Principle", lambda label: ui.select(list(PRINCIPLES), label=label)),
-    "pixels": ("Columns and rows, such as 1032, 772", ui.input),
-    "field": ("Field of view, such as 60 deg, 45 deg", ui.input),
-    "noise": ("Noise of a pixel in the middle, such as 0.1 mm", ui.input),
-    "error": ("Smooth distortion, such as 0.1 mm", ui.input),
 }
 
 
@@ -327,10 +334,6 @@ def _field(name: str, schema: dict[str, Any], value: Any, required: bool) -> ui.
             clearable=True,
         )
     return ui.input(name.replace("_", " "), value=_shown(value), placeholder=told)
-
-
-_EVENTS: dict[type, str] = {ui.input: "change", ui.select: "update:model-value"}
-"""What says that a person has chosen, or has left the box."""
 
 
 def _shown(value: Any) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from flangeye.models.coverage import ENOUGH, Coverage
+from flangeye.models.workspace import ENOUGH, Coverage
 from flangeye.report.look import LIGHT
 
 USED, ASIDE, FAINT = LIGHT["verified"], LIGHT["refused"], LIGHT["axis"]

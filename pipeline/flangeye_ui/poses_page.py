@@ -12,10 +12,9 @@ from flangeye.errors import FlangeyeError
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
 from flangeye.recipe.load import Recipe
-from flangeye_ui.drawing import base_T_camera_of, box_of
 from flangeye_ui.layout import Bar, code, command_line, mistake, page, weigh
 from flangeye_ui.project import Project
-from flangeye_ui.scene import Scene3D
+from flangeye_ui.scene import Scene3D, base_T_camera_of, box_of
 
 
 def add(project: Project) -> None:

@@ -28,8 +28,7 @@ from flangeye.run.outlook import Outlook, outlook_of_log
 from flangeye_ui.charts import coverage_drawing, residual_chart
 from flangeye_ui.layout import Bar, code, command_line, mistake, page, svg, warning
 from flangeye_ui.project import Project
-from flangeye_ui.scan_view import ScanView
-from flangeye_ui.scene import CELL, RIM, TAKEN, Scene3D, outline_of, views_of
+from flangeye_ui.scene import CELL, RIM, TAKEN, ScanView, Scene3D, outline_of, views_of
 from flangeye_ui.touch_box import Touch
 
 LIGHTS = {

@@ -12,11 +12,10 @@ from nicegui import Client, ui
 
 from flangeye.errors import StageError
 from flangeye_ui.charts import coverage_drawing, place_chart, residual_chart
-from flangeye_ui.drawing import drawing_of
 from flangeye_ui.layout import Bar, code_from_terminal, command_line, mistake, page, svg, weigh
 from flangeye_ui.process import RunProcess
 from flangeye_ui.project import Project
-from flangeye_ui.scene import EARLIER, FLANGE, RIM, SCAN, SCANNED, Scene3D, outline_of
+from flangeye_ui.scene import EARLIER, FLANGE, RIM, SCAN, SCANNED, Scene3D, drawing_of, outline_of
 
 EVERY = 0.25
 """Between two looks at the run [s]."""

@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from nicegui import events, ui
 
+from flangeye import types as t
+from flangeye.errors import FlangeyeError
+from flangeye.log.read import RunLog
 from flangeye.maths.geometry import basis_of_plane
+from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
+from flangeye.recipe.load import Recipe
 from flangeye.report.look import LIGHT, SERIES
-from flangeye.report.still import frustum, ready
+from flangeye.report.still import Scene, frustum, ready, still
+from flangeye.report.units import millimetres
 from flangeye.types import CircleFeature, Feature, Floats
+from flangeye_ui.project import Project
 from flangeye_ui.shapes import address_of_arm
 
 ROUND = 90
@@ -187,3 +195,96 @@ def outline_of(feature: Feature) -> Floats:
     ring = np.column_stack([np.cos(angles), np.sin(angles)])
     radius = max(feature.radii.values())
     return np.asarray(feature.centre + radius * ring @ basis_of_plane(feature.normal)[:2])
+
+
+def drawing_of(project: Project) -> str:
+    """Return the cell as SVG; empty while the recipe is wrong or has no arm."""
+    recipe, _ = project.check()
+    robot: RobotModel | None = recipe.context.get(RobotModel) if recipe else None
+    if recipe is None or robot is None:
+        return ""
+    scanner = recipe.context.get(ScannerModel)
+    at = None
+    with suppress(FlangeyeError):
+        at = base_T_camera_of(recipe)
+    rows = project.plan if project.planned == project.text else []
+    scene = Scene(
+        robot=robot,
+        scanner=scanner if at is not None else None,
+        base_T_camera=at,
+        box=box_of(recipe),
+        poses=[(np.array(row["place"]), not row["why_not"]) for row in rows],
+    )
+    return still(scene, f"The cell: {robot.model}{f' and {scanner.model}' if scanner else ''}")
+
+
+def base_T_camera_of(recipe: Recipe) -> Floats | None:
+    """Return where the scanner is guessed to stand, or simulated; None where nobody says.
+
+    Raises:
+        StageError: The poses that were shown are no poses of this arm.
+    """
+    params: Any = recipe.steps[0].params
+    robot, scanner = (recipe.context.get(m) for m in (RobotModel, ScannerModel))
+    view, camera = getattr(params, "view", None), getattr(params, "camera", None)
+    if view is not None and robot is not None and scanner is not None:
+        return np.asarray(view(Arm(robot), scanner))
+    at = getattr(camera, "base_T_camera", None)
+    return None if at is None else np.asarray(at)
+
+
+def box_of(recipe: Recipe) -> tuple[Floats, Floats] | None:
+    """Return centre and size of the box that the arm keeps to [m], if there is one."""
+    limits = recipe.header.robot and recipe.header.robot.limits
+    return (np.array(limits.box.centre), np.array(limits.box.size)) if limits else None
+
+
+class ScanView:
+    """A scene, and a line that says what became of the scan in it.
+
+    Attributes:
+        log: What the scans are of; None until it was read.
+    """
+
+    def __init__(self, log: RunLog | None = None) -> None:
+        self.log = log
+        self._told = ui.label().props('role="status"')
+        self._scene = Scene3D(340, SCANNED)
+
+    def say(self, text: str) -> None:
+        """Say something in place of a scan's verdict."""
+        self._told.text = text
+
+    def show(self, capture: str) -> None:
+        """Show a scan: the flange in it, its rim as fitted, and what became of it."""
+        if self.log is None:
+            return
+        self.say(f"capture {capture}: {fate_of(self.log, capture)}")
+        self._scene.wipe()
+        for entry in self.log.of_kind("segment"):
+            if entry.capture == capture and isinstance(entry.value, t.FlangeCloud):
+                self._cloud(entry.value)
+        for entry in self.log.of_kind("fit"):
+            if entry.capture == capture:
+                self._scene.cloud(outline_of(entry.value), RIM, 0.001)
+
+    def _cloud(self, flange: t.FlangeCloud) -> None:
+        self._scene.cloud(flange.cloud.points().astype(np.float64), FLANGE)
+        at = np.asarray(flange.centre)
+        (x, y, z), (to_x, to_y, to_z) = (at - 0.15 * at / np.linalg.norm(at)).tolist(), at.tolist()
+        self._scene.move_camera(x, y, z, to_x, to_y, to_z, 0.0, -1.0, 0.0, 0.0)
+
+
+def fate_of(log: RunLog, capture: str) -> str:
+    """Return what became of a capture, in words."""
+    for rejection in log.rejections:
+        if rejection.id == capture:
+            return f"set aside by {rejection.stage}: {rejection.reason}"
+    calibration = log.calibration()
+    for pair in calibration.pairs if calibration else ():
+        if pair.observation.id == capture:
+            residual = f"residual {millimetres(float(np.linalg.norm(pair.residual)))} mm"
+            return f"{'used' if pair.used else 'not used'}, {pair.reason or residual}"
+    if log.poses.get(capture, {}).get("role") == "verification":
+        return "kept for verification"
+    return "not solved"

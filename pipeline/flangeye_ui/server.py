@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import contextlib
+import ipaddress
+import secrets
 import socket
 import tempfile
 import threading
 import webbrowser
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from html import escape
 from pathlib import Path
+from typing import Any
 
 from nicegui import app, ui
+from starlette.datastructures import Headers, QueryParams
+from starlette.responses import HTMLResponse, PlainTextResponse, Response
 
 from flangeye.errors import StageError
 from flangeye.plugin.registry import Registry
@@ -26,9 +31,7 @@ from flangeye_ui import (
     use_page,
     watch_page,
 )
-from flangeye_ui.gate import Gate, Keys
-from flangeye_ui.permission import MoveCodes
-from flangeye_ui.project import Project
+from flangeye_ui.project import MoveCodes, Project
 
 PAGES = (
     cell_page, poses_page, scan_page, result_page, use_page, watch_page, archive_page, shapes,
@@ -37,6 +40,31 @@ OPENS = "<!doctype html><meta http-equiv=refresh content='0;url={}'><title>flang
 RECONNECT = 15.0
 """For how long a page may be away [s]. NiceGUI takes a page for dead that leaves a ping unanswered
 for 0.4 of it: longer than ``scan_page.SILENCE``, which alone decides whether a page lives."""
+
+
+DENIED = "wrong, used or missing token: open the address that 'flangeye ui' printed last"
+
+POLICY = (
+    "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; "
+    "style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; frame-ancestors 'none'; "
+    "base-uri 'none'; form-action 'none'; object-src 'none'"
+)
+"""Of the page itself: Vue compiles its templates in the browser, which asks for the unsafe ones."""
+
+HEADERS = {
+    "content-security-policy": POLICY,
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+    "x-frame-options": "DENY",
+}
+"""Of every answer that has none of its own."""
+
+ENTER = "<!doctype html><meta http-equiv=refresh content='0;url={path}/'><title>flangeye</title>"
+"""The page navigates by itself: after a redirect a strict cookie would not be sent."""
+
+SOCKET = "/_nicegui_ws/"
 
 
 def serve(folder: Path, registry: Registry, host: str, port: int, browser: bool) -> None:
@@ -112,3 +140,139 @@ def require_free(host: str, port: int) -> None:
             raise StageError(
                 f"{host}:{port} cannot be listened on ({error.strerror}); name another with --port"
             ) from None
+
+
+Scope = dict[str, Any]
+
+
+class Keys:
+    """The secrets of one server.
+
+    Attributes:
+        path: Under which the page lives, such as ``/q3V…``.
+        token: The one that lets the next browser in.
+    """
+
+    def __init__(self, issued: Callable[[str], None]) -> None:
+        """Make the first token; ``issued`` hears of each that follows when one was used."""
+        name = secrets.token_urlsafe(12)
+        self.path, self._cookie, self._issued = f"/{name}", f"flangeye-{name}", issued
+        self.token = secrets.token_urlsafe(16)
+        self._sessions: list[bytes] = []
+
+    def exchange(self, given: str) -> str | None:
+        """Return the cookie to set for the token, which is used up by this; None for another."""
+        if not secrets.compare_digest(given.encode(), self.token.encode()):
+            return None
+        self.token = secrets.token_urlsafe(16)
+        self._sessions.append(secrets.token_urlsafe(24).encode())
+        self._issued(self.token)
+        value = self._sessions[-1].decode()
+        return f"{self._cookie}={value}; HttpOnly; SameSite=Strict; Path={self.path}"
+
+    def known(self, headers: Headers) -> bool:
+        """Return whether one of the cookies is of a browser that was let in."""
+        given = list(cookies(headers, self._cookie))
+        return any(secrets.compare_digest(g, s) for g in given for s in self._sessions)
+
+
+def cookies(headers: Headers, name: str) -> Iterator[bytes]:
+    """Yield the values of all cookies of a name; what others put beside them is skipped."""
+    for key, line in headers.raw:
+        for crumb in line.split(b";") if key.lower() == b"cookie" else ():
+            found, _, value = crumb.strip().partition(b"=")
+            if found == name.encode():
+                yield value
+
+
+class Gate:
+    """The outermost layer of the server."""
+
+    def __init__(self, app: Any, keys: Keys, host: str, port: int) -> None:
+        self._app, self._keys, self._port = app, keys, port
+        self._names = {host, f"[{host}]", "localhost", "127.0.0.1"}
+        self._any = host in ("0.0.0.0", "::")  # asked for by --host
+
+    async def __call__(self, scope: Scope, receive: Any, send: Any) -> None:
+        """Answer a request, or hand it on."""
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+        elif (answer := self._answer(scope, Headers(scope=scope))) is None:
+            await self._app(self._inside(scope), receive, _guarded(send))
+        elif scope["type"] == "http":
+            await answer(scope, receive, _guarded(send))
+        else:
+            await receive()
+            await send({"type": "websocket.close", "code": 1008})
+
+    def _answer(self, scope: Scope, headers: Headers) -> Response | None:
+        """Return why a request goes no further, or what lets a browser in; None to hand it on."""
+        if not self.is_ours(headers.get("host", "")):
+            return PlainTextResponse("this server has another name\n", 421)
+        if not _same_origin(scope, headers):
+            return PlainTextResponse("asked for by another page\n", 403)
+        if scope["type"] == "http" and scope["method"] not in ("GET", "HEAD"):
+            return PlainTextResponse("GET only\n", 405)
+        token = QueryParams(scope["query_string"]).get("token")
+        if scope["path"] == "/" and token:
+            return self._enter(token)
+        inside = scope["path"].startswith(f"{self._keys.path}/")
+        if not inside or not self._keys.known(headers):
+            return PlainTextResponse(f"{DENIED}\n", 403)
+        if scope["type"] == "http" and scope["path"].startswith(self._keys.path + SOCKET):
+            return PlainTextResponse("web sockets only\n", 403)  # they alone always name an origin
+        return None
+
+    def _enter(self, token: str) -> Response:
+        cookie = self._keys.exchange(token)
+        if cookie is None:
+            return PlainTextResponse(f"{DENIED}\n", 403)
+        page = ENTER.format(path=self._keys.path)
+        return HTMLResponse(page, headers={"set-cookie": cookie, "cache-control": "no-store"})
+
+    def is_ours(self, host: str) -> bool:
+        """Return whether a Host names this server by an address, not by a name somebody rebound."""
+        name, _, port = host.rpartition(":")
+        if port != str(self._port):
+            return False
+        return name in self._names or (self._any and _is_address(name.strip("[]")))
+
+    def _inside(self, scope: Scope) -> Scope:
+        """Return the request as the page may see it: no cookies, no say in its own prefix."""
+        hidden = (b"cookie", b"x-forwarded-prefix")
+        headers = [(k, v) for k, v in scope["headers"] if k.lower() not in hidden]
+        return {**scope, "headers": headers, "root_path": self._keys.path}
+
+
+def _is_address(name: str) -> bool:
+    try:
+        return bool(ipaddress.ip_address(name))
+    except ValueError:
+        return False
+
+
+def _same_origin(scope: Scope, headers: Headers) -> bool:
+    """Return whether a request comes from this page, or from a person who opened the address.
+
+    A web socket is not held to its origin by browsers and has to name it. The first visit comes
+    from elsewhere, with a token as its proof.
+    """
+    origin, site = headers.get("origin"), headers.get("sec-fetch-site", "none")
+    if scope["type"] == "websocket":
+        return origin == f"http://{headers.get('host')}"
+    visit = scope["path"] == "/" and headers.get("sec-fetch-dest", "document") == "document"
+    ours = origin in (None, f"http://{headers.get('host')}")
+    return ours and (site in ("same-origin", "none") or visit)
+
+
+def _guarded(send: Any) -> Any:
+    """Return what sends with the headers that keep a page to itself."""
+
+    async def guarded(message: dict[str, Any]) -> None:
+        if message["type"] == "http.response.start":
+            there = {key.lower() for key, _ in message["headers"]}
+            more = [(k.encode(), v.encode()) for k, v in HEADERS.items() if k.encode() not in there]
+            message = {**message, "headers": [*message["headers"], *more]}
+        await send(message)
+
+    return guarded

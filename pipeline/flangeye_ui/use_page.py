@@ -3,21 +3,33 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from nicegui import ui
 
+from flangeye import result as r
 from flangeye.errors import FlangeyeError
 from flangeye.files.written import write_whole
+from flangeye.models.configuration import CELL
+from flangeye.plugin.stage import Stage
 from flangeye.report.certificate.budget import Conditions
 from flangeye.report.certificate.page import render
-from flangeye.report.exports import exported
 from flangeye.report.facts import Facts
 from flangeye.types import ExportedFile
 from flangeye_ui.foreign import address_of
 from flangeye_ui.layout import Bar, code, command_line, mistake, page
 from flangeye_ui.project import Project
 from flangeye_ui.result_page import chosen_run
+
+LIST = 'bordered separator role="group" aria-label="Systems"'
+
+ASKED = {
+    "temperature": "Temperature of the air, °C", "spread": "Coldest to warmest in use, K",
+    "place": "Where it was done", "operator": "Who did it",
+}  # fmt: skip
+"""What only a person knows of the place: option of the command, and what it is called."""
 
 
 def add(project: Project) -> None:
@@ -126,14 +138,6 @@ class Systems:
         self._bar.say(f"Written: {path.relative_to(self._project.folder)}")
 
 
-LIST = 'bordered separator role="group" aria-label="Systems"'
-ASKED = {
-    "temperature": "Temperature of the air, °C", "spread": "Coldest to warmest in use, K",
-    "place": "Where it was done", "operator": "Who did it",
-}  # fmt: skip
-"""What only a person knows of the place: option of the command, and what it is called."""
-
-
 class Certificate:
     """The certificate: what a person adds, what it will say, and the file."""
 
@@ -185,3 +189,22 @@ def _number(key: str, text: str) -> float | None:
         return float(text) if text else None
     except ValueError:
         raise ValueError(f"{ASKED[key]}: '{text}' is no number") from None
+
+
+def exported(result: r.Result, exports: Sequence[Stage]) -> dict[str, ExportedFile]:
+    """Return the files of a calibration by format, with default parameters.
+
+    Nothing of one that was refused or not finished; formats whose parameters have no defaults, or
+    that cannot write this pose, or of a cell carry one transform alone, are left out.
+    """
+    if result.status not in ("verified", "unverified") or not result.transforms:
+        return {}
+    pose = r.calibrated_pose(result)
+    files: dict[str, ExportedFile] = {}
+    for stage in exports:
+        if pose.others and CELL not in stage.serves:
+            continue
+        with suppress(FlangeyeError, ValueError):
+            params = {} if stage.params is None else {"params": stage.params()}
+            files[stage.name.partition(".")[2]] = stage.function(pose=pose, **params)
+    return files

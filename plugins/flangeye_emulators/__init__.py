@@ -24,7 +24,7 @@ STAGES = {
     "acquire_simulated_images",
     "acquire.simulated_profiles": "flangeye_emulators.acquire.simulated_profiles:"
     "acquire_simulated_profiles",
-    "scan.simulated": "flangeye_emulators.scan.simulated:scan_simulated",
+    "scan.simulated": "flangeye_emulators.scan:scan_simulated",
 }
 
 PARTS = {
@@ -32,7 +32,7 @@ PARTS = {
     "scanner.mounted": "flangeye_emulators.scanner.mounted:scanner_mounted",
     "robot.emulator": "flangeye_emulators.robot.loopback:robot_loopback",
     "robot.simulated": "flangeye_emulators.robot.simulated:robot_simulated",
-    "arc.simulated": "flangeye_emulators.arc.simulated:arc_simulated",
+    "arc.simulated": "flangeye_emulators.arc:arc_simulated",
     "profiler.simulated": "flangeye_emulators.finger.profiler:profiler_simulated",
     "sensor.simulated_finger": "flangeye_emulators.finger.sensor:sensor_simulated_finger",
 }

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from flangeye.batch.dataset import Dataset
 from flangeye.batch.regress import read_manifests
 from flangeye.cli.commands import app
-from flangeye.files.bundled import bundled
+from flangeye.files.paths import bundled
 
 DATA = Path(__file__).parents[2] / "data"
 MANIFEST = """\

@@ -14,11 +14,11 @@ import pytest
 
 from flangeye.batch.command import _tell
 from flangeye.batch.dataset import Dataset, Kind, Ledger, columns_of, row_of
+from flangeye.batch.keys import Software
 from flangeye.batch.outcome import SessionOutcome
 from flangeye.batch.page import drawings_of, write_page
 from flangeye.batch.page import render as rendered
 from flangeye.batch.plan import BatchSession
-from flangeye.batch.software import Software
 from flangeye.batch.tally import Tally
 from flangeye.batch.work import Job
 from flangeye.files.place import place_at

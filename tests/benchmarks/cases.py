@@ -262,7 +262,7 @@ def finger() -> tuple[Work, Work]:
     import cv2
 
     from flangeye.devices import SensorFrame
-    from flangeye.files.bundled import bundled
+    from flangeye.files.paths import bundled
     from flangeye.models.finger import Finger
     from flangeye.models.model import read_model
     from flangeye_emulators.finger.sensor import FingerCamera, Optics, typical_compliance

@@ -19,8 +19,8 @@ from flangeye.models.loading import load_model
 from flangeye.types import CircleFeature, Floats, HandEye, Observation, TransformEstimate
 from flangeye_emulators.acquire.planned_session import PlannedSession, plan_session
 from flangeye_emulators.acquire.simulated_session import ScanParams
-from flangeye_emulators.world.distortion import Distortion
 from flangeye_emulators.world.raycast import pixels_of
+from flangeye_emulators.world.scan_errors import Distortion
 from flangeye_emulators.world.session import View, seen_from
 from flangeye_plugins.solve.robust import RobustParams, solve_cell
 

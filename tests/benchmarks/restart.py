@@ -18,9 +18,9 @@ from rich.console import Console
 
 from flangeye.batch import Request, command
 from flangeye.batch.dataset import BLOCK, Dataset, columns_of, row_of
+from flangeye.batch.keys import software_of
 from flangeye.batch.outcome import SessionOutcome
 from flangeye.batch.plan import plan
-from flangeye.batch.software import software_of
 from flangeye.files.place import place_at
 from flangeye.plugin.registry import Registry, load_registry
 

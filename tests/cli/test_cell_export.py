@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from flangeye import StageError
-from flangeye.files.bundled import bundled
+from flangeye.files.paths import bundled
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.load import load_recipe
 from flangeye.report.certificate import Conditions, budget_of, write_certificate

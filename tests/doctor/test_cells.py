@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from flangeye.cli.commands import app
 from flangeye.doctor.cells import _moved, _scaled, _seen, examine_cell
-from flangeye.files.bundled import bundled
+from flangeye.files.paths import bundled
 from flangeye.maths.geometry import invert, rigid, rotation_exp
 from flangeye.models.cell import Cell, Link
 from flangeye.plugin.registry import load_registry

@@ -8,7 +8,7 @@ import pytest
 
 from flangeye.errors import StageError
 from flangeye.estimation.sightings import branches_of, problem_of
-from flangeye.files.bundled import bundled
+from flangeye.files.paths import bundled
 from flangeye.maths.kinematics import Arm
 from flangeye.models.cell import Cell
 from flangeye.plugin.registry import load_registry

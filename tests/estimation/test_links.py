@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye.files.bundled import bundled
+from flangeye.files.paths import bundled
 from flangeye.log.read import read_run
 from flangeye.maths.geometry import invert, rigid, rotation_exp
 from flangeye.maths.kinematics import Arm

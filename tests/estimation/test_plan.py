@@ -13,7 +13,7 @@ from flangeye.estimation.plan import (
     most_telling,
     so_far,
 )
-from flangeye.files.bundled import bundled
+from flangeye.files.paths import bundled
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.models.cell import Cell
 from flangeye.plugin.registry import load_registry

@@ -110,7 +110,7 @@ def _check_override(path):
 
 
 def _models(folder):
-    from flangeye.files.bundled import bundled
+    from flangeye.files.paths import bundled
 
     return [(bundled("data") / "robots" / f"{name}.yaml").read_bytes() for name in ("ur5", "ur5e")]
 
@@ -488,7 +488,7 @@ def _read_request(path):
     """A request as it comes over the wire: first line, then headers with cookies."""
     import asyncio
 
-    from flangeye_ui.gate import Gate, Keys
+    from flangeye_ui.server import Gate, Keys
 
     first, *lines = path.read_bytes().split(b"\n")
     method, _, rest = first.partition(b" ")

@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as arrays
 from flangeye import types as t
 from flangeye.log.read import read_run
 from flangeye.log.record import Recorder
-from flangeye.log.scans import BLOCK, pack, unpack
+from flangeye.log.records import BLOCK, pack, unpack
 
 
 def scan(rows=300, columns=400):

@@ -8,7 +8,7 @@ import numpy as np
 from flangeye.devices import RobotDriver
 from flangeye.models.arc import ArcTimes
 from flangeye.motion.arc import BURN, with_arc
-from flangeye.motion.leading import led
+from flangeye.motion.executor import led
 from flangeye.plugin.stage import BoundPart
 from flangeye_plugins.arc.ur_digital import UrDigitalParams, arc_ur_digital
 from tests.motion.stand_in import LIMITS, MODEL

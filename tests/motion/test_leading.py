@@ -9,7 +9,7 @@ import pytest
 from flangeye.devices import DeviceError, RobotDriver
 from flangeye.errors import RunStopped
 from flangeye.motion.arm import WatchedArm
-from flangeye.motion.leading import LedArm, led
+from flangeye.motion.executor import LedArm, led
 from flangeye.motion.route import Leg, Route
 from flangeye.motion.watchdog import Charge, Report, Watchdog
 from flangeye.types import BASE, FLANGE, Transform

@@ -15,7 +15,7 @@ from flangeye_paper.oracle import error_oracle
 from flangeye_paper.points import PointsParams, acquire_points
 from flangeye_paper.published import PublishedParams, acquire_published_centres
 from flangeye_paper.stored_results import StoredParams, verify_stored_results
-from flangeye_plugins.cost.costs import TranslationParams, cost_translation
+from flangeye_plugins.cost import TranslationParams, cost_translation
 from flangeye_plugins.reader.ancorasir import AncorasirParams
 from flangeye_plugins.reader.ancorasir import ancorasir as reader
 from flangeye_plugins.solve.svd import SvdParams, solve_svd

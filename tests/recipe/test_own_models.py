@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from flangeye.files.bundled import bundled
+from flangeye.files.paths import bundled
 from flangeye.maths.kinematics import Arm
 from flangeye.models.cell import Cell
 from flangeye.models.loading import load_model, model_names

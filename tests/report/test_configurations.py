@@ -14,7 +14,7 @@ from flangeye.maths.geometry import invert, rigid, rotation_from_rpy
 from flangeye.report import page
 from flangeye.report.cell import cell_drawing
 from flangeye.report.facts import facts_of
-from flangeye.report.images import image_view, missed_view
+from flangeye.report.page import image_view, missed_view
 from flangeye.report.space import workspace_drawing
 from flangeye.types import Pair
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye.files.bundled import bundled
+from flangeye.files.paths import bundled
 from flangeye.log.read import read_run
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.load import load_recipe

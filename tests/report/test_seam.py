@@ -16,7 +16,7 @@ from flangeye.log.read import read_run
 from flangeye.log.record import Recorder
 from flangeye.report.facts import Facts
 from flangeye.report.page import render
-from flangeye.report.seam import seam_view
+from flangeye.report.weld import seam_view
 from flangeye.result import seam_result
 
 LINE = np.column_stack([np.linspace(0.5, 0.7, 41), np.zeros(41), np.full(41, 0.27)])

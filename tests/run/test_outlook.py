@@ -11,7 +11,7 @@ import pytest
 from flangeye import types as t
 from flangeye.log.read import read_run
 from flangeye.maths.geometry import rigid, rotation_exp
-from flangeye.models.coverage import coverage_of
+from flangeye.models.workspace import coverage_of
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.load import parse_recipe
 from flangeye.run.folder import RunFolder

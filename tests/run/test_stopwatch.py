@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from flangeye.run.stopwatch import Stopwatch
+from flangeye.run.outcome import Stopwatch
 
 
 def test_time_is_charged_to_the_innermost_step_and_every_call_counts(

@@ -33,7 +33,7 @@ from flangeye.motion.seam_following import Command, Controller, FollowingTask
 from flangeye.run.replay import ReplayedStep
 from flangeye.testing.solving import reference_solution
 from flangeye.types import FLANGE
-from flangeye_emulators.arc.simulated import SimulatedArc, SimulatedArcParams
+from flangeye_emulators.arc import SimulatedArc, SimulatedArcParams
 from flangeye_emulators.robot.simulated import SimulatedParams, SimulatedRobot
 from flangeye_plugins.fit.rim import fit_rim
 from flangeye_plugins.fit.rim_params import RimParams

@@ -44,8 +44,8 @@ from flangeye_emulators.acquire.simulated_params import SimulatedParams
 from flangeye_emulators.robot.simulated import robot_simulated
 from flangeye_emulators.world.structured_light import StructuredLight
 from flangeye_plugins.acquire.archive import ArchiveParams, acquire_archive
-from flangeye_plugins.cost.costs import cost_axes, cost_translation, cost_work_radius
-from flangeye_plugins.error.errors import error_holdout
+from flangeye_plugins.cost import cost_axes, cost_translation, cost_work_radius
+from flangeye_plugins.error import error_holdout
 from flangeye_plugins.fit.ransac import fit_ransac_circle
 from flangeye_plugins.fit.rim import fit_rim
 from flangeye_plugins.fit.sphere import fit_sphere
@@ -63,7 +63,7 @@ from flangeye_plugins.solve.robust import solve_robust
 from flangeye_plugins.solve.svd import solve_svd
 from flangeye_plugins.verify.holdout import verify_holdout
 from flangeye_plugins.verify.icp import verify_icp
-from flangeye_plugins.view.guess import GuessParams, view_guess
+from flangeye_plugins.view import GuessParams, view_guess
 from tests.emulators.world.bench import facing, flange_scene, zoomed
 
 SAMPLE = Path(__file__).parents[2] / "data" / "samples" / "ur5_phoxi-m"

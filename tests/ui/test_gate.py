@@ -19,7 +19,7 @@ pytest.importorskip("nicegui", reason="nicegui is not installed")
 
 from flangeye.errors import StageError
 from flangeye.recipe.find import find_recipe
-from flangeye_ui.permission import MOST_WRONG, MoveCodes
+from flangeye_ui.project import MOST_WRONG, MoveCodes
 from tests.ui.conftest import Served, ended, serve
 
 HOSTILE = """<!doctype html><title>loading</title><script>
@@ -307,7 +307,7 @@ def test_a_code_is_not_good_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
     codes = MoveCodes(shown.append)
     codes.ask(["cell.yaml"], "page")
     now = __import__("time").monotonic()
-    monkeypatch.setattr("flangeye_ui.permission.time.monotonic", lambda: now + 1000)
+    monkeypatch.setattr("flangeye_ui.project.time.monotonic", lambda: now + 1000)
     with pytest.raises(StageError, match="expired"):
         codes.spend(shown[-1].split()[1], ["cell.yaml"], "page")
 

@@ -32,9 +32,8 @@ from flangeye.maths.pose_corrections import inverted
 from flangeye.plugin.registry import Registry, load_registry
 from flangeye.recipe.find import find_recipe
 from flangeye_ui import scan_page, server
-from flangeye_ui.permission import MoveCodes
 from flangeye_ui.poses_page import plan_in
-from flangeye_ui.project import Project, _mistake
+from flangeye_ui.project import MoveCodes, Project, _mistake
 from flangeye_ui.scene import RIM, TAKEN
 from flangeye_ui.server import require_free
 from tests.doctor.sessions import clean

@@ -27,7 +27,7 @@ from flangeye.batch.plan import BatchSession
 from flangeye.batch.request import BatchError, Tls
 from flangeye.batch.work import WORKER_DIED, Chunk, ChunkTold, Job, run_chunk, write_rows
 from flangeye.errors import FlangeyeError
-from flangeye.files.children import keep_current_folder_out, python_command
+from flangeye.files.processes import keep_current_folder_out, python_command
 
 if TYPE_CHECKING:
     from distributed import Client, Future, Security
@@ -36,44 +36,14 @@ if TYPE_CHECKING:
 PREFIX = "flangeye-batch-"
 
 
-@contextmanager
-def scratch() -> Iterator[Path]:
-    """Give a folder of this process's own; those of batches that are gone are removed."""
-    remove_forgotten()
-    with tempfile.TemporaryDirectory(
-        prefix=f"{PREFIX}{os.getpid()}-", ignore_cleanup_errors=True
-    ) as folder:
-        yield Path(folder)
-
-
-def remove_forgotten() -> None:
-    """Remove the folders of this user's batches whose process is gone."""
-    import psutil
-
-    for folder in Path(tempfile.gettempdir()).glob(f"{PREFIX}*-*"):
-        number = re.match(r"\d{1,9}(?=-)", folder.name.removeprefix(PREFIX))
-        if number and _is_ours(folder) and not psutil.pid_exists(int(number[0])):
-            shutil.rmtree(folder, ignore_errors=True)
-
-
-def _is_ours(folder: Path) -> bool:
-    """Return whether a folder, and no link to one, belongs to this user."""
-    try:
-        return not folder.is_symlink() and folder.is_dir() and folder.stat().st_uid == os.getuid()
-    except (OSError, AttributeError):  # gone meanwhile; a system whose users have no numbers
-        return False
-
-
 CONNECT_SECONDS = 5.0
 """How long to wait for a scheduler that was given by address."""
 
 AHEAD = 3
 """Chunks that the scheduler is to know of for each worker."""
 
-
 CHUNK_SECONDS, MOST = 5.0, 500
 """How long a worker is to be busy with a chunk [s], and how many sessions it has at most."""
-
 
 SINGLE_THREADED = {
     name: 1
@@ -106,6 +76,34 @@ _LOCAL = {
     "distributed.admin.system-monitor.interval": "10s",
 }
 """Dask's settings for workers of this machine."""
+
+
+@contextmanager
+def scratch() -> Iterator[Path]:
+    """Give a folder of this process's own; those of batches that are gone are removed."""
+    remove_forgotten()
+    with tempfile.TemporaryDirectory(
+        prefix=f"{PREFIX}{os.getpid()}-", ignore_cleanup_errors=True
+    ) as folder:
+        yield Path(folder)
+
+
+def remove_forgotten() -> None:
+    """Remove the folders of this user's batches whose process is gone."""
+    import psutil
+
+    for folder in Path(tempfile.gettempdir()).glob(f"{PREFIX}*-*"):
+        number = re.match(r"\d{1,9}(?=-)", folder.name.removeprefix(PREFIX))
+        if number and _is_ours(folder) and not psutil.pid_exists(int(number[0])):
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _is_ours(folder: Path) -> bool:
+    """Return whether a folder, and no link to one, belongs to this user."""
+    try:
+        return not folder.is_symlink() and folder.is_dir() and folder.stat().st_uid == os.getuid()
+    except (OSError, AttributeError):  # gone meanwhile; a system whose users have no numbers
+        return False
 
 
 def check_installed() -> None:

@@ -18,16 +18,16 @@ from flangeye.batch.cluster import (
     worker_count,
 )
 from flangeye.batch.dataset import Dataset, Ledger, columns_of
+from flangeye.batch.keys import Software, software_of
 from flangeye.batch.page import write_page
 from flangeye.batch.plan import BatchSession, Plan, plan
 from flangeye.batch.progress import BatchProgress
 from flangeye.batch.request import BatchError, Request
-from flangeye.batch.software import Software, software_of
 from flangeye.batch.tally import Batch, Tally
 from flangeye.batch.work import READY, STARTS, Job
 from flangeye.errors import FlangeyeError
 from flangeye.files.elsewhere import is_url
-from flangeye.files.printable import printable
+from flangeye.files.words import printable
 
 if TYPE_CHECKING:
     from distributed import Client

@@ -14,7 +14,7 @@ from urllib.parse import quote
 from flangeye import report as run_report
 from flangeye.batch.dataset import Row
 from flangeye.batch.tally import Tally
-from flangeye.files.bundled import VERSION
+from flangeye.files.paths import VERSION
 from flangeye.files.place import Place
 from flangeye.report.look import css
 from flangeye.report.page import packed_plotly

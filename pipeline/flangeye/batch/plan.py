@@ -9,9 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 
 from flangeye import types as t
-from flangeye.batch.keys import Fingerprints, common_key, session_key
+from flangeye.batch.keys import Fingerprints, Software, common_key, session_key
 from flangeye.batch.request import SEED, BatchError, Request
-from flangeye.batch.software import Software
 from flangeye.errors import RecipeError
 from flangeye.files.elsewhere import is_url
 from flangeye.plugin.registry import Registry

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flangeye.batch.outcome import STATUSES, SessionOutcome, Status
-from flangeye.files.printable import printable
+from flangeye.files.words import printable
 
 if TYPE_CHECKING:
     from rich.console import Console

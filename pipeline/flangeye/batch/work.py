@@ -13,7 +13,14 @@ from functools import cache, cached_property
 from pathlib import Path
 
 from flangeye.batch.dataset import Dataset, Kind, row_of
-from flangeye.batch.keys import Fingerprints, common_key, session_key
+from flangeye.batch.keys import (
+    Fingerprints,
+    Software,
+    check_software,
+    common_key,
+    session_key,
+    software_of,
+)
 from flangeye.batch.outcome import (
     ACCEPTED,
     FINISHED,
@@ -24,7 +31,6 @@ from flangeye.batch.outcome import (
     outcome_of,
 )
 from flangeye.batch.plan import BatchSession
-from flangeye.batch.software import Software, check_software, software_of
 from flangeye.errors import FlangeyeError, StageError
 from flangeye.files.elsewhere import archive_at, is_url, results_at
 from flangeye.files.place import Place, place_at

@@ -86,7 +86,7 @@ LogFile = Annotated[Path, typer.Argument(help="A run: its folder, run.mcap or ca
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        from flangeye.files.bundled import VERSION
+        from flangeye.files.paths import VERSION
 
         say(f"flangeye {VERSION}")
         raise typer.Exit

@@ -39,7 +39,7 @@ def scanners() -> None:
 @app.command()
 def standards() -> None:
     """List flange plates: diameters and threads."""
-    from flangeye.models.standards import known_standards
+    from flangeye.models.targets import known_standards
 
     for plate in known_standards():
         mm = [1e3 * d for d in (plate.outer, plate.pitch_circle, plate.centring)]

@@ -5,18 +5,21 @@ from __future__ import annotations
 import io
 import os
 import sys
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from flangeye.errors import FlangeyeError, NothingMoved
-from flangeye.files.children import keep_current_folder_out
-from flangeye.files.printable import printable
+from flangeye.errors import FlangeyeError, NothingMoved, StageError
+from flangeye.files.processes import keep_current_folder_out
+from flangeye.files.words import printable
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from rich.console import Console
+
+    from flangeye.log.read import RunLog
 
 LONGEST = 4000
 """Of a line of an error, what is shown [characters]: names in it come from files."""
@@ -119,3 +122,30 @@ def _fail(error: FlangeyeError) -> NoReturn:
             more = f" ({len(line) - LONGEST} characters more)" if len(line) > LONGEST else ""
             sys.stderr.write(f"error: {line[:LONGEST]}{more}\n")
     sys.exit(error.exit_code)
+
+
+def name_damage(log: RunLog) -> None:
+    """Name every damaged part, and end as for bad input."""
+    for note in log.notes:
+        say(f"note: {note}", err=True)
+    log.require_sound()
+
+
+def require_gathered(log: RunLog) -> None:
+    """Refuse a log in which nothing was recorded."""
+    if not log.gathered:
+        log.require_sound()
+        raise StageError(f"{log.path}: the run ended early; nothing was gathered yet")
+
+
+@contextmanager
+def of_foreign(path: Path, what: str) -> Iterator[None]:
+    """Take any failure for the fault of a log that others may have written."""
+    from flangeye.log.records import reason_of
+
+    try:
+        yield
+    except FlangeyeError:
+        raise
+    except Exception as error:
+        raise StageError(f"{path}: {what}: {reason_of(error)}") from error

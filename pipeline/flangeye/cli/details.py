@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from flangeye.cli.console import write
-from flangeye.files.printable import printable
+from flangeye.files.words import printable
 from flangeye.maths.geometry import rpy_from_rotation
 from flangeye.result import (
     CorrectionResult,

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flangeye.cli.app import LogFile, Overrides, app, load_plugins, read_recipe
-from flangeye.cli.console import at_work, say, say_notes
-from flangeye.cli.foreign import name_damage, of_foreign, require_gathered
+from flangeye.cli.console import at_work, name_damage, of_foreign, require_gathered, say, say_notes
 from flangeye.errors import FlangeyeError, RecipeError
 
 if TYPE_CHECKING:

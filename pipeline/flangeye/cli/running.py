@@ -182,7 +182,7 @@ def _explain_refusal(log: Path, registry: Registry, result: Result) -> None:
 
 def _first_finding(log: Path, registry: Registry) -> Finding | None:
     """Return the mistake that explains most of a run's errors, if the doctor finds one."""
-    from flangeye.cli.foreign import of_foreign
+    from flangeye.cli.console import of_foreign
     from flangeye.doctor import examine, examine_cell, open_cell, open_session
 
     checks = [registry.part(name) for name in registry.parts if name.startswith("check.")]
@@ -367,7 +367,7 @@ def regress(
     from rich.console import Console
 
     from flangeye.batch.regress import compare, read_manifests
-    from flangeye.files.bundled import bundled
+    from flangeye.files.paths import bundled
 
     manifests = read_manifests(folder or bundled("data") / "manifests")
     comparisons = compare(manifests, out, workers, load_plugins(), Console(stderr=True))

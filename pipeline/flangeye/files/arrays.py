@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from flangeye.errors import StageError
 from flangeye.files.clouds import array_of, holds_numbers, load_npy
-from flangeye.files.printable import reason_of
 from flangeye.files.regular import open_regular, read_text
+from flangeye.files.words import reason_of
 from flangeye.types import Floats
 
 MAX_ARRAY = 1 << 28

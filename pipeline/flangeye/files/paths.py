@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import BeforeValidator, PlainSerializer, ValidationInfo
 
-from flangeye.files.bundled import bundled
-from flangeye.files.near import nearest
+from flangeye.files.words import nearest
+
+if TYPE_CHECKING:
+    VERSION: str
+    """Version of the installed project."""
+
+
+WHOLE = PlainSerializer(lambda path: str(path.absolute()), return_type=str, when_used="json")
+"""How a path is written into a resolved recipe: it is the same from any folder."""
 
 
 def _beside_recipe(value: Any, info: ValidationInfo) -> Path:
@@ -19,8 +27,6 @@ def _beside_recipe(value: Any, info: ValidationInfo) -> Path:
     return path if info.context is None else info.context.folder / path
 
 
-WHOLE = PlainSerializer(lambda path: str(path.absolute()), return_type=str, when_used="json")
-"""How a path is written into a resolved recipe: it is the same from any folder."""
 RecipePath = Annotated[Path, BeforeValidator(_beside_recipe), WHOLE]
 """A path in a parameter; a relative one starts at the recipe's folder."""
 
@@ -50,3 +56,22 @@ def bundled_file(
         return path
 
     return found
+
+
+def bundled(folder: str) -> Path:
+    """Return the folder ``recipes`` or ``data``."""
+    packaged = Path(__file__).parents[1] / "_shipped" / folder
+    return packaged if packaged.is_dir() else Path(__file__).parents[3] / folder
+
+
+def __getattr__(name: str) -> str:
+    if name != "VERSION":
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+    return _version()
+
+
+@cache
+def _version() -> str:
+    from importlib.metadata import version  # reads all that is written about the project
+
+    return version("flangeye")

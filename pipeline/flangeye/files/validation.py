@@ -6,7 +6,7 @@ from typing import Any, get_args
 
 from pydantic import BaseModel
 
-from flangeye.files.near import nearest
+from flangeye.files.words import nearest
 
 EXPLAINED = "explained"
 """Type of an error whose message went through :func:`sentence` already."""

@@ -23,8 +23,7 @@ from flangeye.files.images import decode_image
 from flangeye.files.regular import open_regular
 from flangeye.log import foxglove
 from flangeye.log.record import adapter
-from flangeye.log.records import DamageError, LogFile, Message, NotMcapError, reason_of
-from flangeye.log.scans import unpack
+from flangeye.log.records import DamageError, LogFile, Message, NotMcapError, reason_of, unpack
 
 _TYPES: dict[str, type] = {
     cls.__name__: cls

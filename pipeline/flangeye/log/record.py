@@ -27,7 +27,7 @@ topic                         schema                      content
 ============================  ==========================  ======================================
 
 A ``flangeye.Scan`` is the scan's points, three little-endian float32 each, as
-:mod:`flangeye.log.scans` packs them; ``shape`` of its ``flangeye.Capture`` has rows and columns.
+:mod:`flangeye.log.records` packs them; ``shape`` of its ``flangeye.Capture`` has rows and columns.
 JSON messages of steps are ``{"capture": id or null, "seconds": s, "value": …, "shapes": …}``; the
 shapes are those of the clouds' arrays, whose messages do not tell rows and columns. Attachments:
 ``recipe.yaml``, ``recipe.resolved.yaml`` and, when the run ended, ``result.json``. Every message
@@ -52,10 +52,9 @@ from pydantic import TypeAdapter
 from flangeye import types as t
 from flangeye.devices import RobotState
 from flangeye.errors import FlangeyeError
-from flangeye.files.bundled import VERSION
+from flangeye.files.paths import VERSION
 from flangeye.log import foxglove
-from flangeye.log.records import HASHES
-from flangeye.log.scans import pack
+from flangeye.log.records import HASHES, pack
 from flangeye.plugin.hookspecs import hookimpl
 
 PREVIEW_POINTS = 40_000

@@ -12,13 +12,18 @@ from __future__ import annotations
 
 import hashlib
 import io
+import math
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import ValidationError
+
+from flangeye.types import Singles
 
 if TYPE_CHECKING:
     from mcap.records import Chunk
@@ -32,6 +37,13 @@ SLACK, MAX_RATIO = 1 << 30, 100
 """What all chunks together may: so much [bytes], and so many times what they take up."""
 HASHES = "flangeye.sha256"
 """Name of the metadata record that says an attachment's hash."""
+
+
+BLOCK = 2048
+"""Points turned over at once: they fit the processor's nearest memory."""
+
+WIDTH = 12
+"""Bytes of a point."""
 
 
 class Channel(NamedTuple):
@@ -277,3 +289,46 @@ def reason_of(error: Exception) -> str:
         return ": ".join(filter(None, (where, first["msg"].removeprefix("Value error, "))))[:200]
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return (lines[0] if lines else type(error).__name__)[:200]
+
+
+Bytes = NDArray[np.uint8]
+
+
+def pack(xyz: Singles) -> bytes:
+    """Return points (..., 3) in few bytes, bit for bit."""
+    import zstandard
+
+    points = np.ascontiguousarray(xyz, dtype="<f4").reshape(-1, 3).view(np.uint8)
+    # of zstandard: the fast levels lose three hundredths of the size
+    return zstandard.compress(_turned(points, (BLOCK, WIDTH)).data, level=-8)
+
+
+def unpack(packed: bytes, shape: Sequence[int]) -> Singles | None:
+    """Return the points of :func:`pack` in their shape (..., 3), None if they are damaged."""
+    import zstandard
+
+    size = 4 * math.prod(shape)
+    if size > MAX_CHUNK:
+        return None
+    try:
+        # The size is known, so no more than that is ever expanded.
+        planes = zstandard.ZstdDecompressor().stream_reader(packed).read(size + 1)
+    except zstandard.ZstdError:
+        return None
+    if len(planes) != size or size % WIDTH:
+        return None
+    return _turned(np.frombuffer(planes, np.uint8), (WIDTH, BLOCK)).view("<f4").reshape(shape)
+
+
+def _turned(flat: Bytes, block: tuple[int, int]) -> Bytes:
+    """Return each block of bytes, and the shorter rest, with rows and columns exchanged."""
+    flat, out = flat.reshape(-1), np.empty(flat.size, dtype=np.uint8)
+    whole = len(flat) // (BLOCK * WIDTH) * BLOCK * WIDTH
+    rows, columns = block
+    out[:whole].reshape(-1, columns, rows)[:] = (
+        flat[:whole].reshape(-1, rows, columns).transpose(0, 2, 1)
+    )
+    rest = (len(flat) - whole) // WIDTH
+    rows, columns = (rest if side == BLOCK else side for side in block)
+    out[whole:].reshape(columns, rows)[:] = flat[whole:].reshape(rows, columns).T
+    return out

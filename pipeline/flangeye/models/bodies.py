@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flangeye.errors import RecipeError, StageError
-from flangeye.files.bundled import bundled
 from flangeye.files.clouds import PER_METRE, LengthUnit
-from flangeye.files.near import nearest
+from flangeye.files.paths import bundled
+from flangeye.files.words import nearest
 from flangeye.models.workpiece import MESHES, STEP, read_mesh
 from flangeye.types import Floats
 

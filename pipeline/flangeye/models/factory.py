@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from flangeye.errors import RecipeError
-from flangeye.files.printable import reason_of
 from flangeye.files.regular import read_text
+from flangeye.files.words import reason_of
 from flangeye.files.yaml_lines import MAX_BYTES, read_yaml
 from flangeye.maths.geometry import rotation_from_rpy
 from flangeye.models.robots import Joint, RobotModel, Volume

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from flangeye.errors import RecipeError
-from flangeye.files.bundled import bundled
-from flangeye.files.near import nearest
+from flangeye.files.paths import bundled
+from flangeye.files.words import nearest
 from flangeye.files.yaml_lines import read_yaml
 from flangeye.models.model import read_model
 from flangeye.models.robots import RobotModel

@@ -14,7 +14,7 @@ from flangeye.files.yaml_lines import parse_value
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
 from flangeye.models.robots import RobotModel
-from flangeye.models.standards import load_standard
+from flangeye.models.targets import load_standard
 
 
 def write_robot(path: Path, robot: RobotModel) -> str:

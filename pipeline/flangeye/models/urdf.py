@@ -13,9 +13,8 @@ import numpy as np
 from pydantic import ValidationError
 
 from flangeye.errors import RecipeError
-from flangeye.files.near import nearest
-from flangeye.files.printable import require_name
 from flangeye.files.regular import read_text
+from flangeye.files.words import nearest, require_name
 from flangeye.maths.geometry import (
     basis_of_plane,
     invert,

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from flangeye.errors import RecipeError
-from flangeye.files.printable import reason_of
 from flangeye.files.regular import read_regular
+from flangeye.files.words import reason_of
 from flangeye.maths.capsules import Capsule, fit_capsule
 from flangeye.types import Floats
 

@@ -1,12 +1,75 @@
-"""Where the work is: the box over which errors are reported."""
+"""What of the work the poses have been in: which cells of its box, and turned which way."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flangeye import types as t
+from flangeye.maths.geometry import nearest_rotation, rotation_log
+from flangeye.types import Box, Floats
+
+CELLS = 3
+"""Along each edge of the box: the cells at its corners are where a turn shows most."""
+ENOUGH = np.radians(5.0)
+"""A turn by less does not count as one."""
+FAR = np.radians(20.0)
+"""Turns that show the camera's pose well, as the solver asks for."""
+
+
+@dataclass(frozen=True, eq=False)
+class Coverage:
+    """How often each cell was visited, and how far the flange was turned.
+
+    Attributes:
+        places: (3, 3, 3) poses in each cell along base x, y, z. A pose outside the box counts for
+            the nearest cell.
+        turns: (3, 2) largest turn either way about base x, y, z, from the mean of all [rad].
+    """
+
+    places: NDArray[np.intp]
+    turns: Floats
+
+    def __str__(self) -> str:
+        """Say it in a line."""
+        both = int((self.turns.min(axis=1) >= ENOUGH).sum())
+        angles = ", ".join(f"-{low:.0f} +{high:.0f}" for low, high in np.degrees(self.turns))
+        return (
+            f"{np.count_nonzero(self.places)} of {self.places.size} cells of the work; turned both "
+            f"ways about {both} of 3 axes ({angles} deg about base x, y, z)"
+        )
+
+    def lacking(self) -> list[str]:
+        """Say which motion would add most: turns that were left out, sides that were not seen."""
+        out = []
+        for name, turns in zip("xyz", self.turns, strict=True):
+            if turns.min() < ENOUGH:
+                low, high = np.degrees(turns)
+                out.append(
+                    f"turn the flange both ways about base {name}, by {np.degrees(FAR):.0f} deg or "
+                    f"more (so far -{low:.0f} +{high:.0f} deg)"
+                )
+        for axis, name in enumerate("xyz"):
+            visits = self.places.sum(axis=tuple({0, 1, 2} - {axis}))
+            sides = [(visits[0], "low"), (visits[-1], "high")]
+            out += [f"go to the {side} end of the work along {name}" for n, side in sides if not n]
+        return out
+
+
+def coverage_of(box: Box, poses: Iterable[Floats]) -> Coverage:
+    """Return what (4, 4) poses of the flange in the base covered of a box."""
+    found = np.array(list(poses)).reshape(-1, 4, 4)
+    places = np.zeros((CELLS,) * 3, np.intp)
+    if not len(found):
+        return Coverage(places, np.zeros((3, 2)))
+    within = (found[:, :3, 3] - box.centre) / np.maximum(box.size, 1e-9) + 0.5
+    np.add.at(places, tuple(np.clip((within * CELLS).astype(np.intp), 0, CELLS - 1).T), 1)
+    mean = nearest_rotation(found[:, :3, :3].mean(axis=0))
+    turns = rotation_log(found[:, :3, :3] @ mean.T)
+    return Coverage(places, np.column_stack([-turns.min(axis=0), turns.max(axis=0)]).clip(0.0))
 
 
 def workspace_of(source: t.Source, given: t.Box | None, pairs: Sequence[t.Pair]) -> t.Box | None:

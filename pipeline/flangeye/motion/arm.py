@@ -15,8 +15,7 @@ from typing import Any
 
 from flangeye.devices import PATIENCE, DeviceError, RobotDriver, RobotState
 from flangeye.errors import RunStopped
-from flangeye.files.children import keep_current_folder_out
-from flangeye.files.load import busy
+from flangeye.files.processes import busy, keep_current_folder_out
 from flangeye.models.robots import RobotModel
 from flangeye.motion.limits import MotionLimits
 from flangeye.motion.precedence import LEADING, take_precedence

@@ -8,6 +8,8 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from flangeye.devices import DeviceError, RobotDriver, RobotState
+from flangeye.errors import FlangeyeError
 from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.types import Floats
 
@@ -109,3 +111,22 @@ def tilted(place: Floats, facing: Floats, tilt: float, rng: np.random.Generator)
     """Return a pose (4, 4) at a point whose roll, pitch and yaw from facing stay below ``tilt``."""
     roll, pitch, yaw = rng.uniform(-tilt, tilt, 3)
     return rigid(rotation_from_rpy(roll, pitch, yaw) @ facing, place)
+
+
+def read_state(driver: RobotDriver) -> tuple[str, RobotState]:
+    """Return an arm's name and its state; nothing is started on its controller, nothing commanded.
+
+    Raises:
+        DeviceError: The driver has no way to read alone, or the arm cannot be read: why.
+    """
+    if driver.read is None:
+        raise DeviceError(f"{driver.name} has no way to read it without connecting to drive it")
+    try:
+        with driver.read() as robot:
+            return robot.name, robot.state()
+    except FlangeyeError:
+        raise
+    except Exception as error:  # a vendor's client may fail in any way
+        raise DeviceError(
+            f"{driver.name} failed with {type(error).__name__}: {' '.join(str(error).split())}"
+        ) from error

@@ -8,7 +8,7 @@ from typing import Any, get_args
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from flangeye.files.near import nearest
+from flangeye.files.words import nearest
 from flangeye.plugin.registry import PluginNotFoundError, Registry
 from flangeye.plugin.stage import KINDS, PARTS, Choose, Plugin
 

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import pluggy
 
 from flangeye.errors import FlangeyeError
-from flangeye.files.near import nearest
+from flangeye.files.words import nearest
 from flangeye.models.robots import RobotModel
 from flangeye.plugin import hookspecs
 from flangeye.plugin.hookspecs import NAME

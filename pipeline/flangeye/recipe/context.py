@@ -23,8 +23,14 @@ from flangeye.models.loading import load_model
 from flangeye.models.model import read_model
 from flangeye.models.robots import FlangeDetails, RobotModel, SecondRobot
 from flangeye.models.scanners import ScannerData, ScannerModel
-from flangeye.models.standards import FlangeStandard, load_standard
-from flangeye.models.targets import Flange, Sphere, flange_of, wrist_circle_of
+from flangeye.models.targets import (
+    Flange,
+    FlangeStandard,
+    Sphere,
+    flange_of,
+    load_standard,
+    wrist_circle_of,
+)
 from flangeye.plugin.stage import BoundPart
 from flangeye.recipe.header import (
     FeatureSection,

@@ -6,8 +6,8 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from flangeye.errors import RecipeError
-from flangeye.files.bundled import bundled
-from flangeye.files.near import nearest
+from flangeye.files.paths import bundled
+from flangeye.files.words import nearest
 
 
 def recipe_names() -> dict[str, Path]:

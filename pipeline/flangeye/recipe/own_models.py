@@ -16,7 +16,7 @@ from flangeye.models.cell import Cell
 from flangeye.models.model import Model
 from flangeye.models.robots import RobotModel, SecondRobot
 from flangeye.models.scanners import ScannerData
-from flangeye.models.standards import FlangeStandard
+from flangeye.models.targets import FlangeStandard
 from flangeye.recipe.context import Context
 from flangeye.recipe.header import Header
 

@@ -8,22 +8,36 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flangeye import types as t
+from flangeye.maths.seam_geometry import distances_to_line, tube_radii, tube_rings
 from flangeye.report.facts import Facts
 from flangeye.report.plot import (
     CIRCLE,
     HELD_OUT,
+    NEUTRAL,
     TRUTH,
     UNUSED,
     USED,
     Figure,
+    Trace,
     curve,
+    figure3d,
     layout2d,
+    lines,
+    points,
+    round_up,
+    scatter3d,
+    thinned,
 )
 from flangeye.report.units import millimetres
 from flangeye.types import Floats, WeldReport, WorkpieceScan
 
 BANDS = {"seeking": "#8a8f98", "bridging": "#d98a00", "ending": "#3a7ebf", "stopped": "#d5451b"}
 """Colours of the controller's phases; following, the rule, has none."""
+
+
+RINGS, WIDE = 60, 0.01
+"""Circles of the tube, and roughly how wide the tube is drawn [m]."""
 
 
 @dataclass(frozen=True)
@@ -133,8 +147,8 @@ def _paths(view: _View) -> Figure:
         ("torch", weld.torch, CIRCLE, {}),
     )
     traces = []
-    for name, points, colour, rest in named:
-        at = view.flat(points) * 1e3
+    for name, places, colour, rest in named:
+        at = view.flat(places) * 1e3
         traces.append(curve(at[:, 0], at[:, 1], name, colour, **rest))
     layout = layout2d("along the seam [mm]", "across [mm]")
     layout["yaxis"]["scaleanchor"] = "x"
@@ -144,13 +158,13 @@ def _paths(view: _View) -> Figure:
 def _offsets(view: _View) -> Figure:
     weld = view.weld
     traces = []
-    for name, points, colour in (
+    for name, places, colour in (
         ("felt (refined)", weld.refined, TRUTH),
         ("tip", weld.tip, USED),
         ("torch", weld.torch, CIRCLE),
         ("robot", weld.robot, UNUSED),
     ):
-        along, across = view.off_plan(points) if len(points) else (np.zeros(0), np.zeros(0))
+        along, across = view.off_plan(places) if len(places) else (np.zeros(0), np.zeros(0))
         traces.append(curve(along * 1e3, across * 1e3, name, colour))
     layout = layout2d("along the plan [mm]", "left of the plan [mm]")
     return {"data": traces, "layout": layout}
@@ -243,3 +257,101 @@ def _loop(weld: WeldReport) -> list[tuple[str, str]]:
         ("with the tag", f"{weld.figures.get('images_with_tag', 0):.0f}"),
     ]
     return rows if loop else rows[-2:]
+
+
+@dataclass(frozen=True)
+class SeamView:
+    """What the page shows of a seam.
+
+    Attributes:
+        space: The seam on the cloud, for plotly.
+        profile: Its tube along its length, for plotly.
+        summary: What it is, in words.
+        facts: Name and value.
+    """
+
+    space: dict[str, Any]
+    profile: dict[str, Any]
+    summary: str
+    facts: list[tuple[str, str]]
+
+
+def seam_view(facts: Facts) -> SeamView | None:
+    """Return the view of the planned seam, if the run came so far."""
+    seam = facts.log.last(t.Seam)
+    if seam is None:
+        return None
+    scan = facts.log.last(t.WorkpieceScan)
+    truth = list(scan.truth.values()) if scan else []
+    widest = float(tube_radii(seam).max())
+    summary = (
+        f"{seam.source}: {millimetres(float(seam.arc_length[-1]))} mm long. With 95 % probability "
+        f"the true seam passes within {millimetres(widest)} mm of every point of the plan: the "
+        "registration and the hand-eye pose together."
+    )
+    true_seams = [lines(truth, TRUTH, 3, name="true seam")] if truth else []
+    space = figure3d([*_cloud(seam), *_drawn(seam), *true_seams], eye=(0.9, -1.0, 1.1))
+    return SeamView(space, _profile(seam, truth), summary, _facts(seam, facts))
+
+
+def _cloud(seam: t.Seam) -> list[Trace]:
+    if seam.cloud is None or not len(seam.cloud.points()):
+        return []
+    return [points(thinned(seam.cloud.points(), 8_000), NEUTRAL, 1.4, name="scan")]
+
+
+def _drawn(seam: t.Seam) -> list[Trace]:
+    line, openings = seam.points_in_base, seam.openings_in_base
+    at = np.linspace(0, len(line) - 1, 9).round().astype(int)
+    scale = 0.5 * round_up(WIDE / max(float(tube_radii(seam).max()), 1e-9))
+    # Length of the lines that point at the torch [m]
+    arrows = [np.stack([line[i], line[i] + 0.03 * openings[i]]) for i in at]
+    return [
+        lines(_widened(seam, scale), USED, 2, name=f"tube, 95 % × {scale:g}"),
+        lines([line], CIRCLE, 5, name="planned seam"),
+        lines(arrows, CIRCLE, 2, name="towards the torch"),
+        scatter3d(
+            line[:1], "markers", marker={"size": 5, "color": CIRCLE, "symbol": "diamond"},
+            name="start",
+        ),
+    ]  # fmt: skip
+
+
+def _widened(seam: t.Seam, scale: float) -> list[Floats]:
+    """Return the tube's rings, drawn too wide: it would not be seen beside the part."""
+    rings = tube_rings(seam, RINGS)
+    middles = rings[:, :-1].mean(axis=1, keepdims=True)
+    return list(middles + scale * (rings - middles))
+
+
+def _profile(seam: t.Seam, truth: list[Floats]) -> dict[str, Any]:
+    """Return the tube's radius along the seam, and the true error where it is known."""
+    along = seam.arc_length * 1e3
+    traces = [curve(along, tube_radii(seam) * 1e3, "tube, 95 %", USED, width=2)]
+    if truth:
+        errors = [distances_to_line(seam.points_in_base, line) for line in truth]
+        nearest = min(errors, key=lambda each: float(each.max()))
+        traces.append(curve(along, nearest * 1e3, "true error", TRUTH, width=2))
+    layout = {
+        "xaxis": {"title": {"text": "along the seam [mm]"}},
+        "yaxis": {"title": {"text": "across it [mm]"}, "rangemode": "tozero"},
+        "legend": {"orientation": "h", "x": 0, "y": 1, "yanchor": "bottom"},
+        "margin": {"l": 60, "r": 10, "t": 10, "b": 50},
+        "showlegend": True,
+    }
+    return {"data": traces, "layout": layout}
+
+
+def _facts(seam: t.Seam, facts: Facts) -> list[tuple[str, str]]:
+    rows = [("From", seam.source), ("Length", f"{millimetres(float(seam.arc_length[-1]))} mm")]
+    if seam.half_angle is not None:
+        rows.append(("Half angle of the groove", f"{np.degrees(seam.half_angle):.1f}°"))
+    if seam.half_width is not None:
+        rows.append(("Half width of the groove", f"{millimetres(seam.half_width)} mm"))
+    rows += [(name, f"{value:.4g}") for name, value in seam.figures.items()]
+    told = facts.result.seam
+    if told and told.truth:
+        error = f"{millimetres(told.truth.rms)} mm rms, {millimetres(told.truth.max)} mm at most"
+        rows.append(("True error, of the simulation", error))
+        rows.append(("Points whose tube holds the true seam", f"{told.truth.inside:.0%}"))
+    return rows

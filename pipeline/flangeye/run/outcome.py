@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import time
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -17,7 +20,6 @@ from flangeye.models.robots import RobotModel
 from flangeye.models.workspace import work_of
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import Recipe
-from flangeye.run.stopwatch import Stopwatch
 
 
 @dataclass
@@ -149,3 +151,43 @@ def _provenance(outcome: Outcome, recipe: Recipe, registry: Registry) -> r.Prove
         seed=recipe.header.seed,
         notes=t.records_of([*recipe.notes, *outcome.source.notes, *_notes(outcome)]),
     )
+
+
+class Stopwatch:
+    """Exclusive time per label: while an inner step runs, the outer one stands still.
+
+    Attributes:
+        seconds: By label.
+        calls: By label.
+        idle: By label, share of the time in which an arm had nothing to do; None without an arm.
+    """
+
+    def __init__(self) -> None:
+        self.seconds: defaultdict[str, float] = defaultdict(float)
+        self.calls: Counter[str] = Counter()
+        self.idle: dict[str, float | None] = {}
+        self._running: list[str] = []
+        self._since: float  # when time was charged last
+
+    @contextmanager
+    def timing(self, label: str) -> Iterator[None]:
+        """Charge the time inside to ``label``."""
+        self._charge()
+        self._running.append(label)
+        self.calls[label] += 1
+        try:
+            yield
+        finally:
+            self._charge()
+            self._running.pop()
+
+    def add(self, label: str, seconds: float) -> None:
+        """Charge what was done meanwhile, on another core, to ``label``."""
+        self.calls[label] += 1
+        self.seconds[label] += seconds
+
+    def _charge(self) -> None:
+        now = time.perf_counter()
+        if self._running:
+            self.seconds[self._running[-1]] += now - self._since
+        self._since = now

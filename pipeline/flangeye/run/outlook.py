@@ -10,8 +10,7 @@ import numpy as np
 from flangeye import types as t
 from flangeye.errors import FlangeyeError
 from flangeye.log.read import RunLog
-from flangeye.models.coverage import Coverage, coverage_of
-from flangeye.models.workspace import workspace_of
+from flangeye.models.workspace import Coverage, coverage_of, workspace_of
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import Recipe
 from flangeye.run.recorded import recipe_of_log

@@ -28,9 +28,8 @@ from flangeye.recipe.load import Recipe
 from flangeye.recipe.steps import Step, bare
 from flangeye.result import Result, calibrated_pose, require_one
 from flangeye.run.ahead import Done, cores, worked_ahead
-from flangeye.run.outcome import Outcome, Truths, result_of
+from flangeye.run.outcome import Outcome, Stopwatch, Truths, result_of
 from flangeye.run.restart import FromNothing
-from flangeye.run.stopwatch import Stopwatch
 
 
 class Runner:

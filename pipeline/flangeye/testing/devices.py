@@ -27,11 +27,16 @@ from flangeye.devices import (
     TactileSensor,
     WeldProfile,
 )
-from flangeye.files.bundled import bundled
+from flangeye.files.paths import bundled
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
-from flangeye.testing.base import Conformance
-from flangeye.testing.judge import require, require_close, require_one_line, require_round_trip
+from flangeye.testing.base import (
+    Conformance,
+    require,
+    require_close,
+    require_one_line,
+    require_round_trip,
+)
 from flangeye.testing.sources import logged
 
 _One = TypeVar("_One")

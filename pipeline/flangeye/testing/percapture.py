@@ -8,8 +8,8 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from flangeye.models.targets import Flange, Sphere
-from flangeye.testing.base import Conformance
-from flangeye.testing.judge import (
+from flangeye.testing.base import (
+    Conformance,
     require,
     require_close,
     require_covariance,

@@ -11,8 +11,8 @@ import numpy as np
 
 from flangeye import types as t
 from flangeye.maths.geometry import kabsch, kabsch_covariance, rigid, rotation_exp
-from flangeye.testing.base import Conformance
-from flangeye.testing.judge import (
+from flangeye.testing.base import (
+    Conformance,
     require,
     require_close,
     require_covariance,

@@ -17,8 +17,8 @@ from flangeye.log.record import Recorder
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.maths.kinematics import Arm
 from flangeye.motion.planning import Site
-from flangeye.testing.base import Conformance
-from flangeye.testing.judge import (
+from flangeye.testing.base import (
+    Conformance,
     only,
     plain,
     require,

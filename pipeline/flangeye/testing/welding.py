@@ -8,8 +8,8 @@ import numpy as np
 
 from flangeye import types as t
 from flangeye.motion.seam_following import Command, FollowingTask, Phase, ToolPose, Touch
-from flangeye.testing.base import Conformance
-from flangeye.testing.judge import (
+from flangeye.testing.base import (
+    Conformance,
     require,
     require_covariance,
     require_repeats,
@@ -17,6 +17,9 @@ from flangeye.testing.judge import (
     require_type,
 )
 from flangeye.testing.solving import CAMERA, WORK, observed, reference_solution, work_points
+
+PERIOD = 8e-3
+"""Between two cycles of a controller [s]."""
 
 
 def verified() -> t.VerifiedHandEye:
@@ -89,10 +92,6 @@ class WeldConformance(OnceConformance):
 
     kind = "weld"
     gives = t.WeldReport
-
-
-PERIOD = 8e-3
-"""Between two cycles of a controller [s]."""
 
 
 def straight_task() -> FollowingTask:

@@ -39,7 +39,7 @@ from flangeye_emulators.acquire.planned_session import (
 )
 from flangeye_emulators.world import materials
 from flangeye_emulators.world.cell import SimulatedCell
-from flangeye_emulators.world.flange_mesh import flange_mesh
+from flangeye_emulators.world.mesh import flange_mesh
 from flangeye_emulators.world.raycast import Body
 from flangeye_emulators.world.scanner import ScannerQuality, before_camera, scanner_of
 from flangeye_emulators.world.session import (

@@ -21,12 +21,11 @@ from flangeye.errors import FlangeyeError
 from flangeye.files.elsewhere import is_this_machine
 from flangeye.models.emulator import EmulatorOptions
 from flangeye.types import Floats
-from flangeye_emulators.controllers.arm import SimulatedArm
+from flangeye_emulators.controllers.arm import SimulatedArm, starting_joints
 from flangeye_emulators.controllers.client import PORT
 from flangeye_emulators.controllers.compliance import Surface
 from flangeye_emulators.controllers.fault_injection import FaultInjector, Schedule, parse_fault
 from flangeye_emulators.controllers.network import LineConnection, Network
-from flangeye_emulators.controllers.start import starting_joints
 
 KEPT = 60_000
 """Lateness is kept for so many cycles: two minutes at 500 Hz."""

@@ -11,9 +11,8 @@ from flangeye.errors import StageError
 from flangeye.plugin.stage import part
 from flangeye.types import Seed
 from flangeye_emulators.finger.sensor import SimulatedFinger
-from flangeye_emulators.weld_world.clock import Shutter
 from flangeye_emulators.weld_world.settings import LookTruth
-from flangeye_emulators.weld_world.world import WeldWorld
+from flangeye_emulators.weld_world.world import Shutter, WeldWorld
 
 
 class SimulatedProfiler(Device):

@@ -18,10 +18,9 @@ from flangeye.motion.seam_following import ToolPose
 from flangeye.plugin.stage import Params, part
 from flangeye.types import Floats, Image, Seed, Transform
 from flangeye.units import Angle, Duration, Length, param
-from flangeye_emulators.weld_world.clock import Shutter
 from flangeye_emulators.weld_world.groove import Section, Tip
 from flangeye_emulators.weld_world.settings import GapParams, ToolFile, ToolPath, WorldParams
-from flangeye_emulators.weld_world.world import Nominal, WeldWorld
+from flangeye_emulators.weld_world.world import Nominal, Shutter, WeldWorld
 from flangeye_emulators.world import room
 from flangeye_plugins.weld.corners import corners_of
 from flangeye_plugins.weld.frame import Tool, WorkPlane

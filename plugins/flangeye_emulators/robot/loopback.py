@@ -12,8 +12,7 @@ from pydantic import Field
 
 from flangeye.devices import Device, DeviceError, Robot, RobotState
 from flangeye.errors import FlangeyeError
-from flangeye.files.children import python_command
-from flangeye.files.load import busy
+from flangeye.files.processes import busy, python_command
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.stage import BoundPart, Choose, Params, part
 from flangeye.types import Floats, Transform

@@ -9,10 +9,14 @@ from flangeye.models.robots import RobotModel
 from flangeye.plugin.stage import Params, part
 from flangeye.types import BASE, FLANGE, TOOL, Floats, Transform
 from flangeye.units import Angle, AngularSpeed, Duration, param
-from flangeye_emulators.controllers.arm import MotionFault, SimulatedArm
+from flangeye_emulators.controllers.arm import (
+    MotionFault,
+    SimulatedArm,
+    joint_zeros,
+    starting_joints,
+)
 from flangeye_emulators.controllers.motion import joint_move, linear_move
 from flangeye_emulators.controllers.mover import Mover, Plan
-from flangeye_emulators.controllers.start import joint_zeros, starting_joints
 from flangeye_emulators.world import room
 
 

@@ -14,21 +14,26 @@ from flangeye.models.targets import Flange, Sphere
 from flangeye.motion.clearance import ArmVolume
 from flangeye.types import Floats
 from flangeye_emulators.world import materials
-from flangeye_emulators.world.flange_mesh import flange_mesh, wrist_mesh
 from flangeye_emulators.world.mesh import (
     COARSE,
     Mesh,
     box,
     capsule,
     circle,
+    flange_mesh,
     lathe,
     merged,
     region,
+    wrist_mesh,
 )  # fmt: skip
 from flangeye_emulators.world.raycast import Body
 
 SEGMENTS = 360
 """Of the sphere's circles: at a radius of 20 mm its facets are within 1 um of its surface."""
+
+
+DECOY = 1.15
+"""Radii of the disc on the stand over those of the flange: near, and not to be taken for it."""
 
 
 @lru_cache(maxsize=8)
@@ -46,10 +51,6 @@ def stub_mesh(sphere: Sphere) -> Mesh:
     x, y, z = sphere.centre_in_flange
     # Radius of the stub over that of the sphere
     return capsule(np.array([x, y, 0.0]), np.array([x, y, z]), 0.25 * sphere.radius, COARSE)
-
-
-DECOY = 1.15
-"""Radii of the disc on the stand over those of the flange: near, and not to be taken for it."""
 
 
 @dataclass(frozen=True, eq=False)

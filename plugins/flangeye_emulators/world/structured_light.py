@@ -8,10 +8,9 @@ import numpy as np
 
 from flangeye.models.scanners import ScannerModel
 from flangeye.types import Mask
-from flangeye_emulators.world import edges
-from flangeye_emulators.world.distortion import Distortion
-from flangeye_emulators.world.edges import correlated_normal, normal_quantile
+from flangeye_emulators.world import scan_errors
 from flangeye_emulators.world.raycast import Hits, Image, Scene, bands, pixels_of, through
+from flangeye_emulators.world.scan_errors import Distortion, correlated_normal, normal_quantile
 
 FAINTEST = 0.012
 """Least share of the light that a point must return, of what a white surface at mid range and
@@ -86,9 +85,9 @@ class StructuredLight:
         measured = self._illuminated(scene, hits.depth)
         grain = correlated_normal(hits.depth.shape, self._grain, rng)
         width = hits.depth * np.float32(self.pixels.size)
-        beside = edges.steps(hits.depth, width)
-        distance = edges.distance_within(self._reach, beside)
-        depth = edges.rounded(hits.depth, width, self._grain)
+        beside = scan_errors.steps(hits.depth, width)
+        distance = scan_errors.distance_within(self._reach, beside)
+        depth = scan_errors.rounded(hits.depth, width, self._grain)
         to_light = hits.facing(self.projector)
         for rows in bands(depth.shape):
             view = self._view(scene, hits, to_light, rows)
@@ -98,7 +97,7 @@ class StructuredLight:
             sigma = self._depth_noise(view, distance[rows])
             depth[rows] += sigma * grain[rows]
             depth[rows] += self._distortion.depth_error(depth[rows], rows)
-        edges.fly(depth, beside & measured, rng)
+        scan_errors.fly(depth, beside & measured, rng)
         np.copyto(depth, np.float32(np.nan), where=~measured)
         return self._distortion.points(depth)
 
@@ -165,7 +164,7 @@ class StructuredLight:
         patchy, ragged = grains
         measured &= view.cosine > GRAZING
         measured &= view.strength * (1 + np.float32(0.3) * patchy) > FAINTEST
-        measured &= ~edges.lost(distance, self.scanner.edge_loss, ragged)
+        measured &= ~scan_errors.lost(distance, self.scanner.edge_loss, ragged)
         at = np.flatnonzero(measured & (view.dazzled > 0.01))
         measured.ravel()[at] = patchy.ravel().take(at) > normal_quantile(
             view.dazzled.ravel().take(at)

@@ -6,10 +6,9 @@ import numpy as np
 
 from flangeye.models.scanners import ScannerModel
 from flangeye.types import Mask
-from flangeye_emulators.world import edges
-from flangeye_emulators.world.distortion import Distortion
-from flangeye_emulators.world.edges import correlated_normal, normal_quantile
+from flangeye_emulators.world import scan_errors
 from flangeye_emulators.world.raycast import Hits, Image, Scene, pixels_of
+from flangeye_emulators.world.scan_errors import Distortion, correlated_normal, normal_quantile
 
 FLOOR = 0.3
 """Share of the noise that does not depend on the distance; the rest grows with its square."""
@@ -53,9 +52,11 @@ class TimeOfFlight:
         cosine = np.abs(hits.slant) / self._length
         strength = scene.figure("albedo", hits.body) * cosine * (self._middle / depth) ** 2
         grain = correlated_normal(depth.shape, self._grain, rng)
-        distance = edges.distance_to(edges.steps(depth, depth * np.float32(self.pixels.size)))
+        distance = scan_errors.distance_to(
+            scan_errors.steps(depth, depth * np.float32(self.pixels.size))
+        )
         measured = self._measured(scene, hits, cosine, strength, grain)
-        measured &= ~edges.lost(distance, self.scanner.edge_loss, grain[:, ::-1])
+        measured &= ~scan_errors.lost(distance, self.scanner.edge_loss, grain[:, ::-1])
         depth = _mixed(depth, strength)
         depth += self._error(scene, hits, depth, strength, distance) / self._length
         depth += self._sigma(scene, hits, depth, strength) / self._length * grain

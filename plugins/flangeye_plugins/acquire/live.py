@@ -31,8 +31,8 @@ from flangeye.models.scanners import ScannerModel
 from flangeye.models.targets import Flange
 from flangeye.motion.arm import WatchedArm, watched
 from flangeye.motion.limits import MotionLimits, limits_of
+from flangeye.motion.planning import read_state
 from flangeye.motion.reach import Margins
-from flangeye.motion.reading import read_state
 from flangeye.motion.route import Barred, Leg, Route
 from flangeye.motion.supervision import Sample
 from flangeye.plugin.stage import BoundPart, Choose, Params, stage
@@ -54,6 +54,8 @@ from flangeye.types import (
 )
 from flangeye.units import Angle, JointPosition, Length, param
 from flangeye_plugins.acquire.itinerary import Itinerary, Stop, itinerary_of
+
+HOW_TO_MOVE = "dry run, nothing moved; add --move to execute"
 
 
 class Idle:
@@ -82,9 +84,6 @@ class Idle:
         """Share of the session up to the last exposure; None before there was one."""
         whole = self._stands_since - self._began
         return self._idle / whole if whole > 0 else None
-
-
-HOW_TO_MOVE = "dry run, nothing moved; add --move to execute"
 
 
 class LiveParams(Params):

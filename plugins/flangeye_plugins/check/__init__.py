@@ -5,10 +5,8 @@ from flangeye_plugins.check.motion import motion
 from flangeye_plugins.check.order import clock, order
 from flangeye_plugins.check.outliers import flips, outlier
 from flangeye_plugins.check.pose_conventions import convention, direction, exchanged, mirrored
-from flangeye_plugins.check.rounding import rounding
-from flangeye_plugins.check.size import size
 from flangeye_plugins.check.stale import identity, repeated
-from flangeye_plugins.check.units import units
+from flangeye_plugins.check.units import rounding, size, units
 
 CHECKS = (
     identity,

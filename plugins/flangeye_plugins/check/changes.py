@@ -10,11 +10,9 @@ from flangeye import part
 from flangeye.doctor.diagnosis import Finding, Findings, NotApplicable, RecordedSession
 from flangeye.maths.pose_corrections import without_tool
 from flangeye.types import Floats
-from flangeye_plugins.check.as_recorded import fit_of
 from flangeye_plugins.check.equations import equations_of
-from flangeye_plugins.check.fitting import VariantFits, fit
-from flangeye_plugins.check.held_out import moved_helps
-from flangeye_plugins.check.significance import Significance, best_of, exceedance
+from flangeye_plugins.check.fitting import VariantFits, fit, fit_of
+from flangeye_plugins.check.significance import Significance, best_of, exceedance, moved_helps
 
 SPARE = 2
 """Samples on each side of a move beyond those that a calibration takes up."""

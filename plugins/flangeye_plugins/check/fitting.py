@@ -10,14 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
-from flangeye.doctor.diagnosis import Misfit
+from flangeye.doctor.diagnosis import Arms, Misfit, RecordedSession
 from flangeye.maths.geometry import hat, rotation_exp
 from flangeye.types import Floats
-from flangeye_plugins.check.equations import Equations
+from flangeye_plugins.check.equations import Equations, equations_of
 from flangeye_plugins.check.starts import VariantUnknowns, start_of
 
 TAILS = 4.0
@@ -271,3 +272,16 @@ def log_of(rotations: Floats) -> Floats:
     direction = np.where(length > 1e-9, twice_sine_axis / np.maximum(length, 1e-9), away)
     small = 0.5 * twice_sine_axis
     return np.asarray(np.where(angle < 1e-6, small, angle * direction))
+
+
+@lru_cache(maxsize=2)
+def fit_of(session: RecordedSession) -> VariantFits:
+    """Return the best calibration of a session as it is; a session is known by its identity."""
+    return fit(equations_of(session))
+
+
+def named(arms: Arms, session: RecordedSession) -> str:
+    """Return whose poses, as messages call them."""
+    if session.seconds is None:
+        return "the robot's"
+    return {"both": "both arms'", "first": "the first arm's", "second": "the second arm's"}[arms]

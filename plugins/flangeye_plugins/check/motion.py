@@ -8,9 +8,8 @@ from flangeye import part
 from flangeye.doctor.diagnosis import Finding, Findings, RecordedSession
 from flangeye.maths.geometry import hat
 from flangeye.types import Floats
-from flangeye_plugins.check.as_recorded import fit_of
 from flangeye_plugins.check.equations import equations_of
-from flangeye_plugins.check.fitting import VariantFits, fit, log_of
+from flangeye_plugins.check.fitting import VariantFits, fit, fit_of, log_of
 
 TURN = np.radians(2.0)
 """Uncertainty of the camera's rotation that is no answer (one sigma) [rad]."""

@@ -15,8 +15,7 @@ from flangeye.maths.streams import later, pose_at
 from flangeye.types import Floats, Mask
 from flangeye_plugins.check.equations import equations_of
 from flangeye_plugins.check.fitting import fit
-from flangeye_plugins.check.held_out import helps
-from flangeye_plugins.check.significance import Significance, best_of
+from flangeye_plugins.check.significance import Significance, best_of, helps
 
 SHIFTS = (1, -1, 2, -2, 3, -3)
 FEWEST = 5
@@ -29,6 +28,11 @@ Change = Callable[[Floats], tuple[Floats, Mask]]
 """Gives poses (N, 4, 4), and the samples (N,) that have one."""
 Later = Callable[[float], tuple[Floats, Mask]]
 """Gives an arm's poses after a delay [s], and the samples that have one."""
+
+
+_OF: dict[Arms, str] = {
+    "both": "both arms", "first": "the first arm", "second": "the second arm",
+}  # fmt: skip
 
 
 class Alternative(NamedTuple):
@@ -57,11 +61,6 @@ def order(session: RecordedSession) -> Findings:
     if not helps(session.where(others[evidence.which].known), corrected_session):
         return
     yield evidence.finding("shifted poses", what, corrected_session)
-
-
-_OF: dict[Arms, str] = {
-    "both": "both arms", "first": "the first arm", "second": "the second arm",
-}  # fmt: skip
 
 
 def _shifts(session: RecordedSession) -> Iterator[tuple[Arms, int, int]]:

@@ -10,9 +10,8 @@ from flangeye import part
 from flangeye.doctor.diagnosis import Findings, NotApplicable, RecordedSession
 from flangeye.maths.geometry import rotation_exp
 from flangeye.types import Floats
-from flangeye_plugins.check.as_recorded import fit_of
 from flangeye_plugins.check.equations import equations_of
-from flangeye_plugins.check.fitting import VariantFits, fit
+from flangeye_plugins.check.fitting import VariantFits, fit, fit_of
 from flangeye_plugins.check.significance import Significance, best_of, exceedance, negligible
 
 FLIPS: dict[str, Floats] = {

@@ -21,11 +21,9 @@ from flangeye.doctor.diagnosis import (
 from flangeye.maths.pose_corrections import inverted, reread, transposed
 from flangeye.maths.pose_formats import CONVENTIONS, EULER_ORDERS, PLAIN, written
 from flangeye.models.configuration import looks_exchanged
-from flangeye_plugins.check.as_recorded import fit_of, named
 from flangeye_plugins.check.equations import equations_of
-from flangeye_plugins.check.fitting import fit
-from flangeye_plugins.check.held_out import explained, helps
-from flangeye_plugins.check.significance import Significance, best_of
+from flangeye_plugins.check.fitting import fit, fit_of, named
+from flangeye_plugins.check.significance import Significance, best_of, explained, helps
 
 QUATERNIONS = ("xyzw", "wxyz")
 COMMON = ("vector", "ZYX", "xyz", "XYZ", "zyx", "ZYZ", "zyz", "ZXZ")
@@ -37,6 +35,28 @@ NAMES = {
     "xyz": "roll, pitch, yaw or Fanuc's W, P, R (xyz about fixed axes)",
     "XYZ": "angles XYZ about turned axes", "ZYZ": "angles ZYZ about turned axes",
 }  # fmt: skip
+
+_CARRIED = {"target": ("marker", "camera"), "camera": ("camera", "marker")}
+
+LENS = np.radians(60)
+"""No lens of a scanner or depth camera sees further from its axis; Azure Kinect's, wide."""
+
+_MOUNTED_OTHERWISE: Mapping[str, tuple[str, str]] = {
+    "target": ("in the hand", "eye-in-hand"),
+    "camera": ("beside the robot", "eye-on-base"),
+}
+"""By what the recipe says the arm carries: where the camera then is, and how to say so."""
+
+_WAYS: Mapping[str, tuple[Change, str]] = {
+    "inverted": (
+        inverted,
+        "poses are flange_T_base (or the camera is carried the other way round)",
+    ),
+    "transposed": (
+        transposed,
+        "rotations are transposed: matrices were stored column by column",
+    ),
+}
 
 
 class Reading(NamedTuple):
@@ -243,9 +263,6 @@ def mirrored(session: RecordedSession) -> Findings:
         yield evidence.finding("mirrored axis", what, found.read_with(target_mirrored=axis))
 
 
-_CARRIED = {"target": ("marker", "camera"), "camera": ("camera", "marker")}
-
-
 def _distances(session: RecordedSession) -> tuple[float, float]:
     """Return how far from the flange the one is, and from the base the other [m]."""
     found = fit_of(session).unknowns
@@ -275,15 +292,6 @@ def _transposed_markers(session: RecordedSession) -> Iterator[tuple[RecordedSess
     yield alone.read_with(target_transposed=True), "the markers'", "transposed"
     both = alone.corrected(transposed, transposed=True, target_transposed=True)
     yield both, "robot's and markers'", "transposed"
-
-
-LENS = np.radians(60)
-"""No lens of a scanner or depth camera sees further from its axis; Azure Kinect's, wide."""
-_MOUNTED_OTHERWISE: Mapping[str, tuple[str, str]] = {
-    "target": ("in the hand", "eye-in-hand"),
-    "camera": ("beside the robot", "eye-on-base"),
-}
-"""By what the recipe says the arm carries: where the camera then is, and how to say so."""
 
 
 def _may_be_mounted_otherwise(session: RecordedSession) -> bool:
@@ -340,15 +348,3 @@ def _inverted_marker(session: RecordedSession, evidence: Significance) -> Findin
         f"{np.degrees(_off_axis(session)):.0f} deg from the camera's axis"
     )
     return evidence.finding("inverted marker", what, _marker_inverted(session))
-
-
-_WAYS: Mapping[str, tuple[Change, str]] = {
-    "inverted": (
-        inverted,
-        "poses are flange_T_base (or the camera is carried the other way round)",
-    ),
-    "transposed": (
-        transposed,
-        "rotations are transposed: matrices were stored column by column",
-    ),
-}

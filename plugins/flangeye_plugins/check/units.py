@@ -9,14 +9,19 @@ from typing import NamedTuple
 import numpy as np
 
 from flangeye import part
-from flangeye.doctor.diagnosis import CERTAIN, Arms, Finding, Findings, RecordedSession
+from flangeye.doctor.diagnosis import (
+    CERTAIN,
+    Arms,
+    Finding,
+    Findings,
+    NotApplicable,
+    RecordedSession,
+)
 from flangeye.maths.pose_corrections import scaled
 from flangeye.types import Floats
-from flangeye_plugins.check.as_recorded import fit_of, named
 from flangeye_plugins.check.equations import equations_of
-from flangeye_plugins.check.fitting import fit
-from flangeye_plugins.check.held_out import helps
-from flangeye_plugins.check.significance import Significance, best_of
+from flangeye_plugins.check.fitting import VariantFits, fit, fit_of, named
+from flangeye_plugins.check.significance import Significance, best_of, exceedance, explained, helps
 
 UNITS: Mapping[str, float] = {
     "mm": 1e-3, "cm": 1e-2, "inches": 25.4e-3, "feet": 0.3048, "um": 1e-6,
@@ -29,6 +34,19 @@ AGREE = 0.05
 """Share of the arm's distance by which arm and target differ where they agree."""
 ARMS = (0.1, 4.0)
 """Median distance of a flange from its base [m], from the smallest arm to the largest."""
+
+
+NEGLIGIBLE_SCALE = 5e-3
+"""A printer is no better, and nobody measures a marker with less care."""
+
+STEPS = (0.1, 1e-2, 1e-3, 1e-4, 1e-5)
+"""Last decimals of positions in metres, millimetres and so on [m]."""
+
+WHOLE = 1e-3
+"""By what share of the step a position may miss a multiple of it."""
+
+SHARE = 0.5
+"""Rounding to a step moves a place by half of it, rms; this share of the limit is too much."""
 
 
 class Alternative(NamedTuple):
@@ -187,3 +205,69 @@ def _outside(distance: float, allowed: tuple[float, float]) -> float:
 
 def _number(factor: float) -> float:
     return float(f"{factor:.10g}")
+
+
+@part("check.size")
+def size(session: RecordedSession) -> Findings:
+    """The marker's distances are all too long or too short by one factor: its size is wrong."""
+    session.require_samples()
+    if not np.isfinite(session.rotations).any():
+        raise NotApplicable("no marker's whole pose was measured")
+    null = fit_of(session)
+    factor = _factor(session, null)
+    if not 0.2 < factor < 5:
+        return
+    corrected_session = replace(session, centres=session.centres * factor)
+    found = fit_of(corrected_session)
+    evidence = best_of(null, found, 1)
+    ratio, count = float(found.likelihood[0] - null.likelihood[0]), float(null.count[0])
+    effect = abs(np.log(factor)) / NEGLIGIBLE_SCALE
+    p = exceedance(ratio, count, 1, count - found.parameters - 1, effect)
+    if p < 1 and explained(corrected_session):
+        what = f"the marker is {factor:.4f} times as large as the recipe says"
+        fix = f"measure it after printing: its lengths in the fit step times {factor:.4f}"
+        if session.acquire == "acquire.samples":
+            fix = session.read_with(target_scale=float(f"{factor:.4f}")).step()
+        evidence = evidence._replace(probability=p)
+        yield evidence.finding("target size", what, corrected_session, fix)
+
+
+def _factor(session: RecordedSession, null: VariantFits) -> float:
+    """Return by how much the marker's positions must grow; linear once the rotations are known."""
+    seen, equations = session.seen, equations_of(session)
+    turned = session.centres[seen] @ null.unknowns.rotation[0].T
+    mounts = equations.carried(null.unknowns.other)[0][seen]
+    eye = np.broadcast_to(np.eye(3), (len(turned), 3, 3))
+    parts, right = [turned[..., None], eye, -mounts[:, :3, :3]], mounts[:, :3, 3]
+    if equations.bases is not None:
+        # The second arm's base moves too: what it is now comes off, and is found again.
+        bases = equations.bases[0, seen, :3, :3]
+        parts.append(-bases)
+        right = right - (bases @ null.unknowns.other[0, :3, 3])
+    rows = np.concatenate(parts, axis=-1).reshape(len(right) * 3, -1)
+    return float(np.linalg.lstsq(rows, right.ravel(), rcond=1e-10)[0][0])
+
+
+@part("check.rounding")
+def rounding(session: RecordedSession) -> Findings:
+    """Positions are rounded as coarsely as the error that the recipe asks for."""
+    seen = session.centres[session.seen]
+    for whose, places in (("the arm", session.poses[:, :3, 3]), ("the target", seen)):
+        step = _step(places)
+        if step is not None and step / 2 >= SHARE * session.limit:
+            what = (
+                f"positions of {whose} are whole multiples of {1e3 * step:g} mm, and the recipe "
+                f"asks for {1e3 * session.limit:g} mm; if they were rounded, that alone is "
+                f"{1e3 * step / 2:.2g} mm"
+            )
+            fix = f"write positions with {1 + round(-np.log10(step))} or more decimals of a metre"
+            yield Finding("rounded", what, fix, note=True)
+
+
+def _step(places: Floats) -> float | None:
+    """Return the coarsest step [m] that all coordinates are multiples of; None for none."""
+    for step in STEPS:
+        multiples = places / step
+        if len(places) and np.abs(multiples - np.round(multiples)).max() < WHOLE:
+            return step
+    return None

@@ -17,8 +17,7 @@ from flangeye.maths.geometry import rigid
 from flangeye.models.finger import Calibration, Finger
 from flangeye.models.model import read_model
 from flangeye.models.robots import RobotModel
-from flangeye.motion.executor import Executor
-from flangeye.motion.leading import led
+from flangeye.motion.executor import Executor, led
 from flangeye.motion.limits import MotionLimits, limits_of
 from flangeye.plugin.stage import part
 from flangeye.recipe.guide import Recipe

@@ -27,11 +27,14 @@ from flangeye.models.robots import RobotModel, joints_in_order
 from flangeye.types import FLANGE, Floats, Motion
 from flangeye.units import param
 from flangeye_plugins.reader.pairing import Pair, PairingParams, Signal, pair
-from flangeye_plugins.reader.ros2_frames import Frames, Stream, in_order, pose_of
 from flangeye_plugins.reader.ros2_messages import (
+    Frames,
     Raw,
+    Stream,
     bag_files,
+    in_order,
     messages,
+    pose_of,
     save_cloud,
     save_image,
     scratch,

@@ -17,10 +17,9 @@ from typing import Any, NamedTuple, TypeVar
 
 from flangeye.devices import Device, DeviceError
 from flangeye.errors import StageError
-from flangeye.files.children import python_command
-from flangeye.files.load import busy
 from flangeye.files.machine import find_named, settings_file
 from flangeye.files.pipe import Pipe, PipeEndedError
+from flangeye.files.processes import busy, python_command
 from flangeye.models.graph import Topic
 from flangeye_plugins.ros2.messages import CLOCK, CLOCK_TYPE, stamp_of, types
 

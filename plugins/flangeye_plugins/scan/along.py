@@ -11,8 +11,7 @@ from flangeye.errors import NothingMoved
 from flangeye.maths.geometry import invert, rigid, rotation_from_rpy
 from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import RobotModel
-from flangeye.motion.executor import Executor
-from flangeye.motion.leading import led
+from flangeye.motion.executor import Executor, led
 from flangeye.motion.limits import MotionLimits, limits_of
 from flangeye.motion.route import Barred, Route, Router
 from flangeye.recipe.header import LimitsSection

@@ -17,11 +17,11 @@ import numpy as np
 from pydantic import Field
 
 from flangeye.devices import PATIENCE, DeviceError, FrameDropped, Scan, Scanner
-from flangeye.files.children import python_command
 from flangeye.files.machine import MachineName, find_named, require_named
 from flangeye.files.machine import settings_file as machine_settings
 from flangeye.files.paths import RecipePath
 from flangeye.files.pipe import Pipe, PipeEndedError
+from flangeye.files.processes import python_command
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import Params, part
 from flangeye.units import Duration, param

@@ -55,12 +55,10 @@ def segment_flange(
     Raises:
         StageError: The cloud is in millimetres, or otherwise a thousand times off.
     """
-    from flangeye_plugins.segment.choice import choose
-    from flangeye_plugins.segment.crop import crop
-    from flangeye_plugins.segment.discs import DiscLimits
+    from flangeye_plugins.segment.discs import DiscLimits, crop
     from flangeye_plugins.segment.grid import coarse_view
     from flangeye_plugins.segment.scale import check_scale
-    from flangeye_plugins.segment.search import find_discs
+    from flangeye_plugins.segment.search import choose, find_discs
 
     view = coarse_view(capture.cloud.xyz, flange.rim / 15)
     if view is None:

@@ -10,7 +10,7 @@ from flangeye import Params, stage
 from flangeye.models.targets import Sphere
 from flangeye.types import Capture, FlangeCloud, Floats, Indices, PointCloud, Rejected, Singles
 from flangeye.units import Length, param
-from flangeye_plugins.segment.crop import in_box
+from flangeye_plugins.segment.discs import in_box
 from flangeye_plugins.segment.grid import Grid, coarse_view
 from flangeye_plugins.segment.scale import check_scale
 

@@ -24,8 +24,7 @@ from flangeye.devices import (
     WeldProfile,
 )
 from flangeye.errors import FlangeyeError
-from flangeye.files.children import keep_current_folder_out
-from flangeye.files.load import busy
+from flangeye.files.processes import busy, keep_current_folder_out
 from flangeye.types import Floats
 from flangeye_plugins.weld.finger_camera import (
     CameraJob,

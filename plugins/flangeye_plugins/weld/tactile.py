@@ -13,8 +13,7 @@ from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
 from flangeye.models.robots import RobotModel
 from flangeye.motion.arc import with_arc
-from flangeye.motion.executor import Executor
-from flangeye.motion.leading import led
+from flangeye.motion.executor import Executor, led
 from flangeye.motion.limits import limits_of
 from flangeye.motion.precedence import LEADING, precedence
 from flangeye.plugin.stage import stage

@@ -6,9 +6,8 @@ import numpy as np
 
 from flangeye.models.loading import load_model
 from flangeye_emulators.controllers.poses import pose_matrix, twist_between
-from flangeye_emulators.controllers.ur.controller import URController
+from flangeye_emulators.controllers.ur.controller import Runtime, URController
 from flangeye_emulators.controllers.ur.server import DONE, READY, CommandLoop
-from flangeye_emulators.controllers.ur.state import Runtime
 
 HOME = np.radians([0.0, -90.0, 90.0, -90.0, -90.0, 0.0])
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from flangeye_emulators.controllers.ur.state import Runtime, SafetyMode
+from flangeye_emulators.controllers.ur.controller import Runtime, SafetyMode
 from tests.emulators.controllers.desk import HOME, Desk, away
 
 MOVE_JOINTS, MOVE_STRAIGHT, SPEED_JOINTS, SPEED, SERVO, STOP_SPEED = 1, 3, 9, 10, 11, 15

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from flangeye_emulators.controllers.poses import pose_matrix, pose_vector
-from flangeye_emulators.controllers.ur.server import CustomProgram, run_program
-from flangeye_emulators.controllers.ur.state import Runtime
-from flangeye_emulators.controllers.ur.urscript import (
+from flangeye_emulators.controllers.ur.controller import Runtime
+from flangeye_emulators.controllers.ur.script import (
     ScriptSource,
     injected_path,
     register_offset,
     take_program,
 )
+from flangeye_emulators.controllers.ur.server import CustomProgram, run_program
 from tests.emulators.controllers.desk import HOME, Desk, away
 
 CONTROL_SCRIPT = """\

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flangeye_emulators.controllers.compliance import Surface
-from flangeye_emulators.controllers.ur.state import SafetyMode
+from flangeye_emulators.controllers.ur.controller import SafetyMode
 from tests.emulators.controllers.desk import Desk, away
 
 FORCE, STOP_FORCE, ZERO, MOVE, SPEED, UNTIL_CONTACT = 6, 7, 8, 3, 10, 51

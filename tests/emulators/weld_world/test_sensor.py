@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye.files.bundled import bundled
+from flangeye.files.paths import bundled
 from flangeye.maths.seam_geometry import torch_deviation
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model

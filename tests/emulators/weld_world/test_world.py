@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from flangeye.motion.seam_following import Command, ToolPose
-from flangeye_emulators.weld_world.clock import Shutter
 from flangeye_emulators.weld_world.groove import Contact, Groove, Tip
 from flangeye_emulators.weld_world.settings import (
     ArmTruth,
@@ -19,6 +18,7 @@ from flangeye_emulators.weld_world.world import (
     ArmError,
     ArmResponse,
     Distortion,
+    Shutter,
     TrueFinger,
     TrueTool,
     true_groove,

@@ -9,8 +9,7 @@ from flangeye.models.loading import load_model
 from flangeye.models.scanners import ScannerModel
 from flangeye.models.targets import Flange, plate_of
 from flangeye_emulators.world import materials
-from flangeye_emulators.world.flange_mesh import flange_mesh, wrist_mesh
-from flangeye_emulators.world.mesh import box
+from flangeye_emulators.world.mesh import box, flange_mesh, wrist_mesh
 from flangeye_emulators.world.raycast import Body, Scene
 
 SCANNER = load_model("scanners", "phoxi-m")

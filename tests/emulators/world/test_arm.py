@@ -10,8 +10,7 @@ from flangeye import StageError
 from flangeye.maths.kinematics import Arm
 from flangeye.models.configuration import ORIGIN, Configuration
 from flangeye.models.loading import load_model
-from flangeye.models.standards import load_standard
-from flangeye.models.targets import flange_of
+from flangeye.models.targets import flange_of, load_standard
 from flangeye.types import BASE, FLANGE, TARGET, Source, Transform, Truth
 from flangeye_emulators.acquire.planned_session import plan_session
 from flangeye_emulators.acquire.simulated import acquire_simulated

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye.files.bundled import bundled
+from flangeye.files.paths import bundled
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
 from flangeye.models.targets import plate_of

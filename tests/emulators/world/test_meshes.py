@@ -7,10 +7,19 @@ import pytest
 
 from flangeye import StageError
 from flangeye.models.loading import load_model
-from flangeye.models.standards import load_standard
-from flangeye.models.targets import flange_of
-from flangeye_emulators.world.flange_mesh import flange_mesh, recess_outline, wrist_mesh
-from flangeye_emulators.world.mesh import FINE, box, capsule, circle, disc, merged, region
+from flangeye.models.targets import flange_of, load_standard
+from flangeye_emulators.world.mesh import (
+    FINE,
+    box,
+    capsule,
+    circle,
+    disc,
+    flange_mesh,
+    merged,
+    recess_outline,
+    region,
+    wrist_mesh,
+)
 from tests.emulators.world.bench import flange
 
 

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from flangeye.maths.geometry import rigid, rotation_from_rpy
-from flangeye_emulators.world import edges, materials
-from flangeye_emulators.world.distortion import Distortion
-from flangeye_emulators.world.edges import correlated_normal, normal_quantile
+from flangeye_emulators.world import materials, scan_errors
 from flangeye_emulators.world.mesh import box
 from flangeye_emulators.world.raycast import Body, Scene, pixels_of
+from flangeye_emulators.world.scan_errors import Distortion, correlated_normal, normal_quantile
 from flangeye_emulators.world.structured_light import StructuredLight
 from tests.emulators.world.bench import (
     SCANNER,
@@ -195,7 +194,7 @@ def test_edges_lose_points_and_few_fly() -> None:
 def test_distances_near_steps_are_those_of_the_whole_image() -> None:
     marked = np.random.default_rng(3).random((150, 2000)) < 1e-4
     marked[-1, -1] = marked[0, 0] = True
-    whole, near = edges.distance_to(marked), edges.distance_within(9, marked)
+    whole, near = scan_errors.distance_to(marked), scan_errors.distance_within(9, marked)
     # All that noise looks at is exact; farther off, sums of steps are rounded by their order.
     assert np.array_equal(near[whole < 3], whole[whole < 3])
     assert np.abs(near - whole)[whole < 8].max() < 1e-6

@@ -4,8 +4,7 @@ import numpy as np
 
 from flangeye.maths.geometry import basis_of_plane
 from flangeye.models.loading import load_model
-from flangeye.models.standards import load_standard
-from flangeye.models.targets import Flange, flange_of
+from flangeye.models.targets import Flange, flange_of, load_standard
 from flangeye.types import CAMERA, FlangeCloud, PointCloud
 
 CENTRE = np.array([0.05, -0.03, 0.7])

@@ -9,7 +9,7 @@ from flangeye.errors import StageError
 from flangeye.maths.geometry import angle_between, rigid, rotation_from_rpy
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
-from flangeye_plugins.view.guess import GuessParams, ShownParams, view_guess, view_shown
+from flangeye_plugins.view import GuessParams, ShownParams, view_guess, view_shown
 
 ARM, SCANNER = Arm(load_model("robots", "ur5e")), load_model("scanners", "phoxi-m")
 EYE = np.array([0.55, 0.1, 1.05])

@@ -10,7 +10,7 @@ import pytest
 
 from flangeye.devices import DeviceError
 from flangeye.testing import ProfilerConformance
-from flangeye_plugins.profiler.tcp import LONGEST, TcpParams, TcpProfiler, profiler_tcp
+from flangeye_plugins.profiler import LONGEST, TcpParams, TcpProfiler, profiler_tcp
 
 LOCAL = "127.0.0.1"
 

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from flangeye import CalibrationRefused, StageError, part
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.models.loading import load_model
-from flangeye.models.standards import load_standard
-from flangeye.models.targets import flange_of
+from flangeye.models.targets import flange_of, load_standard
 from flangeye.plugin.stage import KINDS, Params
 from flangeye.types import (
     ArmCorrection,
@@ -29,7 +28,7 @@ from flangeye.types import (
     Views,
     by_frame,
 )
-from flangeye_plugins.error.errors import error_icp
+from flangeye_plugins.error import error_icp
 from flangeye_plugins.refine.compensate import (
     CompensateParams,
     compensated,

@@ -16,10 +16,9 @@ from types import SimpleNamespace
 import numpy as np
 
 from flangeye.models.loading import load_model
-from flangeye_emulators.controllers.arm import SimulatedArm
+from flangeye_emulators.controllers.arm import SimulatedArm, starting_joints
 from flangeye_emulators.controllers.motion import joint_move, linear_move
 from flangeye_emulators.controllers.mover import Mover
-from flangeye_emulators.controllers.start import starting_joints
 
 PANDA = load_model("robots", "franka-panda")
 JOINT_SPEED, JOINT_ACCELERATION = 2.0, 15.0

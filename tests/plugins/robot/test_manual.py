@@ -18,8 +18,8 @@ from flangeye.maths.kinematics import Arm
 from flangeye.maths.pose_formats import CONVENTIONS, AngleUnit
 from flangeye.models.loading import load_model
 from flangeye.types import Transform
-from flangeye_emulators.controllers.start import starting_joints
-from flangeye_plugins.robot.manual.driver import (
+from flangeye_emulators.controllers.arm import starting_joints
+from flangeye_plugins.robot.manual import (
     ManualParams,
     ManualRobot,
     OperatorConsole,
@@ -238,7 +238,7 @@ def test_a_pose_without_an_explanation_is_only_described() -> None:
 def test_piped_standard_input_works() -> None:
     code = (
         "from flangeye.models.loading import load_model\n"
-        "from flangeye_plugins.robot.manual.driver import ManualParams, robot_manual\n"
+        "from flangeye_plugins.robot.manual import ManualParams, robot_manual\n"
         "model = load_model('robots', 'aubo-i5')\n"
         "with robot_manual(model, ManualParams(convention='abb')) as robot:\n"
         "    print(robot.state().base_T_flange.translation.round(3).tolist())\n"

@@ -7,7 +7,7 @@ import numpy as np
 
 from flangeye.models.loading import load_model
 from flangeye.types import BASE, CAMERA, PointCloud, Transform, TransformEstimate, VerifiedHandEye
-from flangeye_emulators.scan.simulated import SimulatedScanParams, scan_simulated
+from flangeye_emulators.scan import SimulatedScanParams, scan_simulated
 from flangeye_emulators.world.scanner import CameraPose, before_camera, scanner_of
 from tools.workpieces import Plate, _description, write_stl
 

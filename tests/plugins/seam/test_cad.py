@@ -14,7 +14,7 @@ from flangeye.maths.seam_geometry import errors_from, tube_radii
 from flangeye.models.loading import load_model
 from flangeye.models.workpiece import load_workpiece
 from flangeye.types import CAMERA, Box, PointCloud, Seed, WorkpieceScan
-from flangeye_emulators.scan.simulated import SimulatedScanParams
+from flangeye_emulators.scan import SimulatedScanParams
 from flangeye_plugins.seam.cad import CadParams, seam_cad
 from tests.plugins.seam.scenes import BASE_T_CAMERA, hand_eye, scanned, write_plate
 from tools.workpieces import PLATES, _description
@@ -170,7 +170,7 @@ def test_the_seam_is_chosen_by_name(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("plate", PLATES, ids=lambda p: p.name)
 def test_the_shipped_workpieces_are_those_the_project_makes(plate: Any) -> None:
-    from flangeye.files.bundled import bundled
+    from flangeye.files.paths import bundled
 
     path = bundled("data") / "workpieces" / f"{plate.name}.yaml"
     assert path.read_text() == _description(plate)

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from flangeye.errors import StageError
 from flangeye.models.loading import load_model
-from flangeye.models.standards import load_standard
-from flangeye.models.targets import flange_of, wrist_circle_of
+from flangeye.models.targets import flange_of, load_standard, wrist_circle_of
 from flangeye.types import FlangeCloud, Rejected
 from flangeye_plugins.segment.flange import SegmentParams, segment_flange
 from tests.plugins.segment.scenes import ASIDE, CENTRE, Scene, capture, towards_scanner

@@ -5,8 +5,7 @@ import pytest
 
 from flangeye.maths.planes import Plane
 from flangeye_plugins.segment import grid
-from flangeye_plugins.segment.crop import crop, in_box
-from flangeye_plugins.segment.discs import Disc
+from flangeye_plugins.segment.discs import Disc, crop, in_box
 from flangeye_plugins.segment.grid import Grid, _drawn, _lots, coarse_view, project, range_image
 from flangeye_plugins.segment.grid import thin_out as thinned
 

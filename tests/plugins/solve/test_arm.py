@@ -16,8 +16,7 @@ from flangeye.models.cell import cell_of
 from flangeye.models.configuration import DEFAULT
 from flangeye.models.loading import load_model
 from flangeye.models.robots import RobotModel
-from flangeye.models.standards import load_standard
-from flangeye.models.targets import flange_of
+from flangeye.models.targets import flange_of, load_standard
 from flangeye.types import (
     BASE,
     CAMERA,

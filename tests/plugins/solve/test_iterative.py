@@ -22,7 +22,7 @@ from flangeye.types import (
     Views,
     by_frame,
 )
-from flangeye_plugins.cost.costs import (
+from flangeye_plugins.cost import (
     AxesParams,
     TranslationParams,
     WorkRadiusParams,
@@ -30,7 +30,7 @@ from flangeye_plugins.cost.costs import (
     cost_translation,
     cost_work_radius,
 )
-from flangeye_plugins.error.errors import error_holdout
+from flangeye_plugins.error import error_holdout
 from flangeye_plugins.solve.iterative import (
     IterativeParams,
     improve_pool,

@@ -19,8 +19,7 @@ from flangeye.maths.geometry import (
 )
 from flangeye.models.loading import load_model
 from flangeye.models.robots import FlangeDetails
-from flangeye.models.standards import load_standard
-from flangeye.models.targets import Flange
+from flangeye.models.targets import Flange, load_standard
 from flangeye.models.targets import flange_of as from_catalogue
 from flangeye.types import (
     BASE,
@@ -35,7 +34,7 @@ from flangeye.types import (
     VerificationView,
     Views,
 )
-from flangeye_plugins.error.errors import error_holdout, error_icp
+from flangeye_plugins.error import error_holdout, error_icp
 from flangeye_plugins.verify.icp import (
     CadCloud,
     Comparison,

@@ -3,7 +3,7 @@
 import numpy as np
 
 from flangeye.devices import MotionAllowed, RobotDriver
-from flangeye.files.bundled import bundled
+from flangeye.files.paths import bundled
 from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.models.loading import load_model
 from flangeye.models.workpiece import load_workpiece

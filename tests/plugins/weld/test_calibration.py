@@ -10,7 +10,7 @@ import pytest
 
 from flangeye.devices import SensorFrame
 from flangeye.errors import StageError
-from flangeye.files.bundled import bundled
+from flangeye.files.paths import bundled
 from flangeye.maths.geometry import nearest_rotation, rigid, rotation_exp
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model

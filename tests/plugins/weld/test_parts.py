@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flangeye.files.bundled import bundled
+from flangeye.files.paths import bundled
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.maths.seam_geometry import torch_deviation
 from flangeye.models.finger import Finger

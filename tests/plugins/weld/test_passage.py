@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flangeye.files.bundled import bundled
+from flangeye.files.paths import bundled
 from flangeye.maths.kinematics import Arm
 from flangeye.models.finger import Finger
 from flangeye.models.loading import load_model

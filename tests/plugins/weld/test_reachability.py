@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from flangeye.errors import StageError
-from flangeye.files.bundled import bundled
+from flangeye.files.paths import bundled
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
 from flangeye.motion.limits import MotionLimits

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from flangeye.errors import StageError
-from flangeye.files.bundled import bundled
+from flangeye.files.paths import bundled
 from flangeye.log.read import read_notes
 from flangeye.log.record import Recorder
 from flangeye.models.finger import Finger

@@ -8,7 +8,7 @@ import pytest
 
 from flangeye.devices import DeviceError, RobotDriver
 from flangeye.errors import StageError
-from flangeye.files.bundled import bundled
+from flangeye.files.paths import bundled
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
 from flangeye.motion.executor import Executor

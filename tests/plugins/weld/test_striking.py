@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from flangeye.motion.arc import BURN, GAS, OFF
 from flangeye.plugin.stage import BoundPart
-from flangeye_emulators.arc.simulated import SimulatedArc, SimulatedArcParams, arc_simulated
+from flangeye_emulators.arc import SimulatedArc, SimulatedArcParams, arc_simulated
 from flangeye_plugins.weld.striking import Striking
 from flangeye_plugins.weld.weld_log import columns
 from tests.plugins.weld.cell import planned, run
@@ -39,7 +39,7 @@ def welded(
 ) -> tuple[Any, dict[str, list[Any]], SimulatedArc]:
     """Weld 5 cm with a simulated power source; return report, cycles and source."""
     source = SimulatedArc(given.pop("fails_after", None))
-    monkeypatch.setattr("flangeye_emulators.arc.simulated.SimulatedArc", lambda fails_after: source)
+    monkeypatch.setattr("flangeye_emulators.arc.SimulatedArc", lambda fails_after: source)
     arc = BoundPart(arc_simulated, SimulatedArcParams.model_validate(given.pop("times", {})))
     report, journal = run(planned("v-straight", end=0.05), arc=arc, **given)
     cycles = [value for what, value in journal if what == "cycles"]

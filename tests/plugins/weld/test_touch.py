@@ -9,7 +9,7 @@ import pytest
 
 from flangeye.devices import DeviceError
 from flangeye.errors import StageError
-from flangeye.files.bundled import bundled
+from flangeye.files.paths import bundled
 from flangeye.maths.geometry import rotation_exp
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model

@@ -13,10 +13,10 @@ from pydantic import Field
 
 from flangeye.batch.command import run_sessions
 from flangeye.batch.dataset import Dataset, Ledger, columns_of
+from flangeye.batch.keys import software_of
 from flangeye.batch.outcome import SessionOutcome
 from flangeye.batch.plan import BatchSession, plan
 from flangeye.batch.request import Request
-from flangeye.batch.software import software_of
 from flangeye.doctor import examine, open_session
 from flangeye.errors import FlangeyeError, RecipeError
 from flangeye.files.place import place_at

@@ -16,9 +16,9 @@ import numpy as np
 from flangeye.errors import RecipeError, StageError
 from flangeye.files import matlab_parser
 from flangeye.files.arrays import read_arrays
-from flangeye.files.children import python_command
-from flangeye.files.printable import reason_of
+from flangeye.files.processes import python_command
 from flangeye.files.regular import read_regular, read_text
+from flangeye.files.words import reason_of
 from flangeye.files.yaml_lines import MAX_BYTES, parse_yaml
 from flangeye.types import Floats
 

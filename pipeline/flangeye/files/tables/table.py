@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flangeye.errors import StageError
-from flangeye.files.near import nearest
+from flangeye.files.words import nearest
 from flangeye.types import Floats
 
 Column = str | int

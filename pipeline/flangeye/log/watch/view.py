@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from flangeye.files.printable import printable
+from flangeye.files.words import printable
 from flangeye.log.read import decode_json
 from flangeye.log.records import Message, reason_of
 

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from flangeye.errors import StageError
-from flangeye.files.bundled import VERSION
+from flangeye.files.paths import VERSION
 from flangeye.files.written import write_whole
 from flangeye.plugin.stage import KINDS, PARTS
 

@@ -22,7 +22,7 @@ from flangeye.models.cloud_unit import detect_unit, median_distance
 from flangeye.models.loading import load_model
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerData
-from flangeye.models.standards import load_standard
+from flangeye.models.targets import load_standard
 from flangeye.models.urdf import robot_from_urdf
 from flangeye.plugin.registry import Registry
 from flangeye.plugin.stage import BoundPart

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from flangeye.errors import FlangeyeError, StageError
-from flangeye.files.bundled import VERSION
+from flangeye.files.paths import VERSION
 from flangeye.files.written import write_whole
 from flangeye.files.yaml_lines import parse_yaml
 from flangeye.log.read import read_run

@@ -11,11 +11,11 @@ import numpy as np
 
 from flangeye.models.emulator import EmulatorOptions
 from flangeye.types import Floats
+from flangeye_emulators.controllers.arm import joint_zeros, starting_joints
 from flangeye_emulators.controllers.aubo.controller import OK, POSE, AuboController
 from flangeye_emulators.controllers.fault_injection import FaultInjector
 from flangeye_emulators.controllers.network import Connection, Network
 from flangeye_emulators.controllers.server import Server, run_server
-from flangeye_emulators.controllers.start import joint_zeros, starting_joints
 
 PORT = 30004
 MARK = b"SOF\x01"

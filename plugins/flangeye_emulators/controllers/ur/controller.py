@@ -4,20 +4,32 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import IntEnum
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flangeye.models.robots import RobotModel
 from flangeye.types import Floats
 from flangeye_emulators.controllers.arm import MotionFault, SimulatedArm
 from flangeye_emulators.controllers.poses import pose_vector
-from flangeye_emulators.controllers.ur.models import control_box_of, joint_speeds_of
 from flangeye_emulators.controllers.ur.program import Program, ProgramError
-from flangeye_emulators.controllers.ur.state import Registers, RobotMode, Runtime, SafetyMode
 
 FORCE_LIMIT = 150.0
 """Force on the tool that stops the arm [N]: the safety limit e-Series arms are shipped with."""
+
+
+HALF, THIRD = np.pi, 2 * np.pi / 3
+
+SPEEDS: dict[str, tuple[float, ...]] = {
+    "ur3": (HALF,) * 3 + (2 * np.pi,) * 3,
+    "ur5": (HALF,) * 6,
+    "ur10": (THIRD,) * 2 + (HALF,) * 4,
+}
+"""Largest joint speeds [rad/s] by size of arm: data sheets (UR3e 180 and 360 deg/s, UR5e 180 deg/s,
+UR10e 120 and 180 deg/s; the CB3 arms alike)."""
 
 
 class RefusedError(Exception):
@@ -260,3 +272,93 @@ class URController:
         if self._posed is not self.arm.stance:
             self._posed, self._pose = self.arm.stance, pose_vector(self.arm.stance.base_T_tcp)
         return self._pose
+
+
+@dataclass(frozen=True)
+class ControlBox:
+    """A generation of control boxes.
+
+    Attributes:
+        version: Software version it reports: major, minor, bugfix, build.
+        rate: Control cycles and data packages per second [Hz].
+    """
+
+    version: tuple[int, int, int, int]
+    rate: int
+
+    @property
+    def cycle(self) -> float:
+        """Length of one control cycle [s]."""
+        return 1.0 / self.rate
+
+
+E_SERIES = ControlBox((5, 21, 3, 1), 500)
+CB3 = ControlBox((3, 15, 8, 1), 125)
+
+
+def control_box_of(robot: RobotModel) -> ControlBox:
+    """Return the control box of an arm: e-Series where the model's name ends in ``e``."""
+    return E_SERIES if robot.model.endswith("e") else CB3
+
+
+def joint_speeds_of(robot: RobotModel) -> NDArray[np.float64]:
+    """Return the (6,) largest joint speeds [rad/s]; those of a UR5 for an arm with another name."""
+    return np.array(SPEEDS.get(robot.model.rstrip("e"), SPEEDS["ur5"]))
+
+
+def dashboard_name_of(robot: RobotModel) -> str:
+    """Return the name the dashboard gives the arm: ``UR5`` for a UR5e too."""
+    return robot.model.rstrip("e").upper()
+
+
+class RobotMode(IntEnum):
+    """RTDE ``robot_mode``."""
+
+    POWER_OFF = 3
+    IDLE = 5
+    RUNNING = 7
+
+
+class SafetyMode(IntEnum):
+    """RTDE ``safety_mode``."""
+
+    NORMAL = 1
+    PROTECTIVE_STOP = 3
+    ROBOT_EMERGENCY_STOP = 7
+
+    @property
+    def status_bits(self) -> int:
+        """RTDE ``safety_status_bits``: 0 normal, 2 protective, 6 and 7 emergency, 10 stopped."""
+        bits = {
+            SafetyMode.NORMAL: (0,),
+            SafetyMode.PROTECTIVE_STOP: (2, 10),
+            SafetyMode.ROBOT_EMERGENCY_STOP: (6, 7, 10),
+        }
+        return sum(1 << bit for bit in bits[self])
+
+
+class Runtime(IntEnum):
+    """RTDE ``runtime_state``."""
+
+    STOPPED = 1
+    PLAYING = 2
+    PAUSED = 4
+
+
+class Registers:
+    """The general-purpose registers: clients write the inputs, programs the outputs.
+
+    Attributes:
+        input_int: 48 integers.
+        input_double: 48 floats.
+        output_int: 48 integers.
+        output_double: 48 floats.
+    """
+
+    COUNT = 48
+
+    def __init__(self) -> None:
+        self.input_int = [0] * self.COUNT
+        self.input_double = [0.0] * self.COUNT
+        self.output_int = [0] * self.COUNT
+        self.output_double = [0.0] * self.COUNT

@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from flangeye_emulators.controllers.network import LineConnection, Network
-from flangeye_emulators.controllers.ur.controller import RefusedError, URController
-from flangeye_emulators.controllers.ur.models import dashboard_name_of
-from flangeye_emulators.controllers.ur.state import Runtime
+from flangeye_emulators.controllers.ur.controller import (
+    RefusedError,
+    Runtime,
+    URController,
+    dashboard_name_of,
+)
 
 PORT = 29999
 SERIAL_NUMBER = "20245500001"

@@ -6,20 +6,19 @@ import re
 from collections.abc import Callable
 
 from flangeye.models.emulator import EmulatorOptions
+from flangeye_emulators.controllers.arm import joint_zeros, starting_joints
 from flangeye_emulators.controllers.fault_injection import FaultInjector, Kind
 from flangeye_emulators.controllers.network import Connection, Network
 from flangeye_emulators.controllers.poses import pose_matrix
 from flangeye_emulators.controllers.server import Server, run_server
-from flangeye_emulators.controllers.start import joint_zeros, starting_joints
 from flangeye_emulators.controllers.ur import dashboard, rtde
 from flangeye_emulators.controllers.ur.commands import COMMANDS, STREAMED
 from flangeye_emulators.controllers.ur.commands.moves import travel
-from flangeye_emulators.controllers.ur.controller import RefusedError, URController
+from flangeye_emulators.controllers.ur.controller import RefusedError, Registers, URController
 from flangeye_emulators.controllers.ur.program import Program, ProgramError, Thread
-from flangeye_emulators.controllers.ur.script import ControlScript
-from flangeye_emulators.controllers.ur.state import Registers
-from flangeye_emulators.controllers.ur.urscript import (
+from flangeye_emulators.controllers.ur.script import (
     CONTROL_SCRIPT,
+    ControlScript,
     ScriptSource,
     find_move,
     injected_path,

@@ -6,8 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from flangeye_emulators.controllers.poses import inverse_pose
-from flangeye_emulators.controllers.ur.controller import URController
-from flangeye_emulators.controllers.ur.state import Registers, RobotMode, Runtime
+from flangeye_emulators.controllers.ur.controller import Registers, RobotMode, Runtime, URController
 
 FORMATS = {
     "BOOL": "?",
@@ -25,6 +24,33 @@ FORMATS = {
 NOT_FOUND = "NOT_FOUND"
 
 Values = Sequence[float] | Sequence[int]
+
+
+INPUTS: dict[str, str] = {
+    "speed_slider_mask": "UINT32",
+    "speed_slider_fraction": "DOUBLE",
+    "standard_digital_output_mask": "UINT8",
+    "standard_digital_output": "UINT8",
+    "configurable_digital_output_mask": "UINT8",
+    "configurable_digital_output": "UINT8",
+    "tool_digital_output_mask": "UINT8",
+    "tool_digital_output": "UINT8",
+    "standard_analog_output_mask": "UINT8",
+    "standard_analog_output_type": "UINT8",
+    "standard_analog_output_0": "DOUBLE",
+    "standard_analog_output_1": "DOUBLE",
+    "external_force_torque": "VECTOR6D",
+    **{f"input_int_register_{i}": "INT32" for i in range(Registers.COUNT)},
+    **{f"input_double_register_{i}": "DOUBLE" for i in range(Registers.COUNT)},
+}
+"""What a client may write: name and type."""
+
+DIGITAL_SHIFTS = {
+    "standard_digital_output": 0,
+    "configurable_digital_output": 8,
+    "tool_digital_output": 16,
+}
+"""First bit of each group in ``actual_digital_output_bits``."""
 
 
 class Output(NamedTuple):
@@ -125,32 +151,6 @@ OUTPUTS: dict[str, Output] = {
     **{f"output_double_register_{i}": _double_output(i) for i in range(Registers.COUNT)},
 }
 """What a client may read."""
-
-INPUTS: dict[str, str] = {
-    "speed_slider_mask": "UINT32",
-    "speed_slider_fraction": "DOUBLE",
-    "standard_digital_output_mask": "UINT8",
-    "standard_digital_output": "UINT8",
-    "configurable_digital_output_mask": "UINT8",
-    "configurable_digital_output": "UINT8",
-    "tool_digital_output_mask": "UINT8",
-    "tool_digital_output": "UINT8",
-    "standard_analog_output_mask": "UINT8",
-    "standard_analog_output_type": "UINT8",
-    "standard_analog_output_0": "DOUBLE",
-    "standard_analog_output_1": "DOUBLE",
-    "external_force_torque": "VECTOR6D",
-    **{f"input_int_register_{i}": "INT32" for i in range(Registers.COUNT)},
-    **{f"input_double_register_{i}": "DOUBLE" for i in range(Registers.COUNT)},
-}
-"""What a client may write: name and type."""
-
-DIGITAL_SHIFTS = {
-    "standard_digital_output": 0,
-    "configurable_digital_output": 8,
-    "tool_digital_output": 16,
-}
-"""First bit of each group in ``actual_digital_output_bits``."""
 
 
 def write_inputs(box: URController, values: dict[str, float]) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from flangeye.devices import Device, DeviceError, Mode, RobotState
-from flangeye.files.load import busy
+from flangeye.files.processes import busy
 from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.stage import Params

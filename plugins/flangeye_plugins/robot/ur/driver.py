@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from flangeye.devices import Device, DeviceError, Robot, RobotState
-from flangeye.files.load import busy
+from flangeye.files.processes import busy
 from flangeye.maths.pose_formats import CONVENTIONS
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.sdk import load_sdk

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, NoReturn
 import numpy as np
 
 from flangeye.devices import DeviceError
-from flangeye.files.children import python_command
+from flangeye.files.processes import python_command
 from flangeye.types import Floats
 from flangeye_plugins.robot.ur import worker
 

@@ -26,7 +26,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
-from flangeye_emulators.controllers.start import joint_zeros
+from flangeye_emulators.controllers.arm import joint_zeros
 from tests.plugins.ros2.peers.node import LATCHED, rclpy, say, serve
 from tests.plugins.ros2.urdf import names_of, urdf_of
 

@@ -15,7 +15,7 @@ from flangeye_emulators.controllers.motion import ControllerMotion, Travel, join
 from flangeye_emulators.controllers.poses import pose_matrix
 from flangeye_emulators.controllers.route import JOINTS, POSES, Waypoint
 from flangeye_emulators.controllers.ur.program import ProgramError, Thread
-from flangeye_emulators.controllers.ur.urscript import Move
+from flangeye_emulators.controllers.ur.script import Move
 
 if TYPE_CHECKING:
     from flangeye_emulators.controllers.ur.script import ControlScript

@@ -1,4 +1,4 @@
-"""``arc.simulated``: a power source that only remembers how it was switched."""
+"""Simulated power sources."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is guessed of the scanner's place before the first scan: enough to plan poses in view."""
+"""``view.*``: first guesses of the scanner pose, for planning. Add one: here, in ``guess``."""
 
 from __future__ import annotations
 

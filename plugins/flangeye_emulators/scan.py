@@ -1,4 +1,4 @@
-"""``scan.simulated``: a workpiece on a bench, before the scanner of a simulated cell."""
+"""``scan.simulated``: a simulated workpiece."""
 
 from __future__ import annotations
 

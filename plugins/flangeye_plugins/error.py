@@ -1,4 +1,4 @@
-"""How ``solve.iterative`` measures a candidate: the parts ``error.icp`` and ``error.holdout``."""
+"""``error.*``: how solve.iterative measures a candidate. Add one: a function in ``errors``."""
 
 from __future__ import annotations
 

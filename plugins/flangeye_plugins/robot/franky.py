@@ -1,9 +1,4 @@
-"""``robot.franky``: arms of Franka Robotics through franky and libfranka.
-
-Proven with the library as far as it goes without a controller: it loads, its motions and poses are
-built, a refused and a silent connection are errors in time. Moving, reading and stopping ran
-against a stand-in for the connection alone; see the README of the drivers.
-"""
+"""Arms of Franka Robotics."""
 
 from __future__ import annotations
 
@@ -18,7 +13,7 @@ import numpy as np
 from pydantic import Field
 
 from flangeye.devices import GRACE, SILENT, Device, DeviceError, Mode, Robot, RobotState
-from flangeye.files.children import python_command
+from flangeye.files.processes import python_command
 from flangeye.maths.pose_formats import CONVENTIONS
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.sdk import load_sdk
@@ -46,6 +41,20 @@ os._exit(0)
 """
 """Connects once, in a process that can be killed: where a host is silent, the library never
 returns."""
+
+
+SHOWN = CONVENTIONS["rpy"].in_units("mm", "deg")
+
+MODES: dict[str, tuple[Mode, str]] = {
+    "Idle": ("ready", ""),
+    "Move": ("moving", ""),
+    "Guiding": ("not ready", "the arm is being guided by hand: let go of it"),
+    "Reflex": ("protective stop", "a limit or a collision stopped it: look why, recover in Desk"),
+    "UserStopped": ("emergency stop", "the stop button is pressed: release it"),
+    "AutomaticErrorRecovery": ("not ready", "it recovers from an error"),
+    "Other": ("not ready", "joints locked or FCI off: unlock and activate FCI in Desk"),
+}
+"""libfranka's RobotMode: what it means for motion, and for people."""
 
 
 def require_answer(name: str, host: str, realtime: bool) -> None:
@@ -89,21 +98,6 @@ def cannot_connect(name: str, why: str) -> DeviceError:
 def one_line(text: str) -> str:
     """Return what the library says, without its own line ends."""
     return " ".join(text.split())
-
-
-SHOWN = CONVENTIONS["rpy"].in_units("mm", "deg")
-
-
-MODES: dict[str, tuple[Mode, str]] = {
-    "Idle": ("ready", ""),
-    "Move": ("moving", ""),
-    "Guiding": ("not ready", "the arm is being guided by hand: let go of it"),
-    "Reflex": ("protective stop", "a limit or a collision stopped it: look why, recover in Desk"),
-    "UserStopped": ("emergency stop", "the stop button is pressed: release it"),
-    "AutomaticErrorRecovery": ("not ready", "it recovers from an error"),
-    "Other": ("not ready", "joints locked or FCI off: unlock and activate FCI in Desk"),
-}
-"""libfranka's RobotMode: what it means for motion, and for people."""
 
 
 class FrankyParams(Params):

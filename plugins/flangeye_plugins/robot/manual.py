@@ -1,4 +1,4 @@
-"""``robot.manual``: no connection at all; a person moves the arm and reads its pose out."""
+"""An arm that a person moves: the program says where to, the person says where it stands."""
 
 from __future__ import annotations
 

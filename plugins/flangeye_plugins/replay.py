@@ -1,4 +1,4 @@
-"""A weld decided again, from the images and poses in its log."""
+"""``replay.*``: decisions of a step repeated from its log. Add a step: a new module here."""
 
 from __future__ import annotations
 

@@ -1,1 +1,0 @@
-"""``scan.simulated``: a simulated workpiece."""

@@ -1,1 +1,0 @@
-"""``cost.*``: what solve.iterative minimises. Add a cost: a function in ``costs``."""

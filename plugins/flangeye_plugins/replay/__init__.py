@@ -1,1 +1,0 @@
-"""``replay.*``: decisions of a step repeated from its log. Add a step: a new module here."""

@@ -1,1 +1,0 @@
-"""Arms of Franka Robotics."""

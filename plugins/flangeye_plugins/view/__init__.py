@@ -1,1 +1,0 @@
-"""``view.*``: first guesses of the scanner pose, for planning. Add one: here, in ``guess``."""
