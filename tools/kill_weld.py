@@ -171,7 +171,10 @@ class Stroke:
 
 
 def _silent(after: float) -> tuple[str, ...]:
-    return ("--set", f"{FINGER}.hidden=[{after:.1f} s, 1000 s]")  # at rest after 'still'
+    return (
+        "--set",
+        f"{FINGER}.world.clock.hidden=[{after:.1f} s, 1000 s]",
+    )  # at rest after 'still'
 
 
 def _lost(after: float) -> tuple[str, ...]:

@@ -33,8 +33,6 @@ SHOT = (160, 120)
 """Width and height of a scan's small picture [pixels]."""
 FLANGE = (239, 155, 60)
 """Colour of the flange in it: blue, green, red."""
-DIE_WITH_PARENT = 1
-"""``PR_SET_PDEATHSIG`` of Linux: a run does not outlive its page's server."""
 
 
 class RunProcess:
@@ -208,4 +206,5 @@ class _EndedError(Exception):
 
 def _die_with_parent() -> None:
     if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(DIE_WITH_PARENT, signal.SIGINT)
+        # ``PR_SET_PDEATHSIG`` of Linux: a run does not outlive its page's server
+        ctypes.CDLL(None).prctl(1, signal.SIGINT)

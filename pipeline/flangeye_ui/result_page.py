@@ -38,8 +38,6 @@ LIGHTS = {
 }
 """By verdict: tone, sign and words of the light; anything else is red."""
 RED = ("poor", "✕", "Do not use")
-ARROW = 0.3
-"""The longest residual is drawn at most so long [m]."""
 Show = Callable[[Project, Path, Facts, Bar], None]
 
 
@@ -258,7 +256,8 @@ def _residuals(scene: Scene3D, facts: Facts) -> float:
     left = [(o.tcp_in_base, o.residual_in_base, o.used) for o in facts.measured]
     arrows = [(np.array(p), np.array(r), used) for p, r, used in left if p and r]
     longest = max((float(np.linalg.norm(r)) for _, r, used in arrows if used), default=0.0)
-    most = ARROW / longest if longest else 1.0
+    # The longest residual is drawn at most so long [m]
+    most = 0.3 / longest if longest else 1.0
     decade = float(10.0 ** np.floor(np.log10(most)))
     times = decade * max(step for step in (1, 2, 5) if step * decade <= most)
     for place, residual, used in arrows:

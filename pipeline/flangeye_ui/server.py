@@ -37,11 +37,6 @@ PAGES = (
     cell_page, poses_page, scan_page, result_page, use_page, watch_page, archive_page, shapes,
 )  # fmt: skip
 OPENS = "<!doctype html><meta http-equiv=refresh content='0;url={}'><title>flangeye</title>"
-RECONNECT = 15.0
-"""For how long a page may be away [s]. NiceGUI takes a page for dead that leaves a ping unanswered
-for 0.4 of it: longer than ``scan_page.SILENCE``, which alone decides whether a page lives."""
-
-
 DENIED = "wrong, used or missing token: open the address that 'flangeye ui' printed last"
 
 POLICY = (
@@ -96,9 +91,12 @@ def serve(folder: Path, registry: Registry, host: str, port: int, browser: bool)
     with way_in(folder, at + keys.token) as file:
         if browser:
             app.on_startup(lambda: threading.Thread(target=show, args=(file,), daemon=True).start())
+        # For how long a page may be away [s]. NiceGUI takes a page for dead that leaves a ping
+        # unanswered for 0.4 of it: longer than ``scan_page.SILENCE``, which alone decides whether a
+        # page lives.
         ui.run(
             host=host, port=port, reload=False, show=False, show_welcome_message=False,
-            title="flangeye", dark=None, reconnect_timeout=RECONNECT,
+            title="flangeye", dark=None, reconnect_timeout=15.0,
         )  # fmt: skip
 
 

@@ -11,8 +11,6 @@ from flangeye.plugin.stage import BoundPart, Part
 
 FALSE_ALARM = 1e-3
 """Probability of any finding at all about a session without a mistake."""
-MOST_MISTAKES = 8
-"""One session has no more; a guard against checks that undo each other."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +60,8 @@ def examine(
         found.append(max(mendable, key=lambda finding: finding.gain))
         current = found[-1].corrected_session or current
         offered = []
-        if len(found) == MOST_MISTAKES or current.seen.sum() < FEWEST:
+        # One session has no more; a guard against checks that undo each other
+        if len(found) == 8 or current.seen.sum() < FEWEST:
             break
         offered, _ = _offered(current, bound, checked)
         # What all samples share is read once: the same mistake again would be of the first mending.

@@ -23,13 +23,6 @@ from flangeye.types import Floats, Transform
 OFF, GAS, BURN = 0.0, 1.0, 2.0
 """What the seventh number asks for."""
 
-WATCHED_NS = 200_000_000
-"""An arc that is watched may be out for so long before the weld is stopped [ns]."""
-
-
-LETTING_GO = 1.5
-"""Longest flow of gas when the arm is let go of [s]: half of the time that a guard has to end."""
-
 
 def with_arc(driver: RobotDriver, open_arc: Callable[[], Arc], times: ArcTimes) -> RobotDriver:
     """Return a driver that opens a power source with the arm, in the same process."""
@@ -85,7 +78,8 @@ class ArcedArm(Device):
             self._out_ns = now
             return
         begun = now - self._lit_ns > self._times.ignition * 1e9
-        if begun and now - max(self._out_ns, self._lit_ns) > WATCHED_NS:
+        # An arc that is watched may be out for so long before the weld is stopped [ns]
+        if begun and now - max(self._out_ns, self._lit_ns) > 200_000_000:
             self.quench()
             raise DeviceError(f"{self.arc.name}: the arc does not burn")
 
@@ -136,7 +130,9 @@ class ArcedArm(Device):
 
     def close(self) -> None:
         """End the arc, let the gas flow on for a little, and let go of both."""
-        until = time.monotonic() + LETTING_GO
+        # Longest flow of gas when the arm is let go of [s]: half of the time that a guard has to
+        # end
+        until = time.monotonic() + 1.5
         try:
             with suppress(DeviceError):
                 self.quench()

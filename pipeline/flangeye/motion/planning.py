@@ -19,9 +19,6 @@ NEAR = 0.02
 NEAR_TILT = 0.2
 """Their largest roll, pitch and yaw [rad]."""
 
-NEAR_ATTEMPTS = 50
-"""Poses tried for each of them."""
-
 
 @dataclass(frozen=True, eq=False)
 class Site:
@@ -98,7 +95,8 @@ def poses_near(
     """
     found: list[PlannedPose] = []
     facing, (near, tilt) = site.facing(place), spread
-    for _ in range(NEAR_ATTEMPTS * count):
+    # Poses tried for each of them
+    for _ in range(50 * count):
         if facing is None or len(found) == count:
             break
         pose = tilted(place + rng.uniform(-near, near, 3), facing, tilt, rng)

@@ -18,9 +18,6 @@ from flangeye.types import Floats
 MARGIN = 0.95
 """Share of the field of view, to either side, that a planned flange keeps to."""
 
-MOVES_WELL = 0.5
-"""Share of the best manipulability that is good enough for a posture that is near."""
-
 FOLD = np.radians(120.0)
 """An arm that is under way does not turn a joint farther from home: it would fold over."""
 
@@ -121,7 +118,8 @@ class Reach:
         if start is None:
             chosen = next(each for each in found if each[0] >= best * (1 - 1e-9))
         else:
-            good = [each for each in found if each[0] >= MOVES_WELL * best]
+            # Share of the best manipulability that is good enough for a posture that is near
+            good = [each for each in found if each[0] >= 0.5 * best]
             chosen = min(good, key=lambda each: _turn(each[2], start))
         self.home = chosen[2]
         return chosen[1]

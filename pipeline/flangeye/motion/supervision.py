@@ -14,9 +14,6 @@ from flangeye.motion.limits import MotionLimits
 from flangeye.motion.route import Leg
 from flangeye.types import Floats
 
-REMEMBERED_NS = 20_000_000_000
-"""How far back samples are kept, for exposures that have ended [ns]."""
-
 SETTLED = 0.1
 """An arm has settled when it stood for this long [s]."""
 
@@ -25,9 +22,6 @@ STANDING = 1e-3
 
 ARRIVED = np.radians(0.05)
 """Every joint this near to its goal, the arm is there [rad]."""
-
-OFF_ROUTE = np.radians(3.0)
-"""Farther from the commanded way, the arm is not doing what it was told [rad]."""
 
 START = 1.0
 """An arm that has not set off after this did not take the command [s]."""
@@ -138,7 +132,8 @@ class Supervisor:
 
     def _remember(self, state: RobotState) -> None:
         self.samples.append(Sample(state.time_ns, state.base_T_flange.matrix, state.joints))
-        while state.time_ns - self.samples[0].time_ns > REMEMBERED_NS:
+        # How far back samples are kept, for exposures that have ended [ns]
+        while state.time_ns - self.samples[0].time_ns > 20_000_000_000:
             self.samples.popleft()
 
     def _keep_still(self, state: RobotState) -> None:
@@ -166,7 +161,8 @@ class Supervisor:
         along = float((state.joints - self._from) @ way)
         share = np.clip(along / max(float(way @ way), 1e-12), 0.0, 1.0)
         off = float(np.abs(state.joints - self._from - share * way).max())
-        if off > OFF_ROUTE:
+        # Farther from the commanded way, the arm is not doing what it was told [rad]
+        if off > np.radians(3.0):
             raise SafetyFault(f"the arm is {np.degrees(off):.1f} deg away from its commanded path")
         waited = (state.time_ns - self._since_ns) * 1e-9
         set_off = np.abs(state.joints - self._from).max() > ARRIVED

@@ -24,8 +24,6 @@ SHORT = 0.005
 """It stops this far before the point [m]: a wrong matrix must not drive it into the work."""
 SLOW = 0.02
 """Largest speed of the flange [m/s]."""
-SLOW_JOINT = 0.2
-"""Largest speed of a joint [rad/s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,6 +126,7 @@ class Toucher:
 
     def _slowly(self) -> MotionLimits:
         limits = self.limits
+        # Largest speed of a joint [rad/s]
         return replace(
-            limits, speed=min(limits.speed, SLOW), joint_speed=min(limits.joint_speed, SLOW_JOINT)
+            limits, speed=min(limits.speed, SLOW), joint_speed=min(limits.joint_speed, 0.2)
         )

@@ -19,7 +19,7 @@ from flangeye.plugin.stage import Params, part
 from flangeye.types import Floats, Image, Seed, Transform
 from flangeye.units import Angle, Duration, Length, param
 from flangeye_emulators.weld_world.groove import Section, Tip
-from flangeye_emulators.weld_world.settings import GapParams, ToolFile, ToolPath, WorldParams
+from flangeye_emulators.weld_world.settings import ToolFile, ToolPath, WorldParams
 from flangeye_emulators.weld_world.world import Nominal, Shutter, WeldWorld
 from flangeye_emulators.world import room
 from flangeye_plugins.weld.corners import corners_of
@@ -66,11 +66,6 @@ class SimulatedFingerParams(Params):
     section: SectionParams | None = Field(
         None, description="The joint's true cross-section, where it is not the file's groove."
     )
-    gaps: tuple[GapParams, ...] = Field((), description="Pieces of a wall that are missing.")
-    rate: float = Field(30.0, gt=0, le=200, description="Images per second.")
-    latency: Duration = param("30 ms", ge=0, description="Time from the exposure to the image.")
-    jitter: Duration = param("5 ms", ge=0, description="Standard deviation of the latency.")
-    dropped: float = Field(0.02, ge=0, lt=1, description="Share of images that never arrive.")
     noise: float = Field(
         3.0, ge=0, description="Noise of the image, standard deviation [grey levels]."
     )
@@ -85,9 +80,6 @@ class SimulatedFingerParams(Params):
     )
     held: bool = Field(
         False, description="The tip is held where it is first, as in a punch mark: to calibrate."
-    )
-    hidden: tuple[Duration, Duration] | None = param(
-        None, description="The tag is out of sight from the first time to the second."
     )
     fails: Duration | None = param(None, description="When the camera is lost.")
 
@@ -109,7 +101,7 @@ class SimulatedFinger(Device):
         self.name = f"simulated finger {finger.model}"
         self.camera_matrix, self.distortion = finger.camera.matrix, np.array([])
         self._plane, nominal = _as_planned(finger, params)
-        truth = _truth(params)
+        truth = params.world
         self.world, self._planned = WeldWorld(nominal, truth, [seed, 12]), Path(nominal.seam)
         self.tool = Tool(finger, self._plane)
         self._robot, self._params = robot, params
@@ -185,21 +177,6 @@ class SimulatedFinger(Device):
 
     def _image(self, displacement: Floats) -> Image:
         return self._camera.image(*self._compliance.tag(displacement))
-
-
-def _truth(params: SimulatedFingerParams) -> WorldParams:
-    """Return the world with the clock and workpiece of the sensor's parameters."""
-    own = {
-        name: getattr(params, name) for name in ("rate", "latency", "jitter", "dropped", "hidden")
-    }
-    world = params.world
-    gaps = (*params.gaps, *world.workpiece.gaps)
-    return world.model_copy(
-        update={
-            "clock": world.clock.model_copy(update=own),
-            "workpiece": world.workpiece.model_copy(update={"gaps": gaps}),
-        }
-    )
 
 
 def _as_planned(finger: ToolFile, params: SimulatedFingerParams) -> tuple[WorkPlane, Nominal]:

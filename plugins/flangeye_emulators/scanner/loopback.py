@@ -31,12 +31,6 @@ from flangeye_emulators.world.structured_light import StructuredLight
 from flangeye_emulators.world.time_of_flight import TimeOfFlight
 from flangeye_plugins.scanner.opened import OpenScanner
 
-LOOKS = 3
-"""How often the arm's place is asked for during one exposure: at its ends and in its middle."""
-
-SAME_ARM = 1e-3
-"""Largest distance of the controller's flange from where the robot's model puts it [m]."""
-
 
 class LoopbackParams(Params):
     """Parameters of ``scanner.emulator``."""
@@ -128,7 +122,8 @@ class LoopbackScanner(OpenScanner):
     def require_same_arm(self) -> None:
         """Raise DeviceError when the controller moves another arm than the one to be scanned."""
         off = self._studio.disagreement(self._stance())
-        if not off < SAME_ARM:
+        # Largest distance of the controller's flange from where the robot's model puts it [m]
+        if not off < 1e-3:
             raise DeviceError(
                 f"scanner.emulator: the controller at {self._params.host} does not move the "
                 f"model {self._params.robot}: set robot to what it moves"
@@ -169,7 +164,8 @@ class LoopbackScanner(OpenScanner):
         """Return where the arm was, at even times over the exposure."""
         began = time.monotonic()
         stances = []
-        for after in np.linspace(0.0, self._params.exposure, LOOKS):
+        # How often the arm's place is asked for during one exposure: at its ends and in its middle
+        for after in np.linspace(0.0, self._params.exposure, 3):
             _wait_until(began + after)
             stances.append(self._stance())
         return stances

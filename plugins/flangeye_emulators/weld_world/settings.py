@@ -134,16 +134,10 @@ class LookTruth(Params):
 
     behind: Length = param("30 mm", gt=0, le=0.2, description="How far behind the torch it looks.")
     noise: Length = param("0.05 mm", gt=0, description="Standard deviation of one look; stated.")
-    rate: float = Field(10.0, gt=0, le=200, description="Looks per second.")
-    latency: Duration = param("50 ms", ge=0, description="From the exposure to the measurement.")
-    jitter: Duration = param("5 ms", ge=0, description="Standard deviation of the latency.")
-    dropped: float = Field(0.1, ge=0, lt=1, description="Share of looks that see no bead.")
-
-    @property
-    def clock(self) -> ClockTruth:
-        """Times at which the sensor takes images, and at which they arrive."""
-        named = ("rate", "latency", "jitter", "dropped")
-        return ClockTruth().model_copy(update={name: getattr(self, name) for name in named})
+    clock: ClockTruth = Field(
+        ClockTruth.model_validate({"rate": 10.0, "latency": "50 ms", "dropped": 0.1}),
+        description="When it looks, when its measurements arrive, and which it misses.",
+    )
 
 
 class WorldParams(Params):

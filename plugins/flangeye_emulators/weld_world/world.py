@@ -24,12 +24,6 @@ from flangeye_emulators.weld_world.settings import (
 from flangeye_plugins.weld.body import leaning
 from flangeye_plugins.weld.path import Path
 
-HYSTERESIS_WIDTH = 1e-3
-"""Displacement over which the lagging share comes along [m]."""
-
-VARIES = 60e-3
-"""Period with which the half angle varies along the seam [m]."""
-
 GRAIN = 1e-3
 """Correlation length of spatter along the seam [m]."""
 
@@ -164,7 +158,8 @@ class TrueFinger:
         elapsed = 0.0 if self._time is None else time - self._time
         self._time, self._age = time, self._age + elapsed
         self._played = _follow(self._played, displacement, truth.play / 2)
-        self._lagging = _follow(self._lagging, self._played, HYSTERESIS_WIDTH)
+        # Displacement over which the lagging share comes along [m]
+        self._lagging = _follow(self._lagging, self._played, 1e-3)
         moved = self._played + truth.hysteresis * (self._lagging - self._played)
         share = 1.0 - math.exp(-elapsed / truth.creep_time)
         self._crept = self._crept + share * (moved - self._crept)
@@ -213,7 +208,8 @@ def _relief(
     for tack in truth.tacks:
         inside = np.clip(np.minimum(s - tack.start, tack.start + tack.length - s) / GRAIN, 0.0, 1.0)
         fill = fill + tack.height * inside
-    wider = truth.half_angle_wave * np.sin(2 * np.pi * s / VARIES + rng.uniform(0.0, 2 * np.pi))
+    # Period with which the half angle varies along the seam [m]
+    wider = truth.half_angle_wave * np.sin(2 * np.pi * s / 60e-3 + rng.uniform(0.0, 2 * np.pi))
     aside = _grains(s, truth.spatter, rng)
     return Relief(tuple(fill.tolist()), tuple(aside.tolist()), tuple(wider.tolist()))
 

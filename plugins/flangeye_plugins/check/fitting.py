@@ -23,10 +23,8 @@ from flangeye_plugins.check.starts import VariantUnknowns, start_of
 
 TAILS = 4.0
 """Degrees of freedom of the errors' distribution."""
-FINEST = 20e-6
-"""No scanner and no arm is better than this [m]."""
 FINEST_ANGLE = 1e-4
-"""Likewise [rad]."""
+"""No scanner and no arm is better than this [rad]."""
 STEPS = 15
 MARGIN = 1e-9
 """Share of the information that is added to every direction, for those nothing is known of."""
@@ -126,7 +124,8 @@ def _centre_block(equations: Equations, unknowns: VariantUnknowns) -> Block:
         arm = turns.swapaxes(-1, -2) @ (expected - equations.bases[..., :3, 3])[..., None]
         lever = arm[..., 0] - unknowns.other[:, None, :3, 3]
         parts += [turns @ hat(lever), -turns]
-    return _block(residuals, parts, 3, FINEST)
+    # No scanner and no arm is better than this [m]
+    return _block(residuals, parts, 3, 20e-6)
 
 
 def _rotation_block(equations: Equations, unknowns: VariantUnknowns) -> Block:

@@ -21,8 +21,6 @@ from flangeye_plugins.check.fitting import VariantFits, errors_at, fit
 
 NEGLIGIBLE = 0.5e-3
 """Error that an arm's kinematics or a scanner may have without anybody's mistake [m]."""
-NEGLIGIBLE_ANGLE = 4e-3
-"""Likewise of a normal or of a marker's rotation [rad]."""
 SAME = 1e-3
 """Logarithms of likelihoods that differ by less are equal but for rounding."""
 
@@ -129,7 +127,8 @@ def exceedance(ratio: float, count: float, further: int, freedom: float, effect:
 
 def negligible(kinds: int) -> Floats:
     """Return (B,) what is negligible of each kind of error [m, rad]."""
-    return np.array([NEGLIGIBLE, *[NEGLIGIBLE_ANGLE] * (kinds - 1)])
+    # What is negligible of a normal's or a marker's rotation: 4 mrad
+    return np.array([NEGLIGIBLE, *[4e-3] * (kinds - 1)])
 
 
 def _effect(before: Misfit, after: Misfit) -> float:

@@ -36,9 +36,6 @@ ARMS = (0.1, 4.0)
 """Median distance of a flange from its base [m], from the smallest arm to the largest."""
 
 
-NEGLIGIBLE_SCALE = 5e-3
-"""A printer is no better, and nobody measures a marker with less care."""
-
 STEPS = (0.1, 1e-2, 1e-3, 1e-4, 1e-5)
 """Last decimals of positions in metres, millimetres and so on [m]."""
 
@@ -221,7 +218,8 @@ def size(session: RecordedSession) -> Findings:
     found = fit_of(corrected_session)
     evidence = best_of(null, found, 1)
     ratio, count = float(found.likelihood[0] - null.likelihood[0]), float(null.count[0])
-    effect = abs(np.log(factor)) / NEGLIGIBLE_SCALE
+    # A printer is no better, and nobody measures a marker with less care
+    effect = abs(np.log(factor)) / 5e-3
     p = exceedance(ratio, count, 1, count - found.parameters - 1, effect)
     if p < 1 and explained(corrected_session):
         what = f"the marker is {factor:.4f} times as large as the recipe says"

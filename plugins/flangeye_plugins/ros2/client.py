@@ -32,10 +32,6 @@ PROGRAM = "ros2"
 STARTING = 10.0
 """Longest time until the process has a node: a cold disk reads rclpy's hundred libraries [s]."""
 
-ANSWERING = 2.5
-"""Longest time for an answer; finding a service takes the most, a second, and on a busy machine
-listing the topics [s]."""
-
 DISCOVERY = 2.0
 """After its start a node knows what runs; on an idle machine it does after half a second [s]."""
 
@@ -275,7 +271,9 @@ class Bridge(Device):
     def _ask(self, what: str, **arguments: Any) -> Any:
         with self._asking:
             self._send({"ask": what, **arguments})
-            return self._answer(ANSWERING)
+            # Longest time for an answer; finding a service takes the most, a second, and on a busy
+            # machine listing the topics [s]
+            return self._answer(2.5)
 
     def _answer(self, patience: float) -> Any:
         try:

@@ -20,10 +20,6 @@ STALE = 0.25
 20 Hz unless it is told otherwise [s]."""
 
 
-UNIT = 0.01
-"""A quaternion whose norm is off by more is none, and tf2 leaves such a transform out as well."""
-
-
 class Frame(NamedTuple):
     """A frame: its parent, its pose there (4, 4), and when that came; never for one that stands."""
 
@@ -119,7 +115,9 @@ class Frames:
         for each in decoded(message.data, TF_TYPE).transforms:
             turn, move = each.transform.rotation, each.transform.translation
             xyzw, place = [turn.x, turn.y, turn.z, turn.w], [move.x, move.y, move.z]
-            if not (abs(np.linalg.norm(xyzw) - 1.0) < UNIT and np.isfinite(place).all()):
+            # A quaternion whose norm is off by more is none, and tf2 leaves such a transform out as
+            # well
+            if not (abs(np.linalg.norm(xyzw) - 1.0) < 0.01 and np.isfinite(place).all()):
                 continue
             pose = rigid(rotation_from_quaternion(np.array(xyzw)), place)
             parent, child = (n.lstrip("/") for n in (each.header.frame_id, each.child_frame_id))

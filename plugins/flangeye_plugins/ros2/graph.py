@@ -39,10 +39,6 @@ COUNTED = 1.5
 """For how long messages are counted [s]; a camera that runs by itself gives one in that time."""
 
 
-DAY = 86400.0
-"""[s]"""
-
-
 NONE = "none"
 """The answer that there is no controller, or no trigger."""
 
@@ -135,7 +131,8 @@ class Ros2Graph(Device):
     def stay(self) -> None:
         """Never return; see :class:`flangeye.models.graph.Graph`."""
         while True:
-            self._bridge.wait("", 0, DAY)
+            # [s]
+            self._bridge.wait("", 0, 86400.0)
 
     # --- what runs
 

@@ -41,9 +41,6 @@ NAME = "scanner.ros2"
 TRIGGER_MESSAGE = b"\x00\x01\x00\x00\x00"
 """An std_msgs/msg/Empty, serialised: ROS gives a message without fields one byte."""
 
-EARLY = 0.1
-"""A stamp so long after the message came is of another clock [s]."""
-
 TICK = 20_000_000
 """Simulated time stands still between two messages of /clock, at 100 Hz or more; a stamp may be of
 the one before [ns]. The arm has stood for longer."""
@@ -220,7 +217,8 @@ class Ros2Scanner(OpenScanner):
         while message := self._bridge.wait(topic, count, max(until - time.monotonic(), 0.0)):
             stamp = self._bridge.local_ns(message)
             early = 1e-9 * (stamp - message.received_ns)
-            if early > EARLY:
+            # A stamp so long after the message came is of another clock [s]
+            if early > 0.1:
                 raise DeviceError(
                     f"{NAME}: {topic} is stamped {early:.2f} s after "
                     "it came: set the clocks of both computers (NTP), or sim_time"

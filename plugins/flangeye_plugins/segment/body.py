@@ -28,25 +28,15 @@ from flangeye.units import Length, param
 if TYPE_CHECKING:
     from flangeye_plugins.body.search import Found
 
-LEAST_RAYS = 150
-"""Rays, a hundredth of the body's size apart, that show it: fewer fit by chance."""
-
 FIRM = 0.004
 """Largest standard deviation of what a scan shows least of a body, in its sizes or radians: what
 fits by chance is seldom held in all directions."""
-
-GOES_ON = 0.5
-"""Largest share of the rays beside the body in which its surface goes on: where something is
-fastened to it."""
 
 WIDEST = 1.75
 """Tangent of 60 degrees: no scanner sees farther to the side, stray points do."""
 
 ALL = 6
 """Freedoms of a pose; a round body shows fewer."""
-
-RECENT = 3
-"""Earlier sightings from which the pose is predicted."""
 
 
 class SegmentBodyParams(Params):
@@ -124,7 +114,8 @@ def _between(points: Singles, near: float, far: float) -> Singles:
 def _predicted(capture: Capture, configuration: Configuration, earlier: Earlier) -> Floats:
     """Return (K, 4, 4) where the arm has carried the body since the last sightings."""
     place = configuration.place
-    recent = earlier.observations[-RECENT:]
+    # Earlier sightings from which the pose is predicted
+    recent = earlier.observations[-3:]
     if place is None or configuration.camera != BASE or not recent:
         return np.zeros((0, 4, 4))
     now = capture.poses[configuration.target].matrix @ place
@@ -137,12 +128,15 @@ def _predicted(capture: Capture, configuration: Configuration, earlier: Earlier)
 
 def _passes(found: Found, params: SegmentBodyParams) -> bool:
     verdict = found.verdict
+    # Rays, a hundredth of the body's size apart, that show it: fewer fit by chance
+    # Largest share of the rays beside the body in which its surface goes on: where something is
+    # fastened to it
     return (
         verdict.shown >= params.min_coverage
         and verdict.trusted >= params.min_trust
-        and verdict.agree >= LEAST_RAYS
+        and verdict.agree >= 150
         and verdict.bounded
-        and verdict.goes_on <= GOES_ON * verdict.beside
+        and verdict.goes_on <= 0.5 * verdict.beside
         and found.weakest <= FIRM
     )
 

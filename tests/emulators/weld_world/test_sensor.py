@@ -85,7 +85,9 @@ def edited() -> list[tuple[str, Finger]]:
 def happenings(finger: Finger) -> list[Any]:
     """All that a world does while an arm moves through it, as bytes."""
     robot = SimulatedRobot(MODEL, SimulatedParams(period="16 ms", joints=HOME))
-    given = SimulatedFingerParams.model_validate({"latency": "0 ms", "jitter": "0 ms"})
+    given = SimulatedFingerParams.model_validate(
+        {"world": {"clock": {"latency": "0 ms", "jitter": "0 ms"}}}
+    )
     sensor: Any = sensor_simulated_finger.function(finger, robot, 5, given)
     seen = [sensor.name, sensor.camera_matrix.tobytes()]
     for _ in range(12):

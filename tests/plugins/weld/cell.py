@@ -58,7 +58,10 @@ def run(
     journal=None, **params,
 ):  # fmt: skip
     """Run the stage; return its report and what it wrote into its journal."""
-    simulated = SimulatedFingerParams(workpiece=name, **{"rate": 15.0, **(sensor or {})})
+    given = {"world": {}, **(sensor or {})}
+    clock = {"rate": 15.0, **given["world"].get("clock", {})}
+    given["world"] = {**given["world"], "clock": clock}
+    simulated = SimulatedFingerParams(workpiece=name, **given)
     chosen = BoundPart(sensor_simulated_finger, simulated)
     arm = SimulatedParams(period="16 ms", joints=HOME)
     driver = driver or RobotDriver(

@@ -44,7 +44,7 @@ def test_equal_runs_are_equal() -> None:
 @pytest.mark.parametrize("name", ["v-straight", "v-curved"])
 def test_both_workpieces_with_the_planning_error_of_the_issue(name: str) -> None:
     seam = planning_error(name, seed=0)
-    report, _ = run(seam, name, sensor={"rate": 30.0})
+    report, _ = run(seam, name, sensor={"world": {"clock": {"rate": 30.0}}})
     errors = deviation(report, name)
     assert report.completed
     assert np.sqrt(np.mean(errors**2)) < 0.15e-3
@@ -55,7 +55,7 @@ def test_both_workpieces_with_the_planning_error_of_the_issue(name: str) -> None
 
 @pytest.mark.slow
 def test_a_gap_is_bridged_with_real_images() -> None:
-    gap = {"gaps": ({"start": "80 mm", "length": "20 mm"},)}
+    gap = {"world": {"workpiece": {"gaps": ({"start": "80 mm", "length": "20 mm"},)}}}
     report, _ = run(planning_error("v-curved", seed=0), "v-curved", sensor=gap)
     assert "bridging" in report.phases
     assert report.phases.index("bridging") < len(report.phases) - report.phases[::-1].index(
@@ -147,14 +147,14 @@ def test_a_plan_too_uncertain_to_search() -> None:
 
 
 def test_no_tag_in_view() -> None:
-    assert refused(sensor={"hidden": ("0 s", "100 s")}) == (
+    assert refused(sensor={"world": {"clock": {"hidden": ("0 s", "100 s")}}}) == (
         "weld.tactile: no tag is in view; is the finger's light on, the lens clean, and is the tag "
         "the one its file names?"
     )
 
 
 def test_a_camera_that_gives_nothing() -> None:
-    assert refused(sensor={"latency": "60 s"}).startswith(
+    assert refused(sensor={"world": {"clock": {"latency": "60 s"}}}).startswith(
         "weld.tactile: the camera gives no images;"
     )
 
@@ -225,7 +225,10 @@ def stopped(seam=None, **more):
 
 
 def test_a_tag_that_is_lost_for_too_long() -> None:
-    assert stopped(sensor={"hidden": ("10 s", "60 s")}) == "no tag was seen for 2000 ms"
+    assert (
+        stopped(sensor={"world": {"clock": {"hidden": ("10 s", "60 s")}}})
+        == "no tag was seen for 2000 ms"
+    )
 
 
 def test_a_camera_that_stops() -> None:

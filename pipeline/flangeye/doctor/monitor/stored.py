@@ -24,9 +24,6 @@ from flangeye.models.workspace import workspace_of
 from flangeye.recipe.own_models import carried_files
 from flangeye.types import Floats
 
-SAME_MODEL = 0.03
-"""How far the flanges of two arms of one model may be apart, with all joints at zero [m]."""
-
 
 @dataclass(frozen=True, eq=False)
 class StoredCalibration:
@@ -180,7 +177,8 @@ def _alike(one: Arm, other: Arm) -> bool:
         return False
     at_zero = np.zeros(one.n)
     between = one.flange(at_zero)[:3, 3] - other.flange(at_zero)[:3, 3]
-    return bool(np.linalg.norm(between) < SAME_MODEL)
+    # How far the flanges of two arms of one model may be apart, with all joints at zero [m]
+    return bool(np.linalg.norm(between) < 0.03)
 
 
 def _covariances(turn: Floats, circles: Sequence[t.CircleFeature], expected: Floats) -> Floats:

@@ -15,9 +15,6 @@ from numpy.typing import NDArray
 
 from flangeye.files.clouds.header import refuse
 
-MAX_EXPANSION = 88
-"""A token of three bytes writes 264 at most: more than that is no LZF stream."""
-
 
 class LzfError(ValueError):
     """The stream is damaged."""
@@ -225,7 +222,8 @@ class CompressedTable:
             )
         if compressed > found:
             refuse(self.path, f"truncated: {compressed} compressed bytes promised, it has {found}")
-        if decompressed > MAX_EXPANSION * compressed:
+        # A token of three bytes writes 264 at most: more than that is no LZF stream
+        if decompressed > 88 * compressed:
             refuse(self.path, f"{compressed} compressed bytes cannot stand for {decompressed}")
 
     def decode(self) -> Points:

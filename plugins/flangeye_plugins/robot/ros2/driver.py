@@ -27,14 +27,8 @@ BEGINNING = pieces.BEHIND + 2 * RENEWAL
 SET_OFF = 0.8
 """An arm that has not begun to move after this is not being moved by its controller [s]."""
 
-BEGUN = 1e-3
-"""It has begun when a joint has turned so far [rad]."""
-
 SETTLING = 0.3
 """How long a controller may take to its goal when the motion is over [s]."""
-
-MOVED_ON = 0.02
-"""An arm that was moved by hand has left its last place when a joint turned so far [rad]."""
 
 
 class Ros2Params(ListenParams):
@@ -190,7 +184,8 @@ class Ros2Arm(Listener):
             self._require_motion(joints)
 
     def _require_motion(self, joints: Floats) -> None:
-        if np.abs(joints - self._from).max() < BEGUN:
+        # It has begun when a joint has turned so far [rad]
+        if np.abs(joints - self._from).max() < 1e-3:
             raise DeviceError(
                 f"{self.name}: {self._topic} was given a trajectory {SET_OFF} s ago and the arm "
                 "has not moved: its controller rejects them (its log says why) or is not active; "
@@ -273,7 +268,8 @@ class FreedriveArm(Listener):
         now, joints = time.monotonic(), self._samples[-1].joints
         if moves:
             self._stood_since = now
-        went = self._left is None or bool(np.abs(joints - self._left).max() > MOVED_ON)
+        # An arm that was moved by hand has left its last place when a joint turned so far [rad]
+        went = self._left is None or bool(np.abs(joints - self._left).max() > 0.02)
         if not self._awaited:
             return "ready"
         if not went or now - self._stood_since < self._still:

@@ -29,9 +29,6 @@ SLOWEST = 0.05
 LISTENING = 1.0
 """For how long joint states are counted when an arm is opened [s]."""
 
-WINDOW_NS = 50_000_000
-"""Over which speeds are taken [ns]: what some drivers publish as velocity is noise, or empty."""
-
 STANDING = 1e-3
 """No joint turns faster on an arm that stands [rad/s]."""
 
@@ -184,7 +181,8 @@ class Listener(Device):
         sample = Sample(joints, self._bridge.local_ns(message), message.received_ns)
         self._require_forwards(sample)
         self._samples.append(sample)
-        while len(self._samples) > 2 and sample.time_ns - self._samples[1].time_ns > WINDOW_NS:
+        # Over which speeds are taken [ns]: what some drivers publish as velocity is noise, or empty
+        while len(self._samples) > 2 and sample.time_ns - self._samples[1].time_ns > 50_000_000:
             self._samples.popleft()
         return True
 

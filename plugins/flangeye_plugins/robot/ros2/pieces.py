@@ -36,9 +36,6 @@ KNOT = 0.05
 BRISK = 3.0
 """Deceleration of a stop, where it takes less time [rad/s^2]."""
 
-REACTION = 0.03
-"""From a stop to its beginning at the controller: it brakes from where the arm is by then [s]."""
-
 LAST = 0.03
 """What is left of a motion when its last piece is published: about a renewal [s]."""
 
@@ -83,7 +80,9 @@ class Motion(ABC):
 
     def stop(self) -> list[Point]:
         """Return the piece that brakes from where the arm is on the motion."""
-        points = [*self._recent(), self._point(REACTION)]
+        # From a stop to its beginning at the controller: it brakes from where the arm is by then
+        # [s]
+        points = [*self._recent(), self._point(0.03)]
         return [*points, *brake(points[-1], BRISK)] if points[-1].speeds.any() else points
 
     def _recent(self) -> list[Point]:

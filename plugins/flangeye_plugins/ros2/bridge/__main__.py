@@ -22,9 +22,6 @@ import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-SERVICE = 1.0
-"""Longest wait for a service to be found [s]."""
-
 Request = dict[str, Any]
 
 
@@ -124,7 +121,8 @@ class Bridge:
         """
         kind = getattr(importlib.import_module("std_srvs.srv"), "Trigger")  # noqa: B009
         self._clients[service] = self._node.create_client(kind, service)
-        if not self._clients[service].wait_for_service(timeout_sec=SERVICE):
+        # Longest wait for a service to be found [s]
+        if not self._clients[service].wait_for_service(timeout_sec=1.0):
             raise Refused(f"nobody offers the service {service}")
 
     def trigger(self, service: str, call: int) -> Any:
