@@ -1,0 +1,138 @@
+"""A seam from a file: taught points, a table, a drawing, or the edge of a CAD."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from pydantic import Field
+
+from flangeye import RecipePath, StageError, stage
+from flangeye.files.clouds import PER_METRE, LengthUnit
+from flangeye.files.drawings import read_dxf
+from flangeye.files.tables import read_table
+from flangeye.maths.geometry import rigid, rotation_from_rpy
+from flangeye.maths.polylines import chained, sharp_edges
+from flangeye.maths.seam_geometry import distances_to_line
+from flangeye.models.robots import RobotModel
+from flangeye.models.workpiece import MESHES, STEP, read_mesh
+from flangeye.types import Box, Floats, Seam, VerifiedHandEye
+from flangeye.units import Angle, Length, param
+from flangeye_plugins.seam.planned import (
+    SeamParams,
+    answer_for,
+    for_the_controller,
+    refuse_outside,
+    resampled,
+)
+
+STAGE = "seam.line"
+TABLES = (".csv", ".txt", ".yaml", ".yml", ".json")
+MEET = 1e-6
+"""Pieces of a line whose ends are this near to each other meet [m]."""
+
+
+class LineParams(SeamParams):
+    """Parameters of ``seam.line``."""
+
+    path: RecipePath = Field(
+        description="Points or taught poses in order (CSV, YAML, JSON), a drawing (DXF), or CAD "
+        "whose sharp edges are lines (STL, PLY, OBJ, STEP)."
+    )
+    unit: LengthUnit = Field(description="Unit of the coordinates.")
+    near: tuple[Length, Length, Length] | None = Field(
+        None, description="Point in the file's frame; of several lines the nearest to it is used."
+    )
+    angle: Angle = param("30 deg", gt=0, description="CAD: smallest bend of a sharp edge.")
+    position: tuple[Length, Length, Length] = param(
+        ("0 mm", "0 mm", "0 mm"), description="Origin of the file's frame in the base."
+    )
+    rpy: tuple[Angle, Angle, Angle] = param(
+        ("0 deg", "0 deg", "0 deg"), description="Roll, pitch, yaw of that frame in the base."
+    )
+    opening: tuple[float, float, float] = Field(
+        (0.0, 0.0, 1.0), description="Out of the work towards the torch, in the file's frame."
+    )
+    deviation: Length = param(
+        "3 mm", gt=0, description="Standard deviation of the line across it, in the base."
+    )
+
+
+@stage(STAGE)
+def seam_line(
+    calibration: VerifiedHandEye,
+    params: LineParams,
+    workspace: Box | None = None,
+    robot: RobotModel | None = None,
+) -> Seam:
+    """Take a seam from a file: as it is, or as the rough line of ``seam.joint``.
+
+    Raises:
+        StageError: The file cannot be read, or holds no line, or several and no ``near``.
+        CalibrationRefused: The seam leaves the workspace.
+    """
+    pose = rigid(rotation_from_rpy(*params.rpy), np.asarray(params.position))
+    points = resampled(_line(params), params.spacing) @ pose[:3, :3].T + pose[:3, 3]
+    opening = pose[:3, :3] @ np.asarray(params.opening)
+    if not np.linalg.norm(opening) > 0:
+        raise StageError(f"{STAGE}: opening has no direction")
+    refuse_outside(STAGE, points, workspace)
+    covariance = params.deviation**2 * np.eye(3)
+    seam = Seam(
+        points,
+        np.tile(opening / np.linalg.norm(opening), (len(points), 1)),
+        np.tile(covariance, (len(points), 1, 1)),
+        source=f"line of {params.path.name}",
+    )
+    return for_the_controller(seam, answer_for(STAGE, calibration, params), robot, params)
+
+
+def _line(params: LineParams) -> Floats:
+    """Return the line (N, 3) in the file's frame [m]."""
+    lines = _lines(params.path, params.unit, params.angle)
+    if not lines:
+        raise StageError(f"{params.path}: holds no line; two points at least are needed")
+    if params.near is None and len(lines) > 1:
+        raise StageError(f"{params.path}: holds {len(lines)} lines; say which with near:")
+    at = np.array([params.near or (0.0, 0.0, 0.0)])
+    return min(lines, key=lambda line: float(distances_to_line(at, line)[0]))
+
+
+def _lines(path: Path, unit: LengthUnit, angle: float) -> list[Floats]:
+    """Return all lines (N, 3) of a file [m]."""
+    suffix = path.suffix.lower()
+    if suffix in TABLES:
+        points = _points(path, unit) / PER_METRE[unit]
+        moved = np.linalg.norm(np.diff(points, axis=0), axis=1) > 0
+        points = points[np.append(True, moved)] if len(points) else points
+        return [points] if len(points) > 1 else []
+    if suffix == ".dxf":
+        pieces, said = read_dxf(path)
+        if said not in (None, unit):
+            raise StageError(f"{path}: says that its unit is {said} ($INSUNITS), and unit: {unit}")
+        return chained(pieces / PER_METRE[unit], MEET)
+    if suffix in MESHES:
+        # STEP comes in metres, whatever the drawing was in
+        vertices, triangles = read_mesh(path)
+        scale = 1.0 if suffix in STEP else PER_METRE[unit]
+        return chained(sharp_edges(vertices / scale, triangles, angle), MEET)
+    known = ", ".join((*TABLES, ".dxf", *MESHES))
+    raise StageError(f"{path}: '{path.suffix}' holds no line; known: {known}")
+
+
+def _points(path: Path, unit: LengthUnit) -> Floats:
+    """Return the points (N, 3) of a table or of a list of poses, in its unit.
+
+    Columns x, y, z, or x_mm, y_mm, z_mm; position of poses in YAML or JSON; else the first three.
+    """
+    table = read_table(path.parent, path.name)
+    if not table.rows:
+        return np.zeros((0, 3))
+    suffixed = tuple(f"{axis}_{unit}" for axis in "xyz")
+    names: tuple[str | int, ...] = suffixed if suffixed[0] in table.heading else ("x", "y", "z")
+    if any(name.startswith("position.") for name in table.heading):
+        names = ("position",)
+    points = table.numbers(table.indices(names if table.heading else (1, 2, 3)))
+    if points.shape[1:] != (3,) or not np.isfinite(points).all():
+        raise StageError(f"{path}: holds positions that are not three finite numbers")
+    return points
