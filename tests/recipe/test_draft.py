@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 from flangeye.cli.commands import app
 from flangeye.errors import StageError
 from flangeye.maths.geometry import rigid
+from flangeye.models.bodies import TargetBody
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.draft.headings import frames_in
 from flangeye.recipe.load import load_recipe
@@ -112,6 +113,30 @@ def test_a_table_is_read_as_its_heading_says(
     assert "5 poses (table, log.csv), 5 with a cloud" in told
     assert "scan_0.xyz: 200 points, at 807.6 mm (median)" in told
     assert "recipe.yaml: ok, 5 steps; next: flangeye run recipe.yaml" in told
+
+
+def test_a_tool_is_the_target_by_its_mesh(folder: Path) -> None:
+    shutil.copytree(SAMPLE, folder, dirs_exist_ok=True)
+    mesh = SAMPLE.parents[1] / "bodies" / "gripper.stl"
+    shutil.copy(mesh, folder / "own.stl")
+    told = init("--robot", "ur5", "--target", "body: rec/own.stl")
+    assert "no scan shows the flange" not in told
+    drafted = yaml.safe_load((folder.parent / "recipe.yaml").read_text())
+    assert drafted["target"] == {"body": "rec/own.stl"}
+    assert drafted["steps"][1:3] == ["segment.body", "fit.body"]
+    assert recipe(folder).context[TargetBody].name == "own"
+
+
+def test_scans_without_a_flange_bring_up_the_mesh(folder: Path) -> None:
+    clouds(folder)
+    table(folder, "X,Y,Z,A,B,C", kuka)
+    assert "assumed: no scan shows the flange; what is seen instead, 'body:" in init()
+    (folder.parent / "recipe.yaml").unlink()
+    said = init("--robot", "ur5", "--scanner", "none", "--camera", "base", "--rotation", "kuka",
+                "--pose", "base_T_flange",
+                typed="flange\nbody: gripper\n")  # fmt: skip
+    assert "no scan shows the flange" in said
+    assert recipe(folder).context[TargetBody].name == "gripper"
 
 
 def test_defaults_are_told_and_answers_are_not(folder: Path) -> None:
@@ -489,8 +514,8 @@ def two_poses_of_nobody(folder):
          "rec: is no folder; name the one that holds the recordings"),
         (sample, ["--camera", "wrist"], "--camera wrist: is neither base nor flange"),
         (sample, ["--target", "cube"],
-         "--target cube: is none of flange, sphere, charuco, checkerboard, circles, aruco, with "
-         "parameters"),
+         "--target cube: is none of flange, body, sphere, charuco, checkerboard, circles, aruco, "
+         "with parameters"),
         (sample, ["--target", "charuco: {columns: 8}"],
          "--target charuco.rows: is missing\n--target charuco.square: is missing\n"),
         (sample, ["--reader", "table"], "--reader table: rotation and length: is missing"),

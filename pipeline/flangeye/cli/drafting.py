@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 
 TARGETS = re.compile(r"^.*?: steps\.\d+\.fit\.", re.MULTILINE)
 """Where mistakes in a target are, in a recipe that was drafted."""
+NO_FLANGE = (
+    "no scan shows the flange; what is seen instead, 'body: gripper.stl' for a tool by its mesh"
+)
 Answer = str | None
 """To a question that a person is asked otherwise."""
 
@@ -29,8 +32,9 @@ Camera = Annotated[Answer, typer.Option(help="Where the camera is mounted: base 
 Target = Annotated[
     Answer,
     typer.Option(
-        help="Target: flange; 'sphere: {diameter: …, centre: […]}'; 'charuco: {columns: …}' "
-        "and so on, with the parameters of that fit."
+        help="Target: flange; 'body: gripper.stl', a tool by its mesh; "
+        "'sphere: {diameter: …, centre: […]}'; 'charuco: {columns: …}' and so on, with the "
+        "parameters of that fit."
     ),
 ]
 Table = Annotated[Answer, typer.Option(help="Table or array with the arm's poses.")]
@@ -159,7 +163,27 @@ def _of_folder(folder: Path, out: Path, questions: Questions, registry: Registry
     survey = look(folder)
     for line in survey.lines():
         say(line)
+    draft = draft_recipe(survey, out, questions, registry)
+    if "fit.rim" not in draft.text or _shows_target(draft, folder, out, registry):
+        return draft
+    questions.given["target"] = None
+    questions.ask("target", NO_FLANGE, "flange")
     return draft_recipe(survey, out, questions, registry)
+
+
+def _shows_target(draft: Draft, folder: Path, out: Path, registry: Registry) -> bool:
+    """Return whether any scan shows what a drafted recipe looks for; True if it does not run."""
+    from flangeye.errors import FlangeyeError
+    from flangeye.recipe.load import parse_recipe
+    from flangeye.run.runner import Runner
+    from flangeye.types import ArchivePath
+
+    try:
+        # Its paths start at the recipe's folder.
+        recipe = parse_recipe(draft.text, out.name, registry, [f"steps.0.path={folder}"])
+        return bool(Runner(recipe, registry, ArchivePath(folder)).take(1))
+    except FlangeyeError:
+        return True
 
 
 def _of_what_runs(folder: Path, out: Path, questions: Questions, registry: Registry) -> Draft:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from flangeye.errors import FlangeyeError, RecipeError
@@ -28,13 +28,13 @@ class Questions:
     """Where answers come from.
 
     Attributes:
-        given: Answers by flag; None where it was not given.
+        given: Answers by flag, those asked for as well; None where it was not given.
         prompt: Asks a person, or None where there is nobody.
         assumed: What was taken by default, told at the end.
         likely: By option, an answer that the data show, and how they do.
     """
 
-    given: Mapping[str, str | None] = field(default_factory=dict)
+    given: dict[str, str | None] = field(default_factory=dict)
     prompt: Prompt | None = None
     assumed: list[str] = field(default_factory=list)
     likely: dict[str, tuple[str, str]] = field(default_factory=dict)
@@ -60,8 +60,13 @@ class Questions:
             RecipeError: Nothing is likely, nobody can be asked; names the flag to add.
         """
         answer = self.given.get(flag)
-        if answer is not None:
-            return answer
+        if answer is None:
+            answer = self.given[flag] = self._answered(flag, question, default, example, check)
+        return answer
+
+    def _answered(
+        self, flag: str, question: str, default: str | None, example: str, check: Check | None
+    ) -> str:
         default, shown = self.likely.get(flag, (default, ""))
         if self.prompt is not None:
             return self._asked(f"{question} (--{flag})", default, check)

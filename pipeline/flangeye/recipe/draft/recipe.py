@@ -81,7 +81,7 @@ def draft_recipe(
     reader = _reader(survey, questions, registry, robot)
     archive = _bound(reader, registry, robot)(survey.folder)
     stage, target = _what(archive, questions)
-    head = _head(survey.folder, robot, target, questions)
+    head = _head(survey.folder, out, robot, target, questions)
     first: dict[str, Any] = {"path": os.path.relpath(survey.folder, out.parent)}
     first |= {} if reader == "auto" else {"reader": reader}
     first |= _camera(archive, target, questions) if stage == "acquire.images" else {}
@@ -192,7 +192,8 @@ def _what(archive: Archive, questions: Questions) -> tuple[str, dict[str, Any]]:
     if any(r.cloud for r in records):
         answer = questions.ask(
             "target",
-            "what is seen (flange, sphere, charuco, checkerboard, circles, aruco)",
+            "what is seen (flange, 'body: MESH' for a tool, sphere, charuco, checkerboard, "
+            "circles, aruco)",
             "flange",
             check=_target,
         )
@@ -211,14 +212,18 @@ def _what(archive: Archive, questions: Questions) -> tuple[str, dict[str, Any]]:
 def _target(answer: str) -> dict[str, Any]:
     value = parse_value(answer, "--target")
     target = {value: {}} if isinstance(value, str) else value
-    known = ("flange", "sphere", *PRINTED)
+    known = ("flange", "body", "sphere", *PRINTED)
     if not isinstance(target, dict) or len(target) != 1 or next(iter(target)) not in known:
         raise RecipeError(f"--target {answer}: is none of {', '.join(known)}, with parameters")
     return target
 
 
 def _head(
-    folder: Path, robot: dict[str, Any], target: dict[str, Any], questions: Questions
+    folder: Path,
+    out: Path,
+    robot: dict[str, Any],
+    target: dict[str, Any],
+    questions: Questions,
 ) -> dict[str, Any]:
     """Return the recipe's sections above its steps."""
     head: dict[str, Any] = {"title": f"Calibration from {folder.resolve().name}"}
@@ -233,12 +238,20 @@ def _head(
         "scanner", question, NONE, check=lambda a: a == NONE or load_model("scanners", a)
     )
     configuration = _configuration(target, questions)
+    body = _body(str(target["body"]), out, configuration) if "body" in target else {}
     named: Any = robot["model"] if set(robot) == {"model"} else robot
     sections = {
         "robot": named, "scanner": {} if scanner == NONE else scanner,
-        "feature": feature, "configuration": configuration,
+        "feature": feature, "target": body, "configuration": configuration,
     }  # fmt: skip
     return head | {name: section for name, section in sections.items() if section}
+
+
+def _body(mesh: str, out: Path, configuration: dict[str, Any]) -> dict[str, Any]:
+    """Return the section of a body; where a camera in the hand sees it has to be found."""
+    name = os.path.relpath(mesh, out.parent) if Path(mesh).is_file() else mesh
+    where = {"at": "unknown"} if configuration.pop("place", None) else {}
+    return {"body": name, **where}
 
 
 def _plate(questions: Questions, question: str) -> str:
@@ -281,7 +294,7 @@ def _configuration(target: Mapping[str, Any], questions: Questions) -> dict[str,
         raise RecipeError(f"--camera {carried}: is neither base nor flange")
     if carried == "flange":
         return {"name": "eye-in-hand", "place": "unknown"}
-    known = "flange" in target or "sphere" in target
+    known = bool({"flange", "sphere", "body"} & set(target))
     return {} if known else {"name": "eye-on-base", "place": "unknown"}
 
 
@@ -289,6 +302,8 @@ def _steps(stage: str, target: Mapping[str, Any]) -> list[Any]:
     found: list[Any] = []
     if "flange" in target:
         found = ["segment.flange", "fit.rim"]
+    elif "body" in target:
+        found = ["segment.body", "fit.body"]
     elif "sphere" in target:
         found = ["segment.sphere", "fit.sphere"]
     elif target:
