@@ -58,7 +58,7 @@ def test_the_opening_is_half_way_between_what_meets() -> None:
     assert np.degrees(seam.half_angle) == pytest.approx(45, abs=0.5)
 
 
-def disc_on_plate(radius=30 * MM, height=6 * MM, sides=360):
+def disc_on_plate(radius=30 * MM, height=6 * MM, sides=90):
     """Return a round plate on a square one: a lap joint that closes."""
     angle = np.arange(sides) * 2 * np.pi / sides
     round_ = np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
@@ -68,7 +68,7 @@ def disc_on_plate(radius=30 * MM, height=6 * MM, sides=360):
 
 
 def test_a_round_seam_is_closed() -> None:
-    scan = scan_of("plate", 3, plates=disc_on_plate(), tilt=10.0)
+    scan = scan_of("plate", 3, 0.5 * MM, plates=disc_on_plate(), tilt=10.0)
     angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
     rough = 32 * MM * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle]) + [2 * MM, 0, 0]
     camera = rough @ scan.camera_T_joint[:3, :3].T + scan.camera_T_joint[:3, 3]
