@@ -1,4 +1,11 @@
-"""The server: one address, a token for each browser, five pages."""
+"""The server: one address, a token for each browser, five pages.
+
+Who may speak to the page: Host, Origin, method, and a secret that a browser holds.
+
+The terminal prints an address with a token that works once. It is exchanged for a cookie whose name
+and path are random, so that no program on another port of this machine gets it or can put one of
+its own in its place. Nothing behind the gate sees cookies.
+"""
 
 from __future__ import annotations
 

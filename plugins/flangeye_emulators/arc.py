@@ -1,4 +1,4 @@
-"""Simulated power sources."""
+"""``arc.simulated``: a power source that only remembers how it was switched."""
 
 from __future__ import annotations
 

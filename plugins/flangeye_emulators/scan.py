@@ -1,4 +1,4 @@
-"""``scan.simulated``: a simulated workpiece."""
+"""``scan.simulated``: a workpiece on a bench, before the scanner of a simulated cell."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``cost.*``: what solve.iterative minimises. Add a cost: a function in ``costs``."""
+"""One number from a pose error: the paper's ``||.||_cost`` (sections 2.1.4 and 4.2), in metres."""
 
 from __future__ import annotations
 

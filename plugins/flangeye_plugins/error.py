@@ -1,4 +1,4 @@
-"""``error.*``: how solve.iterative measures a candidate. Add one: a function in ``errors``."""
+"""How ``solve.iterative`` measures a candidate: the parts ``error.icp`` and ``error.holdout``."""
 
 from __future__ import annotations
 

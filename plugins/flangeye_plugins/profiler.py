@@ -1,4 +1,11 @@
-"""``profiler.*``: sensors that look at the bead behind the torch. Add one: a new module."""
+"""``profiler.*``: sensors that look at the bead behind the torch. Add one: a new module.
+
+Profile sensors with an evaluation of their own, which send what they measure as lines of text.
+
+Such a sensor is set up in its maker's program to find bead and joint in each profile, and sends how
+far one lies from the other over TCP, a line for each profile. Which of a line's columns that is, in
+which unit and to which side, the recipe says. A column that holds no number is no look.
+"""
 
 from __future__ import annotations
 

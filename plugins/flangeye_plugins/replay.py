@@ -1,4 +1,4 @@
-"""``replay.*``: decisions of a step repeated from its log. Add a step: a new module here."""
+"""A weld decided again, from the images and poses in its log."""
 
 from __future__ import annotations
 

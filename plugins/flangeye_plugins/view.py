@@ -1,4 +1,4 @@
-"""``view.*``: first guesses of the scanner pose, for planning. Add one: here, in ``guess``."""
+"""What is guessed of the scanner's place before the first scan: enough to plan poses in view."""
 
 from __future__ import annotations
 

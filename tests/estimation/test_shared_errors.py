@@ -11,7 +11,7 @@ import pytest
 
 from flangeye.errors import CalibrationRefused
 from flangeye.maths.geometry import invert, rigid, rotation_exp, rotation_log
-from flangeye.maths.shared_errors import without_shared
+from flangeye.maths.statistics import without_shared
 from flangeye.models.configuration import Configuration
 from flangeye.models.corners import Corners
 from flangeye.types import (

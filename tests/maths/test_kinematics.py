@@ -7,9 +7,9 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from flangeye.maths.closed_form import Undecomposed
 from flangeye.maths.geometry import rigid, rotation_from_rpy, rotation_log
 from flangeye.maths.kinematics import Arm
+from flangeye.maths.offset_wrist import Undecomposed
 from flangeye.models.loading import load_model
 from flangeye.models.robots import Joint
 

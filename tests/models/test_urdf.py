@@ -13,15 +13,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flangeye.errors import RecipeError, StageError
-from flangeye.maths.capsules import fit_capsule
 from flangeye.maths.geometry import rotation_from_rpy
 from flangeye.maths.kinematics import Arm
 from flangeye.models.urdf import robot_from_urdf
-from flangeye.models.urdf_meshes import vertices
+from flangeye.models.urdf_meshes import fit_capsule, vertices
 from flangeye.motion.clearance import ArmVolume
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.check import describe_recipe
-from flangeye.recipe.load import load_recipe
+from flangeye.recipe.load import describe_recipe, load_recipe
 from flangeye.types import Warn
 
 ORIGINS = [  # of a KUKA KR 6 R900 sixx: its maker's table

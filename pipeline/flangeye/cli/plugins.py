@@ -17,8 +17,8 @@ def check(recipe: RecipeName, overrides: Overrides = None) -> None:
 
     Prints every mistake with its line, or the transforms that will be estimated.
     """
-    from flangeye.recipe.check import describe_recipe
     from flangeye.recipe.find import find_recipe
+    from flangeye.recipe.load import describe_recipe
 
     say(describe_recipe(find_recipe(recipe), load_plugins(), overrides or ()))
 

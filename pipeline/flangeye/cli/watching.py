@@ -84,7 +84,7 @@ def monitor(  # noqa: PLR0913  one argument an option
         take,
         write_chart,
     )
-    from flangeye.doctor.monitor.opcua import write_state
+    from flangeye.doctor.monitor.watchman import write_state
     from flangeye.errors import StageError
 
     archive = [*(archive or ()), *(more or ())]
@@ -135,7 +135,7 @@ def _checks(
 
 
 def _opcua_node(opcua: str, security: str | None) -> tuple[str, str]:
-    from flangeye.doctor.monitor.opcua import require_secured
+    from flangeye.doctor.monitor.watchman import require_secured
     from flangeye.errors import StageError
 
     url, comma, node = opcua.partition(",")

@@ -1,6 +1,10 @@
 """From an archive, and the recipe that would run on it, to the arrays that checks look at.
 
 The reader's poses are taken as they are, whatever is wrong with them.
+
+What a recipe's own steps find in an archive's scans, whatever is wrong with its poses.
+
+It does not depend on the poses: they are found with stand-ins that no step can object to.
 """
 
 from __future__ import annotations

@@ -14,9 +14,14 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 
-from flangeye.maths.closed_form import ClosedForm, Undecomposed, closed_form
 from flangeye.maths.geometry import basis_of_plane, rigid, rotation_from_rpy
-from flangeye.maths.offset_wrist import OffsetWrist, offset_wrist
+from flangeye.maths.offset_wrist import (
+    ClosedForm,
+    OffsetWrist,
+    Undecomposed,
+    closed_form,
+    offset_wrist,
+)
 from flangeye.types import Floats
 
 SOLVED = 1e-9
@@ -223,7 +228,7 @@ class Arm:
     def inverse(self, base_T_flange: Floats, starts: int = 48, iterations: int = 40) -> Floats:
         """Return joint angles within the limits that reach a pose, (K, n), K may be zero.
 
-        In closed form where six joints allow it (:mod:`flangeye.maths.closed_form`); an arm that
+        In closed form where six joints allow it (:mod:`flangeye.maths.offset_wrist`); an arm that
         differs a little from such a one, as a calibrated arm does, is polished from there. Six
         joints whose wrist is not spherical are mostly solved by a search over one of them
         (:mod:`flangeye.maths.offset_wrist`). Of the continuum of a seven-joint arm it gives a

@@ -218,7 +218,7 @@ class Cell:
         """Return observations with the flanges where corrected arms have them; see ``Layout``."""
         from flangeye.maths.arm_correction import corrected_observation
         from flangeye.maths.kinematics import Arm
-        from flangeye.maths.shared_errors import without_shared
+        from flangeye.maths.statistics import without_shared
 
         alone = {FLANGE: calibration.correction} if calibration.correction else {}
         moved = [without_shared(o, calibration.shared) for o in observations]

@@ -119,7 +119,7 @@ class Configuration:
     ) -> list[Observation]:
         """Return observations as the calibration corrects them; see :class:`Layout`."""
         from flangeye.maths.arm_correction import corrected_observation
-        from flangeye.maths.shared_errors import without_shared
+        from flangeye.maths.statistics import without_shared
 
         found, correction = calibration.shared, calibration.correction
         seen = [without_shared(o, found) for o in observations]

@@ -1,4 +1,11 @@
-"""An arm that is driven from this process, and watched in each of its cycles like any other."""
+"""An arm that is driven from this process, and watched in each of its cycles like any other.
+
+An arm that a program leads from cycle to cycle, owned and watched by a guard beside it.
+
+The guard's process holds the arm's driver. The program waits for each cycle and answers it with a
+velocity; what it does not answer in time, or at all, the guard ends (:data:`HUNG` of
+:mod:`flangeye.motion.watchdog`). To the program it is a :class:`flangeye.devices.Robot`.
+"""
 
 from __future__ import annotations
 

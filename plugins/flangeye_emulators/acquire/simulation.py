@@ -49,7 +49,7 @@ from flangeye_emulators.world.raycast import Body, Image
 from flangeye_emulators.world.scanner import before_camera, scanner_of
 from flangeye_emulators.world.structured_light import StructuredLight
 from flangeye_emulators.world.time_of_flight import TimeOfFlight
-from flangeye_plugins.acquire.plan_rows import as_plan, left_out, row_at
+from flangeye_plugins.acquire.itinerary import as_plan, left_out, row_at
 
 FEWEST = 3
 """Poses without which no camera pose can be found."""

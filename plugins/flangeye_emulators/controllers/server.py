@@ -1,4 +1,10 @@
-"""A controller as a process: ports, clock, control channel, whoever made the arm."""
+"""A controller as a process: ports, clock, control channel, whoever made the arm.
+
+The control channel: one JSON object a line asks, one a line answers.
+
+``{"do": "state"}`` is answered by ``{"ok": true, ...}`` or ``{"ok": false, "error": "..."}``. It is
+not part of any robot: it is how tests and the simulated scanner reach behind the controller.
+"""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ from flangeye.types import (
     Transform,
     by_frame,
 )
-from flangeye.units import Angle, JointPosition, Length, param
+from flangeye.units import JointPosition, Length, param
 from flangeye_plugins.acquire.itinerary import Itinerary, Stop, itinerary_of
 
 HOW_TO_MOVE = "dry run, nothing moved; add --move to execute"
@@ -98,9 +98,6 @@ class LiveParams(Params):
     verification: int = Field(
         1, ge=0, description="Captures that are kept from solving, near the workspace's middle."
     )
-    joint_margin: Angle = param(
-        "5 deg", ge=0, description="Poses keep this far from the limits of the joints."
-    )
     singularity: float = Field(
         0.05,
         ge=0,
@@ -145,7 +142,8 @@ def acquire_live(  # noqa: PLR0913  what it asks the runner for
         NothingMoved: Motion was not asked for; the message is the plan.
     """
     allowed = limits_of(limits, robot)
-    margins = Margins(allowed, params.joint_margin, params.singularity)
+    # Poses keep 5 deg from the limits of the joints: a pose at a limit cannot be approached.
+    margins = Margins(allowed, np.radians(5.0), params.singularity)
     base_T_camera = params.view(Arm(robot), scanner)
 
     def planned(start: Floats | None) -> Itinerary:

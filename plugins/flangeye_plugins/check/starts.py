@@ -1,4 +1,10 @@
-"""Closed-form calibrations of every variant, to start from."""
+"""Closed-form calibrations of every variant, to start from.
+
+Where two arms' calibrations start: the second one's base is unknown too.
+
+``X @ camera_T_target = carrier_T_base @ Y @ base2_T_mount @ Z``, with ``X = carrier_T_camera``,
+``Y = base_T_base2`` and ``Z = mount_T_target``; of every variant at once.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""Arms of Franka Robotics."""
+"""``robot.franky``: arms of Franka Robotics through franky and libfranka.
+
+Proven with the library as far as it goes without a controller: it loads, its motions and poses are
+built, a refused and a silent connection are errors in time. Moving, reading and stopping ran
+against a stand-in for the connection alone; see the README of the drivers.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An arm that a person moves: the program says where to, the person says where it stands."""
+"""``robot.manual``: no connection at all; a person moves the arm and reads its pose out."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ from flangeye.cli.commands import app
 from flangeye.doctor.monitor import History, from_arm, judge, stored_calibration
 from flangeye.doctor.monitor.chart import figure
 from flangeye.doctor.monitor.history import Finding
-from flangeye.doctor.monitor.opcua import write_state
+from flangeye.doctor.monitor.watchman import write_state
 from flangeye.errors import FlangeyeError, StageError
 from flangeye.estimation.watch.drift import DriftTest
 from flangeye_plugins.reader.folder import FolderParams, folder

@@ -2,6 +2,12 @@
 
 A new kind of file is a function in :mod:`~flangeye.files.tables.documents` and its row there, or a
 pattern in :data:`~flangeye.maths.pose_formats.CONVENTIONS`.
+
+Rows of poses, whatever file they are from.
+
+``poses.csv`` names a file; ``robot/*.txt`` files with a row each; ``log.txt:2`` the second block
+of rows of a text, ``log.txt:2/2`` the second half of its rows; ``poses.npz:arm`` the arrays of a
+document that have as many entries as ``arm``. Several names are tables side by side.
 """
 
 from __future__ import annotations

@@ -1,4 +1,11 @@
-"""The same messages to Foxglove: its own server, fed from the log."""
+"""The same messages to Foxglove: its own server, fed from the log.
+
+Who may look at a run in Foxglove: a browser says which page asks, and no other page may.
+
+Foxglove's own server takes any page's connection. It listens where nothing but this gate finds it,
+at one of 2^24 loopback addresses and a free port; the gate reads the first request and hands on the
+rest unread.
+"""
 
 from __future__ import annotations
 

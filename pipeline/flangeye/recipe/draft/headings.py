@@ -1,4 +1,10 @@
-"""What the columns of a table are called, and the poses, points and joint angles they hold."""
+"""What the columns of a table are called, and the poses, points and joint angles they hold.
+
+What a name says of the poses that it names: whose they are, and which way round.
+
+A name of two frames says both: ``gripper2base`` is a pose of the arm, ``camera_T_target``,
+``T_cam_board`` and ``cHt`` are the target's as the camera sees it.
+"""
 
 from __future__ import annotations
 

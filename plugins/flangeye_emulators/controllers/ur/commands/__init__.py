@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from flangeye_emulators.controllers.ur.commands import moves, queries, settings, streams, touch
+from flangeye_emulators.controllers.ur.commands import moves, queries, streams, touch
 from flangeye_emulators.controllers.ur.program import Thread
 from flangeye_emulators.controllers.ur.script import ControlScript
 
@@ -15,7 +15,6 @@ COMMANDS: dict[int, Handler] = {
     **streams.COMMANDS,
     **touch.COMMANDS,
     **queries.COMMANDS,
-    **settings.COMMANDS,
 }
 
 STREAMED = frozenset({6, 9, 10, 11, 24, 25, 26, 27, 38, 58, *range(66, 72)})

@@ -1,4 +1,4 @@
-"""Commands that only ask; answers go into the output registers."""
+"""Commands that ask, with answers in the output registers, and commands that set something."""
 
 from __future__ import annotations
 
@@ -66,6 +66,35 @@ INTEGERS: Mapping[int, Callable[[ControlScript], int]] = {
 """Questions that are answered with an integer."""
 
 
+def set_payload(script: ControlScript) -> None:
+    """17 and 65, setPayload and setTargetPayload; a centre of zeros keeps the old one."""
+    centre = script.numbers(1, 3)
+    script.box.payload = (
+        script.number(0),
+        centre if centre.any() else script.box.payload[1],
+    )
+
+
+def set_tool(script: ControlScript) -> None:
+    """29, setTcp."""
+    script.arm.set_tool(pose_matrix(script.numbers(0)))
+
+
+def protective_stop(script: ControlScript) -> None:
+    """31, triggerProtectiveStop."""
+    script.box.protective_stop("commanded")
+
+
+def set_watchdog(script: ControlScript) -> None:
+    """35, setWatchdog: stop the program when commands come more slowly than [Hz]."""
+    script.box.set_watchdog(script.offset, script.number(0))
+
+
+def accept(script: ControlScript) -> None:
+    """Do nothing: what is set has no effect on this arm."""
+    del script
+
+
 def _numbers(ask: Callable[[ControlScript], Floats]) -> Callable[[ControlScript], None]:
     return lambda script: script.give_numbers(ask(script))
 
@@ -77,4 +106,13 @@ def _integer(ask: Callable[[ControlScript], int]) -> Callable[[ControlScript], N
 COMMANDS = {
     **{number: _numbers(ask) for number, ask in NUMBERS.items()},
     **{number: _integer(ask) for number, ask in INTEGERS.items()},
+    17: set_payload,
+    20: accept,  # force mode damping
+    29: set_tool,
+    31: protective_stop,
+    35: set_watchdog,
+    56: accept,  # external force sensor through RTDE
+    57: accept,  # external force sensor
+    59: accept,  # gravity
+    65: set_payload,
 }
