@@ -134,7 +134,10 @@ def drawn(seed: int) -> Condition:
         "arm_sigma": _mm(arm), "distortion": _mm(heat),
     }  # fmt: skip
     belief = {"torch_sigma": torch, "along_sigma": along, "tip_sigma": tip_sigma}
-    return Condition(world, settings, (draw.some(12e-3), draw.some(0.1)), belief)
+    planned = draw.some(12e-3), draw.some(0.1)
+    # How far its ends may be off along it, a plan's file states.
+    settings["ends"] = _mm(planned[0] + planned[1] ** 2 * LENGTH / 4.0)
+    return Condition(world, settings, planned, belief)
 
 
 def _arm(draw: _Draw, sigma: float) -> dict[str, Any]:

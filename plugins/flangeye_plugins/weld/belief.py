@@ -22,9 +22,6 @@ UNCALIBRATED = (1000.0, 2000.0)
 CREEP = 0.02
 """Share of a displacement by which a finger creeps, one standard deviation."""
 
-STEEP = 0.35
-"""A tip that climbs rises along its wall, at least at this share of the planned slope."""
-
 NEARLY_UPRIGHT = math.radians(1.0)
 """A wall that leans by less is as good as upright: nothing climbs it."""
 
@@ -120,15 +117,6 @@ class Belief:
             return None
         aside, into = self.pressing(settings) @ [settings.deflection, settings.preload]
         return float(into / max(aside * self._steepness(settings), 1e-9))
-
-    def holding(self, settings: Following, share: float = 1.0) -> Floats:
-        """Return (2,) what holds the tip in its joint per deflection and compression [N/m].
-
-        The same as :meth:`seating`, for what is measured: where both come to less than nothing the
-        seating is below ``share``, and a tip below one climbs its wall.
-        """
-        forces = self.pressing(settings)
-        return np.asarray(forces[1] - share * self._steepness(settings) * forces[0])
 
     def sliding(self, settings: Following) -> float:
         """Return the deflection that friction alone can give on a face [m]."""

@@ -9,6 +9,7 @@ can show (play, noise, a gap) comes on top.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ from flangeye.errors import StageError
 from flangeye.types import Floats
 from flangeye_plugins.weld.belief import MINUTE, Belief
 from flangeye_plugins.weld.path import Path
+from flangeye_plugins.weld.probing import PIVOTED, SOFTER
 from flangeye_plugins.weld.settings import Following
 from flangeye_plugins.weld.weave import Weave
 
@@ -71,10 +73,15 @@ def predicted(plan: Path, belief: Belief, settings: Following) -> Predicted:
     sine = np.where(s + belief.distance < lets_go, sine, least)
     minutes = (s + belief.distance) / settings.speed / MINUTE
     weave = Weave(settings.weave_width, settings.weave_frequency)
-    drift = settings.gain_drift * minutes * settings.deflection
+    # Between two walls the sweep at the start tells how far ahead the tip is.
+    softer = settings.probing and belief.two_walls
+    ahead = min(belief.tip_sigma, PIVOTED if softer else math.inf)
+    press = settings.deflection / (SOFTER if softer else 1.0)
+    drift = settings.gain_drift * minutes * press
     return Predicted(
         s, np.full(len(s), belief.fixed_variance(settings)), (belief.along_sigma * sine) ** 2,
-        (belief.tip_sigma * turned) ** 2, drift**2 + weave.variance,
+        (ahead * turned) ** 2 + (belief.tip_sigma * turned**2 / 2.0) ** 2,
+        drift**2 + weave.variance,
     )  # fmt: skip
 
 

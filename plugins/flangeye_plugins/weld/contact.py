@@ -1,155 +1,225 @@
-"""Whether the tip touches the groove's wall: filtered, with hysteresis in size and time."""
+"""Whether the tip is where the seam is: one hidden Markov model of how it touches the joint.
+
+A tip is seated between the walls, up the wall that it is pressed to on one side or the other, or
+free: then it goes with the arm. Each measurement is weighed against where the seam so far leads:
+
+* seated, it is there, and as high as before, or lifted straight up by a tack weld;
+* up a wall, it is aside by ``flat`` for what it rose, by about :data:`RISE`;
+* free, it is hardly deflected, at any height.
+
+A wall is climbed where the tip is pressed aside by more, for what presses it down, than it was
+seen to stand in the sweep at the start. What is felt counts a little later, by what was felt since
+(a forward-backward pass over the newest): what it may be off by is its ``doubt``.
+"""
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from typing import Literal
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 
 from flangeye.types import Floats
 
-State = Literal["seeking", "held", "lost"]
+SEATED, PRESSED, OTHER, FREE = range(4)
+"""The modes: up the wall on the pressed side, on the other one."""
 
-SMOOTHING = 0.05
-"""Time constant of the filter on the deflection [s]."""
+RISE = 0.5e-3
+"""Scale of how far a tip that climbs has risen [m]."""
 
-DWELL = 0.1
-"""How long a crossing must last to count [s]."""
+LIFTS = 1.0e-3
+"""Scale of the heights of tack welds, and of how far the seam bends off the plan [m]."""
 
-LOST, REGAINED = 0.35, 0.6
-"""Shares of the wanted deflection below which contact is doubted, above which it is believed."""
+TACKS, BENDS = 0.1, 0.02
+"""Share of a seam that tack welds lift the tip on, and where it bends as the plan does not."""
+
+STRIDE = 10e-3
+"""Way over which modes and heights change [m]."""
+
+UP = 1e-3
+"""Way over which a tip climbs that is pressed aside by more than it stands [m]."""
+
+ALIKE = 0.5
+"""Measurements that follow each other see the same error of what is expected: one in two is new."""
+
+STRAINED = 0.9
+"""Share of what the tip is known to stand from which it may climb."""
+
+RARE = 1e-3
+"""Share of a stride's tips that climb though pressed by little, or lose their wall."""
+
+SETTLING = 0.1
+"""Time constant of the filter on deflection and compression [s]."""
 
 
-HELD = 8
-"""Measurements whose mean tells whether the tip is held in its joint: those not yet believed."""
+class Felt(NamedTuple):
+    """A measurement against what was expected of a seated tip [m].
 
-UNHELD = 2.0
-"""Standard deviations by which they have to say that it is not."""
+    Attributes:
+        time: [s].
+        s: Arc length.
+        offset: To the left of the plan.
+        angle: Of the tool [rad].
+        aside: To the left of where the seam was expected.
+        spread: Variance of it, of measurement and expectation [m^2].
+        height: Above the plan's.
+        deflection: Towards the pressed side.
+        compression: Into the joint.
+    """
+
+    time: float
+    s: float
+    offset: float
+    angle: float
+    aside: float
+    spread: float
+    height: float
+    deflection: float
+    compression: float
+
+
+class _Weighed(NamedTuple):
+    """A measurement, and what it says of the modes.
+
+    Attributes:
+        felt: As it was taken.
+        likely: (4,) of the modes, by all up to it.
+        moves: (4, 4) from each mode before to each now.
+        chances: (4,) densities in each mode.
+        climbed: How far it has risen, if it has climbed [m].
+    """
+
+    felt: Felt
+    likely: Floats
+    moves: Floats
+    chances: Floats
+    climbed: float
 
 
 class Contact:
-    """A Schmitt trigger on the deflection along the path's normal.
+    """The state of the tip's contact.
 
     Attributes:
-        state: Seeking until the wall was felt first; then held or lost.
-        since: When the state was last changed [s].
-        deflection: Filtered, positive when the wall is pressed [m].
+        likely: (4,) how likely each mode is.
+        deflection: Filtered, positive towards the pressed side [m].
+        compression: Filtered [m].
+        steady: Largest deflection for its compression that the tip stands, as far as was seen.
     """
 
-    def __init__(self) -> None:
-        self.state: State = "seeking"
-        self.since = -math.inf
-        self.deflection = 0.0
-        self._crossed = math.inf
-        self._time = -math.inf
-
-    def update(self, time: float, deflection: float, wanted: float) -> None:
-        """Take one measurement [m] at ``time`` [s]; ``wanted`` is positive."""
-        left = math.exp(-(time - self._time) / SMOOTHING)  # none of what was before the first
-        self.deflection = deflection + left * (self.deflection - deflection)
-        self._time = time
-        held = self.state == "held"
-        level = (LOST if held else REGAINED) * wanted
-        if (self.deflection < level) != held:
-            self._crossed = math.inf
-            return
-        self._crossed = min(self._crossed, time)
-        if time - self._crossed >= DWELL:
-            self.state, self.since = ("lost" if held else "held"), time
-            self._crossed = math.inf
-
-    def hold(self, time: float, deflection: float) -> None:
-        """Take it for certain that the wall is pressed, by ``deflection`` [m]."""
-        self.state, self.since = "held", time
-        self.deflection, self._time, self._crossed = deflection, time, math.inf
-
-    def doubted(self, deflection: float, wanted: float) -> bool:
-        """Whether one measurement alone speaks against contact."""
-        return self.state != "held" or deflection < LOST * wanted
-
-
-LEANING = 0.1e-3
-"""A tip that is let go of and is displaced by more is held by a wall [m]."""
-
-NEWEST = 5
-"""Measurements that are judged together: never one alone."""
-
-SURE = 4.0
-"""Standard deviations of their mean by which it has to exceed a threshold."""
-
-
-class Release:
-    """Whether the tip is still between the walls while it is let go of.
-
-    Where the robot is, and what was felt before, say by how much it should be deflected. When it is
-    not, its wall is gone; when it is deflected to the other side by more than friction can give,
-    the other wall holds it, whatever was expected. When that does no longer, the tip may have left
-    the groove over it.
-
-    Attributes:
-        loose: Whether what the tip does says nothing of the seam.
-        other: Whether the other wall holds it.
-    """
-
-    def __init__(self, two_walls: bool, sliding: float) -> None:
-        """Begin; friction alone displaces a tip that no wall holds by ``sliding`` [m]."""
-        self.loose = self.other = False
-        self._two_walls, self._sliding = two_walls, sliding
-        self._newest: deque[tuple[float, float]] = deque(maxlen=NEWEST)
-
-    def judge(self, deflection: float, expected: float, sigma: float) -> None:
-        """Take a measurement and what was expected of it, towards the pressed wall [m].
+    def __init__(self, flat: float, slides: float, noise: tuple[float, float]) -> None:
+        """Begin seated.
 
         Args:
-            deflection: As measured.
-            expected: If the seam is where it was felt to lead.
-            sigma: Standard deviation of one measurement.
+            flat: How far a tip goes aside that climbs a wall by one.
+            slides: Deflection that friction alone can give [m].
+            noise: Standard deviations of one measurement across and up [m].
         """
-        self._newest.append((deflection, expected))
-        if len(self._newest) < NEWEST:
-            return
-        deflection, expected = (sum(column) / NEWEST for column in zip(*self._newest, strict=True))
-        least = LEANING + SURE * sigma / math.sqrt(NEWEST)
-        # A tip that goes along and drags agrees with every place the robot leads it to.
-        was = self.other
-        self.other = self._two_walls and deflection < -max(least, self._sliding)
-        if self.other:
-            self.loose = False
-        elif was or (expected > least and deflection < LOST * expected):
-            self.loose = True
+        self.likely = np.array([1.0, 0.0, 0.0, 0.0])
+        self.deflection = self.compression = 0.0
+        self.steady = math.inf
+        self.noise = noise
+        self._flat, self._slides = flat, slides
+        self._time, self._s = -math.inf, 0.0
+        self._height, self._spread = 0.0, math.inf
+        self._newest: deque[_Weighed] = deque()
+
+    def seat(self, time: float, deflection: float, compression: float) -> None:
+        """Take it for certain that the tip is seated and pressed [m]; what it stands is known."""
+        self.likely = np.array([1.0, 0.0, 0.0, 0.0])
+        self.deflection, self.compression, self._time = deflection, compression, time
+        self._spread = math.inf
+
+    @property
+    def free(self) -> float:
+        """How likely it is that no wall holds the tip."""
+        return float(self.likely[FREE])
+
+    @property
+    def strained(self) -> float:
+        """By how much the tip is pressed aside, as a share of what it is known to stand."""
+        stands = self.steady * max(self.compression, 1e-9)
+        return abs(self.deflection) / stands
+
+    def take(self, felt: Felt, side: float) -> None:
+        """Weigh the modes by a measurement; ``side`` is pressed, 1 for the left."""
+        kept = math.exp(-(felt.time - self._time) / SETTLING)
+        self.deflection += (1.0 - kept) * (felt.deflection - self.deflection)
+        self.compression += (1.0 - kept) * (felt.compression - self.compression)
+        way, self._time, self._s = abs(felt.s - self._s), felt.time, felt.s
+        if self._spread == math.inf:
+            way, self._height, self._spread = 0.0, felt.height, self.noise[1] ** 2
+        share, soon = (1.0 - math.exp(-(way + 1e-4) / over) for over in (STRIDE, UP))
+        self._spread += share * LIFTS**2 / 100.0
+        moves = self._moves(share, soon)
+        chances, climbed = self._chances(felt, side)
+        weighed = (self.likely @ moves) * chances
+        self.likely = weighed / weighed.sum()
+        self._newest.append(_Weighed(felt, self.likely, moves, chances, climbed))
+        gain = float(self.likely[SEATED]) * self._spread / (self._spread + self.noise[1] ** 2)
+        self._height += gain * (felt.height - self._height)
+        self._spread *= 1.0 - gain
+
+    def forget(self) -> None:
+        """Drop what was taken and has not counted yet: it was felt where no wall held the tip."""
+        self._newest.clear()
+
+    def settled(self, until: float) -> Iterator[tuple[Felt, float]]:
+        """Return what was felt up to a time [s] and counts, each with its doubt [m^2]."""
+        since, off = np.ones(4), []
+        for weighed in reversed(self._newest):
+            likely = weighed.likely * since
+            off.append(likely / likely.sum())
+            since = weighed.moves @ (weighed.chances * since)
+            since /= since.sum()
+        while self._newest and self._newest[0].felt.time <= until:
+            weighed, likely = self._newest.popleft(), off.pop()
+            if likely[FREE] < 0.5:
+                climbs = float(likely[PRESSED] + likely[OTHER])
+                yield weighed.felt, climbs * (self._flat * weighed.climbed) ** 2
+
+    def _moves(self, share: float, soon: float) -> Floats:
+        """Return how likely each mode becomes each (4, 4), over shares of STRIDE and of UP."""
+        climbing = share * RARE + soon * min(max(self.strained - STRAINED, 0.0) ** 2, 0.9)
+        moves = np.diag([1.0, 1.0 - share, 1.0 - share, 1.0 - share])
+        moves[:, SEATED] += [0.0, share, share, share]
+        moves[SEATED, PRESSED if self.deflection > 0.0 else OTHER] = climbing
+        moves[SEATED, FREE] = share * RARE * 10.0
+        moves[SEATED, SEATED] -= climbing + share * RARE * 10.0
+        return moves
+
+    def _chances(self, felt: Felt, side: float) -> tuple[Floats, float]:
+        """Return the densities (4,) of a measurement in each mode, and how far it has climbed."""
+        up, tall = felt.height - self._height, self._spread + self.noise[1] ** 2
+        seated = _mostly(up, tall, TACKS) * _mostly(felt.aside, felt.spread, BENDS)
+        walls = [
+            _up_a_wall(s * side * felt.aside, up, felt.spread, tall, self._flat) for s in (1, -1)
+        ]
+        drags = [_normal(felt.deflection, self.noise[0] ** 2 + d**2) for d in (0.0, self._slides)]
+        free = 0.5 * sum(drags) * _normal(up, tall + LIFTS**2)
+        climbed = walls[0][1] if felt.deflection > 0.0 else walls[1][1]
+        chances = np.array([seated, walls[0][0], walls[1][0], free]) + 1e-12
+        return chances**ALIKE, max(climbed, RISE)
 
 
-class Hold:
-    """Whether the tip is pressed into its joint enough to stay there, on several measurements.
+def _mostly(off: float, variance: float, seldom: float) -> float:
+    """Return the density of what is seldom off by about LIFTS more."""
+    wide = _normal(off, variance + LIFTS**2)
+    return (1.0 - seldom) * _normal(off, variance) + seldom * wide
 
-    Where a joint gets wider faster than the tool comes down, or the seam turns away faster than
-    the arm follows, what presses the tip aside moves it up its wall. There it stays until it is
-    pressed down by clearly more: what is up a wall is held there by as much as pushes it.
-    """
 
-    def __init__(self, holding: Floats, reseating: Floats) -> None:
-        """Begin; see :meth:`Belief.holding`, of a tip in its joint and of one that left it."""
-        self._holding, self._reseating = holding, reseating
-        self._newest: deque[tuple[float, float]] = deque(maxlen=HELD)
-        self._failed = False
+def _normal(off: float, variance: float) -> float:
+    return math.exp(-0.5 * off * off / variance) / math.sqrt(2.0 * math.pi * variance)
 
-    def fails(self, deflection: float, compression: float, sigma: Floats) -> bool:
-        """Take a measurement; return whether the newest ones do not hold the tip.
 
-        Args:
-            deflection: Towards the pressed wall [m].
-            compression: Into the joint [m].
-            sigma: (2,) standard deviations of one measurement of both [m].
-        """
-        self._newest.append((deflection, compression))
-        if len(self._newest) < HELD:
-            return False
-        mean = [sum(column) / HELD for column in zip(*self._newest, strict=True)]
-        if self._failed:
-            self._failed = bool(self._reseating @ mean < 0.0)
-        else:
-            scatter = float(np.hypot(*(self._holding * sigma))) / math.sqrt(HELD)
-            self._failed = bool(self._holding @ mean < -UNHELD * scatter)
-        return self._failed
+def _up_a_wall(
+    aside: float, up: float, across: float, tall: float, flat: float
+) -> tuple[float, float]:
+    """Return the density of a tip that rose by about RISE along a wall, and how far it has."""
+    weight = 1.0 / RISE**2 + flat**2 / across + 1.0 / tall
+    risen = (1.0 / RISE + flat * aside / across + up / tall) / weight
+    left = (risen - RISE) ** 2 / RISE**2
+    left += (aside - flat * risen) ** 2 / across + (up - risen) ** 2 / tall
+    scale = 2.0 * math.pi * RISE * math.sqrt(across * tall * weight)
+    return math.exp(-0.5 * left) / scale, risen

@@ -14,15 +14,13 @@ from flangeye.motion.seam_following import STILL, Command, Phase, ToolPose, Touc
 from flangeye.types import Floats
 from flangeye_plugins.weld.belief import BAND, MINUTE, Belief
 from flangeye_plugins.weld.bias import Bias, Trail
-from flangeye_plugins.weld.checks import SEATING
-from flangeye_plugins.weld.consistency import LASTING, Seating
-from flangeye_plugins.weld.contact import Contact, Hold, Release
+from flangeye_plugins.weld.contact import STRAINED, Contact, Felt
 from flangeye_plugins.weld.motion import SeamReading, Track
 from flangeye_plugins.weld.path import Path
-from flangeye_plugins.weld.probing import Learned, Probing
-from flangeye_plugins.weld.refined import BIN, RefinedPath
+from flangeye_plugins.weld.probing import MARGIN, SOFTER, Learned, Probing
+from flangeye_plugins.weld.refined import RefinedPath
 from flangeye_plugins.weld.response import Response
-from flangeye_plugins.weld.search import STEEPER, Search
+from flangeye_plugins.weld.search import Search
 from flangeye_plugins.weld.settings import Following
 from flangeye_plugins.weld.steering import SLOWEST, Steering
 from flangeye_plugins.weld.striking import Striking
@@ -34,14 +32,26 @@ BELIEF = 0.3
 SETTLING = 8e-3
 """Way in which an error of the torch is taken back at speed [m]."""
 
+INSIDE = 1.5e-3
+"""The tip goes back to where the seam has surely begun by this [m]."""
+
+SEATS = 20
+"""Last measurements of the sweep that the path begins with."""
+
 SHORT = 0.01
 """A weld is done where no larger share of the planned seam was left out."""
 
 STEADY = 0.03e-3
 """A finger that scatters less is followed from one measurement to the next [m]."""
 
-PLAYED = 1.0
-"""Share of the finger's play and hysteresis that stays uncertain, one standard deviation."""
+WOBBLE = 0.2e-3
+"""So much the deflection changes back and forth while the tip is pressed to one side [m]."""
+
+LOST, REGAINED = 0.9, 0.1
+"""A wall is lost where the tip is as likely free, and held again where it no longer is."""
+
+TRIED = 10e-3
+"""So far along the seam a lost wall is sought on one side, then on the other [m]."""
 
 FIRM = 0.7
 """Share of the wanted deflection below which the tip slows down."""
@@ -64,9 +74,6 @@ curve are equally near."""
 
 SWERVE_AHEAD = 10e-3
 """So far before a curve the tip slows down [m]."""
-
-SHARE = 2e-3
-"""A control cycle finds one piece of the felt seam again for so much of its period [s]."""
 
 PATIENT = 4.0
 """Before the arc burns a tag is waited for so many times longer: the arm stands."""
@@ -132,19 +139,23 @@ class Follower:
             touch: Follow by touch; otherwise the plan alone, for comparison.
             before: What an earlier weld has left that is gone on with.
         """
-        self.mode = "tactile" if touch else "vision"
+        self.mode: str = "tactile" if touch else "vision"
         self.phase: Phase = "seeking" if touch else "following"
         self.reason = ""
         self.tip, self.torch = settings.inset, settings.inset - belief.distance
         self._coming = self.torch
         self.wanted = 0.0
-        self.refined = RefinedPath(plan, belief.distance + settings.ending, settings.wander)
-        self.refined.hurried = True
+        self._margin = belief.distance + settings.ending + (settings.ends or 0.0)
+        self.refined = RefinedPath(plan, self._margin, settings.wander)
         self._before = before
         if before is not None:
             self.refined.recall(before.samples)
         self._moved: list[float] = []
-        self.contact = Contact()
+        self.contact = Contact(
+            belief.flat(settings.sign), belief.sliding(settings) / SOFTER, belief.noise
+        )
+        softer = settings.probing and belief.two_walls  # the sweep tells how much the tip stands
+        self._press = settings.deflection / (SOFTER if softer else 1.0)
         self._plan, self._settings, self._touching = plan, settings, touch
         gain = max(settings.cross_track_gain, settings.speed / SETTLING)
         self._steering = Steering(belief.distance, gain, settings.turn_rate)
@@ -161,23 +172,32 @@ class Follower:
         self._track = Track()
         self._felt: SeamReading | None = None if touch else SeamReading(0.0, 0.0)
         self._time: float | None = None
-        self._seen = self._heard = self._bridge = self._latency = 0.0
-        self._release = Release(belief.two_walls, STEEPER * belief.sliding(settings))
-        self._hold = Hold(belief.holding(settings), belief.holding(settings, SEATING))
-        self._place, self._touched = plan.at(self.tip), self.tip
+        self._seen = self._heard = self._bridge = self._tried = self._latency = 0.0
+        self._place = plan.at(self.tip)
         self._search = Search(settings, belief)
         self._probing = Probing(settings, belief, self.side)
-        self._seating = Seating(self.side, belief.flat(self.side))
         self._level = np.array(belief.level_R_tool)
         self._response = Response()
+        self._backed: list[tuple[float, float, float, float]] | None = None
         self._elapsed = self._began = 0.0
-        self._period, self._climbs, self._put_off = math.inf, False, False
         self._swept: list[tuple[ToolPose, Touch]] = []
+        self._sat: list[tuple[float, float, float, float]] = []
 
     @property
     def begins(self) -> float:
         """Where the torch is to begin to weld, by arc length [m]."""
-        return max(self._settings.offset_along, 0.0)
+        after = self._settings.offset_along
+        return after if after > 0.0 else -self._beyond
+
+    @property
+    def ends(self) -> float:
+        """Where the torch is to end, by arc length [m]."""
+        return self._plan.length + self._beyond
+
+    @property
+    def _beyond(self) -> float:
+        """How far beyond the planned ends the seam may be [m]."""
+        return self._settings.ends or 0.0
 
     @property
     def arc(self) -> float:
@@ -196,8 +216,7 @@ class Follower:
         """Share of the planned seam that was welded with the torch within ``max_error``."""
         if self.lit is None:
             return 0.0
-        end = self._plan.length
-        return max(min(self.torch, end) - self.lit, 0.0) / (end - self.begins)
+        return max(min(self.torch, self.ends) - self.lit, 0.0) / (self.ends - self.begins)
 
     def kept(self) -> ResumePoint | None:
         """Return the state from which to resume; None before the torch was on the seam."""
@@ -210,10 +229,10 @@ class Follower:
         if self._time is None:
             self._time = self._seen = self._heard = pose.time
         self._elapsed, self._time = pose.time - self._time, pose.time
-        if self._elapsed > 0.0:
-            self._period = min(self._period, self._elapsed)  # one that came late is no longer
+        pose = self._true(pose)
         self._track.add(pose)
-        self._renew(bool(touches))
+        if self._backed is None:
+            self.refined.renew(self.torch)
         for touch in touches:
             if self._touching and touch.time > self._seen:
                 self._feel(Touch(touch.time, self._level @ touch.displacement))
@@ -230,18 +249,6 @@ class Follower:
         self._response.record(pose.time, command)
         return command
 
-    def _renew(self, touched: bool) -> None:
-        """Do a cycle's share of finding the seam again from what was felt up to the last cycle.
-
-        A cycle of one share that has a touch to take in leaves it to the next one.
-        """
-        shares = max(round(self._period / SHARE), 1) if self._period < math.inf else 1
-        self._put_off = touched and shares == 1 and not self._put_off
-        if self._put_off:
-            return
-        here = (self.torch, self._coming, self.tip, self._touched)
-        self.refined.renew((*here, *(s + BIN for s in here)), shares)
-
     def _lead(self, pose: ToolPose, coming: ToolPose) -> Command:
         """Return the command that leads the tip along the seam and the torch behind it.
 
@@ -252,7 +259,10 @@ class Follower:
         self._ramp(self._elapsed)
         self._progress(pose, coming)
         point, normal = self.refined.frame(self._coming)
-        velocity = self._velocity(coming, self._pace(coming, normal))
+        pace = self._pace(coming, normal)
+        if self._backed is not None:
+            return Command(self._velocity(coming, -pace), 0.0)
+        velocity = self._velocity(coming, pace)
         sway = self._swayed(coming.time)
         there = float((self._torch_position(coming) - point) @ normal)
         error = there - (self._offset - self.bias.value) - sway.aside
@@ -271,10 +281,11 @@ class Follower:
 
     def _probe(self, pose: ToolPose) -> Command:
         """Return the next piece of the sweep."""
-        speed = self._probing.velocity(self._elapsed)
-        self._probing.note(pose.time, speed, self._lateral(pose))
-        along = self._probing.along(self._elapsed) * self._place.tangent
-        return Command(np.array([*(speed * self._place.normal + along), 0.0]), 0.0)
+        speed, turn = self._probing.velocity(self._elapsed)
+        slant = float(pose.direction @ self._place.normal)
+        self._probing.note(pose.time, speed, self._lateral(pose), slant)
+        up = self._rising(pose) if self._probing.rests else 0.0
+        return Command(np.array([*(speed * self._place.normal), up]), turn)
 
     def _estimate(self, pose: ToolPose) -> None:
         """Estimate how far the torch may be from the seam now, and stop where that is too far."""
@@ -282,7 +293,7 @@ class Follower:
             return
         point, normal = self.refined.frame(self.torch)
         raw = float((self._torch_position(pose) - point) @ normal)
-        error = abs(raw - (self.aim - self.bias.value)) + self.refined.doubt(self.torch)
+        error = abs(raw - (self.aim - self.bias.value))
         variance = self._variance(float(pose.direction @ normal), pose.angle)
         self.sigma = math.sqrt(variance)
         self.band = error + BAND * self.sigma
@@ -291,7 +302,7 @@ class Follower:
             return
         if self.begins - self.torch <= self._belief.arc[0] * self._settings.speed:
             self._striking.gas(pose.time)
-        if not self.begins <= self.torch <= self._plan.length:
+        if not self.begins <= self.torch <= self.ends:
             return
         if self.lit is not None:
             self._trail.pass_by(pose.time, self.torch, raw, variance - self._unseen())
@@ -303,7 +314,7 @@ class Follower:
 
     def _too_far(self) -> None:
         """Stop where the torch may be too far from the seam, or may not be lit in time."""
-        late = self.torch - self.begins > SHORT * (self._plan.length - self.begins)
+        late = self.torch - self.begins > SHORT * (self.ends - self.begins)
         if self.lit is not None:
             self._stop(self._too_uncertain())
         elif self._before is not None and self.torch > self._before.torch:
@@ -320,14 +331,14 @@ class Follower:
         """
         settings, learned = self._settings, self.learned
         aged = settings.gain_drift * ((self._time or 0.0) - self._began) / MINUTE
-        gain = (learned.gain_sigma + aged * (self.phase != "seeking")) * settings.deflection
+        gain = (learned.gain_sigma + aged * (self.phase != "seeking")) * self._press
         fixed = self._unseen() + (self._belief.along_sigma * slant) ** 2
-        play = (PLAYED * learned.width) ** 2 + learned.unexplained**2
         # What the tip is off by is off for the torch too: all but what the tool has turned between.
-        turned_by = 2.0 * math.sin((angle - self.refined.angle(self.torch, angle)) / 2.0)
-        tip = (self._belief.tip_sigma * turned_by) ** 2
+        turned_by = angle - self.refined.angle(self.torch, angle)
+        ahead = min(learned.ahead_sigma, self._belief.tip_sigma) * math.sin(turned_by)
+        tip = ahead**2 + (self._belief.tip_sigma * (1.0 - math.cos(turned_by))) ** 2
         felt = self.refined.variance(self.torch) + self._weave.variance
-        return fixed + gain**2 + play + tip + felt
+        return fixed + gain**2 + learned.variance - learned.noise**2 + tip + felt
 
     def _unseen(self) -> float:
         """Return the variance of the torch that nothing ahead of it measures [m^2]."""
@@ -361,10 +372,6 @@ class Follower:
         late = (self._time or 0.0) - touch.time + self.learned.stamp
         self._latency += LATE_SHARE * (late - self._latency)
         s, felt, deflection = self._located(pose, touch)
-        self._touched = s
-        if self.phase != "seeking" or self._search.found:  # friction on a face is no contact
-            wanted = self._settings.probe if self.phase == "bridging" else self.wanted
-            self.contact.update(touch.time, deflection, max(wanted, self._settings.probe))
         if self.phase == "seeking":
             self._felt = felt
             compression = float(touch.displacement[2] - self._search.rest[2])
@@ -372,14 +379,17 @@ class Follower:
         elif self.phase == "probing":
             moved = turned(touch.displacement - self._search.rest, pose.angle)
             along = float(moved[:2] @ self._place.tangent)
+            self._felt = self._smoothed(felt)
             self._probing.feel(touch.time, -self.side * deflection, felt.height, along)
             self._swept.append((pose, touch))
         else:
-            compression = float(self._corrected(touch.displacement)[2])
-            self._climbs = self._hold.fails(deflection, compression, self._search.sigma[1:])
-            if self._climbs:  # what it feels leads it on, but is not where the seam is
-                self.refined.forget_pending()
-            self._believe(touch.time, s, felt, deflection, pose.angle)
+            pressed = deflection, float(self._corrected(touch.displacement)[2])
+            self._weigh(touch.time, s, felt, pressed, pose.angle)
+
+    def _true(self, pose: ToolPose) -> ToolPose:
+        """Return a pose with the tip as far ahead as the sweep has found it."""
+        ahead = self.learned.ahead * np.array([*pose.direction, 0.0])
+        return ToolPose(pose.time, pose.position + ahead, pose.angle)
 
     def _located(self, pose: ToolPose, touch: Touch) -> tuple[float, SeamReading, float]:
         """Return where on the plan the tip is, the seam there, and the deflection to the wall."""
@@ -393,7 +403,9 @@ class Follower:
     def _corrected(self, displacement: Floats) -> Floats:
         """Return a displacement (3,) without what the finger's rest, gain and play add to it."""
         moved = displacement - self._search.rest
-        play = np.array([0.0, self.side * self.learned.width * self._pressing(), 0.0])
+        # What goes through its play over less than the deflection wobbles by is anywhere in it.
+        kept = self.learned.reversal / (self.learned.reversal + WOBBLE) * self._pressing()
+        play = np.array([0.0, self.side * self.learned.width * kept, 0.0])
         across = 1.0 + self.learned.gain
         # The sweep measures the gain across. That upwards is its like; where it is not, the
         # preload errs towards pressing harder, which holds the tip in its groove.
@@ -405,7 +417,7 @@ class Follower:
         width = abs(self.learned.width)
         if self.phase != "ending" or not width:
             return 1.0
-        return 1.0 - min((self._settings.deflection - self.wanted) / width, 2.0)
+        return 1.0 - min((self._press - self.wanted) / width, 2.0)
 
     def _smoothed(self, felt: SeamReading) -> SeamReading:
         """Return a mean over as many measurements as their scatter asks for."""
@@ -418,32 +430,37 @@ class Follower:
             before.height + share * (felt.height - before.height),
         )
 
-    def _believe(
-        self, time: float, s: float, felt: SeamReading, deflection: float, angle: float
+    def _weigh(
+        self, time: float, s: float, felt: SeamReading, pressed: tuple[float, float], angle: float
     ) -> None:
-        """Keep what the tip felt, unless contact is doubtful."""
-        if not self._tells(s, felt, deflection):
-            return
-        if self.phase == "following" and self.contact.doubted(deflection, self.wanted):
-            return
-        settled = time - self.contact.since > BELIEF
-        if settled and s < self._plan.length - self._settings.ending / 2:
+        """Weigh how the tip touches, and keep what it felt where that is the seam.
+
+        Args:
+            time: [s].
+            s: Arc length of the tip [m].
+            felt: The seam, if the tip is seated.
+            pressed: Deflection to the wall and compression [m].
+            angle: Of the tool [rad].
+        """
+        aside = felt.offset - self.refined.offset(s)
+        spread = self.refined.variance(s) + self.learned.variance + STEADY**2
+        expected = time, s, felt.offset, angle, aside, spread, felt.height
+        self.contact.take(Felt(*expected, *pressed), self.side)
+        if self.phase == "bridging":
+            self.contact.forget()
+        elif self.contact.free < 0.5:
             self._felt = self._smoothed(felt)
             self._compare(s, felt.offset)
-            self._watch(s, felt)
-            if not self._climbs:
-                self.refined.add(time, s, felt.offset, angle, self._seating.doubt)
-        self.refined.confirm(time - BELIEF)
+        self._keep(time - BELIEF)
 
-    def _tells(self, s: float, felt: SeamReading, deflection: float) -> bool:
-        """Return whether the tip is against a wall, so that it measures the seam."""
-        if self.phase == "ending":
-            self._notice_loss(s, felt, deflection)
-            return not self._release.loose
-        if self.phase == "bridging":  # the wall is gone, or turned away; there is another one
-            self._release.judge(deflection, 0.0, self.refined.noise)
-            return self._release.other and deflection < 0.0
-        return self.phase == "following" and self.contact.state == "held"
+    def _keep(self, until: float) -> None:
+        """Believe what was felt up to a time [s], short of where the seam may end."""
+        end = self._plan.length - max(self._settings.ending / 4.0, self._beyond)
+        for felt, doubt in self.contact.settled(until):
+            if self._backed is not None:
+                self._backed.append((felt.s, felt.offset, felt.angle, doubt))
+            elif felt.s < end:
+                self.refined.add(felt.s, felt.offset, felt.angle, doubt)
 
     def _compare(self, s: float, offset: float) -> None:
         """Stop where the seam is not where it was felt before the weld was stopped."""
@@ -459,43 +476,29 @@ class Follower:
                 "the rest as a seam of its own"
             )
 
-    def _watch(self, s: float, felt: SeamReading) -> None:
-        """Stop where the tip does not sit in the groove any more."""
-        wrong = self._seating.judge(s, felt.offset, felt.height)
-        self.refined.suspect(s - LASTING, s, self._seating.risen)
-        if wrong is not None and self.phase == "following":
-            self.refined.forget_pending()
-            self._stop(wrong)
-
-    def _notice_loss(self, s: float, felt: SeamReading, deflection: float) -> None:
-        """Notice that the wall is gone while the tip is let go of: it then goes with the robot."""
-        if self.refined.empty:
-            return
-        expected = deflection + self.side * (felt.offset - self.refined.offset(s))
-        self._release.judge(deflection, expected, self.refined.noise)
-        if self._release.loose:
-            self.refined.forget_pending()
-
     # --- what follows from it -------------------------------------------------------------------
 
     def _judge(self, pose: ToolPose) -> None:
         """Change the phase where what was felt asks for it."""
-        settings, state = self._settings, self.contact.state
+        settings = self._settings
         if self.phase in ("following", "bridging") and self.tip >= self._pressing_ends:
-            self._enter("ending")
-        elif self.phase == "seeking" and state == "held" and self._search.seated:
+            self.phase = "ending"
+        elif self.phase == "seeking" and self._search.seats(self._press):
             self._probing.begin(float(self._search.sigma[1]))
-            self._enter("probing" if settings.probing else "following")
+            self.phase = "probing"
+            if not settings.probing:
+                self._follow(self.learned)
         elif self.phase == "probing" and self._probing.over:
             self._learn()
-        elif self.phase == "following" and state == "lost":
-            self.refined.forget_pending()
-            self._seating.forget()
-            self._bridge = self.tip
-            self._enter("bridging")
-        elif self.phase == "bridging" and state == "held":
-            self._enter("following")
-        if self.torch >= self._plan.length and self.phase != "stopped":
+        elif self.phase == "following" and self.contact.free > LOST:
+            self._bridge = self._tried = self.tip
+            self.phase = "bridging"
+            self._turn_over()
+        elif self.phase == "bridging" and self._regained:
+            self.phase = "following"
+        elif self.phase == "bridging" and self.tip - self._tried > TRIED:
+            self._turn_over()
+        if self.torch >= self.ends and self.phase != "stopped":
             self._finish()
         self._refuse(pose, settings)
 
@@ -506,7 +509,7 @@ class Follower:
         if self._touching and self.lit is None:
             self._stop(f"not begun: {self._too_uncertain()}")
         else:
-            self._enter("done")
+            self.phase = "done"
 
     def _too_uncertain(self) -> str:
         return (
@@ -520,23 +523,60 @@ class Follower:
         if isinstance(found, str):
             self._stop(found)
             return
-        self.learned = replace(found, noise=max(found.noise, float(self._search.sigma[1])))
-        self._response.dead_time, self._response.lag = found.dead_time, found.lag
-        self.refined.noise = self.learned.noise
-        self._began = self._time or 0.0
-        seated = []
-        for pose, touch in self._swept:
-            s, self._felt, self.wanted = self._located(pose, touch)
-            seated.append((s, self._felt.offset, self._felt.height))
-        self._seating.seated(np.array(seated))
-        self.contact.hold(self._seen, self.wanted)
-        self._enter("following")
+        if found is not None:
+            self._follow(replace(found, noise=max(found.noise, float(self._search.sigma[1]))))
 
-    def _enter(self, phase: Phase) -> None:
-        # Where nothing was felt before, nothing says by how much a wall would deflect the tip.
-        unheld = self.phase == "bridging" or self.refined.empty
-        self._release.loose = phase == "ending" and unheld
-        self.phase = phase
+    def _follow(self, found: Learned) -> None:
+        """Begin to follow with what was found: how the finger shows, how hard to press."""
+        settings, self.learned = self._settings, found
+        self._response.dead_time, self._response.lag = found.dead_time, found.lag
+        self._began = self._time or 0.0
+        if self._belief.two_walls:
+            swept = min(found.swept, MARGIN * settings.deflection)
+            self.contact.steady = swept / settings.preload
+            if settings.probing:
+                self._press = min(max(swept / SOFTER, found.least), settings.deflection)
+        self.contact.noise = found.noise, float(self._search.sigma[2])
+        self._backed = []
+        for pose, touch in self._swept[-SEATS:]:
+            s, self._felt, self.wanted = self._located(self._true(pose), touch)
+            self._backed.append((s, self._felt.offset, pose.angle, 0.0))
+        self._take_backed()
+        self.contact.seat(self._seen, self.wanted, settings.preload)
+        self.phase = "following"
+        # The tip goes back to where the seam is sure to have begun.
+        self._backed = [] if self._before is None and self.tip > self._inside else None
+
+    @property
+    def _inside(self) -> float:
+        """Where the tip is sure to be on the seam, by arc length [m]."""
+        ends = self._settings.ends
+        return math.inf if ends is None else ends + INSIDE
+
+    def _take_backed(self) -> None:
+        """Begin the path with what was felt at the sweep, and on the way back to the start."""
+        settings = self._settings
+        self._keep(math.inf)
+        self.refined = RefinedPath(self._plan, self._margin, settings.wander)
+        self.refined.noise = math.sqrt(self.learned.variance)
+        if self._before is not None:
+            self.refined.recall(self._before.samples)
+        self._sat = sorted([*self._sat, *(self._backed or [])])
+        for row in self._sat:
+            self.refined.add(*row)
+        self.refined.renew(self.torch, 10 * len(self._sat))
+        self._backed = None
+
+    @property
+    def _regained(self) -> bool:
+        """Whether a wall holds the tip again: a free one seems to where the arm leads it there."""
+        return self.contact.free < REGAINED and self.contact.deflection > self._press / 2.0
+
+    def _turn_over(self) -> None:
+        """Press the other wall, where there is one."""
+        self._tried = self.tip
+        if self._belief.two_walls:
+            self.side, self.wanted = -self.side, -self.wanted
 
     def _refuse(self, pose: ToolPose, settings: Following) -> None:
         """Stop where going on would be blind."""
@@ -574,13 +614,13 @@ class Follower:
     def _pressing_ends(self) -> float:
         """Where the wanted deflection begins to ramp down, so that it is zero at ``ending``."""
         settings = self._settings
-        release = settings.speed * settings.deflection / settings.release
-        return self._plan.length - settings.ending - release
+        release = settings.speed * self._press / settings.release
+        return self._plan.length - max(settings.ending, self._beyond) - release
 
     def _ramp(self, elapsed: float) -> None:
         """Move the wanted deflection towards what the phase asks for."""
         settings = self._settings
-        target = {"bridging": self._feeler(), "ending": 0.0}.get(self.phase, settings.deflection)
+        target = {"bridging": self._feeler(), "ending": 0.0}.get(self.phase, self._press)
         if not self._touching:
             target = 0.0
         if self.phase == "seeking" and not self._search.found:
@@ -597,11 +637,18 @@ class Follower:
         """
         if self.phase != "bridging":
             return 0.0
-        probe = self._settings.probe
+        probe = self._press if self._belief.two_walls else self._settings.probe
         return probe + min(BAND * math.sqrt(self.refined.variance(self.tip)), probe)
 
     def _progress(self, pose: ToolPose, coming: ToolPose) -> None:
         advance, reach = self._plan.advance, self._settings.speed * 0.1
+        if self._backed is not None:
+            self.tip = self._plan.foot(coming.position[:2], self.tip)
+            self.torch = self._plan.foot(self._torch_position(pose), self.torch)
+            self._coming, self._place = self.torch, self._plan.at(self.tip)
+            if self.tip <= self._inside or self.contact.free > REGAINED:
+                self._take_backed()
+            return
         self.tip = advance(coming.position[:2], self.tip, reach)
         self._place = self._plan.at(self.tip)
         self._coming = advance(self._torch_position(coming), self._coming, reach)
@@ -644,30 +691,38 @@ class Follower:
 
         Where the seam turns away faster than the servo follows, the tip waits for it.
         """
-        if self.phase != "following" or not self._touching:
+        if self.phase == "bridging" and self._belief.two_walls:
+            return WAITING
+        if self.phase not in ("following", "ending") or not self._touching:
             return 1.0
         firm = self.contact.deflection / (FIRM * max(self.wanted, self._settings.probe))
+        held = (STRAINED - self.contact.strained) / 0.4
+        firm = held if self.phase == "ending" else min(firm, held)
         return min(max(firm, WAITING), 1.0)
 
     def _velocity(self, pose: ToolPose, pace: float) -> Floats:
         """Return V_r (3,): along the plan; the servo (14) across it and in height."""
         settings, place, felt = self._settings, self._place, self._seam_at_tip()
         deflection = self.side * (self._lateral(pose) - felt.offset)
-        height = float(pose.position[2]) - place.height - felt.height
         most = settings.lateral_speed
         across = -self.side * settings.servo_gain * (deflection - self.wanted)
         if self.phase == "seeking" and not self._search.found:
             across = settings.servo_gain * self._search.step(self._lateral(pose))
-        preload = settings.preload if self._touching else 0.0
-        up = -settings.height_gain * (height + preload)
         across += pace * self._drifting()
         planar = pace * place.tangent + within(across, most) * place.normal
         climb = pace * self._plan.climb(self.tip)
-        return np.array([*planar, climb + within(up, most)])
+        return np.array([*planar, climb + self._rising(pose)])
+
+    def _rising(self, pose: ToolPose) -> float:
+        """Return how fast to go up for the preload to be right [m/s]."""
+        settings = self._settings
+        height = float(pose.position[2]) - self._place.height - self._seam_at_tip().height
+        preload = settings.preload if self._touching else 0.0
+        return within(-settings.height_gain * (height + preload), settings.lateral_speed)
 
     def _drifting(self) -> float:
         """Return how fast the seam leaves the plan to the left, per length of it, at the tip."""
-        if self.phase != "following" or self.refined.empty:
+        if self.phase != "following" or self.refined.empty or self._backed is not None:
             return 0.0
         return within(self.refined.slope(self.tip), 1.0)
 

@@ -66,7 +66,6 @@ class Traced:
     def path(self, chosen: PassParams) -> Path:
         """Return the torch's path of a pass; its height is that of the tool's end point."""
         s = np.arange(max(chosen.along, 0.0), self._plan.length + STEP / 2, STEP)
-        self._root.refined.hurried = False
         frames = [self._root.refined.frame(x) for x in s.tolist()]
         planar = np.array([point + chosen.across * normal for point, normal in frames])
         self._along, height, self._sigma = np.array(self.rows).T

@@ -155,7 +155,6 @@ def _refined(controller: Controller, plan: Path) -> Floats:
         return np.zeros((0, 3))
     s = np.arange(0.0, plan.length, 1e-3)
     points, tangents = plan.evaluate(s)
-    root.refined.hurried = False
     offsets = np.array([root.refined.offset(x) for x in s.tolist()])
     points[:, :2] += offsets[:, None] * np.stack([-tangents[:, 1], tangents[:, 0]], axis=1)
     return points

@@ -12,7 +12,6 @@ from collections import deque
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import lfilter
 
 from flangeye.motion.seam_following import Command, ToolPose
 from flangeye.types import Floats
@@ -104,5 +103,7 @@ def identify(cycles: Floats) -> tuple[float, float]:
 
 
 def _lagged(command: Floats, lag: float) -> Floats:
+    from scipy.signal import lfilter  # its import takes longer than a weld's checks
+
     share = 1.0 - math.exp(-GRID / lag)
     return np.asarray(lfilter([share], [1.0, share - 1.0], command))

@@ -22,8 +22,11 @@ SEATED = 0.1
 SURE = 4.0
 """A mean is compared with a threshold this many standard deviations away."""
 
-FEWEST, MOST = 3, 15
+FEWEST, MOST = 3, 60
 """Measurements to a mean."""
+
+PRESSED = 0.6
+"""The tip is pressed where it is deflected by this share of what is wanted."""
 
 RESTING = 10
 """Measurements of the tip in the air, before it descends."""
@@ -94,6 +97,10 @@ class Search:
         # Half of them: a tag that is misread once does not make the tip move about.
         usual = float(np.median(np.abs(free - self.rest), axis=0)[:2].max())
         self.bent = max(usual, float(np.linalg.norm(self.rest[:2])) - usual) > FREE
+
+    def seats(self, wanted: float) -> bool:
+        """Return whether the tip bears on its seat and is pressed aside as wanted [m]."""
+        return self.found and self.seated and self._mean(0, PRESSED * wanted) > PRESSED * wanted
 
     def _mean(self, axis: int, threshold: float) -> float:
         """Return the mean of as many measurements as make it sure at a threshold [m]."""

@@ -146,6 +146,11 @@ class Following(Params):
         "0 mm", ge=-0.02, le=0.02,
         description="How far to the left of the seam the torch is led.",
     )  # fmt: skip
+    ends: Length | None = param(
+        None, ge=0, le=0.03, description="How far the seam's ends may be off along the plan, which "
+        "touch does not tell. Where it is given the tip first feels its way back to where the seam "
+        "has surely begun, and the torch welds so far beyond both planned ends.",
+    )  # fmt: skip
     offset_along: Length = param(
         "0 mm", description="How far after the planned start the torch begins to weld."
     )

@@ -107,10 +107,6 @@ def test_a_tip_is_just_held_by_the_deflection_that_its_remedy_names(side: str) -
         Belief(0.04, 900.0, 2100.0, 0.6, lean=0.1, level_R_tool=leant(0.3)),
         settings(side=side),
     )
-    deflection, preload = belief.remedy(asked, 1.0)
-    holding = belief.holding(asked)
-    assert holding @ [deflection, asked.preload] == pytest.approx(0.0, abs=1e-9)
-    assert holding @ [asked.deflection, preload] == pytest.approx(0.0, abs=1e-9)
-    assert holding @ [1.01 * deflection, asked.preload] < 0.0
+    deflection, _ = belief.remedy(asked, 1.0)
     just = settings(side=side, deflection=f"{deflection!r} m")
     assert belief.seating(just) == pytest.approx(1.0)

@@ -43,11 +43,14 @@ def test_the_files_are_known_to_so_many_sigma_within_the_error_that_is_allowed(
 def test_in_a_bend_the_tool_stands_askew_and_turns() -> None:
     """Tip and torch are both on a circle: the chord of 40 mm stands at half its arc to it."""
     belief = Belief(DISTANCE, along_sigma=0.5e-3, tip_sigma=0.3e-3)
-    found = predicted(arc(), belief, following())
+    found = predicted(arc(), belief, following(probing=False))
     half = np.arcsin(DISTANCE / 2 / BEND) + 2e-3 / DISTANCE  # it is pressed to the left by 2 mm
     middle = (found.s > 0.045) & (found.s < 0.05)
     np.testing.assert_allclose(found.askew[middle], (0.5e-3 * np.sin(half)) ** 2, rtol=0.05)
     np.testing.assert_allclose(found.tip[middle], (0.3e-3 * 2 * np.sin(half)) ** 2, rtol=0.2)
+    swept = predicted(arc(), belief, following())  # it tells how far ahead the tip is
+    told = (0.02e-3 * 2 * np.sin(half)) ** 2 + (0.3e-3 * 2 * np.sin(half) ** 2) ** 2
+    np.testing.assert_allclose(swept.tip[middle], told, rtol=0.3)
     line = predicted(Path(straight(0.12)), belief, following())
     assert line.askew.max() == pytest.approx((0.5e-3 * 2e-3 / DISTANCE) ** 2, rel=0.01)
     assert line.tip.max() < 1e-14

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -21,6 +22,8 @@ from flangeye_plugins.weld.weave import Sway
 from tests.plugins.weld.bench import straight
 
 DISTANCE, LENGTH, RADIUS = 40e-3, 0.12, 0.05
+PRESS = 2e-3 / 3
+"""Deflection between two walls before a sweep has told what the tip stands [m]."""
 
 
 def following(**given: Any) -> Following:
@@ -51,8 +54,8 @@ def pose(x: float, y: float = 0.0, z: float = 0.0, angle: float = 0.0, time: flo
 def felt_along(found: Any, offset: float, until: float = 0.1) -> None:
     """Let the seam be felt so far to the left of the plan [m]."""
     for s in np.arange(0.005, until, 2e-4).tolist():
-        found.refined.add(0.0, s, offset, 0.0)
-    found.refined.confirm(1.0)
+        found.refined.add(s, offset, 0.0)
+    found.refined.renew(-DISTANCE, 100_000)
 
 
 # --- how well the torch is known ------------------------------------------------------------------
@@ -63,9 +66,10 @@ def test_all_that_the_torch_s_place_is_uncertain_by_adds_up() -> None:
     asked, belief = following(), Belief(DISTANCE)
     found.refined = SimpleNamespace(variance=lambda s: 9e-10, angle=lambda s, a: 0.1)
     found.learned = Learned(gain_sigma=0.03, width=0.02e-3, unexplained=0.03e-3)
+    found._press = asked.deflection
     found._time = found._began = 5.0
     gain = 0.03 * asked.deflection
-    always = belief.fixed_variance(asked) + gain**2 + (0.02e-3) ** 2 + (0.03e-3) ** 2 + 9e-10
+    always = belief.fixed_variance(asked) + gain**2 + (0.02e-3) ** 2 / 3 + (0.03e-3) ** 2 + 9e-10
     assert found._variance(0.0, 0.1) == pytest.approx(always)
     # A tool that slants to the path is off across it by what its length is off by.
     slanting = (0.4 * belief.along_sigma) ** 2
@@ -73,6 +77,10 @@ def test_all_that_the_torch_s_place_is_uncertain_by_adds_up() -> None:
     # What the tip is off by in the flange goes with the torch, but for what the tool has turned.
     moved = (2 * math.sin(0.6 / 2) * belief.tip_sigma) ** 2
     assert found._variance(0.0, 0.7) == pytest.approx(always + moved)
+    # Where the sweep has told how far ahead the tip is, what it is aside by counts a little.
+    found.learned = replace(found.learned, ahead_sigma=0.02e-3)
+    told = (0.02e-3 * math.sin(0.6)) ** 2 + (belief.tip_sigma * (1 - math.cos(0.6))) ** 2
+    assert found._variance(0.0, 0.7) == pytest.approx(always + told)
     # The gain that the sweep found ages; before it nothing was found.
     found._time = 5.0 + 120.0
     aged = (0.03 + 2 * asked.gain_drift) * asked.deflection
@@ -82,20 +90,20 @@ def test_all_that_the_torch_s_place_is_uncertain_by_adds_up() -> None:
     # A swing is early or late by what the arm's delay is not known to.
     weaving = make(weave_width="3 mm")
     weaving.refined, weaving.learned = found.refined, found.learned
+    weaving._press = found._press
     late = (math.pi * 3e-3 * 10e-3) ** 2 / 2
     assert weaving._variance(0.0, 0.1) == pytest.approx(always + late)
 
 
 @pytest.mark.parametrize("off", [0.3e-3, -0.3e-3])
-def test_what_the_torch_is_stated_to_be_off_by_is_its_error_its_doubt_and_its_sigmas(
+def test_what_the_torch_is_stated_to_be_off_by_is_its_error_and_its_sigmas(
     off: float,
 ) -> None:
     found = make(max_error="5 mm", offset_across="0.1 mm")
     felt_along(found, 1e-3)
-    found.refined.suspect(0.04, 0.06, 0.2e-3)
     found.torch, tip = 0.05, 0.05 + DISTANCE
     found._estimate(pose(tip, 1e-3 + 0.1e-3 + off))
-    error = 0.3e-3 + 0.2e-3
+    error = 0.3e-3
     assert found.sigma == pytest.approx(math.sqrt(found._variance(0.0, 0.0)))
     assert found.band == pytest.approx(error + 2 * found.sigma, abs=1e-6)
     assert found.bound == pytest.approx(error + 3 * found.sigma, abs=1e-6)
@@ -159,8 +167,8 @@ def test_a_torch_that_goes_on_has_to_be_on_the_seam_where_it_had_stopped() -> No
 @pytest.mark.parametrize(
     ("phase", "first", "target", "rate"),
     [
-        ("following", 0.0, following().deflection, "ramp"),
-        ("bridging", 2e-3, 2 * following().probe, "ramp"),  # nothing was felt before
+        ("following", 0.0, PRESS, "ramp"),
+        ("bridging", 2e-3, 2 * PRESS, "ramp"),  # nothing was felt before
         ("ending", 2e-3, 0.0, "release"),
     ],
 )
@@ -177,12 +185,13 @@ def test_the_wanted_deflection_goes_to_what_the_phase_asks_for_at_its_rate(
 
 
 def test_a_lost_wall_is_felt_for_as_far_aside_as_the_seam_is_unknown_at_the_tip() -> None:
-    found, probe = make("bridging"), following().probe
+    found = make("bridging", belief=Belief(DISTANCE, two_walls=False))
+    probe = following().probe
     for i in range(120):
-        found.refined.add(0.0, 3e-4 * i, 0.0, 0.0)
-    found.refined.confirm(0.0)
+        found.refined.add(3e-4 * i, 0.0, 0.0)
+    found.refined.renew(-DISTANCE, 100_000)
     aside = []
-    for found.tip in (0.03, 0.045, 0.055, 0.1):
+    for found.tip in (0.03, 0.04, 0.045, 0.12):
         found._ramp(60.0)
         aside.append(found.wanted - probe)
     assert aside[0] == pytest.approx(2 * math.sqrt(found.refined.variance(0.03)))
@@ -196,13 +205,13 @@ def test_nothing_is_pressed_before_a_wall_was_found_nor_without_touch() -> None:
         assert found.wanted == 0.0
     seeking._search.found = True
     seeking._ramp(60.0)
-    assert seeking.wanted == following().deflection
+    assert seeking.wanted == PRESS
 
 
 def test_the_deflection_has_ended_where_the_tip_is_to_stop_pressing() -> None:
     found, asked = make(), following()
     going, way = 0.0, found._pressing_ends
-    found.phase, found.wanted = "ending", asked.deflection
+    found.phase, found.wanted = "ending", PRESS
     while found.wanted > 1e-12:
         found._ramp(1e-3)
         going, way = going + 1e-3, way + 1e-3 * asked.speed
@@ -254,8 +263,14 @@ def test_a_tip_that_is_not_firmly_on_its_wall_waits_for_it_but_never_stands() ->
     found.wanted, found.contact.deflection = 0.0, 0.35 * asked.probe
     assert found._firmness() == pytest.approx(0.5)
     found.contact.deflection = 0.0
-    for other in (make("bridging"), make("ending"), make(touch=False)):
+    for other in (make("ending"), make(touch=False)):
         assert other._firmness() == 1.0
+    assert make("bridging")._firmness() == 0.2  # it feels for the other wall
+    found.wanted = found.contact.deflection = asked.deflection
+    found.contact.compression = asked.preload
+    for strained, kept in ((0.5, 1.0), (0.7, 0.5), (0.95, 0.2)):
+        found.contact.steady = asked.deflection / asked.preload / strained
+        assert found._firmness() == pytest.approx(kept)
 
 
 def test_the_tip_slows_down_while_no_image_comes() -> None:
@@ -303,8 +318,8 @@ def test_the_tip_climbs_with_the_plan_and_leaves_it_with_the_seam() -> None:
     seated = pose(0.05, asked.deflection, 0.05 * 0.05 - asked.preload)
     assert found._velocity(seated, 4e-3) == pytest.approx([4e-3, 0.0, 0.05 * 4e-3], abs=1e-9)
     for s in np.arange(0.005, 0.06, 2e-4).tolist():
-        found.refined.add(0.0, s, 0.1 * (s - 0.05), 0.0)
-    found.refined.confirm(1.0)
+        found.refined.add(s, 0.1 * (s - 0.05), 0.0)
+    found.refined.renew(-DISTANCE, 100_000)
     assert found._velocity(seated, 4e-3)[1] == pytest.approx(0.1 * 4e-3, rel=0.03)
     found.phase, found._felt = "ending", SeamReading(0.0, 0.0)
     assert found._drifting() == 0.0
@@ -356,13 +371,16 @@ def test_a_displacement_is_freed_of_rest_play_and_gain(side: str) -> None:
     found._search.rest, true = rest, np.array([0.4e-3, 1.5e-3, 1.2e-3])
     sign = 1.0 if side == "left" else -1.0
     for gain, up in ((0.1, 1.1), (-0.1, 1.0)):  # a preload that is shown larger presses harder
-        found.learned = Learned(gain=gain, width=0.05e-3)
+        found.learned = Learned(gain=gain, width=0.05e-3, reversal=1e3)
         shown = rest + true * [1 + gain, 1 + gain, up] + [0.0, sign * 0.05e-3, 0.0]
         assert found._corrected(shown) == pytest.approx(true)
+    # Play that is gone through over less than the deflection wobbles by may be anywhere.
+    found.learned = Learned(width=0.05e-3, reversal=0.2e-3)
+    assert found._corrected(rest)[1] == pytest.approx(-sign * 0.025e-3)
 
 
 def test_a_finger_that_is_let_go_of_goes_through_its_play_to_the_other_side() -> None:
-    found, most = make("ending"), following().deflection
+    found, most = make("ending"), PRESS
     found.learned = Learned(width=-0.1e-3)
     for less, where in ((0.0, 1.0), (0.05e-3, 0.5), (0.1e-3, 0.0), (0.2e-3, -1.0), (1e-3, -1.0)):
         found.wanted = most - less
@@ -448,65 +466,6 @@ def test_a_seam_that_has_moved_by_two_tenths_since_the_stop_is_another_one(
         assert len(found._moved) == 15
 
 
-def test_what_contact_has_not_been_doubted_for_after_a_while_is_believed() -> None:
-    found = make()
-    found.contact.hold(1.0, 2e-3)
-    found.wanted = 2e-3
-    held = SeamReading(1e-3, 0.0)
-    found._believe(1.29, 0.05, held, 2e-3, 0.0)
-    found.refined.confirm(9.0)
-    assert found.refined.empty  # contact is too new
-    found._believe(1.31, 0.05, held, 2e-3, 0.0)
-    found._believe(1.5, 0.05, held, 0.3 * 2e-3, 0.0)  # one that speaks against contact
-    found._believe(1.6, 0.05, held, 2e-3, 0.0)
-    assert found.refined.empty  # not 0.3 s old
-    found._believe(1.62, 0.05, held, 2e-3, 0.0)
-    assert found.refined.samples()[:, 3].tolist() == [1.0]
-    near = LENGTH - following().ending / 2
-    for s, kept in ((near - 1e-4, True), (near + 1e-4, False)):
-        found._believe(5.0, s, SeamReading(2e-3, 0.0), 2e-3, 0.0)
-        assert (found._felt.offset == 2e-3) == kept
-        found._felt = held
-    found._climbs = True  # it leads the tip, but is not where the seam is
-    found.refined.forget_pending()
-    found._believe(6.0, 0.05, SeamReading(2e-3, 0.0), 2e-3, 0.0)
-    assert found._felt.offset == 2e-3 and not found.refined._pending
-
-
-def test_a_wall_tells_while_it_holds_the_tip() -> None:
-    found, felt = make(), SeamReading(0.0, 0.0)
-    assert not found._tells(0.05, felt, 2e-3)
-    found.contact.hold(0.0, 2e-3)
-    assert found._tells(0.05, felt, 2e-3)
-    found.phase = "probing"
-    assert not found._tells(0.05, felt, 2e-3)
-    found.phase = "bridging"
-    for deflection, other in ((-3e-3, True), (3e-3, False)):
-        for _ in range(6):
-            told = found._tells(0.05, felt, deflection)
-        assert told == other
-    found._release.other = True
-    assert not found._tells(0.05, felt, 1e-9)
-
-
-def test_a_wall_that_is_gone_while_the_tip_is_let_go_of_is_noticed() -> None:
-    """By where the arm is, and where the seam was felt before."""
-    for lags, loose in ((1.0, False), (0.2, True)):
-        found = make("ending", side="right")
-        felt_along(found, 1e-3)
-        found.refined.add(2.0, 0.09, 1e-3, 0.0)
-        for _ in range(6):  # the arm presses by 2 mm; a tip that goes along stays aside of the seam
-            deflection = lags * 2e-3
-            aside = 1e-3 - (2e-3 - deflection)
-            found._notice_loss(0.09, SeamReading(aside, 0.0), deflection)
-        assert found._release.loose == loose
-        assert bool(found.refined._pending) != loose
-    unfelt = make("ending")
-    for _ in range(6):
-        unfelt._notice_loss(0.09, SeamReading(2e-3, 0.0), 0.0)
-    assert not unfelt._release.loose
-
-
 # --- from phase to phase --------------------------------------------------------------------------
 
 
@@ -523,17 +482,74 @@ def test_phases_follow_from_what_was_felt() -> None:
     assert judged(make(), tip=ends + 1e-5) == "ending"
     assert judged(make("bridging"), tip=ends + 1e-5) == "ending"
     lost = make()
-    lost.refined.add(0.0, 0.05, 0.0, 0.0)
-    lost.contact.state = "lost"
+    lost.contact.likely = np.array([0.0, 0.0, 0.05, 0.95])
+    lost.wanted = PRESS
     assert judged(lost, tip=0.06) == "bridging"
-    assert lost._bridge == 0.06 and not lost.refined._pending
-    lost.contact.state = "held"
-    assert judged(lost) == "following"
+    assert (lost._bridge, lost.side, lost.wanted) == (0.06, -1.0, -PRESS)  # there is another wall
+    lost.contact.likely = np.array([1.0, 0.0, 0.0, 0.0])
+    assert judged(lost) == "bridging"  # a free tip is where the arm leads it, too
+    lost.contact.deflection = 0.6 * PRESS
+    assert judged(lost) == "following" and lost.side == -1.0
+    sought = make("bridging")
+    sought._tried = 0.02
+    assert judged(sought, tip=0.0299) == "bridging" and sought.side == 1.0
+    assert judged(sought, tip=0.0301) == "bridging" and sought.side == -1.0
+    alone = make(belief=Belief(DISTANCE, two_walls=False))
+    alone.contact.likely = np.array([0.0, 0.0, 0.0, 1.0])
+    assert judged(alone, tip=0.06) == "bridging" and alone.side == 1.0
     for seated, probing, phase in ((False, True, "seeking"), (True, True, "probing"),
                                    (True, False, "following")):  # fmt: skip
         found = make("seeking", probing=probing)
-        found.contact.state, found._search.seated = "held", seated
+        found._search.seats = lambda wanted, seated=seated: seated
         assert judged(found) == phase
+
+
+def felt_at(found: Any, time: float, s: float, offset: float, deflection: float = PRESS) -> None:
+    found._weigh(time, s, SeamReading(offset, 0.0), (deflection, 1.5e-3), 0.1)
+
+
+def test_what_was_felt_a_while_ago_by_a_tip_that_no_wall_lost_is_believed() -> None:
+    found = make()
+    for i in range(40):
+        felt_at(found, 0.033 * i, 0.02 + 2e-4 * i, 1e-3)
+    found.refined.renew(-DISTANCE, 100_000)
+    believed = found.refined.samples()
+    assert believed[:, 3].sum() == 30 and believed[:, 1] == pytest.approx(1e-3)
+    bridging = make("bridging")
+    for i in range(40):
+        felt_at(bridging, 0.033 * i, 0.02 + 2e-4 * i, 1e-3)
+    assert bridging._felt is None and not bridging.refined._sure
+    ending = make("ending", ends="3 mm")
+    for s, kept in ((LENGTH - 3.1e-3, True), (LENGTH - 2.9e-3, False)):
+        felt_at(ending, 9.0, s, 0.0)
+        ending._keep(math.inf)
+        assert (len(ending.refined._sure) == 1) == kept
+        ending.refined._sure.clear()
+
+
+def test_the_tip_goes_back_to_where_the_seam_is_sure_to_have_begun() -> None:
+    found = make("probing", ends="1 mm")
+    found._probing = SimpleNamespace(over=True, learned=lambda: Learned(swept=2.4e-3))
+    down = np.array([0.0, -PRESS, 0.0])
+    found._swept = [(pose(0.005, PRESS), Touch(0.1, down))] * 3
+    found._track.add(pose(0.005, PRESS, -1.5e-3, time=0.1))
+    found._time = found._seen = found._heard = 0.1
+    assert judged(found) == "following" and found._press == pytest.approx(0.8e-3)
+    found.contact.deflection, found.contact.compression = PRESS, 1.5e-3
+    here, times = 5e-3, 0.1
+    while found._backed is not None:
+        times += 0.01
+        at = pose(here, PRESS, -1.5e-3, time=times)
+        touches = [Touch(times, np.array([0.0, -PRESS, 1.5e-3]))]
+        command = found.step(at, touches)
+        assert found._backed is None or (command.turn, command.velocity[0]) < (1e-9, 1e-9)
+        here += command.velocity[0] * 0.01
+    assert here == pytest.approx(2.5e-3, abs=0.1e-3)
+    felt = found.refined.samples()
+    assert felt[0, 0] < 3.1e-3 and felt[-1, 0] > 4.4e-3
+    assert found.begins == -1e-3 and found.ends == LENGTH + 1e-3
+    found.step(pose(here, PRESS, -1.5e-3, time=times + 0.01), [])
+    assert found._lead(at, at).velocity[0] > 0.0
 
 
 def test_a_weld_has_ended_where_the_torch_is_at_the_end_of_the_seam() -> None:
@@ -546,18 +562,6 @@ def test_a_weld_has_ended_where_the_torch_is_at_the_end_of_the_seam() -> None:
     stopped = make("stopped")
     stopped.reason = "why"
     assert judged(stopped, torch=LENGTH, lit=0.0) == "stopped" and stopped.reason == "why"
-
-
-def test_a_tip_is_let_go_of_by_what_was_felt_or_by_nothing() -> None:
-    for phase, felt, loose in (("following", True, False), ("bridging", True, True),
-                               ("following", False, True)):  # fmt: skip
-        found = make(phase)
-        if felt:
-            felt_along(found, 0.0)
-        found._enter("ending")
-        assert found._release.loose == loose
-        found._enter("following")
-        assert not found._release.loose
 
 
 def refused(found: Any, at: Any = None, **state: Any) -> str:
@@ -627,7 +631,7 @@ def test_a_sweep_that_says_why_not_ends_the_weld_and_one_that_learned_begins_it(
     assert found.learned.noise == found.refined.noise == 35e-6
     assert (found._response.dead_time, found._response.lag) == (0.06, 0.1)
     assert found._began == 4.0 and found.wanted == pytest.approx(asked.deflection)
-    assert found.contact.state == "held" and found.contact.since == 3.9
+    assert found.contact.likely[0] == 1.0
     quiet = make("probing")
     quiet._probing, quiet._search.sigma = found._probing, np.array([0, 5e-6, 0])
     quiet._swept = found._swept
@@ -638,40 +642,7 @@ def test_a_sweep_that_says_why_not_ends_the_weld_and_one_that_learned_begins_it(
 # --- cycle by cycle -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("period", "touched", "shares"),
-    [(8e-3, True, 4), (8e-3, False, 4), (5e-3, True, 2), (2e-3, False, 1), (1e-3, False, 1)],
-)
-def test_a_cycle_finds_the_seam_again_by_a_share_for_each_two_milliseconds(
-    period: float, touched: bool, shares: int
-) -> None:
-    found, renewed = make(), list[Any]()
-    found._period = period
-    found.refined = SimpleNamespace(renew=lambda *asked: renewed.append(asked))
-    found.torch, found._coming, found.tip, found._touched = 0.01, 0.011, 0.05, 0.049
-    found._renew(touched)
-    ((places, done),) = renewed
-    assert done == shares
-    here = [0.01, 0.011, 0.05, 0.049]
-    assert places == pytest.approx([*here, *(s + 0.5e-3 for s in here)])
-
-
-def test_a_short_cycle_with_a_touch_leaves_its_share_to_the_next_one() -> None:
-    found, renewed = make(), list[Any]()
-    found._period = 2e-3
-    found.refined = SimpleNamespace(renew=lambda *asked: renewed.append(asked))
-    counts = []
-    for touched in (True, True, True, False, True):
-        found._renew(touched)
-        counts.append(len(renewed))
-    assert counts == [0, 1, 1, 2, 2]
-    unknown = make()
-    unknown.refined = found.refined
-    unknown._renew(False)  # before the second cycle
-    assert len(renewed) == 3
-
-
-def test_a_cycle_takes_what_was_not_given_before_and_a_late_one_makes_none_longer() -> None:
+def test_a_cycle_takes_what_was_not_given_before() -> None:
     found, felt = make("bridging"), list[Any]()
     found._felt = SeamReading(0.0, 0.0)
     found._level = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -681,9 +652,8 @@ def test_a_cycle_takes_what_was_not_given_before_and_a_late_one_makes_none_longe
     found.step(pose(0.05, time=3.1), [Touch(2.9, np.zeros(3)), Touch(3.0, np.zeros(3)), touch])
     assert [each.time for each in felt] == [3.05]
     assert felt[0].displacement == pytest.approx([2e-3, 1e-3, 3e-3])  # in level axes
-    assert found._period == pytest.approx(0.1)
     found.step(pose(0.05, time=3.4), [])
-    assert found._period == pytest.approx(0.1) and found._elapsed == 0.0  # silent: no ramp
+    assert found._elapsed == 0.0  # silent: no ramp
     vision = make(touch=False)
     vision._feel = found._feel
     vision.step(pose(0.05, time=3.0), [])
@@ -745,17 +715,16 @@ def test_a_swing_begins_on_the_seam_and_is_commanded_as_early_as_the_arm_is_late
         assert (later._swings is not None) == swings
 
 
-def test_the_sweep_moves_across_and_along_the_seam_and_is_told_where_the_arm_is() -> None:
+def test_the_sweep_moves_across_the_seam_and_turns_and_is_told_where_the_arm_is() -> None:
     found, noted = make("probing"), list[Any]()
     found._place, found._elapsed = found._plan.at(0.05), 8e-3
     found._probing = SimpleNamespace(
-        velocity=lambda elapsed: 2e-3, along=lambda elapsed: 0.5e-3,
-        note=lambda *given: noted.append(given),
+        velocity=lambda elapsed: (2e-3, 0.1), note=lambda *given: noted.append(given), rests=False
     )  # fmt: skip
-    command = found._probe(pose(0.05, 1e-3, time=4.0))
-    assert isinstance(command, Command) and command.turn == 0.0
-    assert command.velocity == pytest.approx([0.5e-3, 2e-3, 0.0])
-    assert noted == [(4.0, 2e-3, pytest.approx(1e-3))]
+    command = found._probe(pose(0.05, 1e-3, angle=0.2, time=4.0))
+    assert isinstance(command, Command) and command.turn == 0.1
+    assert command.velocity == pytest.approx([0.0, 2e-3, 0.0])
+    assert noted == [(4.0, 2e-3, pytest.approx(1e-3), pytest.approx(math.sin(0.2)))]
 
 
 def test_what_is_kept_of_a_weld_is_what_it_felt_and_where_its_torch_is() -> None:
@@ -768,7 +737,7 @@ def test_what_is_kept_of_a_weld_is_what_it_felt_and_where_its_torch_is() -> None
     assert kept.torch == 0.03 and kept.number == 0 and kept.traced.shape == (0, 3)
     assert kept.samples == pytest.approx(found.refined.samples())
     again = make(before=kept)
-    assert again.refined.offset(0.05) == pytest.approx(1e-3, abs=1e-6)
+    assert again.refined.offset(0.05) == pytest.approx(1e-3, abs=10e-6)
     assert again.tip == following().inset and again.torch == following().inset - DISTANCE
 
 
@@ -786,22 +755,14 @@ def test_a_fast_torch_takes_an_error_back_within_eight_millimetres_of_its_way() 
     assert turn == pytest.approx(20e-3 / 8e-3 * math.sin(0.01), rel=0.02)
 
 
-def test_two_cycles_at_the_same_time_tell_nothing_of_the_arm_s_period() -> None:
-    found = make("bridging")
-    for time in (3.0, 3.0, 3.008, 3.016):
-        found.step(pose(0.05, time=time), [])
-    assert found._period == pytest.approx(8e-3)
-
-
 @pytest.mark.parametrize("turn", [0.02, -0.02])
 def test_a_tool_s_length_before_the_seam_the_torch_is_led_to_where_the_plan_was_moved_to(
     turn: float,
 ) -> None:
     found = make()
     for s in np.arange(0.005, 0.1, 2e-4).tolist():
-        found.refined.add(0.0, s, 1e-3 + turn * s, 0.0)
-    found.refined.confirm(1.0)
-    found.refined.hurried = False
+        found.refined.add(s, 1e-3 + turn * s, 0.0)
+    found.refined.renew(-DISTANCE, 100_000)
     for s in (-DISTANCE, following().inset - DISTANCE, LENGTH + DISTANCE):
         assert found.refined.offset(s) == pytest.approx(1e-3 + turn * s, abs=0.02e-3)
 
@@ -895,19 +856,3 @@ def test_a_torch_that_is_where_its_swing_is_stays_there_and_turns_as_it_goes(asi
         held = on_line.step(pose(0.05, 0.0, angle=-aside / DISTANCE, time=0.01), []).turn
         # The tip ahead stays on its way, so the torch goes to the left by a turn to the right.
         assert turn - held == pytest.approx(-rate / DISTANCE, rel=0.01, abs=1e-9)
-
-
-def test_where_a_tip_has_been_higher_for_long_the_last_two_centimetres_are_doubted() -> None:
-    found = make()
-    found._seating = SimpleNamespace(judge=lambda s, offset, height: None, risen=0.3e-3)
-    found._watch(0.06, SeamReading(0.0, 0.0))
-    for s, doubt in ((0.035, 0.0), (0.041, 0.3e-3), (0.05, 0.3e-3), (0.06, 0.3e-3), (0.065, 0.0)):
-        assert found.refined.doubt(s) == doubt
-    assert found.phase == "following"
-    for phase, stopped in (("following", True), ("ending", False)):
-        wrong = make(phase)
-        wrong.refined.add(1.0, 0.05, 0.0, 0.0)
-        wrong._seating = SimpleNamespace(judge=lambda s, offset, height: "it climbs", risen=0.0)
-        wrong._watch(0.06, SeamReading(0.0, 0.0))
-        assert (wrong.phase == "stopped") == stopped == (wrong.reason == "it climbs")
-        assert bool(wrong.refined._pending) != stopped

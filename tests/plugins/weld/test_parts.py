@@ -14,11 +14,10 @@ from flangeye.motion.seam_following import Command, ToolPose, turned
 from flangeye.types import Transform
 from flangeye_emulators.weld_world.groove import Contact as Tip3D
 from flangeye_emulators.weld_world.groove import Groove, Section, Tip
-from flangeye_plugins.weld.consistency import Seating
 from flangeye_plugins.weld.frame import Tool, WorkPlane
 from flangeye_plugins.weld.motion import Track
 from flangeye_plugins.weld.path import Path
-from flangeye_plugins.weld.refined import BIN, LENGTHS, ZONE, RefinedPath
+from flangeye_plugins.weld.refined import RefinedPath
 from tests.plugins.weld.bench import curved, misplaced, straight
 
 FINGER = read_model(bundled("data") / "fingers" / "srm.yaml", Finger)
@@ -86,9 +85,7 @@ def test_the_curvature_of_a_path_is_a_circle_s_and_not_its_scatter_s() -> None:
 def test_where_nothing_was_felt_the_plan_is_moved_onto_what_was() -> None:
     true, plan = Path(curved()), Path(misplaced(curved(), (1e-3, 2e-3, 0.0), np.deg2rad(1.0)))
     refined = RefinedPath(plan, 0.05)
-    for i, s in enumerate(
-        np.concatenate([np.arange(0.03, 0.05, 2e-4), np.arange(0.07, 0.09, 2e-4)])
-    ):
+    for s in np.concatenate([np.arange(0.03, 0.05, 2e-4), np.arange(0.07, 0.09, 2e-4)]):
         place = plan.at(float(s))
         foot = true.foot(place.point, float(s))
         for _ in range(3):  # the true seam across the plan
@@ -97,35 +94,13 @@ def test_where_nothing_was_felt_the_plan_is_moved_onto_what_was() -> None:
                 at.tangent @ place.tangent
             )
         offset = float((true.at(foot).point - place.point) @ place.normal)
-        refined.add(i * 0.01, float(s), offset, 0.0)
-    refined.confirm(100.0)
+        refined.add(float(s), offset, 0.0)
+    refined.renew(-0.05, 100_000)
     for s in (0.02, 0.04, 0.06, 0.08, 0.1):
         point, normal = refined.frame(s)
         foot = true.foot(point, s)
         assert np.linalg.norm(true.at(foot).point - point) < 0.05e-3
         assert normal @ true.at(foot).normal > np.cos(np.deg2rad(0.5))
-
-
-def test_what_is_not_confirmed_is_not_believed() -> None:
-    refined = RefinedPath(Path(straight()), 0.05)
-    refined.add(1.0, 0.01, 1e-3, 0.0)
-    assert refined.empty
-    refined.confirm(0.5)
-    assert refined.empty
-    refined.forget_pending()
-    refined.confirm(2.0)
-    assert refined.empty
-    assert refined.offset(0.01) == 0.0
-
-
-def test_a_long_seam_costs_a_cycle_no_more_than_a_short_one() -> None:
-    refined = RefinedPath(Path(straight(5.0)), 0.05)
-    for s in np.arange(0.0, 4.0, 4e-4):
-        refined.add(0.0, float(s), 1e-3, 0.0)
-    refined.confirm(1.0)
-    assert len(refined._nearest(20, 120)) == len(refined._nearest(4000, 120)) == 240
-    assert refined.offset(2.0) == pytest.approx(1e-3, abs=1e-6)
-    assert refined.offset(4.5) == pytest.approx(1e-3, abs=1e-5)  # half a metre beyond
 
 
 # --- where the tool was ---------------------------------------------------------------------------
@@ -218,20 +193,6 @@ def test_the_torch_is_measured_across_the_opening_and_only_beside_the_seam() -> 
     np.testing.assert_allclose(found, [2e-3])
 
 
-def test_where_the_field_is_held_by_samples_an_error_of_the_plan_s_motion_does_no_harm() -> None:
-    plan = Path(straight(0.12))
-    refined = RefinedPath(plan, 0.05)
-    refined.noise = 10e-6
-    for s in np.arange(0.0, 0.08, 2e-4):
-        refined.add(0.0, float(s), 1e-3 * np.sin(2 * np.pi * s / 10e-3), 0.2)
-    refined.confirm(1.0)
-    assert refined.offset(0.04) == pytest.approx(1e-3 * np.sin(2 * np.pi * 4), abs=0.01e-3)
-    assert refined.slope(0.04) == pytest.approx(2 * np.pi * 0.1, rel=0.3)
-    assert np.sqrt(refined.variance(0.04)) < 0.03e-3
-    assert np.sqrt(refined.variance(0.1)) > 0.5e-3  # where nothing was felt the waves go on unseen
-    assert refined.angle(0.04, 0.0) == 0.2
-
-
 @pytest.mark.parametrize("bow", [-3e-3, 3e-3])
 def test_a_plan_whose_shape_is_wrong_is_stated_beyond_what_was_felt(bow: float) -> None:
     """A bow that shift and turn nearly explain leads the plan elsewhere beyond its last sample."""
@@ -244,8 +205,8 @@ def test_a_plan_whose_shape_is_wrong_is_stated_beyond_what_was_felt(bow: float) 
         return bow * np.sin(np.pi * s / plan.length)
 
     for s in np.arange(5e-3, plan.length - 10e-3, 2e-4):
-        refined.add(0.0, s, bowed(s) + refined.noise * rng.standard_normal(), 0.0)
-    refined.confirm(1.0)
+        refined.add(s, bowed(s) + refined.noise * rng.standard_normal(), 0.0)
+    refined.renew(-0.05, 100_000)
     for s in np.arange(plan.length - 10e-3, plan.length, 1e-3):
         off = abs(refined.offset(s) - bowed(s))
         assert off < 4 * np.sqrt(refined.variance(s)) < 4e-3
@@ -260,125 +221,16 @@ def test_waves_felt_in_two_short_pieces_are_not_taken_for_a_plan_turned_far() ->
         return -1.3e-3 * np.cos(2 * np.pi * (s - 10.5e-3) / 28e-3) - 0.9e-3
 
     for s in [*np.arange(6e-3, 13e-3, 0.6e-3).tolist(), 27.5e-3, 28e-3]:
-        refined.add(0.0, s, wave(s) + refined.noise * rng.standard_normal(), 0.0)
-    refined.confirm(1.0)
+        refined.add(s, wave(s) + refined.noise * rng.standard_normal(), 0.0)
+    refined.renew(-0.05, 100_000)
     for s in np.arange(14e-3, 27e-3, 1e-3):
         assert abs(refined.offset(s) - wave(s)) < 4 * np.sqrt(refined.variance(s))
-
-
-def test_a_hurried_path_finds_one_thing_again_at_a_time_and_is_the_same_in_the_end() -> None:
-    exact, hurried = (RefinedPath(Path(curved(0.1)), 0.05) for _ in range(2))
-    hurried.hurried = True
-    for refined in (exact, hurried):
-        for s in np.arange(0.0, 0.05, 2e-4).tolist():
-            refined.add(s, s, 1e-3 * np.cos(s / 10e-3), 0.0)
-        refined.confirm(0.02)
-    first = hurried.variance(0.03)
-    assert first == exact.variance(0.03)
-    for refined in (exact, hurried):
-        refined.confirm(1.0)
-    after = []
-    # The motion, a length each, then the field about the place: of the one that is new first.
-    for _ in range(2 * (len(LENGTHS) + 2)):
-        after.append(hurried.variance(0.03))
-        hurried.renew((0.03, 0.05))
-    assert set(after) == {first}
-    assert hurried.variance(0.03) == exact.variance(0.03) < first
-    assert hurried.variance(0.05) == exact.variance(0.05)
-    np.testing.assert_array_equal(hurried.frame(0.03), exact.frame(0.03))
-
-
-def test_a_hurried_path_takes_what_is_known_beside_a_new_place_and_waits_for_nothing(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    refined = RefinedPath(Path(curved(0.1)), 0.05)
-    refined.hurried = True
-    for s in np.arange(0.0, 0.05, 2e-4).tolist():
-        refined.add(s, s, 1e-3 * np.cos(s / 10e-3), 0.0)
-    refined.confirm(1.0)
-    edge = next(s for s in np.arange(0.04, 0.046, BIN) if refined._index(s) % ZONE == ZONE - 1)
-    exact = refined.offset(edge)
-    monkeypatch.setattr(refined, "_find", None)  # whoever finds a motion now would fail
-    beside = refined.offset(edge + 0.9 * BIN)  # by the fit of the bin before
-    assert beside == pytest.approx(1e-3 * np.cos((edge + 0.9 * BIN) / 10e-3), abs=5e-6)
-    assert refined.frame(edge + BIN)[0] != pytest.approx(refined.frame(edge)[0], abs=1e-6)
-    assert len(refined._fits) == 1
-    refined.renew((edge, edge + 2 * BIN))  # the zone's motion is not known: the next one's does
-    assert len(refined._fits) == 2
-    assert refined.offset(edge + 2 * BIN) == pytest.approx(
-        1e-3 * np.cos((edge + 2 * BIN) / 10e-3), abs=5e-6
-    )
-    assert refined.offset(edge) == exact
 
 
 def test_what_was_felt_at_two_places_says_little_of_the_rest() -> None:
     few, many = RefinedPath(Path(straight()), 0.05), RefinedPath(Path(straight()), 0.05)
     for refined, end in ((few, 1e-3), (many, 40e-3)):
         for s in np.arange(0.0, end, 2e-4):
-            refined.add(0.0, s, 1e-3, 0.0)
-        refined.confirm(1.0)
+            refined.add(s, 1e-3, 0.0)
+        refined.renew(-0.05, 100_000)
     assert few.variance(11e-3) > 20 * many.variance(50e-3)
-
-
-# --- whether the tip is where the seam is ---------------------------------------------------------
-
-
-def climbing(aside, lifted):
-    """Judge a straight seam, then a tip aside and lifted [m]; return the largest doubt."""
-    seating, rng, doubt = Seating(1.0, 1.0), np.random.default_rng(0), 0.0
-    for i in range(200):
-        there = i >= 120
-        noise = 10e-6 * rng.standard_normal(2)
-        assert seating.judge(i * 2e-4, there * aside + noise[0], there * lifted + noise[1]) is None
-        doubt = max(doubt, seating.doubt if i > 130 else 0.0)
-    return doubt
-
-
-def test_a_tip_that_may_have_climbed_a_little_is_doubted_by_so_much() -> None:
-    assert climbing(0.3e-3, 0.3e-3) == pytest.approx(0.3e-3, abs=0.05e-3)
-    assert climbing(0.0, 1.5e-3) < 0.05e-3  # a tack weld
-    assert climbing(0.3e-3, 0.0) < 0.05e-3  # the seam turns aside
-
-
-def test_a_piece_of_the_seam_is_suspected_after_it_was_felt() -> None:
-    refined = RefinedPath(Path(straight(0.1)), 0.05)
-    refined.suspect(0.02, 0.04, 1e-3)
-    refined.suspect(0.03, 0.04, 0.5e-3)
-    assert [refined.doubt(s) for s in (0.01, 0.02, 0.035, 0.05)] == [0.0, 1e-3, 1e-3, 0.0]
-
-
-def risen(rise, first=0.03, last=1.0):
-    """Judge a seam that leaves its plan to the other side; the tip rises from first on [m]."""
-    seating, rng, most = Seating(1.0, 1.0), np.random.default_rng(0), 0.0
-    seating.seated(np.array([(5e-3, 0.0, 0.6e-3 * rng.standard_normal()) for _ in range(100)]))
-    for s in np.arange(5e-3, 80e-3, 0.3e-3).tolist():
-        height = rise * max(s - first, 0.0) * (s < last) + 0.6e-3 * rng.standard_normal()
-        seating.judge(s, -0.2 * s, height)
-        most = max(most, seating.risen)
-    return most
-
-
-def test_a_tip_that_stays_higher_is_doubted_whatever_it_does_aside() -> None:
-    assert risen(0.06) > 0.5e-3
-    assert risen(0.015) == 0.0  # the plan is tilted by 1 deg
-    assert risen(0.2, last=38e-3) == 0.0  # a tack weld of 8 mm
-
-
-def test_what_lies_far_behind_is_neither_looked_at_nor_kept() -> None:
-    rng = np.random.default_rng(0)
-    samples = [(0.1e-3 * i, *(0.1e-3 * rng.standard_normal(2))) for i in range(6000)]
-    long, late = Seating(1.0, 1.0), Seating(1.0, 1.0)
-    for i, sample in enumerate(samples):
-        long.judge(*sample)
-        if i > 4000:
-            late.judge(*sample)
-            assert i < 5000 or (long.doubt, long.risen) == (late.doubt, late.risen)
-    assert len(long._seated.rows) < 1000  # a cycle's cost goes with it
-
-
-def test_a_noisy_tip_on_a_short_line_is_not_taken_for_one_that_is_lifted() -> None:
-    for seed in range(20):
-        seating, rng = Seating(1.0, 1.0), np.random.default_rng(seed)
-        for i in range(90):  # the line goes through 1 to 20 mm of what was felt
-            noise = 0.6e-3 * rng.standard_normal(2)
-            assert seating.judge(i * 0.33e-3, noise[0], noise[1]) is None

@@ -111,7 +111,7 @@ def test_a_pass_goes_aside_of_what_was_found_and_higher_than_the_tool_was(points
     found = rooted(passes({"across": "2 mm", "up": "4 mm", "along": "10 mm"}, points=points,
                           aside=0.5e-3))  # fmt: skip
     path, plan = found._path, Path(points)
-    assert found.phase == "returning" and found.number == 1 and not found.root.refined.hurried
+    assert found.phase == "returning" and found.number == 1
     for end, s in ((0.0, 10e-3), (path.length, LENGTH)):
         there, place = path.at(end), plan.at(s)
         assert there.point == pytest.approx(place.point + 2.5e-3 * place.normal, abs=0.3e-3)

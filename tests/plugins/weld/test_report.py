@@ -124,19 +124,18 @@ def test_the_true_torch_is_stated_at_the_report_s_times() -> None:
 def test_the_refined_seam_is_every_millimetre_as_it_was_felt() -> None:
     controller = follower()
     for s in np.arange(0.005, 0.09, 2e-4).tolist():
-        controller.refined.add(0.0, s, 1e-3, 0.0)
-    controller.refined.confirm(1.0)
+        controller.refined.add(s, 1e-3, 0.0)
+    controller.refined.renew(-0.05, 100_000)
     found = reported(logged(5), controller).refined
     x = np.arange(100) * 1e-3 - LENGTH / 2
     assert found == pytest.approx(
         in_base(np.column_stack([x, np.full(100, 1e-3), 0 * x])), abs=1e-5
     )
-    assert not controller.refined.hurried
 
 
 def test_what_the_sweep_found_is_among_the_figures() -> None:
     controller = follower()
-    controller.learned = Learned(0.1, 0.02, -0.03e-3, 0.04, 0.05, 0.06)
+    controller.learned = Learned(0.1, 0.02, -0.03e-3, 0.1e-3, 0.04, 0.05, 0.06)
     assert learned_figures(controller) == {
         "finger_gain_error": 0.1, "finger_play": 0.06e-3, "timestamps_late": 0.04,
         "arm_dead_time": 0.05, "arm_lag": 0.06, "lit_from": -1.0, "share_welded": 0.0,

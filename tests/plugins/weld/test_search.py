@@ -81,8 +81,8 @@ def test_something_is_touched_at_half_the_preload_by_three_measurements() -> Non
 
 
 def test_the_noisier_a_tip_is_the_more_measurements_are_taken_to_a_mean() -> None:
-    """As many as make it four standard deviations of their mean; fifteen at most."""
-    for sigma, count in ((0.0, 3), (0.5, 4), (0.8, 11), (9.0, 15)):
+    """As many as make it four standard deviations of their mean; sixty at most."""
+    for sigma, count in ((0.0, 3), (0.5, 4), (0.8, 11), (1.2, 24), (9.0, 60)):
         upright = max(sigma * PRELOAD / 2, 1e-9)
         search = fed(rested(Belief(40e-3, noise=(1e-9, upright))), count - 1, 0.0, PRELOAD)
         assert not search.down
