@@ -136,7 +136,7 @@ def drawn(seed: int) -> Condition:
     belief = {"torch_sigma": torch, "along_sigma": along, "tip_sigma": tip_sigma}
     planned = draw.some(12e-3), draw.some(0.1)
     # How far its ends may be off along it, a plan's file states.
-    settings["ends"] = _mm(planned[0] + planned[1] ** 2 * LENGTH / 4.0)
+    settings["ends"] = _mm(planned[0] + planned[1] * 12e-3)  # turned, an S of 12 mm is off too
     return Condition(world, settings, planned, belief)
 
 
