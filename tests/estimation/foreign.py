@@ -243,7 +243,7 @@ def _noisy(kind, exact, rng):
 # --- the truth of both answers ------------------------------------------------------------------
 
 
-def work(s: Session, count: int = 300) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def work(s: Session, count: int = 1000) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return flange poses of the work, reported and real (N, 4, 4), over the box."""
     rng = np.random.default_rng(12345)
     targets = np.tile(np.eye(4), (count, 1, 1))
@@ -265,9 +265,11 @@ def best_rigid(frm: np.ndarray, to: np.ndarray) -> np.ndarray:
     return out
 
 
-def reported_camera(s: Session) -> np.ndarray:
-    """Return the camera's pose that maps what it sees onto reported coordinates best."""
-    reported, real, _ = work(s)
+def reported_camera(s: Session, reported: np.ndarray, real: np.ndarray) -> np.ndarray:
+    """Return the camera's pose that maps what it sees onto reported coordinates best.
+
+    Over poses of the work (N, 4, 4), reported and real.
+    """
     onto = best_rigid(real[:, :3, 3], reported[:, :3, 3])
     if not s.in_hand:
         return onto @ s.camera

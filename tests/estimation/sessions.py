@@ -9,10 +9,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flangeye.estimation.answers import Answer, as_reported, expected_error, functional
+from flangeye.estimation.answers import Answer, as_reported, as_true, expected_error
 from flangeye.estimation.estimate import Estimate, estimate
 from flangeye.estimation.graph import Carrier, Problem, Sightings
 from flangeye.estimation.session import Asked, effects_of
+from flangeye.estimation.work import work_of
 from flangeye.maths.frame_graph import Frame
 from flangeye.maths.geometry import hat, kabsch, rigid
 from flangeye.maths.kinematics import Arm
@@ -84,23 +85,26 @@ def estimated(s: foreign.Session, kind: str) -> Estimate:
 
 
 def score(kind: str, arm: dict, s: float, poses: int, seed: int) -> Scores:
-    """Return how wrong both answers of one session are, and how wrong they say."""
+    """Return how wrong both answers of one session are, and how wrong they say.
+
+    The estimator is not told the box of the work that it is judged by: its own is where the
+    session's poses were.
+    """
     session = foreign.session(kind, arm, s, poses, seed)
     found = estimated(session, kind)
-    reported, _, joints = foreign.work(session, 64)
-    camera, target = found.places["camera"], found.places.get("target", np.eye(4))
-    seen = np.linalg.inv(camera) @ reported @ target
-    if session.in_hand:
-        seen = np.linalg.inv(reported @ camera) @ target
-    work = problem_of(session, kind, reported, joints, seen)
-    a = as_reported(found, work)
-    truth = foreign.reported_camera(session)
-    points = seen[:, :3, 3]
+    work = work_of(found.problem.where(found.inliers), found.places)
+    answer = as_reported(found, work)
+    reported, real, _ = foreign.work(session)
+    truth = foreign.reported_camera(session, reported, real)
+    camera = reported @ session.camera if session.in_hand else session.camera
+    points = (
+        np.linalg.inv(camera) @ (session.target if session.in_hand else reported @ session.target)
+    )[:, :3, 3]
     return Scores(
-        _scored(found, functional(found, np.zeros_like(a)), session.camera, points),
-        _scored(found, functional(found, a), truth, points),
+        _scored(found, as_true(found), session.camera, points),
+        _scored(found, answer, truth, points),
         _of_svd(session, truth, points) if kind in ("flange", "centres") else np.nan,
-        expected_error(found, work, functional(found, a).mean).rms,
+        expected_error(found, work, answer.mean).rms,
         int((~found.inliers).sum()),
     )
 

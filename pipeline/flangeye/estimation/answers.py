@@ -20,14 +20,16 @@ import numpy as np
 
 from flangeye.estimation.estimate import Estimate, model_at
 from flangeye.estimation.graph import Carrier, Linear, Problem
+from flangeye.estimation.work import Work
 from flangeye.maths.frame_graph import chain, composed
 from flangeye.maths.geometry import hat, invert
 from flangeye.types import ExpectedError, Floats
 
 DRAWS = 8
 """Of an error at each pose and each draw of the sizes, for its quantiles."""
-LEVER = 0.03
-"""Turns count like what they do so far from the centre [m]: at the rim of a common flange."""
+LEVER = 0.02
+"""Turns count like what they do so far from the flange [m]: enough to tell the turn about a line
+where the work is in one, and no more, for the work is a matter of positions."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,23 +51,35 @@ class Answer:
 
 
 def functional(found: Estimate, a: Floats) -> Answer:
-    """Return the answer p + A delta of a (P, K) matrix, over the mixture."""
+    """Return the answer p + A delta over the mixture, and over (B, P, K) matrices A alike."""
     p = found.posterior.model.p
-    rows = np.concatenate([np.eye(p), a], axis=1)
-    mean = rows @ found.posterior.mean
-    covariance = rows @ found.posterior.covariance @ rows.T
-    return Answer(mean, 0.5 * (covariance + covariance.T))
+    rows = np.concatenate([np.tile(np.eye(p), (len(a), 1, 1)), a], axis=2)
+    each = rows @ found.posterior.mean
+    within = rows @ found.posterior.covariance @ np.swapaxes(rows, 1, 2)
+    apart = each - each.mean(axis=0)
+    covariance = within.mean(axis=0) + apart.T @ apart / max(len(a) - 1, 1)
+    return Answer(each.mean(axis=0), 0.5 * (covariance + covariance.T))
 
 
-def as_reported(found: Estimate, work: Problem, without: frozenset[str] = frozenset()) -> Floats:
-    """Return (P, K): what the effects' numbers add to the places for the arms as reported.
+def as_true(found: Estimate) -> Answer:
+    """Return the places for the arms as they really are."""
+    return functional(found, np.zeros((1, found.posterior.model.p, sum(found.counts))))
+
+
+def as_reported(found: Estimate, work: Work, without: frozenset[str] = frozenset()) -> Answer:
+    """Return the places for the arms as their controllers report them.
 
     Args:
         found: The posterior.
-        work: Sightings as they would be over the workspace.
+        work: Where commands are sent: each box that may be meant has an answer of its own.
         without: Kinds of the arms' errors that are corrected, and so are no part of what they
             report.
     """
+    return functional(found, np.array([_as_reported(found, each, without) for each in work.boxes]))
+
+
+def _as_reported(found: Estimate, work: Problem, without: frozenset[str]) -> Floats:
+    """Return (P, K): what the effects' numbers add to the places."""
     linear = work.linearised(found.places)
     columns = [
         e.block(work, linear)
@@ -202,7 +216,7 @@ def adjoint(pose: Floats) -> Floats:
 
 
 def expected_error(
-    found: Estimate, work: Problem, answer: Floats, corrected: bool = False
+    found: Estimate, work: Work, answer: Floats, corrected: bool = False
 ) -> ExpectedError:
     """Return the predictive spread of an answer at new poses of the work.
 
@@ -211,12 +225,12 @@ def expected_error(
 
     Args:
         found: The posterior.
-        work: Sightings as they would be over the workspace.
+        work: Where it is taken.
         answer: (P,) moves of the places.
         corrected: Whether the arms' errors are corrected by their posterior mean.
     """
-    known, rng = found.posterior, np.random.default_rng(0)
-    model = model_at(work, found.places, found.effects, np.ones(len(work.seen)), of_session=False)
+    known, rng, at = found.posterior, np.random.default_rng(0), work.poses
+    model = model_at(at, found.places, found.effects, np.ones(len(at.seen)), of_session=False)
     p = model.p
     of_places, of_effects = model.places[:, 3:], model.effects[:, 3:]
     put_right = np.repeat([corrected and e.of_arm for e in found.effects], found.counts)

@@ -10,17 +10,17 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from flangeye.errors import FlangeyeError
-from flangeye.estimation.answers import Answer, as_reported, expected_error, functional
+from flangeye.estimation.answers import Answer, as_reported, as_true, expected_error
 from flangeye.estimation.certified import answer_of, certificate_notes, moved_note, verdict_of
 from flangeye.estimation.corrections import CORRECTED, corrections_of
 from flangeye.estimation.estimate import Estimate, estimate
 from flangeye.estimation.flange_roll import roll_note
 from flangeye.estimation.graph import Places, Problem
-from flangeye.estimation.mixed import fit
+from flangeye.estimation.mixed import told
 from flangeye.estimation.observability import LEAST, meaningless, unobservable
 from flangeye.estimation.session import Asked, Session, session_of
 from flangeye.estimation.threads import on_one_thread
-from flangeye.estimation.work import work_of
+from flangeye.estimation.work import Work, work_of
 from flangeye.maths.geometry import adjoint_shift
 from flangeye.models.cell import Cell
 from flangeye.models.configuration import mapped_and_expected
@@ -98,7 +98,7 @@ def calibrate(
         reported,
         method=method,
         corrected=corrected,
-        true=tuple(_estimates(session, _true(session.found), weak)),
+        true=tuple(_estimates(session, as_true(session.found), weak)),
         notes=(*session.notes, *_notes(session, weak, options)),
     )
 
@@ -134,7 +134,7 @@ def calibrate_at(
     work = _work(session, options)
     answer = _reported(session, work, weak, places)
     pairs = tuple(replace(pair, used=True, reason=None) for pair in answer.pairs)
-    true = _true(session.found).at(session.found.problem.moves(session.found.places, places))
+    true = as_true(session.found).at(session.found.problem.moves(session.found.places, places))
     return replace(
         answer,
         pairs=pairs,
@@ -179,30 +179,28 @@ def _weak(session: Session, options: Options) -> Floats:
     """
     found = session.found
     model, sizes = found.posterior.model, found.posterior.mode.sizes.copy()
-    sizes[-2:] = np.maximum(sizes[-2:], LEAST)
-    covariance = fit(model, sizes, with_gradient=False).covariance[: model.p, : model.p]
-    information = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
+    own = slice(len(sizes) - len(model.scatter), len(sizes) - len(model.scatter) + 2)
+    sizes[own] = np.maximum(sizes[own], LEAST)
     agreeing = found.problem.where(found.inliers)
     return unobservable(
-        agreeing, found.places, information, options.limits, options.mark, session.cell.freedoms
+        agreeing,
+        found.places,
+        told(model, sizes),
+        options.limits,
+        options.mark,
+        session.cell.freedoms,
     )
 
 
-def _work(session: Session, options: Options) -> Problem:
+def _work(session: Session, options: Options) -> Work:
     found = session.found
     return work_of(found.problem.where(found.inliers), found.places, options.work)
 
 
-def _true(found: Estimate) -> Answer:
-    return functional(found, np.zeros((found.posterior.model.p, sum(found.counts))))
-
-
-def _reported(
-    session: Session, work: Problem, weak: Floats, given: Places | None = None
-) -> HandEye:
+def _reported(session: Session, work: Work, weak: Floats, given: Places | None = None) -> HandEye:
     """Return the answer for the arms as their controllers report them: the likeliest, or given."""
     found = session.found
-    answered = functional(found, as_reported(found, work))
+    answered = as_reported(found, work)
     if given is not None:
         answered = answered.at(found.problem.moves(found.places, given))
     camera, *others = _estimates(session, answered, weak)
@@ -220,14 +218,14 @@ def _reported(
 
 
 def _corrected(
-    session: Session, work: Problem, weak: Floats, reported: ExpectedError | None
+    session: Session, work: Work, weak: Floats, reported: ExpectedError | None
 ) -> CorrectedArm | None:
     """Return the answer for the arms with their errors corrected, where that is worth its while."""
     found = session.found
     corrections = corrections_of(found, session.tool_offset)
     if not corrections or reported is None:
         return None
-    answered = functional(found, as_reported(found, work, without=CORRECTED))
+    answered = as_reported(found, work, without=CORRECTED)
     likeliest = found.posterior.mean[: found.posterior.model.p]
     expected = expected_error(found, work, likeliest, corrected=True)
     if expected.rms > BETTER * reported.rms:

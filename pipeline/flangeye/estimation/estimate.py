@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flangeye.estimation.effects.arm import QUALITY
+from flangeye.estimation.effects.arm import QUALITY, Scatter, arm_scatters
 from flangeye.estimation.effects.effect import Effect
 from flangeye.estimation.graph import Places, Problem
 from flangeye.estimation.mixed import (
@@ -31,8 +31,8 @@ from flangeye.types import Floats, Mask
 SCALE = 2.0
 """By how many times features may be better or worse than their fits state, one sigma."""
 FURTHER = 0.05e-3, 0.02e-3
-"""Median noise of a sighting beyond its feature's: rotation [rad] and translation [m]. The
-repeatability of industrial arms by ISO 9283 is 0.02 to 0.1 mm."""
+"""Median noise of a sighting beyond its feature's: rotation [rad] and translation [m]: what a
+feature's fit does not state."""
 TIMES = 4.0
 """By how many times that may be more or less, one sigma."""
 OUTLIER = 0.9999
@@ -91,18 +91,23 @@ class Estimate:
         return [int((sizes == k).sum()) for k in range(len(self.effects))]
 
 
-def prior_of(effects: Sequence[Effect], counts: Sequence[int]) -> Sizes:
+def prior_of(
+    effects: Sequence[Effect], counts: Sequence[int], scatters: Sequence[Scatter]
+) -> Sizes:
     """Return the prior of the sizes of effects and noise; those of one cause share its quality."""
-    causes = sorted({e.cause for e in effects if e.cause})
-    count = len(effects)
-    centre = np.log([*(e.size for e in effects), 1.0, 1.0, *FURTHER])
-    mix = np.zeros((count + 4, count + 4 + len(causes)))
-    spread = [*(np.log(e.factor) for e in effects), *[np.log(SCALE)] * 2, *[np.log(TIMES)] * 2]
-    mix[:, : count + 4] = np.diag(spread)
-    for k, effect in enumerate(effects):
-        if effect.cause:
-            mix[k, count + 4 + causes.index(effect.cause)] = np.log(QUALITY)
-    return Sizes(centre, mix, np.repeat(np.arange(count), counts))
+    sized = [*((e.size, e.factor, e.cause) for e in effects), *[(1.0, SCALE, "")] * 2]
+    sized += [
+        *((size, TIMES, "") for size in FURTHER),
+        *((s.size, s.factor, s.cause) for s in scatters),
+    ]
+    causes = sorted({cause for _, _, cause in sized if cause})
+    mix = np.zeros((len(sized), len(sized) + len(causes)))
+    mix[:, : len(sized)] = np.diag(np.log([factor for _, factor, _ in sized]))
+    for k, (_, _, cause) in enumerate(sized):
+        if cause:
+            mix[k, len(sized) + causes.index(cause)] = np.log(QUALITY)
+    centre = np.log([size for size, _, _ in sized])
+    return Sizes(centre, mix, np.repeat(np.arange(len(effects)), counts))
 
 
 def model_at(
@@ -125,16 +130,23 @@ def model_at(
     blocks = [effect.block(problem, linear) for effect in effects]
     if not of_session:
         blocks = [b if e.lasting else 0 * b for b, e in zip(blocks, effects, strict=True)]
-    still = np.zeros((len(s), 6, 0))
+    still, scatters = np.zeros((len(s), 6, 0)), arm_scatters(problem)
     return Model(
         (s.projectors @ linear.residuals[..., None])[..., 0],
         np.concatenate([still, *(linear.blocks[name] for name in problem.unknown)], axis=2),
         np.concatenate([still, *blocks], axis=2),
         s.covariances,
+        np.array([*_further(len(s)), *(each.covariances(problem, linear) for each in scatters)]),
         s.projectors,
-        prior_of(effects, [block.shape[2] for block in blocks]),
+        prior_of(effects, [block.shape[2] for block in blocks], scatters),
         shares,
     )
+
+
+def _further(count: int) -> Floats:
+    """Return (2, N, 6, 6) of turns and of shifts alone."""
+    each = np.kron(np.eye(2)[:, :, None] * np.eye(2), np.eye(3))
+    return np.asarray(np.repeat(each[:, None], count, axis=1))
 
 
 def estimate(problem: Problem, start: Places, effects: Sequence[Effect], agree: Mask) -> Estimate:

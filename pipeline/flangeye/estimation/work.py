@@ -2,51 +2,96 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flangeye.estimation.graph import Places, Problem, Sightings
+from flangeye.estimation.effects.arm import known, told
+from flangeye.estimation.graph import Carrier, Places, Problem, Sightings
 from flangeye.maths.arm_correction import reached_from
 from flangeye.maths.frame_graph import composed
 from flangeye.maths.geometry import invert
-from flangeye.types import Box
+from flangeye.types import Box, Floats
 
-COUNT = 64
-"""New poses: twice as many change the error to expect by less than 2 %."""
+COUNT = 256
+"""New poses: twice as many change the answer by less than a tenth of what is stated."""
+BOXES, WIDEST = 8, 2.5
+"""Boxes that the session's poses may have been drawn from, as likely as each other, and how many
+spacings of poses they reach beyond these at most."""
 
 
-def work_of(problem: Problem, places: Places, box: Box | None = None) -> Problem:
+@dataclass(frozen=True, eq=False)
+class Work:
+    """Where commands are sent.
+
+    Attributes:
+        poses: Sightings as they would be at new poses, where the error to expect is taken.
+        boxes: The same all over each box that may be meant, where the answer is to be right.
+    """
+
+    poses: Problem
+    boxes: Sequence[Problem]
+
+
+def work_of(problem: Problem, places: Places, box: Box | None = None) -> Work:
     """Return sightings that nobody measured, of the same targets by the same cameras.
 
-    At poses like those of the session; with a box, with the flange anywhere in it, as far as the
-    arm gets there near the session's poses.
+    The boxes are filled evenly, the flange turned as in the session, as far as the arm gets there
+    near the session's poses: these are too few to say what an arm does between them. Of several
+    arms, or of one whose joints are not known, all is at poses of the session.
 
     Args:
         problem: The session's sightings that agree.
         places: (4, 4) of each unknown.
-        box: Where the flange is to be, in the root's frame.
+        box: Where the flange is to be, along the axes of the root; None for where the session was,
+            which its poses tell to one spacing between neighbours.
     """
     n = len(problem.seen)
     chosen = np.unique(np.linspace(0, n - 1, min(n, COUNT)).round().astype(int))
-    work = problem.where(chosen)
-    if box is not None and len(problem.carriers) == 1:
-        work = _in_box(problem, box)
+    session = _foreseen(problem.where(chosen), places)
+    carrier = problem.carriers[0] if len(problem.carriers) == 1 else None
+    if carrier is None or carrier.link is not None or not told(carrier):
+        return Work(session, [session])
+    if box is not None:
+        sides = np.asarray(box.centre) + np.array([[-0.5], [0.5]]) * box.size
+        work = _foreseen(_in_box(problem, carrier, sides), places)
+        return Work(work, [work])
+    at = np.asarray(problem.frames[carrier.frame].place)[problem.seen.times, :3, 3]
+    inner = np.array([at.min(axis=0), at.max(axis=0)])
+    outward = (inner[1] - inner[0]) / max(n - 1, 1) * np.array([[-1.0], [1.0]])
+    wide = _foreseen(_in_box(problem, carrier, inner + WIDEST * outward), places)
+    # Beyond the outermost of n poses drawn evenly, what is left is exponential.
+    beyond = np.random.default_rng(0).exponential(size=(BOXES, 2, 3)).clip(max=WIDEST)
+    return Work(session, [_inside(wide, inner + each * outward) for each in beyond])
+
+
+def _foreseen(work: Problem, places: Places) -> Problem:
     return replace(work, seen=_predicted(work, places))
 
 
-def _in_box(problem: Problem, box: Box) -> Problem:
-    """Return the session's sightings with the flange elsewhere: anywhere in a box."""
-    carrier, rng = problem.carriers[0], np.random.default_rng(0)
-    if carrier.link is not None or carrier.kinematics is None or carrier.joints is None:
-        return problem
+def _inside(work: Problem, box: Floats) -> Problem:
+    """Return the sightings with the flange in a box (2, 3); all, where none are."""
+    places = np.asarray(work.frames[work.carriers[0].frame].place)[work.seen.times, :3, 3]
+    inside = ((places >= box[0]) & (places <= box[1])).all(axis=1)
+    return work.where(inside) if inside.any() else work
+
+
+def _in_box(problem: Problem, carrier: Carrier, box: Floats) -> Problem:
+    """Return the session's sightings with the flange evenly in a box (2, 3), where it gets there.
+
+    As they are, where it gets nowhere.
+    """
+    from scipy.stats import qmc
+
+    evenly = qmc.Sobol(4, scramble=True, seed=0).random(COUNT)
+    like = (evenly[:, 3] * len(problem.seen)).astype(int)
     session = np.asarray(problem.frames[carrier.frame].place)
-    like = rng.integers(len(problem.seen), size=COUNT)
     poses = session[problem.seen.times[like]].copy()
-    poses[:, :3, 3] = box.centre + box.size * (rng.random((COUNT, 3)) - 0.5)
+    poses[:, :3, 3] = box[0] + (box[1] - box[0]) * evenly[:, :3]
     apart = np.linalg.norm(poses[:, None, :3, 3] - session[:, :3, 3], axis=2)
-    near = carrier.joints[apart.argmin(axis=1)]
-    joints, reached = reached_from(carrier.kinematics, poses, near)
+    arm, joints = known(carrier)
+    joints, reached = reached_from(arm, poses, joints[apart.argmin(axis=1)])
     if not reached.any():
         return problem
     frame = replace(problem.frames[carrier.frame], place=poses[reached])

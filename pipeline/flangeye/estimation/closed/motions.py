@@ -68,7 +68,9 @@ def translation_of(rotation: Floats, motions: Motions) -> Floats:
     """
     left = motions.a[:, :3, :3] - np.eye(3)
     right = motions.b[:, :3, 3] @ rotation.T - motions.a[:, :3, 3]
-    return np.asarray(np.linalg.lstsq(stack_rows(left), right.ravel(), rcond=None)[0])
+    # Of an arm that stood still rounding would make a shift of 1e12 m: a little pull to zero.
+    rows = np.vstack([stack_rows(left), 1e-6 * np.eye(3)])
+    return np.asarray(np.linalg.lstsq(rows, np.append(right.ravel(), np.zeros(3)), rcond=None)[0])
 
 
 def place_of(carried: Floats, x: Floats, seen: Floats) -> Floats:

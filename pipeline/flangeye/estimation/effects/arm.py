@@ -8,7 +8,8 @@ share its quality, and each is a little better or worse beside it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -31,6 +32,9 @@ KINDS = {
 """Typical size of each kind for zeros of 1 rad: encoders once a turn [rad], a joint's deflection
 for a metre of lever [rad/m], lengths [m], twists [rad]. Ratios seen in published calibrations of
 industrial arms (Nubiola & Bonev 2013; the zeros and lengths of ``refine.arm``), rounded."""
+BACKLASH = 0.1
+"""Likewise of each joint's angle from pose to pose [rad]: an arm that repeats to 0.03 mm by ISO
+9283 at a reach of a metre has 0.03 mrad."""
 FIELD, FIELD_TIMES = 0.1, 4.0
 """Likewise what no kind explains, smooth over the workspace [m], and by how many times it may be
 more or less, one sigma: of it nothing is known beforehand."""
@@ -52,7 +56,7 @@ def arm_effects(problem: Problem, arm: str) -> list[Effect]:
     carriers = [c for c in problem.carriers if c.arm == arm]
     accuracy = carriers[0].accuracy or ACCURACY
     effects = []
-    if all(c.joints is not None and c.kinematics is not None for c in carriers):
+    if _told(problem, arm):
         for kind, (name, ratio) in KINDS.items():
             block = _of_carriers(arm, kind)
             effects.append(Effect(name, block, ratio * accuracy, EACH, arm, True, kind))
@@ -62,6 +66,52 @@ def arm_effects(problem: Problem, arm: str) -> list[Effect]:
         *effects,
         Effect("smooth error", block, FIELD * accuracy, FIELD_TIMES, arm, True, "field"),
     ]
+
+
+@dataclass(frozen=True, eq=False)
+class Scatter:
+    """What a cause adds to the noise of each sighting, anew at every pose.
+
+    Attributes:
+        covariances: Gives (N, 6, 6) of sightings, of size one.
+        size: Prior median of its size.
+        factor: By how many times that size is uncertain, one sigma.
+        cause: Whose quality it shares.
+    """
+
+    covariances: Callable[[Problem, Linear], Floats]
+    size: float
+    factor: float
+    cause: str
+
+
+def arm_scatters(problem: Problem) -> list[Scatter]:
+    """Return the backlash of each arm's joints: it depends on how the arm came to a pose."""
+    arms = {c.arm: c.accuracy or ACCURACY for c in problem.carriers}
+    return [
+        Scatter(_backlash(arm), BACKLASH * accuracy, EACH, arm)
+        for arm, accuracy in arms.items()
+        if _told(problem, arm)
+    ]
+
+
+def _told(problem: Problem, arm: str) -> bool:
+    """Whether the joints of all that an arm carries are known."""
+    carriers = [c for c in problem.carriers if c.arm == arm]
+    return all(told(c) for c in carriers)
+
+
+def told(carrier: Carrier) -> bool:
+    """Whether kinematics and joints of a carrier are known."""
+    return carrier.joints is not None and carrier.kinematics is not None
+
+
+def _backlash(arm: str) -> Callable[[Problem, Linear], Floats]:
+    def covariances(problem: Problem, linear: Linear) -> Floats:
+        moves = _of_carriers(arm, "zeros")(problem, linear)
+        return np.asarray(moves @ np.swapaxes(moves, 1, 2))
+
+    return covariances
 
 
 def _of_carriers(arm: str, kind: str) -> Block:
@@ -93,7 +143,7 @@ def _field_block(problem: Problem, linear: Linear, frame: str, field: SmoothFiel
 @lru_cache(maxsize=16)
 def displacements(carrier: Carrier) -> dict[str, Floats]:
     """Return (T, 6, K) twists of what is carried, in the arm's base at its origin, of each kind."""
-    arm, joints = _known(carrier)
+    arm, joints = known(carrier)
     link = carrier.link
     columns = arm.jacobian(joints, link)
     waves = np.stack([np.sin(joints), np.cos(joints)], axis=1)
@@ -110,7 +160,7 @@ def displacements(carrier: Carrier) -> dict[str, Floats]:
 
 def _by_links(carrier: Carrier, which: Sequence[int]) -> Floats:
     """Return (T, 6, m) what some of the links' (3 n) a, d [m] and alpha [rad] do."""
-    arm, joints = _known(carrier)
+    arm, joints = known(carrier)
     before, columns = arm.pose(joints, carrier.link), []
     for step in DELTA * np.eye(3 * arm.n)[which]:
         after = arm.altered(step.reshape(-1, 3)).pose(joints, carrier.link)
@@ -130,7 +180,7 @@ def _levers(arm: Arm, joints: Floats) -> Floats:
     return np.asarray(np.cross(axes, np.stack(beyond, axis=1)) @ UP)
 
 
-def _known(carrier: Carrier) -> tuple[Arm, Floats]:
+def known(carrier: Carrier) -> tuple[Arm, Floats]:
     """Return kinematics and joints of a carrier that has both.
 
     Raises:
