@@ -16,7 +16,7 @@ from flangeye.estimation.corrections import CORRECTED, corrections_of
 from flangeye.estimation.estimate import Estimate, estimate
 from flangeye.estimation.flange_roll import roll_note
 from flangeye.estimation.graph import Places, Problem
-from flangeye.estimation.mixed import told
+from flangeye.estimation.mixed import told_of_places
 from flangeye.estimation.observability import LEAST, meaningless, unobservable
 from flangeye.estimation.session import Asked, Session, session_of
 from flangeye.estimation.threads import on_one_thread
@@ -185,7 +185,7 @@ def _weak(session: Session, options: Options) -> Floats:
     return unobservable(
         agreeing,
         found.places,
-        told(model, sizes),
+        told_of_places(model, sizes),
         options.limits,
         options.mark,
         session.cell.freedoms,

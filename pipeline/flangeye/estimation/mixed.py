@@ -184,7 +184,7 @@ def fit(model: Model, sizes: Floats, with_gradient: bool = True) -> Fit:
     return replace(found, gradient=_gradient(model, sizes, found, (h, left, bare, prior)))
 
 
-def told(model: Model, sizes: Floats) -> Floats:
+def told_of_places(model: Model, sizes: Floats) -> Floats:
     """Return (P, P) what the sightings tell of the places, the effects marginalised.
 
     By the Schur complement, which stays exact where nothing is told; an inverse covariance is not.
@@ -287,9 +287,9 @@ def posterior(model: Model, mode: Floats | None = None) -> Posterior:
     for draw in draws:
         at = z + spread @ draw
         found = fit(model, model.sizes.at(at), with_gradient=False)
-        told = found if some is model else fit(some, model.sizes.at(at), with_gradient=False)
+        same = found if some is model else fit(some, model.sizes.at(at), with_gradient=False)
         fits.append(found)
-        logs.append(0.5 * float(draw @ draw - told.cost - at @ at))
+        logs.append(0.5 * float(draw @ draw - same.cost - at @ at))
     chances = np.exp(np.array(logs) - max(logs))
     mode_fit = fit(model, model.sizes.at(z), with_gradient=False)
     return Posterior(model, mode_fit, tuple(fits), chances / chances.sum())

@@ -10,7 +10,7 @@ import numpy as np
 from flangeye.estimation.effects.effect import Effect
 from flangeye.estimation.estimate import judged, model_at
 from flangeye.estimation.graph import Places, Problem
-from flangeye.estimation.mixed import Fit, Model, fit, left_out
+from flangeye.estimation.mixed import Fit, Model, fit, left_out, told_of_places
 from flangeye.estimation.observability import unobservable
 from flangeye.estimation.session import Asked, effects_of
 from flangeye.estimation.start import agreeing, begin
@@ -66,6 +66,6 @@ def rough(problem: Problem, freedoms: Mapping[str, Floats] | None = None) -> Rou
         found = fit(model, model.sizes.at(np.zeros(model.sizes.mix.shape[1])), with_gradient=False)
         places = problem.moved(places, found.mean[: model.p])
         agree = judged(model, found)[1] & agree
-    information = np.asarray(np.linalg.inv(found.covariance[: model.p, : model.p]), np.float64)
-    unobservable(problem.where(agree), places, information, LIMITS, False, freedoms)
+    known = told_of_places(model, found.sizes)
+    unobservable(problem.where(agree), places, known, LIMITS, False, freedoms)
     return Rough(problem, places, effects, model, found, agree)
