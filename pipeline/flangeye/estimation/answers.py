@@ -15,21 +15,25 @@ What is common to all poses cancels, so that it is known far better than the tru
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from flangeye.estimation.estimate import Estimate, model_at
 from flangeye.estimation.graph import Carrier, Linear, Problem
+from flangeye.estimation.mixed import spread_of
 from flangeye.estimation.work import Work
 from flangeye.maths.frame_graph import chain, composed
 from flangeye.maths.geometry import hat, invert
-from flangeye.types import ExpectedError, Floats
+from flangeye.types import ExpectedError, Floats, Mask
 
 DRAWS = 8
 """Of an error at each pose and each draw of the sizes, for its quantiles."""
 LEVER = 0.02
 """Turns count like what they do so far from the flange [m]: enough to tell the turn about a line
 where the work is in one, and no more, for the work is a matter of positions."""
+WEIGHT = np.repeat([LEVER, 1.0], 3)[:, None]
+"""Of each number of a twist in the rigid part."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,136 +79,137 @@ def as_reported(found: Estimate, work: Work, without: frozenset[str] = frozenset
         without: Kinds of the arms' errors that are corrected, and so are no part of what they
             report.
     """
-    return functional(found, np.array([_as_reported(found, each, without) for each in work.boxes]))
+    commands = _Commands(found, work.around, without)
+    return functional(found, np.array([commands.answer(box) for box in work.boxes]))
 
 
-def _as_reported(found: Estimate, work: Problem, without: frozenset[str]) -> Floats:
-    """Return (P, K): what the effects' numbers add to the places."""
-    linear = work.linearised(found.places)
-    columns = [
-        e.block(work, linear)
-        if e.of_arm and e.kind not in without
-        else np.zeros((len(work.seen), 6, n))
-        for e, n in zip(found.effects, found.counts, strict=True)
-    ]
-    of_arm = np.concatenate([np.zeros((len(work.seen), 6, 0)), *columns], axis=2)
-    world = _world(found, work, without)
-    out = []
-    for name in found.problem.unknown:
-        if any(c.frame in chain(work.frames, name) for c in work.carriers):
-            out.append(_carried(work, linear, name, (of_arm, world), found))
-        else:
-            out.append(_fixed(found, work, name, world, without))
-    return np.concatenate([np.zeros((0, of_arm.shape[2])), *out])
+@dataclass(frozen=True, eq=False)
+class _Commands:
+    """What the effects' numbers do wherever commands may be sent.
 
-
-def _columns_of_arm(
-    found: Estimate, work: Problem, carrier: Carrier, without: frozenset[str]
-) -> Floats:
-    """Return (T, 6, K) twists of what one carrier moves, by every effect's numbers."""
-    still = np.zeros((len(work.seen), 6, 6))
-    blocks = {c.frame: still + np.eye(6) if c is carrier else still for c in work.carriers}
-    one = Linear(np.zeros(0), np.zeros(0), blocks)
-    columns = [
-        e.block(work, one)
-        if e.of_arm and e.kind not in without
-        else np.zeros((len(work.seen), 6, n))
-        for e, n in zip(found.effects, found.counts, strict=True)
-    ]
-    return np.concatenate([np.zeros((len(work.seen), 6, 0)), *columns], axis=2)
-
-
-def _rigid_part(
-    found: Estimate, work: Problem, carrier: Carrier, without: frozenset[str]
-) -> Floats:
-    """Return (6, K) the rigid motion, about the arm base's origin, of its displacements."""
-    places = np.asarray(work.frames[carrier.frame].place)[work.seen.times, :3, 3]
-    weight = np.repeat([LEVER, 1.0], 3)[:, None]
-    moved = weight * _columns_of_arm(found, work, carrier, without)
-    motions = np.tile(np.eye(6), (len(places), 1, 1))
-    motions[:, 3:, :3] = -hat(places)
-    return np.asarray(
-        np.linalg.pinv((weight * motions).reshape(-1, 6), rcond=1e-6)
-        @ moved.reshape(-1, moved.shape[2])
-    )
-
-
-def _world(found: Estimate, work: Problem, without: frozenset[str]) -> Floats:
-    """Return (6, K) by how much reported coordinates of the root are turned and shifted."""
-    parts = []
-    for carrier in work.carriers:
-        path = chain(work.frames, carrier.frame)[:-1]
-        places = [np.asarray(work.frames[n].place) for n in path]
-        if carrier.link is None and all(place.shape == (4, 4) for place in places):
-            base = np.eye(4)
-            for place in places:
-                base = base @ place
-            parts.append(adjoint(base) @ _rigid_part(found, work, carrier, without))
-    count = len(found.posterior.model.sizes.effect)
-    return np.asarray(sum(parts) / len(parts)) if parts else np.zeros((6, count))
-
-
-def _fixed(
-    found: Estimate, work: Problem, name: str, world: Floats, without: frozenset[str]
-) -> Floats:
-    """Return (6, K) of a place that no arm moves: the rigid part, seen from its own origin."""
-    frames = {n: replace(f, place=found.places.get(n, f.place)) for n, f in work.frames.items()}
-    parent = np.eye(4)
-    for each in chain(frames, name)[:-1]:
-        place = np.asarray(frames[each].place)
-        parent = parent @ (place if place.ndim == 2 else place[0])
-    gauge = -world
-    bases = [c for c in work.carriers if work.frames[c.frame].parent == name and c.link is None]
-    place = parent @ found.places[name]
-    for carrier in bases:
-        gauge = gauge + adjoint(place) @ _rigid_part(found, work, carrier, without)
-    turned = adjoint(invert(parent)) @ gauge
-    shift = np.eye(6)
-    shift[3:, :3] = -hat(found.places[name][:3, 3])
-    return np.asarray(shift @ turned)
-
-
-def _carried(
-    work: Problem, linear: Linear, name: str, parts: tuple[Floats, Floats], found: Estimate
-) -> Floats:
-    """Return (6, K) of a place that an arm moves: what explains its displacements best.
-
-    A camera in hand is to see everything where reported coordinates have it.
+    Attributes:
+        found: The posterior.
+        work: Sightings as they would be there.
+        without: Kinds of the arms' errors that are corrected.
     """
-    of_arm, world = parts
-    weight = np.repeat([LEVER, 1.0], 3)[:, None]
-    moved = of_arm + _seen_of_world(work, found, name) @ world
-    rows = (weight * linear.blocks[name]).reshape(-1, 6)
+
+    found: Estimate
+    work: Problem
+    without: frozenset[str]
+
+    def answer(self, box: Mask) -> Floats:
+        """Return (P, K): what the effects' numbers add to the places, right over one box (W,)."""
+        world, out = self._world(box), [np.zeros((0, self._of_arm.shape[2]))]
+        for name in self.found.problem.unknown:
+            carried = any(c.frame in chain(self.work.frames, name) for c in self.work.carriers)
+            out.append((self._carried if carried else self._fixed)(name, world, box))
+        return np.concatenate(out)
+
+    @cached_property
+    def _linear(self) -> Linear:
+        return self.work.linearised(self.found.places)
+
+    @cached_property
+    def _of_arm(self) -> Floats:
+        """(W, 6, K) how the arms' errors move what is seen."""
+        return self._columns(self._linear)
+
+    def _columns(self, linear: Linear) -> Floats:
+        still = np.zeros((len(self.work.seen), 6, 0))
+        columns = [
+            effect.block(self.work, linear)
+            if effect.of_arm and effect.kind not in self.without
+            else np.zeros((len(still), 6, count))
+            for effect, count in zip(self.found.effects, self.found.counts, strict=True)
+        ]
+        return np.concatenate([still, *columns], axis=2)
+
+    @cached_property
+    def _twists(self) -> dict[str, Floats]:
+        """(W, 6, K) twists of what each carrier moves, by its frame, at the weight of turns."""
+        still, out = np.zeros((len(self.work.seen), 6, 6)), {}
+        for carrier in self.work.carriers:
+            blocks = {c.frame: still + np.eye(6) * (c is carrier) for c in self.work.carriers}
+            out[carrier.frame] = WEIGHT * self._columns(Linear(np.zeros(0), np.zeros(0), blocks))
+        return out
+
+    def _rigid_part(self, carrier: Carrier, box: Mask) -> Floats:
+        """Return (6, K) the rigid motion, about the arm base's origin, of its displacements."""
+        places = np.asarray(self.work.frames[carrier.frame].place)[self.work.seen.times, :3, 3]
+        motions = np.tile(np.eye(6), (int(box.sum()), 1, 1))
+        motions[:, 3:, :3] = -hat(places[box])
+        return _explained(WEIGHT * motions, self._twists[carrier.frame][box])
+
+    def _world(self, box: Mask) -> Floats:
+        """Return (6, K) by how much reported coordinates of the root are turned and shifted."""
+        parts = []
+        for carrier in self.work.carriers:
+            path = chain(self.work.frames, carrier.frame)[:-1]
+            places = [np.asarray(self.work.frames[n].place) for n in path]
+            if carrier.link is None and all(place.shape == (4, 4) for place in places):
+                base = np.eye(4)
+                for place in places:
+                    base = base @ place
+                parts.append(adjoint(base) @ self._rigid_part(carrier, box))
+        count = self._of_arm.shape[2]
+        return np.asarray(sum(parts) / len(parts)) if parts else np.zeros((6, count))
+
+    def _fixed(self, name: str, world: Floats, box: Mask) -> Floats:
+        """Return (6, K) of a place that no arm moves: the rigid part, seen from its own origin."""
+        known, work = self.found.places, self.work
+        frames = {n: replace(f, place=known.get(n, f.place)) for n, f in work.frames.items()}
+        parent = np.eye(4)
+        for each in chain(frames, name)[:-1]:
+            place = np.asarray(frames[each].place)
+            parent = parent @ (place if place.ndim == 2 else place[0])
+        gauge, place = -world, parent @ known[name]
+        for carrier in work.carriers:
+            if work.frames[carrier.frame].parent == name and carrier.link is None:
+                gauge = gauge + adjoint(place) @ self._rigid_part(carrier, box)
+        shift = np.eye(6)
+        shift[3:, :3] = -hat(known[name][:3, 3])
+        return np.asarray(shift @ adjoint(invert(parent)) @ gauge)
+
+    def _carried(self, name: str, world: Floats, box: Mask) -> Floats:
+        """Return (6, K) of a place that an arm moves: what explains its displacements best.
+
+        A camera in hand is to see everything where reported coordinates have it.
+        """
+        moved = self._of_arm[box] + self._seen_of_world(name)[box] @ world
+        return _explained(WEIGHT * self._linear.blocks[name][box], WEIGHT * moved)
+
+    def _seen_of_world(self, name: str) -> Floats:
+        """Return (W, 6, 6) how a twist of reported root coordinates moves what is seen.
+
+        What stands at y is at y - b(y) in reported coordinates: seen through the reported arm, the
+        target stays where it is and the camera's chain is to make up for b; and likewise a target
+        in the hand before a camera that stands.
+        """
+        work, frames = self.work, {}
+        for each, frame in work.frames.items():
+            place = np.asarray(self.found.places.get(each, frame.place))
+            at = place if place.ndim == 2 else place[work.seen.times]
+            frames[each] = replace(frame, place=at)
+        out = np.zeros((len(work.seen), 6, 6))
+        for k, (camera, target) in enumerate(work.ends):
+            rows = np.flatnonzero(work.seen.pairs == k)
+            if not len(rows):
+                continue
+            back = np.broadcast_to(composed(frames, camera), (len(work.seen), 4, 4))[rows]
+            tip = np.broadcast_to(composed(frames, target), (len(work.seen), 4, 4))[rows]
+            turned = np.swapaxes(back[:, :3, :3], 1, 2)
+            places = (tip[:, :3, :3] @ work.seen.offsets[rows][..., None])[..., 0] + tip[:, :3, 3]
+            sign = 1.0 if name in chain(work.frames, camera) else -1.0
+            out[rows, :3, :3] = out[rows, 3:, 3:] = sign * turned
+            out[rows, 3:, :3] = sign * turned @ -hat(places)
+        return out
+
+
+def _explained(by: Floats, moved: Floats) -> Floats:
+    """Return (6, K) the least-squares amounts of (W, 6, 6) in (W, 6, K)."""
     return np.asarray(
-        np.linalg.pinv(rows, rcond=1e-6) @ (weight * moved).reshape(-1, moved.shape[2])
+        np.linalg.pinv(by.reshape(-1, 6), rcond=1e-6) @ moved.reshape(-1, moved.shape[2])
     )
-
-
-def _seen_of_world(work: Problem, found: Estimate, name: str) -> Floats:
-    """Return (W, 6, 6) how a twist of reported root coordinates moves what is seen.
-
-    What stands at y is at y - b(y) in reported coordinates: seen through the reported arm, the
-    target stays where it is and the camera's chain is to make up for b; and likewise a target in
-    the hand before a camera that stands.
-    """
-    frames = {}
-    for each, frame in work.frames.items():
-        place = np.asarray(found.places.get(each, frame.place))
-        frames[each] = replace(frame, place=place if place.ndim == 2 else place[work.seen.times])
-    out = np.zeros((len(work.seen), 6, 6))
-    for k, (camera, target) in enumerate(work.ends):
-        rows = np.flatnonzero(work.seen.pairs == k)
-        if not len(rows):
-            continue
-        back = np.broadcast_to(composed(frames, camera), (len(work.seen), 4, 4))[rows]
-        tip = np.broadcast_to(composed(frames, target), (len(work.seen), 4, 4))[rows]
-        turned = np.swapaxes(back[:, :3, :3], 1, 2)
-        places = (tip[:, :3, :3] @ work.seen.offsets[rows][..., None])[..., 0] + tip[:, :3, 3]
-        in_hand = name in chain(work.frames, camera)
-        sign = 1.0 if in_hand else -1.0
-        out[rows, :3, :3] = out[rows, 3:, 3:] = sign * turned
-        out[rows, 3:, :3] = sign * turned @ -hat(places)
-    return out
 
 
 def adjoint(pose: Floats) -> Floats:
@@ -240,7 +245,7 @@ def expected_error(
     for chance, each in zip(known.chances, known.fits, strict=True):
         bias = rows @ each.mean - expected
         noise = model.noise(each.sizes)[:, 3:, 3:]
-        covariance = rows @ each.covariance @ np.swapaxes(rows, 1, 2) + noise
+        covariance = spread_of(rows, each.covariance) + noise
         root = np.linalg.cholesky(covariance + 1e-18 * np.eye(3))
         drawn = bias + (root @ rng.standard_normal((DRAWS, len(bias), 3, 1)))[..., 0]
         exact = float(((bias**2).sum(axis=1) + np.trace(covariance, axis1=1, axis2=2)).mean())

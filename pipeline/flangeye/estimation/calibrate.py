@@ -318,11 +318,11 @@ def _pairs(session: Session, answer: HandEye) -> tuple[Pair, ...]:
     transforms = {name: x.transform for name, x in answer.transforms.items()}
     moved = session.cell.corrected(observations, answer)
     mapped, expected = mapped_and_expected(session.cell.ends(transforms, moved), moved)
-    residuals = found.problem.residuals(found.places)
+    residuals, ranks = found.problem.residuals(found.places), found.problem.seen.ranks
     pairs = []
     for i, (o, used) in enumerate(zip(observations, found.inliers, strict=True)):
         turn, shift = np.linalg.norm(residuals[i].reshape(2, 3), axis=1)
-        turned = f" and {np.degrees(turn):.1f} deg" if found.problem.seen.ranks[i] == 6 else ""
+        turned = f" and {np.degrees(turn):.1f} deg" if ranks[i] == 6 else ""
         sigma = np.sqrt(found.squares[i])
         reason = None if used else f"residual {shift * 1e3:.1f} mm{turned}, {sigma:.0f} sigma"
         pairs.append(Pair(o, mapped[i] - expected[i], bool(used), reason))

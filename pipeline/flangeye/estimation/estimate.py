@@ -8,7 +8,7 @@ agree.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -185,10 +185,8 @@ def _moved(problem: Problem, places: Places, found: Fit) -> tuple[Places, float]
 
 def judged(model: Model, found: Fit) -> tuple[Floats, Mask]:
     """Return (N,) squared distances from what the others predict, and which agree with them."""
-    everyone = replace(model, shares=np.ones(len(model.shares)))
-    noise = model.noise(found.sizes)
-    q = model.projectors
-    left, spread = left_out(everyone, found)
+    noise, q = model.noise(found.sizes), model.projectors
+    left, spread = left_out(model, found)
     covariance = q @ (noise + spread) @ q + (np.eye(6) - q)
     squares = np.einsum("na,nab,nb->n", left, np.linalg.inv(covariance), left)
     ranks = np.trace(q, axis1=1, axis2=2).round()

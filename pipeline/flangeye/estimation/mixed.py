@@ -21,7 +21,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import cho_solve, cholesky
+from scipy.linalg import cholesky
+from scipy.linalg.lapack import dpotri
 
 from flangeye.types import Floats
 
@@ -86,7 +87,10 @@ class Model:
     @cached_property
     def design(self) -> Floats:
         """(N, 6, P + K) of places and effects, across what was measured alone."""
-        return np.asarray(self.projectors @ np.concatenate([self.places, self.effects], axis=2))
+        h, whole = np.concatenate([self.places, self.effects], axis=2), np.eye(6)
+        part = (self.projectors != whole).any(axis=(1, 2))
+        h[part] = self.projectors[part] @ h[part]
+        return h
 
     @property
     def p(self) -> int:
@@ -167,7 +171,8 @@ def fit(model: Model, sizes: Floats, with_gradient: bool = True) -> Fit:
     information = flat.T @ flat_weighted + np.diag(prior)
     scaled, scale = _scaled(information)
     root = cholesky(scaled, lower=True)
-    covariance = cho_solve((root, True), np.eye(count)) / np.outer(scale, scale)
+    inverse = np.tril(dpotri(root, lower=1)[0])
+    covariance = (inverse + np.tril(inverse, -1).T) / np.outer(scale, scale)
     mean = covariance @ right
     left = np.asarray(r - h @ mean)
     log_noise = np.linalg.slogdet(noise)[1]
@@ -218,7 +223,7 @@ def _gradient(
     second = np.diag(found.covariance)[model.p :] + found.mean[model.p :] ** 2
     np.add.at(out, model.sizes.effect, 2 * (1 - second * prior[model.p :]))
     w = found.weights
-    spread = h @ found.covariance @ np.swapaxes(h, 1, 2) + left[:, :, None] * left[:, None, :]
+    spread = spread_of(h, found.covariance) + left[:, :, None] * left[:, None, :]
     # dcost/dR, (N, 6, 6)
     slope = model.shares[:, None, None] * (model.projectors @ bare @ model.projectors) - (
         w @ spread @ w
@@ -229,6 +234,12 @@ def _gradient(
     out[own - 1] = product[:, 3:].sum() + product[:, :, 3:].sum()
     out[own:] = 2 * (slope * further).sum(axis=(1, 2, 3))
     return out
+
+
+def spread_of(rows: Floats, covariance: Floats) -> Floats:
+    """Return (N, 6, 6) covariances of (N, 6, K) rows times what has a covariance (K, K)."""
+    flat = rows.reshape(-1, rows.shape[2]) @ covariance
+    return np.asarray(flat.reshape(rows.shape) @ np.swapaxes(rows, 1, 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -332,7 +343,7 @@ def left_out(model: Model, found: Fit) -> tuple[Floats, Floats]:
     """
     h = model.design
     left = (model.projectors @ model.residuals[..., None])[..., 0] - h @ found.mean
-    leverage = h @ found.covariance @ np.swapaxes(h, 1, 2)
+    leverage = spread_of(h, found.covariance)
     full = np.linalg.inv(np.eye(6) - leverage @ found.weights)
     predicted = full @ leverage
     return (full @ left[..., None])[..., 0], predicted

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +11,7 @@ from flangeye.estimation.graph import Carrier, Places, Problem, Sightings
 from flangeye.maths.arm_correction import reached_from
 from flangeye.maths.frame_graph import composed
 from flangeye.maths.geometry import invert
-from flangeye.types import Box, Floats
+from flangeye.types import Box, Floats, Mask
 
 COUNT = 256
 """New poses: twice as many change the answer by less than a tenth of what is stated."""
@@ -27,11 +26,14 @@ class Work:
 
     Attributes:
         poses: Sightings as they would be at new poses, where the error to expect is taken.
-        boxes: The same all over each box that may be meant, where the answer is to be right.
+        around: The same all over the widest box that may be meant.
+        boxes: (B, W) which of those are in each box that may be meant, where the answer is to be
+            right.
     """
 
     poses: Problem
-    boxes: Sequence[Problem]
+    around: Problem
+    boxes: Mask
 
 
 def work_of(problem: Problem, places: Places, box: Box | None = None) -> Work:
@@ -52,29 +54,32 @@ def work_of(problem: Problem, places: Places, box: Box | None = None) -> Work:
     session = _foreseen(problem.where(chosen), places)
     carrier = problem.carriers[0] if len(problem.carriers) == 1 else None
     if carrier is None or carrier.link is not None or not told(carrier):
-        return Work(session, [session])
+        return _all_of(session)
     if box is not None:
         sides = np.asarray(box.centre) + np.array([[-0.5], [0.5]]) * box.size
-        work = _foreseen(_in_box(problem, carrier, sides), places)
-        return Work(work, [work])
+        return _all_of(_foreseen(_in_box(problem, carrier, sides), places))
     at = np.asarray(problem.frames[carrier.frame].place)[problem.seen.times, :3, 3]
     inner = np.array([at.min(axis=0), at.max(axis=0)])
     outward = (inner[1] - inner[0]) / max(n - 1, 1) * np.array([[-1.0], [1.0]])
     wide = _foreseen(_in_box(problem, carrier, inner + WIDEST * outward), places)
     # Beyond the outermost of n poses drawn evenly, what is left is exponential.
     beyond = np.random.default_rng(0).exponential(size=(BOXES, 2, 3)).clip(max=WIDEST)
-    return Work(session, [_inside(wide, inner + each * outward) for each in beyond])
+    return Work(session, wide, np.array([_inside(wide, inner + b * outward) for b in beyond]))
+
+
+def _all_of(work: Problem) -> Work:
+    return Work(work, work, np.ones((1, len(work.seen)), dtype=bool))
 
 
 def _foreseen(work: Problem, places: Places) -> Problem:
     return replace(work, seen=_predicted(work, places))
 
 
-def _inside(work: Problem, box: Floats) -> Problem:
-    """Return the sightings with the flange in a box (2, 3); all, where none are."""
+def _inside(work: Problem, box: Floats) -> Mask:
+    """Return (W,) which sightings have the flange in a box (2, 3); all, where none have."""
     places = np.asarray(work.frames[work.carriers[0].frame].place)[work.seen.times, :3, 3]
-    inside = ((places >= box[0]) & (places <= box[1])).all(axis=1)
-    return work.where(inside) if inside.any() else work
+    inside = np.asarray(((places >= box[0]) & (places <= box[1])).all(axis=1))
+    return inside if inside.any() else ~inside
 
 
 def _in_box(problem: Problem, carrier: Carrier, box: Floats) -> Problem:

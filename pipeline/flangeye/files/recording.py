@@ -159,11 +159,14 @@ def check_poses(
 
 
 def _check_distinct(root: Path, recordings: Sequence[Recording]) -> None:
+    from scipy.spatial import KDTree
+
     poses = np.array([recording.base_T_flange for recording in recordings])
-    for first in poses:
-        same = np.flatnonzero(np.abs(poses - first).max(axis=(1, 2)) < SAME_POSE)
-        if len(same) > 1:
-            raise StageError(f"{root}: {_repeated([r.id for r in recordings], same, first)}")
+    tree = KDTree(poses.reshape(-1, 16))
+    near = tree.query_ball_point(tree.data, SAME_POSE, p=np.inf, return_length=True)
+    for first in poses[near > 1][:1]:
+        same = np.flatnonzero(np.abs(poses - first).max(axis=(1, 2)) <= SAME_POSE)
+        raise StageError(f"{root}: {_repeated([r.id for r in recordings], same, first)}")
 
 
 def _repeated(names: Sequence[str], same: Indices, pose: Floats) -> str:

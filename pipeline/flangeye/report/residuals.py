@@ -88,7 +88,8 @@ def residual_figure(errors: Errors) -> Figure | None:
         _bars("residual, not used", errors.group(used=False), UNUSED),
         *(_diamonds(step, held) for step, held in errors.held_out.items()),
     ]
-    hover = {i: _hover(i, errors) for i in errors.ids}
+    measured = {o.id: o for o in errors.poses}
+    hover = {i: _hover(i, measured.get(i), errors) for i in errors.ids}
     drawn = [_placed(trace, names, hover) for trace in traces if trace["errors"]]
     return {"data": drawn, "layout": _layout(names, errors)}
 
@@ -125,8 +126,7 @@ def _placed(trace: Trace, names: Mapping[str, str], hover: Mapping[str, str]) ->
     }
 
 
-def _hover(capture: str, errors: Errors) -> str:
-    found = next((o for o in errors.poses if o.id == capture), None)
+def _hover(capture: str, found: r.ObservationResult | None, errors: Errors) -> str:
     lines = [f"<b>{plain(capture, 60)}</b>"]
     if found and capture in errors.residuals:
         xyz = ", ".join(millimetres(x) for x in found.residual_in_base or [])
