@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from flangeye import Params, stage
+from flangeye import stage
 from flangeye.maths.geometry import rotation_log
 from flangeye.models.boards import Board, Dictionary
 from flangeye.models.corners import Corners, find_corners
@@ -23,13 +23,14 @@ from flangeye_plugins.fit.planar import (
     reprojection,
     scale_of,
 )
+from flangeye_plugins.fit.uncertainty import ScannerErrorParams
 
 CERTAIN = float(np.log(1000))
 """Logarithm of how many times likelier than the other the better of two poses must be."""
 NO_IMAGE = "there is no image; printed targets are found in the scanner's image"
 
 
-class TargetParams(Params):
+class TargetParams(ScannerErrorParams):
     """What fits of printed targets share."""
 
     depth: Literal["auto", "off", "only"] = Field(
@@ -37,18 +38,10 @@ class TargetParams(Params):
         description="Use the organised cloud under the image: where it gives the better pose, "
         "never, or always.",
     )
-    corner_noise: float = Field(
-        0.1, gt=0, description="Expected standard deviation of a corner's coordinate [px]."
-    )
-    scanner_error: Length = param(
-        "0.06 mm",
-        ge=0,
-        description="Standard deviation along each axis of the scanner's own distortion, which a "
-        "single scan cannot show; added to the covariance by depth.",
-    )
-    max_error: float = Field(
-        1.0, gt=0, description="Largest standard deviation of the reprojection [px]."
-    )
+    # Expected standard deviation of a corner's coordinate [px] [px]
+    corner_noise: ClassVar[float] = 0.1
+    # Largest standard deviation of the reprojection [px] [px]
+    max_error: ClassVar[float] = 1.0
 
 
 class DictionaryParams(TargetParams):
@@ -59,12 +52,17 @@ class DictionaryParams(TargetParams):
     )
 
 
-class CharucoParams(DictionaryParams):
-    """Parameters of ``fit.charuco``."""
+class SquaresParams(TargetParams):
+    """What fits of boards of squares share."""
 
-    columns: int = Field(ge=3, description="Squares from left to right.")
+    columns: int = Field(ge=3, description="Squares from left to right, inner and outer.")
     rows: int = Field(ge=3, description="Squares from top to bottom.")
     square: Length = param(gt=0, description="Edge of a square, measured on the print.")
+
+
+class CharucoParams(SquaresParams, DictionaryParams):
+    """Parameters of ``fit.charuco``."""
+
     marker: Length = param(gt=0, description="Edge of a marker, measured on the print.")
 
     @model_validator(mode="after")
@@ -74,12 +72,8 @@ class CharucoParams(DictionaryParams):
         return self
 
 
-class CheckerboardParams(TargetParams):
+class CheckerboardParams(SquaresParams):
     """Parameters of ``fit.checkerboard``."""
-
-    columns: int = Field(ge=3, description="Squares from left to right, inner and outer.")
-    rows: int = Field(ge=3, description="Squares from top to bottom.")
-    square: Length = param(gt=0, description="Edge of a square, measured on the print.")
 
     @model_validator(mode="after")
     def _asymmetric(self) -> CheckerboardParams:

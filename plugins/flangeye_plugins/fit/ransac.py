@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from flangeye import Params, stage
 from flangeye.maths.circles import sectors
@@ -27,17 +26,16 @@ class RansacCircleParams(Params):
         gt=0,
         description="R, the largest radius a circle may have; the flange's if not given.",
     )
-    e_r: Length = param("1 mm", gt=0, description="Largest difference of a radius below R.")
-    e_d: Length = param(
-        "0.3 mm", gt=0, description="Largest distance of a point from the sphere about the centre."
-    )
-    k_max: int = Field(10_000, ge=1, description="Number of three-point samples.")
-    plane: Length = param(
-        "1 mm", gt=0, description="Largest distance of a point from the face's plane."
-    )
-    min_points: int = Field(
-        100, ge=3, description="Fewest points near the best circle for it to be believed."
-    )
+    # Largest difference of a radius below R [m]
+    e_r: ClassVar[float] = 1e-3
+    # Largest distance of a point from the sphere about the centre [m]
+    e_d: ClassVar[float] = 0.3e-3
+    # Number of three-point samples
+    k_max: ClassVar[int] = 10_000
+    # Largest distance of a point from the face's plane [m]
+    plane: ClassVar[float] = 1e-3
+    # Fewest points near the best circle for it to be believed
+    min_points: ClassVar[int] = 100
 
 
 class CircleHypotheses(NamedTuple):

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
-from flangeye import Params, stage
+from flangeye import stage
 from flangeye.maths.circles import sectors
 from flangeye.maths.geometry import basis_of_plane
 from flangeye.maths.statistics import SIGMA_OF_MAD
 from flangeye.models.targets import Sphere
 from flangeye.types import CircleFeature, FlangeCloud, Floats, Indices, Rejected
-from flangeye.units import Angle, Length, param
 from flangeye_plugins.fit.circles import cauchy_curvature, cauchy_weights
-from flangeye_plugins.fit.uncertainty import STRETCHES, clustered_covariance
+from flangeye_plugins.fit.uncertainty import STRETCHES, ScannerErrorParams, clustered_covariance
 
 FEWEST_POINTS = 50
 RINGS = 3
@@ -26,7 +25,7 @@ LEAST_SCALE = 1e-6
 """Noise below which points are exact [m]."""
 
 
-class SphereParams(Params):
+class SphereParams(ScannerErrorParams):
     """Parameters of ``fit.sphere``."""
 
     radius: Literal["known", "free"] = Field(
@@ -35,27 +34,16 @@ class SphereParams(Params):
         "diameter is unknown. On a cap a free radius costs the depth of the centre most of its "
         "accuracy.",
     )
-    max_incidence: Angle = param(
-        "60 deg", gt=0, description="Points seen more obliquely than this are left out."
-    )
+    # Points seen more obliquely than this are left out [rad]
+    max_incidence: ClassVar[float] = float(np.radians(60))
     min_coverage: float = Field(
         0.4, gt=0, le=1, description="Smallest share of the cap within that angle to be seen."
     )
-    radius_tolerance: Length = param(
-        "0.5 mm", gt=0, description="Largest difference of the fitted radius from the sphere's."
-    )
-    radius_error: Length = param(
-        "0.02 mm",
-        ge=0,
-        description="Standard deviation of the sphere's radius as the scanner sees it (make, "
-        "coating, penetration of light), when it is held; added to the covariance along the view.",
-    )
-    scanner_error: Length = param(
-        "0.06 mm",
-        ge=0,
-        description="Standard deviation along each axis of the scanner's own distortion, which a "
-        "single scan cannot show; added to the covariance.",
-    )
+    # Largest difference of the fitted radius from the sphere's [m]
+    radius_tolerance: ClassVar[float] = 0.5e-3
+    # Standard deviation of the sphere's radius as the scanner sees it (make, coating, penetration
+    # of light), when it is held; added to the covariance along the view [m]
+    radius_error: ClassVar[float] = 0.02e-3
 
 
 class SphereFit(NamedTuple):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -12,7 +12,6 @@ from flangeye.maths.circles import sectors
 from flangeye.maths.statistics import SIGMA_OF_MAD
 from flangeye.models.targets import Sphere
 from flangeye.types import Capture, CircleFeature, Floats, Rejected, Seed
-from flangeye.units import Length, param
 from flangeye_plugins.fit.circles import (
     Circles,
     cauchy_curvature,
@@ -40,27 +39,19 @@ class SphereProfileParams(Params):
         description="On which side of the laser's plane, in the scanner's frame, the centre of "
         "the sphere is. A profile cannot tell; keep every pose of a session on one side.",
     )
-    offset: tuple[float, float] = Field(
-        (0.4, 0.97),
-        description="Least and largest distance of the centre from the plane, in radii. Near the "
-        "middle the distance follows badly from the circle's size, near the edge the circle is "
-        "small; the best is 0.7 to 0.97.",
-    )
-    tolerance: Length = param(
-        "0.3 mm", gt=0, description="Largest distance of a point from the circle it belongs to."
-    )
-    min_coverage: float = Field(
-        0.15, gt=0, le=1, description="Smallest share of the circle to be seen; half is the most."
-    )
-    radius_error: Length = param(
-        "0.02 mm", ge=0, description="Standard deviation of the sphere's radius as it is seen."
-    )
-    scanner_error: Length = param(
-        "0.03 mm",
-        ge=0,
-        description="Standard deviation along each axis of the scanner's own distortion, which a "
-        "single profile cannot show; added to the covariance.",
-    )
+    # Least and largest distance of the centre from the plane, in radii. Near the middle the
+    # distance follows badly from the circle's size, near the edge the circle is small; the best
+    # is 0.7 to 0.97
+    offset: ClassVar[tuple[float, float]] = (0.4, 0.97)
+    # Largest distance of a point from the circle it belongs to [m]
+    tolerance: ClassVar[float] = 0.3e-3
+    # Smallest share of the circle to be seen; half is the most
+    min_coverage: ClassVar[float] = 0.15
+    # Standard deviation of the sphere's radius as it is seen [m]
+    radius_error: ClassVar[float] = 0.02e-3
+    # Standard deviation along each axis of the scanner's own distortion, which a single profile
+    # cannot show; added to the covariance [m]
+    scanner_error: ClassVar[float] = 0.03e-3
 
 
 class Arc(NamedTuple):
@@ -198,13 +189,10 @@ def _why_not(offset: float, coverage: float, params: SphereProfileParams) -> str
     if not least <= offset <= most:
         return (
             f"the laser passes {offset:.2f} radii beside the sphere's centre, {least:g} to "
-            f"{most:g} are asked for (offset); move the scanner across its line"
+            f"{most:g} are asked for; move the scanner across its line"
         )
     if coverage < params.min_coverage:
-        return (
-            f"{coverage:.0%} of the circle is seen, at least {params.min_coverage:.0%} is needed "
-            "(min_coverage)"
-        )
+        return f"{coverage:.0%} of the circle is seen, at least {params.min_coverage:.0%} is needed"
     return None
 
 

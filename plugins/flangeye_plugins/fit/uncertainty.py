@@ -6,11 +6,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flangeye.maths.circles import distances, sectors
+from flangeye.plugin.stage import Params
 from flangeye.types import Floats
+from flangeye.units import Length, param
 
 STRETCHES = 12
 """Stretches of a rim that err independently, 30 degrees each: the correlation length of the
 residuals on the published clouds."""
+
+
+class ScannerErrorParams(Params):
+    """What fits to a scan share."""
+
+    scanner_error: Length = param(
+        "0.06 mm",
+        ge=0,
+        description="Standard deviation along each axis of the scanner's own distortion, which a "
+        "single scan cannot show: its calibration accuracy over root 3; added to the covariance.",
+    )
 
 
 def clustered_covariance(

@@ -14,22 +14,28 @@ from flangeye.units import Angle, Length, param
 Point = tuple[Length, Length, Length]
 
 
-class GridParams(Params):
-    """Parameters of ``plan.grid``."""
+class PlanParams(Params):
+    """Where plans look for poses."""
 
     centre: Point | None = Field(
-        None, description="Centre of the grid; before the scanner if not given."
+        None, description="Centre of the work; before the scanner if not given."
     )
     size: Point = param(
-        ("300 mm", "300 mm", "200 mm"), description="Edges of the grid along the base's axes."
+        ("300 mm", "300 mm", "200 mm"),
+        description="Edges of the work along the base's axes: where the matrix has to be right.",
     )
-    counts: tuple[int, int, int] = Field((3, 3, 2), description="Grid points along each edge.")
     tilt: Angle = param(
         "0.3 rad", ge=0, description="Largest roll, pitch and yaw away from facing the scanner."
     )
     facing: Angle = param(
         "35 deg", gt=0, description="Largest angle between the flange's normal and the view."
     )
+
+
+class GridParams(PlanParams):
+    """Parameters of ``plan.grid``."""
+
+    counts: tuple[int, int, int] = Field((3, 3, 2), description="Grid points along each edge.")
 
 
 @part("plan.grid")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -10,38 +11,22 @@ from pydantic import Field
 from flangeye.estimation.observability import in_base
 from flangeye.maths.geometry import angle_between, hat, rigid, rotation_from_rpy
 from flangeye.motion.planning import Plan, PlannedPose, Site
-from flangeye.plugin.stage import Params, part
+from flangeye.plugin.stage import part
 from flangeye.types import Box, Floats
-from flangeye.units import Angle, Length, param
-from flangeye_plugins.plan.grid import Point
+from flangeye_plugins.plan.grid import PlanParams
 
 PRIOR = np.array([0.2, 0.2, 0.2, 0.1, 0.1, 0.1])
 """What is known before the first pose: standard deviations, rotation [rad], translation [m]."""
 
 
-class NextBestParams(Params):
+class NextBestParams(PlanParams):
     """Parameters of ``plan.next_best``."""
 
-    centre: Point | None = Field(
-        None, description="Centre of the work; before the scanner if not given."
-    )
-    size: Point = param(
-        ("300 mm", "300 mm", "200 mm"),
-        description="Edges of the work along the base's axes: where the matrix has to be right.",
-    )
-    tilt: Angle = param(
-        "0.3 rad", ge=0, description="Largest roll, pitch and yaw away from facing the scanner."
-    )
-    facing: Angle = param(
-        "35 deg", gt=0, description="Largest angle between the flange's normal and the view."
-    )
     count: int = Field(30, ge=3, description="Number of poses.")
-    candidates: int = Field(400, ge=10, description="Candidate poses compared for each choice.")
-    noise: Length = param(
-        "0.15 mm",
-        gt=0,
-        description="Expected standard deviation of a centre per axis: scanner, fit and arm.",
-    )
+    # Candidate poses compared for each choice
+    candidates: ClassVar[int] = 400
+    # Expected standard deviation of a centre per axis: scanner, fit and arm [m]
+    noise: ClassVar[float] = 0.15e-3
 
 
 @part("plan.next_best")

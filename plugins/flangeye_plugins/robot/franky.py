@@ -22,10 +22,10 @@ from flangeye.files.processes import python_command
 from flangeye.maths.pose_formats import CONVENTIONS
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.sdk import load_sdk
-from flangeye.plugin.stage import Params, part
+from flangeye.plugin.stage import part
 from flangeye.types import BASE, FLANGE, TOOL, Floats, Transform
 from flangeye_plugins.robot.tool_check import (
-    ToolOffset,
+    ControllerParams,
     require_model,
     require_tool,
     twist_at_tool,
@@ -105,15 +105,11 @@ def one_line(text: str) -> str:
     return " ".join(text.split())
 
 
-class FrankyParams(Params):
+class FrankyParams(ControllerParams):
     """Parameters of ``robot.franky``."""
 
-    host: str = Field(min_length=1, description="Address of the controller: 172.16.0.2.")
     realtime: bool = Field(
         True, description="Require a real-time kernel; without one, moves may be aborted."
-    )
-    tool: ToolOffset = Field(
-        default_factory=ToolOffset, description="The end effector set in Desk; none when not given."
     )
 
 

@@ -7,7 +7,7 @@ import select
 import sys
 import time
 from collections.abc import Iterator
-from typing import NamedTuple, TextIO
+from typing import ClassVar, NamedTuple, TextIO
 
 import numpy as np
 from pydantic import Field, field_validator
@@ -19,7 +19,6 @@ from flangeye.maths.pose_formats import CONVENTIONS, AngleUnit, LengthUnit, Pose
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.stage import Params, part
 from flangeye.types import BASE, FLANGE, Floats, Transform
-from flangeye.units import Angle, Length, param
 
 PERIOD = 0.05
 """Between two looks at the input [s]."""
@@ -82,16 +81,10 @@ class ManualParams(Params):
     length: LengthUnit | None = Field(
         None, description="Unit of the pendant's positions, where it is not the usual one."
     )
-    distance: Length = param(
-        "20 mm",
-        gt=0,
-        description="Distance from the requested pose beyond which the entry is queried.",
-    )
-    angle: Angle = param(
-        "5 deg",
-        gt=0,
-        description="Rotation from the requested pose beyond which the entry is queried.",
-    )
+    # Distance from the requested pose beyond which the entry is queried [m]
+    distance: ClassVar[float] = 0.02
+    # Rotation from the requested pose beyond which the entry is queried [rad]
+    angle: ClassVar[float] = float(np.radians(5))
 
     @field_validator("convention")
     @classmethod

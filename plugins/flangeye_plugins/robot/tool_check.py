@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from pydantic import Field
 
 from flangeye.devices import DeviceError, RobotState
 from flangeye.maths.geometry import hat
@@ -25,6 +26,16 @@ class ToolOffset(Params):
     def flange_T_tool(self, convention: PoseConvention) -> Floats:
         """Return the offset as a (4, 4) matrix [m]; the rotation is the convention's."""
         return convention.in_units("m", "rad").matrix([*self.position, *self.rotation])
+
+
+class ControllerParams(Params):
+    """What every driver of a controller is given."""
+
+    host: str = Field(min_length=1, description="Address of the controller: 192.168.1.10.")
+    tool: ToolOffset = Field(
+        default_factory=ToolOffset,
+        description="Tool (TCP) set in the controller; none if not given.",
+    )
 
 
 def require_tool(

@@ -11,7 +11,7 @@ import json
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -24,7 +24,6 @@ from flangeye.files.pipe import Pipe, PipeEndedError
 from flangeye.files.processes import python_command
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import Params, part
-from flangeye.units import Duration, param
 from flangeye_plugins.scanner.kinect_view import DepthView
 from flangeye_plugins.scanner.opened import OpenScanner
 
@@ -54,7 +53,8 @@ class AzureKinectParams(Params):
     depth_mode: Literal["NFOV_UNBINNED", "NFOV_2X2BINNED", "WFOV_UNBINNED", "WFOV_2X2BINNED"] = (
         Field("NFOV_UNBINNED", description="Depth mode of the camera; a recording has its own.")
     )
-    timeout: Duration = param("2 s", gt=0, le=PATIENCE, description="Longest wait for a frame.")
+    # Longest wait for a frame [s]
+    timeout: ClassVar[float] = 2.0
     python: MachineName = Field(
         DEFAULT_PYTHON,
         description="The Python that has pyk4a, where this one cannot have it: a name under "

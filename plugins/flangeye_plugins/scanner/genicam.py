@@ -7,7 +7,7 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,17 +17,16 @@ from flangeye.devices import DeviceError, FrameDropped, Scan, Scanner
 from flangeye.files.machine import MachineName, find_named
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.sdk import load_sdk
-from flangeye.plugin.stage import Params, part
-from flangeye.units import Duration, param
+from flangeye.plugin.stage import part
 from flangeye_plugins.scanner.genicam_nodes import Layout, configure, has_node
-from flangeye_plugins.scanner.opened import OpenScanner
+from flangeye_plugins.scanner.opened import OpenScanner, SerialParams
 
 NAME = "scanner.genicam"
 INSTALL = "pip install 'flangeye[genicam]'"
 SEARCH_PATH = "GENICAM_GENTL64_PATH"
 
 
-class GenicamParams(Params):
+class GenicamParams(SerialParams):
     """Parameters of ``scanner.genicam``."""
 
     producer: MachineName | None = Field(
@@ -35,8 +34,8 @@ class GenicamParams(Params):
         description=f"Which GenTL producer: the name of a .cti file of {SEARCH_PATH}, or one under "
         "[libraries] of this machine's settings; all of the former if not given.",
     )
-    serial: str | None = Field(None, description="Which device, if there are several.")
-    timeout: Duration = param("3 s", gt=0, le=3.0, description="Longest wait for a frame.")
+    # Longest wait for a frame [s]
+    timeout: ClassVar[float] = 3.0
 
 
 @part("scanner.genicam")

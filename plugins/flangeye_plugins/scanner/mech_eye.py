@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 from pydantic import Field
 
-from flangeye.devices import PATIENCE, DeviceError, Scan, Scanner
+from flangeye.devices import DeviceError, Scan, Scanner
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.sdk import load_sdk
 from flangeye.plugin.stage import Params, part
-from flangeye.units import Duration, param
 from flangeye_plugins.scanner.opened import OpenScanner
 
 NAME = "scanner.mech_eye"
@@ -24,9 +23,8 @@ class MechEyeParams(Params):
     address: str | None = Field(
         None, description="IP address of the camera; the only one found if not given."
     )
-    timeout: Duration = param(
-        "3 s", gt=0, le=PATIENCE, description="Longest wait for a connection, and for a frame."
-    )
+    # Longest wait for a connection, and for a frame [s]
+    timeout: ClassVar[float] = 3.0
 
 
 @part("scanner.mech_eye")

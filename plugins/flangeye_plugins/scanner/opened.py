@@ -7,11 +7,21 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from flangeye.devices import Device, DeviceError, Scan
 from flangeye.models.cloud_unit import STATED_LIMIT, median_distance, times_outside
 from flangeye.models.scanners import ScannerModel
+from flangeye.plugin.stage import Params
 from flangeye.types import CAMERA, Image, PointCloud
+
+
+class SerialParams(Params):
+    """Which of several cameras."""
+
+    serial: str | None = Field(
+        None, description="Serial number of the camera, if there are several."
+    )
 
 
 def cloud_of(xyz: NDArray[Any], per_metre: float) -> PointCloud:

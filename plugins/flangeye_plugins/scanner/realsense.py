@@ -6,7 +6,7 @@ import contextlib
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -15,23 +15,20 @@ from flangeye.devices import PATIENCE, DeviceError, Scan, Scanner
 from flangeye.files.paths import RecipePath
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.sdk import load_sdk
-from flangeye.plugin.stage import Params, part
-from flangeye.units import Duration, param
-from flangeye_plugins.scanner.opened import OpenScanner
+from flangeye.plugin.stage import part
+from flangeye_plugins.scanner.opened import OpenScanner, SerialParams
 
 NAME = "scanner.realsense"
 
 
-class RealsenseParams(Params):
+class RealsenseParams(SerialParams):
     """Parameters of ``scanner.realsense``."""
 
     recording: RecipePath | None = Field(
         None, description="A .db3 or .bag recording to play instead, one frame an exposure."
     )
-    serial: str | None = Field(
-        None, description="Serial number or index of the camera, if there are several."
-    )
-    timeout: Duration = param("2 s", gt=0, le=PATIENCE, description="Longest wait for a frame.")
+    # Longest wait for a frame [s]
+    timeout: ClassVar[float] = 2.0
 
 
 @part("scanner.realsense")

@@ -5,18 +5,17 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from flangeye.devices import PATIENCE, DeviceError, FrameDropped, Scan, Scanner
+from flangeye.devices import DeviceError, FrameDropped, Scan, Scanner
 from flangeye.errors import StageError
 from flangeye.models.graph import Topic
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import Params, part
 from flangeye.types import Floats, Image
-from flangeye.units import Duration, param
 from flangeye_plugins.ros2.client import Bridge, Message
 from flangeye_plugins.ros2.messages import (
     CLOUD,
@@ -65,7 +64,8 @@ class Ros2Params(Params):
         None, description="Service (std_srvs/Trigger) or topic (std_msgs/Empty) that takes a scan; "
         "without one the camera runs by itself.",
     )  # fmt: skip
-    timeout: Duration = param("2.5 s", gt=0, le=PATIENCE, description="Longest wait for a scan.")
+    # Longest wait for a scan [s]
+    timeout: ClassVar[float] = 2.5
     sim_time: bool = Field(False, description="Stamps are simulated time, of the topic /clock.")
 
     @model_validator(mode="after")

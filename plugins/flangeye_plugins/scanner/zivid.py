@@ -13,8 +13,8 @@ from flangeye.devices import DeviceError, Scan, Scanner
 from flangeye.files.paths import RecipePath
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.sdk import load_sdk
-from flangeye.plugin.stage import Params, part
-from flangeye_plugins.scanner.opened import OpenScanner
+from flangeye.plugin.stage import part
+from flangeye_plugins.scanner.opened import OpenScanner, SerialParams
 
 NAME = "scanner.zivid"
 
@@ -22,14 +22,11 @@ PER_METRE = 1000.0
 """The SDK's points are millimetres; nothing in it says so at run time."""
 
 
-class ZividParams(Params):
+class ZividParams(SerialParams):
     """Parameters of ``scanner.zivid``."""
 
     settings: RecipePath | None = Field(
         None, description="Settings saved by Zivid Studio (.yml); one default acquisition if none."
-    )
-    serial: str | None = Field(
-        None, description="Serial number or index of the camera, if there are several."
     )
     file_camera: RecipePath | None = Field(
         None, description="A file camera (.zfc) to capture from instead."

@@ -3,41 +3,33 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from flangeye import Params, stage
+from flangeye import stage
 from flangeye.models.targets import Flange
 from flangeye.types import Capture, FlangeCloud, PointCloud, Rejected
-from flangeye.units import Angle, Length, param
+from flangeye.units import param
+from flangeye_plugins.segment.scale import RangeParams, check_scale
 
 if TYPE_CHECKING:
     from flangeye_plugins.segment.grid import Grid
 
 
-class SegmentParams(Params):
+class SegmentParams(RangeParams):
     """Parameters of ``segment.flange``."""
 
-    near: Length = param("100 mm", ge=0, description="Points nearer to the scanner are left out.")
-    far: Length = param("3 m", gt=0, description="Points farther from the scanner are left out.")
-    max_incidence: Angle = param(
-        "55 deg", gt=0, description="Largest angle between the flange's normal and the view."
-    )
+    # Largest angle between the flange's normal and the view [rad]
+    max_incidence: ClassVar[float] = float(np.radians(55))
     min_coverage: float = param(
         0.3, gt=0, le=1, description="Smallest share of the rim, and of the bore, to be seen."
     )
-    crease: Length = param(
-        "0.8 mm",
-        gt=0,
-        description="How much depth bends from one coarse point to the next where a surface ends; "
-        "five times the scan's noise if that is more.",
-    )
-    margin: Length = param(
-        "2 mm",
-        gt=0,
-        description="Distance from the face, and beyond its circle, up to which points are kept.",
-    )
+    # How much depth bends from one coarse point to the next where a surface ends; five times the
+    # scan's noise if that is more [m]
+    crease: ClassVar[float] = 0.8e-3
+    # Distance from the face, and beyond its circle, up to which points are kept [m]
+    margin: ClassVar[float] = 2e-3
 
 
 @stage("segment.flange")
@@ -57,7 +49,6 @@ def segment_flange(
     """
     from flangeye_plugins.segment.discs import DiscLimits, crop
     from flangeye_plugins.segment.grid import coarse_view
-    from flangeye_plugins.segment.scale import check_scale
     from flangeye_plugins.segment.search import choose, find_discs
 
     view = coarse_view(capture.cloud.xyz, flange.rim / 15)

@@ -5,14 +5,22 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from flangeye import StageError
+from flangeye import Params, StageError
 from flangeye.maths.statistics import median
+from flangeye.units import Length, param
 
 FARTHEST, NEAREST = 30.0, 0.01
 """No scanner for such work sees farther than 30 m or nearer than 10 mm."""
 
 SAMPLE = 100_000
 """Coordinates that settle the median depth."""
+
+
+class RangeParams(Params):
+    """How far from the scanner something is looked for."""
+
+    near: Length = param("100 mm", ge=0, description="Points nearer to the scanner are left out.")
+    far: Length = param("3 m", gt=0, description="Points farther from the scanner are left out.")
 
 
 def check_scale(xyz: NDArray[np.float32], where: str) -> None:

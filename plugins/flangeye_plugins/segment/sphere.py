@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from flangeye import Params, stage
+from flangeye import stage
 from flangeye.models.targets import Sphere
 from flangeye.types import Capture, FlangeCloud, Floats, Indices, PointCloud, Rejected, Singles
-from flangeye.units import Length, param
+from flangeye.units import param
 from flangeye_plugins.segment.discs import in_box
 from flangeye_plugins.segment.grid import Grid, coarse_view
-from flangeye_plugins.segment.scale import check_scale
+from flangeye_plugins.segment.scale import RangeParams, check_scale
 
 ACROSS = 16
 """Coarse points across the sphere."""
@@ -32,20 +32,16 @@ SEEN_TO = np.sin(np.radians(60.0))
 """Share of the radius within which, across the view, a scanner sees a sphere well."""
 
 
-class SegmentSphereParams(Params):
+class SegmentSphereParams(RangeParams):
     """Parameters of ``segment.sphere``."""
 
-    near: Length = param("100 mm", ge=0, description="Points nearer to the scanner are left out.")
-    far: Length = param("3 m", gt=0, description="Points farther from the scanner are left out.")
     min_coverage: float = param(
         0.4, gt=0, le=1, description="Smallest share of the face it turns to be seen."
     )
-    tolerance: Length = param(
-        "1 mm", gt=0, description="Largest distance of a coarse point from the sphere's surface."
-    )
-    margin: Length = param(
-        "2 mm", gt=0, description="Distance from the surface up to which points are kept."
-    )
+    # Largest distance of a coarse point from the sphere's surface [m]
+    tolerance: ClassVar[float] = 1e-3
+    # Distance from the surface up to which points are kept [m]
+    margin: ClassVar[float] = 2e-3
 
 
 class Candidate(NamedTuple):

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from flangeye.maths.geometry import angle_between
 from flangeye.motion.planning import Site
 from flangeye_plugins.plan.next_best import NextBestParams, next_best
+from tests.plugins.fixed import fixed
 from tools.study_next_best import compare
 
 SAID = (
@@ -23,14 +24,14 @@ def site(joints=lambda pose: np.zeros(6), lost=frozenset):
 
 
 def planned(seed=0, place=None, **params):
-    plan = next_best(place or site(), np.random.default_rng(seed), NextBestParams(**params))
+    plan = next_best(place or site(), np.random.default_rng(seed), fixed(NextBestParams, **params))
     return [pose.base_T_flange for pose in plan.poses]
 
 
 @given(seed=st.integers(0, 1000), count=st.integers(3, 8))
 @settings(max_examples=15, deadline=None)
 def test_poses_stay_in_the_region_and_face_the_scanner(seed: int, count: int) -> None:
-    params = NextBestParams(count=count, candidates=50, facing="30 deg")
+    params = fixed(NextBestParams, count=count, candidates=50, facing="30 deg")
     poses = planned(seed, count=count, candidates=50, facing="30 deg")
     assert len(poses) == count
     for pose in poses:
@@ -52,7 +53,7 @@ def test_the_same_seed_gives_the_same_poses() -> None:
 def test_a_pose_that_told_nothing_is_made_up_for() -> None:
     lost: set[int] = set()
     place = site(lost=lambda: lost)
-    plan = next_best(place, np.random.default_rng(0), NextBestParams(count=6))
+    plan = next_best(place, np.random.default_rng(0), fixed(NextBestParams, count=6))
     poses = []
     for index, pose in enumerate(plan.poses):
         poses.append(pose.base_T_flange[:3, 3])
@@ -74,7 +75,9 @@ def test_it_needs_at_most_three_quarters_of_the_grids_poses() -> None:
 
 
 def test_a_pose_says_what_it_promises_and_what_it_tells_most_of() -> None:
-    plan = next_best(site(), np.random.default_rng(0), NextBestParams(count=6, candidates=50))
+    plan = next_best(
+        site(), np.random.default_rng(0), fixed(NextBestParams, count=6, candidates=50)
+    )
     said = [re.fullmatch(SAID, pose.why) for pose in plan.poses]
     before, after = (np.array([float(s[i]) for s in said if s]) for i in (1, 2))
     assert len(before) == 6
@@ -84,7 +87,9 @@ def test_a_pose_says_what_it_promises_and_what_it_tells_most_of() -> None:
 
 def test_a_pose_that_was_lost_is_not_counted_in_what_the_next_promises() -> None:
     lost: set[int] = set()
-    plan = next_best(site(lost=lambda: lost), np.random.default_rng(0), NextBestParams(count=3))
+    plan = next_best(
+        site(lost=lambda: lost), np.random.default_rng(0), fixed(NextBestParams, count=3)
+    )
     found = []
     for index, pose in enumerate(plan.poses):
         found.append(re.fullmatch(SAID, pose.why))

@@ -11,13 +11,14 @@ from flangeye.devices import PATIENCE, SILENT
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.models.loading import load_model
 from flangeye.types import Transform
-from flangeye_plugins.robot.ur.driver import UrRtdeParams, robot_ur_rtde
+from flangeye_plugins.robot.tool_check import ControllerParams
+from flangeye_plugins.robot.ur.driver import robot_ur_rtde
 
 UR5E = load_model("robots", "ur5e")
 
 
 def open_ur(host, **params):
-    return robot_ur_rtde(UR5E, UrRtdeParams(host=host, **params))
+    return robot_ur_rtde(UR5E, ControllerParams(host=host, **params))
 
 
 def moved(pose, x=0.0, y=0.0, z=0.0, turn=(0.0, 0.0, 0.0)):

@@ -14,8 +14,9 @@ import pytest
 from flangeye.devices import GRACE, SILENT, DeviceError
 from flangeye.models.loading import load_model
 from flangeye.testing import RobotConformance
+from flangeye_plugins.robot.tool_check import ControllerParams
 from flangeye_plugins.robot.ur import worker
-from flangeye_plugins.robot.ur.driver import UrRtdeParams, robot_ur_rtde
+from flangeye_plugins.robot.ur.driver import robot_ur_rtde
 from tests.emulators.controllers.process import Process, free_address
 from tests.plugins.robot.behaviour import DrivesAnArm
 from tests.plugins.robot.cell import UR5E, arrived, in_time, moved, open_ur, until
@@ -125,7 +126,7 @@ def test_what_only_reads_starts_nothing_and_needs_no_arm_that_can_be_driven(with
     control.fault("remote-control-off")
     with pytest.raises(DeviceError, match="local control"):
         open_ur(host, tool=TOOL)
-    params = UrRtdeParams(host=host, tool=TOOL)
+    params = ControllerParams(host=host, tool=TOOL)
     with robot_ur_rtde(UR5E, params, reads_only=True) as robot:
         truth = control.truth()
         np.testing.assert_allclose(
@@ -139,21 +140,21 @@ def test_what_only_reads_starts_nothing_and_needs_no_arm_that_can_be_driven(with
 
 def test_a_tool_that_the_recipe_does_not_know_is_noticed_by_reading_alone(with_tool: Any) -> None:
     with pytest.raises(DeviceError, match="its flange is .* mm from where a ur5e has it"):
-        robot_ur_rtde(UR5E, UrRtdeParams(host=with_tool.host), reads_only=True)
+        robot_ur_rtde(UR5E, ControllerParams(host=with_tool.host), reads_only=True)
 
 
 def test_an_arm_with_more_joints_than_the_controller_is_refused(controller: Any) -> None:
     with pytest.raises(DeviceError, match="it has 6 joints and a franka-panda 7: is robot.model"):
         robot_ur_rtde(
             load_model("robots", "franka-panda"),
-            UrRtdeParams(host=controller.host),
+            ControllerParams(host=controller.host),
             reads_only=True,
         )
 
 
 def test_another_arm_than_the_recipes_is_refused(controller: Any) -> None:
     with pytest.raises(DeviceError) as error:
-        robot_ur_rtde(load_model("robots", "ur10e"), UrRtdeParams(host=controller.host))
+        robot_ur_rtde(load_model("robots", "ur10e"), ControllerParams(host=controller.host))
     assert str(error.value).startswith(f"ur10e at {controller.host}: its flange is ")
     assert str(error.value).endswith(
         "mm from where a ur10e has it at these joint angles: is robot.model the right one?"

@@ -15,6 +15,7 @@ from flangeye_plugins.robot.ros2.driver import (
 )
 from flangeye_plugins.scanner.ros2 import Ros2Params as Topics
 from flangeye_plugins.scanner.ros2 import scanner_ros2
+from tests.plugins.fixed import fixed
 from tests.plugins.ros2.cell import Camera, Controller, peers
 
 pytestmark = [pytest.mark.realtime, pytest.mark.ros2]
@@ -97,7 +98,7 @@ def test_what_goes_wrong_with_an_arm_is_one_line(env):
 
 def test_an_arm_that_others_move_is_ready_when_it_stands_elsewhere(env):
     with peers(Controller(env, controller=None)) as (arm,):
-        params = FreedriveParams(joints=tuple(arm.joints), still="200 ms")
+        params = fixed(FreedriveParams, joints=tuple(arm.joints), still=0.2)
         with robot_ros2_freedrive.function(ARM, params) as robot:
             start = robot.state().joints
             for turn in (0.0, 0.3):

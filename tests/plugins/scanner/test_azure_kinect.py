@@ -20,6 +20,7 @@ from flangeye_plugins.scanner.azure_kinect import (
     scanner_azure_kinect,
 )
 from flangeye_plugins.scanner.kinect_view import DepthView
+from tests.plugins.fixed import fixed
 from tests.plugins.scanner.mkv import COLUMNS, ROWS, Recorder
 
 KINECT = load_model("scanners", "azure-kinect")
@@ -174,7 +175,7 @@ def test_an_abort_of_the_sdk_does_not_end_the_run(host: Callable[..., Any]) -> N
 
 def test_a_camera_that_falls_silent_is_said(host: Callable[..., Any]) -> None:
     host("say(facts={'serial': '7'})\nimport time; time.sleep(60)")
-    scanner = scanner_azure_kinect(None, AzureKinectParams(timeout="1 ms"))
+    scanner = scanner_azure_kinect(None, fixed(AzureKinectParams, timeout=1e-3))
     with scanner, pytest.raises(DeviceError) as error:
         scanner.expose()
     assert str(error.value) == (

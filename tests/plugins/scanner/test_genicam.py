@@ -13,6 +13,7 @@ from flangeye.devices import DeviceError, FrameDropped, Scanner
 from flangeye.models.loading import load_model
 from flangeye_plugins.scanner.genicam import GenicamParams, scanner_genicam
 from flangeye_plugins.scanner.genicam_nodes import configure
+from tests.plugins.fixed import fixed
 from tests.plugins.scanner.genapi import Description, node_map
 
 genicam = pytest.importorskip("genicam", reason="pip install 'flangeye[genicam]'")
@@ -29,7 +30,7 @@ def named(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def opened(serial="0", model=None, **changes):
-    return scanner_genicam(model, GenicamParams(producer="viky", serial=serial, **changes))
+    return scanner_genicam(model, fixed(GenicamParams, producer="viky", serial=serial, **changes))
 
 
 def refused(*arguments):
@@ -145,7 +146,7 @@ def test_a_missing_sdk_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_frame_that_does_not_come_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    with opened("1", timeout="1 ms") as scanner:
+    with opened("1", timeout=1e-3) as scanner:
         with pytest.raises(DeviceError) as error:
             scanner.expose()
         assert str(error.value) == (

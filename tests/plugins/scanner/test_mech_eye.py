@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from flangeye.devices import DeviceError, Scanner
-from flangeye.units import SI
 from flangeye_plugins.scanner.mech_eye import MechEyeParams, scanner_mech_eye
+from tests.plugins.fixed import fixed
 
 api = pytest.importorskip("mecheye.area_scan_3d_camera", reason="pip install 'flangeye[mech_eye]'")
 
@@ -23,7 +23,7 @@ def refused(params):
 
 def test_no_camera_is_found_by_the_real_library() -> None:
     began = time.monotonic()
-    assert refused(MechEyeParams(timeout=SI(0.3))) == (
+    assert refused(fixed(MechEyeParams, timeout=0.3)) == (
         "scanner.mech_eye: no camera found; is it on, and in this computer's network?"
     )
     assert time.monotonic() - began < 10
@@ -34,7 +34,7 @@ def test_what_the_real_library_says_of_an_address_is_said() -> None:
         "scanner.mech_eye: not an address: Failed to connect to the Mech-Eye Industrial 3D Camera. "
         "IP Address is invalid. (error -7)"
     )
-    assert refused(MechEyeParams(address="127.0.0.9", timeout=SI(0.3))).startswith(
+    assert refused(fixed(MechEyeParams, address="127.0.0.9", timeout=0.3)).startswith(
         "scanner.mech_eye: 127.0.0.9: Failed to connect to the Mech-Eye Industrial 3D Camera. "
     )
 

@@ -11,8 +11,8 @@ import pytest
 
 from flangeye.devices import DeviceError, Scanner
 from flangeye.models.loading import load_model
-from flangeye.units import SI
 from flangeye_plugins.scanner.realsense import RealsenseParams, scanner_realsense
+from tests.plugins.fixed import fixed
 from tests.plugins.scanner.realsense_device import COLUMNS, ROWS, Camera, ramp, rs
 
 KINECT = load_model("scanners", "azure-kinect")
@@ -26,7 +26,7 @@ def refused(params, model=None):
 
 
 def test_a_recording_is_played_in_metres(recording: Path) -> None:
-    params = RealsenseParams(recording=recording, timeout=SI(1.0))
+    params = fixed(RealsenseParams, recording=recording, timeout=1.0)
     with scanner_realsense(KINECT, params) as scanner:
         assert isinstance(scanner, Scanner)
         assert scanner.name == "RealSense cell.db3"
@@ -46,7 +46,7 @@ def test_a_recording_is_played_in_metres(recording: Path) -> None:
 
 
 def test_the_end_of_a_recording_is_said(recording: Path) -> None:
-    scanner = scanner_realsense(None, RealsenseParams(recording=recording, timeout=SI(0.5)))
+    scanner = scanner_realsense(None, fixed(RealsenseParams, recording=recording, timeout=0.5))
     with scanner, pytest.raises(DeviceError) as error:
         for _ in range(9):
             scanner.expose()()

@@ -12,6 +12,7 @@ from flangeye.models.loading import load_model
 from flangeye.models.targets import flange_of, load_standard, wrist_circle_of
 from flangeye.types import FlangeCloud, Rejected
 from flangeye_plugins.segment.flange import SegmentParams, segment_flange
+from tests.plugins.fixed import fixed
 from tests.plugins.segment.scenes import ASIDE, CENTRE, Scene, capture, towards_scanner
 
 UR5 = flange_of(load_model("robots", "ur5").flange, load_standard("50-4-M6"))
@@ -23,13 +24,13 @@ BORE = UR5.bore
 
 
 def found(xyz, flange=UR5, **params) -> FlangeCloud:
-    cloud = segment_flange(capture(xyz), flange, SegmentParams(**params))
+    cloud = segment_flange(capture(xyz), flange, fixed(SegmentParams, **params))
     assert isinstance(cloud, FlangeCloud), cloud
     return cloud
 
 
 def reason(xyz, flange=UR5, **params) -> str:
-    rejected = segment_flange(capture(xyz), flange, SegmentParams(**params))
+    rejected = segment_flange(capture(xyz), flange, fixed(SegmentParams, **params))
     assert isinstance(rejected, Rejected), rejected
     return rejected.reason
 
@@ -107,7 +108,7 @@ def test_says_that_there_is_no_bore() -> None:
 
 def test_says_how_steeply_it_is_seen() -> None:
     xyz = Scene().table().flange(UR5, normal=towards_scanner(tilt=0.6)).scan()
-    assert reason(xyz, max_incidence="30 deg") == "incidence 34 deg over the limit of 30 deg"
+    assert reason(xyz, max_incidence=np.radians(30)) == "incidence 34 deg over the limit of 30 deg"
 
 
 def test_says_what_size_there_is() -> None:

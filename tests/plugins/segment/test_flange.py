@@ -13,6 +13,7 @@ from flangeye.recipe.load import parse_recipe
 from flangeye_plugins.segment.discs import in_box
 from flangeye_plugins.segment.flange import SegmentParams, segment_flange
 from flangeye_plugins.segment.grid import coarse_view
+from tests.plugins.fixed import fixed
 
 RECIPE = """\
 title: Segmentation
@@ -43,7 +44,7 @@ def scans(outliers, count):
 
 
 def found(capture, flange, **params):
-    return segment_flange(capture, flange, SegmentParams(**params))
+    return segment_flange(capture, flange, fixed(SegmentParams, **params))
 
 
 def test_the_flange_is_found_where_it_is(cell: Any) -> None:
@@ -99,7 +100,7 @@ def test_the_reasons(cell: Any) -> None:
     assert found(capture, flange, far="150 mm").reason.startswith(
         "no point between near 100 mm and far 150 mm: depths from "
     )
-    steep = found(capture, flange, max_incidence="0.5 deg").reason
+    steep = found(capture, flange, max_incidence=np.radians(0.5)).reason
     assert "incidence" in steep
     table = np.stack(
         [

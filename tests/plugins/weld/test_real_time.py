@@ -16,7 +16,8 @@ from flangeye_emulators.finger.sensor import (
     SimulatedFingerParams,
     sensor_simulated_finger,
 )
-from flangeye_plugins.robot.ur.driver import UrRtdeParams, robot_ur_rtde
+from flangeye_plugins.robot.tool_check import ControllerParams
+from flangeye_plugins.robot.ur.driver import robot_ur_rtde
 from flangeye_plugins.weld.settings import WeldTactileParams
 from flangeye_plugins.weld.tactile import weld_tactile
 from tests.emulators.controllers.process import Process
@@ -42,7 +43,7 @@ def test_the_torch_stays_in_the_seam_in_real_time(tmp_path: Path) -> None:
     journal = []
     with Process("--joints", "180 -90 90 -90 -90 0 deg", model="ur10e") as controller:
         driver = RobotDriver(
-            "robot.ur_rtde", partial(robot_ur_rtde, MODEL, UrRtdeParams(host=controller.host))
+            "robot.ur_rtde", partial(robot_ur_rtde, MODEL, ControllerParams(host=controller.host))
         )
         report = weld_tactile.function(
             None, seam, MODEL, driver, LimitsSection.model_validate({"box": BOX}),

@@ -15,11 +15,11 @@ from flangeye.maths.geometry import rotation_log
 from flangeye.maths.pose_formats import CONVENTIONS
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.sdk import load_sdk
-from flangeye.plugin.stage import Params, part
+from flangeye.plugin.stage import part
 from flangeye.types import BASE, FLANGE, TOOL, Floats, Transform
 from flangeye_plugins.robot.aubo.client import STANDING, AuboClient, Ride
 from flangeye_plugins.robot.tool_check import (
-    ToolOffset,
+    ControllerParams,
     require_model,
     require_tool,
     twist_at_tool,
@@ -54,17 +54,12 @@ SAFETY: dict[str, tuple[Mode, str]] = {
 """SafetyModeType: what it means for motion, and for people."""
 
 
-class AuboParams(Params):
+class AuboParams(ControllerParams):
     """Parameters of ``robot.aubo``."""
 
-    host: str = Field(min_length=1, description="Address of the controller: 192.168.1.10.")
     user: str = Field("aubo", description="Account on the controller.")
     password: str = Field(
         "123456", description="Password of that account; the default is the factory's."
-    )
-    tool: ToolOffset = Field(
-        default_factory=ToolOffset,
-        description="Tool (TCP) set in the controller; none if not given.",
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from typing import ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -12,7 +13,7 @@ from flangeye.devices import SILENT, DeviceError, Mode, Robot
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.stage import part
 from flangeye.types import Floats, Transform
-from flangeye.units import Duration, in_mm, param
+from flangeye.units import in_mm
 from flangeye_plugins.robot.ros2 import pieces
 from flangeye_plugins.robot.ros2.listener import Listener, ListenParams
 from flangeye_plugins.ros2.client import Bridge
@@ -43,9 +44,8 @@ class Ros2Params(ListenParams):
 class FreedriveParams(ListenParams):
     """Parameters of ``robot.ros2_freedrive``."""
 
-    still: Duration = param(
-        "500 ms", gt=0, description="How long the arm must have stood before a scan is taken."
-    )
+    # How long the arm must have stood before a scan is taken [s]
+    still: ClassVar[float] = 0.5
 
 
 @part("robot.ros2")

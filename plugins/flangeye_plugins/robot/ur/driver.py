@@ -7,17 +7,16 @@ import time
 from typing import Any
 
 import numpy as np
-from pydantic import Field
 
 from flangeye.devices import Device, DeviceError, Robot, RobotState
 from flangeye.files.processes import busy
 from flangeye.maths.pose_formats import CONVENTIONS
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.sdk import load_sdk
-from flangeye.plugin.stage import Params, part
+from flangeye.plugin.stage import part
 from flangeye.types import BASE, FLANGE, TOOL, Floats, Transform
 from flangeye_plugins.robot.tool_check import (
-    ToolOffset,
+    ControllerParams,
     require_model,
     require_tool,
     twist_at_tool,
@@ -35,18 +34,8 @@ STALE = 0.1
 """A sample older than this is no news of the arm [s]."""
 
 
-class UrRtdeParams(Params):
-    """Parameters of ``robot.ur_rtde``."""
-
-    host: str = Field(min_length=1, description="Address of the controller: 192.168.1.10.")
-    tool: ToolOffset = Field(
-        default_factory=ToolOffset,
-        description="Tool (TCP) set in the controller; none if not given.",
-    )
-
-
 @part("robot.ur_rtde")
-def robot_ur_rtde(model: RobotModel, params: UrRtdeParams, reads_only: bool = False) -> Robot:
+def robot_ur_rtde(model: RobotModel, params: ControllerParams, reads_only: bool = False) -> Robot:
     """An arm of Universal Robots, e-Series or CB3, through the library ur_rtde.
 
     On the pendant: power on, brakes released, Remote Control, the payload of what is mounted in
@@ -54,7 +43,7 @@ def robot_ur_rtde(model: RobotModel, params: UrRtdeParams, reads_only: bool = Fa
 
     Args:
         model: The arm; its kinematics are compared with what the controller says.
-        params: See :class:`UrRtdeParams`.
+        params: See :class:`ControllerParams`.
         reads_only: Open RTDE's receiving side alone. The client library starts its program on the
             controller for the other side only; the arm may be in local control, or switched off.
 
