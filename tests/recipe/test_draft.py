@@ -481,8 +481,8 @@ def two_poses_of_nobody(folder):
          "1,2,3,4,5,6 --rotation joints"),
         (odd_heading, ["--columns", "u,v,ww,4,5,6"],
          "rec/log.csv: has no column 'ww'; known: w"),
-        (angles_of_nobody, [], "how the rotation in columns rx, ry, rz is written (ur, kuka, "
-         "fanuc, abb, yaskawa, staubli, kawasaki, doosan, halcon, rpy, quaternion_xyzw, "
+        (angles_of_nobody, [], "how the rotation in columns rx, ry, rz of log.csv is written (ur, "
+         "kuka, fanuc, abb, yaskawa, staubli, kawasaki, doosan, halcon, rpy, quaternion_xyzw, "
          "quaternion_wxyz, vector, xyz, ZYX, …): nothing tells; add --rotation vector"),
         (images, [], "which printed target is seen: nothing tells; add --target 'charuco: "
          "{columns: 8, rows: 6, square: 30 mm, marker: 22 mm}'"),

@@ -75,6 +75,18 @@ def index_column(f, j, a, s):
         (f / f"{name}.csv").write_text(text(indexed(vector(poses, 1e3)[:, [3, 4, 5, 0, 1, 2]])))
 
 
+def index_with_gaps(f, j, a, s):
+    kept = np.cumsum([1, 2] * (COUNT // 2))
+    for name, poses in (("rob", a), ("mark", s)):
+        (f / f"{name}.csv").write_text(text(np.column_stack([kept, vector(poses, 1e3)])))
+
+
+def blank_lines(f, j, a, s):
+    for name, poses in (("robot", a), ("marker", s)):
+        lines = text(quaternion(poses), "  ").replace("\n", "\n\n")
+        (f / f"{name}.txt").write_text(f"// exported from the pendant\n{lines}")
+
+
 def cam2target(f, j, a, s):
     (f / "gripper2base.csv").write_text(text(indexed(vector(a, 1e3))))
     (f / "cam2target.csv").write_text(text(indexed(vector(np.linalg.inv(s), 1e3))))
@@ -198,6 +210,8 @@ LAYOUTS: dict[str, Callable[..., None]] = {
     "two blocks of rows in one text, arm above marker": blocks,
     "the same without a line between them": halves,
     "a running index, rotation vector before the position": index_column,
+    "an index with gaps, where some images were left out": index_with_gaps,
+    "a remark behind `//`, and a blank line after each row": blank_lines,
     "`cam2target.csv`: the camera in the target": cam2target,
     "`gripper2base`, `cam2target`, `target2cam` side by side": side_by_side,
     "OpenCV's storage, `robot_0`, `cam_0`, … matrices": opencv_numbered,

@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from glob import escape
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Literal
 
 import numpy as np
@@ -221,22 +221,36 @@ def _with_scans(folder: Path, text: Table, poses: Floats, params: TableParams) -
 
 
 def _scans(folder: Path, text: Table, params: TableParams) -> tuple[list[list[Path]], list[str]]:
-    """Return the scans of each row: the named one, or those that belong to it; and notes."""
+    """Return the scans of each row: the named one, or those that belong to it; and notes.
+
+    Names of which none is a file's call the rows, and belong to scans by the number in common.
+    """
     column = _scan_column(text, params)
-    if column is not None:
-        names = text.texts(column)
-        return [[_named(folder, text.where(i), name)] for i, name in enumerate(names)], []
     files = text.files if len(text.files) == len(text.rows) > 1 else ()
-    return scans_of(folder, Poses(str(text.file), len(text.rows), files, text.names), text.files)
+    poses = Poses(str(text.file), len(text.rows), files, text.names)
+    if column is None:
+        return scans_of(folder, poses, text.files)
+    named = text.texts(column)
+    found = [_named(folder, name) for name in named]
+    if all(found):
+        return [[path] for path in found if path], []
+    if not any(found) and all(named):
+        called = replace(poses, names=[PurePath(name).stem for name in named])
+        try:
+            return scans_of(folder, called, text.files)
+        except StageError:
+            if not PurePath(named[0]).suffix:
+                raise
+    missed = found.index(None)
+    raise StageError(f"{text.where(missed)}: its scan '{named[missed]}' does not exist")
 
 
-def _named(folder: Path, where: str, name: str) -> Path:
+def _named(folder: Path, name: str) -> Path | None:
     """Return the scan of a name, in the folder or, where one has it only, in a folder in it."""
     inner = sorted(folder.glob(f"*/{escape(name)}")) if name and Path(name).name == name else []
-    found = folder / name if (folder / name).is_file() else inner[0] if len(inner) == 1 else None
-    if not name or found is None:
-        raise StageError(f"{where}: its scan '{name}' does not exist")
-    return found
+    if name and (folder / name).is_file():
+        return folder / name
+    return inner[0] if len(inner) == 1 else None
 
 
 # --- the target in the table

@@ -216,6 +216,20 @@ def test_a_mistake_in_a_table_is_named_with_its_line(
     assert str(error.value).removeprefix(f"{tmp_path}/") == message
 
 
+@pytest.mark.parametrize("names", ["P{0}", "s{0}.tif", "pose_{0:03}"])
+def test_rows_whose_names_are_no_files_belong_to_scans_by_their_numbers(
+    tmp_path: Path, names: str
+) -> None:
+    write_images(tmp_path)
+    numbers = [3, 1, 4, 0, 2]
+    rows = [f"{names.format(n)},{n},0,0,0,0,0\n" for n in numbers]
+    (tmp_path / "poses.csv").write_text("".join(rows))
+    archive = table(tmp_path, KUKA)
+    seen = [(r.image.name, round(1e3 * r.base_T_flange[0, 3])) for r in archive.recordings]
+    assert seen == [(f"s{n}.png", n) for n in numbers]
+    assert archive.notes[0].startswith("paired by n")
+
+
 @pytest.mark.parametrize(
     ("values", "message"),
     [

@@ -44,6 +44,8 @@ __all__ = [
 ]
 
 
+_COMMENT = re.compile(r"\s*(?:[#%]|//)[#%/ ]*")
+"""What a line of comment begins with."""
 _SHARE = re.compile(r"([1-9]\d?)/([1-9]\d?)")
 """A part of a file's rows: the first of so many equal ones."""
 
@@ -240,9 +242,9 @@ class Block:
 def text_rows(file: Path, text: str) -> list[Rows]:
     """Return the blocks of a text, mostly one.
 
-    ``#`` and ``%`` begin a comment, of which the last before the numbers may be the heading. Blank
-    lines and titles part blocks of three rows and more, and so do comments between blocks of one
-    length. Matrices that stand line by line are a row each.
+    ``#``, ``%`` and ``//`` begin a comment, of which the last before the numbers may be the
+    heading. Blank lines and titles part blocks of three rows and more, and so do comments between
+    blocks of one length. Matrices that stand line by line are a row each.
     """
     blocks = [_with_matrices(block) for block in _blocks(file, text.splitlines())]
     merged = _merged(blocks)
@@ -267,11 +269,12 @@ def row_of(file: Path, text: str) -> Rows | None:
 
 
 def _blocks(file: Path, lines: Sequence[str]) -> Iterator[Block]:
-    split = _splitter([line for line in lines if line.strip() and line.strip()[0] not in "#%"])
+    split = _splitter([line for line in lines if line.strip() and not _COMMENT.match(line)])
     block = Block(after_blank=True, marked=split.mark != " ")
     for n, line in enumerate(map(str.strip, lines), 1):
-        comment = line[:1] in ("#", "%")
-        cells = split(line.lstrip("#% ") if comment else line) if line else ()
+        comment = bool(_COMMENT.match(line))
+        plain = _COMMENT.sub("", line)
+        cells = split(plain) if plain else ()
         if cells and not comment and any(number_of(cell) is not None for cell in cells):
             block.rows.append((f"{file}:{n}", cells))
             continue
@@ -280,7 +283,7 @@ def _blocks(file: Path, lines: Sequence[str]) -> Iterator[Block]:
             block = Block(marked=block.marked)
         block.after_blank |= not comment
         if any(cells):
-            block.heading, block.title = cells, line.lstrip("#% ").rstrip(" :")
+            block.heading, block.title = cells, plain.rstrip(" :")
     if block.rows:
         yield block
 

@@ -428,9 +428,9 @@ def _rotation(pose: PoseColumns, questions: Questions, prefix: str, maker: str |
     shown = ", ".join(map(str, pose.columns[3:] or pose.columns))
     joints = ", or joints, with --robot" if pose.may_be_joints and not prefix else ""
     known = f"{', '.join(CONVENTIONS)}, vector, xyz, ZYX, …{joints}"
-    question = f"how the rotation in columns {shown} is written ({known})"
-    others = ("point", "joints", MATRIX, APART)
-    return questions.ask(key, question, usual, "vector", one_of(*CONVENTIONS, *PLAIN, *others))
+    question = f"how the rotation in columns {shown} of {pose.table.name} is written"
+    names = one_of(*CONVENTIONS, *PLAIN, "point", "joints", MATRIX, APART)
+    return questions.ask(key, question, usual, "vector", names, known)
 
 
 def _length(numbers: Floats, pose: PoseColumns) -> str:

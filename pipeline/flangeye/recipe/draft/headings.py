@@ -56,12 +56,12 @@ _JOINT = re.compile(
 _ENTRY = re.compile(r"(.+?)((?:\.\d+)+)")
 
 
-SEEN = re.compile(
-    r"target|marker|cam|board|tag|cent(er|re)|seen|sphere|object|optical|track|detect"
-)
+SEEN = re.compile(r"target|mark|cam|board|tag|cent(er|re)|seen|sphere|object|optical|track|detect")
 """In the name of what a camera measured."""
 
-_ARM = re.compile(r"robot|arm|joint|gripper|flange|hand|tool|tcp|effector|(?<![a-z])ee(?![a-z])")
+_ARM = re.compile(
+    r"robot|arm|joint|gripper|flange|hand|tool|tcp|effector|(?<![a-z])(?:ee|rob)(?![a-z])"
+)
 
 _FRAMES: Mapping[str, str] = {
     name: frame

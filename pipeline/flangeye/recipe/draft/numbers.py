@@ -28,7 +28,7 @@ def poses_by_number(table: Table) -> tuple[list[PoseColumns], Headings]:
         return [], rest
     numbers = table.numbers(columns)
     told = ""
-    if _is_index(numbers[:, 0]) and _shape(numbers[:, 1:]):
+    if _is_index(numbers) and _shape(numbers[:, 1:]):
         columns, numbers = columns[1:], numbers[:, 1:]
         told = f"column {columns[0]} is a running index"
     elif _rises(numbers[:, 0]) and _shape(numbers[:, 1:]) and not _shape(numbers):
@@ -42,9 +42,18 @@ def poses_by_number(table: Table) -> tuple[list[PoseColumns], Headings]:
     return found, rest
 
 
-def _is_index(column: Floats) -> bool:
-    whole = bool((column == np.round(column)).all())
-    return whole and len(column) > 2 and bool((np.diff(column) == 1).all())
+def _is_index(numbers: Floats) -> bool:
+    """Return whether the first column counts the rows, or those that were kept of more.
+
+    With gaps it counts only before six numbers that are no quaternion's: whole numbers before a
+    position and a quaternion may be times (TUM's trajectories).
+    """
+    first = numbers[:, 0]
+    if len(first) < 3 or bool((first != np.round(first)).any()):
+        return False
+    counts = bool((np.diff(first) == 1).all())
+    six = numbers.shape[1] == 7 and _quaternion_at(numbers) is None
+    return counts or (six and _rises(first))
 
 
 def _rises(column: Floats) -> bool:
@@ -116,13 +125,20 @@ def _pose(table: Table, part: list[int], numbers: Floats, told: str) -> PoseColu
 
 
 def _of_seven(table: Table, part: list[int], numbers: Floats, told: str) -> PoseColumns | None:
+    if (first := _quaternion_at(numbers)) is not None:
+        columns = part if first == 3 else [*part[4:], *part[:4]]
+        return PoseColumns(table, tuple(columns), QUATERNIONS, guess=told)
+    angles = np.nanmax(np.abs(numbers)) <= 360.0
+    return PoseColumns(table, tuple(part), JOINTS, guess=told) if angles else None
+
+
+def _quaternion_at(numbers: Floats) -> int | None:
+    """Return where in seven columns a quaternion begins; None where none does."""
     for first in (3, 0):
         norms = np.linalg.norm(numbers[:, first : first + 4], axis=1)
         if np.nanmax(np.abs(norms - 1)) < ROUNDED:
-            columns = part if first == 3 else [*part[4:], *part[:4]]
-            return PoseColumns(table, tuple(columns), QUATERNIONS, guess=told)
-    angles = np.nanmax(np.abs(numbers)) <= 360.0
-    return PoseColumns(table, tuple(part), JOINTS, guess=told) if angles else None
+            return first
+    return None
 
 
 def _of_six(table: Table, part: list[int], numbers: Floats, told: str) -> PoseColumns:

@@ -46,6 +46,7 @@ class Questions:
         default: str | None,
         example: str = "",
         check: Check | None = None,
+        known: str = "",
     ) -> str:
         """Return the answer to a question; a person whose answer is refused is asked again.
 
@@ -55,32 +56,32 @@ class Questions:
             default: What is likely; None where nothing is.
             example: An answer, for the message where there is none.
             check: Refuses an answer that is none.
+            known: The answers there are, for whoever has to choose one.
 
         Raises:
             RecipeError: Nothing is likely, nobody can be asked; names the flag to add.
         """
         answer = self.given.get(flag)
         if answer is None:
-            answer = self.given[flag] = self._answered(flag, question, default, example, check)
+            default, shown = self.likely.get(flag, (default, ""))
+            if self.prompt is None and default is not None:
+                reason = f"{shown}; " if shown else ""
+                self.assumed.append(f"{question}: {default} ({reason}--{flag} says otherwise)")
+                answer = default
+            else:
+                asked = f"{question} ({known})" if known else question
+                answer = self._asked(flag, asked, default, example, check)
+            self.given[flag] = answer
         return answer
 
-    def _answered(
+    def _asked(
         self, flag: str, question: str, default: str | None, example: str, check: Check | None
     ) -> str:
-        default, shown = self.likely.get(flag, (default, ""))
-        if self.prompt is not None:
-            return self._asked(f"{question} (--{flag})", default, check)
-        if default is None:
+        if self.prompt is None:
             raise RecipeError(f"{question}: nothing tells; add --{flag} {example}".rstrip())
-        reason = f"{shown}; " if shown else ""
-        self.assumed.append(f"{question}: {default} ({reason}--{flag} says otherwise)")
-        return default
-
-    def _asked(self, question: str, default: str | None, check: Check | None) -> str:
-        assert self.prompt is not None  # noqa: S101  for type checkers
         refused = ""
         while True:
-            answer = self.prompt(f"{refused}{question}", default)
+            answer = self.prompt(f"{refused}{question} (--{flag})", default)
             try:
                 if check:
                     check(answer)
