@@ -22,6 +22,10 @@ class StageError(FlangeyeError):
     """A step cannot do its work at all with the input it was given."""
 
 
+class NothingSeen(StageError):
+    """No capture shows what is looked for."""
+
+
 class CalibrationRefused(FlangeyeError):
     """The input was sound, but no answer can be trusted: the reason, and what is missing."""
 

@@ -14,7 +14,7 @@ from flangeye.cli.commands import app
 from flangeye.cli.console import write
 from flangeye.cli.progress import RunProgress
 from flangeye.cli.summary import print_refusal, print_summary, wrapped
-from flangeye.types import Source, Warn
+from flangeye.types import Rejection, Source, Warn
 
 SCALE = {"text": "the target is 1.3 % larger than configured", "fix": "feature.size: 40.52 mm"}
 
@@ -115,6 +115,16 @@ def test_warnings_of_the_source_are_printed_before_the_run() -> None:
         )
     assert out.getvalue() == "warning: wrong\n  -> mend\n"
     assert progress.said == ["wrong"]
+
+
+def test_captures_rejected_for_one_reason_are_told_together() -> None:
+    out = io.StringIO()
+    with RunProgress(Console(file=out), ["0.acquire.toy"]) as progress:
+        for name, why in (("a", "dark"), ("b", "dark"), ("c", "far"), ("d", "dark")):
+            progress.flangeye_capture_rejected(rejection=Rejection(name, "fit.toy", why))
+    assert out.getvalue().splitlines() == [
+        "rejected a: fit.toy: dark", "rejected c: fit.toy: far", "rejected for the same reason as a: b, d",
+    ]  # fmt: skip
 
 
 def test_markup_of_others_is_not_followed() -> None:

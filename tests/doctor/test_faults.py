@@ -379,6 +379,14 @@ def test_a_marker_that_was_printed_in_another_size(factor: float) -> None:
     assert float(finding.what.split()[3]) == pytest.approx(1 / factor, rel=2e-3)
 
 
+@pytest.mark.parametrize("factor", [1.04, 0.9])
+def test_a_camera_of_another_focal_length(factor: float) -> None:
+    session = session_of("marker")
+    finding = only(replace(session, centres=session.centres * [1.0, 1.0, factor]))
+    assert finding.name == "focal length"
+    assert float(finding.what.split()[5]) == pytest.approx(1 / factor, rel=2e-3)
+
+
 @pytest.mark.parametrize("kind", ["marker", "point"])
 @pytest.mark.parametrize("carried", ["target", "camera"])
 def test_too_little_rotation(kind: str, carried: str) -> None:

@@ -173,7 +173,7 @@ def _of_folder(folder: Path, out: Path, questions: Questions, registry: Registry
 
 def _shows_target(draft: Draft, folder: Path, out: Path, registry: Registry) -> bool:
     """Return whether any scan shows what a drafted recipe looks for; True if it does not run."""
-    from flangeye.errors import FlangeyeError
+    from flangeye.errors import FlangeyeError, NothingSeen
     from flangeye.recipe.load import parse_recipe
     from flangeye.run.runner import Runner
     from flangeye.types import ArchivePath
@@ -182,6 +182,8 @@ def _shows_target(draft: Draft, folder: Path, out: Path, registry: Registry) -> 
         # Its paths start at the recipe's folder.
         recipe = parse_recipe(draft.text, out.name, registry, [f"steps.0.path={folder}"])
         return bool(Runner(recipe, registry, ArchivePath(folder)).take(1))
+    except NothingSeen:
+        return False
     except FlangeyeError:
         return True
 

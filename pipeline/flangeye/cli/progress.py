@@ -28,6 +28,7 @@ class RunProgress:
         self.said: list[str] = []
         self._console = console
         self._once = list(steps)
+        self._rejected: dict[tuple[str, str], list[str]] = {}
         # 60 columns at most: the name, a bar of 12, the count, and both times.
         self._progress = progress.Progress(
             progress.TextColumn("{task.description:<16.16}", markup=False),
@@ -52,8 +53,11 @@ class RunProgress:
 
     @hookimpl
     def flangeye_capture_rejected(self, rejection: Rejection) -> None:
-        """Say which capture was rejected, and why."""
-        write(self._console, f"rejected {rejection.id}: {rejection.stage}: {rejection.reason}")
+        """Say which capture was rejected, and why; of those that share a reason, the first."""
+        alike = self._rejected.setdefault((rejection.stage, rejection.reason), [])
+        if not alike:
+            write(self._console, f"rejected {rejection.id}: {rejection.stage}: {rejection.reason}")
+        alike.append(rejection.id)
 
     @hookimpl
     def flangeye_capture_finished(self, capture: str) -> None:
@@ -83,5 +87,10 @@ class RunProgress:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Take the bar away."""
+        """Take the bar away, and name what was rejected for a reason that was told."""
         self._progress.stop()
+        for first, *others in self._rejected.values():
+            if others:
+                write(
+                    self._console, f"rejected for the same reason as {first}: {', '.join(others)}"
+                )

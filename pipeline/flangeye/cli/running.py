@@ -138,7 +138,7 @@ def run(  # noqa: PLR0913  one for each option
         with _plan_as_json() if json_ else nullcontext():
             result = _record(checked, recipe or checked.name, registry, folder, start)
         if result.status == "refused":
-            _explain_refusal(folder.log, registry, result)
+            _explain_refusal(folder.log, registry, result, checked)
     if result.status == "refused" or (result.weld and not result.weld.completed):
         raise typer.Exit(1)
 
@@ -159,18 +159,20 @@ def _refuse(options: object, why: str) -> None:
         raise StageError(why)
 
 
-def _explain_refusal(log: Path, registry: Registry, result: Result) -> None:
+def _explain_refusal(log: Path, registry: Registry, result: Result, recipe: Recipe) -> None:
     """Print a refusal in three parts; the doctor looks for the mistake behind it."""
     from rich.console import Console
 
     from flangeye.cli.summary import print_refusal
+    from flangeye.doctor import evidence_of
     from flangeye.files.elsewhere import with_urls
 
     wrong = str(result.refused)
     doctor = with_urls(f"flangeye doctor {log}")
-    finding = _first_finding(log, registry)
+    finding = _first_finding(log, registry, recipe)
     if finding:
-        known = f"{wrong}. Doctor: {finding.name}"
+        evidence = evidence_of(finding)
+        known = f"with that mended: {evidence}" if evidence else wrong
         print_refusal(Console(), finding.what, known, finding.choices[:2] or [doctor])
         return
     known = "no mistake was recognised in poses or scans"
@@ -180,7 +182,7 @@ def _explain_refusal(log: Path, registry: Registry, result: Result) -> None:
     print_refusal(Console(), wrong, known, [doctor, more] if result.holdout else [doctor])
 
 
-def _first_finding(log: Path, registry: Registry) -> Finding | None:
+def _first_finding(log: Path, registry: Registry, recipe: Recipe) -> Finding | None:
     """Return the mistake that explains most of a run's errors, if the doctor finds one."""
     from flangeye.cli.console import of_foreign
     from flangeye.doctor import examine, examine_cell, open_cell, open_session
@@ -191,10 +193,10 @@ def _first_finding(log: Path, registry: Registry) -> Finding | None:
             of_foreign(log, "it cannot be examined"),
             at_work("looking for the mistake", len(checks)) as checked,
         ):
-            if cell := open_cell(log, registry):
+            if cell := open_cell(log, registry, recipe):
                 found = examine_cell(*cell)
             else:
-                found = examine(open_session(log, registry), checks, checked)
+                found = examine(open_session(log, registry, recipe), checks, checked)
     except FlangeyeError:
         return None  # the doctor needs more than this log has, and says so when it is asked
     return next(iter(found.findings), None)

@@ -36,7 +36,8 @@ def print_summary(
     for each in result.warnings:
         if each.text not in said:
             write(console, wrapped(console, f"warning: {each.text}"), "yellow")
-            write(console, wrapped(console, f"  -> {each.fix}"), "yellow")
+            fix = each.fix.replace("RUN", run)
+            write(console, wrapped(console, f"  -> {fix}"), "yellow")
     rows(console, errors(result))
     for name, estimate in result.transforms.items() if not result.refused else ():
         matrix = ["  " + "  ".join(f"{x:10.6f}" for x in row) for row in estimate.matrix]

@@ -55,10 +55,17 @@ def _details(finding: Finding) -> list[str]:
         shown = ", ".join(finding.samples[:LISTED])
         more = len(finding.samples) - LISTED
         lines.append(f"   samples: {shown}" + (f" and {more} more" if more > 0 else ""))
-    if finding.before is not None and finding.after is not None:
-        error = f"error {_error(finding.before)} before, {_error(finding.after)} after"
-        lines.append(f"   evidence: {error}; by chance {_chance(finding.probability)}")
+    if evidence := evidence_of(finding):
+        lines.append(f"   evidence: {evidence}")
     return [*lines, *fix_lines(finding, "   ")]
+
+
+def evidence_of(finding: Finding) -> str:
+    """Return by how much a correction shrinks the errors; empty where they say nothing."""
+    if finding.before is None or finding.after is None:
+        return ""
+    error = f"error {_error(finding.before)} before, {_error(finding.after)} after"
+    return f"{error}; by chance {_chance(finding.probability)}"
 
 
 def fix_lines(finding: Finding, indent: str) -> list[str]:

@@ -137,7 +137,7 @@ def _set_aside(log: RunLog) -> Iterator[Finding]:
     """Yield a note on the observations that the run's solver did not use."""
     of_solver = [o for o in (log.result or {}).get("observations", ()) if o["residual"] is not None]
     gone = [o for o in of_solver if not o["used"]]
-    if gone:
+    if gone and len(gone) < len(of_solver):
         worst = sorted(gone, key=lambda o: -o["residual"])
         told = ", ".join(f"'{o['id']}' {1e3 * o['residual']:.1f} mm" for o in worst[:LISTED])
         what = f"the run's solver did not use {len(gone)} of the samples: {told} off"

@@ -9,6 +9,7 @@ distortion: a side of 200 px away from the middle is bent by half a pixel.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -109,13 +110,29 @@ def _charuco(board: Board, grey: Grey, _image: Image) -> Corners | Rejected:
     corners, ids, _, markers = detector.detectBoard(grey)
     count = 0 if ids is None else len(ids)
     if count < FEWEST_CHARUCO:
-        seen = 0 if markers is None else len(markers)
+        seen = [] if markers is None else [int(each) for each in np.asarray(markers).ravel()]
+        told = _of_other_size(board, seen) if seen else _of_other_families(board, grey)
         return Rejected(
             f"{count} corners of the ChArUco board found, at least {FEWEST_CHARUCO} are needed "
-            f"({seen} of its markers were{'' if seen else _of_other_families(board, grey)})"
+            f"({len(seen)} of its markers were{told})"
         )
     pixels = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
     return Corners(pixels, board.inner_corners()[np.asarray(ids).ravel()])
+
+
+def _of_other_size(board: Board, seen: Sequence[int]) -> str:
+    """Return which markers are seen where they are another board's; empty where too few are.
+
+    The markers of a board are numbered row by row, so corners between them are found only with the
+    columns and rows of the print.
+    """
+    if len(seen) < FEWEST_CHARUCO:
+        return ""
+    last = board.columns * board.rows // 2 - 1
+    return (
+        f": {min(seen)} to {max(seen)}, and a board of {board.columns} x {board.rows} squares has "
+        f"0 to {last}; count the squares of the print"
+    )
 
 
 def _of_other_families(board: Board, grey: Grey) -> str:

@@ -19,6 +19,7 @@ from flangeye.errors import RecipeError
 from flangeye.files.regular import read_text
 from flangeye.files.validation import sentence
 from flangeye.files.yaml_lines import MAX_BYTES, Document, parse_yaml, read_yaml
+from flangeye.models.boards import Board
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.registry import Lookup, PluginNotFoundError, Registry
 from flangeye.plugin.stage import Params, Stage
@@ -48,7 +49,8 @@ class Recipe:
         name: File name without its suffix.
         header: The sections, as written.
         steps: The checked steps.
-        context: What stages may ask for by type: robot, scanner, flange, sphere, workspace, seed.
+        context: What stages may ask for by type: robot, scanner, flange, sphere, workspace, seed,
+            and the printed board that its fit step looks for.
         text: The recipe as the person wrote it.
     """
 
@@ -172,6 +174,8 @@ class _Checker:
         steps = self._steps(entries if isinstance(entries, list) else [], context)
         if self._mistakes:
             raise RecipeError("\n".join(self._mistakes))
+        boards = (getattr(step.params, "board", None) for step in steps)
+        context[Board] = next((board for board in boards if isinstance(board, Board)), None)
         return Recipe(name, header, tuple(steps), context, text)
 
     def complain(self, keys: Sequence[Hashable], message: str) -> None:

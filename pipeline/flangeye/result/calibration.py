@@ -98,7 +98,7 @@ def standing_warnings(result: Result) -> list[WarningResult]:
         fix = "add '- verify.holdout' after the solver"
         found.append(("no verify step judged this calibration", fix))
     used, count = sum(o.used for o in result.observations), len(result.observations)
-    if used < MOST * count:
+    if used < MOST * count and not (result.refused and used == 0):
         text = f"{count - used} of {count} captures were rejected"
         found.append((text, "look for the cause: flangeye doctor RUN"))
     return [WarningResult(text=text, fix=fix) for text, fix in found]

@@ -7,6 +7,7 @@ per-capture steps. When the solver stops pulling, nothing more is acquired.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import fields, replace
@@ -18,7 +19,7 @@ import pluggy
 
 from flangeye import types as t
 from flangeye.devices import MotionAllowed
-from flangeye.errors import CalibrationRefused, FlangeyeError, StageError
+from flangeye.errors import CalibrationRefused, FlangeyeError, NothingSeen, StageError
 from flangeye.models.cell import Cell, cell_of
 from flangeye.models.configuration import CELL, DEFAULT, Configuration
 from flangeye.models.robots import RobotModel, SecondRobot
@@ -174,6 +175,7 @@ class Runner:
             with self._watch.timing(label):
                 capture = next(captures, None)
             if capture is None:
+                self._require_seen()
                 return
             seconds = self._watch.seconds[label] - before
             if isinstance(capture, t.Rejection):
@@ -189,6 +191,19 @@ class Runner:
             self._hooks.flangeye_capture_finished(capture=capture.id)
             if observation is not None:
                 yield observation
+
+    def _require_seen(self) -> None:
+        """Refuse captures of which none shows the target, by the reason that most of them share.
+
+        Raises:
+            NothingSeen: None does; with verification views alone there was none to look at.
+        """
+        why = [f"{each.stage}: {each.reason}" for each in self._outcome.rejections]
+        if self._outcome.seen or self._values[t.Views] or not why:
+            return
+        usual, share = Counter(why).most_common(1)[0]
+        of = f"{share} of the " if share < len(why) else "the "
+        raise NothingSeen(f"no capture can be used; {of}{len(why)} were rejected by {usual}")
 
     def _may_work_ahead(self, stream: t.Captures) -> bool:
         steps = (*self._steps("segment"), *self._steps("fit"))

@@ -173,18 +173,54 @@ def _looked(images: Mapping[str, Grey], board: Board) -> dict[str, Corners | Rej
     views = {name: Image(pixels, np.eye(3)) for name, pixels in images.items()}
     if len(views) <= FIRST:
         return {name: find_corners(board, view) for name, view in views.items()}
-    first = [list(views)[i] for i in np.linspace(0, len(views) - 1, FIRST).astype(int)]
+    first = _spread_over(list(views))
     early = {name: find_corners(board, views[name], thorough=False) for name in first}
     early |= {n: find_corners(board, views[n]) for n in first[:2] if isinstance(early[n], Rejected)}
-    why = [found.reason for found in early.values() if isinstance(found, Rejected)]
-    if len(why) == len(early):
-        instead = why[0] if board.kind == "charuco" else board_seen(views[first[0]])
-        raise StageError(
-            f"none of {len(early)} of the {len(images)} images, spread over all, shows the board "
-            f"({board.kind}, {board.columns} x {board.rows}); {first[0]}: {instead}"
-        )
+    missed = {name: found for name, found in early.items() if isinstance(found, Rejected)}
+    if len(missed) == len(early):
+        raise _not_shown(board, missed, len(images), views[first[0]])
     seen = {name: found for name, found in early.items() if isinstance(found, Corners)}
     return {name: seen.get(name) or find_corners(board, view) for name, view in views.items()}
+
+
+def _spread_over(names: Sequence[str]) -> list[str]:
+    return [names[i] for i in np.linspace(0, len(names) - 1, FIRST).astype(int)]
+
+
+def _not_shown(
+    board: Board, missed: Mapping[str, Rejected], count: int, first: Image
+) -> StageError:
+    """Return the error that no image shows the board, with what the first of them shows."""
+    name, found = next(iter(missed.items()))
+    instead = found.reason if board.kind in ("charuco", "marker") else board_seen(first)
+    what = board.kind if board.kind == "marker" else f"{board.kind}, {board.columns} x {board.rows}"
+    return StageError(
+        f"none of {len(missed)} of the {count} images, spread over all, shows the board ({what}); "
+        f"{name}: {instead}"
+    )
+
+
+def _require_shown(
+    usable: Sequence[Recording], cameras: Mapping[str, Camera], board: Board
+) -> None:
+    """Refuse images of which none shows the board that is fitted, before all are searched for it.
+
+    Raises:
+        StageError: None of those that are looked at first does; names the board that is seen.
+    """
+    files = {r.id: r.image for r in usable if r.image is not None}
+    first = _spread_over(list(files))
+    views = {name: Image(read_image(files[name]), *cameras[name]) for name in first}
+    missed: dict[str, Rejected] = {}
+    # A checkerboard is looked for in every way in two of them; the others have one way
+    looks = [(name, False) for name in first]
+    looks += [(name, True) for name in first[:2] if board.kind == "checkerboard"]
+    for name, thorough in looks:
+        found = find_corners(board, views[name], thorough)
+        if isinstance(found, Corners):
+            return
+        missed[name] = found
+    raise _not_shown(board, missed, len(files), views[first[0]])
 
 
 def _require_views(seen: int, looked: Mapping[str, Corners | Rejected]) -> None:
@@ -314,7 +350,9 @@ class ImagesParams(OpeningParams):
 
 
 @stage("acquire.images")
-def acquire_images(archive: ArchivePath, params: ImagesParams) -> Captures:
+def acquire_images(
+    archive: ArchivePath, params: ImagesParams, board: Board | None = None
+) -> Captures:
     """Replay recorded images and robot poses; for targets that are found in images.
 
     A cloud of the same name as an image comes with it: where it is organised as the image, fits
@@ -326,6 +364,8 @@ def acquire_images(archive: ArchivePath, params: ImagesParams) -> Captures:
         raise StageError(f"{recorded.root}: holds no images ({recorded.layout})")
     check_poses(recorded.root, usable, whole=True, fewest=params.fewest)
     cameras, told = _cameras(recorded.root, usable, params)
+    if board is not None and params.board is None and len(usable) > FIRST:
+        _require_shown(usable, cameras, board)
     files = [path for r in usable for path in (r.image, r.cloud) if path is not None]
     skipped = skipped_note(recorded, lambda r: r.image is not None, "image")
     source = source_of(recorded, [*skipped, *told], digests_of([*files, *recorded.files]))

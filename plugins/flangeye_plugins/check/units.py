@@ -42,6 +42,10 @@ STEPS = (0.1, 1e-2, 1e-3, 1e-4, 1e-5)
 WHOLE = 1e-3
 """By what share of the step a position may miss a multiple of it."""
 
+CALIBRATE = (
+    "calibrate the camera: add board: {kind: …, columns: …, rows: …, square: …} to acquire.images, "
+    "which finds it by its views of the board"
+)
 SHARE = 0.5
 """Rounding to a step moves a place by half of it, rms; this share of the limit is too much."""
 
@@ -204,17 +208,23 @@ def _number(factor: float) -> float:
     return float(f"{factor:.10g}")
 
 
+ALONG = {"size": np.ones(3), "focal": np.array([0.0, 0.0, 1.0])}
+"""Which of the target's coordinates in the camera a wrong length stretches: all of them, or, as a
+wrong focal length does (Zhang 2000, equation 2), its depth alone."""
+
+
 @part("check.size")
 def size(session: RecordedSession) -> Findings:
-    """The marker's distances are all too long or too short by one factor: its size is wrong."""
+    """The target's distances are off by one factor: its size is wrong, or the focal length."""
     session.require_samples()
     if not np.isfinite(session.rotations).any():
         raise NotApplicable("no marker's whole pose was measured")
     null = fit_of(session)
-    factor = _factor(session, null)
-    if not 0.2 < factor < 5:
+    factors = {kind: _factor(session, null, along) for kind, along in ALONG.items()}
+    tried = [_stretched(session, kind, k) for kind, k in factors.items() if 0.2 < k < 5]
+    if not tried:
         return
-    corrected_session = replace(session, centres=session.centres * factor)
+    kind, factor, corrected_session = max(tried, key=lambda one: fit_of(one[2]).likelihood[0])
     found = fit_of(corrected_session)
     evidence = best_of(null, found, 1)
     ratio, count = float(found.likelihood[0] - null.likelihood[0]), float(null.count[0])
@@ -222,21 +232,39 @@ def size(session: RecordedSession) -> Findings:
     effect = abs(np.log(factor)) / 5e-3
     p = exceedance(ratio, count, 1, count - found.parameters - 1, effect)
     if p < 1 and explained(corrected_session):
+        evidence = evidence._replace(probability=min(1.0, len(tried) * p))
+        if kind == "focal":
+            what = f"the camera's focal length is {factor:.4f} times as long as was said"
+            yield evidence.finding("focal length", what, corrected_session, CALIBRATE)
+            return
         what = f"the marker is {factor:.4f} times as large as the recipe says"
         fix = f"measure it after printing: its lengths in the fit step times {factor:.4f}"
         if session.acquire == "acquire.samples":
             fix = session.read_with(target_scale=float(f"{factor:.4f}")).step()
-        evidence = evidence._replace(probability=p)
         yield evidence.finding("target size", what, corrected_session, fix)
 
 
-def _factor(session: RecordedSession, null: VariantFits) -> float:
-    """Return by how much the marker's positions must grow; linear once the rotations are known."""
+def _stretched(
+    session: RecordedSession, kind: str, factor: float
+) -> tuple[str, float, RecordedSession]:
+    scale = 1 + (factor - 1) * ALONG[kind]
+    return kind, factor, replace(session, centres=session.centres * scale)
+
+
+def _factor(session: RecordedSession, null: VariantFits, along: Floats) -> float:
+    """Return by how much coordinates must grow; linear once the rotations are known.
+
+    Args:
+        session: The samples.
+        null: Their calibration as they are.
+        along: (3,) 1 for each coordinate in the camera that grows, 0 for the others.
+    """
     seen, equations = session.seen, equations_of(session)
-    turned = session.centres[seen] @ null.unknowns.rotation[0].T
+    turn = null.unknowns.rotation[0].T
+    grown, kept = session.centres[seen] * along @ turn, session.centres[seen] * (1 - along) @ turn
     mounts = equations.carried(null.unknowns.other)[0][seen]
-    eye = np.broadcast_to(np.eye(3), (len(turned), 3, 3))
-    parts, right = [turned[..., None], eye, -mounts[:, :3, :3]], mounts[:, :3, 3]
+    eye = np.broadcast_to(np.eye(3), (len(grown), 3, 3))
+    parts, right = [grown[..., None], eye, -mounts[:, :3, :3]], mounts[:, :3, 3] - kept
     if equations.bases is not None:
         # The second arm's base moves too: what it is now comes off, and is found again.
         bases = equations.bases[0, seen, :3, :3]

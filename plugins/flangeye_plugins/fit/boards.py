@@ -71,6 +71,12 @@ class CharucoParams(SquaresParams, DictionaryParams):
             raise ValueError("the markers of a ChArUco board are smaller than its squares")
         return self
 
+    @property
+    def board(self) -> Board:
+        """The print."""
+        size = self.columns, self.rows, self.square
+        return Board("charuco", *size, self.marker, self.dictionary)
+
 
 class CheckerboardParams(SquaresParams):
     """Parameters of ``fit.checkerboard``."""
@@ -83,6 +89,11 @@ class CheckerboardParams(SquaresParams):
                 "turn; use one with an odd and an even number of squares, or a ChArUco board"
             )
         return self
+
+    @property
+    def board(self) -> Board:
+        """The print."""
+        return Board("checkerboard", self.columns, self.rows, self.square)
 
 
 class CirclesParams(TargetParams):
@@ -102,12 +113,22 @@ class CirclesParams(TargetParams):
             )
         return self
 
+    @property
+    def board(self) -> Board:
+        """The print."""
+        return Board("circles", self.columns, self.rows, self.spacing, self.diameter)
+
 
 class MarkerParams(DictionaryParams):
     """Parameters of ``fit.aruco``."""
 
     id: int = Field(0, ge=0, description="Which marker of the dictionary.")
     size: Length = param(gt=0, description="Edge of the black square, measured on the print.")
+
+    @property
+    def board(self) -> Board:
+        """The print."""
+        return Board("marker", 1, 1, self.size, dictionary=self.dictionary, marker_id=self.id)
 
 
 @stage("fit.charuco")
@@ -116,10 +137,7 @@ def fit_charuco(capture: Capture, params: CharucoParams) -> PoseFeature | Reject
 
     The frame has its origin in the middle of the board, x right, y up, z towards the camera.
     """
-    board = Board(
-        "charuco", params.columns, params.rows, params.square, params.marker, params.dictionary
-    )
-    return fit_board(capture, board, params)
+    return fit_board(capture, params.board, params)
 
 
 @stage("fit.checkerboard")
@@ -129,9 +147,7 @@ def fit_checkerboard(capture: Capture, params: CheckerboardParams) -> PoseFeatur
     The frame has its origin in the middle of the board, x right, y up, z towards the camera; the
     square at the top left is black.
     """
-    return fit_board(
-        capture, Board("checkerboard", params.columns, params.rows, params.square), params
-    )
+    return fit_board(capture, params.board, params)
 
 
 @stage("fit.circles")
@@ -141,8 +157,7 @@ def fit_circles(capture: Capture, params: CirclesParams) -> PoseFeature | Reject
     The frame has its origin in the middle of the grid, x right, y up, z towards the camera; the
     first row begins half a step further to the left than the second.
     """
-    size = params.columns, params.rows, params.spacing
-    board = Board("circles", *size, params.diameter)
+    board = params.board
     if capture.image is None:
         return Rejected(NO_IMAGE)
     middles = find_corners(board, capture.image)
@@ -161,8 +176,7 @@ def fit_aruco(capture: Capture, params: MarkerParams) -> PoseFeature | Rejected:
     Four corners tell little: a board with many gives a pose several times better. Seen nearly
     frontally a marker has two poses that fit alike, and is set aside unless depth decides.
     """
-    board = Board("marker", 1, 1, params.size, dictionary=params.dictionary, marker_id=params.id)
-    return fit_board(capture, board, params)
+    return fit_board(capture, params.board, params)
 
 
 def fit_board(capture: Capture, board: Board, params: TargetParams) -> PoseFeature | Rejected:

@@ -16,6 +16,7 @@ from flangeye.types import ArchivePath, Image
 from flangeye.units import SI
 from flangeye_emulators.world.board_image import BoardCamera, render_board
 from flangeye_plugins.acquire.images import ImagesParams, SeenBoardParams, acquire_images, lens_of
+from flangeye_plugins.fit.boards import CheckerboardParams
 
 MATRIX = np.array([[1000.0, 0, 407], [0, 1003, 295], [0, 0, 1]])
 LENS = np.array([-0.12, 0.05, 0.001, -0.0005, 0.0])
@@ -135,12 +136,7 @@ def test_too_few_or_too_equal_views_are_refused(views: Any) -> None:
 
 
 def test_a_folder_of_images_needs_no_calibrated_camera(views: Any, tmp_path: Path) -> None:
-    rows = ["cloud,x_m,y_m,z_m,rx_rad,ry_rad,rz_rad"]
-    for k, (name, pixels) in enumerate(views.items()):
-        cv2.imwrite(str(tmp_path / f"{name}.png"), pixels)
-        rows.append(f"{0.1 * k},0.1,0.2,{0.1 * k},0,0")
-    (tmp_path / "poses.csv").write_text("\n".join(["x,y,z,a,b,c", *rows[1:]]))
-    reader = table_reader()
+    reader = written_with_poses(tmp_path, views)
     known = ImagesParams(path=tmp_path, reader=reader, board=OF_BOARD)
     taken = acquire_images(ArchivePath(None), known)
     first = next(iter(taken))
@@ -148,6 +144,28 @@ def test_a_folder_of_images_needs_no_calibrated_camera(views: Any, tmp_path: Pat
     assert any(note.startswith("camera by 12 views") for note in taken.source.notes)
     with pytest.raises(StageError, match=r"or board: \{kind: charuco, …\} to find it"):
         acquire_images(ArchivePath(None), ImagesParams(path=tmp_path, reader=reader))
+
+
+def test_images_of_a_known_camera_without_the_board_that_is_fitted_end_early(
+    views: Any, tmp_path: Path
+) -> None:
+    reader = written_with_poses(tmp_path, views)
+    lens = {"focal_length": (1000.0, 1003.0), "principal_point": (407.0, 295.0)}
+    params = ImagesParams(path=tmp_path, reader=reader, **lens)
+    fitted = CheckerboardParams(columns=10, rows=7, square=SI(0.02)).board
+    with pytest.raises(StageError, match=r"none of 8 of the 12 images.*\(checkerboard, 10 x 7\)"):
+        acquire_images(ArchivePath(None), params, fitted)
+    assert acquire_images(ArchivePath(None), params, BOARD).total == 12
+
+
+def written_with_poses(folder, views):
+    """Write images with poses beside them; return how the poses are read."""
+    rows = ["x,y,z,a,b,c"]
+    for k, (name, pixels) in enumerate(views.items()):
+        cv2.imwrite(str(folder / f"{name}.png"), pixels)
+        rows.append(f"{0.1 * k},0.1,0.2,{0.1 * k},0,0")
+    (folder / "poses.csv").write_text("\n".join(rows))
+    return table_reader()
 
 
 def table_reader():

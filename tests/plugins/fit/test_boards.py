@@ -214,6 +214,16 @@ def test_markers_of_another_family_are_named(kind: str, family: str, told: str) 
     assert not isinstance(fit(printed, written), Rejected)
 
 
+def test_a_charuco_board_of_another_size_is_told_by_its_markers() -> None:
+    board, fit, params = FITS["charuco"]
+    printed = capture(board, looking())
+    larger = params.model_copy(update={"columns": board.columns + 3, "rows": board.rows + 2})
+    last = (board.columns + 3) * (board.rows + 2) // 2 - 1
+    assert (
+        f"squares has 0 to {last}; count the squares of the print)" in fit(printed, larger).reason
+    )
+
+
 def test_a_family_may_be_written_in_small_letters() -> None:
     assert MarkerParams(size=SI(0.02), dictionary="5x5_100").dictionary == "5X5_100"
     assert MarkerParams(size=SI(0.02), dictionary="apriltag_36H11").dictionary == "APRILTAG_36h11"
