@@ -52,7 +52,7 @@ steps:
   - solve.robust
   - verify.holdout
   - scan.live
-  - seam.groove
+  - seam.joint: {{joint: vee, line: [[510 mm, -50 mm, 260 mm], [700 mm, 20 mm, 260 mm]]}}
 """
 
 

@@ -77,7 +77,6 @@ STAGES = {
     "seam.cad": "flangeye_plugins.seam.cad:seam_cad",
     "seam.line": "flangeye_plugins.seam.line:seam_line",
     "seam.joint": "flangeye_plugins.seam.joint:seam_joint",
-    "seam.groove": "flangeye_plugins.seam.groove:seam_groove",
     "weld.tactile": "flangeye_plugins.weld.tactile:weld_tactile",
 }
 

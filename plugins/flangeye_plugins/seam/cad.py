@@ -85,7 +85,7 @@ def seam_cad(  # noqa: PLR0913  what it asks the runner for
     if scan.places:
         raise CalibrationRefused(
             f"{STAGE}: the scan is put together from {len(scan.places)} places, and a CAD is "
-            "registered to what one place sees; plan the seam with seam.groove"
+            "registered to what one place sees; plan the seam with seam.joint"
         )
     seen = seen_in_base(STAGE, scan, answer, robot)
     rng = np.random.default_rng([SEED, seed])

@@ -72,6 +72,11 @@ class Course:
         along = (s - self.step * np.round(s / self.step))[:, None] * self.axes[k, 0]
         return self.points[k] + along, self.axes[k]
 
+    def points_at(self, local: Floats) -> Floats:
+        """Return (N, 3) points that are at s, y and z (N, 3) [m]."""
+        origin, axes = self.at(local[:, 0])
+        return np.asarray(origin + np.einsum("ni,nij->nj", local[:, 1:], axes[:, 1:]))
+
     def moved(self, y: Floats, z: Floats, roll: Floats) -> Course:
         """Return frames along a line that lies (K,) beside this one and is rolled (K,) [rad]."""
         points = self.points + y[:, None] * self.axes[:, 1] + z[:, None] * self.axes[:, 2]

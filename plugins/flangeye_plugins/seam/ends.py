@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,6 +13,14 @@ from flangeye_plugins.seam.template import EDGES, Section
 
 FEWEST = 5
 """Lanes that an end is known from."""
+LOOSE = 0.5e-3
+"""An end that is known less well is not sharp [m]."""
+TWO = 2.0
+"""Lanes whose middle half is spread over more pixels end at two places."""
+AROUND = 0.06
+"""Directions about a line in which the scanner may look past it: 40 mm at 0.7 m [rad]."""
+SIGMA_OF_IQR = 0.7413
+"""Of a normal distribution, from its quartiles' distance."""
 NEAR = 8e-3
 """Lanes this near to the seam say where it ends [m]."""
 
@@ -66,26 +76,113 @@ def _on_face(section: Section, q: Floats, face: int, tolerance: float) -> Mask:
     return np.asarray(np.abs(q @ section.normals[face] - section.heights[face]) < tolerance)
 
 
-def seam_end(s: Floats, across: Floats, pitch: float, sign: int) -> tuple[float, float]:
-    """Return where along the seam a surface ends, and its standard deviation [m].
+@dataclass(frozen=True)
+class End:
+    """Where along the seam a surface ends [m].
 
-    The median over lanes; half of them may have lost their last points.
+    Attributes:
+        place: Along the way to the end: less is sooner.
+        deviation: Its standard deviation.
+        seen: Whether the scanner looked past it there; otherwise it may go on unseen.
+    """
+
+    place: float
+    deviation: float
+    seen: bool
+
+    @property
+    def sharp(self) -> bool:
+        """Whether the last points of the surface are at one place."""
+        return self.deviation < LOOSE
+
+
+def surface_end(way: Floats, past: Mask, pitch: float) -> End | None:
+    """Return where a surface ends, from where its lanes do; None where it has too few.
+
+    The median over lanes, of those behind which the scanner sees something farther away where
+    there are enough. Lanes that end at two places are no sample of one.
 
     Args:
-        s: (N,) of its points [m].
-        across: (N,) their distance from the seam [m].
+        way: (L,) ends of lanes along the way to the end [m].
+        past: (L,) where the scanner looks past them.
         pitch: Distance between neighbouring points [m].
-        sign: 1 for the end, -1 for the start.
     """
-    last, more = last_in_lanes(across, sign * s, pitch)
-    if len(last) < FEWEST:
-        return float(sign * np.inf), np.inf
-    found = sign * s[last] + more
-    low, middle, high = np.quantile(found, [0.25, 0.5, 0.75])
-    scatter = (high - low) / 1.35
-    # Lanes that end at two places are no sample of one.
-    share = 1.0 if high - low > 5 * pitch else 1.25 / np.sqrt(len(last))
-    return float(sign * middle), float(np.hypot(share * scatter, pitch / 6))
+    if len(way) < FEWEST:
+        return None
+    seen = past.sum() >= FEWEST
+    way = way[past] if seen else way
+    low, middle, high = np.quantile(way, [0.25, 0.5, 0.75])
+    share = 1.25 / np.sqrt(len(way)) if seen and high - low <= TWO * pitch else 1.0
+    return End(float(middle), float(share * SIGMA_OF_IQR * (high - low)), bool(seen))
+
+
+def soonest(ends: list[End]) -> tuple[float, float]:
+    """Return the end that a seam comes to first, from those of its surfaces, and its deviation [m].
+
+    Surfaces that end there as well, for all that is known, tell its place together. One whose end
+    is hidden or blurred, and is not seen so far, may end anywhere in between.
+    """
+    if not ends:
+        return np.inf, np.inf
+    sharp = [end for end in ends if end.sharp]
+    certain = [end for end in sharp if end.seen] or sharp or ends
+    first = min(certain, key=lambda end: end.place)
+    same = [first]
+    for end in certain:
+        near = 3 * np.hypot(first.deviation, end.deviation)
+        if end is not first and end.sharp and end.place - first.place <= near:
+            same.append(end)
+    weights = np.array([max(end.deviation, 1e-6) ** -2 for end in same])
+    place = float(weights @ [end.place for end in same] / weights.sum())
+    hidden = max([0.0, *(place - end.place for end in ends)])
+    return place, float(np.hypot(weights.sum() ** -0.5, hidden / np.sqrt(12)))
+
+
+class Rays:
+    """What the scanner saw along its rays, from one or more places, about a line."""
+
+    def __init__(self, eyes: Floats, clouds: tuple[Floats, ...], line: Floats) -> None:
+        """Keep what lies in the directions of a line.
+
+        Args:
+            eyes: (P, 3) where it was [m].
+            clouds: P of (N, 3), what it saw from there [m].
+            line: (K, 3) [m].
+        """
+        from scipy.spatial import cKDTree
+
+        self._places = []
+        for eye, cloud in zip(eyes, clouds, strict=True):
+            sight, seen = _directions(line - eye)[0], cloud - eye
+            rays, far = _directions(seen)
+            low, high = sight.min(axis=0) - AROUND, sight.max(axis=0) + AROUND
+            about = ((rays > low) & (rays < high)).all(axis=1)
+            if about.any():
+                self._places.append((eye, cKDTree(rays[about]), far[about]))
+
+    def past(self, points: Floats, pitch: float, tolerance: float) -> Mask:
+        """Return at which of points (N, 3) it saw only what is farther away by the tolerance [m].
+
+        Args:
+            points: Where something might be [m].
+            pitch: Distance between neighbouring points of the scan there [m].
+            tolerance: What is farther away by less is there [m].
+        """
+        out = np.zeros(len(points), dtype=bool)
+        for eye, tree, far in self._places:
+            rays, away = _directions(points - eye)
+            off, at = tree.query(rays, k=4)
+            # A ray is seen by what lies within a pixel of it.
+            near = off < pitch / away[:, None]
+            behind = far[np.minimum(at, len(far) - 1)] - away[:, None] > tolerance
+            out |= near.any(axis=1) & (behind | ~near).all(axis=1)
+        return out
+
+
+def _directions(sight: Floats) -> tuple[Floats, Floats]:
+    """Return unit vectors (N, 3), and the lengths (N,) [m]."""
+    lengths = np.linalg.norm(sight, axis=1)
+    return sight / lengths[:, None], lengths
 
 
 def surfaces(swept: Swept, local: Floats, tolerance: float) -> dict[int, Mask]:

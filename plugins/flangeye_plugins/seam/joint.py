@@ -15,7 +15,14 @@ from flangeye.models.scanners import ScannerModel
 from flangeye.types import Box, Floats, Seam, VerifiedHandEye, WorkpieceScan
 from flangeye.units import Length, param
 from flangeye_plugins.seam.course import Course, course
-from flangeye_plugins.seam.ends import face_ends, seam_end, surfaces
+from flangeye_plugins.seam.ends import (
+    Rays,
+    face_ends,
+    last_in_lanes,
+    soonest,
+    surface_end,
+    surfaces,
+)
 from flangeye_plugins.seam.planned import (
     SeamParams,
     answer_for,
@@ -30,15 +37,21 @@ from flangeye_plugins.seam.sweep import WIDE, Spline, Swept, fitted, swept_from
 from flangeye_plugins.seam.template import EDGES, FACES, JOINTS, Joint
 
 STAGE = "seam.joint"
-MOST = 120_000
+MOST = 400_000
 """Points that are fitted to; of more, every second, third, ..."""
 FEWEST = 300
 REFITS = 3
 """The second and third time along the line that the first has found."""
 UNSHARED = 0.15
 """Of a pixel, what an edge may be off for how pixels there are measured."""
-LOOSE = 0.5e-3
-"""Ends of surfaces that are known less well are not taken for the same [m]."""
+UNSEEN = 0.5
+"""Of a pixel, standard deviation of an end for pixels that scanners drop or invent beside a jump of
+depth: the simulated PhoXi M drops 0.7 to 1.2 of one."""
+TURNED = np.cos(np.radians(120))
+"""A rough line that turns by more goes back."""
+BEYOND = (1.0, 2.0, 3.0, 4.0)
+"""Pixels beyond a surface's last point at which the scanner may look past its end."""
+END = "max_end_deviation"
 CELL = 3e-3
 """Lengths of the seam that are seen or not [m]."""
 PLANE = 0.95
@@ -69,6 +82,15 @@ class JointParams(SeamParams):
     max_deviation: Length = param(
         "0.5 mm", gt=0, description="Largest standard deviation of the seam across it, in the scan."
     )
+    max_end_deviation: Length = param(
+        "1 mm", gt=0, description="Largest standard deviation along it of where it starts or ends."
+    )
+    max_apart: Length = param(
+        "1 mm",
+        gt=0,
+        description="Largest distance of clouds from neighbouring places where both show the same "
+        "face, median.",
+    )
     min_explained: float = Field(
         0.6, gt=0, lt=1, description="Smallest share of the points about the seam on the joint."
     )
@@ -86,6 +108,7 @@ class Found:
         swept: Its section, beside these.
         local: (N, 3) points about it.
         pitch: Distance between neighbouring points [m].
+        rays: What the scanner saw along its rays.
         ends: Where along the course it starts and ends [m].
         deviations: Of both ends [m]; infinite where an end was not seen.
     """
@@ -94,6 +117,7 @@ class Found:
     swept: Swept
     local: Floats
     pitch: float
+    rays: Rays
     ends: tuple[float, float] = (0.0, 0.0)
     deviations: tuple[float, float] = (np.inf, np.inf)
 
@@ -137,6 +161,7 @@ def seam_joint(  # noqa: PLR0913  what it asks the runner for
     """
     answer = answer_for(STAGE, calibration, params)
     seen = seen_in_base(STAGE, scan, answer, robot)
+    _refuse_apart(seen, params)
     found = _found(seen, _rough(seen, params, seam), params)
     figures = _judged(found, params)
     line, openings, covariances = _line(found, params.spacing)
@@ -158,13 +183,31 @@ def seam_joint(  # noqa: PLR0913  what it asks the runner for
     return for_the_controller(planned, answer, robot, params)
 
 
+def _refuse_apart(seen: PlacedScan, params: JointParams) -> None:
+    """Refuse clouds of several places that do not agree where they show the same face."""
+    if seen.apart is not None and seen.apart > params.max_apart:
+        raise CalibrationRefused(
+            f"{STAGE}: neighbouring clouds are {seen.apart * 1e3:.2f} mm apart where both show the "
+            f"same face, limit {params.max_apart * 1e3:g} mm (max_apart); calibrate the scanner on "
+            "the flange again"
+        )
+
+
 def _rough(seen: PlacedScan, params: JointParams, seam: Seam | None) -> Course:
     """Return frames along the rough line, in ``camera``."""
     if params.line is None and seam is None:
         raise StageError(f"{STAGE}: knows no rough line; write line:, or put a seam step before it")
     given = np.array(params.line) if params.line else seam.points_in_base  # type: ignore[union-attr]
-    if not (np.linalg.norm(np.diff(given, axis=0), axis=1) > 0).all():
+    steps = np.diff(given, axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    if not (lengths > 0).all():
         raise StageError(f"{STAGE}: line has the same point twice in a row")
+    back = np.einsum("ni,ni->n", steps[:-1], steps[1:]) < TURNED * lengths[:-1] * lengths[1:]
+    if back.any():
+        raise StageError(
+            f"{STAGE}: line turns back at its point {int(np.argmax(back)) + 2}; give its points in "
+            "their order along the seam"
+        )
     line = seen.base_T_camera.inverse().apply(given)
     return course(line, seen.eyes, params.closed, params.reach)
 
@@ -172,16 +215,18 @@ def _rough(seen: PlacedScan, params: JointParams, seam: Seam | None) -> Course:
 def _found(seen: PlacedScan, rough: Course, params: JointParams) -> Found:
     """Return the joint and its ends."""
     box = params.reach + WIDE + 10e-3
-    at, local = rough.local(seen.points, box)
+    points = seen.points
+    at, local = rough.local(points, box)
     if len(at) < FEWEST:
         raise StageError(f"{STAGE}: {len(at)} points are near the line; {FEWEST} are needed")
-    pitch, points = _solid(seen.points[at[:: -(-len(at) // MOST)]])
+    pitch, points = _solid(points[at[:: -(-len(at) // MOST)]])
     at, local = rough.local(points, box)
     points = points[at]
     places = _placed(rough, local, points, params)
     swept = swept_from(places, rough.length, rough.closed)
     line = rough
-    found = Found(line, swept, local, pitch, (0.0, line.length))
+    rays = Rays(seen.eyes, seen.clouds, rough.points)
+    found = Found(line, swept, local, pitch, rays, (0.0, line.length))
     for k in range(REFITS):
         found = found.again(points, box) if k else found
         edges = face_ends(found.swept, found.inside, pitch, params.max_residual)
@@ -238,42 +283,33 @@ def _with_ends(found: Found) -> Found:
     """Return the joint between its ends: it ends where the first of its surfaces does."""
     if found.course.closed:
         return replace(found, ends=(0.0, found.course.length), deviations=(0.0, 0.0))
-    swept, local = found.swept, found.local
+    start, stop = (_end(found, sign) for sign in (-1, 1))
+    return replace(found, ends=(start[0], stop[0]), deviations=(start[1], stop[1]))
+
+
+def _end(found: Found, sign: int) -> tuple[float, float]:
+    """Return where the joint starts (-1) or ends (1) along its course, and its deviation [m].
+
+    Where it goes on to the course's end the deviation is infinite.
+    """
+    swept, local, pitch = found.swept, found.local, found.pitch
     q = swept.in_section(local)
     across = np.linalg.norm(q, axis=1) * np.sign(q[:, 0])
-    start, stop = (
-        _soonest(
-            [
-                seam_end(local[on, 0], across[on], found.pitch, sign)
-                for on in surfaces(swept, local, 4 * swept.sigma).values()
-            ],
-            sign,
-        )
-        for sign in (-1, 1)
-    )
-    low, high = 2 * found.pitch, found.course.length - 2 * found.pitch
-    return replace(
-        found,
-        ends=(max(start[0], 0.0), min(stop[0], found.course.length)),
-        deviations=(
-            start[1] if start[0] > low else np.inf,
-            stop[1] if stop[0] < high else np.inf,
-        ),
-    )
-
-
-def _soonest(ends: list[tuple[float, float]], sign: int) -> tuple[float, float]:
-    """Return the end that a seam comes to first, from those of its surfaces, and its deviation.
-
-    Surfaces that end there as well, for all that is known, tell its place together.
-    """
-    values, deviations = np.array(ends).T
-    k = int(np.argmin(sign * values))
-    sharp = (deviations < LOOSE) & (deviations[k] < LOOSE)
-    same = sharp & (np.abs(values - values[k]) <= 3 * np.hypot(deviations, deviations[k]))
-    same[k] = True
-    weights = deviations[same] ** -2.0
-    return float(weights @ values[same] / weights.sum()), float(weights.sum() ** -0.5)
+    ends = []
+    for on in surfaces(swept, local, 4 * swept.sigma).values():
+        last, more = last_in_lanes(across[on], sign * local[on, 0], pitch)
+        at = local[on][last, :3]
+        on_beyond = sign * (more + pitch * np.array(BEYOND)[:, None]).ravel()
+        there = np.tile(at, (len(BEYOND), 1)) + np.outer(on_beyond, [1, 0, 0])
+        past = found.rays.past(found.course.points_at(there), pitch, 5 * swept.sigma)
+        any_past = np.asarray(past.reshape(len(BEYOND), -1).any(axis=0))
+        end = surface_end(sign * at[:, 0] + more, any_past, pitch)
+        ends += [] if end is None else [end]
+    place, deviation = soonest(ends)
+    last_seen = (found.course.length if sign > 0 else 0.0) - sign * 2 * pitch
+    if place >= sign * last_seen:
+        return (found.course.length if sign > 0 else 0.0), np.inf
+    return sign * place, float(np.hypot(deviation, UNSEEN * pitch))
 
 
 def _line(found: Found, spacing: float) -> tuple[Floats, Floats, Floats]:
@@ -315,9 +351,15 @@ def _judged(found: Found, params: JointParams) -> dict[str, float]:
     start, stop = found.ends
     s = np.linspace(start, stop, 50)
     deviation = float(np.sqrt(np.linalg.eigvalsh(found.swept.line_covariance(s)).max()))
+    named = zip(("start", "end"), found.deviations, strict=True)
+    ends = {name: value for name, value in named if np.isfinite(value)}
     limits = [
         (found.swept.sigma, params.max_residual, "points are {} from the joint", "max_residual"),
         (deviation, params.max_deviation, "the seam is known to {} (1 sigma)", "max_deviation"),
+        *(
+            (value, params.max_end_deviation, f"its {end} is known to {{}} (1 sigma)", END)
+            for end, value in ends.items()
+        ),
     ]
     for value, limit, what, name in limits:
         if not value <= limit:
@@ -345,13 +387,12 @@ def _judged(found: Found, params: JointParams) -> dict[str, float]:
                 f"{STAGE}: this is no {params.joint} joint: {value:.0%} {what}, at least "
                 f"{limit:.0%} are needed ({name})"
             )
-    ends = dict(zip(("start", "end"), found.deviations, strict=True))
     return {
         "residual": found.swept.sigma,
         "registration": deviation,
         "explained": explained,
         "coverage": coverage,
-        **{name: value for name, value in ends.items() if np.isfinite(value)},
+        **ends,
     }
 
 

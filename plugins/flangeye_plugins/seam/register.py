@@ -238,5 +238,5 @@ def _refuse_ambiguous(best: CadFit, other: CadFit, seam: CadSeam, second: float)
     raise CalibrationRefused(
         f"{STAGE}: ambiguous: the part {moved} agrees with the scan {second:.0%} as well, and its "
         f"seam would be up to {1e3 * _apart(best.pose, other.pose, seam.points):.0f} mm away; scan "
-        "it so that a feature shows which way it lies, or weld it without CAD (seam.groove)"
+        "it so that a feature shows which way it lies, or find the seam without CAD (seam.joint)"
     )

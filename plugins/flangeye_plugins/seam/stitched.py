@@ -56,19 +56,24 @@ class PlacedScan:
     """A scan, and what is known of where it stands.
 
     Attributes:
-        points: (N, 3) in ``camera`` [m]; of several places, as that of the middle one has them.
-        base_T_camera: Of that camera.
+        base_T_camera: Of the camera; of several places, of the middle one.
         covariance: Of points mapped to the base.
         eyes: (P, 3) where the camera was at each place, in ``camera`` [m].
+        clouds: P of (N, 3), what it saw there, in ``camera`` [m].
         apart: Median distance of one place's face from its neighbour's, the largest of all [m];
             None where there is one place.
     """
 
-    points: Floats
     base_T_camera: Transform
     covariance: OfPose
     eyes: Floats
+    clouds: tuple[Floats, ...]
     apart: float | None = None
+
+    @property
+    def points(self) -> Floats:
+        """(N, 3) of all clouds."""
+        return np.concatenate(self.clouds)
 
     def of_scanner(self, line: Floats, scanner: ScannerModel | None) -> Floats:
         """Return the (K, 3, 3) covariances [m^2] that the scanner's own distortion gives a line.
@@ -115,17 +120,18 @@ def seen_in_base(
         raise CalibrationRefused(f"{stage}: the scanner {told}; scan the workpiece with {use}")
     points = scan.cloud.points().astype(np.float64)
     if not scan.places:
-        return PlacedScan(points, camera.transform, _AsOnePlace(answer), np.zeros((1, 3)))
+        return PlacedScan(camera.transform, _AsOnePlace(answer), np.zeros((1, 3)), (points,))
     stands = [_stand(place, answer, robot) for place in scan.places]
     ends = np.cumsum([place.points for place in scan.places])
-    clouds = np.split(points, ends[:-1])
-    seen = [s.apply(cloud) for s, cloud in zip(stands, clouds, strict=True)]
+    split = np.split(points, ends[:-1])
+    seen = [s.apply(cloud) for s, cloud in zip(stands, split, strict=True)]
     middle = stands[len(stands) // 2]
     shown = [thinned(cloud, CELL) for cloud in seen]
     of_pose = _AsSeveral(scan.places, answer, robot, shown)
     back = middle.inverse()
     eyes = back.apply(np.array([stand.translation for stand in stands]))
-    return PlacedScan(back.apply(np.concatenate(seen)), middle, of_pose, eyes, _apart(shown))
+    clouds = tuple(back.apply(cloud) for cloud in seen)
+    return PlacedScan(middle, of_pose, eyes, clouds, _apart(shown))
 
 
 def _stand(place: ScanPlace, answer: HandEye, robot: RobotModel | None) -> Transform:

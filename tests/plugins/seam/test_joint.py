@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from flangeye import CalibrationRefused, StageError
-from flangeye.maths.seam_geometry import tube_radii
-from flangeye.types import CAMERA, PointCloud, WorkpieceScan
+from flangeye.maths.geometry import rigid, rotation_from_rpy
+from flangeye.maths.seam_geometry import errors_from, tube_radii
+from flangeye.types import CAMERA, Box, PointCloud, WorkpieceScan
 from flangeye_plugins.seam.joint import JointParams, seam_joint
-from tests.plugins.seam.raycast import JOINTS, MM, Plate, box, prism, scan_of
-from tests.plugins.seam.scenes import BASE_T_CAMERA, hand_eye
+from tests.plugins.seam.raycast import JOINTS, LENGTH, MM, WIDE, Plate, box, prism, scan_of
+from tests.plugins.seam.scenes import BASE_T_CAMERA, hand_eye, scanned
 from tools.seam_joints import outcome, planned, table
 
 
@@ -82,6 +83,66 @@ def test_a_round_seam_is_closed() -> None:
     assert np.median(errors) < 0.15 * MM
     assert (errors <= tube_radii(seam)).mean() > 0.9
     assert np.linalg.norm(place[0] - place[-1]) < 0.1 * MM
+
+
+@pytest.mark.parametrize("workpiece", ["v-straight", "v-curved"])
+def test_a_groove_before_the_simulated_scanner(workpiece: str) -> None:
+    scan, truth = scanned(workpiece, seed=1)
+    seam = in_groove(scan, truth[[0, len(truth) // 2, -1]] if len(truth) > 2 else truth)
+    errors = errors_from(seam, truth)
+    assert np.sqrt(np.mean(errors**2)) < 0.2 * MM
+    assert (errors <= tube_radii(seam)).mean() > 0.9
+    assert np.degrees(seam.half_angle) == pytest.approx(40, abs=1.5)
+    assert seam.half_width == pytest.approx(8.4 * MM, abs=0.5 * MM)
+    off = np.linalg.norm(seam.points_in_base[[0, -1]] - truth[[0, -1]], axis=1)
+    assert (off < 4 * np.array([seam.figures["start"], seam.figures["end"]])).all()
+
+
+def in_groove(scan, line, workspace=None, hand=None, **given):
+    """Return the V-groove along a rough line (N, 3) in base."""
+    line = [[f"{1e3 * v} mm" for v in point] for point in line]
+    params = JointParams.model_validate({"joint": "vee", "line": line, **given})
+    return seam_joint(hand or hand_eye(), scan, params, None, workspace)
+
+
+def test_the_seam_moves_with_the_scene() -> None:
+    scan, truth = scanned("v-straight", seed=1)
+    motion = rigid(rotation_from_rpy(0.02, -0.03, 0.04), np.array([0.01, 0.02, -0.03]))
+    moved = truth @ motion[:3, :3].T + motion[:3, 3]
+    seam, other = in_groove(scan, truth), in_groove(scan, moved, hand=hand_eye(error=motion))
+    expected = seam.points_in_base @ motion[:3, :3].T + motion[:3, 3]
+    assert np.allclose(other.points_in_base, expected, atol=1e-9)
+
+
+def test_a_seam_outside_the_workspace_is_refused() -> None:
+    scan, truth = scanned("v-straight", seed=1)
+    box = Box(np.array([0.6, 0.0, 0.3]), np.array([0.1, 0.3, 0.2]))
+    with pytest.raises(CalibrationRefused, match="seam.joint: the seam leaves the workspace by"):
+        in_groove(scan, truth, box)
+
+
+def test_a_line_that_turns_back_is_refused() -> None:
+    scan, truth = scanned("v-straight", seed=1)
+    with pytest.raises(StageError, match="seam.joint: line turns back at its point 2; give its po"):
+        in_groove(scan, [truth[1], truth[0], truth.mean(axis=0)])
+
+
+@pytest.mark.parametrize(("hides", "told"), [(2.5 * MM, None), (9 * MM, "its end is known to")])
+def test_an_end_that_a_block_hides(hides: float, told: str | None) -> None:
+    """A block on one face at the seam's end: as far as the others end alike, or not at all."""
+    section = [(-WIDE, 0), (0, 0), (-8 * MM, 10 * MM), (-WIDE, 10 * MM)]
+    other = [(0, 0), (WIDE, 0), (WIDE, 10 * MM), (8 * MM, 10 * MM)]
+    block = box([LENGTH / 2 - hides, -WIDE, 10 * MM], [LENGTH / 2 + 0.02, -8 * MM, 25 * MM])
+    plates = [prism(section), prism(other), block], (-LENGTH / 2, LENGTH / 2)
+    scan = scan_of("plate", 4, faults=False, plates=plates, tilt=5.0)
+    if told:
+        with pytest.raises(CalibrationRefused, match=told):
+            planned(scan, "vee")
+        return
+    seam, truth = planned(scan, "vee")
+    off = np.linalg.norm(seam.points_in_base[-1] - truth[1])
+    assert off < 4 * seam.figures["end"]
+    assert seam.figures["end"] > 2 * seam.figures["start"]
 
 
 def test_without_a_line_it_says_what_to_write() -> None:

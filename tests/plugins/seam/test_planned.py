@@ -84,7 +84,10 @@ steps:
   - SOLVE
   - verify.holdout
   - scan.simulated: {workpiece: v-straight}
-  - seam.groove: {arm: corrected}
+  - seam.joint:
+      joint: vee
+      line: [[510 mm, -50 mm, 260 mm], [700 mm, 20 mm, 260 mm]]
+      arm: corrected
 """
 
 
@@ -96,7 +99,7 @@ def checked(tmp_path, solve):
 
 def test_a_recipe_that_mixes_the_two_arms_fails_check(tmp_path: Path) -> None:
     assert checked(tmp_path, "solve.robust")
-    with pytest.raises(RecipeError, match=r"r.yaml:15: steps.6.seam.groove.arm: the corrected arm"):
+    with pytest.raises(RecipeError, match=r"r.yaml:18: steps.6.seam.joint.arm: the corrected arm"):
         checked(tmp_path, "solve.svd")
     mixed = "solve.robust\n  - refine.compensate"
     with pytest.raises(RecipeError, match="refine.compensate gives the pose for the arm as its co"):

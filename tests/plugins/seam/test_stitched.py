@@ -12,16 +12,18 @@ from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.maths.seam_geometry import errors_from, tube_radii
 from flangeye.types import Seam, Seed, VerifiedHandEye
 from flangeye_plugins.seam.cad import CadParams, seam_cad
-from flangeye_plugins.seam.groove import GrooveParams, seam_groove
+from flangeye_plugins.seam.joint import JointParams, seam_joint
 from flangeye_plugins.seam.stitched import seen_in_base
 from tests.plugins.scan.flange_cell import PHOXI, UR10E, on_flange, scan_of_the_plate
 from tests.plugins.seam.scenes import hand_eye, scanned
 
+ROUGH = [["560 mm", "-100 mm", "75 mm"], ["563 mm", "98 mm", "72 mm"]]
+
 
 def planned(calibration: VerifiedHandEye, **given: str) -> Seam:
-    params = GrooveParams.model_validate(given)
+    params = JointParams.model_validate({"joint": "vee", "line": ROUGH, **given})
     scan = replace(scan_of_the_plate(), truth={})
-    seam: Seam = seam_groove(calibration, scan, Seed(0), params, None, PHOXI, UR10E)
+    seam: Seam = seam_joint(calibration, scan, params, None, None, PHOXI, UR10E)
     return seam
 
 
@@ -44,7 +46,7 @@ def test_the_covariance_is_that_of_drawn_calibrations() -> None:
     scan, sigma = scan_of_the_plate(), (2e-3, 1e-3)
     known = on_flange(sigma)
     at = np.array([[0.56, y, 0.08] for y in (-0.1, 0.0, 0.1)])
-    stated = seen_in_base("seam.groove", scan, known, None).covariance(at)
+    stated = seen_in_base("seam.joint", scan, known, None).covariance(at)
     rng, about = np.random.default_rng(1), np.asarray(known.camera.about)
     moved = []
     for _ in range(4000):
@@ -59,8 +61,8 @@ def test_the_covariance_is_that_of_drawn_calibrations() -> None:
 
 def test_zeros_of_the_joints_are_part_of_it() -> None:
     at, scan = np.array([[0.56, 0.0, 0.08]]), scan_of_the_plate()
-    with_arm = seen_in_base("seam.groove", scan, on_flange(), UR10E).covariance(at)
-    without = seen_in_base("seam.groove", scan, on_flange(), None).covariance(at)
+    with_arm = seen_in_base("seam.joint", scan, on_flange(), UR10E).covariance(at)
+    without = seen_in_base("seam.joint", scan, on_flange(), None).covariance(at)
     added = np.sqrt(np.trace((with_arm - without)[0]))
     assert 0.5 * UR10E.joint_accuracy < added < 3 * UR10E.joint_accuracy  # at about a metre
 
@@ -81,7 +83,8 @@ def test_a_scan_of_another_scanner_is_refused() -> None:
     with pytest.raises(
         CalibrationRefused, match="rides on the flange; scan the workpiece with sca"
     ):
-        seam_groove(on_flange(), scan, Seed(0), GrooveParams(), None, PHOXI)
+        params = JointParams.model_validate({"joint": "vee", "line": ROUGH})
+        seam_joint(on_flange(), scan, params, None, None, PHOXI)
 
 
 def test_a_cad_is_registered_to_one_place_alone() -> None:
