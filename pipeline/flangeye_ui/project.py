@@ -13,12 +13,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from flangeye.errors import FlangeyeError, StageError
+from flangeye.errors import FlangeyeError, RecipeError, StageError
+from flangeye.files.yaml_edit import edited
+from flangeye.files.yaml_lines import parse_yaml
 from flangeye.log.read import read_run
 from flangeye.plugin.registry import Registry
+from flangeye.plugin.stage import KINDS
 from flangeye.recipe.load import Recipe, load_recipe
+from flangeye.recipe.steps import SEVERAL
 from flangeye.report.facts import Facts, facts_of
 from flangeye_ui.process import RunProcess
 
@@ -98,14 +100,14 @@ class Project:
     def data(self) -> dict[str, Any]:
         """Return the recipe as data; empty while it is no mapping."""
         try:
-            data = yaml.safe_load(self.text)
-        except yaml.YAMLError:
+            data = parse_yaml(self.text, self.recipe_path.name).data
+        except RecipeError:
             return {}
         return data if isinstance(data, dict) else {}
 
     def edit(self, data: dict[str, Any]) -> None:
-        """Write the recipe from data."""
-        self.text = yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=100)
+        """Write what differs from the recipe on disk; the rest stays, comments included."""
+        self.text = edited(self.text if self.data() else "", data)
 
     def check(self) -> tuple[Recipe | None, list[Mistake]]:
         """Return the checked recipe, or everything that is wrong with it."""
@@ -176,13 +178,24 @@ class Project:
             self.edit({**{k: v for k, v in data.items() if k != "steps"}, "steps": data["steps"]})
 
     def write_step(self, name: str, params: Mapping[str, Any]) -> None:
-        """Put parameters into a step of the recipe; where it has none such, into the first."""
+        """Put parameters into a step of the recipe; where it has none such, add one in its place.
+
+        Of kinds that a recipe has one of, the step that is there makes room.
+        """
         data = self.data()
-        steps = data.get("steps") or [name]
+        steps = list(data.get("steps") or [])
         names = [next(iter(s)) if isinstance(s, dict) else s for s in steps]
-        at = names.index(name) if name in names else 0
-        given = (steps[at][name] if isinstance(steps[at], dict) and name in names else None) or {}
-        steps[at] = {name: {**given, **params}}
+        if name in names:
+            at = names.index(name)
+            given = (steps[at][name] if isinstance(steps[at], dict) else None) or {}
+            steps[at] = {name: {**given, **params}}
+        else:
+            kinds, kind = list(KINDS), name.partition(".")[0]
+            ranks = [kinds.index(each.partition(".")[0]) for each in names]
+            before = kinds.index(kind) + (kind in SEVERAL)
+            at = next((i for i, rank in enumerate(ranks) if rank >= before), len(steps))
+            replaced = kind not in SEVERAL and kinds.index(kind) in ranks
+            steps[at : at + replaced] = [{name: dict(params)}]
         self.edit({**data, "steps": steps})
 
     def unfinished(self) -> Path | None:

@@ -90,15 +90,10 @@ class Touch:
 
     def _write(self) -> None:
         """Put the point into the recipe's step, beside those that are there."""
-        given, data = self._given(), self._project.data()
-        steps = [step for step in data["steps"] if not (isinstance(step, dict) and STEP in step)]
-        old: dict[str, Any] = next(
-            (s[STEP] for s in data["steps"] if isinstance(s, dict) and STEP in s), {}
-        )
+        given, steps = self._given(), self._project.data()["steps"]
+        old = next((s[STEP] for s in steps if isinstance(s, dict) and STEP in s), None) or {}
         touches = [*old.get("touches", []), _touch(given)]
-        self._project.edit(
-            {**data, "steps": [*steps, {STEP: {**old, "tip": given["tip"], "touches": touches}}]}
-        )
+        self._project.write_step(STEP, {"tip": given["tip"], "touches": touches})
         self._keep.set_enabled(False)
         ui.notify(f"The recipe has the point: {STEP}, {len(touches)} in all.")
 

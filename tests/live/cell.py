@@ -28,7 +28,7 @@ scanner:
 steps:
   - acquire.live:
       view: {{guess: {{position: [620 mm, 0 mm, 980 mm]}}}}
-      poses: {{next_best: {{count: {count}, candidates: 60}}}}
+      poses: {{next_best: {{count: {count}}}}}
       verification: 0
   - segment.flange
   - fit.rim

@@ -31,7 +31,7 @@ scanner:
 steps:
   - acquire.live:
       view: {guess: {position: [620 mm, 0 mm, 980 mm]}}
-      poses: {next_best: {count: 5, candidates: 60}}
+      poses: {next_best: {count: 5}}
       verification: 0
       moved: 1 mm
   - segment.flange

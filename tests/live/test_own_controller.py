@@ -15,7 +15,7 @@ from flangeye_emulators.controllers.client import OWN, PORT
 pytestmark = pytest.mark.realtime
 
 RECIPE = "ur5e_phoxi-m_loopback"
-FEW = ("--set", "acquire.live.poses={next_best: {count: 4, candidates: 40}}")
+FEW = ("--set", "acquire.live.poses={next_best: {count: 4}}")
 
 
 def start(folder, *words):

@@ -8,7 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from flangeye.maths.geometry import basis_of_plane, rotation_exp, rotation_log
+from flangeye.maths.geometry import (
+    basis_of_plane,
+    rotation_exp,
+    rotation_from_rpy,
+    rotation_log,
+    rpy_from_rotation,
+)
 
 VECTORS = st.lists(st.floats(-7.0, 7.0), min_size=3, max_size=3).map(np.array)
 
@@ -43,3 +49,19 @@ def test_the_axes_of_a_plane_are_a_rotation_about_its_normal(normal: Any) -> Non
 @pytest.mark.parametrize("normal", [[0, 0, 0], [np.nan, 0, 1], [np.inf, 0, 0]])
 def test_a_plane_without_a_normal_has_no_axes(normal: list[float]) -> None:
     assert np.isnan(basis_of_plane(np.array(normal))).all()
+
+
+ANGLES = st.floats(-7.0, 7.0) | st.sampled_from([0.0, np.pi / 2, -np.pi / 2, np.pi])
+
+
+@given(ANGLES, ANGLES, ANGLES, st.sampled_from([0.0, 1e-15, 1e-9, 1e-5]))
+def test_roll_pitch_and_yaw_give_the_rotation_at_any_pitch(r: Any, p: Any, y: Any, by: Any) -> None:
+    expected = Rotation.from_euler("xyz", [r, p + by, y]).as_matrix()
+    found = rotation_from_rpy(*rpy_from_rotation(expected))
+    np.testing.assert_allclose(found, expected, atol=1e-14)
+
+
+@pytest.mark.parametrize("axis", [*np.eye(3), *-np.eye(3)])
+def test_a_frame_whose_z_lies_along_any_axis_has_angles(axis: Any) -> None:
+    angles = rpy_from_rotation(basis_of_plane(axis).T)
+    np.testing.assert_allclose(rotation_from_rpy(*angles)[:, 2], axis, atol=1e-15)

@@ -171,6 +171,11 @@ def test_which_links_were_taken_is_said(kuka: Path) -> None:
     base, without = robot_from_urdf(kuka).notes
     assert base == f"{kuka}: base 'link_0', flange 'tool0'"  # not the world above it
     assert "2 of 7 links have no collision body (link_0, link_1)" in without
+    kuka.write_text(re.sub("<collision>.*?</collision>", "", text))
+    assert (
+        "no link has a <collision> body, so that no moves can be planned"
+        in (robot_from_urdf(kuka).notes[1])
+    )
 
 
 def test_a_flange_that_looks_aside_is_said_with_the_line_that_turns_it(kuka: Path) -> None:

@@ -46,7 +46,7 @@ SMALL = """title: A small cell
 robot: {model: ur5}
 scanner: {model: phoxi-m}
 steps:
-  - acquire.simulated: {resolution: 0.25, poses: {next_best: {count: 7, candidates: 60}}}
+  - acquire.simulated: {resolution: 0.25, poses: {next_best: {count: 7}}}
   - segment.flange
   - fit.rim
   - solve.robust
@@ -553,6 +553,36 @@ def test_a_recipes_mistake_stands_at_its_field() -> None:
     found = _mistake("cell.yaml:7: steps.2.fit.rim.inlier: '3' has no unit")
     assert (found.line, found.path) == (7, "steps.2.fit.rim.inlier")
     assert _mistake("cell.yaml: no such file").text == "cell.yaml: no such file"
+
+
+def project_with(folder: Path, recipe: str) -> Project:
+    (folder / "cell.yaml").write_text(recipe)
+    return Project(folder, load_registry(), MoveCodes(print))
+
+
+COMMENTED = """title: T  # mine
+steps:
+  # recorded on Monday
+  - acquire.samples: {path: samples}
+  - solve.robust
+  - export.ros2_launch
+"""
+
+
+def test_a_step_is_written_once_in_its_place_and_comments_stay(tmp_path: Path) -> None:
+    project = project_with(tmp_path, COMMENTED)
+    project.write_step("verify.holdout", {"max_rms": "1 mm"})
+    holdout = "  - solve.robust\n  - verify.holdout: {max_rms: 1 mm}\n"
+    expected = COMMENTED.replace("  - solve.robust\n", holdout)
+    assert project.text == expected
+    project.write_step("verify.holdout", {"max_rms": "2 mm"})
+    assert project.text == expected.replace("1 mm", "2 mm")
+    project.write_step("acquire.archive", {"path": "scans"})
+    assert project.text == expected.replace("1 mm", "2 mm").replace(
+        "acquire.samples: {path: samples}", "acquire.archive: {path: scans}"
+    )
+    project.write_line("robot", {"model": "ur5"})
+    assert "title: T  # mine\nrobot: {model: ur5}\nsteps:\n  # recorded on Monday\n" in project.text
 
 
 def test_the_plan_is_read_as_the_command_prints_it() -> None:

@@ -137,10 +137,17 @@ def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Floats:
 
 
 def rpy_from_rotation(rotation: Floats) -> Floats:
-    """Return (roll, pitch, yaw) [rad] with R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    """Return (roll, pitch, yaw) [rad] with R = Rz(yaw) Ry(pitch) Rx(roll).
+
+    The roll is that of Rz(-yaw) R: at a pitch of 90 deg, where yaw and roll are about one axis and
+    each alone is arbitrary, the three still give R.
+    """
     r = np.asarray(rotation, dtype=np.float64)
     pitch = np.arctan2(-r[2, 0], np.hypot(r[0, 0], r[1, 0]))
-    return np.array([np.arctan2(r[2, 1], r[2, 2]), pitch, np.arctan2(r[1, 0], r[0, 0])])
+    yaw = np.arctan2(r[1, 0], r[0, 0])
+    s, c = np.sin(yaw), np.cos(yaw)
+    roll = np.arctan2(s * r[0, 2] - c * r[1, 2], c * r[1, 1] - s * r[0, 1])
+    return np.array([roll, pitch, yaw]) + 0.0  # no -0
 
 
 def rigid(rotation: ArrayLike, translation: ArrayLike) -> Floats:

@@ -311,7 +311,10 @@ def _notes(
     yield f"{urdf.path}: base '{base}', flange '{flange}'"
     if (odd := _sideways(urdf, robot, flange)) is not None:
         yield odd
-    if without := bodies.without():
+    without = bodies.without()
+    if len(without) > len(robot.joints):
+        yield f"{urdf.path}: no link has a <collision> body, so that no moves can be planned"
+    elif without:
         yield (
             f"{urdf.path}: {len(without)} of {len(robot.joints) + 1} links have no collision body "
             f"({_some(without)}); a planned move does not keep clear of them"
@@ -330,7 +333,7 @@ def _sideways(urdf: Urdf, robot: RobotModel, flange: str) -> Warn | None:
     # A flange's z is along the last axis; beyond this angle [rad] it is another frame of the link
     if off < np.radians(5.0) or joint.slides:
         return None
-    rpy = " ".join(f"{angle:.6g}" for angle in rpy_from_rotation(basis_of_plane(seen).T))
+    rpy = " ".join(f"{angle:z.6g}" for angle in rpy_from_rotation(basis_of_plane(seen).T))
     name = f"{flange}_face"
     return Warn(
         f"{urdf.path}: z of flange '{flange}' is {np.degrees(off):.0f} deg to the last axis, "

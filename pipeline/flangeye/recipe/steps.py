@@ -97,6 +97,8 @@ WHAT_FOR = {
     "weld": "to lead the torch along the seam",
 }
 """Why a stage needs kinematics, by the longest start of its name."""
+SEVERAL = ("refine", "verify", "seam", "export")
+"""Kinds of which a recipe may have more than one step."""
 IN_A_CELL = {
     "acquire": "use acquire.samples, acquire.centres or acquire.archive with reader: cell, or "
     "acquire.simulated_cell",
@@ -215,7 +217,7 @@ class StepOrder:
         rank = list(KINDS).index(kind)
         if kind == "export":  # done after verifying, wherever it stands behind the solver
             return
-        if kind in self._kinds and kind not in ("refine", "verify", "seam"):
+        if kind in self._kinds and kind not in SEVERAL:
             self._complain(at, f"a recipe has one {kind} step, and this is the second")
         elif rank < self._rank:
             later = list(KINDS)[self._rank]

@@ -29,6 +29,7 @@ from flangeye.report.certificate.page import render, sandbox, standard_text
 from flangeye.report.facts import facts_of
 from flangeye.report.units import millimetres
 from flangeye.result import Result
+from flangeye.result.contract import ExpectedErrorResult
 from tests.report.conftest import WORKSPACE, Script, scripted
 
 SCANNER = load_model("scanners", "phoxi-m")
@@ -172,6 +173,14 @@ def _numbers(row: str) -> list[float]:
     cells = re.findall(r'<td class="n">(.*?)</td>', row)
     plain = [re.sub(r"below |< | mm|°", "", cell).replace("–", "0") for cell in cells]
     return [float(cell) for cell in plain]
+
+
+def test_the_expected_error_is_printed_once(run: Path) -> None:
+    facts = facts_of(read_run(run / "run.mcap"))
+    error = ExpectedErrorResult(rms=0.123e-3, p95=0.234e-3)
+    known = replace(facts, result=facts.result.model_copy(update={"expected_error": error}))
+    text = re.sub(r"<[^>]+>", "", render(known, Conditions()))
+    assert [text.count(each) for each in ("0.123 mm rms; 95 % below 0.234 mm", "0.123")] == [1, 1]
 
 
 def test_no_uncertainty_is_printed_as_zero(result: Result, run: Path, tmp_path: Path) -> None:

@@ -9,14 +9,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from flangeye.errors import RecipeError, StageError
 from flangeye.files.cameras import cameras_in
 from flangeye.files.clouds import CONVERSIONS, read_cloud
 from flangeye.files.recording import Archive, NotThisLayout
 from flangeye.files.scans import CLOUDS, IMAGES
 from flangeye.files.tables import tables_in
+from flangeye.files.yaml_edit import entry, flow
 from flangeye.files.yaml_lines import parse_value
 from flangeye.models.cloud_unit import detect_unit, median_distance
 from flangeye.models.loading import load_model
@@ -347,19 +346,5 @@ def _of_cloud(path: Path) -> str:
 
 def yaml_of(data: Mapping[str, Any]) -> str:
     """Return a recipe's text: a line a section, a line a step."""
-    lines = [f"{key}: {_flow(value)}" for key, value in data.items() if key != "steps"]
-    return "\n".join([*lines, "steps:", *(f"  - {_step(step)}" for step in data["steps"])]) + "\n"
-
-
-def _step(step: Any) -> str:
-    if isinstance(step, str):
-        return step
-    ((name, params),) = step.items()
-    return f"{name}: {_flow(params)}"
-
-
-def _flow(value: Any) -> str:
-    text = yaml.safe_dump(
-        value, default_flow_style=True, sort_keys=False, allow_unicode=True, width=10_000
-    )
-    return text.removesuffix("...\n").strip()
+    lines = [f"{key}: {flow(value)}" for key, value in data.items() if key != "steps"]
+    return "\n".join([*lines, "steps:", *(f"  - {entry(step)}" for step in data["steps"])]) + "\n"
