@@ -204,8 +204,7 @@ def test_the_doctors_button_mends_the_recipe(browser: Any, served: Served) -> No
     finding = page.get_by_text("pose direction").first
     finding.evaluate("found => found.scrollIntoView({block: 'center'})")
     shot(page, "doctor")
-    page.get_by_role("button", name="Write configuration into the recipe (choice 1)").wait_for()
-    page.get_by_role("button", name="Write acquire.samples into the recipe (choice 2)").click()
+    page.get_by_role("button", name="Write acquire.samples into the recipe").click()
     page.get_by_text("Written into the recipe").wait_for()
     step = yaml.safe_load((served.folder / "cell.yaml").read_text())["steps"][0]["acquire.samples"]
     assert Path(step["path"]).name == "samples"

@@ -21,8 +21,15 @@ class RunProgress:
         said: The warnings of the source, which are printed as the run starts.
     """
 
-    def __init__(self, console: Console, steps: Iterable[str]) -> None:
-        """Make a bar for a recipe whose steps have these labels."""
+    def __init__(self, console: Console, steps: Iterable[str], opening: bool = False) -> None:
+        """Make a bar.
+
+        Args:
+            console: Where to.
+            steps: Labels of the recipe's steps.
+            opening: Whether to show it while recordings are opened; a cell that is opened may
+                ask its person something first.
+        """
         from rich import progress
 
         self.said: list[str] = []
@@ -40,7 +47,8 @@ class RunProgress:
             transient=True,
             disable=not console.is_terminal,
         )
-        self._task = self._progress.add_task("captures", total=None)
+        self._task = self._progress.add_task("opening", total=None)
+        self._opening = opening
 
     @hookimpl
     def flangeye_run_started(self, source: Source, total: int | None) -> None:
@@ -48,7 +56,7 @@ class RunProgress:
         for each in warnings_of(source.notes):
             write(self._console, f"warning: {each}\n  -> {each.fix}", "yellow")
             self.said.append(str(each))
-        self._progress.update(self._task, total=total)
+        self._progress.update(self._task, description="captures", total=total)
         self._progress.start()
 
     @hookimpl
@@ -84,6 +92,9 @@ class RunProgress:
         self._progress.update(self._task, description=name)
 
     def __enter__(self) -> RunProgress:
+        """Show the bar, where recordings are opened."""
+        if self._opening:
+            self._progress.start()
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -254,7 +254,8 @@ def _record(
 
     try:
         labels = [step.label for step in recipe.steps]
-        with RunProgress(Console(stderr=True), labels) as progress:
+        opening = recipe.archive is not None
+        with RunProgress(Console(stderr=True), labels, opening) as progress:
             registry.hooks.register(progress)
             result = record_run(recipe, registry, folder, start)
     except FlangeyeError:
