@@ -112,3 +112,12 @@ def test_the_rail_of_the_walk_is_an_arm(tmp_path: Path) -> None:
     here = arm.flange(np.array([0.5, 0, -1, 1, 0, 0, 0]))
     assert np.linalg.norm(there[:3, 3] - here[:3, 3]) == pytest.approx(1.0)
     assert np.allclose(there[:3, :3], here[:3, :3])
+
+
+def test_the_navigation_has_at_most_forty_pages_and_each_is_there() -> None:
+    text = (ROOT / "mkdocs.yml").read_text().partition("\nnav:")[2].partition("\ntheme:")[0]
+    pages = re.findall(r"[\w/.-]+\.md", text)
+    assert len(pages) == len(set(pages)) <= 40
+    made = {"reference/cli.md", "reference/stages.md", "reference/result.md"}  # by tools.reference
+    written = {str(p.relative_to(ROOT / "docs")) for p in (ROOT / "docs").glob("**/*.md")}
+    assert set(pages) == written | made
