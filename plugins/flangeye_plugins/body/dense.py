@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from flangeye.maths.geometry import rigid, rotation_exp
+from flangeye.maths.geometry import hat, rigid, rotation_exp
 from flangeye.maths.statistics import SIGMA_OF_MAD
 from flangeye.types import Floats, Indices, Singles
 from flangeye_plugins.body.shape import GRAZING, Oriented, Shape
-from flangeye_plugins.body.view import view_of
+from flangeye_plugins.body.view import spacing_of, view_of
 
-MOST, FEWEST = 12_000, 60
-"""Points that are used at most, and needed."""
+MOST, FEWEST, FEWEST_ENDS = 12_000, 60, 9
+"""Points that are used at most, and needed; and of ends, below which none counts."""
 
 ROUNDS = 12
 """Times that the body is moved."""
@@ -28,11 +29,30 @@ REACH, LEAST_REACH = 0.06, 4.0
 PATCHES = 8
 """Patches along the body's size: points of one err together."""
 
+SMOOTH = 1 / 4
+"""Length over which a body's surface is off its CAD alike, as a share of its size: about a face."""
+
 STRAIGHT = float(np.cos(np.radians(40.0)))
 """Cosine of the largest angle between the ends of a face in body and scan."""
 
 LEAST_NOISE = 1e-6
 """Deviation below which points are exact [m]."""
+
+LOST, ROUNDED = 2.0, 10.0
+"""Standard deviations of what a scanner does at edges, before any scan: the width that it loses
+along them, in distances between points, and how much it rounds, see ``_rounding``. Filters of
+scanners reach over a few points."""
+
+FILTER = 2
+"""Distances between points within which a scanner averages most: published scans of planes
+correlate by 0.7 so far apart."""
+
+SIDES = ((1, 0), (-1, 0), (0, 1), (0, -1))
+"""Neighbours of a ray."""
+
+SAME = 5.0
+"""Neighbouring rays meet one surface where their depths differ by less than so many of the
+distances between them: seen at less than 79 degrees to its normal."""
 
 UNKNOWN = 1.0
 """Standard deviation of what the scan does not show at all: of a turn [rad], and of a shift in
@@ -43,10 +63,10 @@ KNOWN = 0.05
 
 
 class _Equations(NamedTuple):
-    """Linearised residuals. The columns: turn [rad], shift in sizes, and the loss at edges.
+    """Linearised residuals. Columns: turn [rad], shift in sizes, edges' loss and rounding.
 
     Attributes:
-        jacobian: (N, 7).
+        jacobian: (N, 8).
         residual: (N,) [m].
         place: (N, 3) on the body [m].
         facing: (N, 3) which way the face looks there, on the body.
@@ -69,9 +89,10 @@ class BodyFit:
         edges: How many points of edges do.
         size: Of the body [m].
         centre: (3,) of the body in ``camera`` [m].
-        bread: (7, 7) inverse of the information, with the prior's.
-        meat: (7, 7) covariance of the scores, and the prior's information.
-        faces: (F, 7) derivative of the scores by how far each face is off [1/m].
+        bread: (8, 8) inverse of the information, with the prior's.
+        meat: (8, 8) covariance of the scores by the scan's noise, and the prior's information.
+        patches: (P, 3) places on the body that err together, in ``camera`` [m].
+        pulls: (P, 8, 3) derivative of the scores by how far each of them is off [1/m].
     """
 
     pose: Floats
@@ -82,7 +103,8 @@ class BodyFit:
     centre: Floats
     bread: Floats
     meat: Floats
-    faces: Floats
+    patches: Floats
+    pulls: Floats
 
     def weakest(self, freedoms: int) -> float:
         """Return the standard deviation of what the scan shows least, of so many directions.
@@ -99,22 +121,25 @@ class BodyFit:
         shift = np.linalg.eigvalsh(self.bread[3:6, 3:6])
         return int((np.r_[turn, shift] < (KNOWN * UNKNOWN) ** 2).sum())
 
-    def covariance(self, model_error: float, scanner_error: float) -> Floats:
+    def covariance(self, model_error: float, distortion: Callable[[Floats], Floats]) -> Floats:
         """Return (6, 6), order (rotation, translation), left perturbation in ``camera``.
 
         Args:
-            model_error: Standard deviation of each face against the CAD [m].
-            scanner_error: Standard deviation of the scanner's distortion along each axis [m].
+            model_error: Standard deviation of the surface against the CAD, along each axis [m]; a
+                smooth field over the body.
+            distortion: Of the scanner, (P, 3, K): how each of K independent weights of unit
+                variance moves (P, 3) points [m].
         """
-        inner = self.meat + model_error**2 * self.faces.T @ self.faces
-        about_centre = (self.bread @ inner @ self.bread)[:6, :6]
-        scale = np.repeat([1.0, self.size], 3)
-        about_centre = scale[:, None] * about_centre * scale
-        about_centre += np.diag(np.repeat([scanner_error / self.size, scanner_error], 3) ** 2)
+        apart = np.linalg.norm(self.patches[:, None] - self.patches, axis=2)
+        alike = np.exp(-0.5 * (apart / (SMOOTH * self.size)) ** 2)
+        inner = self.meat + model_error**2 * np.einsum(
+            "pai,pq,qbi->ab", self.pulls, alike, self.pulls, optimize=True
+        )
+        bent = np.einsum("pai,pik->ak", self.pulls, distortion(self.patches))
+        about_centre = (self.bread @ (inner + bent @ bent.T) @ self.bread)[:6, :6]
         # The turn is about the centre, and the translation is the origin's.
-        arm = self.pose[:3, 3] - self.centre
-        carried = np.eye(6)
-        carried[3:, :3] = -_cross_matrix(arm)
+        carried = np.diag(np.repeat([1.0, self.size], 3))
+        carried[3:, :3] = -hat(self.pose[:3, 3] - self.centre)
         moved = carried @ about_centre @ carried.T
         return np.asarray((moved + moved.T) / 2)
 
@@ -130,57 +155,92 @@ def fitted(points: Singles, shape: Shape, start: Floats, most: int = MOST) -> Bo
     """
     if len(points) < FEWEST:
         return None
-    some = points[:: 1 + len(points) // most].astype(np.float64)
+    some, spacing = points[:: 1 + len(points) // most].astype(np.float64), spacing_of(points)
     edges = _scan_edges(points, shape.size)
-    pose, lost, noise, reach = start, 0.0, np.inf, REACH * shape.size
+    prior = _prior(spacing * float(np.median(some[:, 2])))
+    pose, reach, beside = start, REACH * shape.size, REACH * shape.size
+    (lost, rounded), rounding = np.zeros(2), np.zeros(len(some))
     for _ in range(ROUNDS):
-        surface = _surface(some, shape, pose, reach)
-        ends = _ends(edges, shape, pose, lost, max(reach, 0.02 * shape.size))
+        surface = _surface(some, shape, pose, reach, rounding, rounded)
+        ends = _ends(edges, shape, pose, lost, beside, spacing)
         if len(surface.residual) < FEWEST:
             return None
         noise = _deviation(surface.residual)
-        spread = max(_deviation(ends.residual), noise) if len(ends.residual) > 8 else np.inf
+        few = len(ends.residual) < FEWEST_ENDS
+        spread = np.inf if few else max(_deviation(ends.residual), noise)
         equations, weights = _weighted(surface, ends, noise, spread)
-        information = (equations.jacobian.T * weights) @ equations.jacobian + _prior(shape.size)
+        information = (equations.jacobian.T * weights) @ equations.jacobian + prior
         gradient = (equations.jacobian.T * weights) @ equations.residual
         step = np.asarray(np.linalg.solve(information, gradient), np.float64)
-        pose, lost = _moved(pose, shape, step), lost + float(step[6])
-        closest = LEAST_REACH * noise
-        if reach <= closest and np.abs(step).max() < STILL:
-            break
-        reach = max(0.5 * reach, closest)
+        pose, lost, rounded = _moved(pose, shape, step), lost + step[6], rounded + step[7]
+        if reach < 2 * LEAST_REACH * noise:
+            if rounding.any() and np.abs(step[:6]).max() < STILL:
+                break
+            rounding = _rounding(some, shape, pose, spacing)
+        reach = max(0.5 * reach, LEAST_REACH * noise)
+        if not few:
+            beside = max(0.5 * beside, LEAST_REACH * spread)
     centre = pose[:3, :3] @ shape.centre + pose[:3, 3]
-    residual = equations.residual - equations.jacobian @ step
-    bread, meat = _sandwich(equations, weights, residual, shape)
+    left = equations._replace(residual=equations.residual - equations.jacobian @ step)
+    bread: Floats = np.linalg.inv(information).astype(np.float64)
+    cluster = _patches(left, shape)
+    meat = _noise(left, weights, cluster, len(surface.residual)) + prior
+    patches, pulls = _pulls(left, weights, cluster, pose)
     return BodyFit(
         pose, noise, len(surface.residual), len(ends.residual), shape.size, centre, bread, meat,
-        _faces(equations, weights),
+        patches, pulls,
     )  # fmt: skip
 
 
-def _surface(points: Floats, shape: Shape, pose: Floats, reach: float) -> _Equations:
+def _surface(
+    points: Floats, shape: Shape, pose: Floats, reach: float, rounding: Floats, rounded: float
+) -> _Equations:
     """Return how far points are off the body along the scanner's rays, where those meet it."""
     rotation, origin = pose[:3, :3], -pose[:3, 3] @ pose[:3, :3]
     rays = points @ rotation
     met = shape.meet(origin, rays)
     length = np.linalg.norm(rays, axis=1)
     facing = -np.einsum("ni,ni->n", met.normals, rays) / length
-    away = (1 - met.depth) * length * facing  # along the normal, behind is positive
+    bent = rounding * length * facing
+    away = (1 - met.depth) * length * facing - rounded * bent  # along the normal, behind: positive
     at = np.flatnonzero(np.isfinite(met.depth) & (facing > GRAZING))
-    at = at[np.abs(away[at]) < reach]
+    at = at[np.abs(away[at]) < reach]  # none beside a step, where it is not a number
     place = origin + met.depth[at, None] * rays[at]
-    normals = met.normals[at]
-    return _equations(place, normals, -away[at], pose, shape, edge=False)
+    return _equations(place, met.normals[at], -away[at], pose, shape, (0.0, -bent[at]))
 
 
-def _ends(edges: Oriented, shape: Shape, pose: Floats, lost: float, reach: float) -> _Equations:
-    """Return how far ends of the scan's surfaces are off those of the body's faces."""
+def _rounding(points: Floats, shape: Shape, pose: Floats, spacing: float) -> Floats:
+    """Return (N,) by which share of its depth each point lies before the mean of those around it.
+
+    A scanner averages over neighbouring rays: where the surface bends, points are off by a multiple
+    of this, which depends on the scanner's filter. NaN beside a step, where it averages over what
+    is left; of a body that is nothing but edges, zero.
+    """
+    rotation, origin = pose[:3, :3], -pose[:3, 3] @ pose[:3, :3]
+    own = shape.meet(origin, points @ rotation).depth
+    total = np.zeros(len(points))
+    for side in SIDES:
+        beside = points + FILTER * spacing * np.array([*side, 0.0]) * points[:, 2:]
+        with np.errstate(invalid="ignore"):
+            off = shape.meet(origin, beside @ rotation).depth - own
+            total += np.where(np.abs(off) < SAME * FILTER * spacing, off, np.nan)
+    few = np.isfinite(total).sum() < FEWEST
+    return np.zeros(len(points)) if few else total / len(SIDES)
+
+
+def _ends(
+    edges: Oriented, shape: Shape, pose: Floats, lost: float, reach: float, spacing: float
+) -> _Equations:
+    """Return how far ends of the scan's surfaces are off those of the body's faces.
+
+    Across the ray, as a scanner sees them: on a face askew a point lost is a longer way.
+    """
     from scipy.spatial import cKDTree
 
-    model = _visible_ends(shape, pose)
+    model = _visible_ends(shape, pose, spacing)
     placed = model.points @ pose[:3, :3].T + pose[:3, 3]
     outwards = model.directions @ pose[:3, :3].T
-    empty = _equations(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), pose, shape, edge=True)
+    empty = _equations(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), pose, shape, (1.0, 0.0))
     if not len(placed) or not len(edges.points):
         return empty
     gap, nearest = cKDTree(edges.points).query(placed, distance_upper_bound=2 * reach)
@@ -188,26 +248,32 @@ def _ends(edges: Oriented, shape: Shape, pose: Floats, lost: float, reach: float
     number = nearest[at]
     straight = np.einsum("ni,ni->n", edges.directions[number], outwards[at]) > STRAIGHT
     at, number = at[straight], number[straight]
-    residual = np.einsum("ni,ni->n", edges.points[number] - placed[at], outwards[at]) - lost
+    rays = placed[at] / np.linalg.norm(placed[at], axis=1, keepdims=True)
+    across = np.linalg.norm(np.cross(outwards[at], rays), axis=1)
+    offset = np.einsum("ni,ni->n", edges.points[number] - placed[at], outwards[at])
+    residual = across * offset - lost
     near = np.abs(residual) < reach
-    at, residual = at[near], residual[near]
+    at, residual, across = at[near], residual[near], across[near]
     if not len(at):
         return empty
-    return _equations(model.points[at], model.directions[at], residual, pose, shape, edge=True)
+    along = across[:, None] * model.directions[at]
+    return _equations(model.points[at], along, residual, pose, shape, (1.0, 0.0))
 
 
-def _visible_ends(shape: Shape, pose: Floats) -> Oriented:
+def _visible_ends(shape: Shape, pose: Floats, spacing: float) -> Oriented:
     """Return the ends of faces that end before the background, as the scanner sees them."""
-    ends, origin = shape.ends, -pose[:3, 3] @ pose[:3, :3]
+    ends, origin = shape.outline, -pose[:3, 3] @ pose[:3, :3]
     if not len(ends.points):
         return ends
-    apart = 0.02 * shape.size
-    facing = np.einsum("ni,ni->n", ends.normals, origin - ends.points)
     far = np.linalg.norm(origin - ends.points, axis=1)
-    on, off = (ends.points + side * apart * ends.directions - origin for side in (-1, 1))
-    on_depth, off_depth = shape.meet(origin, on).depth, shape.meet(origin, off).depth
-    share = apart / far
-    seen = (facing > GRAZING * far) & (np.abs(on_depth - 1) < share) & (off_depth > 1 + 3 * share)
+    facing = np.einsum("ni,ni->n", ends.normals, origin - ends.points)
+    seen = facing > GRAZING * far
+    # Right beyond its end a chamfer goes on, and a little farther a fillet.
+    for share in (2 * spacing, 0.02 * shape.size / far):
+        apart = (share * far)[:, None] * ends.directions
+        on, off = (ends.points + side * apart - origin for side in (-1, 1))
+        seen &= np.abs(shape.meet(origin, on).depth - 1) < share
+        seen &= shape.meet(origin, off).depth > 1 + 3 * share
     return ends.take(np.flatnonzero(seen))
 
 
@@ -220,14 +286,22 @@ def _scan_edges(points: Singles, size: float) -> Oriented:
 
 
 def _equations(
-    place: Floats, along: Floats, residual: Floats, pose: Floats, shape: Shape, edge: bool
+    place: Floats,
+    along: Floats,
+    residual: Floats,
+    pose: Floats,
+    shape: Shape,
+    scanner: tuple[Floats | float, Floats | float],
 ) -> _Equations:
-    """Return the equations of points (N, 3) on the body that are off along (N, 3) of it."""
+    """Return the equations of points (N, 3) on the body that are off along (N, 3) of it.
+
+    The last are what a loss at edges and rounding do to each.
+    """
     rotation = pose[:3, :3]
     arms = (place - shape.centre) @ rotation.T
     normals = along @ rotation.T
-    lost = np.full((len(place), 1), float(edge))
-    jacobian = np.hstack([np.cross(arms, normals), shape.size * normals, lost])
+    errors = [np.broadcast_to(each, len(place)) for each in scanner]
+    jacobian = np.column_stack([np.cross(arms, normals), shape.size * normals, *errors])
     return _Equations(jacobian, residual, place, along)
 
 
@@ -243,24 +317,26 @@ def _weighted(
     return joined, np.concatenate(parts)
 
 
-def _prior(size: float) -> Floats:
-    """Return the (7, 7) information of what is known without a scan; of a loss at edges, 1 mm."""
-    return np.diag(np.r_[np.repeat(1 / UNKNOWN**2, 6), 1 / 1e-3**2])
+def _prior(spacing: float) -> Floats:
+    """Return the (8, 8) information of what is known without a scan of points so far apart [m]."""
+    return np.diag(np.r_[np.repeat(UNKNOWN, 6), LOST * spacing, ROUNDED] ** -2.0)
 
 
-def _sandwich(
-    equations: _Equations, weights: Floats, residual: Floats, shape: Shape
-) -> tuple[Floats, Floats]:
-    """Return bread and meat of a fit in which the points of a patch err together."""
-    prior = _prior(shape.size)
-    information = (equations.jacobian.T * weights) @ equations.jacobian + prior
-    bread: Floats = np.linalg.inv(information).astype(np.float64)
-    cluster = _patches(equations, shape)
-    each = equations.jacobian.T * (weights * residual)
-    scores = np.stack([np.bincount(cluster, column) for column in each], axis=1)
-    occupied = len(scores)
-    small_sample = occupied / max(occupied - 7, 1)
-    return bread, small_sample * scores.T @ scores + prior
+def _noise(equations: _Equations, weights: Floats, cluster: Indices, surface: int) -> Floats:
+    """Return the (8, 8) covariance of the scores by noise that points of a patch share.
+
+    How many times as much as that of independent ones is one number for surfaces and one for edges:
+    a covariance by the patches' own sums would have hardly more of them than columns.
+    """
+    each = weights * equations.residual
+    out = np.zeros((8, 8))
+    for part in (slice(0, surface), slice(surface, None)):
+        own, total = each[part] ** 2, np.bincount(cluster[part], each[part])
+        if len(own):
+            shared = max(float((total**2).sum() / max(own.sum(), 1e-300)), 1.0)
+            jacobian = equations.jacobian[part]
+            out += shared * (jacobian.T * own) @ jacobian
+    return out
 
 
 def _patches(equations: _Equations, shape: Shape) -> Indices:
@@ -269,11 +345,18 @@ def _patches(equations: _Equations, shape: Shape) -> Indices:
     return np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
 
 
-def _faces(equations: _Equations, weights: Floats) -> Floats:
-    """Return (F, 7) what each face does to the scores where it is off by one metre."""
-    _, face = np.unique(_sextants(equations.facing), return_inverse=True)
-    each = equations.jacobian.T * weights
-    return np.stack([np.bincount(face.reshape(-1), column) for column in each], axis=1)
+def _pulls(
+    equations: _Equations, weights: Floats, cluster: Indices, pose: Floats
+) -> tuple[Floats, Floats]:
+    """Return where patches are (P, 3), and what being off there does to the scores (P, 8, 3)."""
+    many = np.bincount(cluster)
+    place = equations.place @ pose[:3, :3].T + pose[:3, 3]
+    middles = np.stack([np.bincount(cluster, x) / many for x in place.T], axis=1)
+    each = (equations.jacobian * weights[:, None])[:, :, None]
+    each = each * (equations.facing @ pose[:3, :3].T)[:, None]
+    pulls = np.zeros((len(many), *each.shape[1:]))
+    np.add.at(pulls, cluster, each)
+    return middles, pulls
 
 
 def _sextants(directions: Floats) -> Indices:
@@ -290,8 +373,3 @@ def _moved(pose: Floats, shape: Shape, step: Floats) -> Floats:
 
 def _deviation(residual: Floats) -> float:
     return max(float(SIGMA_OF_MAD * np.median(np.abs(residual))), LEAST_NOISE)
-
-
-def _cross_matrix(vector: Floats) -> Floats:
-    x, y, z = vector
-    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])

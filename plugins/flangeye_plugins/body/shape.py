@@ -150,6 +150,12 @@ class Shape:
 
     @cached_property
     def ends(self) -> Oriented:
+        """Some of the points where faces end, some spacings apart for each direction."""
+        ends = self.outline
+        return ends.take(thin(ends.points, ends.directions, self.size / SPACINGS))
+
+    @cached_property
+    def outline(self) -> Oriented:
         """Points where faces end at edges of the body that can be seen from outside."""
         from scipy.spatial import cKDTree
 
@@ -160,8 +166,7 @@ class Shape:
         ends, nearest = ends.take(np.isfinite(gap)), nearest[np.isfinite(gap)]
         side = np.einsum("ni,ni->n", ends.normals, outwards[nearest])
         ends = ends._replace(normals=ends.normals * np.sign(side)[:, None])
-        ends = ends.take(np.abs(side) > CREASE)
-        return ends.take(thin(ends.points, ends.directions, self.size / SPACINGS))
+        return ends.take(np.abs(side) > CREASE)
 
     @cached_property
     def outside(self) -> tuple[Floats, Floats]:

@@ -207,8 +207,7 @@ def view_of(points: Singles, pitch: float) -> View:
     z = points[:, 2]
     u, v = points[:, 0] / z, points[:, 1] / z
     low = float(u.min()), float(v.min())
-    spacing = _spacing(u, v)
-    angle = max(pitch / float(np.median(z)), SPARSE * spacing)
+    angle = max(pitch / float(np.median(z)), SPARSE * spacing_of(points))
     columns = int((u.max() - low[0]) / angle) + 1
     rows = int((v.max() - low[1]) / angle) + 1
     cell = ((v - low[1]) / angle).astype(np.int64) * columns + ((u - low[0]) / angle).astype(
@@ -249,8 +248,9 @@ def _along(ends: Oriented, angle: float) -> Oriented:
     return ends._replace(directions=_unit(total))
 
 
-def _spacing(u: Singles, v: Singles) -> float:
-    """Return how far points are apart at unit depth: the root of seen area over their number."""
+def spacing_of(points: Singles) -> float:
+    """Return how far (N, 3) points are apart at unit depth: root of seen area over their number."""
+    u, v = (points[:, :2] / points[:, 2:]).T
     across = max(float(np.ptp(u)), float(np.ptp(v)), 1e-6) / 64
     cell = ((u - u.min()) / across).astype(np.int64) * 65 + ((v - v.min()) / across).astype(
         np.int64

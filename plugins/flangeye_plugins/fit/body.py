@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from functools import partial
+
+import numpy as np
+
 from flangeye import Params, stage
+from flangeye.estimation.effects.scanner import DistortionField
 from flangeye.models.bodies import TargetBody
-from flangeye.types import CAMERA, TARGET, FlangeCloud, PoseFeature, Rejected, Transform
+from flangeye.models.scanners import ScannerModel
+from flangeye.types import CAMERA, TARGET, FlangeCloud, Floats, PoseFeature, Rejected, Transform
 from flangeye.units import Length, param
 
 
@@ -14,14 +20,15 @@ class FitBodyParams(Params):
     model_error: Length = param(
         "0.1 mm",
         ge=0,
-        description="Standard deviation of each face of the body against its CAD: make, coating, "
-        "play; added to the covariance.",
+        description="Standard deviation of the body's surface against its CAD along each axis, "
+        "smooth over it: make, coating, play; added to the covariance.",
     )
     scanner_error: Length = param(
         "0.06 mm",
         ge=0,
         description="Standard deviation along each axis of the scanner's own distortion, which a "
-        "single scan cannot show; added to the covariance, and to the turn over the body's size.",
+        "single scan cannot show; added to the covariance. Where the recipe names the scanner's "
+        "model, its calibration error over its volume counts instead.",
     )
     max_rms: Length = param(
         "4 mm", gt=0, description="Largest robust deviation of the scan from the body's surface."
@@ -29,13 +36,20 @@ class FitBodyParams(Params):
 
 
 @stage("fit.body")
-def fit_body(cloud: FlangeCloud, body: TargetBody, params: FitBodyParams) -> PoseFeature | Rejected:
+def fit_body(
+    cloud: FlangeCloud,
+    body: TargetBody,
+    params: FitBodyParams,
+    scanner: ScannerModel | None = None,
+) -> PoseFeature | Rejected:
     """Lay a body on the scan around it: surface on points, and ends of faces on the scan's edges.
 
     Every point of the scan is compared with the body along the scanner's own ray, so that only
-    visible faces count, and robustly. A scanner loses the outermost points of an edge, by how much
-    is fitted along. Neighbouring points err together: they count as patches. What a symmetric body
-    does not show keeps a variance as large as the body.
+    visible faces count, and robustly. A scanner loses the outermost points of an edge, and rounds
+    what bends: by how much is fitted along. Neighbouring points err together: they count as
+    patches. The covariance has what no scan shows as smooth fields: the body against its CAD, and
+    the scanner's distortion. What a symmetric body does not show keeps a variance as large as the
+    body.
     """
     from flangeye_plugins.body.dense import fitted
     from flangeye_plugins.body.looks import prepared
@@ -50,7 +64,9 @@ def fit_body(cloud: FlangeCloud, body: TargetBody, params: FitBodyParams) -> Pos
             f"the scan is {fit.noise * 1e3:.2f} mm off {body.name}'s surface (limit "
             f"{params.max_rms * 1e3:g} mm): does it move against its mesh, as a gripper's jaws do?"
         )
-    covariance = fit.covariance(params.model_error, params.scanner_error)
+    alone = partial(_somewhere, params.scanner_error)
+    distortion = DistortionField(scanner).at if scanner else alone
+    covariance = fit.covariance(params.model_error, distortion)
     figures = {
         "points": float(fit.points),
         "edges": float(fit.edges),
@@ -58,3 +74,14 @@ def fit_body(cloud: FlangeCloud, body: TargetBody, params: FitBodyParams) -> Pos
         "freedoms": float(fit.freedoms),
     }
     return PoseFeature(Transform(CAMERA, TARGET, fit.pose), covariance, figures)
+
+
+def _somewhere(error: float, points: Floats) -> Floats:
+    """Return (P, 3, 12): a distortion at (P, 3) points, about their middle, linear in 12 weights.
+
+    Its slope is that of a field which changes its sign over half the distance.
+    """
+    middle = points.mean(axis=0)
+    arms = (points - middle) / (np.linalg.norm(middle) / 2)
+    weights = np.column_stack([np.ones(len(points)), arms])
+    return np.asarray(error * np.einsum("pj,ik->pikj", weights, np.eye(3)).reshape(-1, 3, 12))

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from flangeye.errors import RecipeError, StageError
-from flangeye.maths.geometry import rigid, rotation_from_rpy, rotation_log
+from flangeye.maths.geometry import hat, rigid, rotation_from_rpy, rotation_log
 from flangeye.models.bodies import TargetBody, load_body
 from flangeye.models.configuration import ORIGIN, Configuration
 from flangeye.models.loading import load_model
@@ -37,6 +37,7 @@ from flangeye_emulators.world.scanner import scanner_of
 from flangeye_plugins.body.looks import prepared
 from flangeye_plugins.fit.body import FitBodyParams, fit_body
 from flangeye_plugins.segment.body import SegmentBodyParams, segment_body
+from tools.study_bodies import SCANNER, as_made
 
 GRIPPER = load_body("gripper", None, Path())
 POSE = rigid(rotation_from_rpy(2.5, 0.6, 0.8), np.array([0.03, -0.02, 0.75]))
@@ -99,6 +100,36 @@ def test_a_gripper_is_found_without_a_guess_and_its_error_is_as_stated() -> None
     assert np.degrees(np.linalg.norm(error[:3])) < 0.1
     assert error @ np.linalg.solve(feature.covariance, error) < 22.5  # 99.9 % of 6 freedoms
     assert feature.figures["freedoms"] == 6
+
+
+def test_what_is_stated_covers_what_scanner_and_make_do() -> None:
+    """The scanner's distortion and how the body is made differ from scan to scan, as stated."""
+    chi = []
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        made = as_made(GRIPPER, rng)
+        q = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+        pose = rigid((q := q * np.sign(np.linalg.det(q))), POSE[:3, 3] - q @ made.centre)
+        xyz = scanner_of(SCANNER, 0.3, 1.0, rng).scan(
+            Scene([Body(Mesh(made.vertices, made.triangles).moved(pose), materials.MATT)]), rng
+        )
+        capture = Capture("0000", PointCloud(CAMERA, xyz), {})
+        feature = fit_body(around(capture, pose), GRIPPER, FitBodyParams(), SCANNER)
+        assert isinstance(feature, PoseFeature), feature
+        error = off(feature, pose)
+        chi.append(error @ np.linalg.solve(feature.covariance, error))
+    assert 27.5 < sum(chi) < 100  # 99.9 % of 60 freedoms: 30.3 to 99.6
+
+
+def test_a_scanner_without_a_model_has_the_distortion_that_is_stated() -> None:
+    capture = around(scan(GRIPPER), POSE)
+    wide = {"model_error": "0 mm", "scanner_error": "1 mm"}
+    feature = fit_body(capture, GRIPPER, FitBodyParams.model_validate(wide))
+    assert isinstance(feature, PoseFeature), feature
+    centre = POSE[:3, :3] @ prepared(GRIPPER)[0].centre  # from the body's origin
+    about = np.hstack([-hat(centre), np.eye(3)])  # the shift of the centre
+    shift = about @ feature.covariance @ about.T
+    assert np.sqrt(np.trace(shift) / 3) == pytest.approx(1e-3, rel=0.3)
 
 
 HALF_TURN = rigid(rotation_from_rpy(0.0, 0.0, np.pi), np.zeros(3))

@@ -53,7 +53,7 @@ def scanner_effects(problem: Problem, scanner: ScannerModel | None) -> list[Effe
 
 
 def _distortion(scanner: ScannerModel, seen: Sightings) -> Effect:
-    field = _Field(scanner)
+    field = DistortionField(scanner)
     moves = field.moves(seen) * seen.by_depth[:, None, None]
     scaled = moves * np.repeat([LEVER, 1.0], 3)[:, None]
     _, sizes, ways = np.linalg.svd(stack_rows(scaled), full_matrices=False)
@@ -98,8 +98,8 @@ def _edge_size(s: Sightings) -> float:
 
 
 @dataclass(frozen=True)
-class _Field:
-    """A field of the scanner's size, linear in weights of unit variance."""
+class DistortionField:
+    """A scanner's distortion, as large as its model says: linear in weights of unit variance."""
 
     scanner: ScannerModel
 
@@ -128,7 +128,7 @@ class _Field:
     def moves(self, s: Sightings) -> Floats:
         """Return (N, 6, K): how each weight turns and moves a target, in ``camera``."""
         across, along, normals = (s.rotations[:, :, i] for i in range(3))
-        bent = [(self._at(s.centres + RADIUS * t) - self._at(s.centres - RADIUS * t))
+        bent = [(self.at(s.centres + RADIUS * t) - self.at(s.centres - RADIUS * t))
                 / (2 * RADIUS) for t in (across, along)]  # fmt: skip
         rising = [np.einsum("ni,nik->nk", normals, each)[:, None] for each in bent]
         turning = np.einsum("ni,nik->nk", along, bent[0]) - np.einsum("ni,nik->nk", across, bent[1])
@@ -137,9 +137,9 @@ class _Field:
             - along[..., None] * rising[0]
             + normals[..., None] * turning[:, None] / 2
         )
-        return np.concatenate([turned, self._at(s.centres)], axis=1)
+        return np.concatenate([turned, self.at(s.centres)], axis=1)
 
-    def _at(self, points: Floats) -> Floats:
+    def at(self, points: Floats) -> Floats:
         """Return (N, 3, K) by how much each weight moves points (N, 3) of the view [m]."""
         rigid, scale = self._over_volume
         return np.asarray(scale * (self._raw(points) - self._motions(points) @ rigid))
