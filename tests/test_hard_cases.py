@@ -24,8 +24,7 @@ from flangeye.files.arrays import read_npz
 from flangeye.files.clouds import read_cloud
 from flangeye.files.paths import bundled
 from flangeye.files.processes import keep_current_folder_out, python_command
-from flangeye.files.regular import open_regular
-from flangeye.files.written import write_whole
+from flangeye.files.regular import open_regular, write_whole
 from flangeye.log import records
 from flangeye.log.read import read_run
 from flangeye.models.model import read_model

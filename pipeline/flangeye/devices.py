@@ -17,9 +17,10 @@ no driver leaves a controller with a command that outlasts its own silence. Time
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Literal, Protocol, Self, runtime_checkable
+from typing import Any, Literal, Protocol, Self, runtime_checkable
 
 from flangeye.errors import StageError
 from flangeye.types import Array, Floats, Image, PointCloud, Transform, Truth
@@ -392,3 +393,21 @@ class MotionAllowed:
     allowed: bool = False
     offline: bool = False
     plan_only: bool = False
+
+
+def load_sdk(module: str, driver: str, install: str) -> Any:
+    """Return the module ``module``.
+
+    Args:
+        module: What to import.
+        driver: Who needs it, for example ``scanner.realsense``.
+        install: What brings it, for example ``pip install 'flangeye[realsense]'``.
+
+    Raises:
+        DeviceError: It is not there, or does not load; with the reason and the install hint.
+    """
+    try:
+        return importlib.import_module(module)
+    except (ImportError, OSError) as error:
+        reason = str(error).strip().partition("\n")[0]
+        raise DeviceError(f"{driver}: needs {module} ({reason}); {install}") from None

@@ -19,12 +19,11 @@ from flangeye import types as t
 from flangeye.errors import FlangeyeError
 from flangeye.log import foxglove
 from flangeye.log.read import RunLog, read_run, take
-from flangeye.log.watch.tail import Message, follow
-from flangeye.log.watch.view import View
+from flangeye.log.watch.view import Message, View, follow
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import Recipe
+from flangeye.run.folder import recipe_of_log
 from flangeye.run.outlook import Outlook, outlook
-from flangeye.run.recorded import recipe_of_log
 from flangeye.types import Floats
 
 POINTS = 20_000

@@ -11,7 +11,7 @@ from nicegui import ui
 
 from flangeye import result as r
 from flangeye.errors import FlangeyeError
-from flangeye.files.written import write_whole
+from flangeye.files.regular import write_whole
 from flangeye.models.configuration import CELL
 from flangeye.plugin.stage import Stage
 from flangeye.report.certificate.budget import Conditions

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from flangeye import hookimpl
 
 if TYPE_CHECKING:
-    from flangeye.models.emulator import Emulator, EmulatorOptions
+    from flangeye.models.graph import Emulator, EmulatorOptions
 
 STAGES = {
     "acquire.simulated": "flangeye_emulators.acquire.simulated:acquire_simulated",
@@ -65,7 +65,7 @@ def _serve_aubo(options: "EmulatorOptions") -> None:
 @hookimpl
 def flangeye_emulators() -> Iterable["Emulator"]:
     """Offer controllers of Universal Robots and of AUBO."""
-    from flangeye.models.emulator import Emulator
+    from flangeye.models.graph import Emulator
 
     return (
         Emulator("ur", "Universal Robots", _serve_ur),

@@ -12,7 +12,7 @@ STAGES = {
     "acquire.published_centres": "flangeye_paper.published:acquire_published_centres",
     "verify.realisations": "flangeye_paper.realisations:verify_realisations",
     "verify.icp_as_in_paper": "flangeye_paper.icp_as_in_paper:verify_icp_as_in_paper",
-    "verify.algorithm_1_by_iteration": "flangeye_paper.by_iteration:verify_by_iteration",
+    "verify.algorithm_1_by_iteration": "flangeye_paper.icp_as_in_paper:verify_by_iteration",
     "verify.stored_results_as_in_paper": "flangeye_paper.stored_results:verify_stored_results",
     "scan.as_laid": "flangeye_paper.misplanned:scan_as_laid",
     "seam.misplanned": "flangeye_paper.misplanned:seam_misplanned",
@@ -20,7 +20,7 @@ STAGES = {
 
 PARTS = {
     "controller.as_printed": "flangeye_paper.as_printed:controller_as_printed",
-    "error.oracle_as_in_paper": "flangeye_paper.oracle:error_oracle",
+    "error.oracle_as_in_paper": "flangeye_paper.realisations:error_oracle",
     "error.icp_as_in_paper": "flangeye_paper.icp_as_in_paper:error_icp_as_in_paper",
 }
 

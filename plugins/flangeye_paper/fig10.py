@@ -6,19 +6,24 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from flangeye_paper.drawing import (
+from flangeye_paper.fig9 import realised
+from flangeye_paper.tables import (
+    AXES,
     AXIS_COLOURS,
     BOUND,
     METHODS,
     PRINTED,
+    WITHIN_TEN,
+    WITHIN_TWENTY,
+    Row,
+    columns,
     dress,
     legend,
     logarithmic,
+    read_sessions,
     sheet,
+    write_csv,
 )
-from flangeye_paper.fig9 import realised
-from flangeye_paper.printed import AXES, WITHIN_TEN, WITHIN_TWENTY
-from flangeye_paper.tables import Row, columns, read_sessions, write_csv
 
 ORACLE = "algorithm-1-oracle"
 SHOWN = (5, 10, 20, 40, 75)

@@ -10,10 +10,18 @@ import numpy as np
 
 from flangeye.files.arrays import read_npz
 from flangeye.types import Floats
-from flangeye_paper.drawing import AXIS_COLOURS, dress, legend, sheet
-from flangeye_paper.printed import AXES
 from flangeye_paper.stored_results import stored_file
-from flangeye_paper.tables import Row, columns, read_sessions, write_csv
+from flangeye_paper.tables import (
+    AXES,
+    AXIS_COLOURS,
+    Row,
+    columns,
+    dress,
+    legend,
+    read_sessions,
+    sheet,
+    write_csv,
+)
 
 FIRST_STORED = 5
 """The authors' loop tells its first error once five poses are there."""

@@ -13,8 +13,7 @@ from flangeye import FlangeyeError
 from flangeye.log.read import read_run
 from flangeye.maths.seam_geometry import torch_deviation
 from flangeye.types import Floats, WeldReport, WorkpieceScan
-from flangeye_paper.drawing import dress, legend, sheet
-from flangeye_paper.tables import Row, SessionRow, read_sessions, write_csv
+from flangeye_paper.tables import Row, SessionRow, dress, legend, read_sessions, sheet, write_csv
 
 BEYOND = 0.2
 """The true seam is extended straight by this much, for what happens before and after it [m]."""

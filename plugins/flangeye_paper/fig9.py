@@ -8,17 +8,22 @@ from typing import Any
 
 import numpy as np
 
-from flangeye_paper.drawing import (
+from flangeye_paper.tables import (
+    AXES,
     BOUND,
+    GROWTH,
     METHODS,
     PRINTED,
+    Row,
+    SessionRow,
+    columns,
     dress,
     legend,
     logarithmic,
+    read_sessions,
     sheet,
+    write_csv,
 )
-from flangeye_paper.printed import AXES, GROWTH
-from flangeye_paper.tables import Row, SessionRow, columns, read_sessions, write_csv
 
 STAGE = "verify.realisations"
 

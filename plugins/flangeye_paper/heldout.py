@@ -9,9 +9,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flangeye import FlangeyeError
-from flangeye_paper.drawing import METHODS, Look, dress, legend, logarithmic, sheet
 from flangeye_paper.stored_results import stored_results
-from flangeye_paper.tables import Row, SessionRow, read_sessions, write_csv
+from flangeye_paper.tables import (
+    METHODS,
+    Look,
+    Row,
+    SessionRow,
+    dress,
+    legend,
+    logarithmic,
+    read_sessions,
+    sheet,
+    write_csv,
+)
 
 STAGE = "verify.holdout"
 

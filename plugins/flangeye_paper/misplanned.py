@@ -4,37 +4,34 @@ from __future__ import annotations
 
 import numpy as np
 
-from flangeye import Params, stage
-from flangeye.maths.geometry import rigid, rotation_exp, rotation_from_rpy
-from flangeye.models.workpiece import WorkpiecePath, load_workpiece
+from flangeye import stage
+from flangeye.maths.geometry import rotation_exp
+from flangeye.models.workpiece import load_workpiece
 from flangeye.types import CAMERA, Floats, PointCloud, Seam, Seed, VerifiedHandEye, WorkpieceScan
 from flangeye.units import Angle, Length, param
+from flangeye_emulators.world.bench import LaidParams
 
 
-class LaidParams(Params):
+class AsLaidParams(LaidParams):
     """Parameters of ``scan.as_laid``."""
-
-    workpiece: WorkpiecePath = param("v-straight", description="One of data/workpieces.")
-    position: tuple[Length, Length, Length] = param(("600 mm", "0 mm", "250 mm"))
-    rpy: tuple[Angle, Angle, Angle] = param(("0 deg", "0 deg", "20 deg"))
 
     def seam(self) -> tuple[Floats, Floats, float | None]:
         """Return the true seam (N, 3) its opening (3,), in base, and its half angle."""
         (seam,) = load_workpiece(self.workpiece).seams.values()
-        pose = rigid(rotation_from_rpy(*self.rpy), np.asarray(self.position))
+        pose = self.base_T_part
         points = _dense(seam.points) @ pose[:3, :3].T + pose[:3, 3]
         return points, pose[:3, :3] @ seam.opening, seam.half_angle
 
 
 @stage("scan.as_laid")
-def scan_as_laid(params: LaidParams) -> WorkpieceScan:
+def scan_as_laid(params: AsLaidParams) -> WorkpieceScan:
     """Nothing is scanned: where the workpiece lies is known, for a study of the weld alone."""
     points, _, _ = params.seam()
     cloud = PointCloud(CAMERA, points.astype(np.float32))
     return WorkpieceScan(cloud, f"{params.workpiece.stem}, as laid", (), {"groove": points})
 
 
-class MisplannedParams(LaidParams):
+class MisplannedParams(AsLaidParams):
     """Parameters of ``seam.misplanned``."""
 
     shift: Length = param(

@@ -1,17 +1,29 @@
-"""``verify.realisations``: the recipe's solve step, again and again on fresh noise."""
+"""The solve step on fresh noise, again and again; and section 3.1's cost, which knows the truth."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from pydantic import Field
 
-from flangeye import CalibrationRefused, Params, StageError, stage
+from flangeye import CalibrationRefused, Params, StageError, part, stage
 from flangeye.maths.geometry import kabsch, rigid, rpy_from_rotation
 from flangeye.maths.statistics import rms
-from flangeye.types import Box, Floats, HandEye, Observations, Solver, Verification
+from flangeye.models.targets import Flange
+from flangeye.types import (
+    Box,
+    Floats,
+    HandEye,
+    Observation,
+    Observations,
+    PoseError,
+    Solver,
+    Transform,
+    Verification,
+    Views,
+)
 from flangeye_paper.paper_cell import (
     BASE_T_CAMERA,
     CENTRE,
@@ -129,3 +141,16 @@ def _summary(figures: dict[str, float]) -> str:
         f"{figures['realisations']:.0f} realisations; no estimate is better than "
         f"{figures['bound_workspace_rms'] * 1e3:.3f} mm"
     )
+
+
+@part("error.oracle_as_in_paper")
+def error_oracle(
+    base_T_camera: Transform, kept: Sequence[Observation], views: Views, flange: Flange | None
+) -> PoseError:
+    """The distance from the simulation's own truth (17): no method, an emulation of section 3.1.
+
+    The paper writes ``e = H^ H_true`` for the error that Algorithm 1 minimises in simulation: the
+    algorithm picks its poses by looking at the answer. No real cell offers that.
+    """
+    at = BASE_T_CAMERA[:3, :3].T @ (CENTRE - BASE_T_CAMERA[:3, 3])
+    return PoseError(errors_of(base_T_camera.matrix), at, base_T_camera.rotation)

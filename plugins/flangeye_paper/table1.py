@@ -8,9 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from flangeye_paper.drawing import PRINTED, dress, legend, sheet
-from flangeye_paper.printed import AXES, KINECT, TABLE_1
-from flangeye_paper.tables import Row, SessionRow, read_sessions, write_csv
+from flangeye_paper.tables import (
+    AXES,
+    KINECT,
+    PRINTED,
+    TABLE_1,
+    Row,
+    SessionRow,
+    dress,
+    legend,
+    read_sessions,
+    sheet,
+    write_csv,
+)
 
 ICP, STORED = "verify.icp_as_in_paper", "verify.stored_results_as_in_paper"
 

@@ -10,9 +10,19 @@ import numpy as np
 
 from flangeye.maths.geometry import rpy_from_rotation
 from flangeye.types import Floats
-from flangeye_paper.drawing import PRINTED, dress, legend, logarithmic, sheet
-from flangeye_paper.printed import AXES, TABLE_2
-from flangeye_paper.tables import Row, SessionRow, read_sessions, write_csv
+from flangeye_paper.tables import (
+    AXES,
+    PRINTED,
+    TABLE_2,
+    Row,
+    SessionRow,
+    dress,
+    legend,
+    logarithmic,
+    read_sessions,
+    sheet,
+    write_csv,
+)
 
 TARGETS = {"flange": "#1d4ed8", "sphere": "#d97706"}
 COUNTS = "steps.0.poses.grid.counts"

@@ -1,4 +1,4 @@
-"""Read what ``flangeye batch`` left, write what the page shows."""
+"""Read what ``flangeye batch`` left, draw and write what the page shows, as the paper prints it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from flangeye import FlangeyeError
 from flangeye.batch.outcome import ACCEPTED
@@ -100,3 +100,111 @@ def _text(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.3f}" if abs(value) >= 1e-3 or value == 0 else f"{value:.3g}"
     return "" if value is None else str(value)
+
+
+AXES = ("x", "y", "z", "roll", "pitch", "yaw")
+
+TABLE_1: Mapping[str, tuple[float, ...]] = {
+    "UR5 PhoXi M": (11.60, 2.81, 5.55, 0.49, -0.89, -0.47),
+    "UR10e PhoXi M": (0.60, 1.75, -0.41, 0.10, -0.04, -0.23),
+    "Franka PhoXi M": (4.34, -4.06, -0.13, -0.30, -0.34, -0.07),
+    "Aubo i5 PhoXi S": (-0.26, -0.27, -0.35, 0.14, 0.04, 0.01),
+}
+"""Table 1: errors with all sample points."""
+
+KINECT = (-11.11, 3.90, 7.15, -0.15, 0.92, 1.56)
+"""Section 4.2: UR10e and Azure Kinect."""
+
+TABLE_2: Mapping[str, tuple[float, ...]] = {
+    "4 pairs": (-1.94, -0.90, -0.86, -0.07, 0.04, -0.10),
+    "16 pairs": (-0.98, -1.01, -0.83, -0.07, 0.09, -0.11),
+}
+"""Table 2: Photoneo's software with a sphere."""
+
+GROWTH = 1 / 7
+"""Section 3.1: growth of the translational deviation with noise, iterative to all data."""
+WITHIN_TEN, WITHIN_TWENTY = 1.0, 0.2
+"""Section 3.1: translational deviations after so many poses, at 1 mm of noise."""
+YAW = 0.2
+"""Section 3.1: the largest rotational deviation, at 1 mm of noise."""
+
+
+class Look(NamedTuple):
+    """How a method is called and drawn."""
+
+    label: str
+    colour: str
+
+
+METHODS: Mapping[str, Look] = {
+    "all-data": Look("least squares on all poses", "#64748b"),
+    "algorithm-1-oracle": Look("Algorithm 1, its cost knows the truth (emulation)", "#d97706"),
+    "algorithm-1-held-out": Look("Algorithm 1, held-out cost", "#be123c"),
+    "robust": Look("solve.robust", "#1d4ed8"),
+}
+BOUND = Look("Cramér-Rao bound", "black")
+PRINTED = Look("the paper", "#15803d")
+
+AXIS_COLOURS = {
+    "x": "#d97706", "y": "#1d4ed8", "z": "#15803d",
+    "roll": "#d97706", "pitch": "#1d4ed8", "yaw": "#15803d",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A figure and its panels.
+
+    Attributes:
+        figure: matplotlib's.
+        panels: Row by row.
+    """
+
+    figure: Any
+    panels: Sequence[Any]
+
+    def save(self, path: Path) -> None:
+        """Write a PNG that is the same for the same numbers."""
+        self.figure.savefig(path, dpi=100, metadata={"Software": None})
+
+
+def sheet(rows: int, columns: int, width: float, height: float) -> Sheet:
+    """Return an empty figure of ``rows`` times ``columns`` panels, in inches.
+
+    Raises:
+        FlangeyeError: matplotlib is not installed.
+    """
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise FlangeyeError(
+            "the studies' pictures need matplotlib; install with: pip install 'flangeye[studies]'"
+        ) from None
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = [figure.add_subplot(rows, columns, i + 1) for i in range(rows * columns)]
+    for panel in panels:
+        panel.grid(visible=True, color="#e2e8f0", linewidth=0.8)
+        panel.spines[["top", "right"]].set_visible(False)
+        panel.tick_params(labelsize=8)
+    return Sheet(figure, panels)
+
+
+def dress(panel: Any, title: str, x: str, y: str) -> None:
+    """Give a panel its title and its axes' names."""
+    panel.set_title(title, fontsize=9, loc="left")
+    panel.set_xlabel(x, fontsize=8)
+    panel.set_ylabel(y, fontsize=8)
+
+
+def logarithmic(panel: Any, *ticks: float) -> None:
+    """Make a panel's height logarithmic, with plain numbers at the ticks."""
+    panel.set_yscale("log")
+    panel.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
+    panel.minorticks_off()
+
+
+def legend(panel: Any, **options: Any) -> None:
+    """Put a small legend into a panel."""
+    panel.legend(fontsize=7, frameon=False, **options)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -29,7 +29,8 @@ class AxesParams(Params):
     axes: tuple[Literal["x", "y", "z"], ...] = Field(
         ("x", "y"), min_length=1, description="Axes to use."
     )
-    frame: Literal["base", "camera"] = Field("base", description="Frame of the axes.")
+    # Frame of the axes
+    frame: ClassVar[str] = "base"
     at: Place = Field("work", description=_AT)
 
 

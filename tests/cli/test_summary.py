@@ -12,8 +12,7 @@ from flangeye import result as r
 from flangeye.cli.app import GROUPS
 from flangeye.cli.commands import app
 from flangeye.cli.console import write
-from flangeye.cli.progress import RunProgress
-from flangeye.cli.summary import print_refusal, print_summary, wrapped
+from flangeye.cli.summary import RunProgress, print_refusal, print_summary, wrapped
 from flangeye.types import Rejection, Source, Warn
 
 SCALE = {"text": "the target is 1.3 % larger than configured", "fix": "feature.size: 40.52 mm"}

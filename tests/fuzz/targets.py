@@ -226,8 +226,7 @@ def _read_rewritten(path):
 
 def _follow(path):
     from flangeye.errors import StageError
-    from flangeye.log.watch.tail import follow
-    from flangeye.log.watch.view import View
+    from flangeye.log.watch.view import View, follow
 
     def wait():
         raise StageError("no more")

@@ -11,9 +11,7 @@ import pytest
 from flangeye import FlangeyeError
 from flangeye_paper import fig9, fig10, fig11, heldout, table1, table2
 from flangeye_paper.__main__ import refreshed
-from flangeye_paper.drawing import METHODS
-from flangeye_paper.printed import AXES
-from flangeye_paper.tables import read_csv, read_sessions, write_csv
+from flangeye_paper.tables import AXES, METHODS, read_csv, read_sessions, write_csv
 
 REALISED = "verify.realisations"
 WORSE = {"all-data": 1.02, "algorithm-1-oracle": 3.2, "algorithm-1-held-out": 2.9, "robust": 1.03}

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from flangeye import StageError
 from flangeye.maths.geometry import kabsch, rigid, rotation_exp
 from flangeye.types import BASE, CAMERA, Transform, Views
-from flangeye_paper.oracle import error_oracle
 from flangeye_paper.paper_cell import (
     BASE_T_CAMERA,
     CENTRE,
@@ -26,6 +25,7 @@ from flangeye_paper.points import PointsParams, acquire_points, observations_of
 from flangeye_paper.realisations import (
     WORKSPACE,
     RealisationsParams,
+    error_oracle,
     verify_realisations,
 )
 

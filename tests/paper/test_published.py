@@ -9,11 +9,15 @@ import pytest
 
 from flangeye import StageError
 from flangeye.types import BASE, CAMERA, ArchivePath, Transform, Views
-from flangeye_paper.by_iteration import ByIterationParams, verify_by_iteration
-from flangeye_paper.icp_as_in_paper import PaperIcpParams, error_icp_as_in_paper
-from flangeye_paper.oracle import error_oracle
+from flangeye_paper.icp_as_in_paper import (
+    ByIterationParams,
+    PaperIcpParams,
+    error_icp_as_in_paper,
+    verify_by_iteration,
+)
 from flangeye_paper.points import PointsParams, acquire_points
 from flangeye_paper.published import PublishedParams, acquire_published_centres
+from flangeye_paper.realisations import error_oracle
 from flangeye_paper.stored_results import StoredParams, verify_stored_results
 from flangeye_plugins.cost import TranslationParams, cost_translation
 from flangeye_plugins.reader.ancorasir import AncorasirParams

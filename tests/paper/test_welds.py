@@ -14,7 +14,7 @@ from flangeye.types import CAMERA, PointCloud, Seam, WeldReport, WorkpieceScan
 from flangeye_paper import fig13
 from flangeye_paper.fig13 import SeenWeld, seen
 from flangeye_paper.misplanned import (
-    LaidParams,
+    AsLaidParams,
     MisplannedParams,
     scan_as_laid,
     seam_misplanned,
@@ -147,7 +147,7 @@ def test_a_session_that_did_not_weld(tmp_path: Path) -> None:
 @pytest.mark.parametrize("workpiece", ["v-straight", "v-curved"])
 def test_the_planning_error_is_as_large_as_asked_and_differs_by_seed(workpiece: str) -> None:
     params = MisplannedParams(workpiece=workpiece)
-    truth = scan_as_laid.function(LaidParams(workpiece=workpiece)).truth["groove"]
+    truth = scan_as_laid.function(AsLaidParams(workpiece=workpiece)).truth["groove"]
     seams = [seam_misplanned.function(None, seed, params) for seed in range(6)]
     ways = set()
     for seam in seams:

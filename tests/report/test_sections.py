@@ -19,8 +19,7 @@ from flangeye import FlangeyeError
 from flangeye.cli.details import print_details
 from flangeye.log.read import RunLog, read_run
 from flangeye.report import write_report
-from flangeye.report.account import idle_of, set_aside_of, timings_of, without_numbers
-from flangeye.report.facts import facts_of
+from flangeye.report.facts import facts_of, idle_of, set_aside_of, timings_of, without_numbers
 from flangeye.report.page import render
 from flangeye.report.summary import banner_of, evidence_of, next_steps_of, tiles_of, transform_text
 from flangeye.report.units import degrees, duration, millimetres

@@ -38,7 +38,7 @@ def write(console: Console, text: str, style: str = "") -> None:
 def say_notes(notes: Sequence[str]) -> None:
     """Say beside the output what the person should know."""
     if notes:
-        from flangeye.types.notes import as_line
+        from flangeye.types.arrays import as_line
 
         for note in notes:
             say(as_line(note), err=True)

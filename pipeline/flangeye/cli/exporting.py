@@ -62,7 +62,7 @@ def export(
 
     Exit codes: 0 written, 1 the calibration was refused, 2 there is none.
     """
-    from flangeye.files.written import write_whole
+    from flangeye.files.regular import write_whole
 
     if to == "tables":
         _write_tables(run, out)
@@ -93,7 +93,7 @@ def publish(
 
     The recipe names the frames in its export.ros2_launch step; without one they are ours.
     """
-    from flangeye.run.recorded import recipe_of_log
+    from flangeye.run.folder import recipe_of_log
 
     registry = load_plugins()
     log, pose = _calibrated(run, registry.stage(ROS2), anyway, camera)

@@ -125,7 +125,7 @@ def emulator(  # noqa: PLR0913  one for each option
     ] = False,
 ) -> None:
     """Emulate a robot controller on this machine."""
-    from flangeye.models.emulator import EmulatorOptions, find_emulator, read_height, read_joints
+    from flangeye.models.graph import EmulatorOptions, find_emulator, read_height, read_joints
     from flangeye.models.loading import load_model
 
     model = load_model("robots", robot)

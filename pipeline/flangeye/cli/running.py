@@ -247,8 +247,7 @@ def _record(
     """Run with a log and a progress bar, and print the result."""
     from rich.console import Console
 
-    from flangeye.cli.progress import RunProgress
-    from flangeye.cli.summary import print_summary
+    from flangeye.cli.summary import RunProgress, print_summary
     from flangeye.files.elsewhere import with_urls
     from flangeye.run.session import record_run
 

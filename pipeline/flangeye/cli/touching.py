@@ -10,7 +10,7 @@ import yaml
 
 from flangeye.devices import RobotDriver
 from flangeye.errors import StageError
-from flangeye.files.written import write_whole
+from flangeye.files.regular import write_whole
 from flangeye.log.read import read_run
 from flangeye.maths.geometry import rpy_from_rotation
 from flangeye.models.robots import RobotModel
@@ -19,7 +19,7 @@ from flangeye.motion.touching import Touched, Toucher
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.header import LimitsSection
 from flangeye.recipe.load import Recipe
-from flangeye.run.recorded import recipe_of_log
+from flangeye.run.folder import recipe_of_log
 from flangeye.types import Floats, FrameMismatchError
 from flangeye.units import parse_quantity
 

@@ -1,8 +1,9 @@
-"""Keep watch over a calibration."""
+"""Keep watch over a calibration; the local page."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,7 +16,6 @@ if TYPE_CHECKING:
     from flangeye.doctor.monitor import Check, StoredCalibration
     from flangeye.estimation.watch.drift import DriftTest
     from flangeye.plugin.registry import Registry
-
 
 Later = Annotated[
     list[Path] | None,
@@ -143,3 +143,22 @@ def _opcua_node(opcua: str, security: str | None) -> tuple[str, str]:
         raise StageError(f"--opcua {opcua}: give URL,NODE: opc.tcp://plc:4840,ns=2;s=flangeye")
     require_secured(url, security)
     return url, node
+
+
+@app.command("ui")
+def local_page(
+    folder: Annotated[Path, typer.Argument(help="Folder with recipes and runs.")] = Path(),
+    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="Port to listen on.")] = 8090,
+    browser: Annotated[
+        bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")
+    ] = True,
+) -> None:
+    """Open the local web page: plan, run and judge."""
+    from flangeye.errors import StageError
+
+    try:
+        pages = import_module("flangeye_ui")  # by name: the page is a layer above the engine
+    except ModuleNotFoundError as error:
+        raise StageError(f"the page needs {error.name}: pip install 'flangeye[ui]'") from None
+    pages.serve(folder, load_plugins(), host, port, browser)

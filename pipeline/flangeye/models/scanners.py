@@ -1,14 +1,19 @@
-"""3D scanners: what they see, how finely, and how wrongly."""
+"""3D scanners: what they see, how finely, how wrongly, and in which unit their files are."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
+from flangeye.errors import StageError
+from flangeye.files.clouds import PER_METRE, LengthUnit
 from flangeye.models.model import Model
-from flangeye.types import Floats
+from flangeye.types import Floats, PointCloud
 from flangeye.units import Angle, Length, param
 
 
@@ -66,3 +71,96 @@ def middle_of_view(scanner: ScannerModel, base_T_camera: Floats) -> Floats:
     # From the scanner to the middle of the workspace, where its range allows: the paper's [m]
     distance = min(0.7, (scanner.near + scanner.far) / 2)
     return np.asarray(base_T_camera[:3, 3] + distance * base_T_camera[:3, 2])
+
+
+STATED_LIMIT = 20.0
+"""A stated unit is believed until the median point is this many times out of the scanner's range:
+no wall or window behind the robot is that far, and a wrong unit is off by 1,000."""
+DETECTED_LIMIT = 5.0
+"""A unit is only detected where the median point is closer to the range than this."""
+SAMPLE = 50_000
+"""Points the median is taken of."""
+
+NAMES: Mapping[LengthUnit, str] = {"m": "metres", "mm": "millimetres", "in": "inches"}
+
+
+def median_distance(cloud: PointCloud) -> float:
+    """Return the median distance of the finite points from the scanner [m], NaN without any."""
+    flat = cloud.xyz.reshape(-1, 3)
+    flat = flat[:: max(1, len(flat) // SAMPLE)]
+    distances = np.linalg.norm(flat.astype(np.float64), axis=1)
+    finite = distances[np.isfinite(distances)]
+    return float(np.median(finite)) if len(finite) else math.nan
+
+
+def times_outside(distance: float, scanner: ScannerData) -> float:
+    """Return how many times nearer than near or farther than far; 1 or less is inside."""
+    near, far = scanner.range
+    return max(near / max(distance, 1e-12), distance / far)
+
+
+def check_unit(path: Path, distance: float, unit: LengthUnit, scanner: ScannerData) -> None:
+    """Refuse a unit that the scanner's range contradicts.
+
+    Args:
+        path: The cloud's file.
+        distance: Median distance of its points [m], if they are in ``unit``.
+        unit: Unit that was stated or detected.
+        scanner: What it was recorded with.
+
+    Raises:
+        StageError: Says what the unit looks like instead.
+    """
+    if not times_outside(distance, scanner) > STATED_LIMIT:
+        return
+    raw = distance * PER_METRE[unit]
+    others: list[LengthUnit] = [other for other in NAMES if other != unit]
+    best = min(others, key=lambda other: times_outside(raw / PER_METRE[other], scanner))
+    metres = raw / PER_METRE[best]
+    if times_outside(metres, scanner) <= DETECTED_LIMIT:
+        cure = f"these look like {NAMES[best]}: set unit: {best}"
+    else:
+        cure = f"and {metres:.3g} m with unit {best} does not fit either; is it this scanner?"
+    raise StageError(
+        f"{path}: median distance {distance:.3g} m with unit {unit}, but {_range(scanner)}; {cure}"
+    )
+
+
+def detect_unit(path: Path, raw: float, scanner: ScannerData) -> LengthUnit:
+    """Return the unit in which a median distance fits the scanner's range: metres or millimetres.
+
+    Inches are only between the two, and few record in them: they have to be stated.
+
+    Args:
+        path: The cloud's file.
+        raw: Median distance of its points, in the file's unknown unit.
+        scanner: What it was recorded with.
+
+    Raises:
+        StageError: Neither metres nor millimetres fit.
+    """
+    units: tuple[LengthUnit, ...] = ("m", "mm")
+    outside = {unit: times_outside(raw / PER_METRE[unit], scanner) for unit in units}
+    unit = min(units, key=lambda u: outside[u])
+    if outside[unit] > DETECTED_LIMIT:
+        inches = times_outside(raw / PER_METRE["in"], scanner) <= DETECTED_LIMIT
+        cure = "unit: in, which fits," if inches else "unit: m or unit: mm,"
+        raise StageError(
+            f"{path}: median distance {raw:.3g} fits neither m nor mm: {_range(scanner)}; state "
+            f"{cure} or the right scanner"
+        )
+    return unit
+
+
+def unit_note(unit: LengthUnit, how: str, distance: float, scanner: ScannerData) -> str:
+    """Return the note about the unit."""
+    return (
+        f"clouds in {unit} ({how}): the first has its median point at {distance:.3f} m; "
+        f"{_range(scanner)}"
+    )
+
+
+def _range(scanner: ScannerData) -> str:
+    near, far = scanner.range
+    known = "sees" if scanner.near and scanner.far else "has no range stated and may see"
+    return f"{scanner.model} {known} {near:.3f} to {far:.3f} m"

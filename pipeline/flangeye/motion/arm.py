@@ -18,10 +18,17 @@ from flangeye.errors import RunStopped
 from flangeye.files.processes import busy, keep_current_folder_out
 from flangeye.models.robots import RobotModel
 from flangeye.motion.limits import MotionLimits
-from flangeye.motion.precedence import LEADING, take_precedence
 from flangeye.motion.route import Route
 from flangeye.motion.supervision import Sample
-from flangeye.motion.watchdog import BEAT, Charge, Report, guard, watchdog_process
+from flangeye.motion.watchdog import (
+    BEAT,
+    LEADING,
+    Charge,
+    Report,
+    guard,
+    take_precedence,
+    watchdog_process,
+)
 
 OPENING = 30.0
 """Longest time for a driver to connect, its client library's import included [s]."""

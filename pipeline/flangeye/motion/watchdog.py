@@ -12,12 +12,13 @@ stopped too.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection
 from typing import Any, NamedTuple
 
@@ -27,9 +28,29 @@ from flangeye.devices import GRACE, SILENT, DeviceError, MovedByHand, Robot, Rob
 from flangeye.errors import FlangeyeError
 from flangeye.models.robots import RobotModel
 from flangeye.motion.limits import MotionLimits
-from flangeye.motion.precedence import GUARDING, take_precedence
 from flangeye.motion.route import Leg
 from flangeye.motion.supervision import SafetyFault, Sample, Supervisor
+
+GUARDING, LEADING = 2, 1
+"""Priorities among those who come first; the process of a maker's client has one of its own."""
+
+
+def take_precedence(priority: int) -> None:
+    """Let the calling thread come first, and what it starts from now on."""
+    with contextlib.suppress(OSError, AttributeError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+
+
+@contextlib.contextmanager
+def precedence(priority: int) -> Iterator[None]:
+    """Let the calling thread come first for a while."""
+    take_precedence(priority)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError, AttributeError):
+            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
 
 TOLD_NS = 200_000_000
 """Between two states told to the program while the arm is under way [ns]."""

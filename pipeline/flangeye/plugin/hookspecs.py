@@ -9,8 +9,7 @@ import pluggy
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
-    from flangeye.models.emulator import Emulator
-    from flangeye.models.graph import Graph
+    from flangeye.models.graph import Emulator, Graph
     from flangeye.plugin.stage import Part, Stage
     from flangeye.types import Capture, Rejection, Source
 

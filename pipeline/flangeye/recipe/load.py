@@ -344,7 +344,7 @@ def describe_recipe(path: Path, registry: Registry, overrides: Sequence[str] = (
     from flangeye.models.cell import Cell
     from flangeye.models.configuration import Configuration
     from flangeye.models.robots import RobotModel
-    from flangeye.types.notes import as_line
+    from flangeye.types.arrays import as_line
 
     checked = load_recipe(path, registry, overrides)
     if checked.plans and RobotModel in checked.context:

@@ -15,13 +15,12 @@ import numpy as np
 from flangeye import types as t
 from flangeye.errors import StageError
 from flangeye.files.paths import VERSION
-from flangeye.files.written import write_whole
+from flangeye.files.regular import write_whole
 from flangeye.log.read import JournalEntry, RunLog, read_notes
 from flangeye.maths.statistics import rms
-from flangeye.report.account import idle_of, provenance_of, set_aside_of, timings_of
 from flangeye.report.cell import cell_drawing
 from flangeye.report.clouds import cloud_panels
-from flangeye.report.facts import Facts, facts_of
+from flangeye.report.facts import Facts, facts_of, idle_of, provenance_of, set_aside_of, timings_of
 from flangeye.report.graph import graph_drawing
 from flangeye.report.look import LOGO, css
 from flangeye.report.plot import AXES, HELD_OUT, USED, Figure, layout2d, plain, round_up

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from itertools import chain, count
 from pathlib import Path
@@ -12,10 +12,13 @@ from typing import Any
 import numpy as np
 import yaml
 
-from flangeye.errors import FlangeyeError
-from flangeye.files.written import write_whole
+from flangeye.errors import FlangeyeError, StageError
+from flangeye.files.regular import write_whole
+from flangeye.log.read import RunLog
 from flangeye.log.record import dump_result
 from flangeye.maths.geometry import quaternion_from_rotation, rpy_from_rotation
+from flangeye.plugin.registry import Registry
+from flangeye.recipe.load import Recipe, parse_recipe
 from flangeye.result import Result, TransformResult
 from flangeye.result.contract import AnswerResult
 
@@ -169,3 +172,24 @@ def _pose(name: str, estimate: TransformResult) -> dict[str, Any]:
         "sigma_translation_m": estimate.sigma[3:],
         **open_directions,
     }
+
+
+def recipe_of_log(
+    log: RunLog, registry: Registry, overrides: Sequence[str] = (), name: str | None = None
+) -> Recipe:
+    """Return the recipe of a run, with the models of its own that its log carries.
+
+    Args:
+        log: The run's; it may be going on, killed or done.
+        registry: The plugins on offer.
+        overrides: Changes to it.
+        name: What to call it; the log's name if not given.
+
+    Raises:
+        StageError: The log holds no recipe.
+        RecipeError: It does not fit the plugins that are installed here.
+    """
+    text = log.text("recipe.resolved.yaml") or log.text("recipe.yaml")
+    if text is None:
+        raise StageError(f"{log.path}: holds no recipe")
+    return parse_recipe(text, name or log.path.name, registry, overrides, log.models)

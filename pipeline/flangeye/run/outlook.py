@@ -13,7 +13,7 @@ from flangeye.log.read import RunLog
 from flangeye.models.workspace import Coverage, coverage_of, workspace_of
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import Recipe
-from flangeye.run.recorded import recipe_of_log
+from flangeye.run.folder import recipe_of_log
 from flangeye.run.runner import Runner
 
 

@@ -20,7 +20,7 @@ from flangeye.plugin.registry import Registry
 from flangeye.plugin.stage import KINDS
 from flangeye.recipe.load import Recipe
 from flangeye.recipe.steps import Step
-from flangeye.run.recorded import recipe_of_log
+from flangeye.run.folder import recipe_of_log
 
 _ORDER = list(KINDS)
 LEFT_OUT = "left out by --leave-out"

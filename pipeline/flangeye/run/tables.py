@@ -13,14 +13,14 @@ import yaml
 
 from flangeye.errors import StageError
 from flangeye.files.clouds import write_cloud
-from flangeye.files.written import write_whole
+from flangeye.files.regular import write_whole
 from flangeye.files.yaml_lines import parse_yaml
 from flangeye.log.read import RunLog
 from flangeye.maths.geometry import quaternion_from_rotation, rotation_log
 from flangeye.models.cell import Axis, Cell
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import Recipe
-from flangeye.run.recorded import recipe_of_log
+from flangeye.run.folder import recipe_of_log
 from flangeye.types import Observation, PoseFeature, Transform
 
 POSE = ("number", "x", "y", "z", "qx", "qy", "qz", "qw")

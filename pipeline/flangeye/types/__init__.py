@@ -24,7 +24,20 @@ from typing import Any, NewType, Protocol
 
 import numpy as np
 
-from flangeye.types.arrays import Array, FloatArray, Floats, Indices, Mask, Pixels, Singles, freeze
+from flangeye.types.arrays import (
+    Array,
+    FloatArray,
+    Floats,
+    Indices,
+    Mask,
+    Note,
+    Pixels,
+    Singles,
+    Warn,
+    freeze,
+    records_of,
+    warnings_of,
+)
 from flangeye.types.calibration import (
     ArmCorrection,
     CorrectedArm,
@@ -37,7 +50,6 @@ from flangeye.types.calibration import (
     Verification,
     VerifiedHandEye,
 )
-from flangeye.types.clouds import PointCloud
 from flangeye.types.features import (
     CircleFeature,
     Feature,
@@ -58,12 +70,12 @@ from flangeye.types.frames import (
     Box,
     FrameMismatchError,
     Motion,
+    PointCloud,
     Poses,
     Transform,
     TransformEstimate,
     by_frame,
 )
-from flangeye.types.notes import Note, Warn, records_of, warnings_of
 from flangeye.types.scans import Capture, FlangeCloud, Image, Role, ScanPlace, WorkpieceScan
 from flangeye.types.streams import (
     Captures,

@@ -7,10 +7,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from flangeye.types.arrays import Array, Floats, freeze
+from flangeye.types.arrays import Array, Floats, Note, freeze
 from flangeye.types.features import Observation
 from flangeye.types.frames import BASE, FrameMismatchError, TransformEstimate
-from flangeye.types.notes import Note
 
 
 @dataclass(frozen=True, eq=False)

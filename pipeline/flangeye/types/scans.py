@@ -8,10 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from flangeye.types.arrays import Array, Pixels, freeze
-from flangeye.types.clouds import PointCloud
-from flangeye.types.frames import CAMERA, TARGET, Motion, Placed, Poses
-from flangeye.types.notes import Note
+from flangeye.types.arrays import Array, Note, Pixels, freeze
+from flangeye.types.frames import CAMERA, TARGET, Motion, Placed, PointCloud, Poses
 
 Role = Literal["calibration", "verification"]
 

@@ -6,10 +6,9 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
-from flangeye.types.clouds import PointCloud
+from flangeye.types.arrays import Note
 from flangeye.types.features import Observation, Rejection, VerificationView
-from flangeye.types.frames import Box, Transform
-from flangeye.types.notes import Note
+from flangeye.types.frames import Box, PointCloud, Transform
 from flangeye.types.scans import Capture
 
 Look = Callable[[Sequence[Any]], PointCloud]

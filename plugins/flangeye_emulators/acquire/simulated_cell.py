@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -50,7 +51,8 @@ class SimulatedCellParams(CellSessionParams):
     field: tuple[Angle, Angle] = param(
         ("50 deg", "40 deg"), description="Horizontal and vertical field of view of the cameras."
     )
-    near: Length = param("300 mm", gt=0, description="Nearest that cameras see.")
+    # Nearest that cameras see [m]
+    near: ClassVar[float] = 0.3
     far: Length = param("2 m", gt=0, description="Farthest that cameras see.")
     target_rotation: Angle = param(
         "0.05 deg",

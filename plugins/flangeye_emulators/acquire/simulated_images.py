@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -130,7 +131,8 @@ class ImagesParams(SessionParams):
     resolution: float = Field(
         1.0, gt=0, le=1, description="Scale of the scanner's columns and rows."
     )
-    noise: float = Field(3.0, ge=0, description="Standard deviation of a pixel's grey value.")
+    # Standard deviation of a pixel's grey value
+    noise: ClassVar[float] = 3.0
     covered: float = Field(
         0.15,
         ge=0,

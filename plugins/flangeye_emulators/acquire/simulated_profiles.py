@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,15 +43,16 @@ class ProfilesParams(SessionParams):
         default_factory=lambda: PlaceParams.model_validate(IN_THE_HAND),
         description="The scanner's true place on what carries it.",
     )
-    near: Length = param("190 mm", gt=0, description="Nearest that the scanner sees.")
-    far: Length = param("290 mm", gt=0, description="Farthest that the scanner sees.")
-    points: int = Field(1280, ge=50, description="Number of points in a profile.")
-    noise: Length = param(
-        "0.03 mm", ge=0, description="Standard deviation of a point along its ray."
-    )
-    table: Length = param(
-        "40 mm", gt=0, description="Height of the sphere's centre above the table."
-    )
+    # Nearest that the scanner sees [m]
+    near: ClassVar[float] = 0.19
+    # Farthest that the scanner sees [m]
+    far: ClassVar[float] = 0.29
+    # Number of points in a profile
+    points: ClassVar[int] = 1280
+    # Standard deviation of a point along its ray [m]
+    noise: ClassVar[float] = 0.03e-3
+    # Height of the sphere's centre above the table [m]
+    table: ClassVar[float] = 0.04
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from flangeye.devices import Device
 from flangeye.errors import StageError
 from flangeye.motion.arm import run_number
 from flangeye.types import Floats
-from flangeye_emulators.controllers.compliance import Surface
+from flangeye_emulators.controllers.arm import Surface
 
 PORT = 29998
 """Of the control channel. It is here, for a client needs nothing of what serves it."""

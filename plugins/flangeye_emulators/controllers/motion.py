@@ -14,8 +14,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from flangeye.types import Floats
-from flangeye_emulators.controllers.chain import Stance
-from flangeye_emulators.controllers.poses import carried
+from flangeye_emulators.controllers.poses import Stance, carried
 from flangeye_emulators.controllers.route import JOINTS, POSES, Space, Waypoint, route
 
 SLOWEST = 1e-4

@@ -25,11 +25,10 @@ import numpy as np
 
 from flangeye.errors import FlangeyeError
 from flangeye.files.elsewhere import is_this_machine
-from flangeye.models.emulator import EmulatorOptions
+from flangeye.models.graph import EmulatorOptions
 from flangeye.types import Floats
-from flangeye_emulators.controllers.arm import SimulatedArm, starting_joints
+from flangeye_emulators.controllers.arm import SimulatedArm, Surface, starting_joints
 from flangeye_emulators.controllers.client import PORT
-from flangeye_emulators.controllers.compliance import Surface
 from flangeye_emulators.controllers.fault_injection import FaultInjector, Schedule, parse_fault
 from flangeye_emulators.controllers.network import LineConnection, Network
 

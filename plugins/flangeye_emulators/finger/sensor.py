@@ -10,10 +10,10 @@ from pydantic import Field
 
 from flangeye.devices import Device, DeviceError, SensorFrame, StateSource, TactileSensor
 from flangeye.errors import StageError
-from flangeye.maths.geometry import rigid, rotation_exp, rotation_from_rpy, rotation_log
+from flangeye.maths.geometry import rotation_exp, rotation_from_rpy, rotation_log
 from flangeye.models.finger import Finger, FingerGeometry
 from flangeye.models.model import read_model
-from flangeye.models.workpiece import CadSeam, WorkpiecePath, load_workpiece
+from flangeye.models.workpiece import CadSeam, load_workpiece
 from flangeye.motion.seam_following import ToolPose
 from flangeye.plugin.stage import Params, part
 from flangeye.types import Floats, Image, Seed, Transform
@@ -22,6 +22,7 @@ from flangeye_emulators.weld_world.groove import Section, Tip
 from flangeye_emulators.weld_world.settings import ToolFile, ToolPath, WorldParams
 from flangeye_emulators.weld_world.world import Nominal, Shutter, WeldWorld
 from flangeye_emulators.world import room
+from flangeye_emulators.world.bench import LaidParams
 from flangeye_plugins.weld.corners import corners_of
 from flangeye_plugins.weld.frame import Tool, WorkPlane
 from flangeye_plugins.weld.path import Path
@@ -45,23 +46,13 @@ class SectionParams(Params):
     depth: Length = param(gt=0, description="From the walls' upper edge to the root.")
 
 
-class SimulatedFingerParams(Params):
+class SimulatedFingerParams(LaidParams):
     """Parameters of ``sensor.simulated_finger``: the world, whatever the controller's files say."""
 
     tool: ToolPath = param(
         "srm", description="The true finger and torch: one of data/worlds, or a .yaml file."
     )
-    workpiece: WorkpiecePath = param(
-        "v-straight", description="One of data/workpieces, or a .yaml file of one's own."
-    )
     seam: str = Field("groove", description="Name of the seam in that file.")
-    position: tuple[Length, Length, Length] = param(
-        ("600 mm", "0 mm", "250 mm"),
-        description="Position of the workpiece's CAD origin in the base.",
-    )
-    rpy: tuple[Angle, Angle, Angle] = param(
-        ("0 deg", "0 deg", "20 deg"), description="Roll, pitch, yaw of its CAD, in base."
-    )
     leg: int | None = Field(None, ge=1, description="Leg of a seam with sharp corners.")
     section: SectionParams | None = Field(
         None, description="The joint's true cross-section, where it is not the file's groove."
@@ -186,7 +177,7 @@ def _as_planned(finger: ToolFile, params: SimulatedFingerParams) -> tuple[WorkPl
         known = ", ".join(workpiece.seams)
         raise StageError(f"{params.workpiece}: has no seam '{params.seam}'; it has: {known}")
     seam = workpiece.seams[params.seam]
-    pose = rigid(rotation_from_rpy(*params.rpy), np.asarray(params.position))
+    pose = params.base_T_part
     points = seam.points @ pose[:3, :3].T + pose[:3, 3]
     openings = np.tile(pose[:3, :3] @ seam.opening, (len(points), 1))
     plane = WorkPlane(points, openings)

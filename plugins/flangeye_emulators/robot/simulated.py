@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 
 from flangeye.devices import GRACE, SILENT, Device, DeviceError, Mode, Robot, RobotState
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.stage import Params, part
 from flangeye.types import BASE, FLANGE, TOOL, Floats, Transform
-from flangeye.units import Angle, AngularSpeed, Duration, param
+from flangeye.units import Angle, Duration, param
 from flangeye_emulators.controllers.arm import (
     MotionFault,
     SimulatedArm,
@@ -28,7 +30,8 @@ class SimulatedParams(Params):
         description="Initial joint angles; by default flange down, half a metre from the base.",
     )
     period: Duration = param("2 ms", gt=0, description="Control cycle time.")
-    joint_speed: AngularSpeed = param("180 deg/s", gt=0, description="Maximum joint speed.")
+    # Maximum joint speed [rad/s]
+    joint_speed: ClassVar[float] = float(np.pi)
     joint_errors: int | None = param(
         None,
         ge=0,

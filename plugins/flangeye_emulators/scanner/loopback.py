@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -22,7 +22,6 @@ from flangeye.models.scanners import ScannerModel, middle_of_view
 from flangeye.models.targets import plate_of
 from flangeye.plugin.stage import Params, part
 from flangeye.types import BASE, CAMERA, Floats, PointCloud, Transform, Truth
-from flangeye.units import Duration, Length, param
 from flangeye_emulators.controllers.client import AUTO, EmulatorControl, address_of
 from flangeye_emulators.world.cell import SimulatedCell
 from flangeye_emulators.world.raycast import Image, Scene
@@ -42,20 +41,18 @@ class LoopbackParams(Params):
         "ur5e", description="Robot model of the controller: one of data/robots, or a file."
     )
     camera: CameraPose = Field(default_factory=CameraPose, description="The scanner's true pose.")
-    workspace: tuple[Length, Length, Length] = param(
-        ("300 mm", "300 mm", "200 mm"), description="The wall and the stand are beside this box."
-    )
+    # The wall and the stand are beside this box [m]
+    workspace: ClassVar[tuple[float, float, float]] = (0.3, 0.3, 0.2)
     seed: int = Field(0, ge=0, description="Draws noise, distortion and dropped frames.")
-    noise: float = Field(1.0, ge=0, description="Scale of the scanner's noise and distortion.")
+    # Scale of the scanner's noise and distortion
+    noise: ClassVar[float] = 1.0
     resolution: float = Field(
         0.35, gt=0, le=1, description="Scale of columns and rows; at 1 a scan takes seconds."
     )
-    exposure: Duration = param(
-        "300 ms", ge=0, le=2.0, description="Exposure time, during which the arm must stand still."
-    )
-    latency: Duration = param(
-        "200 ms", ge=0, le=3.0, description="Time from the end of the exposure to the data."
-    )
+    # Exposure time, during which the arm must stand still [s]
+    exposure: ClassVar[float] = 0.3
+    # Time from the end of the exposure to the data [s]
+    latency: ClassVar[float] = 0.2
     dropped: float = Field(0.0, ge=0, le=1, description="Share of exposures that are lost.")
     lost_after: int | None = Field(
         None, ge=0, description="Exposures after which the scanner is gone, as if unplugged."

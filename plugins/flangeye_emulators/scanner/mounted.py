@@ -7,6 +7,7 @@ robot only tells where its controller has it.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -17,7 +18,6 @@ from flangeye.models.scanners import ScannerModel
 from flangeye.models.workpiece import load_workpiece
 from flangeye.plugin.stage import part
 from flangeye.types import CAMERA, Array, Floats, PointCloud
-from flangeye.units import Length, param
 from flangeye_emulators.world import room
 from flangeye_emulators.world.bench import BenchParams, bench_with
 from flangeye_emulators.world.scanner import ScannerQuality, before_camera, scanner_of
@@ -27,9 +27,8 @@ from flangeye_plugins.scanner.opened import OpenScanner
 class MountedParams(ScannerQuality, BenchParams):
     """Parameters of ``scanner.mounted``."""
 
-    mount: tuple[Length, Length, Length] = param(
-        ("60 mm", "0 mm", "40 mm"), description="The scanner's true position in ``flange``."
-    )
+    # The scanner's true position in ``flange`` [m]
+    mount: ClassVar[tuple[float, float, float]] = (0.06, 0.0, 0.04)
     seed: int = Field(0, ge=0, description="Draws noise, distortion and what lies about.")
 
     @property

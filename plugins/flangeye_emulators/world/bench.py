@@ -19,8 +19,8 @@ MARGIN = 0.25
 """From the workpiece's box to the edge of the bench, to each side [m]."""
 
 
-class BenchParams(Params):
-    """A workpiece on a bench, as it really lies there."""
+class LaidParams(Params):
+    """A workpiece as it really lies."""
 
     workpiece: WorkpiecePath = param(
         "v-straight", description="One of data/workpieces, or a .yaml file of one's own."
@@ -32,15 +32,20 @@ class BenchParams(Params):
     rpy: tuple[Angle, Angle, Angle] = param(
         ("0 deg", "0 deg", "20 deg"), description="Roll, pitch, yaw of its CAD, in base."
     )
-    clutter: int = Field(6, ge=0, description="Number of other objects on the bench.")
-    covered: float = Field(
-        0.0, ge=0, lt=1, description="Share of the workpiece covered by a sheet, at one end."
-    )
 
     @property
     def base_T_part(self) -> Floats:
         """(4, 4), translation in [m]."""
         return rigid(rotation_from_rpy(*self.rpy), np.asarray(self.position))
+
+
+class BenchParams(LaidParams):
+    """A workpiece on a bench."""
+
+    clutter: int = Field(6, ge=0, description="Number of other objects on the bench.")
+    covered: float = Field(
+        0.0, ge=0, lt=1, description="Share of the workpiece covered by a sheet, at one end."
+    )
 
     def true_seams(self, workpiece: Workpiece) -> dict[str, Floats]:
         """Return the true seams by name, (N, 3) in ``base`` [m]."""

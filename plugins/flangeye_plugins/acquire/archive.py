@@ -22,13 +22,13 @@ from flangeye.files.recording import (
 from flangeye.log.read import is_log, read_run
 from flangeye.log.record import adapter
 from flangeye.models.cell import Cell
-from flangeye.models.cloud_unit import (
+from flangeye.models.scanners import (
+    ScannerData,
     check_unit,
     detect_unit,
     median_distance,
     unit_note,
 )
-from flangeye.models.scanners import ScannerData
 from flangeye.types import (
     CAMERA,
     TARGET,

@@ -1,4 +1,4 @@
-"""Poses that belong to other samples: shifted by some, or read too early or too late."""
+"""Poses of other samples or made up by a driver; and what moved that was taken as fixed."""
 
 from __future__ import annotations
 
@@ -7,15 +7,22 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flangeye import part
-from flangeye.doctor.diagnosis import Arms, Findings, NotApplicable, RecordedSession
-from flangeye.maths.pose_corrections import delaying, shifted
+from flangeye.doctor.diagnosis import Arms, Finding, Findings, NotApplicable, RecordedSession
+from flangeye.maths.pose_corrections import delaying, shifted, without_tool
 from flangeye.maths.streams import later, pose_at
 from flangeye.types import Floats, Mask
 from flangeye_plugins.check.equations import equations_of
-from flangeye_plugins.check.fitting import fit
-from flangeye_plugins.check.significance import Significance, best_of, helps
+from flangeye_plugins.check.fitting import VariantFits, fit, fit_of
+from flangeye_plugins.check.significance import (
+    Significance,
+    best_of,
+    exceedance,
+    helps,
+    moved_helps,
+)
 
 SHIFTS = (1, -1, 2, -2, 3, -3)
 FEWEST = 5
@@ -159,3 +166,184 @@ def _evidence(
     given = fit(equations_of(session).without(~chosen))
     others_fit = fit(equations_of(*tried).without(~known))
     return best_of(given, others_fit, further, against=against.reshape(-1))
+
+
+SAME = 1e-9
+"""Numbers that differ by less were not measured twice."""
+MOVED = 1e-3
+"""A target that has moved further was seen from another pose [m]."""
+
+
+@part("check.identity")
+def identity(session: RecordedSession) -> Findings:
+    """A driver without data returned the identity as a robot pose or a marker's pose."""
+    for whose, poses in _reported(session):
+        robot = np.abs(poses - np.eye(4)).max(axis=(1, 2), initial=0.0) < SAME
+        if robot.any():
+            what = (
+                f"{robot.sum()} of {len(session)} {whose} poses are the identity: the flange "
+                "cannot be in the base; the driver had no pose to give"
+            )
+            yield _left_out(session, robot, "identity matrices", what)
+    marker = _is_identity(session)
+    if marker.any():
+        what = f"{marker.sum()} of {len(session)} markers are at the camera itself, not turned"
+        yield _left_out(session, marker, "identity matrices", f"{what}: nothing was detected there")
+
+
+def _reported(session: RecordedSession) -> Iterator[tuple[str, Floats]]:
+    """Give the poses (N, 4, 4) that the controllers reported, and what to call them."""
+    if session.uses_poses:
+        yield "robot", session.poses
+    if session.links is not None:
+        yield "link", session.links
+    if session.seconds is not None:
+        yield "second arm's", session.seconds
+
+
+def _is_identity(session: RecordedSession) -> Mask:
+    at_camera = np.abs(np.nan_to_num(session.centres, nan=1.0)).max(axis=1) < SAME
+    turned = np.abs(session.rotations - np.eye(3)).max(axis=(1, 2))
+    return np.asarray(at_camera & ~(turned > SAME))
+
+
+@part("check.repeated")
+def repeated(session: RecordedSession) -> Findings:
+    """A pose or a detection was repeated although the arm had moved."""
+    reported = [poses[:, :3].reshape(len(poses), 12) for _, poses in _reported(session)]
+    yield from _repeats(session, np.concatenate(reported, axis=1), session.centres, "robot pose")
+    places = np.concatenate([poses[:, :3, 3] for _, poses in _reported(session)], axis=1)
+    yield from _repeats(session, session.centres, places, "detection")
+
+
+def _repeats(
+    session: RecordedSession, numbers: Floats, others: Floats, what: str
+) -> Iterator[Finding]:
+    """Find rows that repeat an earlier one to the last digit although the others moved on."""
+    apart = np.abs(numbers[:, None] - numbers[None]).max(axis=2, initial=0.0)
+    moved = np.linalg.norm(others[:, None] - others[None], axis=2) > MOVED
+    wrong = np.tril((apart < SAME) & moved, k=-1).any(axis=1)
+    made_up = any((np.abs(p[wrong] - np.eye(4)) < SAME).all() for _, p in _reported(session))
+    if wrong.any() and not made_up:
+        told = f"{wrong.sum()} of {len(session)} times the {what} is an earlier one to the last "
+        yield _left_out(
+            session,
+            wrong,
+            f"repeated {what}",
+            f"{told}digit, although the arm had moved: it is stale",
+        )
+
+
+def _left_out(session: RecordedSession, wrong: NDArray[np.bool_], name: str, what: str) -> Finding:
+    names = [each for each, bad in zip(session.ids, wrong, strict=True) if bad]
+    if (session.seen & ~wrong).sum() < session.seen.sum() / 2:
+        return Finding(name, what, "record again: too little is left", tuple(names))
+    corrected_session = session.without(wrong)
+    return Finding(
+        name, what, corrected_session.step(), tuple(names), corrected_session=corrected_session
+    )
+
+
+SPARE = 2
+"""Samples on each side of a move beyond those that a calibration takes up."""
+OFFSET = 1e-3
+"""A seen circle further than this from where the arm has it is a mistake [m]."""
+
+
+@part("check.moved")
+def moved(session: RecordedSession) -> Findings:
+    """The camera or the target was moved part way through."""
+    session.require_samples()
+    null = fit_of(session)
+    seen = np.flatnonzero(session.seen)
+    each = SPARE + int(np.ceil(null.parameters * len(seen) / null.count[0]))
+    starts = seen[each : len(seen) - each + 1]
+    if not len(starts):
+        raise NotApplicable(f"{len(seen)} samples are too few for two calibrations")
+    after = np.arange(len(session)) >= starts[:, None]
+    equations = equations_of(session)
+    halves = fit(equations.without(after)), fit(equations.without(~after))
+    evidence = best_of(null, _together(*halves), null.parameters)
+    start = int(starts[evidence.which])
+    if evidence.probability < 1 and moved_helps(session, np.arange(len(session)) >= start):
+        yield _moved_finding(session, evidence, start)
+
+
+def _together(first: VariantFits, second: VariantFits) -> VariantFits:
+    """Return two fits of separate samples as one."""
+    counts = first.count + second.count
+    share = (first.count / counts)[:, None]
+    residuals = tuple(
+        np.where(np.isfinite(one), one, other)
+        for one, other in zip(first.residuals, second.residuals, strict=True)
+    )
+    return replace(
+        first,
+        likelihood=first.likelihood + second.likelihood,
+        residuals=residuals,
+        scales=np.sqrt(share * first.scales**2 + (1 - share) * second.scales**2),
+        count=counts,
+    )
+
+
+def _moved_finding(session: RecordedSession, evidence: Significance, start: int) -> Finding:
+    later = np.arange(len(session)) >= start
+    shorter = later if later.sum() <= len(session) / 2 else ~later
+    name = session.ids[start]
+    what = (
+        f"the camera or what it looks at moved before '{name}', or the poses are written another "
+        "way from there on: the samples before and after fit two calibrations"
+    )
+    kept = session.without(shorter)
+    return evidence.finding("moved target", what, kept, samples=(session.ids[start],))
+
+
+@part("check.tool")
+def tool(session: RecordedSession) -> Findings:
+    """The poses are those of a tool (TCP): a constant offset in the flange frame."""
+    _require_known_place(session)
+    null = fit_of(session)
+    found = fit(equations_of(session).with_free_place())
+    offset = session.place[:3, :3] @ (found.unknowns.place[0, 0] - session.places[0])
+    length = float(np.linalg.norm(offset))
+    evidence = best_of(null, found, 3)
+    freedom = float(null.count[0]) - found.parameters
+    ratio = float(found.likelihood[0] - null.likelihood[0])
+    p = exceedance(ratio, float(null.count[0]), 3, freedom, length / OFFSET)
+    if p == 1 or not _known(found, offset):
+        return
+    listed = [f"{value * 1e3:.2f} mm" for value in offset + 0.0]
+    what = (
+        f"the seen target is {length * 1e3:.1f} mm from where the arm carries it, constantly: "
+        "the poses are probably those of a tool set in the controller, or it is mounted there, "
+        "which configuration: {place: unknown} says"
+    )
+    corrected_session = session.corrected(
+        lambda poses: without_tool(poses, -offset),
+        "both" if session.seconds is None else "second",
+        target_offset=listed,
+    )
+    yield evidence._replace(probability=p).finding("tool offset", what, corrected_session)
+
+
+def _require_known_place(session: RecordedSession) -> None:
+    """Go on only where it is known where the arm has the target.
+
+    Raises:
+        NotApplicable: It is not, or no arm has it.
+    """
+    session.require_samples()
+    if session.carried == "camera":
+        raise NotApplicable("a constant offset of what carries the camera is part of the answer")
+    if not np.isfinite(session.places).all():
+        raise NotApplicable("the target's pose on the arm is unknown and absorbs any offset")
+
+
+def _known(found: VariantFits, offset: Floats) -> bool:
+    """Whether the offset is known to a tenth of itself along every direction.
+
+    Where it is not, the smooth errors of an arm pass for one: the poses turn too little.
+    """
+    covariance = np.linalg.pinv(found.information[0], hermitian=True)[6:9, 6:9]
+    deviation = np.sqrt(np.linalg.eigvalsh(covariance)[-1])
+    return bool(deviation < 0.1 * np.linalg.norm(offset))

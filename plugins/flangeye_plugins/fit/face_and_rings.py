@@ -9,8 +9,7 @@ import numpy as np
 from flangeye.maths.circles import distances, edge_points, fringe, sectors, vote_centre
 from flangeye.maths.geometry import basis_of_plane
 from flangeye.maths.planes import Plane, chosen, fit_plane, thinned
-from flangeye.models.bolt_pattern import roll_angle
-from flangeye.models.targets import Flange
+from flangeye.models.targets import Flange, roll_angle
 from flangeye.types import CircleFeature, FlangeCloud, Floats, Indices, Mask, Rejected
 from flangeye_plugins.fit.circles import (
     Circles,

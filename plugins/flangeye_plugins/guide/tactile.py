@@ -12,7 +12,7 @@ import yaml
 
 from flangeye.devices import MotionAllowed, Robot, RobotDriver, TactileSensor
 from flangeye.errors import NothingMoved, StageError
-from flangeye.files.written import write_whole
+from flangeye.files.regular import write_whole
 from flangeye.maths.geometry import rigid
 from flangeye.models.finger import Calibration, Finger
 from flangeye.models.model import read_model

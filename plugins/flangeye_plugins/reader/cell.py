@@ -30,23 +30,35 @@ from flangeye.types import Floats, Motion
 from flangeye.units import param
 from flangeye_plugins.reader.columns import (
     PER_UNIT,
+    POINT,
     ColumnsParams,
     JointsParams,
+    TimesParams,
     readings_of,
     table_with_rows,
     times_of,
 )
 from flangeye_plugins.reader.pairing import Pair, PairingParams, pair
-from flangeye_plugins.reader.written import POINT
-
-NUMBER = "Column of the pose's number, or name, by which tables are joined."
 
 
-class OwnTableParams(ColumnsParams):
-    """A separate table, joined by number or by time."""
+class JoinedParams(Params):
+    """A table beside the others."""
 
     file: str = Field(description="The table's name, beside the others.")
-    number: Column | None = Field(None, description=NUMBER)
+    number: Column | None = Field(
+        None, description="Column of the pose's number, or name, by which tables are joined."
+    )
+
+
+class SeenParams(JoinedParams):
+    """What one camera saw of one target."""
+
+    camera: str = Field(description="Name of the camera in the recipe's cell.")
+    target: str = Field(description="Name of the target in the recipe's cell.")
+
+
+class OwnTableParams(JoinedParams, ColumnsParams):
+    """A separate table, joined by number or by time."""
 
     @model_validator(mode="after")
     def _joined_one_way(self) -> OwnTableParams:
@@ -63,22 +75,16 @@ class ArmTableParams(OwnTableParams, JointsParams):
     )
 
 
-class AxisTableParams(Params):
+class AxisTableParams(JoinedParams, TimesParams):
     """Where a rail's or a positioner's controller had it."""
 
-    file: str = Field(description="The table's name, beside the others.")
     column: Column = Field(description="Column of the value.")
     unit: Literal["m", "mm", "rad", "deg"] = Field(description="Unit of the value.")
-    number: Column | None = Field(None, description=NUMBER)
-    time: Column | None = Field(None, description="Column of the time.")
-    time_unit: Literal["s", "ms", "us", "ns"] = Field("s", description="Unit of the times.")
 
 
-class SightingsParams(OwnTableParams):
+class SightingsParams(SeenParams, OwnTableParams):
     """One target as one camera saw it; empty cells where it did not."""
 
-    camera: str = Field(description="Name of the camera in the recipe's cell.")
-    target: str = Field(description="Name of the target in the recipe's cell.")
     pose: Literal["camera_T_target", "target_T_camera"] = Field(
         "camera_T_target", description="Whose pose it is. rotation: point gives its place alone."
     )
@@ -89,14 +95,10 @@ class SightingsParams(OwnTableParams):
         return (POINT,)
 
 
-class ScansParams(Params):
-    """The scans that one camera took of one target."""
+class ScansParams(SeenParams):
+    """The scans that one camera took of one target: a table that names them."""
 
-    camera: str = Field(description="Name of the camera in the recipe's cell.")
-    target: str = Field(description="Name of the target in the recipe's cell.")
-    file: str = Field(description="The table that names them, beside the others.")
     scan: Column = Field("scan", description="Column of the scans' files, beside the table.")
-    number: Column | None = Field(None, description=NUMBER)
 
 
 class CellParams(Params):

@@ -1,4 +1,4 @@
-"""Columns of a text table: which of them hold a pose, a point or a time, and how it is written."""
+"""Columns of a text table: which hold a pose, a point or a time, and in which convention."""
 
 from __future__ import annotations
 
@@ -8,18 +8,93 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, field_validator, model_validator
 
 from flangeye import Params, StageError
+from flangeye.files.clouds import LengthUnit
 from flangeye.files.tables import Cell, Column, Table, read_table
+from flangeye.maths.pose_formats import (
+    APART,
+    CONVENTIONS,
+    MATRIX,
+    PLAIN,
+    pose_of_numbers,
+    written,
+)
 from flangeye.types import Floats
-from flangeye_plugins.reader.written import WrittenParams
+
+POINT = "point"
+
+
+class WrittenParams(Params):
+    """A convention; nothing of it is guessed."""
+
+    rotation: str = Field(
+        description="How the rotations are written: xyzw or wxyz (quaternions), vector, three axes "
+        "(xyz: fixed, ZYX: turned), matrix (12 or 16 numbers, row by row), 3x3 (9 numbers behind "
+        "the position), or a maker's way: " + ", ".join(CONVENTIONS) + ".",
+    )
+    length: Literal["m", "mm"] = Field(description="Unit of the positions.")
+    angle: Literal["deg", "rad"] | None = Field(
+        None, description="Unit of the angles, or of the rotation vector's length."
+    )
+
+    @field_validator("rotation")
+    @classmethod
+    def _known(cls, value: str) -> str:
+        known = (*CONVENTIONS, *PLAIN, MATRIX, APART, *cls.more())
+        if value not in known:
+            raise ValueError(f"no rotation '{value}'; known: {', '.join(known)}")
+        return value
+
+    @model_validator(mode="after")
+    def _angle_given(self) -> WrittenParams:
+        numbers = self.rotation in (*CONVENTIONS, *PLAIN)
+        if self.angle is None and numbers and not written(self.rotation, "m", "rad").is_quaternion:
+            raise ValueError(f"rotation: {self.rotation} needs angle: deg or angle: rad")
+        return self
+
+    @classmethod
+    def more(cls) -> tuple[str, ...]:
+        """Return what else may be written here than whole poses."""
+        return ()
+
+    def value(self, where: str, numbers: Floats) -> Floats:
+        """Return the pose (4, 4) or the point (3,) [m] of a row of numbers.
+
+        Raises:
+            StageError: They are no pose in this convention.
+        """
+        if self.rotation == POINT:
+            if numbers.size != 3 or not np.isfinite(numbers).all():
+                raise StageError(f"{where}: a point has 3 finite numbers, not {numbers.size}")
+            return np.asarray(numbers * (1e-3 if self.length == "mm" else 1.0))
+        try:
+            return pose_of_numbers(numbers, self.rotation, self.length, self.angle or "rad")
+        except ValueError as error:
+            raise StageError(f"{where}: {error}") from None
+
 
 PER_UNIT = {"m": 1.0, "mm": 1e-3, "rad": 1.0, "deg": float(np.pi / 180)}
 PER_SECOND = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 
-class ColumnsParams(WrittenParams):
+class CloudUnitParams(Params):
+    """The unit of clouds that lie beside poses."""
+
+    cloud_unit: LengthUnit | None = Field(
+        None, description="Unit of the clouds; found by the scanner's range if not given."
+    )
+
+
+class TimesParams(Params):
+    """Which column holds the time."""
+
+    time: Column | None = Field(None, description="Column of the time.")
+    time_unit: Literal["s", "ms", "us", "ns"] = Field("s", description="Unit of the times.")
+
+
+class ColumnsParams(TimesParams, WrittenParams):
     """Which columns hold a pose, and how it is written."""
 
     columns: tuple[Column, ...] = Field(
@@ -27,8 +102,6 @@ class ColumnsParams(WrittenParams):
         "position first; of JSON and YAML also a list's, by its own name; all that nothing else "
         "takes if not given.",
     )  # fmt: skip
-    time: Column | None = Field(None, description="Column of the time.")
-    time_unit: Literal["s", "ms", "us", "ns"] = Field("s", description="Unit of the times.")
 
 
 class JointsParams(Params):

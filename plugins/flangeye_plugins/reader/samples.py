@@ -22,10 +22,10 @@ from typing import Any, Literal
 from pydantic import Field
 
 from flangeye import Params, StageError, part
-from flangeye.files.clouds import LengthUnit
 from flangeye.files.pairs import natural
 from flangeye.files.recording import Archive, NotThisLayout
 from flangeye.files.tables import Table, document_of, files_at, read_table
+from flangeye_plugins.reader.columns import CloudUnitParams
 from flangeye_plugins.reader.table import TableParams, table
 
 QUATERNION = ("translation.x", "translation.y", "translation.z",
@@ -50,13 +50,10 @@ class EasyHandeyeParams(Params):
     )
 
 
-class ZividParams(Params):
+class ZividParams(CloudUnitParams):
     """How the poses are written."""
 
     length: Literal["m", "mm"] = Field(description="Unit of the positions; Zivid's own are mm.")
-    cloud_unit: LengthUnit | None = Field(
-        None, description="Unit of the exported clouds; found by the scanner's range if not given."
-    )
 
 
 @part("reader.easy_handeye")

@@ -23,7 +23,6 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from flangeye import StageError, part
-from flangeye.files.clouds import LengthUnit
 from flangeye.files.pairs import partners
 from flangeye.files.recording import Archive, NotThisLayout, Recording
 from flangeye.files.scans import Poses, recording_of, scans_of
@@ -35,6 +34,8 @@ from flangeye.models.robots import RobotModel
 from flangeye.types import FLANGE, FLANGE2, Floats, Motion
 from flangeye.units import param
 from flangeye_plugins.reader.columns import (
+    POINT,
+    CloudUnitParams,
     ColumnsParams,
     JointsParams,
     Readings,
@@ -43,7 +44,6 @@ from flangeye_plugins.reader.columns import (
     times_of,
 )
 from flangeye_plugins.reader.pairing import Pair, PairingParams, pair
-from flangeye_plugins.reader.written import POINT
 
 SCAN = "scan"
 """How the column of the scans' file names is called, if the recipe does not say."""
@@ -90,7 +90,7 @@ class SecondParams(OtherParams):
     )
 
 
-class TableParams(ColumnsParams, JointsParams):
+class TableParams(ColumnsParams, JointsParams, CloudUnitParams):
     """The convention of the poses; nothing of it is guessed."""
 
     file: str | tuple[str, ...] = Field(
@@ -118,9 +118,6 @@ class TableParams(ColumnsParams, JointsParams):
     )
     second: SecondParams | None = Field(None, description="A second arm's pose.")
     join: PairingParams = param(PairingParams(), description="Joining of separate tables by time.")
-    cloud_unit: LengthUnit | None = Field(
-        None, description="Unit of the clouds; found by the scanner's range if not given."
-    )
 
     @classmethod
     def more(cls) -> tuple[str, ...]:

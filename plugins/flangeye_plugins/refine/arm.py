@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
-from pydantic import Field
 
 from flangeye import Params, StageError, stage
 from flangeye.estimation.arm_model import (
@@ -33,7 +33,6 @@ from flangeye.types import (
     Observation,
     TransformEstimate,
 )
-from flangeye.units import Angle, param
 
 FOLDS, HELPFUL = 5, 0.95
 """The arm's error is kept when it brings the error on poses held out to this share or less."""
@@ -46,12 +45,10 @@ UNITS = (("mrad", 1e3), ("mm", 1e3), ("mm", 1e3), ("mrad", 1e3))
 class ArmParams(Params):
     """Parameters of ``refine.arm``."""
 
-    zeros: Angle = param(
-        "5 mrad", gt=0, description="Expected standard deviation of a joint's zero."
-    )
-    propose: int = Field(
-        6, ge=0, description="Number of further poses to propose for identifying the arm."
-    )
+    # Expected standard deviation of a joint's zero [rad]
+    zeros: ClassVar[float] = 5e-3
+    # Number of further poses to propose for identifying the arm
+    propose: ClassVar[int] = 6
 
     @property
     def corrects_arm(self) -> bool:

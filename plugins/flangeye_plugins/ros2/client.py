@@ -17,9 +17,8 @@ from typing import Any, NamedTuple, TypeVar
 
 from flangeye.devices import Device, DeviceError
 from flangeye.errors import StageError
-from flangeye.files.machine import find_named, settings_file
-from flangeye.files.pipe import Pipe, PipeEndedError
-from flangeye.files.processes import busy, python_command
+from flangeye.files.paths import find_named, settings_file
+from flangeye.files.processes import Pipe, PipeEndedError, busy, python_command
 from flangeye.models.graph import Topic
 from flangeye_plugins.ros2.messages import CLOCK, CLOCK_TYPE, stamp_of, types
 

@@ -17,15 +17,12 @@ import numpy as np
 from pydantic import Field
 
 from flangeye.devices import PATIENCE, DeviceError, FrameDropped, Scan, Scanner
-from flangeye.files.machine import MachineName, find_named, require_named
-from flangeye.files.machine import settings_file as machine_settings
-from flangeye.files.paths import RecipePath
-from flangeye.files.pipe import Pipe, PipeEndedError
-from flangeye.files.processes import python_command
+from flangeye.files.paths import MachineName, RecipePath, find_named, require_named
+from flangeye.files.paths import settings_file as machine_settings
+from flangeye.files.processes import Pipe, PipeEndedError, python_command
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import Params, part
-from flangeye_plugins.scanner.kinect_view import DepthView
-from flangeye_plugins.scanner.opened import OpenScanner
+from flangeye_plugins.scanner.opened import DepthView, OpenScanner
 
 NAME = "scanner.azure_kinect"
 DEFAULT_PYTHON = "kinect"

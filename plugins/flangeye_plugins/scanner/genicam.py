@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from flangeye.devices import DeviceError, FrameDropped, Scan, Scanner
-from flangeye.files.machine import MachineName, find_named
+from flangeye.devices import DeviceError, FrameDropped, Scan, Scanner, load_sdk
+from flangeye.files.paths import MachineName, find_named
 from flangeye.models.scanners import ScannerModel
-from flangeye.plugin.sdk import load_sdk
 from flangeye.plugin.stage import part
 from flangeye_plugins.scanner.genicam_nodes import Layout, configure, has_node
 from flangeye_plugins.scanner.opened import OpenScanner, SerialParams

@@ -8,9 +8,8 @@ from typing import Any, ClassVar
 
 from pydantic import Field
 
-from flangeye.devices import DeviceError, Scan, Scanner
+from flangeye.devices import DeviceError, Scan, Scanner, load_sdk
 from flangeye.models.scanners import ScannerModel
-from flangeye.plugin.sdk import load_sdk
 from flangeye.plugin.stage import Params, part
 from flangeye_plugins.scanner.opened import OpenScanner
 

@@ -11,10 +11,9 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from flangeye.devices import PATIENCE, DeviceError, Scan, Scanner
+from flangeye.devices import PATIENCE, DeviceError, Scan, Scanner, load_sdk
 from flangeye.files.paths import RecipePath
 from flangeye.models.scanners import ScannerModel
-from flangeye.plugin.sdk import load_sdk
 from flangeye.plugin.stage import part
 from flangeye_plugins.scanner.opened import OpenScanner, SerialParams
 

@@ -32,8 +32,7 @@ from flangeye_plugins.ros2.messages import (
     pixels_of,
     values_of,
 )
-from flangeye_plugins.scanner.kinect_view import DepthView
-from flangeye_plugins.scanner.opened import OpenScanner
+from flangeye_plugins.scanner.opened import DepthView, OpenScanner
 
 NAME = "scanner.ros2"
 

@@ -16,8 +16,7 @@ from flangeye.devices import DeviceError, Scan, Scanner
 from flangeye.errors import StageError
 from flangeye.files.clouds import CLOUD_SUFFIXES, LengthUnit, read_cloud
 from flangeye.files.paths import RecipePath
-from flangeye.models.cloud_unit import check_unit, median_distance
-from flangeye.models.scanners import ScannerModel
+from flangeye.models.scanners import ScannerModel, check_unit, median_distance
 from flangeye.plugin.stage import Params, part
 from flangeye.types import PointCloud
 from flangeye.units import Duration, param

@@ -12,8 +12,7 @@ from flangeye.files.clouds import PER_METRE, LengthUnit
 from flangeye.files.drawings import read_dxf
 from flangeye.files.tables import read_table
 from flangeye.maths.geometry import rigid, rotation_from_rpy
-from flangeye.maths.polylines import chained, sharp_edges
-from flangeye.maths.seam_geometry import distances_to_line
+from flangeye.maths.seam_geometry import chained, distances_to_line, sharp_edges
 from flangeye.models.robots import RobotModel
 from flangeye.models.workpiece import MESHES, STEP, read_mesh
 from flangeye.types import Box, Floats, Seam, VerifiedHandEye

@@ -8,8 +8,7 @@ import numpy as np
 
 from flangeye.maths.planes import robust_planes, thinned
 from flangeye.maths.statistics import SIGMA_OF_MAD, median
-from flangeye.models.bolt_pattern import match_holes
-from flangeye.models.targets import Flange
+from flangeye.models.targets import Flange, match_holes
 from flangeye.types import Indices, Mask, Singles
 from flangeye_plugins.segment.discs import Disc, DiscLimits, compare, in_box, of_size
 from flangeye_plugins.segment.grid import Grid, cells

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from flangeye import CalibrationRefused, Params, StageError
+from flangeye import CalibrationRefused, StageError
 from flangeye.estimation.calibrate import Options, calibrate_at
 from flangeye.estimation.closed.motions import Motions, motions_of, place_of
 from flangeye.estimation.graph import Places, Problem
@@ -17,21 +17,14 @@ from flangeye.maths.geometry import invert
 from flangeye.models.cell import Cell
 from flangeye.models.scanners import ScannerModel
 from flangeye.types import Floats, HandEye, Observation
-from flangeye.units import Angle, Length, param
+from flangeye_plugins.solve.observations import LimitsParams
 
 ClosedForm = Callable[[Problem], Places]
 """Gives (4, 4) of each unknown."""
 
 
-class ClosedFormParams(Params):
+class ClosedFormParams(LimitsParams):
     """Parameters of the closed forms."""
-
-    rotation_limit: Angle = param(
-        "2 deg", gt=0, description="A rotation known less well is not observable."
-    )
-    translation_limit: Length = param(
-        "20 mm", gt=0, description="A translation known less well is not observable."
-    )
 
 
 def solve_closed(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -48,9 +48,8 @@ class IterativeParams(Params):
     required: Length = param(
         "0.3 mm", ge=0, description="Stop acquiring once the cost is this small."
     )
-    k_max: int = Field(
-        100, ge=0, description="Largest number of poses tried after the initial pool."
-    )
+    # Largest number of poses tried after the initial pool
+    k_max: ClassVar[int] = 100
     reserve: int = Field(
         0, ge=0, description="First poses kept from the pool, for error.holdout to measure on."
     )

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from flangeye.maths.geometry import rigid
+from flangeye.plugin.stage import Params
 from flangeye.types import (
     BASE,
     CAMERA,
@@ -17,6 +18,25 @@ from flangeye.types import (
     Transform,
     TransformEstimate,
 )
+from flangeye.units import Angle, Length, param
+
+
+class RotationLimitParams(Params):
+    """When a rotation is not observable."""
+
+    rotation_limit: Angle = param(
+        "2 deg",
+        gt=0,
+        description="Refuse when rotation about some axis has a larger standard deviation.",
+    )
+
+
+class LimitsParams(RotationLimitParams):
+    """When a calibration is not observable."""
+
+    translation_limit: Length = param(
+        "20 mm", gt=0, description="A translation known less well is not observable."
+    )
 
 
 def centres_of(observations: Sequence[Observation]) -> Floats:

@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
-from flangeye import FlangeyeError, Params, stage
+from flangeye import FlangeyeError, stage
 from flangeye.models.cell import Cell, cell_of
 from flangeye.models.configuration import CELL, DEFAULT, EVERY, Configuration
 from flangeye.models.robots import RobotModel, SecondRobot
 from flangeye.models.scanners import ScannerModel
 from flangeye.types import Box, HandEye, Observation, Observations, Progress, Solver, StageLog
-from flangeye.units import Angle, Length, param
+from flangeye.units import Length, param
+from flangeye_plugins.solve.observations import LimitsParams
 
 if TYPE_CHECKING:
     from flangeye.estimation.calibrate import Options
@@ -22,19 +23,11 @@ FEWEST_ONLINE = 6
 """Poses before an online run may stop: fewer tell too little of the noise."""
 
 
-class RobustParams(Params):
+class RobustParams(LimitsParams):
     """Parameters of ``solve.robust``."""
 
     normals: Literal["auto", "off"] = Field(
         "auto", description="Use the flange's measured normals where there are any."
-    )
-    rotation_limit: Angle = param(
-        "2 deg",
-        gt=0,
-        description="Refuse when rotation about some axis has a larger standard deviation.",
-    )
-    translation_limit: Length = param(
-        "20 mm", gt=0, description="A translation known less well is not observable."
     )
     unobservable: Literal["refuse", "mark"] = Field(
         "refuse",

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from flangeye import Params, stage
+from flangeye import stage
 from flangeye.estimation.observability import (
     FINEST_NOISE,
     information_of_centres,
@@ -20,8 +20,8 @@ from flangeye.estimation.observability import (
 from flangeye.maths.geometry import kabsch, kabsch_covariance
 from flangeye.maths.statistics import covariance_inflation
 from flangeye.types import Floats, HandEye, Observation, Observations, TransformEstimate
-from flangeye.units import Angle, param
 from flangeye_plugins.solve.observations import (
+    RotationLimitParams,
     centres_of,
     estimate_of,
     hand_eye,
@@ -30,14 +30,8 @@ from flangeye_plugins.solve.observations import (
 )
 
 
-class SvdParams(Params):
+class SvdParams(RotationLimitParams):
     """Parameters of ``solve.svd``."""
-
-    rotation_limit: Angle = param(
-        "2 deg",
-        gt=0,
-        description="Refuse when rotation about some axis has a larger standard deviation.",
-    )
 
 
 @stage("solve.svd")

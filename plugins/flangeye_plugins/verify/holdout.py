@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -33,7 +34,7 @@ from flangeye.types import (
     Solver,
     Verification,
 )
-from flangeye.units import Angle, Length, param
+from flangeye.units import Length, param
 
 
 class HoldoutParams(Params):
@@ -41,15 +42,11 @@ class HoldoutParams(Params):
 
     folds: int = Field(5, ge=2, description="Number of folds; each is held out once.")
     max_rms: Length = param("1 mm", gt=0, description="Largest held-out error that passes, rms.")
-    max_tilt: Angle = param(
-        "2 deg",
-        gt=0,
-        description="Largest held-out angle between measured and expected faces that passes, rms. "
-        "Positions alone can fit while every angle was read wrongly.",
-    )
-    max_outliers: float = Field(
-        0.3, ge=0, lt=1, description="Largest share of poses the solver may set aside as wrong."
-    )
+    # Largest held-out angle between measured and expected faces that passes, rms. Positions alone
+    # can fit while every angle was read wrongly [rad]
+    max_tilt: ClassVar[float] = float(np.radians(2))
+    # Largest share of poses the solver may set aside as wrong
+    max_outliers: ClassVar[float] = 0.3
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -26,8 +27,13 @@ from flangeye.types import (
     Views,
 )
 from flangeye.units import Angle, Length, param
-from flangeye_plugins.verify.registration import Registration, register
-from flangeye_plugins.verify.surface import Surface, read_surface, surface_of
+from flangeye_plugins.verify.registration import (
+    Registration,
+    Surface,
+    read_surface,
+    register,
+    surface_of,
+)
 
 
 class CadCloud(Params):
@@ -51,21 +57,19 @@ class IcpSettings(Params):
     cad: CadCloud | None = Field(
         None, description="The flange's shape; by default made from its dimensions."
     )
-    reach: Length = param(
-        "20 mm", gt=0, description="Largest initial error from which ICP is started."
-    )
-    distance: Length = param(
-        "1 mm", gt=0, description="Points further from the surface are not the flange, in the end."
-    )
+    # Largest initial error from which ICP is started [m]
+    reach: ClassVar[float] = 20e-3
+    # Points further from the surface are not the flange, in the end [m]
+    distance: ClassVar[float] = 1e-3
 
 
 class IcpParams(IcpSettings):
     """Parameters of ``verify.icp``."""
 
-    max_translation: Length = param(
-        "1 mm", gt=0, description="Largest translation error at the flange that passes."
-    )
-    max_tilt: Angle = param("1 deg", gt=0, description="Largest error of its axis that passes.")
+    # Largest translation error at the flange that passes [m]
+    max_translation: ClassVar[float] = 1e-3
+    # Largest error of its axis that passes [rad]
+    max_tilt: ClassVar[float] = float(np.radians(1))
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from flangeye.models.robots import RobotModel
 from flangeye.motion.arc import with_arc
 from flangeye.motion.executor import Executor, led
 from flangeye.motion.limits import limits_of
-from flangeye.motion.precedence import LEADING, precedence
+from flangeye.motion.watchdog import LEADING, precedence
 from flangeye.plugin.stage import stage
 from flangeye.recipe.header import LimitsSection
 from flangeye.types import Floats, Seam, Seed, StageLog, VerifiedHandEye, WeldReport

@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
-from flangeye_emulators.controllers.chain import Chain, UnreachableError
-from flangeye_emulators.controllers.poses import pose_matrix, twist_between
+from flangeye_emulators.controllers.poses import Chain, UnreachableError, pose_matrix, twist_between
 
 MODELS = ["ur3e", "ur5", "ur5e", "ur10e", "aubo-i5", "franka-panda"]
 joint_angles = st.tuples(*[st.floats(-3.0, 3.0)] * 6).map(np.array)

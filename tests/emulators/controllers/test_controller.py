@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from flangeye_emulators.controllers.ur.controller import RobotMode, Runtime, SafetyMode
-from flangeye_emulators.controllers.ur.dashboard import answer
 from flangeye_emulators.controllers.ur.script import ScriptSource
-from flangeye_emulators.controllers.ur.server import run_program
+from flangeye_emulators.controllers.ur.server import answer, run_program
 from tests.emulators.controllers.desk import Desk, away
 
 SPEED, MOVE = 10, 3

@@ -7,7 +7,7 @@ import pytest
 
 from flangeye import cli, hookimpl
 from flangeye.errors import StageError
-from flangeye.models.emulator import Emulator, EmulatorOptions, find_emulator
+from flangeye.models.graph import Emulator, EmulatorOptions, find_emulator
 from flangeye.models.loading import load_model
 from flangeye.plugin import registry
 from flangeye.plugin.registry import Registry, load_registry

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye_emulators.controllers.compliance import Surface
+from flangeye_emulators.controllers.arm import Surface
 from flangeye_emulators.controllers.ur.controller import SafetyMode
 from tests.emulators.controllers.desk import Desk, away
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye_emulators.controllers.compliance import Surface
+from flangeye_emulators.controllers.arm import Surface
 from flangeye_emulators.controllers.poses import pose_matrix, twist_between
 from tests.emulators.controllers.desk import HOME, away
 from tests.emulators.controllers.process import Process

@@ -16,11 +16,11 @@ import pytest
 from flangeye.cli import main
 from flangeye.errors import StageError
 from flangeye.maths.kinematics import Arm
-from flangeye.models.emulator import EmulatorOptions
+from flangeye.models.graph import EmulatorOptions
 from flangeye.models.loading import load_model
 from flangeye_emulators.controllers import server
+from flangeye_emulators.controllers.arm import Surface
 from flangeye_emulators.controllers.client import EmulatorControl
-from flangeye_emulators.controllers.compliance import Surface
 from flangeye_emulators.controllers.network import Network
 from flangeye_emulators.controllers.ur.server import serve
 from tests.emulators.controllers.desk import HOME, away

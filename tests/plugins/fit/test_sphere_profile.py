@@ -47,7 +47,7 @@ UP = np.array([0.0, 0.1, -0.995])
 
 def profile(centre: Floats = CENTRE, seed: int = 0, **changes: Any) -> Floats:
     """Return what a line scanner sees of a sphere over a table."""
-    params = ProfilesParams(**changes)
+    params = fixed(ProfilesParams, **changes)
     found = profile_of(centre, SPHERE.radius, UP, params, np.random.default_rng(seed))
     return found.astype(np.float64)
 
@@ -92,7 +92,7 @@ def test_wherever_it_passes_the_centre_is_found(
 def test_the_covariance_is_that_of_the_errors(beside: float) -> None:
     centre = np.array([0.0, beside * SPHERE.radius, 0.25])
     exact = {"scanner_error": SI(0), "radius_error": SI(0)}
-    fits = [found(profile(centre, seed), **exact) for seed in range(100)]
+    fits = [found(profile(centre, seed), **exact) for seed in range(50)]
     errors = np.array([f.centre - centre for f in fits])
     stated = np.mean([f.covariance for f in fits], axis=0)
     assert errors.std(axis=0) == pytest.approx(np.sqrt(np.diag(stated)), rel=0.35)
@@ -167,7 +167,7 @@ def test_what_no_scatter_shows_is_added_where_it_belongs() -> None:
 
 def test_a_larger_sphere_is_farther_from_the_plane_as_the_covariance_says() -> None:
     larger = 2e-5
-    xyz = profile_of(CENTRE, SPHERE.radius + larger, UP, ProfilesParams(noise=SI(0)),
+    xyz = profile_of(CENTRE, SPHERE.radius + larger, UP, fixed(ProfilesParams, noise=0.0),
                      np.random.default_rng(0)).astype(np.float64)  # fmt: skip
     none = {"scanner_error": SI(0), "radius_error": SI(larger)}
     feature = found(xyz, **none)

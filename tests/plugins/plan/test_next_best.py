@@ -3,6 +3,7 @@
 import re
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -69,6 +70,7 @@ def test_what_the_arm_cannot_reach_is_passed_over() -> None:
     assert planned(place=site(joints=lambda pose: None)) == []
 
 
+@pytest.mark.slow
 def test_it_needs_at_most_three_quarters_of_the_grids_poses() -> None:
     pairs = [compare(seed) for seed in (1, 3)]
     assert sum(found.poses for _, found in pairs) <= 0.75 * sum(w.poses for w, _ in pairs)

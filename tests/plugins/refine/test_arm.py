@@ -32,6 +32,7 @@ from flangeye_plugins.export.robot import export_robot
 from flangeye_plugins.export.writing import NamedParams
 from flangeye_plugins.refine.arm import ArmParams, refine_arm
 from flangeye_plugins.solve.robust import RobustParams, solve_robust
+from tests.plugins.fixed import fixed
 
 UR5 = load_model("robots", "ur5")
 HOME = np.radians([0, -90, 90, -90, -90, 0])
@@ -132,7 +133,7 @@ def test_without_joint_angles_only_what_all_ways_to_the_poses_agree_on_is_identi
     """An elbow that bends the other way explains the same scans by zeros of the other sign."""
     observations = observed(40, 0, 0.5, ArmErrors(quality="real", zeros="3 mrad"))
     without = [replace(o, joints=None) for o in observations]
-    found = refine_arm(solved(without), ArmParams(propose=0), UR5)
+    found = refine_arm(solved(without), fixed(ArmParams, propose=0), UR5)
     (said,) = [n for n in found.notes if "joint angles" in n]
     assert said.startswith("the recordings have no joint angles, and the arm may have reached the")
     assert said.endswith("; record the joint angles with the poses")
@@ -147,7 +148,7 @@ def test_an_offset_of_the_circle_that_the_arm_explains_better_is_not_kept() -> N
     """Else the arm's parameters make up for it, each stated as sure."""
     calibration = solved(observed(40, 0, 0.5, ArmErrors(quality="real", zeros="3 mrad")))
     taken = replace(calibration, correction=ArmCorrection(np.array([0.6e-3, 0.0, -0.4e-3])))
-    found = refine_arm(taken, ArmParams(propose=0), UR5)
+    found = refine_arm(taken, fixed(ArmParams, propose=0), UR5)
     correction, sure = found.corrected.correction, refined().corrected.correction
     assert not correction.tool_offset.any()
     assert correction.joint_offsets == pytest.approx(sure.joint_offsets, abs=1e-5)
@@ -172,7 +173,7 @@ def test_an_arm_of_seven_joints_without_their_angles_tells_no_parameter_singly()
         for i, pose in enumerate(arm.flange(joints))
     ]  # fmt: skip
     calibration = solve_robust(Observations(observations, Source("")), RobustParams(), robot=panda)
-    found = refine_arm(calibration, ArmParams(propose=0), panda)
+    found = refine_arm(calibration, fixed(ArmParams, propose=0), panda)
     assert any("parameters singly" in n and "identify none" in n for n in found.notes)
     assert any("in any number of ways that fit alike" in n for n in found.notes)
 

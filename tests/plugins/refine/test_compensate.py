@@ -34,7 +34,7 @@ from flangeye_plugins.refine.compensate import (
     compensated,
     refine_compensate,
 )
-from flangeye_plugins.verify.surface import surface_of
+from flangeye_plugins.verify.registration import surface_of
 
 UR5 = load_model("robots", "ur5")
 FLANGE = flange_of(UR5.flange, load_standard("50-4-M6"))

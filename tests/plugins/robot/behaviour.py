@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from flangeye.devices import GRACE, SILENT, DeviceError, Robot
-from flangeye_emulators.controllers.compliance import Surface
+from flangeye_emulators.controllers.arm import Surface
 from tests.plugins.robot.cell import arrived, in_time, moved, until
 
 

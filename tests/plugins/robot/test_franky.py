@@ -11,7 +11,7 @@ import pytest
 
 from flangeye.devices import SILENT, DeviceError, Robot
 from flangeye.maths.geometry import rigid, rotation_exp
-from flangeye_emulators.controllers.compliance import Surface
+from flangeye_emulators.controllers.arm import Surface
 from flangeye_plugins.robot.franky import (
     FrankyParams,
     FrankyRobot,

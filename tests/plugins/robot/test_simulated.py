@@ -12,7 +12,7 @@ from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
 from flangeye.types import Transform
-from flangeye_emulators.controllers.compliance import Surface
+from flangeye_emulators.controllers.arm import Surface
 from flangeye_emulators.controllers.poses import twist_between
 from flangeye_emulators.robot.simulated import SimulatedParams, robot_simulated
 

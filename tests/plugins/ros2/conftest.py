@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from flangeye.motion.precedence import LEADING, precedence
+from flangeye.motion.watchdog import LEADING, precedence
 from tests.plugins.ros2 import installed
 
 

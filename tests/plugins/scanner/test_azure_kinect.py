@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 from flangeye.devices import DeviceError, FrameDropped, Scanner
-from flangeye.files.machine import settings_file
+from flangeye.files.paths import settings_file
 from flangeye.models.loading import load_model
 from flangeye_plugins.scanner import azure_kinect as driver
 from flangeye_plugins.scanner.azure_kinect import (
     AzureKinectParams,
     scanner_azure_kinect,
 )
-from flangeye_plugins.scanner.kinect_view import DepthView
+from flangeye_plugins.scanner.opened import DepthView
 from tests.plugins.fixed import fixed
 from tests.plugins.scanner.mkv import COLUMNS, ROWS, Recorder
 

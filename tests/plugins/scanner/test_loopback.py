@@ -23,6 +23,7 @@ from flangeye_plugins.fit.rim import fit_rim
 from flangeye_plugins.fit.rim_params import RimParams
 from flangeye_plugins.segment.flange import SegmentParams, segment_flange
 from tests.emulators.controllers.process import Process
+from tests.plugins.fixed import fixed
 
 pytestmark = pytest.mark.realtime
 
@@ -50,7 +51,7 @@ def controller() -> Iterator[Any]:
 
 def params(controller, **changes):
     plain = {"resolution": 0.25, "exposure": SI(0.02), "latency": SI(0.0)}
-    return LoopbackParams(host=controller.host, **plain | changes)
+    return fixed(LoopbackParams, host=controller.host, **plain | changes)
 
 
 def opened(controller, **changes):

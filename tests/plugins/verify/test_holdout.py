@@ -30,6 +30,7 @@ from flangeye_plugins.verify.holdout import (
     deal_moments,
     verify_holdout,
 )
+from tests.plugins.fixed import fixed
 
 TRUTH = rotation_exp(np.array([2.9, 0.4, -0.3])), np.array([0.4, -0.7, 0.9])
 MM = 1e-3
@@ -174,7 +175,7 @@ def test_an_outlier_the_solver_set_aside_is_counted_and_reported() -> None:
 def test_too_many_outliers_do_not_pass() -> None:
     observations = simulate(20)
     observations[7] = displaced(observations[7], [0.02, 0, 0])
-    params = HoldoutParams(max_outliers=0.01)
+    params = fixed(HoldoutParams, max_outliers=0.01)
     result = verify_holdout(without_07(observations), without_07, params)
     assert not result.passed
     assert result.reason == (

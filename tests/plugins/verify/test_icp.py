@@ -43,8 +43,7 @@ from flangeye_plugins.verify.icp import (
     _figures,
     verify_icp,
 )
-from flangeye_plugins.verify.registration import Registration
-from flangeye_plugins.verify.surface import Surface, read_surface, surface_of
+from flangeye_plugins.verify.registration import Registration, Surface, read_surface, surface_of
 
 MM = 1e-3
 TRUTH = Transform(

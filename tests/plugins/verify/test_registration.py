@@ -5,8 +5,14 @@ import pytest
 
 from flangeye.maths.geometry import rigid, rotation_exp, rotation_log
 from flangeye_plugins.verify import registration
-from flangeye_plugins.verify.registration import Registration, _least_squares, _limits, register
-from flangeye_plugins.verify.surface import Surface, surface_of
+from flangeye_plugins.verify.registration import (
+    Registration,
+    Surface,
+    _least_squares,
+    _limits,
+    register,
+    surface_of,
+)
 from tests.plugins.verify.test_icp import FLANGE_50, MM
 
 SHAPE = surface_of(FLANGE_50, 0.6 * MM)

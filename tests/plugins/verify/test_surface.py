@@ -8,7 +8,7 @@ import pytest
 from flangeye import StageError
 from flangeye.models.loading import load_model
 from flangeye.models.targets import wrist_circle_of
-from flangeye_plugins.verify.surface import _normals, _ring, read_surface, surface_of
+from flangeye_plugins.verify.registration import _normals, _ring, read_surface, surface_of
 from tests.plugins.verify.test_icp import FLANGE_50, MM
 
 SPACING = 0.4 * MM

@@ -19,8 +19,7 @@ from flangeye.files.yaml_lines import parse_yaml
 from flangeye.log.read import RunLog, log_of, read_run
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import parse_recipe
-from flangeye.run.folder import CHECKS, RunFolder
-from flangeye.run.recorded import recipe_of_log
+from flangeye.run.folder import CHECKS, RunFolder, recipe_of_log
 from flangeye.run.runner import Runner
 from flangeye.run.session import record_scans
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from flangeye.doctor.monitor.history import Finding, History
 from flangeye.estimation.watch.drift import DriftTest
-from flangeye.files.written import write_whole
+from flangeye.files.regular import write_whole
 from flangeye.report.look import LIGHT, SERIES, css
 
 COLOURS = {"OK": LIGHT["verified"], "DEGRADED": LIGHT["unverified"], "MOVED": LIGHT["refused"]}

@@ -19,8 +19,7 @@ from pydantic import Field
 from flangeye import types as t
 from flangeye.errors import StageError
 from flangeye.estimation.watch.drift import State
-from flangeye.files.regular import read_regular
-from flangeye.files.written import write_whole
+from flangeye.files.regular import read_regular, write_whole
 from flangeye.log.read import decode_json
 from flangeye.log.record import adapter
 from flangeye.log.records import DamageError, reason_of

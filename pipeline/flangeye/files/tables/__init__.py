@@ -26,8 +26,16 @@ from flangeye.errors import StageError
 from flangeye.files.pairs import natural
 from flangeye.files.regular import read_text
 from flangeye.files.tables.documents import KINDS, document_of
-from flangeye.files.tables.records import record_of, rows_of
-from flangeye.files.tables.table import Cell, Column, Row, Rows, Table, number_of
+from flangeye.files.tables.table import (
+    Cell,
+    Column,
+    Row,
+    Rows,
+    Table,
+    number_of,
+    record_of,
+    rows_of,
+)
 from flangeye.files.words import reason_of
 from flangeye.maths.pose_formats import CONVENTIONS
 

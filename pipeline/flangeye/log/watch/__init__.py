@@ -10,8 +10,7 @@ from rich.console import Console
 
 from flangeye.errors import StageError
 from flangeye.log.watch.server import foxglove_server
-from flangeye.log.watch.tail import follow
-from flangeye.log.watch.view import View
+from flangeye.log.watch.view import View, follow
 
 __all__ = ["watch_run"]
 

@@ -20,7 +20,7 @@ from contextlib import ExitStack, closing, contextmanager, suppress
 from functools import partial
 
 from flangeye.errors import StageError
-from flangeye.log.watch.tail import Channel, Message
+from flangeye.log.watch.view import Channel, Message
 
 Send = Callable[[Message], None]
 

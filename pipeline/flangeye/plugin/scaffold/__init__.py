@@ -7,7 +7,7 @@ from pathlib import Path
 
 from flangeye.errors import StageError
 from flangeye.files.paths import VERSION
-from flangeye.files.written import write_whole
+from flangeye.files.regular import write_whole
 from flangeye.plugin.stage import KINDS, PARTS
 
 TEMPLATES = Path(__file__).parent / "templates"

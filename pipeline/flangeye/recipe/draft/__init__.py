@@ -12,9 +12,8 @@ from flangeye.maths.geometry import basis_of_plane, rpy_from_rotation
 from flangeye.models.graph import RunningCell
 from flangeye.models.loading import load_model
 from flangeye.models.scanners import ScannerModel, middle_of_view
-from flangeye.recipe.draft.questions import Questions
 from flangeye.recipe.draft.recipe import PLATE, Draft, draft_recipe, yaml_of
-from flangeye.recipe.draft.survey import look
+from flangeye.recipe.draft.survey import Questions, look
 from flangeye.types import Floats
 from flangeye.units import in_mm, parse_quantity
 

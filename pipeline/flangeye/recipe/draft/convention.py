@@ -22,7 +22,14 @@ from flangeye.maths.pose_formats import (
 )
 from flangeye.maths.pose_formats import convention_of_maker as usual_of
 from flangeye.models.robots import RobotModel
-from flangeye.recipe.draft.evidence import Writing, mounting_of, writing_of
+from flangeye.recipe.draft.evidence import (
+    FARTHEST,
+    TURN,
+    Writing,
+    mounting_of,
+    poses_by_number,
+    writing_of,
+)
 from flangeye.recipe.draft.headings import (
     JOINTS,
     Headings,
@@ -31,8 +38,7 @@ from flangeye.recipe.draft.headings import (
     is_inverse,
     poses_by_name,
 )
-from flangeye.recipe.draft.numbers import FARTHEST, TURN, poses_by_number
-from flangeye.recipe.draft.questions import Questions, one_of
+from flangeye.recipe.draft.survey import Questions, one_of
 from flangeye.types import Floats
 
 NAME_THE_ARM = "name the arm: --robot NAME ('flangeye robots' lists them), or its .urdf"

@@ -17,17 +17,15 @@ from flangeye.files.scans import CLOUDS, IMAGES
 from flangeye.files.tables import tables_in
 from flangeye.files.yaml_edit import entry, flow
 from flangeye.files.yaml_lines import parse_value
-from flangeye.models.cloud_unit import detect_unit, median_distance
 from flangeye.models.loading import load_model
 from flangeye.models.robots import RobotModel
-from flangeye.models.scanners import ScannerData
+from flangeye.models.scanners import ScannerData, detect_unit, median_distance
 from flangeye.models.targets import load_standard
 from flangeye.models.urdf import robot_from_urdf
 from flangeye.plugin.registry import Registry
 from flangeye.plugin.stage import BoundPart
 from flangeye.recipe.draft.convention import table_params
-from flangeye.recipe.draft.questions import Questions, one_of
-from flangeye.recipe.draft.survey import FolderSurvey
+from flangeye.recipe.draft.survey import FolderSurvey, Questions, one_of
 from flangeye.recipe.load import parse_recipe
 
 PLATE = "ISO 9409-1-50-4-M6"

@@ -12,13 +12,12 @@ from typing import Any
 
 from flangeye.errors import FlangeyeError, StageError
 from flangeye.files.paths import VERSION
-from flangeye.files.written import write_whole
+from flangeye.files.regular import write_whole
 from flangeye.files.yaml_lines import parse_yaml
 from flangeye.log.read import read_run
 from flangeye.models.loading import load_model
 from flangeye.models.scanners import ScannerModel
 from flangeye.recipe.own_models import carried_files
-from flangeye.report.account import provenance_of
 from flangeye.report.certificate.budget import (
     Conditions,
     Contribution,
@@ -27,7 +26,7 @@ from flangeye.report.certificate.budget import (
     shares_of,
     use_budget_of,
 )
-from flangeye.report.facts import Facts, facts_of
+from flangeye.report.facts import Facts, facts_of, provenance_of
 from flangeye.report.look import css
 from flangeye.report.summary import transform_text
 from flangeye.report.units import degrees, millimetres

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flangeye.types import Floats
-from flangeye_emulators.controllers.compliance import ForceMode
+from flangeye_emulators.controllers.arm import ForceMode
 from flangeye_emulators.controllers.ur.controller import URController
 from flangeye_emulators.controllers.ur.program import Program, Thread
 

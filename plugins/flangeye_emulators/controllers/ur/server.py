@@ -1,20 +1,26 @@
-"""A controller of Universal Robots as a process."""
+"""A controller of Universal Robots as a process, and its dashboard server."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable
 
-from flangeye.models.emulator import EmulatorOptions
+from flangeye.models.graph import EmulatorOptions
 from flangeye_emulators.controllers.arm import joint_zeros, starting_joints
 from flangeye_emulators.controllers.fault_injection import FaultInjector, Kind
-from flangeye_emulators.controllers.network import Connection, Network
+from flangeye_emulators.controllers.network import Connection, LineConnection, Network
 from flangeye_emulators.controllers.poses import pose_matrix
 from flangeye_emulators.controllers.server import Server, run_server
-from flangeye_emulators.controllers.ur import dashboard, rtde
+from flangeye_emulators.controllers.ur import rtde, server
 from flangeye_emulators.controllers.ur.commands import COMMANDS, STREAMED
 from flangeye_emulators.controllers.ur.commands.moves import travel
-from flangeye_emulators.controllers.ur.controller import RefusedError, Registers, URController
+from flangeye_emulators.controllers.ur.controller import (
+    RefusedError,
+    Registers,
+    Runtime,
+    URController,
+    dashboard_name_of,
+)
 from flangeye_emulators.controllers.ur.program import Program, ProgramError, Thread
 from flangeye_emulators.controllers.ur.script import (
     CONTROL_SCRIPT,
@@ -25,6 +31,103 @@ from flangeye_emulators.controllers.ur.script import (
     register_offset,
     take_program,
 )
+
+PORT = 29999
+SERIAL_NUMBER = "20245500001"
+PROGRAM_NAME = "loopback.urp"
+
+Answer = Callable[[URController, str], str]
+
+
+class DashboardSession(LineConnection):
+    """One client."""
+
+    def __init__(self, network: Network, box: URController) -> None:
+        super().__init__(network)
+        self._box = box
+
+    def opened(self) -> None:
+        """Greet."""
+        self.say("Connected: Universal Robots Dashboard Server")
+
+    def line(self, text: str) -> None:
+        """Answer one command."""
+        if text.lower() in ("quit", "exit"):
+            self.say("Disconnected")
+            self.close()
+            return
+        self.say(answer(self._box, text))
+
+
+def answer(box: URController, text: str) -> str:
+    """Return the answer to one command, after doing what it says."""
+    lowered = text.lower()
+    for command, act in ANSWERS.items():
+        if lowered == command or lowered.startswith(command + " "):
+            try:
+                return act(box, text[len(command) :].strip())
+            except RefusedError as refused:
+                return str(refused)
+    return f"could not understand: '{text}'"
+
+
+def _doing(action: Callable[[URController], None], words: str) -> Answer:
+    def act(box: URController, argument: str) -> str:
+        del argument
+        action(box)
+        return words
+
+    return act
+
+
+def _telling(words: Callable[[URController], str]) -> Answer:
+    return lambda box, argument: words(box)
+
+
+def _stop(box: URController) -> None:
+    box.stop_program("stopped at the dashboard")
+
+
+def _program_state(box: URController) -> str:
+    words = {Runtime.PLAYING: "PLAYING", Runtime.PAUSED: "PAUSED", Runtime.STOPPED: "STOPPED"}
+    return f"{words[box.runtime]} {PROGRAM_NAME}"
+
+
+def _version(box: URController) -> str:
+    return f"URSoftware {'.'.join(map(str, box.box.version))} (loopback)"
+
+
+ANSWERS: dict[str, Answer] = {
+    "polyscopeversion": _telling(_version),
+    "get serial number": _telling(lambda box: SERIAL_NUMBER),
+    "get robot model": _telling(lambda box: dashboard_name_of(box.robot)),
+    "is in remote control": _telling(lambda box: str(box.remote_control).lower()),
+    "running": _telling(
+        lambda box: f"Program running: {str(box.runtime is Runtime.PLAYING).lower()}"
+    ),
+    "programstate": _telling(_program_state),
+    "robotmode": _telling(lambda box: f"Robotmode: {box.robot_mode.name}"),
+    "safetymode": _telling(lambda box: f"Safetymode: {box.safety.name}"),
+    "safetystatus": _telling(lambda box: f"Safetystatus: {box.safety.name}"),
+    "get loaded program": _telling(lambda box: f"Loaded program: /programs/{PROGRAM_NAME}"),
+    "isprogramsaved": _telling(lambda box: f"true {PROGRAM_NAME}"),
+    "load": lambda box, name: f"Loading program: {name}",
+    "play": _doing(URController.play, "Starting program"),
+    "pause": _doing(URController.pause, "Pausing program"),
+    "stop": _doing(_stop, "Stopped"),
+    "power on": _doing(URController.power_on, "Powering on"),
+    "power off": _doing(URController.power_off, "Powering off"),
+    "brake release": _doing(URController.release_brakes, "Brake releasing"),
+    "unlock protective stop": _doing(URController.unlock, "Protective stop releasing"),
+    "restart safety": _doing(URController.release_emergency_stop, "Restarting safety"),
+    "close safety popup": _telling(lambda box: "closing safety popup"),
+    "close popup": _telling(lambda box: "closing popup"),
+    "popup": _telling(lambda box: "showing popup"),
+    "addtolog": _telling(lambda box: "Added log message"),
+    "setuserrole": lambda box, role: f"Setting user role: {role}",
+}
+"""Commands and what they answer; a command with an argument is followed by it."""
+
 
 READY, DONE = 1, 2
 SCRIPT_PORT = 30003
@@ -143,8 +246,8 @@ def serve(options: EmulatorOptions) -> None:
     network = Network(options.host)
     stream = rtde.RtdePort(network, box)
     network.offer(SCRIPT_PORT, lambda: ScriptSession(network, box))
-    network.offer(dashboard.PORT, lambda: dashboard.DashboardSession(network, box))
-    ports = {"RTDE": rtde.PORT, "script": SCRIPT_PORT, "dashboard": dashboard.PORT}
+    network.offer(server.PORT, lambda: server.DashboardSession(network, box))
+    ports = {"RTDE": rtde.PORT, "script": SCRIPT_PORT, "dashboard": server.PORT}
     run_server(Server(options, box, network, URFaultInjector(box, network), ports), stream.publish)
 
 

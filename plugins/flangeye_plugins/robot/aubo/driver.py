@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from flangeye.devices import GRACE, Device, DeviceError, Mode, Robot, RobotState
+from flangeye.devices import GRACE, Device, DeviceError, Mode, Robot, RobotState, load_sdk
 from flangeye.maths.geometry import rotation_log
 from flangeye.maths.pose_formats import CONVENTIONS
 from flangeye.models.robots import RobotModel
-from flangeye.plugin.sdk import load_sdk
 from flangeye.plugin.stage import part
 from flangeye.types import BASE, FLANGE, TOOL, Floats, Transform
 from flangeye_plugins.robot.aubo.client import STANDING, AuboClient, Ride

@@ -10,9 +10,8 @@ import numpy as np
 
 from flangeye.types import Floats
 from flangeye_emulators.controllers.arm import BRAKES, SimulatedArm
-from flangeye_emulators.controllers.chain import UnreachableError
 from flangeye_emulators.controllers.motion import ControllerMotion, Travel, joint_move, linear_move
-from flangeye_emulators.controllers.poses import pose_matrix
+from flangeye_emulators.controllers.poses import UnreachableError, pose_matrix
 from flangeye_emulators.controllers.route import JOINTS, POSES, Waypoint
 from flangeye_emulators.controllers.ur.program import ProgramError, Thread
 from flangeye_emulators.controllers.ur.script import Move

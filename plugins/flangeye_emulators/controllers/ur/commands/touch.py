@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from flangeye.types import Floats
-from flangeye_emulators.controllers.compliance import ForceMode
+from flangeye_emulators.controllers.arm import ForceMode
 from flangeye_emulators.controllers.motion import Speed
 from flangeye_emulators.controllers.poses import rotation_matrix
 from flangeye_emulators.controllers.ur.commands.moves import to_pose
