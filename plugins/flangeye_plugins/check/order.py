@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -13,7 +13,7 @@ from flangeye import part
 from flangeye.doctor.diagnosis import Arms, Finding, Findings, NotApplicable, RecordedSession
 from flangeye.maths.pose_corrections import delaying, shifted, without_tool
 from flangeye.maths.streams import later, pose_at
-from flangeye.types import Floats, Mask
+from flangeye.types import Floats, Indices, Mask
 from flangeye_plugins.check.equations import equations_of
 from flangeye_plugins.check.fitting import VariantFits, fit, fit_of
 from flangeye_plugins.check.significance import (
@@ -22,6 +22,7 @@ from flangeye_plugins.check.significance import (
     exceedance,
     helps,
     moved_helps,
+    narrowed,
 )
 
 SHIFTS = (1, -1, 2, -2, 3, -3)
@@ -54,9 +55,14 @@ class Alternative(NamedTuple):
 def order(session: RecordedSession) -> Findings:
     """Scans are paired with the pose before or after their own, from the start or some scan."""
     session.require_samples()
-    tried = list(_shifts(session))
+    every = np.arange(1, len(session) - 1)
+    tried = [(arms, by, 0) for arms in session.arms for by in SHIFTS]
+    count = len(tried) + 2 * len(every)
+    for by in (1, -1):
+        near = narrowed(every, lambda some, by=by: _gains(session, by, some))  # type: ignore[misc]
+        tried += [("both", by, int(start)) for start in near]
     others = [_shifted(session, *each) for each in tried]
-    evidence = _evidence(session, others)
+    evidence = _evidence(session, others, tried=count)
     if evidence is None or evidence.probability == 1:
         return
     arms, by, start = tried[evidence.which]
@@ -70,10 +76,13 @@ def order(session: RecordedSession) -> Findings:
     yield evidence.finding("shifted poses", what, corrected_session)
 
 
-def _shifts(session: RecordedSession) -> Iterator[tuple[Arms, int, int]]:
-    """Give (arms, by, start)."""
-    yield from ((arms, by, 0) for arms in session.arms for by in SHIFTS)
-    yield from (("both", by, start) for by in (1, -1) for start in range(1, len(session) - 1))
+def _gains(session: RecordedSession, by: int, starts: Indices) -> Floats:
+    """Return (K,) logarithms of likelihood ratios of shifts that begin with some samples."""
+    fits = _fits(session, [_shifted(session, "both", by, int(start)) for start in starts])
+    if fits is None:
+        return np.zeros(len(starts))
+    given, found, against = fits
+    return np.asarray(found.likelihood - given.likelihood[against])
 
 
 def _shifted(session: RecordedSession, arms: Arms, by: int, start: int) -> Alternative:
@@ -152,9 +161,23 @@ def _delayed(
 
 
 def _evidence(
-    session: RecordedSession, others: Sequence[Alternative], further: int = 0
+    session: RecordedSession,
+    others: Sequence[Alternative],
+    further: int = 0,
+    tried: int | None = None,
 ) -> Significance | None:
     """Hold poses of other moments against those given, on the samples that have both."""
+    fits = _fits(session, others)
+    if fits is None:
+        return None
+    given, found, against = fits
+    return best_of(given, found, further, tried, against)
+
+
+def _fits(
+    session: RecordedSession, others: Sequence[Alternative]
+) -> tuple[VariantFits, VariantFits, Indices] | None:
+    """Return fits as given, of the others, and which of the former has the samples of each."""
     known = np.array([other.known for other in others])
     enough = (known & session.seen).sum(axis=1) >= FEWEST
     if not enough.any():
@@ -164,8 +187,7 @@ def _evidence(
     tried = [o.session if kept else session for o, kept in zip(others, enough, strict=True)]
     chosen, against = np.unique(known, axis=0, return_inverse=True)
     given = fit(equations_of(session).without(~chosen))
-    others_fit = fit(equations_of(*tried).without(~known))
-    return best_of(given, others_fit, further, against=against.reshape(-1))
+    return given, fit(equations_of(*tried).without(~known)), against.reshape(-1)
 
 
 SAME = 1e-9
@@ -220,9 +242,14 @@ def _repeats(
     session: RecordedSession, numbers: Floats, others: Floats, what: str
 ) -> Iterator[Finding]:
     """Find rows that repeat an earlier one to the last digit although the others moved on."""
-    apart = np.abs(numbers[:, None] - numbers[None]).max(axis=2, initial=0.0)
-    moved = np.linalg.norm(others[:, None] - others[None], axis=2) > MOVED
-    wrong = np.tril((apart < SAME) & moved, k=-1).any(axis=1)
+    from scipy.spatial import KDTree
+
+    read = np.flatnonzero(np.isfinite(numbers).all(axis=1))
+    alike = KDTree(numbers[read]).query_pairs(SAME, p=np.inf, output_type="ndarray")
+    before, after = np.sort(read[alike], axis=1).T
+    moved = np.linalg.norm(others[after] - others[before], axis=1) > MOVED
+    wrong = np.zeros(len(numbers), dtype=bool)
+    wrong[after[moved]] = True
     made_up = any((np.abs(p[wrong] - np.eye(4)) < SAME).all() for _, p in _reported(session))
     if wrong.any() and not made_up:
         told = f"{wrong.sum()} of {len(session)} times the {what} is an earlier one to the last "
@@ -260,11 +287,15 @@ def moved(session: RecordedSession) -> Findings:
     starts = seen[each : len(seen) - each + 1]
     if not len(starts):
         raise NotApplicable(f"{len(seen)} samples are too few for two calibrations")
-    after = np.arange(len(session)) >= starts[:, None]
     equations = equations_of(session)
-    halves = fit(equations.without(after)), fit(equations.without(~after))
-    evidence = best_of(null, _together(*halves), null.parameters)
-    start = int(starts[evidence.which])
+
+    def two(some: Indices) -> VariantFits:
+        after = np.arange(len(session)) >= some[:, None]
+        return _together(fit(equations.without(after)), fit(equations.without(~after)))
+
+    near = narrowed(starts, lambda some: two(some).likelihood)
+    evidence = best_of(null, two(near), null.parameters, tried=len(starts))
+    start = int(near[evidence.which])
     if evidence.probability < 1 and moved_helps(session, np.arange(len(session)) >= start):
         yield _moved_finding(session, evidence, start)
 
