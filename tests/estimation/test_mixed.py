@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flangeye.estimation.mixed import fit, left_out
+from flangeye.estimation.mixed import Posterior, fit, left_out, shares
 from tests.estimation import foreign
 from tests.estimation.sessions import estimated, robot, score
 
@@ -32,12 +32,28 @@ def test_the_gradient_is_that_of_the_cost(found) -> None:
 
 def test_leaving_one_out_in_closed_form_is_leaving_it_out(found) -> None:
     model, mode = found.posterior.model, found.posterior.mode
-    shares = np.ones(16)
-    everyone = fit(model.weighted(shares), mode.sizes)
-    shares[3] = 0.0
-    others = fit(model.weighted(shares), mode.sizes)
+    parts = np.ones(16)
+    everyone = fit(model.weighted(parts), mode.sizes)
+    parts[3] = 0.0
+    others = fit(model.weighted(parts), mode.sizes)
     expected = (model.residuals - model.design @ others.mean)[3]
     assert left_out(model, everyone)[0][3] == pytest.approx(expected, rel=1e-5, abs=1e-10)
+
+
+def test_shares_are_what_each_cause_does_to_the_answer(found) -> None:
+    known, mode = found.posterior, found.posterior.mode
+    model, (n, _, count) = known.model, known.model.design.shape
+    one = Posterior(model, mode, (mode,), np.ones(1))
+    of_effects, noise = shares(one, np.eye(count)[: model.p])
+    gain = (mode.covariance @ (mode.weights @ model.design).reshape(6 * n, count).T)[: model.p]
+    # An effect of one size at a time, through the linear estimator
+    for k, share in enumerate(of_effects):
+        columns = model.p + np.flatnonzero(model.sizes.effect == k)
+        error = gain @ model.design.reshape(6 * n, count)[:, columns] * mode.sizes[k]
+        assert share == pytest.approx(error @ error.T, rel=1e-4, abs=1e-6 * share.max())
+    each = gain.reshape(model.p, n, 6).swapaxes(0, 1)
+    whole = (each @ model.noise(mode.sizes) @ each.swapaxes(1, 2)).sum(axis=0)
+    assert noise == pytest.approx(whole, rel=1e-4, abs=1e-6 * whole.max())
 
 
 def test_a_pose_that_belongs_elsewhere_is_set_aside() -> None:

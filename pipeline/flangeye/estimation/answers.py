@@ -14,6 +14,7 @@ What is common to all poses cancels, so that it is known far better than the tru
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -21,12 +22,14 @@ import numpy as np
 
 from flangeye.estimation.estimate import Estimate, model_at
 from flangeye.estimation.graph import Carrier, Linear, Problem
-from flangeye.estimation.mixed import spread_of
+from flangeye.estimation.mixed import shares, spread_of
 from flangeye.estimation.work import Work
 from flangeye.maths.frame_graph import chain, composed
 from flangeye.maths.geometry import hat, invert
 from flangeye.types import ExpectedError, Floats, Mask
 
+NOISE = "scans and poses, one by one"
+"""The share of what is drawn anew at each sighting."""
 DRAWS = 8
 """Of an error at each pose and each draw of the sizes, for its quantiles."""
 LEVER = 0.02
@@ -43,15 +46,17 @@ class Answer:
     Attributes:
         mean: (P,) moves of the places from those of the estimate.
         covariance: (P, P) of them.
+        shares: (P, P) of it by what causes it; the rest is that few poses tell how large each is.
     """
 
     mean: Floats
     covariance: Floats
+    shares: Mapping[str, Floats]
 
     def at(self, mean: Floats) -> Answer:
         """Return other moves (P,), with the covariance about them."""
         off = mean - self.mean
-        return Answer(mean, self.covariance + np.outer(off, off))
+        return replace(self, mean=mean, covariance=self.covariance + np.outer(off, off))
 
 
 def functional(found: Estimate, a: Floats) -> Answer:
@@ -62,7 +67,11 @@ def functional(found: Estimate, a: Floats) -> Answer:
     within = rows @ found.posterior.covariance @ np.swapaxes(rows, 1, 2)
     apart = each - each.mean(axis=0)
     covariance = within.mean(axis=0) + apart.T @ apart / max(len(a) - 1, 1)
-    return Answer(each.mean(axis=0), 0.5 * (covariance + covariance.T))
+    of_effects, noise = shares(found.posterior, rows.mean(axis=0))
+    named = {NOISE: noise}
+    for effect, share in zip(found.effects, of_effects, strict=True):
+        named[effect.name] = named.get(effect.name, 0.0) + share
+    return Answer(each.mean(axis=0), 0.5 * (covariance + covariance.T), named)
 
 
 def as_true(found: Estimate) -> Answer:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
@@ -255,9 +255,9 @@ def _estimates(session: Session, answer: Answer, weak: Floats) -> list[Transform
         transform = Transform.named(session.cell.name_of(name), moved[name])
         # A turn of a round target is about its own axis.
         free = np.hstack([weak[rows], _in_parent(moved[name], rounds[rows])])
-        out[name] = _estimate(
-            transform, answer.covariance[rows, rows], _about(session, transform), free
-        )
+        own = {cause: share[rows, rows] for cause, share in answer.shares.items()}
+        about = _about(session, transform)
+        out[name] = _estimate(transform, answer.covariance[rows, rows], own, about, free)
     order = [n for n in session.cell.unknown_frames if n in out]
     return [out[name] for name in order]
 
@@ -286,24 +286,33 @@ def _about(session: Session, transform: Transform) -> Floats:
 
 
 def _estimate(
-    transform: Transform, covariance: Floats, about: Floats, free: Floats
+    transform: Transform,
+    covariance: Floats,
+    shares: Mapping[str, Floats],
+    about: Floats,
+    free: Floats,
 ) -> TransformEstimate:
     """Return an estimate, its covariance taken about a point instead of the child's origin.
 
     Args:
         transform: The value.
         covariance: (6, 6), rotation and translation, this at the child's origin.
+        shares: (6, 6) of it, likewise.
         about: (3,) in the parent [m].
         free: (6, k) moves that nothing tells of, taken like the covariance.
     """
     shift = adjoint_shift(about - transform.translation)
-    moved = shift @ covariance @ shift.T
     sizes = np.linalg.norm(free, axis=0)
     kept = (shift @ free)[:, sizes > 1e-6]  # others move other places alone
     directions = np.linalg.qr(kept)[0].T if kept.shape[1] else np.zeros((0, 6))
     across = np.eye(6) - directions.T @ directions
-    moved = across @ moved @ across
-    return TransformEstimate(transform, 0.5 * (moved + moved.T), about, directions)
+
+    def moved(each: Floats) -> Floats:
+        there = across @ shift @ each @ shift.T @ across
+        return np.asarray(0.5 * (there + there.T))
+
+    parts = {cause: moved(share) for cause, share in shares.items()}
+    return TransformEstimate(transform, moved(covariance), about, directions, parts)
 
 
 def _shared(found: Estimate) -> Floats:

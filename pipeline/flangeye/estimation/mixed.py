@@ -271,6 +271,26 @@ class Posterior:
         return np.asarray(within + (apart.T * self.chances) @ apart)
 
 
+def shares(known: Posterior, rows: Floats) -> tuple[Floats, Floats]:
+    """Return what the covariance of (A, P + K) rows of the unknowns is made of.
+
+    The error of Henderson's solution is V (Lambda delta - H'W e), so that of each effect is
+    V_k V_k' / s_k^2; the noise has the rest of V.
+
+    Returns:
+        (E, A, A) of each effect, and (A, A) of the noise.
+    """
+    sizes = known.model.sizes.effect
+    own = np.eye(int(sizes.max(initial=-1)) + 1)[:, sizes]
+    of_effects, whole = np.zeros((len(own), len(rows), len(rows))), np.zeros((len(rows),) * 2)
+    for chance, each in zip(known.chances, known.fits, strict=True):
+        moved = rows @ each.covariance
+        scaled = moved[:, known.model.p :] / each.sizes[sizes]
+        of_effects += chance * np.einsum("ak,ek,bk->eab", scaled, own, scaled)
+        whole += chance * moved @ rows.T
+    return of_effects, np.asarray(whole - of_effects.sum(axis=0))
+
+
 def mode_of(model: Model, start: Floats | None = None, steps: int = 60) -> Floats:
     """Return (Z,) the most likely sizes, as standard normal numbers, by L-BFGS."""
     from scipy.optimize import minimize

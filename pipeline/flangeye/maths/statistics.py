@@ -68,34 +68,6 @@ def covariance_inflation(freedom: float, parameters: int = 6, probability: float
     return honest / chi2_quantile(probability, parameters)
 
 
-def excess_variance(errors: Floats, covariances: Floats) -> float:
-    """Return the isotropic variance [m^2] that errors show beyond their own covariances, robustly.
-
-    Chosen so that the median squared distance is that of a chi-square variable of three degrees
-    of freedom; up to half of the errors may be anything. Never negative.
-
-    Args:
-        errors: (N, 3) [m].
-        covariances: (N, 3, 3) what is known of each [m^2].
-    """
-    variances, axes = np.linalg.eigh(covariances)
-    with np.errstate(over="ignore"):  # what a file says may be beyond all numbers
-        squares = np.einsum("nji,nj->ni", axes, errors) ** 2
-    median = chi2_quantile(0.5, 3)
-
-    def too_small(excess: float) -> bool:
-        return bool(np.median((squares / (variances + excess)).sum(axis=1)) > median)
-
-    low, high = 0.0, float(squares.sum(axis=1).max())
-    tiny = np.finfo(float).tiny
-    if high <= tiny or not too_small(tiny):
-        return 0.0
-    for _ in range(100):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if too_small(middle) else (low, middle)
-    return high
-
-
 def corners_of(centre: Floats, size: Floats) -> Floats:
     """Return the (8, 3) corners of an axis-aligned box."""
     signs = np.array(list(product([-0.5, 0.5], repeat=3)))

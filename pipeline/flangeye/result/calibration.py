@@ -50,6 +50,7 @@ def _transform(estimate: t.TransformEstimate) -> TransformResult:
         covariance=estimate.covariance.tolist(),
         about=estimate.about.tolist(),
         unobservable=estimate.unobservable.tolist() if len(estimate.unobservable) else None,
+        shares={cause: share.tolist() for cause, share in estimate.shares.items()},
     )
 
 

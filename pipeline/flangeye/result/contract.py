@@ -31,14 +31,19 @@ class TransformResult(_Part):
         description="Directions (rotation, translation), about the same point, along which the "
         "estimate is arbitrary and the covariance says nothing.",
     )
+    shares: dict[str, Matrix] = Field(
+        {}, description="6x6 of the covariance by what causes it; the rest is what few poses leave "
+        "open of how large each cause is."
+    )  # fmt: skip
 
     @model_validator(mode="after")
     def _are_of_a_transform(self) -> Self:
         """Check the sizes, which JSON leaves open."""
-        sizes = {"matrix": (self.matrix, 4, 4), "covariance": (self.covariance, 6, 6)}
-        for name, (rows, count, columns) in sizes.items():
-            if len(rows) != count or any(len(row) != columns for row in rows):
-                raise ValueError(f"'{name}' is not {count}x{columns}")
+        sizes = {"matrix": (self.matrix, 4), "covariance": (self.covariance, 6)}
+        sizes |= {f"shares.{cause}": (share, 6) for cause, share in self.shares.items()}
+        for name, (rows, count) in sizes.items():
+            if len(rows) != count or any(len(row) != count for row in rows):
+                raise ValueError(f"'{name}' is not {count}x{count}")
         if len(self.about) != 3:
             raise ValueError("'about' has not 3 coordinates")
         if any(len(direction) != 6 for direction in self.unobservable or []):

@@ -207,15 +207,20 @@ class TransformEstimate:
         unobservable: (k, 6) unit directions, in the same order and about the same point, that no
             measurement tells anything of: the estimate is arbitrary along them, and the covariance
             is of the rest.
+        shares: (6, 6) of the covariance by what causes it, where the solver says so. What they do
+            not make up is not known of how large each cause is.
     """
 
     transform: Transform
     covariance: Array
     about: Array
     unobservable: Array = field(default_factory=lambda: np.zeros((0, 6)))
+    shares: Mapping[str, Array] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         freeze(self, covariance=(6, 6), about=(3,))
+        parts = {cause: frozen(share, (6, 6), cause) for cause, share in self.shares.items()}
+        object.__setattr__(self, "shares", parts)
         directions = np.reshape(self.unobservable, (-1, 6))
         object.__setattr__(self, "unobservable", frozen(directions, directions.shape, "directions"))
 

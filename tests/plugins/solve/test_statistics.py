@@ -8,7 +8,6 @@ from flangeye.maths.statistics import (
     chi2_quantile,
     corners_of,
     covariance_inflation,
-    excess_variance,
     f_quantile,
     largest_error_quantile,
 )
@@ -23,21 +22,6 @@ def test_quantiles_of_the_tables() -> None:
 def test_inflation_falls_to_one() -> None:
     assert covariance_inflation(6) == pytest.approx(6 * 4.2839 / 12.592, rel=1e-3)
     assert covariance_inflation(10**7) == pytest.approx(1.0, abs=1e-5)
-
-
-def test_excess_variance_is_found_beside_outliers() -> None:
-    rng = np.random.default_rng(0)
-    own = np.array([np.diag([1.0, 1.0, 0.01]) * 1e-8] * 400)
-    errors = rng.standard_normal((400, 3)) * np.sqrt([2e-8 + 1e-8, 2e-8 + 1e-8, 2e-8 + 1e-10])
-    errors[:80] += 0.1
-    assert excess_variance(errors[80:], own[80:]) == pytest.approx(2e-8, rel=0.2)
-    assert excess_variance(errors, own) == pytest.approx(2e-8, rel=0.8)
-
-
-def test_errors_within_their_covariances_have_no_excess() -> None:
-    errors = 1e-5 * np.random.default_rng(0).standard_normal((50, 3))
-    assert excess_variance(errors, np.array([np.eye(3) * 1e-8] * 50)) == 0.0
-    assert excess_variance(np.zeros((5, 3)), np.zeros((5, 3, 3))) == 0.0
 
 
 def test_a_pure_shift_is_as_likely_in_every_corner() -> None:

@@ -24,7 +24,7 @@ from flangeye.report.certificate import (
     use_budget_of,
     write_certificate,
 )
-from flangeye.report.certificate.budget import shares_of
+from flangeye.report.certificate.budget import Share, shares_of
 from flangeye.report.certificate.page import render, sandbox, standard_text
 from flangeye.report.facts import facts_of
 from flangeye.report.units import millimetres
@@ -119,11 +119,19 @@ def test_the_budget_of_use_agrees_with_gtc(result: Result) -> None:
 
 
 def test_the_causes_add_up_to_the_calibrations_uncertainty(result: Result) -> None:
-    shares = {s.cause: s.standard for s in shares_of(result)}
+    (name, estimate), *_ = result.transforms.items()
+    parts = {"sag": 0.5, "joint zeros": 0.3, "drift": 0.004}
+    told = {c: (p * np.array(estimate.covariance)).tolist() for c, p in parts.items()}
+    told_of = result.model_copy(
+        update={"transforms": {name: estimate.model_copy(update={"shares": told})}}
+    )
     total = float(np.sum(budget_of(result).standard ** 2))
-    assert sum(u**2 for u in shares.values()) == pytest.approx(total, rel=1e-9)
-    # 0.1 mm from the fits (their covariance says so) and 0.11 mm more in the residuals
-    assert shares["scans, fit by fit"] > 0 and shares["arm, pose by pose"] > 0
+    shares = {s.cause: s.standard**2 / total for s in shares_of(told_of)}
+    expected = {"sag": 0.5, "joint zeros": 0.3, "sizes of all these": 0.196, "others": 0.004}
+    assert shares == pytest.approx(expected, rel=1e-9)
+    assert list(shares) == list(expected)
+    (alone,) = shares_of(result)  # a solver that does not say
+    assert alone.standard**2 == pytest.approx(total, rel=1e-9)
 
 
 def test_correlated_quantities_are_named(result: Result) -> None:
@@ -187,16 +195,12 @@ def test_no_uncertainty_is_printed_as_zero(result: Result, run: Path, tmp_path: 
     quiet = result.model_copy(deep=True)
     assert quiet.holdout and quiet.workspace
     quiet.holdout.rms = 1e-9
-    for each in quiet.observations:
-        each.residual_in_base = [0.0, 0.0, 0.0]
-    arm = next(s for s in shares_of(quiet) if s.cause == "arm, pose by pose")
     (one, *_) = [
         c for c in use_budget_of(quiet, SCANNER).contributions if c.name.startswith("Arm and scan")
     ]
-    for row in (arm, one):
-        assert row.bound
+    assert one.bound
+    for row in (one, Share("sag", 1e-12, "")):
         assert re.fullmatch(r"below 0\.\d*[1-9]\d* mm", standard_text(row))
-    assert f"below {re.findall('[0-9.]+', arm.evidence)[0]}" in arm.evidence
     text = write_certificate(run, tmp_path / "c.html", Conditions()).read_text()
     assert not re.search(r'<td class="n">0\.0+( mm|°)?</td>', text)
 

@@ -82,7 +82,8 @@ def _edges(problem: Problem, linear: Linear) -> Floats:
 def _along(s: Sightings) -> Floats:
     """Return (N, 3) the direction to the camera, in the face, as long as the face is tilted."""
     normals = s.rotations[:, :, 2]
-    to_camera = -s.centres / np.linalg.norm(s.centres, axis=1)[:, None]
+    far = np.linalg.norm(s.centres, axis=1)
+    to_camera = -s.centres / np.where(far > 0, far, 1.0)[:, None]
     return np.asarray(to_camera - (to_camera * normals).sum(axis=1)[:, None] * normals)
 
 

@@ -17,9 +17,9 @@ import numpy as np
 
 from flangeye.errors import StageError
 from flangeye.maths.geometry import hat
-from flangeye.maths.statistics import corners_of, excess_variance
+from flangeye.maths.statistics import corners_of
 from flangeye.models.scanners import ScannerModel
-from flangeye.result import ObservationResult, Result, TransformResult
+from flangeye.result import Result, TransformResult
 from flangeye.types import Floats
 
 
@@ -64,6 +64,8 @@ def coverage_factor(freedom: float, probability: float = 0.95) -> float:
     return float(ndtri(upper) if np.isinf(freedom) else stdtrit(freedom, upper))
 
 
+SMALL = 0.01
+"""A cause with a smaller share of the variance is counted among the others."""
 EXPANSION = 23e-6
 """Of aluminium, of which most arms are made, per kelvin: larger than that of steel."""
 
@@ -224,70 +226,42 @@ class Share:
         cause: The cause.
         standard: Its part, one standard uncertainty [m].
         evidence: Where the figure comes from.
-        bound: Whether the residuals show no such error: ``standard`` is what they could hide.
     """
 
     cause: str
     standard: float
     evidence: str
-    bound: bool = False
 
 
 def shares_of(result: Result) -> list[Share]:
-    """Return what the calibration's uncertainty comes from, by least squares over the centres.
+    """Return what the calibration's uncertainty comes from, the largest first.
 
-    Scans and poses that differ from capture to capture average out; the rest is common to all
-    captures: joint zeros, a tilt of every normal, what few poses leave unknown of the noise.
+    Their squares add up to that of the budget: what each cause leaves in the answer by the
+    estimator's own model, and what few poses leave open of how large the causes are.
     """
     _, estimate = _estimate_of(result)
-    used = [o for o in result.observations if o.used and o.covariance is not None]
-    point = _worst_corner(result, estimate)
-    total = float(np.sum(budget_of(result).standard ** 2))
-    if len(used) < 3:
-        return [Share("all causes", np.sqrt(total), _evidence(result))]
-    scans, arm, noise, bound = _averaged(used, estimate, point)
-    scale = min(1.0, total / (scans + arm))
-    n = len(used)
-    below = "below " if bound else ""
-    return [
-        Share("scans, fit by fit", np.sqrt(scale * scans), f"covariances of {n} fitted centres"),
-        Share(
-            "arm, pose by pose", np.sqrt(scale * arm),
-            f"residuals beyond them, {below}{np.sqrt(noise) * 1e3:.3f} mm per axis over {n} poses",
-            bound,
-        ),
-        Share(
-            "common to all poses", np.sqrt(max(total - scale * (scans + arm), 0.0)),
-            "correlated: the arm's joint zeros, a tilt common to all normals, few poses",
-        ),
-    ]  # fmt: skip
+    motions = _motions(_worst_corner(result, estimate)[None], np.array(estimate.about))[0]
 
+    def variance(covariance: Sequence[Sequence[float]]) -> float:
+        return float(np.trace(motions @ np.array(covariance) @ motions.T))
 
-def _averaged(
-    used: Sequence[ObservationResult], estimate: TransformResult, point: Floats
-) -> tuple[float, float, float, bool]:
-    """Return the variances [m^2] at ``point`` from the scans and the arm, and the arm's own.
-
-    Where the residuals show nothing beyond the scans' own covariances, the arm's is what they could
-    hide, and the last value is true.
-    """
-    turn = np.array(estimate.matrix)[:3, :3]
-    own = turn @ np.array([o.covariance for o in used]) @ turn.T
-    seen = np.array([o.centre_in_camera for o in used], dtype=float)
-    places = seen @ turn.T + np.array(estimate.matrix)[:3, 3]
-    if used[0].tcp_in_base is not None:  # in a cell no single arm tells
-        places = np.array([o.tcp_in_base for o in used], dtype=float)
-    residuals = np.array([o.residual_in_base for o in used], dtype=float)
-    noise = excess_variance(residuals, own)
-    hidden = _standard_error(float(np.trace(own, axis1=1, axis2=2).mean() / 3), 3 * len(used))
-    bound, noise = noise < hidden, max(noise, hidden)
-    weights = np.linalg.inv(own + max(noise, 1e-14) * np.eye(3))
-    rows = _motions(places, np.array(estimate.about))
-    information = np.einsum("nia,nij,njb->ab", rows, weights, rows)
-    gains = np.linalg.pinv(information) @ rows.transpose(0, 2, 1) @ weights
-    moved = _motions(point[None], np.array(estimate.about))[0] @ gains
-    scans = np.einsum("nia,nab,nib->", moved, own, moved)
-    return float(scans), float(noise * np.sum(moved**2)), noise, bound
+    whole = variance(estimate.covariance)
+    if not estimate.shares:
+        return [Share("all causes", np.sqrt(max(whole, 0.0)), _evidence(result))]
+    used = sum(o.used for o in result.observations)
+    told = {cause: max(variance(share), 0.0) for cause, share in estimate.shares.items()}
+    rows = {cause: v for cause, v in told.items() if v >= SMALL * whole}
+    small, rest = sum(told.values()) - sum(rows.values()), whole - sum(told.values())
+    shares = [
+        Share(cause, np.sqrt(v), f"what {used} poses leave open of it") for cause, v in rows.items()
+    ]
+    if small > 0:
+        each = f"{len(told) - len(rows)} causes of less than {SMALL:.0%} of the variance each"
+        shares.append(Share("others", np.sqrt(small), each))
+    if rest > 0:
+        few = "few poses do not tell how large each cause is, nor where exactly the work ends"
+        shares.append(Share("sizes of all these", np.sqrt(rest), few))
+    return sorted(shares, key=lambda share: -share.standard)
 
 
 def _standard_error(variance: float, count: int) -> float:

@@ -106,7 +106,7 @@ def standard_text(row: Contribution | Share) -> str:
     angle = isinstance(row, Contribution) and row.unit == "rad"
     # Smallest uncertainty that is printed as a number [rad]: 0.0001 degrees
     shown, least = (degrees, 1.75e-6) if angle else (millimetres, LEAST_LENGTH)
-    bound = row.standard < least or row.bound
+    bound = row.standard < least or (isinstance(row, Contribution) and row.bound)
     return f"{'below ' if bound else ''}{shown(max(row.standard, least))}{'°' if angle else ' mm'}"
 
 
