@@ -11,7 +11,7 @@ from flangeye.models.finger import Finger
 from flangeye.motion.seam_following import Controller
 from flangeye.types import Floats
 from flangeye_emulators.weld_world.groove import Section, Tip
-from flangeye_emulators.weld_world.world import Nominal
+from flangeye_emulators.weld_world.world import Nominal, WeldWorld
 from flangeye_plugins.weld.belief import Belief, belief_of
 from flangeye_plugins.weld.body import Body, body_from
 from flangeye_plugins.weld.bound import check_bound
@@ -78,6 +78,32 @@ def try_condition(
     return run_trial(controller, nominal, condition.truth, start, seed)
 
 
+def could_be_welded(condition: Condition, seed: int, length: float, period: float) -> bool:
+    """Return whether one who knew all that is true could weld within ``max_error``.
+
+    The same steering is given the seam as it truly lies and a tool, an arm's path and heat that are
+    as their files say; what is left to it are the arm's delay, backlash and repeatability.
+    """
+    settings = Following.model_validate(condition.settings)
+    body = built_for(settings)
+    section, belief = known(condition, body, settings)
+    torch = body.level_R_tool.T @ body.torch
+    nominal = Nominal(curved(length), section, Tip(), torch, body.level_R_tool)
+    seam = WeldWorld(nominal, condition.truth, [seed, 0]).groove.root.points
+    left = ("lag", "dead_time", "backlash", "repeatability")
+    arm = {name: value for name, value in condition.world["arm"].items() if name in left}
+    plan = Path(seam)
+    controller = controller_of(plan, belief, settings, "vision")
+    truth = Condition({"arm": arm}).truth
+    response = controller._response  # type: ignore[attr-defined]
+    response.dead_time, response.lag = truth.arm.dead_time, truth.arm.lag
+    start = start_at(plan, belief, settings, period)
+    trial = run_trial(controller, replace(nominal, seam=seam), truth, start, seed)
+    s, off = trial.column("torch_s"), np.abs(trial.column("torch"))
+    beside = (s > 0.0) & (s < trial.length)
+    return trial.done and bool((off[beside] <= settings.max_error).mean() >= 0.99)
+
+
 def built_for(settings: Following) -> Body:
     """Return a tool whose torch is as high as its tip at the planned lean."""
     up = -DISTANCE * np.tan(settings.travel_angle) / np.cos(settings.work_angle)
@@ -98,7 +124,7 @@ def known(condition: Condition, body: Body, settings: Following) -> tuple[Sectio
 
 def start_at(plan: Path, belief: Belief, settings: Following, period: float) -> Start:
     """Return where a weld begins: above the plan's start."""
-    first = plan.at(settings.inset)
+    first = plan.at(settings.set_down)
     x, y = (first.point + belief.set_down(settings) * first.normal).tolist()
     angle = float(np.arctan2(first.tangent[1], first.tangent[0]))
     return Start((x, y, first.height + ABOVE), angle, period)

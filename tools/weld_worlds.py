@@ -13,14 +13,14 @@ import math
 from collections import Counter
 from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 
 from flangeye.errors import StageError
-from tools.weld_bench import DISTANCE, try_condition
+from tools.weld_bench import DISTANCE, could_be_welded, try_condition
 from tools.weld_conditions import Condition
 from tools.weld_trial import Trial
 
@@ -51,6 +51,7 @@ class WorldScore:
         largest: Largest of those distances [m].
         rms: Their root mean square [m].
         inside: Share of the seam on which the torch was within its 95 % band.
+        weldable: Whether one who knew all that is true could have welded within ``max_error``.
     """
 
     seed: int
@@ -61,6 +62,7 @@ class WorldScore:
     largest: float = 0.0
     rms: float = 0.0
     inside: float = 1.0
+    weldable: bool = True
 
     @property
     def silent(self) -> bool:
@@ -177,6 +179,12 @@ def _workpiece(draw: _Draw) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def compared(seed: int) -> WorldScore:
+    """Weld in a random world; compare with its truth, and with one who knows it."""
+    able = could_be_welded(drawn(seed), seed, LENGTH, PERIOD)
+    return replace(judged(seed), weldable=able)
+
+
 def judged(seed: int, **settings: Any) -> WorldScore:
     """Weld in a random world, with its settings and these; compare the bound with the truth."""
     condition = drawn(seed)
@@ -217,7 +225,7 @@ def worlds(
     """Weld in each world and print what came of it."""
     verdicts = []
     with ProcessPoolExecutor(workers) as pool:
-        for verdict in pool.map(judged, range(first, first + worlds), chunksize=4):
+        for verdict in pool.map(compared, range(first, first + worlds), chunksize=4):
             verdicts.append(verdict)
             if as_json:
                 print(json.dumps(asdict(verdict)), flush=True)
@@ -237,6 +245,11 @@ def summary(verdicts: list[WorldScore]) -> list[str]:
     lines += [
         f"  world {v.seed}: {v.largest * 1e3:.2f} mm, {v.over_bound:.2f} times its bound, {v.status}"
         for v in silent
+    ]
+    able = [v for v in verdicts if v.weldable]
+    lines += [
+        f"{len(able)} of them could be welded by one who knows all that is true; "
+        f"{sum(v.status == 'done' for v in able) / max(len(able), 1):.0%} of these were done"
     ]
     if done:
         rms, share = np.array([v.rms for v in done]) * 1e3, np.array([v.share_welded for v in done])

@@ -6,16 +6,17 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
 from numpy.typing import NDArray
 
 from flangeye.types import Floats
-from flangeye_emulators.world.mesh import Mesh
+from flangeye_emulators.world.mesh import Mesh, box
 
 LENGTH, WIDTH, HEIGHT = 0.2, 0.13, 0.024
 """Of the plates [m]: x along the groove, y across, z up; the origin is amid the lower face."""
@@ -142,11 +143,42 @@ LONG = Plate(
 PLATES = (STRAIGHT, CURVED, LONG)
 
 
+T_JOINT = ([-0.1, -0.055, 0.0], [0.1, 0.055, 0.01]), ([-0.08, 0.0, 0.01], [0.08, 0.01, 0.06])
+"""Corners of two plates [m], the shorter one upright on the other; their fillet is along x."""
+
+
 def write_files(folder: Path) -> None:
     """Write every sample as a binary STL and the YAML file of its seam, in millimetres."""
-    for plate in PLATES:
-        write_stl(folder / f"{plate.name}.stl", plate.mesh())
-        (folder / f"{plate.name}.yaml").write_text(_description(plate), encoding="utf-8")
+    for name, (mesh, description) in samples().items():
+        write_stl(folder / f"{name}.stl", mesh)
+        (folder / f"{name}.yaml").write_text(description, encoding="utf-8")
+
+
+def samples() -> Mapping[str, tuple[Mesh, str]]:
+    """Return each sample's surface and YAML file, by name."""
+    plates = {plate.name: (plate.mesh(), _description(plate)) for plate in PLATES}
+    return {**plates, "fillet": (t_joint(), _fillet())}
+
+
+def t_joint() -> Mesh:
+    """Return the two plates of a T-joint."""
+    base, upright = (box(*corners) for corners in T_JOINT)
+    vertices = np.concatenate([base.vertices, upright.vertices])
+    triangles = np.concatenate([base.triangles, upright.triangles + len(base.vertices)])
+    return Mesh(vertices, triangles.astype(np.int32))
+
+
+def _fillet() -> str:
+    (start, _, root), (end, _, _) = T_JOINT[1]
+    leg = T_JOINT[1][1][2] - root
+    seam = {
+        "name": "fillet",
+        "points": [[1e3 * x, 0.0, 1e3 * root] for x in (start, end)],
+        "opening": [0, -1, 1],
+        "half_angle": "45 deg",
+        "half_width": f"{1e3 * leg * np.sin(np.pi / 4):.6g} mm",
+    }
+    return _yaml("T-joint of two plates of 10 mm", "fillet", seam)
 
 
 def write_stl(path: Path, mesh: Mesh) -> None:
@@ -169,11 +201,15 @@ def _description(plate: Plate) -> str:
         "half_angle": f"{np.degrees(HALF_ANGLE):.6g} deg",
         "half_width": f"{1e3 * DEPTH * np.tan(HALF_ANGLE):.6g} mm",
     }
+    return _yaml(plate.title, plate.name, seam)
+
+
+def _yaml(title: str, name: str, seam: Mapping[str, Any]) -> str:
     described = {
-        "title": plate.title,
-        "cad": f"{plate.name}.stl",
+        "title": title,
+        "cad": f"{name}.stl",
         "unit": "mm",
-        "seams": [seam],
+        "seams": [dict(seam)],
         "source": "made by python -m tools.workpieces",
     }
     return yaml.safe_dump(described, sort_keys=False, default_flow_style=None, width=100)

@@ -150,7 +150,7 @@ def check_seam(seam: Seam, plan: Path, distance: float, settings: Following) -> 
     Raises:
         StageError: Too short, steep, curved, or uncertain.
     """
-    used = settings.inset + settings.ending
+    used = settings.set_down + settings.ending
     used += settings.speed * settings.deflection / settings.release
     if plan.length <= used:
         raise StageError(

@@ -105,6 +105,7 @@ class Contact:
         likely: (4,) how likely each mode is.
         deflection: Filtered, positive towards the pressed side [m].
         compression: Filtered [m].
+        at: Arc length of the newest measurement [m].
         steady: Largest deflection for its compression that the tip stands, as far as was seen.
     """
 
@@ -121,7 +122,7 @@ class Contact:
         self.steady = math.inf
         self.noise = noise
         self._flat, self._slides = flat, slides
-        self._time, self._s = -math.inf, 0.0
+        self._time, self.at = -math.inf, math.inf
         self._height, self._spread = 0.0, math.inf
         self._newest: deque[_Weighed] = deque()
 
@@ -147,7 +148,7 @@ class Contact:
         kept = math.exp(-(felt.time - self._time) / SETTLING)
         self.deflection += (1.0 - kept) * (felt.deflection - self.deflection)
         self.compression += (1.0 - kept) * (felt.compression - self.compression)
-        way, self._time, self._s = abs(felt.s - self._s), felt.time, felt.s
+        way, self._time, self.at = abs(felt.s - self.at), felt.time, felt.s
         if self._spread == math.inf:
             way, self._height, self._spread = 0.0, felt.height, self.noise[1] ** 2
         share, soon = (1.0 - math.exp(-(way + 1e-4) / over) for over in (STRIDE, UP))

@@ -21,7 +21,7 @@ from flangeye_plugins.weld.probing import MARGIN, SOFTER, Learned, Probing
 from flangeye_plugins.weld.refined import RefinedPath
 from flangeye_plugins.weld.response import Response
 from flangeye_plugins.weld.search import Search
-from flangeye_plugins.weld.settings import Following
+from flangeye_plugins.weld.settings import INSIDE, Following
 from flangeye_plugins.weld.steering import SLOWEST, Steering
 from flangeye_plugins.weld.striking import Striking
 from flangeye_plugins.weld.weave import Sway, Weave
@@ -32,9 +32,6 @@ BELIEF = 0.3
 SETTLING = 8e-3
 """Way in which an error of the torch is taken back at speed [m]."""
 
-INSIDE = 1.5e-3
-"""The tip goes back to where the seam has surely begun by this [m]."""
-
 SEATS = 20
 """Last measurements of the sweep that the path begins with."""
 
@@ -43,9 +40,6 @@ SHORT = 0.01
 
 STEADY = 0.03e-3
 """A finger that scatters less is followed from one measurement to the next [m]."""
-
-WOBBLE = 0.2e-3
-"""So much the deflection changes back and forth while the tip is pressed to one side [m]."""
 
 LOST, REGAINED = 0.9, 0.1
 """A wall is lost where the tip is as likely free, and held again where it no longer is."""
@@ -142,7 +136,7 @@ class Follower:
         self.mode: str = "tactile" if touch else "vision"
         self.phase: Phase = "seeking" if touch else "following"
         self.reason = ""
-        self.tip, self.torch = settings.inset, settings.inset - belief.distance
+        self.tip, self.torch = settings.set_down, settings.set_down - belief.distance
         self._coming = self.torch
         self.wanted = 0.0
         self._margin = belief.distance + settings.ending + (settings.ends or 0.0)
@@ -261,7 +255,7 @@ class Follower:
         point, normal = self.refined.frame(self._coming)
         pace = self._pace(coming, normal)
         if self._backed is not None:
-            return Command(self._velocity(coming, -pace), 0.0)
+            return Command(self._velocity(coming, -min(pace, self._backwards())), 0.0)
         velocity = self._velocity(coming, pace)
         sway = self._swayed(coming.time)
         there = float((self._torch_position(coming) - point) @ normal)
@@ -306,21 +300,42 @@ class Follower:
             return
         if self.lit is not None:
             self._trail.pass_by(pose.time, self.torch, raw, variance - self._unseen())
-        if self.bound > self._settings.max_error:
-            self._too_far()
+        worst, bound = self.torch, self.bound
+        if self.lit is None and bound <= self._settings.max_error:
+            worst, bound = self._ahead(variance)
+        if bound > self._settings.max_error:
+            self._too_far(worst, bound)
         elif self.lit is None:
             self.lit = self.torch
             self._striking.strike(pose.time)
 
-    def _too_far(self) -> None:
-        """Stop where the torch may be too far from the seam, or may not be lit in time."""
+    def _ahead(self, variance: float) -> tuple[float, float]:
+        """Return where the seam that was felt is known least, and the torch's bound there [m].
+
+        Args:
+            variance: Of the torch's place where it is now [m^2].
+        """
+        place, felt = self.refined.worst(self.torch, self.ends)
+        variance += felt - self.refined.variance(self.torch)
+        return place, self._settings.sigmas * math.sqrt(max(variance, 0.0))
+
+    def _too_far(self, place: float, bound: float) -> None:
+        """Stop where the torch may be too far from the seam, or may not be lit in time.
+
+        Args:
+            place: Where the bound does not hold, by arc length [m].
+            bound: The torch's bound there [m].
+        """
         late = self.torch - self.begins > SHORT * (self.ends - self.begins)
-        if self.lit is not None:
-            self._stop(self._too_uncertain())
+        if self.lit is not None and self.share_welded >= 1.0 - SHORT:
+            self._finish()
+        elif self.lit is not None:
+            self._stop(self._too_uncertain(bound))
         elif self._before is not None and self.torch > self._before.torch:
             self._stop("the torch was not on the seam again where it had stopped; raise 'overlap'")
         elif self._before is None and late:
-            self._stop(f"not begun: {self._too_uncertain()}")
+            ahead = f" at {place * 1e3:.0f} mm of the seam" if place > self.torch else ""
+            self._stop(f"not begun: {self._too_uncertain(bound, ahead)}")
 
     def _variance(self, slant: float, angle: float) -> float:
         """Return the variance of the torch's place across the seam [m^2].
@@ -338,7 +353,7 @@ class Follower:
         ahead = min(learned.ahead_sigma, self._belief.tip_sigma) * math.sin(turned_by)
         tip = ahead**2 + (self._belief.tip_sigma * (1.0 - math.cos(turned_by))) ** 2
         felt = self.refined.variance(self.torch) + self._weave.variance
-        return fixed + gain**2 + learned.variance - learned.noise**2 + tip + felt
+        return fixed + gain**2 + learned.systematic + tip + felt
 
     def _unseen(self) -> float:
         """Return the variance of the torch that nothing ahead of it measures [m^2]."""
@@ -403,8 +418,7 @@ class Follower:
     def _corrected(self, displacement: Floats) -> Floats:
         """Return a displacement (3,) without what the finger's rest, gain and play add to it."""
         moved = displacement - self._search.rest
-        # What goes through its play over less than the deflection wobbles by is anywhere in it.
-        kept = self.learned.reversal / (self.learned.reversal + WOBBLE) * self._pressing()
+        kept = self.learned.kept * self._pressing()
         play = np.array([0.0, self.side * self.learned.width * kept, 0.0])
         across = 1.0 + self.learned.gain
         # The sweep measures the gain across. That upwards is its like; where it is not, the
@@ -507,13 +521,13 @@ class Follower:
         if self.lit is not None and not self._striking.filled(self._time or 0.0):
             return
         if self._touching and self.lit is None:
-            self._stop(f"not begun: {self._too_uncertain()}")
+            self._stop(f"not begun: {self._too_uncertain(self.bound)}")
         else:
             self.phase = "done"
 
-    def _too_uncertain(self) -> str:
+    def _too_uncertain(self, bound: float, where: str = "") -> str:
         return (
-            f"the torch is known to {self.bound * 1e3:.2f} mm only, max_error is "
+            f"the torch is known to {bound * 1e3:.2f} mm only{where}, max_error is "
             f"{self._settings.max_error * 1e3:.3g} mm"
         )
 
@@ -550,8 +564,7 @@ class Follower:
     @property
     def _inside(self) -> float:
         """Where the tip is sure to be on the seam, by arc length [m]."""
-        ends = self._settings.ends
-        return math.inf if ends is None else ends + INSIDE
+        return math.inf if self._settings.ends is None else self._settings.ends + INSIDE
 
     def _take_backed(self) -> None:
         """Begin the path with what was felt at the sweep, and on the way back to the start."""
@@ -646,7 +659,10 @@ class Follower:
             self.tip = self._plan.foot(coming.position[:2], self.tip)
             self.torch = self._plan.foot(self._torch_position(pose), self.torch)
             self._coming, self._place = self.torch, self._plan.at(self.tip)
-            if self.tip <= self._inside or self.contact.free > REGAINED:
+            # Friction holds the tip back: where it was felt counts. The arm stays on the seam as
+            # well: a tip that slips comes to where it is.
+            gone = self.tip <= self._inside - 2.0 * INSIDE / 3.0
+            if self.contact.at <= self._inside or gone or self.contact.free > REGAINED:
                 self._take_backed()
             return
         self.tip = advance(coming.position[:2], self.tip, reach)
@@ -685,6 +701,11 @@ class Follower:
         if delay <= 0.0 or sharpest <= 0.0:
             return math.inf
         return max(math.sqrt(2.0 * SWERVE / sharpest) / delay, SLOWEST * self._settings.speed)
+
+    def _backwards(self) -> float:
+        """Return the speed at which the tip goes back: it ends before it can leave the seam."""
+        delay = self._latency + self._response.delay
+        return INSIDE / (2.0 * delay) if delay > 0.0 else math.inf
 
     def _firmness(self) -> float:
         """Return the share of its speed that the tip may keep by how firmly it is on the wall.

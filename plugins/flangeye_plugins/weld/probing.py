@@ -43,6 +43,9 @@ STAMPS = np.arange(-0.06, 0.121, 0.01)
 REVERSALS = (0.02e-3, 0.05e-3, 0.1e-3, 0.15e-3, 0.2e-3, 0.25e-3, 0.3e-3, 0.4e-3, 0.6e-3, 1e-3)
 """Half widths of play or hysteresis among which the finger's is sought [m]."""
 
+WOBBLE = 0.2e-3
+"""So much the deflection changes back and forth while the tip is pressed to one side [m]."""
+
 PIVOTS = 0.1
 """The tool is turned about the tip to either side by this [rad]."""
 
@@ -107,9 +110,24 @@ class Learned:
     ahead_sigma: float = math.inf
 
     @property
+    def kept(self) -> float:
+        """How likely play stays where the wall presses it; what wobbles by more goes through it."""
+        return self.reversal / (self.reversal + WOBBLE)
+
+    @property
+    def systematic(self) -> float:
+        """Variance of what is alike in measurements that follow each other, of the tip [m^2].
+
+        Play, taken for ``kept`` of its half width, is at the pressed side as often and anywhere in
+        its width otherwise; and what the sweep left unexplained.
+        """
+        spread = self.kept + (1.0 - self.kept) / 3.0 - self.kept**2
+        return (spread * self.width**2 + self.unexplained**2) / (1.0 + self.gain) ** 2
+
+    @property
     def variance(self) -> float:
-        """Variance of one measurement: its place in the play, which is even, and the rest [m^2]."""
-        return self.noise**2 + self.width**2 / 3.0 + self.unexplained**2
+        """Variance of one measurement of the tip [m^2]."""
+        return (self.noise / (1.0 + self.gain)) ** 2 + self.systematic
 
     @property
     def least(self) -> float:

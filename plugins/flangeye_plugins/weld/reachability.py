@@ -216,7 +216,7 @@ def _stations(task: Task) -> list[Station]:
     The tip goes on beyond the seam's end by the torch's distance.
     """
     plan, params, tool = task.plan, task.params, task.tool
-    start = plan.at(params.inset)
+    start = plan.at(params.set_down)
     aside = start.point + task.aside * start.normal
     above = np.array([*aside, start.height + params.clearance])
     count = 1 + int(np.ceil(abs(params.start_angle) / (JUMP / 2)))

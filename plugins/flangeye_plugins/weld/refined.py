@@ -236,6 +236,17 @@ class RefinedPath:
         index, near = self._index(s), round(4e-3 / BIN)
         return float(weights @ spread + self._doubts[max(index - near, 0) : index + near + 1].max())
 
+    def worst(self, first: float, last: float) -> tuple[float, float]:
+        """Return where between two arc lengths the seam is known least, and the variance there.
+
+        Up to what later measurements hardly change: the shortest field's length short of the tip.
+        """
+        last = min(last, self._at - LENGTHS[0])
+        places = np.arange(first, max(first, last) + BIN, SLOPE)
+        variances = [self.variance(s) for s in places.tolist()]
+        worst = int(np.argmax(variances))
+        return float(places[worst]), variances[worst]
+
     def angle(self, s: float, otherwise: float) -> float:
         """Return the tool's angle when the seam was felt at ``s``, or nearest to it [rad]."""
         if self.empty:

@@ -205,9 +205,9 @@ def set_back(
     release = params.speed * params.deflection / params.release
     last = plan.length - params.ending - release - PRESSING
     lit = kept.torch - params.overlap
-    if last < params.inset:
+    if last < params.set_down:
         raise StageError("weld.tactile: the rest of the seam is too short for the tip to press on")
-    tip = min(_away(plan, max(lit - RUN_IN, params.inset - distance), distance), last)
+    tip = min(_away(plan, max(lit - RUN_IN, params.set_down - distance), distance), last)
     return _standing(params, plan, distance, max(lit, params.offset_along), tip)
 
 

@@ -16,6 +16,9 @@ from flangeye_plugins.weld.joint import JointKind
 Mode = Annotated[str | BoundPart, Choose("controller", words=("tactile", "vision"))]
 """By touch, by the plan alone, or as a controller of a plugin decides."""
 
+INSIDE = 1.5e-3
+"""The tip is set down, or goes back to, where the seam has surely begun by this [m]."""
+
 
 class PassParams(Params):
     """A pass after the root's, along the path that this has found; nothing is touched."""
@@ -176,6 +179,11 @@ class Following(Params):
         description="Without a tag for longer while the arc burns, or for four times as "
         "long before, the weld is stopped.",
     )
+
+    @property
+    def set_down(self) -> float:
+        """Where on the plan the tip is set down, by arc length: the seam has surely begun [m]."""
+        return self.inset if self.ends is None else max(self.inset, self.ends + INSIDE)
 
     @property
     def sign(self) -> float:

@@ -8,7 +8,7 @@ import pytest
 from flangeye.errors import StageError
 from flangeye_plugins.weld.follower import Follower
 from tools import weld_trial as trials
-from tools.weld_bench import try_condition
+from tools.weld_bench import could_be_welded, try_condition
 from tools.weld_conditions import CONDITIONS, Condition
 from tools.weld_worlds import drawn, judged, summary
 
@@ -207,3 +207,15 @@ def test_a_weld_that_is_done_is_welded(seed: int) -> None:
     verdict = judged(seed)
     assert not verdict.silent
     assert verdict.status != "done" or verdict.share_welded >= 0.99
+
+
+def test_one_who_knows_the_truth_is_held_up_by_the_arm_alone() -> None:
+    wave = {"wave": "1 mm", "wave_length": "40 mm"}
+    late = {"lag": "400 ms", "dead_time": "200 ms"}
+    bent = Condition({"workpiece": wave, "tool": {"torch": ["0 mm", "3 mm"]}, "arm": late})
+    assert could_be_welded(bent, 0, 0.1, 16e-3)
+    narrow = bent._replace(
+        world={**bent.world, "workpiece": {"wave": "3 mm", "wave_length": "10 mm"}},
+        settings={"speed": "20 mm/s"},
+    )
+    assert not could_be_welded(narrow, 0, 0.1, 16e-3)

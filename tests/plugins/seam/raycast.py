@@ -128,6 +128,18 @@ def scan_of(joint, seed, pitch=0.35 * MM, noise=0.08 * MM, faults=True, plates=N
     return Scan(depth[:, None] * rays[keep], pose, seam, bodies)
 
 
+def seen_by(bodies, pitch, half=0.12, noise=0.08 * MM, seed=0):
+    """Return what a camera at the origin sees of bodies, without faults; pitch and half of a ray."""
+    ticks = np.arange(-half, half, pitch)
+    x, y = np.meshgrid(ticks, ticks)
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    depth = _first(bodies, np.zeros(3), rays)[0]
+    depth = depth + noise * np.random.default_rng(seed).normal(size=len(depth))
+    kept = np.isfinite(depth)
+    return depth[kept, None] * rays[kept]
+
+
 JOINTS = ("vee", "bevel", "butt", "lap", "fillet", "corner")
 
 

@@ -17,7 +17,7 @@ from flangeye.types import CAMERA, Box, PointCloud, Seed, WorkpieceScan
 from flangeye_emulators.scan import SimulatedScanParams
 from flangeye_plugins.seam.cad import CadParams, seam_cad
 from tests.plugins.seam.scenes import BASE_T_CAMERA, hand_eye, scanned, write_plate
-from tools.workpieces import PLATES, _description
+from tools.workpieces import PLATES, samples
 
 MM = 1e-3
 PHOXI = load_model("scanners", "phoxi-m")
@@ -168,14 +168,15 @@ def test_the_seam_is_chosen_by_name(tmp_path: Path) -> None:
     assert told == f"seam.cad: {path} has the seams groove, second; say which with seam:"
 
 
-@pytest.mark.parametrize("plate", PLATES, ids=lambda p: p.name)
-def test_the_shipped_workpieces_are_those_the_project_makes(plate: Any) -> None:
+@pytest.mark.parametrize("name", samples())
+def test_the_shipped_workpieces_are_those_the_project_makes(name: str) -> None:
     from flangeye.files.paths import bundled
 
-    path = bundled("data") / "workpieces" / f"{plate.name}.yaml"
-    assert path.read_text() == _description(plate)
+    mesh, description = samples()[name]
+    path = bundled("data") / "workpieces" / f"{name}.yaml"
+    assert path.read_text() == description
     read = load_workpiece(path)
-    corners = plate.mesh().vertices[plate.mesh().triangles]
+    corners = mesh.vertices[mesh.triangles]
     assert np.allclose(read.vertices[read.triangles], corners, atol=1e-8)
 
 

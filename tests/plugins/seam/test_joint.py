@@ -6,9 +6,19 @@ import pytest
 from flangeye import CalibrationRefused, StageError
 from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.maths.seam_geometry import errors_from, tube_radii
-from flangeye.types import CAMERA, Box, PointCloud, WorkpieceScan
+from flangeye.types import (
+    CAMERA,
+    FLANGE,
+    Box,
+    PointCloud,
+    ScanPlace,
+    Transform,
+    TransformEstimate,
+    VerifiedHandEye,
+    WorkpieceScan,
+)
 from flangeye_plugins.seam.joint import JointParams, seam_joint
-from tests.plugins.seam.raycast import JOINTS, LENGTH, MM, WIDE, Plate, box, prism, scan_of
+from tests.plugins.seam.raycast import JOINTS, LENGTH, MM, WIDE, Plate, box, prism, scan_of, seen_by
 from tests.plugins.seam.scenes import BASE_T_CAMERA, hand_eye, scanned
 from tools.seam_joints import outcome, planned, table
 
@@ -143,6 +153,42 @@ def test_an_end_that_a_block_hides(hides: float, told: str | None) -> None:
     off = np.linalg.norm(seam.points_in_base[-1] - truth[1])
     assert off < 4 * seam.figures["end"]
     assert seam.figures["end"] > 2 * seam.figures["start"]
+
+
+def test_a_pipe_on_a_plate_is_closed_and_seen_from_around_it() -> None:
+    """One place sees half of the fillet about it; six clouds of a scanner on the flange see it all."""
+    radius, angles = 30 * MM, np.arange(6) * np.pi / 3
+    plates = disc_on_plate(radius, height=40 * MM)
+    clouds, places = [], []
+    for angle in angles:
+        c, s = np.cos(angle), np.sin(angle)
+        spin = rigid(np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]), np.zeros(3))
+        lean = rigid(rotation_from_rpy(np.radians(40), 0, 0), np.zeros(3))
+        stands = (
+            spin @ lean @ np.array([[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 0.6], [0, 0, 0, 1.0]])
+        )
+        bodies = [plate.moved(np.linalg.inv(stands)) for plate in plates[0]]
+        clouds.append(seen_by(bodies, 0.5 * MM / 0.6))
+        places.append(ScanPlace(len(clouds[-1]), stands, np.zeros(6)))
+    covariance = np.diag([1e-10] * 6)
+    camera = TransformEstimate(Transform(FLANGE, CAMERA, np.eye(4)), covariance, np.zeros(3))
+    cloud = PointCloud(CAMERA, np.concatenate(clouds).astype(np.float32))
+    around = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    rough = 32 * MM * np.column_stack([np.cos(around), np.sin(around), 0 * around]) + [2 * MM, 0, 0]
+    line = [[f"{1e3 * v} mm" for v in point] for point in rough]
+    params = JointParams.model_validate({"joint": "fillet", "line": line, "closed": True})
+    scan = WorkpieceScan(cloud, "pipe", places=tuple(places))
+    seam = seam_joint(VerifiedHandEye(camera, (), "test"), scan, params)
+    errors = np.hypot(
+        np.linalg.norm(seam.points_in_base[:, :2], axis=1) - radius, seam.points_in_base[:, 2]
+    )
+    assert np.median(errors) < 0.15 * MM and errors.max() < 0.5 * MM
+    assert np.linalg.norm(seam.points_in_base[0] - seam.points_in_base[-1]) < 0.2 * MM
+    assert seam.arc_length[-1] == pytest.approx(2 * np.pi * radius, rel=0.01)
+    assert np.degrees(seam.half_angle) == pytest.approx(45, abs=1)
+    outwards = seam.points_in_base * [1, 1, 0] / radius
+    tilted = np.einsum("ni,ni->n", seam.openings_in_base, (outwards + [0, 0, 1]) / np.sqrt(2))
+    assert (tilted > 0.99).all()
 
 
 def test_without_a_line_it_says_what_to_write() -> None:

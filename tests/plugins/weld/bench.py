@@ -85,7 +85,7 @@ class World:
         self.root = Path(true)
         self.contact = Contact(Groove(self.root, SECTION, gaps), Tip())
         self.controller = controller
-        start = Path(plan).at(settings.inset)
+        start = Path(plan).at(settings.set_down)
         self.position = np.array([*start.point, start.height + above])
         self.angle = np.arctan2(start.tangent[1], start.tangent[0]) + angle
         self.rng = np.random.default_rng(seed)

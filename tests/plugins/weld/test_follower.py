@@ -69,7 +69,8 @@ def test_all_that_the_torch_s_place_is_uncertain_by_adds_up() -> None:
     found._press = asked.deflection
     found._time = found._began = 5.0
     gain = 0.03 * asked.deflection
-    always = belief.fixed_variance(asked) + gain**2 + (0.02e-3) ** 2 / 3 + (0.03e-3) ** 2 + 9e-10
+    play = (0.02e-3) ** 2 * (1 / 11 + 10 / 33 - 1 / 121)  # of 0.02 in 0.22 mm it stays pressed
+    always = belief.fixed_variance(asked) + gain**2 + play + (0.03e-3) ** 2 + 9e-10
     assert found._variance(0.0, 0.1) == pytest.approx(always)
     # A tool that slants to the path is off across it by what its length is off by.
     slanting = (0.4 * belief.along_sigma) ** 2
@@ -142,6 +143,41 @@ def test_a_weld_that_cannot_begin_within_the_first_hundredth_of_the_seam_is_refu
     assert told.reason.startswith("not begun: the torch is known to 3.")
     assert doubtful(0.0178, None, plan=long, offset_along="15 mm").phase == "following"
     assert doubtful(0.0179, None, plan=long, offset_along="15 mm").phase == "stopped"
+
+
+def test_a_weld_is_not_begun_where_the_seam_ahead_is_not_known() -> None:
+    """The tip has felt it already: the torch would have to be stopped there."""
+    long = straight(0.3)
+    for doubt, torch, phase in ((0.0, 0.0031, "following"), (1e-6, 0.0029, "following"),
+                                (1e-6, 0.0031, "stopped")):  # fmt: skip
+        found = make(plan=long)
+        felt_along(found, 0.0)
+        found.refined._doubts[found.refined._index(0.03)] = doubt
+        found.torch = torch
+        found._estimate(pose(torch + DISTANCE, 0.0))
+        assert found.phase == phase and (found.lit is None) == (doubt > 0.0)
+    assert found.reason.startswith("not begun: the torch is known to 3.")
+    assert " mm only at 2" in found.reason and " mm of the seam, max_error" in found.reason
+
+
+def test_a_weld_whose_last_hundredth_is_not_known_is_done_there() -> None:
+    long = straight(0.3)
+    assert doubtful(0.296, 0.0, plan=long).phase == "stopped"
+    assert doubtful(0.2975, 0.0, plan=long).phase == "done"
+    assert doubtful(0.2975, 0.001, plan=long).phase == "stopped"  # it began late as well
+
+
+def test_the_tip_is_set_down_where_the_seam_has_surely_begun() -> None:
+    assert following().set_down == following().inset
+    assert following(ends="2 mm").set_down == following().inset
+    assert following(ends="9 mm").set_down == pytest.approx(10.5e-3)
+    assert make(ends="9 mm").tip == pytest.approx(10.5e-3)
+
+
+def test_the_tip_goes_back_slowly_where_it_is_seen_late() -> None:
+    found = make(ends="1 mm", speed="20 mm/s")
+    found._latency, found._response.dead_time, found._response.lag = 0.1, 0.05, 0.1
+    assert found._backwards() == pytest.approx(1.5e-3 / 2 / 0.25)
 
 
 def test_the_share_that_was_welded_is_of_the_planned_seam() -> None:

@@ -1,6 +1,7 @@
 """The sweep of the seated tip: what it finds, and what it refuses to begin with."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -352,3 +353,15 @@ def test_a_finger_scatters_across_as_its_file_says_at_least() -> None:
         found = going(noise=5e-6)
         found.begin(seen)
         assert found._noise == (across, 6e-5)  # in height as its file says
+
+
+def test_play_is_as_uncertain_as_where_in_it_the_finger_is() -> None:
+    """At the pressed side as often as it is kept there, else anywhere; the tip goes with both."""
+    known = Learned(gain=-0.2, width=0.3e-3, reversal=0.3e-3, noise=0.0)
+    rng = np.random.default_rng(0)
+    kept = rng.random(100_000) < known.kept
+    at = np.where(kept, 1.0, rng.uniform(-1, 1, len(kept))) * 0.3e-3
+    off = (at - known.kept * 0.3e-3) / 0.8
+    assert np.sqrt(known.systematic) == pytest.approx(off.std(), rel=0.01)
+    assert abs(off.mean()) < 2e-6
+    assert replace(known, noise=0.1e-3).variance - known.variance == pytest.approx(0.125e-3**2)

@@ -265,7 +265,7 @@ def test_the_seam_is_looked_at_from_above_its_start_to_where_the_torch_comes_to_
     plane = WorkPlane(points, np.tile([0.0, 0, 1.0], (len(points), 1)))
     tool = Tool(FINGER, plane)
     plan = Path(plane.points(points))
-    params: Any = SimpleNamespace(inset=5e-3, clearance=15e-3, start_angle=angle)
+    params: Any = SimpleNamespace(set_down=5e-3, clearance=15e-3, start_angle=angle)
     task: Any = SimpleNamespace(plan=plan, params=params, tool=tool, aside=2e-3, finger=FINGER)
     stations = _stations(task)
     poses = [tool.pose(station.pose, 0.0) for station in stations]
