@@ -84,19 +84,21 @@ class End:
         place: Along the way to the end: less is sooner.
         deviation: Its standard deviation.
         seen: Whether the scanner looked past it there; otherwise it may go on unseen.
+        covered: Whether it goes on below something else, for all that is known.
     """
 
     place: float
     deviation: float
     seen: bool
+    covered: bool
 
     @property
     def sharp(self) -> bool:
-        """Whether the last points of the surface are at one place."""
-        return self.deviation < LOOSE
+        """Whether the last points of the surface are at one place, and nothing is over it there."""
+        return self.deviation < LOOSE and not self.covered
 
 
-def surface_end(way: Floats, past: Mask, pitch: float) -> End | None:
+def surface_end(way: Floats, past: Mask, covered: Mask, pitch: float) -> End | None:
     """Return where a surface ends, from where its lanes do; None where it has too few.
 
     The median over lanes, of those behind which the scanner sees something farther away where
@@ -105,6 +107,7 @@ def surface_end(way: Floats, past: Mask, pitch: float) -> End | None:
     Args:
         way: (L,) ends of lanes along the way to the end [m].
         past: (L,) where the scanner looks past them.
+        covered: (L,) where something else is before what is behind them.
         pitch: Distance between neighbouring points [m].
     """
     if len(way) < FEWEST:
@@ -113,17 +116,21 @@ def surface_end(way: Floats, past: Mask, pitch: float) -> End | None:
     way = way[past] if seen else way
     low, middle, high = np.quantile(way, [0.25, 0.5, 0.75])
     share = 1.25 / np.sqrt(len(way)) if seen and high - low <= TWO * pitch else 1.0
-    return End(float(middle), float(share * SIGMA_OF_IQR * (high - low)), bool(seen))
+    deviation = float(share * SIGMA_OF_IQR * (high - low))
+    return End(float(middle), deviation, bool(seen), bool(not seen and covered.sum() >= FEWEST))
 
 
-def soonest(ends: list[End]) -> tuple[float, float]:
+def soonest(ends: list[End], limit: float) -> tuple[float, float]:
     """Return the end that a seam comes to first, from those of its surfaces, and its deviation [m].
 
+    Surfaces that go on to the limit of what is looked at do not end; where none ends the deviation
+    is infinite.
     Surfaces that end there as well, for all that is known, tell its place together. One whose end
     is hidden or blurred, and is not seen so far, may end anywhere in between.
     """
+    ends = [end for end in ends if end.place < limit]
     if not ends:
-        return np.inf, np.inf
+        return limit, np.inf
     sharp = [end for end in ends if end.sharp]
     certain = [end for end in sharp if end.seen] or sharp or ends
     first = min(certain, key=lambda end: end.place)
@@ -135,6 +142,8 @@ def soonest(ends: list[End]) -> tuple[float, float]:
     weights = np.array([max(end.deviation, 1e-6) ** -2 for end in same])
     place = float(weights @ [end.place for end in same] / weights.sum())
     hidden = max([0.0, *(place - end.place for end in ends)])
+    if first.covered:
+        hidden = limit - first.place
     return place, float(np.hypot(weights.sum() ** -0.5, hidden / np.sqrt(12)))
 
 
@@ -160,23 +169,24 @@ class Rays:
             if about.any():
                 self._places.append((eye, cKDTree(rays[about]), far[about]))
 
-    def past(self, points: Floats, pitch: float, tolerance: float) -> Mask:
-        """Return at which of points (N, 3) it saw only what is farther away by the tolerance [m].
+    def past(self, points: Floats, pitch: float, tolerance: float) -> tuple[Mask, Mask]:
+        """Return at which of points (N, 3) it saw only what is farther away, and what is nearer.
 
         Args:
             points: Where something might be [m].
             pitch: Distance between neighbouring points of the scan there [m].
-            tolerance: What is farther away by less is there [m].
+            tolerance: What is farther away or nearer by less is there [m].
         """
-        out = np.zeros(len(points), dtype=bool)
+        out, covered = np.zeros((2, len(points)), dtype=bool)
         for eye, tree, far in self._places:
             rays, away = _directions(points - eye)
             off, at = tree.query(rays, k=4)
             # A ray is seen by what lies within a pixel of it.
             near = off < pitch / away[:, None]
-            behind = far[np.minimum(at, len(far) - 1)] - away[:, None] > tolerance
-            out |= near.any(axis=1) & (behind | ~near).all(axis=1)
-        return out
+            behind = far[np.minimum(at, len(far) - 1)] - away[:, None]
+            out |= near.any(axis=1) & ((behind > tolerance) | ~near).all(axis=1)
+            covered |= (near & (behind < -tolerance)).any(axis=1)
+        return out, covered & ~out
 
 
 def _directions(sight: Floats) -> tuple[Floats, Floats]:

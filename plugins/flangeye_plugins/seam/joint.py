@@ -301,14 +301,14 @@ def _end(found: Found, sign: int) -> tuple[float, float]:
         at = local[on][last, :3]
         on_beyond = sign * (more + pitch * np.array(BEYOND)[:, None]).ravel()
         there = np.tile(at, (len(BEYOND), 1)) + np.outer(on_beyond, [1, 0, 0])
-        past = found.rays.past(found.course.points_at(there), pitch, 5 * swept.sigma)
-        any_past = np.asarray(past.reshape(len(BEYOND), -1).any(axis=0))
-        end = surface_end(sign * at[:, 0] + more, any_past, pitch)
+        looked = found.rays.past(found.course.points_at(there), pitch, 5 * swept.sigma)
+        past, covered = np.reshape(looked, (2, len(BEYOND), -1)).max(axis=1)
+        end = surface_end(sign * at[:, 0] + more, past, covered, pitch)
         ends += [] if end is None else [end]
-    place, deviation = soonest(ends)
-    last_seen = (found.course.length if sign > 0 else 0.0) - sign * 2 * pitch
-    if place >= sign * last_seen:
-        return (found.course.length if sign > 0 else 0.0), np.inf
+    limit = found.course.length if sign > 0 else 0.0
+    place, deviation = soonest(ends, sign * limit - 2 * pitch)
+    if np.isinf(deviation):
+        return limit, deviation
     return sign * place, float(np.hypot(deviation, UNSEEN * pitch))
 
 
