@@ -14,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from flangeye.estimation.watch.drift import Sightings, sightings_of
+from flangeye.estimation.watch.drift import CheckSightings, sightings_of
 from flangeye.maths.geometry import rigid, rotation_exp, rotation_from_rpy
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
@@ -77,7 +77,7 @@ class Watched:
         scanner: (3,) where the scanner stands, by the calibration [m].
     """
 
-    sightings: Sightings
+    sightings: CheckSightings
     prior: Floats
     scanner: Floats
 

@@ -26,7 +26,7 @@ from flangeye.models.targets import plate_of
 from flangeye.types import CAMERA, Capture, Earlier, PointCloud, PoseFeature, Rejected
 from flangeye_emulators.world import materials
 from flangeye_emulators.world.mesh import Mesh, box, capsule, flange_mesh, wrist_mesh
-from flangeye_emulators.world.raycast import Body, Scene
+from flangeye_emulators.world.raycast import RaycastScene, SolidBody
 from flangeye_emulators.world.scanner import scanner_of
 from flangeye_plugins.body.judge import judged
 from flangeye_plugins.body.looks import prepared
@@ -65,9 +65,13 @@ def as_made(body, rng):
 def wrist():
     plate = plate_of(load_model("robots", "ur5e", Path()))
     arm = [([0, 0, -0.06], [0, 0.12, -0.07], 0.04), ([0, 0.12, -0.07], [-0.35, 0.15, -0.15], 0.045)]
-    links = [Body(capsule(np.array(a), np.array(b), r), materials.PAINTED) for a, b, r in arm]
+    links = [SolidBody(capsule(np.array(a), np.array(b), r), materials.PAINTED) for a, b, r in arm]
     finish = materials.FINISHES[plate.details.finish]
-    return [Body(flange_mesh(plate), finish), Body(wrist_mesh(plate), materials.PAINTED), *links]
+    return [
+        SolidBody(flange_mesh(plate), finish),
+        SolidBody(wrist_mesh(plate), materials.PAINTED),
+        *links,
+    ]
 
 
 def turned(rng):
@@ -82,11 +86,11 @@ def scene(rng, body):
     depth = rng.uniform(0.55, 0.85)
     centre = np.array([rng.uniform(-0.15, 0.15) * depth, rng.uniform(-0.12, 0.12) * depth, depth])
     pose = rigid(rotation, centre - rotation @ body.centre)
-    own = Body(Mesh(body.vertices, body.triangles), materials.METAL)
+    own = SolidBody(Mesh(body.vertices, body.triangles), materials.METAL)
     bodies = [one.moved(pose) for one in [*wrist(), own]]
     tilt = rotation_from_rpy(rng.uniform(-0.3, 0.3), rng.uniform(-0.3, 0.3), 0.0)
     table = box([-1, -1, 0], [1, 1, 0.05]).moved(rigid(tilt, [0, 0, rng.uniform(0.95, 1.1)]))
-    bodies.append(Body(table, materials.TABLE))
+    bodies.append(SolidBody(table, materials.TABLE))
     for k in range(6):
         z = rng.uniform(0.6, 1.0)
         at = np.array([rng.uniform(-0.4, 0.4) * z, rng.uniform(-0.3, 0.3) * z, z])
@@ -101,7 +105,7 @@ def scene(rng, body):
             else capsule(np.zeros(3), np.array([0, 0, length]), radius, 32)
         )
         if np.linalg.norm(at - centre) > 0.6 * body.size:
-            bodies.append(Body(mesh.moved(rigid(turned(rng), at)), materials.PAINTED))
+            bodies.append(SolidBody(mesh.moved(rigid(turned(rng), at)), materials.PAINTED))
     return bodies, pose
 
 
@@ -125,7 +129,9 @@ def trial(name, seed):
     others = [other for other in BODIES if other != name]
     shown = body if there else load_body(others[seed % 2], None, Path())
     bodies, pose = scene(rng, as_made(shown, rng))
-    capture = Capture(f"{seed:04d}", PointCloud(CAMERA, eye(rng).scan(Scene(bodies), rng)), {})
+    capture = Capture(
+        f"{seed:04d}", PointCloud(CAMERA, eye(rng).scan(RaycastScene(bodies), rng)), {}
+    )
     points, shape = capture.cloud.points(), prepared(body)[0]
     view = view_of(points, body.size / FINE_ACROSS)
     tolerance = max(FINE * body.size, 3.5 * view.noise)

@@ -10,10 +10,10 @@ import numpy as np
 from flangeye.models.finger import Finger
 from flangeye.motion.seam_following import Controller
 from flangeye.types import Floats
-from flangeye_emulators.weld_world.groove import Section, Tip
+from flangeye_emulators.weld_world.groove import GrooveSection, Tip
 from flangeye_emulators.weld_world.world import Nominal, WeldWorld
 from flangeye_plugins.weld.belief import Belief, belief_of
-from flangeye_plugins.weld.body import Body, body_from
+from flangeye_plugins.weld.body import LeaningTool, body_from
 from flangeye_plugins.weld.bound import check_bound
 from flangeye_plugins.weld.checks import check_tool
 from flangeye_plugins.weld.path import Path
@@ -23,7 +23,7 @@ from tools.weld_conditions import Condition
 from tools.weld_trial import Start, Trial, run_trial
 
 DISTANCE = 40e-3
-SECTION = Section(np.deg2rad(40.0), 10e-3)
+SECTION = GrooveSection(np.deg2rad(40.0), 10e-3)
 FINGER = {
     "model": "bench", "tag": {"side": "12 mm"},
     "camera": {"width": 320, "height": 240, "focal": [400, 400], "centre": [159.5, 119.5]},
@@ -104,19 +104,21 @@ def could_be_welded(condition: Condition, seed: int, length: float, period: floa
     return trial.done and bool((off[beside] <= settings.max_error).mean() >= 0.99)
 
 
-def built_for(settings: Following) -> Body:
+def built_for(settings: Following) -> LeaningTool:
     """Return a tool whose torch is as high as its tip at the planned lean."""
     up = -DISTANCE * np.tan(settings.travel_angle) / np.cos(settings.work_angle)
     torch = np.array([-DISTANCE, 0.0, float(up)])
     return body_from(torch, settings.sign * settings.work_angle, settings.travel_angle)
 
 
-def known(condition: Condition, body: Body, settings: Following) -> tuple[Section, Belief]:
+def known(
+    condition: Condition, body: LeaningTool, settings: Following
+) -> tuple[GrooveSection, Belief]:
     """Return the planned joint, and the controller's model of tool and joint."""
     section, half_angle = condition.section, None
     if section is None:
         half_angle = condition.half_angle or SECTION.half_angle
-        section = Section(half_angle, SECTION.depth)
+        section = GrooveSection(half_angle, SECTION.depth)
     belief = belief_of(Finger.model_validate(FINGER), body, half_angle, settings)
     behind = None if condition.look is None else condition.look.behind
     return section, replace(belief, behind=behind, **condition.belief)

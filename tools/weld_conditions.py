@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flangeye_emulators.weld_world.groove import Section, square_butt
+from flangeye_emulators.weld_world.groove import GrooveSection, square_butt
 from flangeye_emulators.weld_world.settings import LookTruth, WorldParams
 
 
@@ -29,7 +29,7 @@ class Condition(NamedTuple):
     planned: tuple[float, float] = (3e-3, 0.01745)
     belief: Mapping[str, Any] = {}
     half_angle: float | None = None
-    section: Section | None = None
+    section: GrooveSection | None = None
     look: LookTruth | None = None
 
     @property
@@ -38,9 +38,9 @@ class Condition(NamedTuple):
         return WorldParams.model_validate(self.world)
 
 
-FILLET = Section(np.pi / 4, 30e-3, -np.pi / 4)
-LAP = Section(np.pi / 4, 5e-3, -np.pi / 4)
-CORNER = Section(np.pi / 4, 6e-3)
+FILLET = GrooveSection(np.pi / 4, 30e-3, -np.pi / 4)
+LAP = GrooveSection(np.pi / 4, 5e-3, -np.pi / 4)
+CORNER = GrooveSection(np.pi / 4, 6e-3)
 BUTT = square_butt(2.2e-3, 1.5e-3)
 
 CONDITIONS: Mapping[str, Condition] = {
@@ -114,7 +114,7 @@ CONDITIONS: Mapping[str, Condition] = {
     "tag hidden 0.6 s": Condition({"clock": {"hidden": ["12 s", "12.6 s"]}}),
     "T-fillet, upright tool": Condition({}, {"joint": "fillet"}, section=FILLET),
     "T-fillet, pressed on the right, upright tool": Condition(
-        {}, {"joint": "fillet", "side": "right"}, section=Section(np.pi / 4, 30e-3, np.pi / 4)
+        {}, {"joint": "fillet", "side": "right"}, section=GrooveSection(np.pi / 4, 30e-3, np.pi / 4)
     ),
     "T-fillet, tool leans 40 deg away, 10 deg forwards": Condition(
         {}, {"joint": "fillet", "work_angle": "40 deg", "travel_angle": "10 deg"}, section=FILLET

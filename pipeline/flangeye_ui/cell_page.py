@@ -15,7 +15,7 @@ from flangeye.files.yaml_lines import read_yaml
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import Stage
 from flangeye.recipe.find import find_recipe, recipe_names
-from flangeye_ui.layout import Bar, command_line, mistake, page, svg
+from flangeye_ui.layout import ActionBar, command_line, mistake, page, svg
 from flangeye_ui.project import Mistake, Project, at
 from flangeye_ui.scene import drawing_of
 
@@ -70,7 +70,7 @@ def add(project: Project) -> None:
 class Form:
     """The form and the recipe: two views of one file."""
 
-    def __init__(self, project: Project, bar: Bar) -> None:
+    def __init__(self, project: Project, bar: ActionBar) -> None:
         self._project, self._bar, self._wanted = project, bar, ""
         self._choices: dict[tuple[str, str], ui.select] = {}
         self._agreeing = False

@@ -15,7 +15,7 @@ POLICY = (
     "base-uri 'none'"
 )
 """An origin of its own for each file: its drawings run and reach neither the page nor a network."""
-SHOWN = {
+OPENED = {
     ".html": "text/html; charset=utf-8", ".pdf": "application/pdf", ".png": "image/png",
     ".json": "text/plain; charset=utf-8", ".csv": "text/plain; charset=utf-8",
     ".yaml": "text/plain; charset=utf-8", ".txt": "text/plain; charset=utf-8",
@@ -42,7 +42,7 @@ def answer(folder: Path, path: str) -> Response:
     found = _found(folder, path)
     if found is None:
         return PlainTextResponse("no such file of a run\n", 404)
-    kind = SHOWN.get(found.suffix.lower())
+    kind = OPENED.get(found.suffix.lower())
     return FileResponse(
         found, media_type=kind or "application/octet-stream", filename=found.name,
         content_disposition_type="inline" if kind else "attachment",

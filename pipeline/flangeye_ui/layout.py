@@ -14,7 +14,7 @@ from flangeye.report.look import LIGHT, LOGO, css
 if TYPE_CHECKING:
     from flangeye_ui.project import Project
 
-STEPS = {
+WAY = {
     "Cell": ("/", "Choose the arm, the scanner and how they stand."),
     "Poses": ("/poses", "Check that the arm reaches every pose and the scanner sees it."),
     "Scan": ("/scan", "Let the scanner look at the flange from every pose."),
@@ -30,7 +30,7 @@ SIMULATED = "SIMULATED: no real arm or scanner; the figures are the simulation's
 STYLE = css() + (Path(__file__).parent / "page.css").read_text(encoding="utf-8")
 
 
-class Bar:
+class ActionBar:
     """The bar below a page: how things stand, and the one button that leads on."""
 
     def __init__(self) -> None:
@@ -58,7 +58,7 @@ class Bar:
 
     def lead(self, title: str, label: str) -> ui.button:
         """Return a button that leads to a step."""
-        return self.offer(label, lambda: ui.navigate.to(STEPS[title][0]))
+        return self.offer(label, lambda: ui.navigate.to(WAY[title][0]))
 
 
 def weigh(button: ui.button, second: bool) -> None:
@@ -68,7 +68,7 @@ def weigh(button: ui.button, second: bool) -> None:
 
 
 @contextmanager
-def page(project: Project, title: str) -> Iterator[Bar]:
+def page(project: Project, title: str) -> Iterator[ActionBar]:
     """Lay out one page around what is made inside; yield the bar with its primary button."""
     ui.add_css(STYLE)
     ui.add_head_html("<script>document.documentElement.lang = 'en'</script>")
@@ -78,11 +78,11 @@ def page(project: Project, title: str) -> Iterator[Bar]:
     )  # fmt: skip
     ui.page_title(f"{title} · flangeye")
     _header(project, title)
-    bar = Bar()
+    bar = ActionBar()
     with ui.column().classes("w-full max-w-screen-xl mx-auto gap-3 page"):
         with ui.column().classes("gap-0"):
             ui.label(title).classes("title").props('role="heading" aria-level="1"')
-            ui.label({**STEPS, **BESIDE}[title][1]).classes("what")
+            ui.label({**WAY, **BESIDE}[title][1]).classes("what")
         yield bar
 
 
@@ -92,7 +92,7 @@ def _header(project: Project, title: str) -> None:
         with ui.element("nav").props('aria-label="Steps"').classes("ways"):
             ui.html(f"{LOGO}<span>flangeye</span>", sanitize=False).classes("brand")
             with ui.element("ol").classes("steps"):
-                for number, name in enumerate(STEPS, 1):
+                for number, name in enumerate(WAY, 1):
                     with ui.element("li"):
                         _way(name, name == title, f"{number}", name in done)
             with ui.element("ul").classes("beside"):
@@ -104,7 +104,7 @@ def _header(project: Project, title: str) -> None:
 
 
 def _way(name: str, here: bool, number: str = "", done: bool = False) -> None:
-    link = ui.link(target={**STEPS, **BESIDE}[name][0]).classes("done" if done else "")
+    link = ui.link(target={**WAY, **BESIDE}[name][0]).classes("done" if done else "")
     with link:
         if number:
             ui.label("✓" if done else number).classes("mark").props('aria-hidden="true"')

@@ -12,7 +12,7 @@ from flangeye.errors import FlangeyeError
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
 from flangeye.recipe.load import Recipe
-from flangeye_ui.layout import Bar, code, command_line, mistake, page, weigh
+from flangeye_ui.layout import ActionBar, code, command_line, mistake, page, weigh
 from flangeye_ui.project import Project
 from flangeye_ui.scene import Scene3D, base_T_camera_of, box_of
 
@@ -28,13 +28,13 @@ def add(project: Project) -> None:
                 mistake(f"The recipe has {len(mistakes)} errors; see step 1, Cell.")
                 bar.lead("Cell", "Go to step 1: cell")
                 return
-            Planner(project, recipe, bar)
+            PosePlanner(project, recipe, bar)
 
 
-class Planner:
+class PosePlanner:
     """The drawing and the plan beside it."""
 
-    def __init__(self, project: Project, recipe: Recipe, bar: Bar) -> None:
+    def __init__(self, project: Project, recipe: Recipe, bar: ActionBar) -> None:
         self._project, self._recipe, self._bar = project, recipe, bar
         self._rows: list[dict[str, Any]] = []
         self._words = ("run", project.recipe_path.name, "--json")

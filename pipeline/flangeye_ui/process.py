@@ -19,7 +19,7 @@ from flangeye import types as t
 from flangeye.errors import FlangeyeError
 from flangeye.log import foxglove
 from flangeye.log.read import RunLog, read_run, take
-from flangeye.log.watch.view import Message, View, follow
+from flangeye.log.watch.view import LogMessage, RunView, follow
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import Recipe
 from flangeye.run.folder import recipe_of_log
@@ -54,7 +54,7 @@ class RunProcess:
         """Start ``flangeye run`` in a folder with words of its command line."""
         self.path = folder / "runs" / f"{time.strftime('%Y-%m-%dT%H-%M-%S')}_ui"
         self.moves, self.stopped = move, ""
-        self.view, self.log = View(self.path.name), RunLog(self.path / "run.mcap")
+        self.view, self.log = RunView(self.path.name), RunLog(self.path / "run.mcap")
         self.outlook: Outlook | None = None
         self.cloud: Floats = np.zeros((0, 3))
         self.flange: Floats = np.zeros((0, 3))
@@ -126,7 +126,7 @@ class RunProcess:
             raise _EndedError
         time.sleep(0.05)
 
-    def _mark(self, message: Message) -> None:
+    def _mark(self, message: LogMessage) -> None:
         """Keep where the flange has been, and hear of what was fitted."""
         if message.channel.topic == "/capture":
             self._capture = json.loads(message.data)["id"]
@@ -154,7 +154,7 @@ class RunProcess:
     def _recipe(self) -> Recipe:
         return recipe_of_log(read_run(self.log.path), self._registry, name=self.path.name)
 
-    def _show(self, message: Message) -> None:
+    def _show(self, message: LogMessage) -> None:
         """Keep the newest scan and the flange in it, thin enough for a page."""
         topic = message.channel.topic
         if message.channel.schema != "foxglove.PointCloud":

@@ -28,7 +28,7 @@ from flangeye.run.outlook import Outlook, outlook_of_log
 from flangeye.types import HandEye
 from flangeye.units import parse_quantity
 from flangeye_ui.charts import coverage_drawing, residual_chart
-from flangeye_ui.layout import Bar, code, command_line, mistake, page, svg, warning
+from flangeye_ui.layout import ActionBar, code, command_line, mistake, page, svg, warning
 from flangeye_ui.project import Project
 from flangeye_ui.scene import CELL, RIM, TAKEN, ScanView, Scene3D, outline_of, views_of
 
@@ -44,7 +44,7 @@ OPTIONS = ("seen", "tip")
 """Those of them that ``flangeye touch`` takes: it reads the arm itself."""
 
 
-class Touch:
+class TouchBox:
     """Says where a seen point lies in the base, and how far from there the tip was."""
 
     def __init__(self, project: Project, run: Path, calibration: HandEye) -> None:
@@ -127,7 +127,7 @@ LIGHTS = {
 }
 """By verdict: tone, sign and words of the light; anything else is red."""
 RED = ("poor", "✕", "Do not use")
-Show = Callable[[Project, Path, Facts, Bar], None]
+Show = Callable[[Project, Path, Facts, ActionBar], None]
 
 
 def add(project: Project) -> None:
@@ -139,7 +139,7 @@ def add(project: Project) -> None:
             chosen_run(project, run, "/result", bar, _show)
 
 
-def chosen_run(project: Project, run: str, address: str, bar: Bar, show: Show) -> None:
+def chosen_run(project: Project, run: str, address: str, bar: ActionBar, show: Show) -> None:
     """Let a run be chosen, the newest at first, and show it."""
     runs = project.runs()
     chosen = next((r for r in runs if r.name == run), runs[0] if runs else None)
@@ -155,7 +155,7 @@ def chosen_run(project: Project, run: str, address: str, bar: Bar, show: Show) -
     ui.timer(0.05, lambda: _load(project, chosen, place, bar, show), once=True)
 
 
-async def _load(project: Project, run: Path, place: ui.column, bar: Bar, show: Show) -> None:
+async def _load(project: Project, run: Path, place: ui.column, bar: ActionBar, show: Show) -> None:
     """Read the log aside, so that the page answers meanwhile, and show it."""
     with place:
         spinner = ui.spinner()
@@ -167,7 +167,7 @@ async def _load(project: Project, run: Path, place: ui.column, bar: Bar, show: S
         spinner.delete()
 
 
-def _show(project: Project, run: Path, facts: Facts, bar: Bar) -> None:
+def _show(project: Project, run: Path, facts: Facts, bar: ActionBar) -> None:
     with ui.row().classes("w-full gap-6 items-start"):
         with ui.column().classes("col-12 col-md-5 gap-3"):
             _light(facts)
@@ -185,7 +185,7 @@ def _show(project: Project, run: Path, facts: Facts, bar: Bar) -> None:
     calibration = facts.log.calibration()
     if calibration is not None and facts.base_T_camera is not None:
         with ui.expansion("Check it by touch").classes("w-full"):
-            Touch(project, run, calibration)
+            TouchBox(project, run, calibration)
     with ui.expansion("What would make it better", value=True).classes("w-full"):
         Better(project, run, facts)
     with ui.expansion("Ask the doctor what is wrong").classes("w-full") as box:

@@ -12,7 +12,15 @@ from nicegui import Client, ui
 
 from flangeye.errors import StageError
 from flangeye_ui.charts import coverage_drawing, place_chart, residual_chart
-from flangeye_ui.layout import Bar, code_from_terminal, command_line, mistake, page, svg, weigh
+from flangeye_ui.layout import (
+    ActionBar,
+    code_from_terminal,
+    command_line,
+    mistake,
+    page,
+    svg,
+    weigh,
+)
 from flangeye_ui.process import RunProcess
 from flangeye_ui.project import Project
 from flangeye_ui.scene import EARLIER, FLANGE, RIM, SCAN, SCANNED, Scene3D, drawing_of, outline_of
@@ -36,13 +44,13 @@ def add(project: Project) -> None:
     @ui.page("/scan")
     def scan(client: Client) -> None:
         with page(project, "Scan") as bar:
-            Panel(project, client, bar)
+            RunPanel(project, client, bar)
 
 
-class Panel:
+class RunPanel:
     """What is seen of the run, and the buttons that start and stop it."""
 
-    def __init__(self, project: Project, client: Client, bar: Bar) -> None:
+    def __init__(self, project: Project, client: Client, bar: ActionBar) -> None:
         self._project, self._me, self._bar = project, client.id, bar
         self._heard, self._shown, self._said = time.monotonic(), tuple[Any, ...](), list[Any]()
         self._shown_run: RunProcess | None = None

@@ -19,7 +19,7 @@ from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
 from flangeye.recipe.load import Recipe
 from flangeye.report.look import LIGHT, SERIES
-from flangeye.report.still import Scene, frustum, ready, still
+from flangeye.report.still import StillScene, frustum, ready, still
 from flangeye.report.units import millimetres
 from flangeye.types import CircleFeature, Feature, Floats
 from flangeye_ui.project import Project
@@ -53,7 +53,7 @@ TAKEN, LEFT_OUT = "#2e9e5b", "#d64545"
 """Colours of poses and of what is left at them."""
 SHAFT, TIP = 0.002, 0.006
 """Radii of an arrow [m]."""
-SHOWN = 2_500
+MOST_SENT = 2_500
 """Points of a cloud that are sent: 20,000 held a browser up for a second on two busy cores."""
 DARK = "body.body--dark .scene canvas {filter: invert(0.88) hue-rotate(180deg)}"
 """At night what is light is dark and colours keep their hue: a scene has one background only."""
@@ -173,7 +173,7 @@ class Scene3D(ui.scene):
 
     def cloud(self, points: Floats, colour: str, size: float = 0.002) -> None:
         """Draw a cloud, thinned and to 0.1 mm, in one colour, its points of a size [m]."""
-        few = np.round(points[:: 1 + len(points) // SHOWN], 4)
+        few = np.round(points[:: 1 + len(points) // MOST_SENT], 4)
         with self:
             self.point_cloud(few.tolist(), point_size=size).material(colour)
 
@@ -208,7 +208,7 @@ def drawing_of(project: Project) -> str:
     with suppress(FlangeyeError):
         at = base_T_camera_of(recipe)
     rows = project.plan if project.planned == project.text else []
-    scene = Scene(
+    scene = StillScene(
         robot=robot,
         scanner=scanner if at is not None else None,
         base_T_camera=at,

@@ -17,7 +17,7 @@ from flangeye.models.loading import load_model, model_names
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
 from flangeye.models.urdf import robot_from_urdf
-from flangeye.report.still import Scene, rods, still
+from flangeye.report.still import StillScene, rods, still
 from flangeye.types import Floats
 from flangeye_ui.project import Project
 
@@ -29,7 +29,7 @@ PUBLISHED = {
     "franka-panda": "panda_description/urdf/panda.urdf",
 }  # fmt: skip
 """URDFs of the package ``example-robot-data`` that have the meshes of an arm, by model."""
-ALIKE = 5e-3
+PUBLISHED_WITHIN = 5e-3
 """An arm whose flange stands farther than this from the published one's is not drawn by its meshes:
 ten times what a correction of an arm's lengths changes [m]."""
 KEPT = {"cache-control": "private, max-age=3600"}
@@ -70,8 +70,8 @@ def address_of_arm(joints: Floats) -> str:
 def _picture(kind: str, name: str) -> str:
     model = load_model(kind, name)  # type: ignore[arg-type]
     if kind == "robots":
-        return still(Scene(robot=model), name)
-    return still(Scene(scanner=model if isinstance(model, ScannerModel) else None), name)
+        return still(StillScene(robot=model), name)
+    return still(StillScene(scanner=model if isinstance(model, ScannerModel) else None), name)
 
 
 def _mesh(robot: RobotModel, joints: Floats) -> bytes:
@@ -94,7 +94,7 @@ def _published(robot: RobotModel, joints: Floats) -> RobotModel | None:
     if found is None or len(found.joints) != len(robot.joints):
         return None
     apart = Arm(found).flange(joints) - Arm(robot).flange(joints)
-    return found if np.linalg.norm(apart[:3, 3]) < ALIKE else None
+    return found if np.linalg.norm(apart[:3, 3]) < PUBLISHED_WITHIN else None
 
 
 @cache

@@ -19,7 +19,7 @@ from flangeye.report.certificate.page import render
 from flangeye.report.facts import Facts
 from flangeye.types import ExportedFile
 from flangeye_ui.foreign import address_of
-from flangeye_ui.layout import Bar, code, command_line, mistake, page
+from flangeye_ui.layout import ActionBar, code, command_line, mistake, page
 from flangeye_ui.project import Project
 from flangeye_ui.result_page import chosen_run
 
@@ -41,7 +41,7 @@ def add(project: Project) -> None:
             chosen_run(project, run, "/use", bar, _show)
 
 
-def _show(project: Project, run: Path, facts: Facts, bar: Bar) -> None:
+def _show(project: Project, run: Path, facts: Facts, bar: ActionBar) -> None:
     formats = project.registry.exports()
     files = exported(facts.result, formats)
     if not files:
@@ -53,14 +53,18 @@ def _show(project: Project, run: Path, facts: Facts, bar: Bar) -> None:
     with ui.expansion("Certificate: who, where and how warm, and what it says").classes(
         "w-full"
     ) as x:
-        Certificate(project, run, facts, x)
+        CertificateForm(project, run, facts, x)
 
 
 class Systems:
     """The systems that take the calibration: searched, looked at, copied, downloaded."""
 
     def __init__(
-        self, project: Project, run: Path, files: dict[str, tuple[str, ExportedFile]], bar: Bar
+        self,
+        project: Project,
+        run: Path,
+        files: dict[str, tuple[str, ExportedFile]],
+        bar: ActionBar,
     ) -> None:
         self._project, self._run, self._files, self._bar = project, run, files, bar
         self._file: ExportedFile | None = None
@@ -138,7 +142,7 @@ class Systems:
         self._bar.say(f"Written: {path.relative_to(self._project.folder)}")
 
 
-class Certificate:
+class CertificateForm:
     """The certificate: what a person adds, what it will say, and the file."""
 
     def __init__(self, project: Project, run: Path, facts: Facts, box: ui.expansion) -> None:

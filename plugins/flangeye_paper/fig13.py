@@ -19,7 +19,7 @@ BEYOND = 0.2
 """The true seam is extended straight by this much, for what happens before and after it [m]."""
 
 
-STEP = 0.1
+STEP_TIME = 0.1
 """A lateral step is what happens across the seam within this time [s]."""
 
 
@@ -86,10 +86,10 @@ class SeenWeld:
         time = self.report.time[leaving]
         if not len(time):
             return 0.0
-        both = time + STEP <= time[-1]
+        both = time + STEP_TIME <= time[-1]
         paths = (self.torch, self.report.tip, self.report.robot)
         laterals = [self._seen(path)[1][leaving] for path in paths]
-        steps = [np.abs(np.interp(time + STEP, time, off) - off)[both] for off in laterals]
+        steps = [np.abs(np.interp(time + STEP_TIME, time, off) - off)[both] for off in laterals]
         return float(np.max(steps, initial=0.0))
 
     def _seen(self, points: Floats) -> tuple[Floats, Floats]:

@@ -33,7 +33,7 @@ HELD_OUT_METHODS: Mapping[str, Look] = {
 }
 
 
-class Recording(NamedTuple):
+class CentreSet(NamedTuple):
     """One set of centres.
 
     Attributes:
@@ -45,11 +45,11 @@ class Recording(NamedTuple):
     stored: str | None
 
 
-RECORDINGS: Mapping[str, Recording] = {
-    "run.mcap": Recording("Aubo, 30 clouds by fit.rim", None),
-    "aubo": Recording("Aubo, 54 published centres", "aubo"),
-    "ur5": Recording("UR5, 52 published centres", "ur5"),
-    "franka": Recording("Franka, 48 published centres", "franka"),
+RECORDINGS: Mapping[str, CentreSet] = {
+    "run.mcap": CentreSet("Aubo, 30 clouds by fit.rim", None),
+    "aubo": CentreSet("Aubo, 54 published centres", "aubo"),
+    "ur5": CentreSet("UR5, 52 published centres", "ur5"),
+    "franka": CentreSet("Franka, 48 published centres", "franka"),
 }
 """By the name of the archive's last folder or file."""
 
@@ -101,7 +101,7 @@ def _kept(session: SessionRow) -> set[str]:
     return {o["id"] for o in session.result()["observations"] if o["used"]}
 
 
-def _row(recording: Recording, label: str, splits: list[SessionRow], kept: set[str]) -> Row:
+def _row(recording: CentreSet, label: str, splits: list[SessionRow], kept: set[str]) -> Row:
     errors = [_errors(session) for session in splits]
     common = [_rms(v for k, v in e.items() if k in kept) for e in errors]
     return {
@@ -125,7 +125,7 @@ def _errors(session: SessionRow) -> dict[str, float]:
     raise FlangeyeError(f"{session.folder}: has no step {STAGE}")
 
 
-def _stored_row(recording: Recording, archive: Path, session: SessionRow, kept: set[str]) -> Row:
+def _stored_row(recording: CentreSet, archive: Path, session: SessionRow, kept: set[str]) -> Row:
     """Return how the authors' 50 stored answers do on all poses, those of their pools included."""
     matrices, _ = stored_results(archive, recording.stored or "")
     poses = [o for o in session.result()["observations"] if o["centre_in_camera"]]

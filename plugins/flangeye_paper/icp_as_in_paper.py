@@ -13,9 +13,9 @@ from flangeye.maths.geometry import rpy_from_rotation
 from flangeye.models.targets import Flange
 from flangeye.types import Floats, HandEye, Observation, PoseError, Transform, Verification, Views
 from flangeye.units import param
-from flangeye_paper.open3d_0_7 import IcpFit, Normals, Stop, icp
+from flangeye_paper.open3d_0_7 import IcpFit, IcpStop, Normals, icp
 from flangeye_paper.published import PublishedView
-from flangeye_plugins.solve.iterative import Search, improve_pool, solve_pool
+from flangeye_plugins.solve.iterative import SearchState, improve_pool, solve_pool
 from flangeye_plugins.solve.observations import residuals_of
 
 
@@ -108,7 +108,7 @@ def register_as_in_paper(
     rotation, shift = camera_T_shape[:3, :3], camera_T_shape[:3, 3]
     target = view.shape @ rotation.T + shift
     normals = view.normals(params.normals) @ rotation.T
-    stop = Stop(params.iterations, params.change)
+    stop = IcpStop(params.iterations, params.change)
     return icp(view.measured, target, normals, params.distance, stop)
 
 
@@ -188,7 +188,7 @@ def verify_by_iteration(
     return Verification(True, f"Algorithm 1 ends at a cost of {last:.3f} mm", figures)
 
 
-def _figures(search: Search, measured: dict[float, PoseError], first: int) -> dict[str, float]:
+def _figures(search: SearchState, measured: dict[float, PoseError], first: int) -> dict[str, float]:
     """Return the error after each pose; poses before the first finite cost have none."""
     figures: dict[str, float] = {}
     for seen, cost in enumerate(search.history, first):
@@ -197,7 +197,7 @@ def _figures(search: Search, measured: dict[float, PoseError], first: int) -> di
     return figures | (figures_of(measured[search.cost]) if np.isfinite(search.cost) else {})
 
 
-def _rms_outside(search: Search, poses: Sequence[Observation]) -> float:
+def _rms_outside(search: SearchState, poses: Sequence[Observation]) -> float:
     inside = {o.id for o in search.pool}
     answer = solve_pool(search.pool)
     others = [o for o in poses if o.id not in inside]

@@ -25,7 +25,7 @@ NEIGHBOURS = 30
 
 
 @dataclass(frozen=True)
-class Stop:
+class IcpStop:
     """When ICP ends: few steps, or changes of share and rms below a limit.
 
     Attributes:
@@ -115,7 +115,7 @@ class IcpFit:
 
 
 def icp(
-    source: Floats, target: Floats, normals: Floats, distance: float, stop: Stop
+    source: Floats, target: Floats, normals: Floats, distance: float, stop: IcpStop
 ) -> IcpFit | None:
     """Point-to-plane ICP as Open3D does it, from the identity; None when too little matches.
 

@@ -17,7 +17,7 @@ from flangeye.plugin.stage import part
 from flangeye.run.replay import ReplayedStep
 from flangeye_plugins.sensor.recorded import piece_of
 from flangeye_plugins.weld.execution import touch_of
-from flangeye_plugins.weld.finger_camera import Reader
+from flangeye_plugins.weld.finger_camera import FingerReader
 from flangeye_plugins.weld.resuming import LoggedWeld
 
 
@@ -45,7 +45,7 @@ class WeldReplay(LoggedWeld):
         super().__init__(start)
         self.felt = defaultdict(lambda: None)
         self._finger = Finger.model_validate(start["finger"])
-        self._reader = Reader(self._finger)
+        self._reader = FingerReader(self._finger)
         self._pixels: Any = None
         self._worst_feeling = self._worst_command = 0.0
 

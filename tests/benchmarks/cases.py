@@ -266,12 +266,12 @@ def finger() -> tuple[Work, Work]:
     from flangeye.models.finger import Finger
     from flangeye.models.model import read_model
     from flangeye_emulators.finger.sensor import FingerCamera, Optics, typical_compliance
-    from flangeye_plugins.weld.finger_camera import Reader
+    from flangeye_plugins.weld.finger_camera import FingerReader
 
     model = read_model(bundled("data") / "fingers" / "srm.yaml", Finger)
     camera = FingerCamera(model, Optics(), np.random.default_rng(0))
     frame = SensorFrame(camera.image(*typical_compliance().tag(np.array([2e-3, 0.0, 1e-3]))), 0)
-    reader = Reader(model)
+    reader = FingerReader(model)
     pixels = frame.image.pixels
     return (
         Work(lambda: reader.read(frame), "an image of a finger", pixels.size),

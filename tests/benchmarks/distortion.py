@@ -21,7 +21,7 @@ from flangeye_emulators.acquire.planned_session import PlannedSession, plan_sess
 from flangeye_emulators.acquire.simulated_session import ScanParams
 from flangeye_emulators.world.raycast import pixels_of
 from flangeye_emulators.world.scan_errors import Distortion
-from flangeye_emulators.world.session import View, seen_from
+from flangeye_emulators.world.session import CameraView, seen_from
 from flangeye_plugins.solve.robust import RobustParams, solve_cell
 
 ROBOT, SCANNER = load_model("robots", "ur5"), load_model("scanners", "phoxi-m")
@@ -64,7 +64,9 @@ def session(name: str, seed: int, scale: float = 1.0) -> tuple[PlannedSession, l
     """Return a session, and what a scanner sees that bends by ``scale`` times its file's size."""
     configuration, given = CONFIGURATIONS[name]
     rng, params = np.random.default_rng(seed), ScanParams.model_validate(given)
-    view = View(params.distance, SCANNER.near, SCANNER.far, SCANNER.field_of_view, params.facing)
+    view = CameraView(
+        params.distance, SCANNER.near, SCANNER.far, SCANNER.field_of_view, params.facing
+    )
     planned = plan_session(ROBOT, None, configuration, (params, view), rng)
     size = max(scale * SCANNER.calibration_error, 1e-12)
     distortion, found = Distortion(SCANNER, PIXELS, size, rng), []

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from flangeye.estimation.lifted import Side, Sightings
+from flangeye.estimation.lifted import LiftedSightings, Side
 from flangeye.maths.geometry import invert, rigid, rotation_exp, rotation_log
 from flangeye.types import Floats
 
@@ -22,7 +22,7 @@ def moved(rng: np.random.Generator, n: int, turn: float) -> Floats:
     return np.array([rigid(r, t) for r, t in zip(turns, shifts, strict=True)])
 
 
-def sighted(noise: tuple[float, float], seed: int) -> tuple[Sightings, Floats, Floats]:
+def sighted(noise: tuple[float, float], seed: int) -> tuple[LiftedSightings, Floats, Floats]:
     """Fifteen sightings of A X M = Y with noise [rad, m], X and Y."""
     rng = np.random.default_rng(seed)
     x, y, seen = anywhere(rng), anywhere(rng), []
@@ -39,16 +39,16 @@ def sighted(noise: tuple[float, float], seed: int) -> tuple[Sightings, Floats, F
     )
 
 
-def of_two(sides: Any, turning: Floats, shifting: Floats) -> Sightings:
+def of_two(sides: Any, turning: Floats, shifting: Floats) -> LiftedSightings:
     """Return sightings of ``A X M = B Y D`` with errors alike in all directions."""
     a, m, b, d = sides
     each = np.repeat(np.stack([turning, shifting], axis=1), 3, axis=1)
     first, still = np.zeros(len(a), dtype=np.intp), np.tile(np.eye(4), (len(a), 1, 1))
     camera, target = Side(still, first + 2, a, first, m), Side(still, first + 2, b, first + 1, d)
-    return Sightings(camera, target, each[:, :, None] * np.eye(6), np.full(len(a), 6.0))
+    return LiftedSightings(camera, target, each[:, :, None] * np.eye(6), np.full(len(a), 6.0))
 
 
-def of_three(noise: tuple[float, float], seed: int, n: int = 15) -> tuple[Sightings, Floats]:
+def of_three(noise: tuple[float, float], seed: int, n: int = 15) -> tuple[LiftedSightings, Floats]:
     """Return sightings of ``A X M = Y B Z`` with noise [rad, m], and X, Y and Z."""
     rng = np.random.default_rng(seed)
     x, y, z = places = np.array([anywhere(rng) for _ in range(3)])
@@ -60,24 +60,24 @@ def of_three(noise: tuple[float, float], seed: int, n: int = 15) -> tuple[Sighti
     camera, target = Side(still, none, a, none - 3, m), Side(still, none - 2, b, none - 1, still)
     each = np.repeat(np.power(noise, -2.0), 3)
     weights = np.tile(np.diag(each), (n, 1, 1))
-    return Sightings(camera, target, weights, np.full(n, 6.0)), places
+    return LiftedSightings(camera, target, weights, np.full(n, 6.0)), places
 
 
-def errors_of(s: Sightings, places: Floats) -> float:
+def errors_of(s: LiftedSightings, places: Floats) -> float:
     """Return the weighed squares of one side less the other, half of the rotation matrices'."""
     off = s.camera.at(places) - s.target.at(places)
     turned, shifted = (off[:, :3, :3] ** 2).sum(axis=(1, 2)), (off[:, :3, 3] ** 2).sum(axis=1)
     return float(s.weights[:, 0, 0] @ turned / 2 + s.weights[:, 3, 3] @ shifted)
 
 
-def any_sightings(seed: int) -> Sightings:
+def any_sightings(seed: int) -> LiftedSightings:
     """Return sightings in which nothing rests, of different weights."""
     rng = np.random.default_rng(seed)
     a, m, b, d = (np.array([anywhere(rng) for _ in range(6)]) for _ in range(4))
     return of_two((a, m, b, d), rng.uniform(1, 3, 6), rng.uniform(1, 3, 6))
 
 
-def squared(s: Sightings, places: Floats) -> float:
+def squared(s: LiftedSightings, places: Floats) -> float:
     """Return the weighed squares of the turns and shifts that take one side to the other."""
     left, right = s.camera.at(places), s.target.at(places)
     turns = rotation_log(left[:, :3, :3] @ np.swapaxes(right[:, :3, :3], 1, 2))

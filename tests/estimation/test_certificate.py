@@ -9,7 +9,7 @@ import pytest
 from flangeye.estimation import certificate, certified
 from flangeye.estimation.certificate import GAP, Certificate, _Dual, certify
 from flangeye.estimation.certified import NOT_CERTIFIED, OPTIMAL
-from flangeye.estimation.lifted import Sightings, squares_of
+from flangeye.estimation.lifted import LiftedSightings, squares_of
 from flangeye.maths.geometry import invert
 from flangeye.types import Floats
 from tests.estimation.cells import CONFIGURATIONS, session, solved
@@ -93,7 +93,7 @@ def test_a_circle_anywhere_is_certified_though_nothing_tells_its_turn_about_itse
 def test_how_much_better_another_answer_may_be_is_said(
     cost: float, missing: float, told: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def shown(sightings: Sightings, places: Floats) -> Certificate:
+    def shown(sightings: LiftedSightings, places: Floats) -> Certificate:
         return Certificate(places, cost, missing, False)
 
     monkeypatch.setattr(certified, "certify", shown)

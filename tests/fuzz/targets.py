@@ -226,12 +226,12 @@ def _read_rewritten(path):
 
 def _follow(path):
     from flangeye.errors import StageError
-    from flangeye.log.watch.view import View, follow
+    from flangeye.log.watch.view import RunView, follow
 
     def wait():
         raise StageError("no more")
 
-    view = View("run")
+    view = RunView("run")
     for message in follow(path, wait, view.note):
         view.take(message)
     view.rendered()
@@ -345,7 +345,7 @@ def _read_json(path):
 
 
 def _histories(folder):
-    from flangeye.doctor.monitor.history import Check, Finding, History
+    from flangeye.doctor.monitor.history import CheckFinding, History, MonitorCheck
     from flangeye.types import BASE, FLANGE, CircleFeature, Observation, Transform, by_frame
 
     def seen(i):
@@ -358,8 +358,8 @@ def _histories(folder):
 
     history = History(folder / "sound.jsonl", "a calibration")
     for i in range(3):
-        history.checks.append(Check(f"run {i}", (seen(2 * i), seen(2 * i + 1)), 10**18 + i))
-        history.findings.append(Finding(i, "MOVED", 1e-3, (0.0,) * 6, i, 2.0, "scanner", 0.9))
+        history.checks.append(MonitorCheck(f"run {i}", (seen(2 * i), seen(2 * i + 1)), 10**18 + i))
+        history.findings.append(CheckFinding(i, "MOVED", 1e-3, (0.0,) * 6, i, 2.0, "scanner", 0.9))
     history.write()
     return [history.path.read_bytes()]
 

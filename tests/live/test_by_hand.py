@@ -14,7 +14,7 @@ from flangeye.maths.kinematics import Arm
 from flangeye.maths.pose_formats import CONVENTIONS
 from flangeye.models.loading import load_model
 from flangeye.types import CAMERA, PointCloud
-from flangeye_emulators.scanner.loopback import CellScene, Stance
+from flangeye_emulators.scanner.loopback import CellScene, TrueStance
 from flangeye_emulators.world.scanner import CameraPose, scanner_of
 
 pytestmark = [pytest.mark.realtime, pytest.mark.slow]
@@ -65,7 +65,7 @@ class Person:
 
     def press_the_button(self):
         self.count += 1
-        stance = Stance(self.joints, self.arm.flange(self.joints))
+        stance = TrueStance(self.joints, self.arm.flange(self.joints))
         xyz = self.studio.scan([stance], (0, self.count)) * 1000.0
         write_cloud(self.folder / f"scan_{self.count}.pcd", PointCloud(CAMERA, xyz))
 

@@ -20,7 +20,7 @@ from flangeye.errors import RunStopped
 from flangeye.motion import watchdog as guard_module
 from flangeye.motion.arm import GUARD, WatchedArm, _alarmed, run_number, watched
 from flangeye.motion.route import Router
-from flangeye.motion.supervision import Sample
+from flangeye.motion.supervision import RememberedState
 from flangeye.motion.watchdog import Charge, Watchdog
 from tests.motion.stand_in import (
     LIMITS,
@@ -64,7 +64,7 @@ def test_it_knows_where_the_arm_was() -> None:
 
 
 def test_the_samples_of_an_interval_are_those_in_it_and_one_to_each_side() -> None:
-    samples = [Sample(t, np.eye(4), np.zeros(6)) for t in (10, 20, 30, 40)]
+    samples = [RememberedState(t, np.eye(4), np.zeros(6)) for t in (10, 20, 30, 40)]
 
     def during(start: int, end: int) -> list[int]:
         return [sample.time_ns for sample in guard_module._during(samples, start, end)]

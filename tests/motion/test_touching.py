@@ -17,7 +17,7 @@ from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
 from flangeye.motion.limits import MotionLimits
 from flangeye.motion.touching import Toucher
-from flangeye_emulators.robot.simulated import SimulatedParams, SimulatedRobot
+from flangeye_emulators.robot.simulated import SimulatedRobot, SimulatedRobotParams
 
 UR5E = load_model("robots", "ur5e")
 ARM = Arm(UR5E)
@@ -32,7 +32,7 @@ class Cell:
     """An arm that stays where it is between two connections, and whoever jogs it."""
 
     def __init__(self, jogs_to: list[np.ndarray]) -> None:
-        self.robot = SimulatedRobot(UR5E, SimulatedParams())
+        self.robot = SimulatedRobot(UR5E, SimulatedRobotParams())
         self.asked: list[str] = []
         self.stood: list[np.ndarray] = []
         self._jogs_to = iter(jogs_to)
@@ -118,7 +118,7 @@ class Forgetful(Cell):
 
     @contextmanager
     def _open(self) -> Iterator[SimulatedRobot]:
-        yield SimulatedRobot(UR5E, SimulatedParams())
+        yield SimulatedRobot(UR5E, SimulatedRobotParams())
 
 
 def test_an_arm_that_is_not_where_it_was_sent_is_not_touched_with() -> None:

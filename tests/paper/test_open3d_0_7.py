@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from flangeye.maths.geometry import rigid, rotation_exp
-from flangeye_paper.open3d_0_7 import Stop, icp, normals_of
+from flangeye_paper.open3d_0_7 import IcpStop, icp, normals_of
 
-CONVERGED = Stop(100, 1e-12)
+CONVERGED = IcpStop(100, 1e-12)
 
 
 def plate(tilt=0.0):
@@ -68,8 +68,8 @@ def test_icp_finds_the_motion() -> None:
 def test_icp_stops_when_told() -> None:
     target, normals = corner()
     source = target + [2e-3, 1e-3, 0.0]
-    assert icp(source, target, normals, 1.0, Stop(2, 0.0)).iterations == 2
-    assert icp(source, target, normals, 1.0, Stop(30, 1.0)).iterations == 1
+    assert icp(source, target, normals, 1.0, IcpStop(2, 0.0)).iterations == 2
+    assert icp(source, target, normals, 1.0, IcpStop(30, 1.0)).iterations == 1
 
 
 def test_icp_fails_when_nothing_is_near() -> None:

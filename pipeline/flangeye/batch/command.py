@@ -20,7 +20,7 @@ from flangeye.batch.cluster import (
 from flangeye.batch.dataset import Dataset, Ledger, columns_of
 from flangeye.batch.keys import Software, software_of
 from flangeye.batch.page import write_page
-from flangeye.batch.plan import BatchSession, Plan, plan
+from flangeye.batch.plan import BatchPlan, BatchSession, plan
 from flangeye.batch.progress import BatchProgress
 from flangeye.batch.request import BatchError, Request
 from flangeye.batch.tally import Batch, Tally
@@ -61,7 +61,7 @@ def run_batch(request: Request, registry: Registry, console: Console) -> Batch:
 def run_sessions(
     request: Request,
     out: str,
-    sessions: Plan | Sequence[BatchSession],
+    sessions: BatchPlan | Sequence[BatchSession],
     varied: Mapping[str, Sequence[str]],
     software: Software,
     console: Console,

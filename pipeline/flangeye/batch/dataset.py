@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from flangeye.batch.outcome import FINISHED, SessionOutcome
 from flangeye.batch.plan import BatchSession
-from flangeye.files.place import Place
+from flangeye.files.place import Storage
 from flangeye.files.yaml_lines import parse_value
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ class Ledger:
 class Dataset:
     """The rows of a batch in its folder."""
 
-    def __init__(self, place: Place, columns: Mapping[str, Kind]) -> None:
+    def __init__(self, place: Storage, columns: Mapping[str, Kind]) -> None:
         import pyarrow as pa
 
         self._place = place

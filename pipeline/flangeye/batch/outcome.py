@@ -6,7 +6,7 @@ import json
 from dataclasses import asdict, dataclass
 from typing import Literal
 
-from flangeye.files.place import Place
+from flangeye.files.place import Storage
 from flangeye.result import Result
 
 Status = Literal["verified", "unverified", "refused", "failed", "crashed"]
@@ -75,7 +75,7 @@ def outcome_of(result: Result) -> SessionOutcome:
     )
 
 
-def mark_finished(place: Place, folder: str, key: str, outcome: SessionOutcome) -> None:
+def mark_finished(place: Storage, folder: str, key: str, outcome: SessionOutcome) -> None:
     """Leave the outcome in a session's folder, whole or not at all.
 
     Raises:
@@ -85,7 +85,7 @@ def mark_finished(place: Place, folder: str, key: str, outcome: SessionOutcome) 
     place.write(f"{folder}/{MARKER}", text.encode())
 
 
-def finished_outcome(place: Place, folder: str, key: str, report: bool) -> SessionOutcome | None:
+def finished_outcome(place: Storage, folder: str, key: str, report: bool) -> SessionOutcome | None:
     """Return what :func:`mark_finished` left; None when the session has to run.
 
     Args:

@@ -15,7 +15,7 @@ from flangeye import report as run_report
 from flangeye.batch.dataset import Row
 from flangeye.batch.tally import Tally
 from flangeye.files.paths import VERSION
-from flangeye.files.place import Place
+from flangeye.files.place import Storage
 from flangeye.report.look import css
 from flangeye.report.page import packed_plotly
 from flangeye.report.units import degrees, duration, millimetres
@@ -73,7 +73,7 @@ class TableCell:
     kind: str
 
 
-def write_page(tally: Tally, place: Place) -> None:
+def write_page(tally: Tally, place: Storage) -> None:
     """Write the summary of a batch into its folder.
 
     Raises:

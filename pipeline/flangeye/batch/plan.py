@@ -66,7 +66,7 @@ class Variant:
 
 
 @dataclass(frozen=True)
-class Plan:
+class BatchPlan:
     """The sessions of a batch; each is made when it is come to, so none of them are held.
 
     Attributes:
@@ -100,7 +100,7 @@ class Plan:
         return {path: list({v.varied[path]: None for v in self.variants}) for path in paths}
 
 
-def plan(request: Request, registry: Registry, software: Software) -> Plan:
+def plan(request: Request, registry: Registry, software: Software) -> BatchPlan:
     """Return the sessions of a batch, with the recipe of each checked.
 
     Raises:
@@ -116,7 +116,7 @@ def plan(request: Request, registry: Registry, software: Software) -> Plan:
         overrides = (*request.overrides, *_written(varied))
         shown = {k: v for k, v in varied.items() if k != SEED}
         found.append(Variant(overrides, shown, common_key(recipe, software, prints), seeds))
-    made = Plan(path, found, archives, prints)
+    made = BatchPlan(path, found, archives, prints)
     _check_distinct(made)
     return made
 
@@ -157,7 +157,7 @@ def _session_name(recipe: str, archive: str | None) -> str:
     return re.sub(r"[^A-Za-z0-9._=-]+", "-", name)[:80].lstrip(".-")
 
 
-def _check_distinct(made: Plan) -> None:
+def _check_distinct(made: BatchPlan) -> None:
     """Refuse equal sessions: those of an archive that is given twice, or of equal variants."""
     seen: dict[tuple[str, int], Variant] = {}
     for variant in made.variants:
@@ -171,7 +171,7 @@ def _check_distinct(made: Plan) -> None:
         known.add(archive)
 
 
-def _refuse(made: Plan, *same: tuple[Variant, str | None]) -> None:
+def _refuse(made: BatchPlan, *same: tuple[Variant, str | None]) -> None:
     told = (
         " ".join([archive or made.recipe.name, *_written(variant.varied)])
         for variant, archive in same

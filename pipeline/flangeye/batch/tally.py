@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 FIGURES = ("holdout_rms_m", "expected_p95_m", "true_rms_m")
 """Of which medians are told."""
 
-MOST = 1000
+MOST_LISTED = 1000
 """Sessions, and variants, in the page's tables, and about as many dots in its plots."""
 
 Names = tuple[Any, ...]
@@ -62,7 +62,7 @@ class Tally:
         self.told: set[str] = set()
         self.sample: list[Row] = []
         self.common: Path | None = None
-        self._step = 1 + about // MOST
+        self._step = 1 + about // MOST_LISTED
         self._archive: str | None = None
         self._archives = self._urls = False
         self._worst: pa.Table | None = None
@@ -113,7 +113,7 @@ class Tally:
 
     def variants(self) -> list[VariantTold]:
         """Return what each variant came to; none where nothing was repeated, or they are many."""
-        if len(self._variants) > MOST or len(self._variants) == self.total:
+        if len(self._variants) > MOST_LISTED or len(self._variants) == self.total:
             return []
         members, statuses = np.concatenate(self._members), np.concatenate(self._statuses)
         figures = np.concatenate(self._figures, axis=1)
@@ -143,7 +143,7 @@ class Tally:
         self._figures.append(np.where(statuses < len(ACCEPTED), figures, np.nan))
 
     def _add_variants(self, table: pa.Table) -> None:
-        if len(self._variants) > MOST:
+        if len(self._variants) > MOST_LISTED:
             return
         values = [table[name].to_pylist() for name in ("archive", *self.varied)]
         known = self._variants
@@ -154,10 +154,10 @@ class Tally:
         import pyarrow as pa
 
         worst = table if self._worst is None else pa.concat_tables([self._worst, table])
-        if len(worst) > MOST:
+        if len(worst) > MOST_LISTED:
             accepted = np.isin(worst["status"].to_pylist(), ACCEPTED)
             error = np.nan_to_num(worst["holdout_rms_m"].to_numpy().astype(float))
-            worst = worst.take(np.lexsort((-error, accepted))[:MOST])
+            worst = worst.take(np.lexsort((-error, accepted))[:MOST_LISTED])
         self._worst = worst
 
 

@@ -33,7 +33,7 @@ from flangeye.batch.outcome import (
 from flangeye.batch.plan import BatchSession
 from flangeye.errors import FlangeyeError, StageError
 from flangeye.files.elsewhere import archive_at, is_url, results_at
-from flangeye.files.place import Place, place_at
+from flangeye.files.place import Storage, place_at
 from flangeye.plugin.registry import Registry, load_registry
 from flangeye.recipe.load import Recipe, load_recipe
 from flangeye.run.folder import RunFolder
@@ -77,7 +77,7 @@ class Job:
     start: str = field(default_factory=lambda: secrets.token_hex(4))
 
     @cached_property
-    def place(self) -> Place:
+    def place(self) -> Storage:
         """The batch's folder."""
         return place_at(self.out)
 

@@ -13,7 +13,7 @@ from flangeye.cli.app import Overrides, app, load_plugins
 from flangeye.cli.console import say
 
 if TYPE_CHECKING:
-    from flangeye.doctor.monitor import Check, StoredCalibration
+    from flangeye.doctor.monitor import MonitorCheck, StoredCalibration
     from flangeye.estimation.watch.drift import DriftTest
     from flangeye.plugin.registry import Registry
 
@@ -125,7 +125,7 @@ def _checks(
     archives: list[Path],
     live: tuple[int, bool],
     overrides: Sequence[str],
-) -> Iterator[Check]:
+) -> Iterator[MonitorCheck]:
     from flangeye.doctor.monitor import from_archive, from_arm
 
     for path in archives:

@@ -25,7 +25,7 @@ Reader = str | Mapping[str, Any]
 Arms = Literal["both", "first", "second"]
 """Whose poses: where there is one arm, ``both`` is that one."""
 
-FEWEST = 4
+FEWEST_SAMPLES = 4
 """Samples below which every explanation fits."""
 
 USUAL_LIMIT = 1e-3
@@ -115,8 +115,10 @@ class RecordedSession:
         Raises:
             NotApplicable: There are too few with a target in them.
         """
-        if (seen := int(self.seen.sum())) < FEWEST:
-            raise NotApplicable(f"{seen} samples with a target in them, {FEWEST} are needed")
+        if (seen := int(self.seen.sum())) < FEWEST_SAMPLES:
+            raise NotApplicable(
+                f"{seen} samples with a target in them, {FEWEST_SAMPLES} are needed"
+            )
 
     def require_poses(self) -> None:
         """Go on only where a mistake in the flanges' poses would show.

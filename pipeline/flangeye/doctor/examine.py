@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from flangeye.doctor.diagnosis import FEWEST, Finding, NotApplicable, RecordedSession
+from flangeye.doctor.diagnosis import FEWEST_SAMPLES, Finding, NotApplicable, RecordedSession
 from flangeye.errors import StageError
 from flangeye.plugin.stage import BoundPart, Part
 
@@ -61,7 +61,7 @@ def examine(
         current = found[-1].corrected_session or current
         offered = []
         # One session has no more; a guard against checks that undo each other
-        if len(found) == 8 or current.seen.sum() < FEWEST:
+        if len(found) == 8 or current.seen.sum() < FEWEST_SAMPLES:
             break
         offered, _ = _offered(current, bound, checked)
         # What all samples share is read once: the same mistake again would be of the first mending.
@@ -101,8 +101,8 @@ def require_enough(session: RecordedSession) -> None:
         StageError: There are fewer.
     """
     seen = int(session.seen.sum())
-    if seen < FEWEST:
+    if seen < FEWEST_SAMPLES:
         raise StageError(
-            f"{seen} of {len(session)} samples have a target in them; at least {FEWEST} are needed "
-            "to tell a mistake from noise"
+            f"{seen} of {len(session)} samples have a target in them; at least {FEWEST_SAMPLES} "
+            "are needed to tell a mistake from noise"
         )

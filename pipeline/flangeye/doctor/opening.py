@@ -19,7 +19,7 @@ import numpy as np
 
 from flangeye import types as t
 from flangeye.doctor.diagnosis import (
-    FEWEST,
+    FEWEST_SAMPLES,
     USUAL_LIMIT,
     Finding,
     ReadAgain,
@@ -413,10 +413,10 @@ def found_in(
         found = _found_by(archive, first, recipe, registry)
     except StageError as error:
         refused = error
-    if len(found) < FEWEST and stated is not None:
+    if len(found) < FEWEST_SAMPLES and stated is not None:
         for unit in _UNITS[stated]:
             others = _in_unit(archive, first, recipe, registry, unit)
-            if len(others) >= FEWEST:
+            if len(others) >= FEWEST_SAMPLES:
                 few = f"{len(found)} of {len(archive.recordings)} scans show a target with unit: "
                 seen = f"{few}{stated}, {len(others)} do with unit: {unit}"
                 return others, (unit, seen if refused is None else f"{refused}; {seen}")

@@ -19,7 +19,7 @@ from flangeye.maths.geometry import hat, rigid, rotation_exp, stack_rows
 from flangeye.maths.kinematics import Arm
 from flangeye.types import Floats, Mask
 
-STEPS = 12
+GAUSS_NEWTON_STEPS = 12
 """Of Gauss and Newton; what scatters and the parameters are found in turn, and settle by a fifth
 each time."""
 DELTA = 1e-6
@@ -114,7 +114,7 @@ def fit_arm(arm: Arm, session: ArmSession, start: Floats, prior: Floats, scatter
     about: Floats = np.asarray(session.poses[:, :3, 3].mean(axis=0))
     nothing = np.asarray(np.eye(0))
     fit = ArmFit(start, np.zeros_like(prior), nothing, nothing, about, scatter)
-    for _ in range(STEPS):
+    for _ in range(GAUSS_NEWTON_STEPS):
         fit = _step(arm, session, fit, prior)
     return fit
 

@@ -29,7 +29,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flangeye.estimation.lifted import Family, Sightings, Squares, squares_of
+from flangeye.estimation.lifted import Family, LiftedSightings, Squares, squares_of
 from flangeye.maths.geometry import nearest_rotation, rotation_exp
 from flangeye.types import Floats, Indices
 
@@ -62,7 +62,7 @@ class Certificate:
     better: Floats | None = None
 
 
-def certify(sightings: Sightings, places: Floats) -> Certificate:
+def certify(sightings: LiftedSightings, places: Floats) -> Certificate:
     """Return what can be shown of the valley in which the unknowns (K, 4, 4) lie."""
     squares = squares_of(sightings, places)
     found = squares.descend(np.tile(np.eye(4), (len(places), 1, 1)))

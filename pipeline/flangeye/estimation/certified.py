@@ -16,7 +16,7 @@ import numpy as np
 
 from flangeye.estimation.certificate import Certificate, certify
 from flangeye.estimation.estimate import Estimate
-from flangeye.estimation.lifted import Side, Sightings, families_of
+from flangeye.estimation.lifted import LiftedSightings, Side, families_of
 from flangeye.maths.frame_graph import Frame, chain
 from flangeye.maths.geometry import invert, rotation_exp, rotation_log
 from flangeye.types import Floats, Indices
@@ -28,7 +28,7 @@ OPTIMAL = "globally optimal: nowhere is there an answer that fits the agreeing p
 NOT_CERTIFIED = "not certified as globally optimal"
 
 
-class Verdict(NamedTuple):
+class CertificateVerdict(NamedTuple):
     """What is said of an answer.
 
     Attributes:
@@ -40,7 +40,7 @@ class Verdict(NamedTuple):
     better: Mapping[str, Floats] | None = None
 
 
-class Step(NamedTuple):
+class PathStep(NamedTuple):
     """One frame on a way, or back from it to what it stands on."""
 
     name: str
@@ -48,7 +48,7 @@ class Step(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
+class CertifiedAnswer:
     """The answer for N sightings that agree.
 
     Attributes:
@@ -75,7 +75,7 @@ class Answer:
         """Return (M,) the sightings of one target by one camera."""
         return np.flatnonzero([each == ends for each in self.ends])
 
-    def ways(self, ends: tuple[str, str], root: str = "") -> tuple[list[Step], list[Step]]:
+    def ways(self, ends: tuple[str, str], root: str = "") -> tuple[list[PathStep], list[PathStep]]:
         """Return the frames that lead to a camera and to a target, from where both ways part.
 
         Args:
@@ -86,25 +86,27 @@ class Answer:
         shared = sum(1 for a, b in zip(first, second, strict=False) if a == b)
         return first[shared:], second[shared:]
 
-    def _way(self, root: str, end: str) -> list[Step]:
+    def _way(self, root: str, end: str) -> list[PathStep]:
         up, down = chain(self.frames, root), chain(self.frames, end)
         shared = sum(1 for a, b in zip(up, down, strict=False) if a == b)
-        back = [Step(name, True) for name in reversed(up[shared:])]
-        return [*back, *(Step(name, False) for name in down[shared:])]
+        back = [PathStep(name, True) for name in reversed(up[shared:])]
+        return [*back, *(PathStep(name, False) for name in down[shared:])]
 
-    def unknown(self, ends: tuple[str, str], root: str = "") -> tuple[list[Step], list[Step]]:
+    def unknown(
+        self, ends: tuple[str, str], root: str = ""
+    ) -> tuple[list[PathStep], list[PathStep]]:
         """Return the unknown ones of those."""
         first, second = ([s for s in w if s.name in self.places] for w in self.ways(ends, root))
         return first, second
 
-    def place(self, step: Step, times: Indices) -> Floats:
+    def place(self, step: PathStep, times: Indices) -> Floats:
         """Return the (M, 4, 4) places of a step whose frame's is known."""
         place = np.asarray(self.frames[step.name].place)
         every = np.broadcast_to(place, (len(times), 4, 4)) if place.ndim == 2 else place[times]
         return invert(every) if step.back else every
 
 
-def answer_of(found: Estimate) -> Answer:
+def answer_of(found: Estimate) -> CertifiedAnswer:
     """Return the answer for the sightings that agree; what may be wrong stays as it was found."""
     problem, model, kept = found.problem, found.posterior.model, found.inliers
     s = problem.seen.where(kept)
@@ -116,7 +118,7 @@ def answer_of(found: Estimate) -> Answer:
         ends = [(camera, f"{target}_point") for camera, target in problem.ends]
     mode = found.posterior.mode
     left = model.residuals - (model.effects @ mode.mean[model.p :])
-    return Answer(
+    return CertifiedAnswer(
         frames,
         [ends[k] for k in s.pairs],
         s.times,
@@ -131,11 +133,11 @@ def answer_of(found: Estimate) -> Answer:
     )
 
 
-def verdict_of(answer: Answer) -> Verdict:
+def verdict_of(answer: CertifiedAnswer) -> CertificateVerdict:
     """Return whether the sightings that agree have no better answer than the one found."""
     root = _seen_from(answer)
     if root is None:
-        return Verdict(_not_certifiable(answer))
+        return CertificateVerdict(_not_certifiable(answer))
     shown = certify(_sightings(answer, root), _array(_turned(answer.places, root, answer)))
     if not shown.optimal:
         share = min(shown.missing / max(shown.cost, 1e-300), 1)
@@ -143,12 +145,16 @@ def verdict_of(answer: Answer) -> Verdict:
             f"{NOT_CERTIFIED} (gap {share:.1%}): another answer may leave squared errors less by "
             "so much"
         )
-        return Verdict(note, _named(shown.better, root, answer))
+        return CertificateVerdict(note, _named(shown.better, root, answer))
     away = _far_away(shown, root, answer)
-    return Verdict(away, _named(shown.places, root, answer)) if away else Verdict(OPTIMAL)
+    return (
+        CertificateVerdict(away, _named(shown.places, root, answer))
+        if away
+        else CertificateVerdict(OPTIMAL)
+    )
 
 
-def certificate_notes(answer: Answer) -> tuple[str, ...]:
+def certificate_notes(answer: CertifiedAnswer) -> tuple[str, ...]:
     """Return in words whether there is a better answer."""
     return (verdict_of(answer).note,)
 
@@ -158,13 +164,13 @@ def moved_note() -> str:
     return "what the search had found was not the best: the certificate led to a likelier answer"
 
 
-def _named(places: Floats | None, root: str, answer: Answer) -> dict[str, Floats] | None:
+def _named(places: Floats | None, root: str, answer: CertifiedAnswer) -> dict[str, Floats] | None:
     if places is None:
         return None
     return _turned(dict(zip(answer.places, places, strict=True)), root, answer)
 
 
-def _far_away(shown: Certificate, root: str, answer: Answer) -> str | None:
+def _far_away(shown: Certificate, root: str, answer: CertifiedAnswer) -> str | None:
     """Return what is said where the bottom of the valley is not the answer."""
     places = _array(_turned(answer.places, root, answer))
     turns = shown.places[:, :3, :3] @ invert(places)[:, :3, :3]
@@ -177,7 +183,7 @@ def _far_away(shown: Certificate, root: str, answer: Answer) -> str | None:
     return f"{NOT_CERTIFIED}: with its weights the best answer is {far:.2g} deg from it"
 
 
-def _not_certifiable(answer: Answer) -> str:
+def _not_certifiable(answer: CertifiedAnswer) -> str:
     def between(ends: tuple[str, str]) -> list[str]:
         return [step.name for way in answer.unknown(ends) for step in way]
 
@@ -191,7 +197,7 @@ def _not_certifiable(answer: Answer) -> str:
 # --- from where the graph is looked at -----------------------------------------------------------
 
 
-def _seen_from(answer: Answer) -> str | None:
+def _seen_from(answer: CertifiedAnswer) -> str | None:
     """Return the frame from which errors are a quadratic of fewest features; None if there is none.
 
     The root is an empty name.
@@ -201,7 +207,7 @@ def _seen_from(answer: Answer) -> str | None:
     return min(possible, key=possible.__getitem__) if possible else None
 
 
-def _size(answer: Answer, root: str) -> int:
+def _size(answer: CertifiedAnswer, root: str) -> int:
     """Return how many features errors are a quadratic of; none where they are not."""
     ways = [way for ends in dict.fromkeys(answer.ends) for way in answer.unknown(ends, root)]
     index = {name: i for i, name in enumerate(answer.places)}
@@ -212,7 +218,7 @@ def _size(answer: Answer, root: str) -> int:
     return families_of(pairs, len(index))[1]
 
 
-def _turned(places: Mapping[str, Floats], root: str, answer: Answer) -> dict[str, Floats]:
+def _turned(places: Mapping[str, Floats], root: str, answer: CertifiedAnswer) -> dict[str, Floats]:
     """Return places, those that lead the other way from a root as their inverses."""
     back = chain(answer.frames, root)
     return {name: invert(place) if name in back else place for name, place in places.items()}
@@ -225,9 +231,9 @@ def _array(places: Mapping[str, Floats]) -> Floats:
 # --- the sightings -------------------------------------------------------------------------------
 
 
-def _sightings(answer: Answer, root: str) -> Sightings:
+def _sightings(answer: CertifiedAnswer, root: str) -> LiftedSightings:
     pairs = [_of_pair(answer, ends, root) for ends in dict.fromkeys(answer.ends)]
-    return Sightings(
+    return LiftedSightings(
         _joined([p.camera for p in pairs]),
         _joined([p.target for p in pairs]),
         np.concatenate([p.weights for p in pairs]),
@@ -239,7 +245,7 @@ def _joined(sides: Sequence[Side]) -> Side:
     return Side(*(np.concatenate([getattr(s, f.name) for s in sides]) for f in fields(Side)))
 
 
-def _of_pair(answer: Answer, ends: tuple[str, str], root: str) -> Sightings:
+def _of_pair(answer: CertifiedAnswer, ends: tuple[str, str], root: str) -> LiftedSightings:
     rows = answer.of_pair(ends)
     camera, target = (_side(answer, way, answer.times[rows]) for way in answer.ways(ends, root))
     places = _array(_turned(answer.places, root, answer))
@@ -247,10 +253,12 @@ def _of_pair(answer: Answer, ends: tuple[str, str], root: str) -> Sightings:
     turn = np.kron(np.eye(2), there[:, :3, :3])
     weights = turn @ answer.weights[rows] @ np.swapaxes(turn, 1, 2)
     measured = _measured(invert(there) @ seen, answer.errors[rows])
-    return Sightings(replace(camera, c=camera.c @ measured), target, weights, answer.freedoms[rows])
+    return LiftedSightings(
+        replace(camera, c=camera.c @ measured), target, weights, answer.freedoms[rows]
+    )
 
 
-def _side(answer: Answer, way: Sequence[Step], times: Indices) -> Side:
+def _side(answer: CertifiedAnswer, way: Sequence[PathStep], times: Indices) -> Side:
     """Return a way as one side of sightings: of two unknown places at most."""
     index = {name: i for i, name in enumerate(answer.places)}
     still = np.tile(np.eye(4), (len(times), 1, 1))

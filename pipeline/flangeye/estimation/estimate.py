@@ -17,7 +17,7 @@ from flangeye.estimation.effects.effect import Effect
 from flangeye.estimation.graph import Places, Problem
 from flangeye.estimation.mixed import (
     Fit,
-    Model,
+    LinearModel,
     Posterior,
     Sizes,
     fit,
@@ -116,7 +116,7 @@ def model_at(
     effects: Sequence[Effect],
     shares: Floats,
     of_session: bool = True,
-) -> Model:
+) -> LinearModel:
     """Return the linear model near some places.
 
     Args:
@@ -131,7 +131,7 @@ def model_at(
     if not of_session:
         blocks = [b if e.lasting else 0 * b for b, e in zip(blocks, effects, strict=True)]
     still, scatters = np.zeros((len(s), 6, 0)), arm_scatters(problem)
-    return Model(
+    return LinearModel(
         (s.projectors @ linear.residuals[..., None])[..., 0],
         np.concatenate([still, *(linear.blocks[name] for name in problem.unknown)], axis=2),
         np.concatenate([still, *blocks], axis=2),
@@ -183,7 +183,7 @@ def _moved(problem: Problem, places: Places, found: Fit) -> tuple[Places, float]
     return problem.moved(places, step), float(np.abs(step).max(initial=0.0))
 
 
-def judged(model: Model, found: Fit) -> tuple[Floats, Mask]:
+def judged(model: LinearModel, found: Fit) -> tuple[Floats, Mask]:
     """Return (N,) squared distances from what the others predict, and which agree with them."""
     noise, q = model.noise(found.sizes), model.projectors
     left, spread = left_out(model, found)

@@ -14,7 +14,7 @@ from flangeye.maths.geometry import basis_of_plane
 from flangeye.maths.statistics import SIGMA_OF_MAD
 from flangeye.types import Floats, Observation
 
-FEWEST = 3
+FEWEST_ROLLS = 3
 """Poses whose holes were seen, for their scatter to mean anything."""
 
 
@@ -29,7 +29,7 @@ def roll_note(
         covariance: (3, 3) of its rotation [rad^2].
     """
     turns = roll_of(observations, base_R_camera)
-    if len(turns) < FEWEST:
+    if len(turns) < FEWEST_ROLLS:
         return (
             "a constant turn of the plate about its own axis (flange roll) does not show, for the "
             f"holes were told apart in {len(turns)} of {len(observations)} poses: the camera's "

@@ -72,7 +72,7 @@ class Side:
 
 
 @dataclass(frozen=True, eq=False)
-class Sightings:
+class LiftedSightings:
     """N sightings of which both sides are the same place.
 
     Attributes:
@@ -237,7 +237,7 @@ def _moves(place: Floats) -> Floats:
 # --- the quadratic -------------------------------------------------------------------------------
 
 
-def squares_of(sightings: Sightings, places: Floats) -> Squares:
+def squares_of(sightings: LiftedSightings, places: Floats) -> Squares:
     """Return the squares by what the unknowns are beyond those places (K, 4, 4)."""
     sides = [side.about(places) for side in (sightings.camera, sightings.target)]
     index = np.concatenate([side.unknowns for side in sides], axis=1)
@@ -289,7 +289,7 @@ def _by_both(before: Floats, entries: Floats) -> Floats:
     return out.reshape(-1, 12, 169)
 
 
-def _of_entries(s: Sightings, turned: Floats) -> Floats:
+def _of_entries(s: LiftedSightings, turned: Floats) -> Floats:
     """Return (N, 12, 12) weights of the entries by which one side differs from the other.
 
     Args:

@@ -60,7 +60,7 @@ class Sizes:
 
 
 @dataclass(frozen=True, eq=False)
-class Model:
+class LinearModel:
     """What was seen, near one set of places.
 
     Attributes:
@@ -116,7 +116,7 @@ class Model:
         both = self.projectors @ (bare + np.swapaxes(bare, 1, 2)) @ self.projectors
         return np.asarray(both * self.shares[:, None, None] / 2)
 
-    def telling(self) -> Model:
+    def telling(self) -> LinearModel:
         """Return the model of some sightings that take part, evenly over all."""
         kept = np.flatnonzero(self.shares)
         if len(kept) <= TELLING:
@@ -126,7 +126,7 @@ class Model:
         some = {name: getattr(self, name)[rows] for name in each}
         return replace(self, scatter=self.scatter[:, rows], **some)
 
-    def weighted(self, shares: Floats) -> Model:
+    def weighted(self, shares: Floats) -> LinearModel:
         """Return the model with other weights of its sightings."""
         return replace(self, shares=shares)
 
@@ -152,7 +152,7 @@ class Fit:
     gradient: Floats
 
 
-def fit(model: Model, sizes: Floats, with_gradient: bool = True) -> Fit:
+def fit(model: LinearModel, sizes: Floats, with_gradient: bool = True) -> Fit:
     """Solve Henderson's mixed-model equations at (S,) sizes, with the restricted likelihood.
 
     Without the gradient (zeros) it takes half the time.
@@ -189,7 +189,7 @@ def fit(model: Model, sizes: Floats, with_gradient: bool = True) -> Fit:
     return replace(found, gradient=_gradient(model, sizes, found, (h, left, bare, prior)))
 
 
-def told_of_places(model: Model, sizes: Floats) -> Floats:
+def told_of_places(model: LinearModel, sizes: Floats) -> Floats:
     """Return (P, P) what the sightings tell of the places, the effects marginalised.
 
     By the Schur complement, which stays exact where nothing is told; an inverse covariance is not.
@@ -211,7 +211,7 @@ def _scaled(information: Floats) -> tuple[Floats, Floats]:
 
 
 def _gradient(
-    model: Model, sizes: Floats, found: Fit, parts: tuple[Floats, Floats, Floats, Floats]
+    model: LinearModel, sizes: Floats, found: Fit, parts: tuple[Floats, Floats, Floats, Floats]
 ) -> Floats:
     """Return (S,) derivatives of the cost by the logarithms of the sizes.
 
@@ -253,7 +253,7 @@ class Posterior:
         chances: (F,) weights of the draws; they sum to one.
     """
 
-    model: Model
+    model: LinearModel
     mode: Fit
     fits: tuple[Fit, ...]
     chances: Floats
@@ -291,7 +291,7 @@ def shares(known: Posterior, rows: Floats) -> tuple[Floats, Floats]:
     return of_effects, np.asarray(whole - of_effects.sum(axis=0))
 
 
-def mode_of(model: Model, start: Floats | None = None, steps: int = 60) -> Floats:
+def mode_of(model: LinearModel, start: Floats | None = None, steps: int = 60) -> Floats:
     """Return (Z,) the most likely sizes, as standard normal numbers, by L-BFGS."""
     from scipy.optimize import minimize
 
@@ -309,7 +309,7 @@ def mode_of(model: Model, start: Floats | None = None, steps: int = 60) -> Float
     )  # fmt: skip
 
 
-def posterior(model: Model, mode: Floats | None = None) -> Posterior:
+def posterior(model: LinearModel, mode: Floats | None = None) -> Posterior:
     """Return the joint posterior, the sizes integrated over."""
     z, some = mode_of(model) if mode is None else mode, model.telling()
     spread = _laplace(some, z)
@@ -326,7 +326,7 @@ def posterior(model: Model, mode: Floats | None = None) -> Posterior:
     return Posterior(model, mode_fit, tuple(fits), chances / chances.sum())
 
 
-def _laplace(model: Model, z: Floats) -> Floats:
+def _laplace(model: LinearModel, z: Floats) -> Floats:
     """Return (Z, Z) the root of the covariance of the sizes about their mode.
 
     The symmetric one: eigenvectors have no sign of their own, and draws are to be the same for
@@ -355,7 +355,7 @@ def _draws(count: int, samples: int) -> Floats:
     return np.concatenate([half, -half])
 
 
-def left_out(model: Model, found: Fit) -> tuple[Floats, Floats]:
+def left_out(model: LinearModel, found: Fit) -> tuple[Floats, Floats]:
     """Return (N, 6) residuals and (N, 6, 6) covariances of each sighting by all the others.
 
     In closed form (the leave-one-out residual of Cook & Weisberg 1982): a sighting that took part

@@ -10,7 +10,7 @@ import numpy as np
 from flangeye.estimation.effects.effect import Effect
 from flangeye.estimation.estimate import judged, model_at
 from flangeye.estimation.graph import Places, Problem
-from flangeye.estimation.mixed import Fit, Model, fit, left_out, told_of_places
+from flangeye.estimation.mixed import Fit, LinearModel, fit, left_out, told_of_places
 from flangeye.estimation.observability import unobservable
 from flangeye.estimation.session import Asked, effects_of
 from flangeye.estimation.start import agreeing, begin
@@ -37,7 +37,7 @@ class Rough:
     problem: Problem
     places: Places
     effects: Sequence[Effect]
-    model: Model
+    model: LinearModel
     fit: Fit
     inliers: Mask
 

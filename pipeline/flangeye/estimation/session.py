@@ -38,7 +38,7 @@ CLOCK_STEPS, EXACT_DELAY = 6, 1e-5
 SIZE_STEPS, EXACT_SIZE, LOOSEST_SIZE = 6, 1e-6, 0.05
 """Steps to find a target's size, the share by which the last one changes it, and the largest
 standard deviation of what is taken for found: half the prior's."""
-CERTAIN = 1 - 1e-6
+MISTAKE_CERTAIN = 1 - 1e-6
 """Probability with which a mistake that is named is not noise's doing."""
 LARGEST_NOISE = 0.02, np.radians(5.0)
 """Sightings that agree no better than this [m, rad], nor than a share of their extent, belong to
@@ -407,7 +407,9 @@ def _require_size(session: Session) -> None:
     if not told:
         return
     share, sigma, kind = max(told, key=lambda each: abs(each[0]) / each[1])
-    if abs(share) <= session.asked.size_limit or (share / sigma) ** 2 < chi2_quantile(CERTAIN, 1):
+    if abs(share) <= session.asked.size_limit or (share / sigma) ** 2 < chi2_quantile(
+        MISTAKE_CERTAIN, 1
+    ):
         return
     factor = f"{1 + share:.4f} +- {sigma:.4f} times as"
     if kind == "size":
@@ -435,7 +437,7 @@ def _with_offset(session: Session) -> Session:
         return session
     again = estimate(found.problem, found.places, wrong, found.inliers)
     _, mean, covariance = again.numbers("offset")[0]
-    if mean @ np.linalg.solve(covariance, mean) < chi2_quantile(CERTAIN, 3):
+    if mean @ np.linalg.solve(covariance, mean) < chi2_quantile(MISTAKE_CERTAIN, 3):
         return session
     listed = ", ".join(f"{value * 1e3:.3f}" for value in mean)
     what = f"the seen circle is ({listed}) mm from the origin of the flange frame, in it"

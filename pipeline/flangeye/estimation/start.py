@@ -35,7 +35,7 @@ from flangeye.maths.geometry import (
 )
 from flangeye.types import Floats, Indices, Mask
 
-MOST = 40
+MOST_SIGHTINGS = 40
 """Sightings that one closed form takes: beyond, more cost time and change the start little."""
 FIRST, SETS = 10, 80
 """Small sets drawn where all sightings agree, and where they do not: 40 % of them wrong, four of
@@ -210,7 +210,7 @@ def _solved(loop: _Loop, rng: np.random.Generator) -> dict[str, Floats] | None:
     if form is None or len(loop.seen) < form.fewest:
         return None
     n = len(loop.seen)
-    everyone = np.arange(n) if n <= MOST else rng.choice(n, MOST, replace=False)
+    everyone = np.arange(n) if n <= MOST_SIGHTINGS else rng.choice(n, MOST_SIGHTINGS, replace=False)
     size = min(form.fewest + (1 if n > form.fewest else 0), n)
     tried: list[tuple[dict[str, Floats], Floats]] = []
     least, of_all = np.inf, np.inf

@@ -19,7 +19,7 @@ from flangeye.types import Floats
 Group = tuple[int, str]
 Entity = tuple[str, list[Group]]
 
-MOST = 200_000
+MOST_PIECES = 200_000
 """Straight pieces of one drawing."""
 ARC_STEP = math.radians(3)
 UNITS = {"1": "in", "4": "mm", "6": "m"}
@@ -40,8 +40,10 @@ def read_dxf(path: Path) -> tuple[Floats, str | None]:
         except (ValueError, OverflowError):
             raise StageError(f"{path}: a {name} has a coordinate that is no number") from None
         pieces += [np.stack([line[:-1], line[1:]], axis=1)] if len(line) > 1 else []
-        if sum(map(len, pieces)) > MOST:
-            raise StageError(f"{path}: holds more than {MOST} pieces of lines; keep the seam only")
+        if sum(map(len, pieces)) > MOST_PIECES:
+            raise StageError(
+                f"{path}: holds more than {MOST_PIECES} pieces of lines; keep the seam only"
+            )
     out = np.concatenate([np.zeros((0, 2, 3)), *pieces])
     if not np.isfinite(out).all():
         raise StageError(f"{path}: holds coordinates that are not finite")

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from flangeye.errors import StageError
 
 Key = str | tuple[int, ...]
-SHOWN = 4
+NAMES_SHOWN = 4
 """Names that a message lists before it says how many more there are."""
 
 
@@ -94,5 +94,5 @@ def _differing(
 
 
 def _list(names: Sequence[str]) -> str:
-    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
-    return ", ".join(names[:SHOWN]) + more
+    more = f" and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else ""
+    return ", ".join(names[:NAMES_SHOWN]) + more

@@ -14,7 +14,7 @@ from flangeye.errors import StageError
 from flangeye.files.elsewhere import is_url, reaching, system_of
 
 
-class Place(Protocol):
+class Storage(Protocol):
     """What many processes read from and write to; names are relative, with ``/``."""
 
     def read(self, name: str) -> bytes | None:
@@ -46,7 +46,7 @@ class Place(Protocol):
         ...
 
 
-def place_at(at: str) -> Place:
+def place_at(at: str) -> Storage:
     """Return a folder by path or URL.
 
     Raises:

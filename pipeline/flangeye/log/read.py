@@ -23,7 +23,7 @@ from flangeye.files.images import decode_image
 from flangeye.files.regular import open_regular
 from flangeye.log import foxglove
 from flangeye.log.record import adapter
-from flangeye.log.records import DamageError, LogFile, Message, NotMcapError, reason_of, unpack
+from flangeye.log.records import DamageError, LogFile, LogMessage, NotMcapError, reason_of, unpack
 
 _TYPES: dict[str, type] = {
     cls.__name__: cls
@@ -371,14 +371,14 @@ def read_notes(path: Path, steps: Set[str] | None = None) -> Iterator[JournalEnt
                 raise StageError(f"{path}: {_error_line(message, error)}") from None
 
 
-def _note(message: Message) -> JournalEntry:
+def _note(message: LogMessage) -> JournalEntry:
     step, _, name = message.channel.topic.removeprefix("/note/").rpartition("/")
     if message.channel.schema == "foxglove.CompressedImage":
         return JournalEntry(step, name, _decode_image(message.data))
     return JournalEntry(step, name, decode_json(message.data)["value"])
 
 
-def take(log: RunLog, message: Message, clouds: dict[str, t.PointCloud]) -> None:
+def take(log: RunLog, message: LogMessage, clouds: dict[str, t.PointCloud]) -> None:
     """Take one message into what is known of a run; what cannot be read is named in its damage.
 
     Args:
@@ -392,7 +392,7 @@ def take(log: RunLog, message: Message, clouds: dict[str, t.PointCloud]) -> None
         log.damage.append(_error_line(message, error))
 
 
-def _take(log: RunLog, message: Message, clouds: dict[str, t.PointCloud]) -> None:
+def _take(log: RunLog, message: LogMessage, clouds: dict[str, t.PointCloud]) -> None:
     topic, schema = message.channel.topic, message.channel.schema
     if topic.startswith("/note/"):
         log.noted.add(topic.removeprefix("/note/").rpartition("/")[0])
@@ -467,7 +467,7 @@ def _no_number(text: str) -> None:
     raise DamageError(f"it holds {text}, which is no number")
 
 
-def _error_line(message: Message, error: Exception) -> str:
+def _error_line(message: LogMessage, error: Exception) -> str:
     return f"message {message.number} on {message.channel.topic}: {reason_of(error)}"
 
 
@@ -508,7 +508,7 @@ def _decode_log(data: bytes) -> str:
     return str(Log.FromString(data).message)
 
 
-def _messages(path: Path, log: RunLog | None = None, strict: bool = False) -> Iterator[Message]:
+def _messages(path: Path, log: RunLog | None = None, strict: bool = False) -> Iterator[LogMessage]:
     """Yield the messages until the log's end, or as far as it goes; fill ``log``."""
 
     def damaged(what: str) -> None:

@@ -71,7 +71,7 @@ class Channel(NamedTuple):
     encoding: str
 
 
-class Message(NamedTuple):
+class LogMessage(NamedTuple):
     """One message of a log.
 
     Attributes:
@@ -124,7 +124,7 @@ class LogFile:
         """Whether the log says that flangeye wrote it, or was killed before it could."""
         return self.library.startswith("flangeye") or not self._read
 
-    def messages(self, file: IO[bytes], size: int = MAX_RECORD) -> Iterator[Message]:
+    def messages(self, file: IO[bytes], size: int = MAX_RECORD) -> Iterator[LogMessage]:
         """Yield the messages until the log's end, or as far as it goes.
 
         Args:
@@ -162,7 +162,7 @@ class LogFile:
             yield opcode, body
             self._crc = zlib.crc32(body, zlib.crc32(head, self._crc))
 
-    def _taken(self, opcode: int, body: bytes) -> Iterator[Message]:
+    def _taken(self, opcode: int, body: bytes) -> Iterator[LogMessage]:
         from mcap import records
         from mcap.data_stream import ReadDataStream
         from mcap.opcode import Opcode
@@ -186,7 +186,7 @@ class LogFile:
         elif opcode == Opcode.FOOTER:
             self.ended = True
 
-    def _flat(self, opcode: int, body: bytes) -> Iterator[Message]:
+    def _flat(self, opcode: int, body: bytes) -> Iterator[LogMessage]:
         """Take in one of the records that may stand in a chunk."""
         from mcap import records
         from mcap.data_stream import ReadDataStream
@@ -210,14 +210,14 @@ class LogFile:
             self._messages += 1
             if message.channel_id not in self._channels:
                 raise DamageError(f"message {self._messages - 1} is of no channel")
-            yield Message(
+            yield LogMessage(
                 self._channels[message.channel_id],
                 message.log_time,
                 message.data,
                 self._messages - 1,
             )
 
-    def _of_chunk(self, chunk: Chunk) -> Iterator[Message]:
+    def _of_chunk(self, chunk: Chunk) -> Iterator[LogMessage]:
         content = memoryview(self._expand(chunk))
         at = 0
         while at < len(content):

@@ -36,7 +36,7 @@ FINER = 16
 """Samples for one, where a root may hide."""
 
 
-STEPS = 12
+ROOT_STEPS = 12
 """Steps from a bracket to a root at most; most take two."""
 
 
@@ -165,7 +165,7 @@ class OffsetWrist:
         """
         way, (a, b, fa, fb) = brackets[0].astype(int), brackets[1:]
         at = a + (b - a) * fa / (fa - fb)
-        for _ in range(STEPS):
+        for _ in range(ROOT_STEPS):
             value = self._posture(orbits, at, way)[0]
             same = value * fa > 0
             c, fc = np.where(same, a, b), np.where(same, fa, fb)

@@ -14,13 +14,13 @@ from flangeye.errors import RecipeError, StageError
 from flangeye.files.clouds import PER_METRE, LengthUnit
 from flangeye.files.paths import bundled
 from flangeye.files.words import nearest
-from flangeye.models.workpiece import MESHES, STEP, read_mesh
+from flangeye.models.workpiece import MESHES, STEP_SUFFIXES, read_mesh
 from flangeye.types import Floats
 
 SMALLEST, LARGEST = 0.02, 3.0
 """Diagonal of a body that an arm carries and a scanner sees [m]; of the robot's base at most."""
 
-IN_METRES = (".glb", *STEP)
+IN_METRES = (".glb", *STEP_SUFFIXES)
 """Formats that come in metres: glTF by definition (2.0, section 3.4), STEP as it is read."""
 
 

@@ -20,7 +20,7 @@ from flangeye.types import Floats
 
 MESHES = (".stl", ".obj", ".dae", ".ply")
 
-SHOWN = 300
+NAME_SHOWN = 300
 """Characters of a name that a message shows."""
 
 
@@ -118,7 +118,7 @@ def _is_file(path: Path) -> bool:
 
 
 def _short(name: str) -> str:
-    return name if len(name) <= SHOWN else f"{name[:SHOWN]}…"
+    return name if len(name) <= NAME_SHOWN else f"{name[:NAME_SHOWN]}…"
 
 
 def _nearby(urdf: Path, package: str) -> list[Path]:

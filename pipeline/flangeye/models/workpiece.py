@@ -38,7 +38,7 @@ from flangeye.units import Angle, Length
 Vector = tuple[float, float, float]
 
 MESHES = (".stl", ".ply", ".obj", ".glb", ".3mf", ".step", ".stp")
-STEP = (".step", ".stp")
+STEP_SUFFIXES = (".step", ".stp")
 """Surfaces, which ``cascadio`` of the extra ``cad`` cuts into triangles, in metres."""
 
 
@@ -140,7 +140,7 @@ def read_mesh(path: Path) -> tuple[Floats, NDArray[np.int32]]:
     """
     if path.suffix.lower() not in MESHES:
         raise StageError(f"{path}: '{path.suffix}' is no CAD; known: {', '.join(MESHES)}")
-    if path.suffix.lower() in (*STEP, ".3mf") and find_spec("cascadio") is None:
+    if path.suffix.lower() in (*STEP_SUFFIXES, ".3mf") and find_spec("cascadio") is None:
         raise StageError(f"{path}: STEP and 3MF need: pip install 'flangeye[cad]'")
     # Largest CAD file [bytes]: five million triangles
     vertices, triangles = _decoded(path, read_regular(path, 256_000_000))

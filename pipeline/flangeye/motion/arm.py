@@ -19,7 +19,7 @@ from flangeye.files.processes import busy, keep_current_folder_out
 from flangeye.models.robots import RobotModel
 from flangeye.motion.limits import MotionLimits
 from flangeye.motion.route import Route
-from flangeye.motion.supervision import Sample
+from flangeye.motion.supervision import RememberedState
 from flangeye.motion.watchdog import (
     BEAT,
     LEADING,
@@ -113,7 +113,7 @@ class WatchedArm:
         self._state = report.content
         return self._state
 
-    def during(self, start_ns: int, end_ns: int) -> list[Sample]:
+    def during(self, start_ns: int, end_ns: int) -> list[RememberedState]:
         """Return where the arm was in an interval that has ended, as far as is known.
 
         What else the guard says meanwhile, a safety fault too, is heard by the next :meth:`wait`.
@@ -121,7 +121,7 @@ class WatchedArm:
         self._say("samples", (start_ns, end_ns))
         while (report := self._read(PATIENCE, "does not answer")).what != "samples":
             self._unheard.append(report)
-        samples: list[Sample] = report.content
+        samples: list[RememberedState] = report.content
         return samples
 
     def stop(self) -> None:

@@ -13,7 +13,7 @@ from flangeye.errors import FlangeyeError
 from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.types import Floats
 
-NEAR = 0.02
+POINT_WITHIN = 0.02
 """Poses near a point are this near to it, along each axis [m]."""
 
 NEAR_TILT = 0.2
@@ -81,7 +81,7 @@ def poses_near(
     count: int,
     site: Site,
     rng: np.random.Generator,
-    spread: tuple[Any, float] = (NEAR, NEAR_TILT),
+    spread: tuple[Any, float] = (POINT_WITHIN, NEAR_TILT),
 ) -> list[PlannedPose]:
     """Return poses drawn around a point (3,): as many as asked for, or as can be found.
 

@@ -15,7 +15,7 @@ from flangeye.motion.clearance import ArmVolume
 from flangeye.motion.limits import MotionLimits
 from flangeye.types import Floats
 
-MARGIN = 0.95
+VIEW_SHARE = 0.95
 """Share of the field of view, to either side, that a planned flange keeps to."""
 
 FOLD = np.radians(120.0)
@@ -233,5 +233,5 @@ def _turn(first: Floats, second: Floats) -> float:
 
 def _within(points: Floats, field: tuple[float, float]) -> bool:
     """Return whether (N, 3) points before a pinhole lie in its field of view, with a margin."""
-    half = np.tan(np.asarray(field) / 2) * MARGIN
+    half = np.tan(np.asarray(field) / 2) * VIEW_SHARE
     return bool((np.abs(points[:, :2]) <= half * points[:, 2:]).all())

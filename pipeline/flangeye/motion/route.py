@@ -13,7 +13,7 @@ from flangeye.motion.limits import MotionLimits
 from flangeye.types import Floats
 from flangeye.units import in_mm
 
-STEP = np.radians(2.0)
+LARGEST_TURN = np.radians(2.0)
 """Largest turn of a joint between two checked postures [rad]."""
 
 JOINT_ACCELERATION = np.radians(60.0)
@@ -84,7 +84,7 @@ class Router:
         return straight
 
     def _leg(self, start: Floats, goal: Floats) -> Leg | Barred:
-        count = 2 + int(np.abs(goal - start).max() / STEP)
+        count = 2 + int(np.abs(goal - start).max() / LARGEST_TURN)
         postures = start + np.linspace(0.0, 1.0, count)[:, None] * (goal - start)
         frames = self._arm.frames(postures)
         places = self._arm.flange(postures)[:, :3, 3]

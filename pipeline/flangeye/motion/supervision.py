@@ -46,7 +46,7 @@ class SafetyFault(Exception):
     """A reason to stop; its text is for people."""
 
 
-class Sample(NamedTuple):
+class RememberedState(NamedTuple):
     """What is remembered of a state."""
 
     time_ns: int
@@ -65,7 +65,7 @@ class Supervisor:
     def __init__(self, robot: RobotModel, limits: MotionLimits, by_hand: bool = False) -> None:
         """Begin; an arm that a person moves is where they say, when they say so."""
         self._arm, self._limits, self._by_hand = Arm(robot), limits, by_hand
-        self.samples: deque[Sample] = deque()
+        self.samples: deque[RememberedState] = deque()
         self.leg: Leg | None = None
         self._from = np.zeros(self._arm.n)
         self._since_ns = self._stood_ns = self._halted_ns = self._ready_ns = 0
@@ -131,7 +131,9 @@ class Supervisor:
             )
 
     def _remember(self, state: RobotState) -> None:
-        self.samples.append(Sample(state.time_ns, state.base_T_flange.matrix, state.joints))
+        self.samples.append(
+            RememberedState(state.time_ns, state.base_T_flange.matrix, state.joints)
+        )
         # How far back samples are kept, for exposures that have ended [ns]
         while state.time_ns - self.samples[0].time_ns > 20_000_000_000:
             self.samples.popleft()

@@ -29,7 +29,7 @@ from flangeye.errors import FlangeyeError
 from flangeye.models.robots import RobotModel
 from flangeye.motion.limits import MotionLimits
 from flangeye.motion.route import Leg
-from flangeye.motion.supervision import SafetyFault, Sample, Supervisor
+from flangeye.motion.supervision import RememberedState, SafetyFault, Supervisor
 
 GUARDING, LEADING = 2, 1
 """Priorities among those who come first; the process of a maker's client has one of its own."""
@@ -316,7 +316,7 @@ class Watchdog:
             self._bar(str(lost))
 
 
-def _during(samples: Any, start_ns: int, end_ns: int) -> list[Sample]:
+def _during(samples: Any, start_ns: int, end_ns: int) -> list[RememberedState]:
     """Return the samples of an interval, and the nearest on either side of it."""
     times = np.array([sample.time_ns for sample in samples], dtype=np.int64)
     first = max(int(np.searchsorted(times, start_ns, side="right")) - 1, 0)

@@ -17,21 +17,21 @@ from flangeye.plugin.stage import BoundPart, Choose, Params
 from flangeye.units import Acceleration, Angle, AngularSpeed, Length, Speed, param
 
 
-class Section(Params):
+class RecipeSection(Params):
     """Base of a recipe's sections."""
 
 
 Positive = Annotated[Length, Field(gt=0)]
 
 
-class BoxSection(Section):
+class BoxSection(RecipeSection):
     """A box along the axes of the robot's base."""
 
     centre: tuple[Length, Length, Length]
     size: tuple[Positive, Positive, Positive]
 
 
-class LimitsSection(Section):
+class LimitsSection(RecipeSection):
     """What the arm must keep to; required where a driver is named, for a real arm may be there."""
 
     box: BoxSection = Field(description="The flange's centre stays inside, in the robot's base.")
@@ -45,7 +45,7 @@ class LimitsSection(Section):
     )
 
 
-class NamedSection(Section):
+class NamedSection(RecipeSection):
     """A section whose one word is its model: ``robot: ur10e``."""
 
     word: ClassVar[str] = "model"
@@ -144,7 +144,7 @@ class ScannerSection(NamedSection):
         return self
 
 
-class SphereSection(Section):
+class SphereSection(RecipeSection):
     """A calibration sphere."""
 
     diameter: Annotated[Length, Field(gt=0)] | Literal["unknown"] = Field(
@@ -156,7 +156,7 @@ class SphereSection(Section):
     )
 
 
-class FeatureSection(Section):
+class FeatureSection(RecipeSection):
     """Which circle to look for; by default the flange the robot's file names."""
 
     standard: str | None = Field(
@@ -188,7 +188,7 @@ class TargetSection(NamedSection):
     )
 
 
-class PlaceSection(Section):
+class PlaceSection(RecipeSection):
     """Where the target is, in the frame that carries it."""
 
     position: tuple[Length, Length, Length] = param(("0 mm", "0 mm", "0 mm"))
@@ -201,7 +201,7 @@ class PlaceSection(Section):
 Place = Literal["known", "unknown"] | PlaceSection
 
 
-class ConfigurationSection(Section):
+class ConfigurationSection(RecipeSection):
     """Who carries the camera and who the target; what has to be found follows."""
 
     name: Literal["eye-on-base", "eye-in-hand", "eye-on-arm", "two-arms"] = "eye-on-base"
@@ -240,7 +240,7 @@ class CellArmSection(NamedSection):
     place: Place = KNOWN
 
 
-class AxisSection(Section):
+class AxisSection(RecipeSection):
     """What rails and positioners have in common."""
 
     axis: tuple[float, float, float] = Field(description="Its direction in its base.")
@@ -279,7 +279,7 @@ class StandingSection(NamedSection):
     place: Place = TO_FIND
 
 
-class CellSection(Section):
+class CellSection(RecipeSection):
     """Several cameras, arms, rails and targets: what stands on what. One run solves all of it."""
 
     arms: dict[FrameName, CellArmSection] = Field(default_factory=dict)
@@ -293,7 +293,7 @@ class WorkspaceSection(BoxSection):
     """Where the work is, in the robot's base; errors are reported over this box."""
 
 
-class LogSection(Section):
+class LogSection(RecipeSection):
     """What goes into run.mcap besides the results, which always do."""
 
     clouds: Literal["preview", "full"] = Field(
@@ -301,7 +301,7 @@ class LogSection(Section):
     )
 
 
-class Header(Section):
+class Header(RecipeSection):
     """A recipe, its steps not yet checked."""
 
     title: str = Field(description="One line for people.")

@@ -23,14 +23,14 @@ from flangeye.report.plot import (
     points,
     thinned,
 )
-from flangeye.report.space import Drawing, in_words, mapped, target_centres
+from flangeye.report.space import PlotlyFigure, in_words, mapped, target_centres
 from flangeye.types import Floats
 
 AXES = 0.2
 """Length of the axes of base and camera [m]."""
 
 
-def cell_drawing(facts: Facts) -> Drawing | None:
+def cell_drawing(facts: Facts) -> PlotlyFigure | None:
     """Return what was seen, the workspace and the frames.
 
     In the base where the camera stands there. Where an arm's flange carries the camera also in
@@ -65,7 +65,7 @@ def cell_drawing(facts: Facts) -> Drawing | None:
     return _drawing(traces, shown, carrier)
 
 
-def _from_moving_camera(facts: Facts) -> Drawing | None:
+def _from_moving_camera(facts: Facts) -> PlotlyFigure | None:
     """Return the base with the camera and what it saw at every capture."""
     if facts.estimate is None:
         return None
@@ -91,10 +91,10 @@ def _from_moving_camera(facts: Facts) -> Drawing | None:
     return _drawing(traces, list(dict.fromkeys(str(x["name"]) for x in drawn)), t.BASE)
 
 
-def _drawing(traces: list[Trace], shown: list[str], name: str) -> Drawing:
+def _drawing(traces: list[Trace], shown: list[str], name: str) -> PlotlyFigure:
     words = in_words(name)
     axes = "Axes are x red, y green, z blue."
-    return Drawing(figure3d(traces), words, f"In {words}: {', '.join(shown)}. {axes}")
+    return PlotlyFigure(figure3d(traces), words, f"In {words}: {', '.join(shown)}. {axes}")
 
 
 def _marker_poses(facts: Facts) -> dict[str, Floats]:

@@ -30,14 +30,14 @@ from flangeye.report.plot import (
     points,
     thinned,
 )
-from flangeye.report.space import Drawing, mapped
+from flangeye.report.space import PlotlyFigure, mapped
 from flangeye.types import BASE, Floats, Observation, Transform
 
 AXES = 0.2
 """Length of the axes of the root and of cameras [m]."""
 
 
-def graph_drawing(facts: Facts) -> Drawing | None:
+def graph_drawing(facts: Facts) -> PlotlyFigure | None:
     """Return where cameras were, and where they saw targets; None where not all of it was found."""
     cell, seen = _cell_of(facts.log, facts.recipe), facts.log.observations()
     found = {name: Transform.named(name, x.matrix) for name, x in facts.result.transforms.items()}
@@ -53,7 +53,7 @@ def graph_drawing(facts: Facts) -> Drawing | None:
     summary = (
         f"In {words}: {shown}. Axes are x red, y green, z blue, of cameras at their first sighting."
     )
-    return Drawing(figure3d(traces), words, summary)
+    return PlotlyFigure(figure3d(traces), words, summary)
 
 
 def _cell_of(log: RunLog, recipe: str) -> Cell | None:

@@ -155,7 +155,7 @@ def _environment() -> Environment:
 
 
 @dataclass(frozen=True)
-class Drawing:
+class CheckDrawing:
     """One drawing of a check.
 
     Attributes:
@@ -171,7 +171,7 @@ class Drawing:
     figure: Figure | None = None
 
 
-def drawings_of(facts: Facts) -> list[Drawing]:
+def drawings_of(facts: Facts) -> list[CheckDrawing]:
     """Return what the verify steps of a run drew; nothing of a log that is damaged."""
     found = facts.log.of_kind("verify")
     judged = {e.step: e.value.reason for e in found if e.step in facts.log.noted}
@@ -183,13 +183,13 @@ def drawings_of(facts: Facts) -> list[Drawing]:
         return []  # the report says of the damage already
 
 
-def _drawn(facts: Facts, judged: dict[str, str]) -> Iterator[Drawing]:
+def _drawn(facts: Facts, judged: dict[str, str]) -> Iterator[CheckDrawing]:
     for note in read_notes(facts.log.path, set(judged)):
         summary = judged[note.step]
         if note.name == "comparison":
-            yield Drawing(note.step, summary, figure=_figure(note))
+            yield CheckDrawing(note.step, summary, figure=_figure(note))
         elif not isinstance(note.value, dict):
-            yield Drawing(note.step, summary, data_uri(note.value))
+            yield CheckDrawing(note.step, summary, data_uri(note.value))
 
 
 def _figure(note: JournalEntry) -> Figure:

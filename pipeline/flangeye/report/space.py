@@ -29,7 +29,7 @@ from flangeye.types import Floats
 
 
 @dataclass(frozen=True)
-class Drawing:
+class PlotlyFigure:
     """A figure for plotly, the frame it is in, and what it shows in words."""
 
     figure: dict[str, Any]
@@ -37,7 +37,7 @@ class Drawing:
     summary: str
 
 
-def workspace_drawing(facts: Facts) -> Drawing | None:
+def workspace_drawing(facts: Facts) -> PlotlyFigure | None:
     """Return the error to expect at every place of the workspace, and the true one if known."""
     box, found = facts.result.workspace, facts.estimate
     if box is None or found is None:
@@ -62,7 +62,7 @@ def workspace_drawing(facts: Facts) -> Drawing | None:
         arrows, scale, size = _true_errors(facts, grid, max(box.size))
         traces.append(arrows)
         summary += f" The true error, drawn {scale:g} times too long, is at most {size} mm there."
-    return Drawing(figure3d(traces), in_words(frame), summary)
+    return PlotlyFigure(figure3d(traces), in_words(frame), summary)
 
 
 def _predicted(grid: Floats, sigma: Floats) -> Trace:

@@ -30,12 +30,12 @@ PLATE = 0.032
 """Radius of the smallest flange plate of ISO 9409-1 that arms of this size carry [m]."""
 PIXELS = 'vector-effect="non-scaling-stroke"'
 """For a line whose width is in pixels, whatever the picture's scale."""
-MARGIN = 0.08
+PICTURE_MARGIN = 0.08
 """Round the picture [m]."""
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class StillScene:
     """What a picture shows; all in the base.
 
     Attributes:
@@ -74,7 +74,7 @@ def _ready(model: str) -> tuple[float, ...]:
     return (0.0,) * arm.n
 
 
-def scene_of(facts: Facts) -> Scene | None:
+def scene_of(facts: Facts) -> StillScene | None:
     """Return the cell as a run found it, its arm at the first pose that was used.
 
     None where the scanner does not stand in the base, or its models are not known here.
@@ -93,7 +93,7 @@ def scene_of(facts: Facts) -> Scene | None:
         return None
     used = [o for o in facts.measured if o.used]
     joints = next((facts.log.poses[o.id]["joints"] for o in used if o.id in facts.log.poses), None)
-    return Scene(
+    return StillScene(
         robot=arm,
         joints=None if joints is None else np.array(joints),
         scanner=camera if isinstance(camera, ScannerModel) else None,
@@ -102,13 +102,13 @@ def scene_of(facts: Facts) -> Scene | None:
     )
 
 
-def still(scene: Scene, label: str) -> str:
+def still(scene: StillScene, label: str) -> str:
     """Return the picture as SVG; its colours follow the look of the page that it stands in."""
     shapes = [*_arm(scene), *_seen(scene), *_kept(scene), *_poses(scene)]
     corners = np.vstack([shape.points for shape in shapes] or [np.zeros((1, 3))])
     floor = _floor(corners)
     flat = np.vstack([_flat(shape.points) for shape in [*floor, *shapes]])
-    low, high = flat.min(axis=0) - MARGIN, flat.max(axis=0) + MARGIN
+    low, high = flat.min(axis=0) - PICTURE_MARGIN, flat.max(axis=0) + PICTURE_MARGIN
     size = high - low
     drawn = "".join(shape.drawn() for shape in [*floor, *shapes])
     return (
@@ -173,7 +173,7 @@ def rods(robot: RobotModel, joints: Floats) -> list[tuple[float, Floats]]:
     return [*found, (PLATE, flange[:3, 3] - np.outer([0.03, PLATE], flange[:3, 2]))]
 
 
-def _arm(scene: Scene) -> list[_Line]:
+def _arm(scene: StillScene) -> list[_Line]:
     """Return the arm's capsules, the far ones first, each with an edge."""
     if scene.robot is None:
         return []
@@ -193,7 +193,7 @@ def _arm(scene: Scene) -> list[_Line]:
     ]
 
 
-def _seen(scene: Scene) -> list[_Line]:
+def _seen(scene: StillScene) -> list[_Line]:
     """Return the scanner, and the edges of what it sees."""
     if scene.scanner is None:
         return []
@@ -216,7 +216,7 @@ def frustum(scanner: ScannerModel, base_T_camera: Floats) -> tuple[Floats, Float
     return near, far
 
 
-def _kept(scene: Scene) -> list[_Line]:
+def _kept(scene: StillScene) -> list[_Line]:
     """Return the edges of the box that the arm keeps to."""
     if scene.box is None:
         return []
@@ -228,6 +228,6 @@ def _kept(scene: Scene) -> list[_Line]:
     return [_Line(line, "var(--unverified, #d98a00)", 1.0, dashed) for line in [*rims, *posts]]
 
 
-def _poses(scene: Scene) -> list[_Line]:
+def _poses(scene: StillScene) -> list[_Line]:
     good, bad = "var(--verified, #1a7f45)", "var(--refused, #c02626)"
     return [_Line(np.stack([at, at]), good if taken else bad, 0.03) for at, taken in scene.poses]

@@ -32,7 +32,7 @@ from flangeye.result.contract import (
     WorkspaceResult,
 )
 
-MOST = 0.5
+LEAST_USED = 0.5
 """Share of captures that a sound session uses at least. Of our choice."""
 Robots = tuple[Layout, Arm | None]
 
@@ -99,7 +99,7 @@ def standing_warnings(result: Result) -> list[WarningResult]:
         fix = "add '- verify.holdout' after the solver"
         found.append(("no verify step judged this calibration", fix))
     used, count = sum(o.used for o in result.observations), len(result.observations)
-    if used < MOST * count and not (result.refused and used == 0):
+    if used < LEAST_USED * count and not (result.refused and used == 0):
         text = f"{count - used} of {count} captures were rejected"
         found.append((text, "look for the cause: flangeye doctor RUN"))
     return [WarningResult(text=text, fix=fix) for text, fix in found]

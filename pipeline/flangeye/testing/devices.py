@@ -48,7 +48,7 @@ SPEED = 0.3
 ACCELERATION = 2.0
 """Of joints in the kit's moves [rad/s^2]."""
 
-STEP = 0.1
+TESTED_TURN = 0.1
 """How far the last joint is turned [rad]."""
 
 RESTS = 0.5
@@ -142,7 +142,7 @@ class RobotConformance(DriverConformance):
         """There and back, never faster than the commanded limit."""
         with self.opened() as robot:
             start = robot.state().joints
-            target = start + np.eye(len(start))[-1] * STEP
+            target = start + np.eye(len(start))[-1] * TESTED_TURN
             for joints in (target, start):
                 robot.move_joints(joints, SPEED, ACCELERATION)
                 fastest, state = self._until_still(robot)
@@ -157,14 +157,14 @@ class RobotConformance(DriverConformance):
         """In the middle of a move, and it stays where it stopped."""
         with self.opened() as robot:
             start = robot.state().joints
-            robot.move_joints(start + np.eye(len(start))[-1] * 4 * STEP, SPEED, ACCELERATION)
+            robot.move_joints(start + np.eye(len(start))[-1] * 4 * TESTED_TURN, SPEED, ACCELERATION)
             self._watch(robot, 0.3)
             require(_fastest(robot.state()) > STANDING, "the move has not begun")
             robot.stop()
             robot.stop()
             _, state = self._until_still(robot)
             gone = abs(state.joints[-1] - start[-1])
-            require(gone < 3 * STEP, f"after stop() the joint went on to {gone:.3g} rad")
+            require(gone < 3 * TESTED_TURN, f"after stop() the joint went on to {gone:.3g} rad")
             robot.move_joints(start, SPEED, ACCELERATION)
             self._until_still(robot)
 
@@ -175,7 +175,7 @@ class RobotConformance(DriverConformance):
         """
         with self.opened() as robot:
             start = robot.state().joints
-            robot.move_joints(start + np.eye(len(start))[-1] * 4 * STEP, SPEED, ACCELERATION)
+            robot.move_joints(start + np.eye(len(start))[-1] * 4 * TESTED_TURN, SPEED, ACCELERATION)
             self._watch(robot, 0.3)
             before = robot.state()
             require(_fastest(before) > STANDING, "the move has not begun")
@@ -189,7 +189,10 @@ class RobotConformance(DriverConformance):
                 gone < SPEED * RESTS, f"in {RESTS} s without a look it went on by {gone:.3g} rad"
             )
             on = max(_apart(after, state) for state in self._watch(robot, 0.5))
-            require(on < 0.1 * STEP, f"after {RESTS} s without a look it moves on by {on:.3g} rad")
+            require(
+                on < 0.1 * TESTED_TURN,
+                f"after {RESTS} s without a look it moves on by {on:.3g} rad",
+            )
             robot.move_joints(start, SPEED, ACCELERATION)
             self._until_still(robot)
 

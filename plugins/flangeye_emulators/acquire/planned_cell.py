@@ -29,7 +29,7 @@ from flangeye_emulators.acquire.planned_session import (
     noise_free,
 )
 from flangeye_emulators.world.arm import ImperfectArm
-from flangeye_emulators.world.session import DRAWS, View, disturbed
+from flangeye_emulators.world.session import DRAWS, CameraView, disturbed
 
 UPRIGHT = np.radians([0, -90, 90, -90, -90, 0])
 """Joints of an arm of which nothing is said."""
@@ -100,7 +100,7 @@ class PlannedCell:
     moments: Moments
     scheduled: Sequence[Sighting]
     source: Source
-    view: View
+    view: CameraView
     chooses: bool
 
     def sightings(self, seen: Callable[[], Sequence[Observation]]) -> Iterator[Sighting]:
@@ -165,7 +165,7 @@ class NextBest:
 
 
 def plan_cell(
-    cell: Cell, seed: int, params: CellSessionParams, view: View, rng: np.random.Generator
+    cell: Cell, seed: int, params: CellSessionParams, view: CameraView, rng: np.random.Generator
 ) -> PlannedCell:
     """Draw where everything that moves is, and deal the moments to who sees whom.
 
@@ -330,7 +330,7 @@ def _changes(plan: str, joints: int, rng: np.random.Generator) -> Floats:
     return regular if plan == "grid" else np.where(either, regular, anywhere)
 
 
-def _schedule(cell: Cell, moments: Moments, sightings: int, view: View) -> list[Sighting]:
+def _schedule(cell: Cell, moments: Moments, sightings: int, view: CameraView) -> list[Sighting]:
     """Choose who sees whom at which moment: each pair in turn, as long as it sees anything."""
     free = {p: list(np.flatnonzero(seen)) for p, seen in _visible(cell, moments, view).items()}
     taken: set[int] = set()
@@ -345,7 +345,9 @@ def _schedule(cell: Cell, moments: Moments, sightings: int, view: View) -> list[
     return chosen
 
 
-def _schedule_at_once(cell: Cell, moments: Moments, sightings: int, view: View) -> list[Sighting]:
+def _schedule_at_once(
+    cell: Cell, moments: Moments, sightings: int, view: CameraView
+) -> list[Sighting]:
     """Choose moments at which most is seen, and all that is."""
     visible = _visible(cell, moments, view)
     most = np.argsort(-np.sum([*visible.values()], axis=0), kind="stable")
@@ -353,7 +355,7 @@ def _schedule_at_once(cell: Cell, moments: Moments, sightings: int, view: View) 
     return seen[: sightings + UNSEEN]
 
 
-def _visible(cell: Cell, moments: Moments, view: View) -> dict[tuple[str, str], Mask]:
+def _visible(cell: Cell, moments: Moments, view: CameraView) -> dict[tuple[str, str], Mask]:
     """Return (N,) whether a camera sees a target at each moment, by the two."""
     pairs = [(camera, target) for camera in cell.cameras for target in cell.targets]
     return {pair: view.sees(moments.seen(*pair)) for pair in pairs if _apart(cell, pair)}

@@ -37,9 +37,9 @@ from flangeye.units import Angle, Length, param
 from flangeye_emulators.world.arm import ArmErrors, ImperfectArm
 from flangeye_emulators.world.session import (
     ArmPoses,
+    CameraView,
     Cast,
     Places,
-    View,
     as_built,
     close_loop,
     draw_arm_poses,
@@ -167,7 +167,7 @@ def plan_session(
     robot: RobotModel,
     second: SecondRobot | None,
     configuration: Configuration,
-    given: tuple[SessionParams, View],
+    given: tuple[SessionParams, CameraView],
     rng: np.random.Generator,
 ) -> PlannedSession:
     """Draw the arms' poses, and put camera and target where the loop closes.

@@ -40,9 +40,9 @@ from flangeye_emulators.acquire.planned_cell import (
 )
 from flangeye_emulators.acquire.planned_session import VERSION
 from flangeye_emulators.world import cell as world
-from flangeye_emulators.world.raycast import Body
+from flangeye_emulators.world.raycast import SolidBody
 from flangeye_emulators.world.scanner import ScannerQuality, before_camera, scanner_of
-from flangeye_emulators.world.session import View
+from flangeye_emulators.world.session import CameraView
 
 
 class SimulatedCellParams(CellSessionParams):
@@ -65,9 +65,9 @@ class SimulatedCellParams(CellSessionParams):
     outliers: float = Field(0.0, ge=0, lt=0.5, description="Share of sightings that are outliers.")
 
     @property
-    def view(self) -> View:
+    def view(self) -> CameraView:
         """What the cameras see."""
-        return View(0.0, self.near, self.far, self.field, self.facing)
+        return CameraView(0.0, self.near, self.far, self.field, self.facing)
 
 
 @stage("acquire.simulated_cell")
@@ -120,7 +120,7 @@ def acquire_simulated_cell_scans(
     """
     _require_flanges(cell)
     rng = np.random.default_rng([VERSION, seed])
-    view = View(0.0, scanner.near, scanner.far, scanner.field_of_view, params.facing)
+    view = CameraView(0.0, scanner.near, scanner.far, scanner.field_of_view, params.facing)
     planned = plan_cell(cell, seed, params, view, rng)
     eyes = {
         camera: scanner_of(scanner, params.resolution, params.noise, rng.spawn(1)[0])
@@ -155,7 +155,7 @@ def _require_flanges(cell: Cell) -> None:
             )
 
 
-def _arms(moments: Moments, i: int, flange: Flange) -> list[Body]:
+def _arms(moments: Moments, i: int, flange: Flange) -> list[SolidBody]:
     """Return the arms as they stand at a moment, in the root."""
     bodies, nowhere = [], np.zeros(3)
     for name, angles in moments.angles.items():

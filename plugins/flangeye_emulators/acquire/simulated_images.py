@@ -26,11 +26,11 @@ from flangeye_emulators.acquire.planned_session import (
     source_of,
 )
 from flangeye_emulators.world import materials
-from flangeye_emulators.world.board_image import MARGIN, BoardCamera, Cover, render_board
+from flangeye_emulators.world.board_image import PAPER_MARGIN, BoardCamera, Cover, render_board
 from flangeye_emulators.world.mesh import box
-from flangeye_emulators.world.raycast import Body, Pixels, Scene
+from flangeye_emulators.world.raycast import Pixels, RaycastScene, SolidBody
 from flangeye_emulators.world.scanner import scanner_of
-from flangeye_emulators.world.session import View, seen_from
+from flangeye_emulators.world.session import CameraView, seen_from
 from flangeye_emulators.world.structured_light import StructuredLight
 from flangeye_emulators.world.time_of_flight import TimeOfFlight
 
@@ -44,12 +44,12 @@ def camera_of(pixels: Pixels, camera: BoardCamera) -> BoardCamera:
     return replace(camera, camera_matrix=matrix, size=(width, height), distortion=np.zeros(0))
 
 
-def sheet_of(board: Board) -> Body:
+def sheet_of(board: Board) -> SolidBody:
     """Return the sheet with the print on its front, in ``target``; the print's black is as matt."""
-    half = np.array(board.size) / 2 + MARGIN * board.square
+    half = np.array(board.size) / 2 + PAPER_MARGIN * board.square
     # Of the sheet that carries the print [m]
     low, high = [*-half, -4e-3], [*half, 0.0]
-    return Body(box(low, high), materials.MATT)
+    return SolidBody(box(low, high), materials.MATT)
 
 
 def uncovered(cloud: PointCloud, board: Board, camera_T_target: Floats, cover: Cover) -> PointCloud:
@@ -116,7 +116,7 @@ class LensParams(Params):
         return BoardCamera(matrix, self.size, np.array(self.distortion), 0.7, noise, 0.4)
 
 
-class ImagesParams(SessionParams):
+class SimulatedImagesParams(SessionParams):
     """Parameters of ``acquire.simulated_images``."""
 
     board: BoardParams = Field(default_factory=BoardParams, description="The board as printed.")
@@ -146,7 +146,7 @@ def acquire_simulated_images(
     robot: RobotModel,
     configuration: Configuration,
     seed: Seed,
-    params: ImagesParams,
+    params: SimulatedImagesParams,
     second: SecondRobot | None = None,
     scanner: ScannerModel | None = None,
 ) -> Captures:
@@ -163,7 +163,7 @@ def acquire_simulated_images(
     if eye is not None:
         camera = camera_of(eye.pixels, camera)
         near, far = eye.scanner.near, eye.scanner.far
-    view = View(params.distance, near, far, _field(camera), params.facing)
+    view = CameraView(params.distance, near, far, _field(camera), params.facing)
     session = plan_session(robot, second, configuration, (params, view), rng)
     studio = _CellScene(params.board.board, camera, eye, session)
     covers = _covers(params, rng)
@@ -178,7 +178,7 @@ def acquire_simulated_images(
 
 
 def _eye(
-    scanner: ScannerModel | None, params: ImagesParams, rng: np.random.Generator
+    scanner: ScannerModel | None, params: SimulatedImagesParams, rng: np.random.Generator
 ) -> StructuredLight | TimeOfFlight | None:
     if not params.depth:
         return None
@@ -196,7 +196,7 @@ def _field(camera: BoardCamera) -> tuple[float, float]:
     return float(across), float(down)
 
 
-def _covers(params: ImagesParams, rng: np.random.Generator) -> list[Cover | None]:
+def _covers(params: SimulatedImagesParams, rng: np.random.Generator) -> list[Cover | None]:
     """Return what lies over the target in each capture."""
     chosen = rng.permutation(params.poses)[: round(params.covered * params.poses)]
     side = min(params.board.board.size)
@@ -222,7 +222,7 @@ class _CellScene:
         image = render_board(self.board, camera_T_target, self.camera, rng, cover)
         if self.eye is None:
             return image, PointCloud(CAMERA, np.zeros((0, 3), dtype=np.float32))
-        scene = Scene([sheet_of(self.board).moved(camera_T_target)])
+        scene = RaycastScene([sheet_of(self.board).moved(camera_T_target)])
         cloud = PointCloud(CAMERA, self.eye.scan(scene, rng))
         if cover is not None:
             cloud = uncovered(cloud, self.board, camera_T_target, cover)

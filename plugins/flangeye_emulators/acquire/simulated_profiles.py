@@ -23,7 +23,7 @@ from flangeye_emulators.acquire.planned_session import (
     plan_session,
     source_of,
 )
-from flangeye_emulators.world.session import View, seen_from
+from flangeye_emulators.world.session import CameraView, seen_from
 
 IN_THE_HAND = {"position": ("60 mm", "0 mm", "40 mm"), "rpy": ("0 deg", "0 deg", "90 deg")}
 
@@ -56,7 +56,7 @@ class ProfilesParams(SessionParams):
 
 
 @dataclass(frozen=True)
-class ProfileView(View):
+class ProfileView(CameraView):
     """What a line scanner can see of a sphere: one that its laser passes beside the centre."""
 
     radius: float = 0.0

@@ -40,15 +40,15 @@ from flangeye_emulators.acquire.planned_session import (
 from flangeye_emulators.world import materials
 from flangeye_emulators.world.cell import SimulatedCell
 from flangeye_emulators.world.mesh import flange_mesh
-from flangeye_emulators.world.raycast import Body
+from flangeye_emulators.world.raycast import SolidBody
 from flangeye_emulators.world.scanner import ScannerQuality, before_camera, scanner_of
 from flangeye_emulators.world.session import (
-    View,
+    CameraView,
     seen_from,
 )
 
 
-class MarkerParams(SessionParams):
+class SimulatedMarkerParams(SessionParams):
     """Parameters of ``acquire.simulated_marker``."""
 
     field: tuple[Angle, Angle] = param(
@@ -68,7 +68,7 @@ def acquire_simulated_marker(
     robot: RobotModel,
     configuration: Configuration,
     seed: Seed,
-    params: MarkerParams,
+    params: SimulatedMarkerParams,
     second: SecondRobot | None = None,
 ) -> Observations:
     """Measure a marker's pose in any configuration: poses with noise, no images.
@@ -77,7 +77,7 @@ def acquire_simulated_marker(
         StageError: The camera does not see the marker at enough poses.
     """
     rng = np.random.default_rng([VERSION, seed])
-    view = View(params.distance, 0.3, 2.0, params.field, params.facing)
+    view = CameraView(params.distance, 0.3, 2.0, params.field, params.facing)
     session = plan_session(robot, second, configuration, (params, view), rng)
     seen = seen_from(session.actual, session.places)
     # Of a marker's measured pose, about and along each axis [rad, m].
@@ -108,7 +108,9 @@ def acquire_simulated_session(  # noqa: PLR0913  what it asks the runner for
         StageError: The camera does not see it at enough poses.
     """
     rng = np.random.default_rng([VERSION, seed])
-    view = View(params.distance, scanner.near, scanner.far, scanner.field_of_view, params.facing)
+    view = CameraView(
+        params.distance, scanner.near, scanner.far, scanner.field_of_view, params.facing
+    )
     session = plan_session(robot, second, configuration, (params, view), rng)
     eye = scanner_of(scanner, params.resolution, params.noise, rng)
     stage_set = _Set(robot, second.model if second else None, flange, session)
@@ -132,7 +134,7 @@ class _Set:
     flange: Flange
     session: PlannedSession
 
-    def bodies(self, i: int) -> list[Body]:
+    def bodies(self, i: int) -> list[SolidBody]:
         """Return what there is to see at a pose, in ``base``."""
         actual, places = self.session.actual, self.session.places
         if self.second is not None and actual.second is not None:
@@ -141,9 +143,9 @@ class _Set:
         if self.session.configuration.target == FLANGE and actual.joints is not None:
             return self._arm(self.robot, actual.joints[i], actual.flange[i])
         finish = materials.FINISHES[self.flange.details.finish]
-        return [Body(flange_mesh(self.flange), finish).moved(actual.target[i] @ places.z)]
+        return [SolidBody(flange_mesh(self.flange), finish).moved(actual.target[i] @ places.z)]
 
-    def _arm(self, robot: RobotModel, joints: Floats, flange: Floats) -> list[Body]:
+    def _arm(self, robot: RobotModel, joints: Floats, flange: Floats) -> list[SolidBody]:
         nowhere = np.zeros(3)
         return SimulatedCell(robot, self.flange, nowhere, nowhere).arm(
             Arm(robot).frames(joints), flange

@@ -45,13 +45,13 @@ from flangeye_emulators.acquire.planned_session import UNSEEN, noise_free
 from flangeye_emulators.acquire.simulated_params import SimulatedParams
 from flangeye_emulators.world.arm import ImperfectArm
 from flangeye_emulators.world.cell import SimulatedCell
-from flangeye_emulators.world.raycast import Body, Image
+from flangeye_emulators.world.raycast import Image, SolidBody
 from flangeye_emulators.world.scanner import before_camera, scanner_of
 from flangeye_emulators.world.structured_light import StructuredLight
 from flangeye_emulators.world.time_of_flight import TimeOfFlight
 from flangeye_plugins.acquire.itinerary import as_plan, left_out, row_at
 
-FEWEST = 3
+FEWEST_POSES = 3
 """Poses without which no camera pose can be found."""
 
 
@@ -138,10 +138,10 @@ def _stops(
 ) -> _Stops:
     plan: Plan = params.poses(site, _rng(seeds[0]))
     poses = list(plan.poses)
-    if len(poses) < FEWEST:
+    if len(poses) < FEWEST_POSES:
         raise StageError(
             f"acquire.simulated: {names} at {len(poses)} of {plan.wanted} planned poses, "
-            f"{FEWEST} are needed ({reach.why_refused()}); "
+            f"{FEWEST_POSES} are needed ({reach.why_refused()}); "
             "move camera.position, or the plan's centre, or make its size or tilt smaller"
         )
     return _Stops(plan, _checks(plan, site, params.verification, _rng(seeds[1])), poses)
@@ -249,7 +249,7 @@ class _Session:
                 for _, made in working:
                     yield made()
 
-    def look(self, bodies: Sequence[Body], rng: np.random.Generator) -> PointCloud:
+    def look(self, bodies: Sequence[SolidBody], rng: np.random.Generator) -> PointCloud:
         """Scan other bodies, given in ``base``, with the same scanner from the same place."""
         return PointCloud(CAMERA, self._eye().scan(before_camera(bodies, self.base_T_camera), rng))
 

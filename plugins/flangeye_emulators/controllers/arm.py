@@ -15,8 +15,8 @@ from flangeye.models.robots import RobotModel
 from flangeye.types import Floats
 from flangeye_emulators.controllers.motion import ControllerMotion, stop
 from flangeye_emulators.controllers.poses import (
-    Chain,
-    Stance,
+    JointStance,
+    ToolChain,
     UnreachableError,
     carried,
     twist_between,
@@ -67,7 +67,7 @@ def _turned(rotation: Floats, vector: Floats) -> Floats:
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class SpringSurface:
     """A plane that gives way like a spring with a damper, without friction.
 
     Attributes:
@@ -148,9 +148,9 @@ class SimulatedArm:
         self, robot: RobotModel, speed_limits: Floats, cycle: float, joints: Floats, zeros: Floats
     ) -> None:
         """Stand still at ``joints`` (n,)."""
-        self.chain = Chain(robot)
+        self.chain = ToolChain(robot)
         self.speed_limits, self.cycle, self.zeros = speed_limits, cycle, zeros
-        self.surfaces: list[Surface] = []
+        self.surfaces: list[SpringSurface] = []
         self.force_mode: ForceMode | None = None
         self.slider, self.held = 1.0, False
         self._tare = np.zeros(6)
@@ -254,7 +254,7 @@ class SimulatedArm:
         self.twist = stance.jacobian @ self.speeds
         self.stance = stance
 
-    def _stance_at(self, target: Floats, dt: float) -> Stance:
+    def _stance_at(self, target: Floats, dt: float) -> JointStance:
         if self._braking:
             return self.chain.stance(np.clip(target, self.chain.lower, self.chain.upper))
         if target.ndim == 1:

@@ -14,7 +14,7 @@ from flangeye.devices import Device
 from flangeye.errors import StageError
 from flangeye.motion.arm import run_number
 from flangeye.types import Floats
-from flangeye_emulators.controllers.arm import Surface
+from flangeye_emulators.controllers.arm import SpringSurface
 
 PORT = 29998
 """Of the control channel. It is here, for a client needs nothing of what serves it."""
@@ -129,7 +129,7 @@ class EmulatorControl(Device):
         """Be as after switching on, without faults; open connections stay open."""
         self.ask("reset")
 
-    def set_surfaces(self, *surfaces: Surface) -> None:
+    def set_surfaces(self, *surfaces: SpringSurface) -> None:
         """Let there be these surfaces and no others."""
         self.ask(
             "surfaces",

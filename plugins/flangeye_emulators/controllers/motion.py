@@ -14,7 +14,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from flangeye.types import Floats
-from flangeye_emulators.controllers.poses import Stance, carried
+from flangeye_emulators.controllers.poses import JointStance, carried
 from flangeye_emulators.controllers.route import JOINTS, POSES, Space, Waypoint, route
 
 SLOWEST = 1e-4
@@ -33,7 +33,7 @@ class ControllerMotion(Protocol):
 
     done: bool
 
-    def step(self, dt: float, here: Stance) -> Floats:
+    def step(self, dt: float, here: JointStance) -> Floats:
         """Return the next target after ``dt`` [s] of the motion's own time, from ``here``."""
 
 
@@ -65,7 +65,7 @@ class Travel:
         """How long the ride takes at full speed [s]."""
         return self._profile.duration
 
-    def step(self, dt: float, here: Stance) -> Floats:
+    def step(self, dt: float, here: JointStance) -> Floats:
         """Return the next target; the last one is the last waypoint, bit for bit."""
         self._time += dt
         self.done = self._time >= self._profile.duration
@@ -106,7 +106,7 @@ class Speed:
         self._velocity = velocity
         self.done = False
 
-    def step(self, dt: float, here: Stance) -> Floats:
+    def step(self, dt: float, here: JointStance) -> Floats:
         """Return the next target: pose (4, 4) or joints (n,)."""
         change = self.target - self._velocity
         allowed = max(self.acceleration, SLOWEST) * dt
@@ -147,7 +147,7 @@ class Servo:
         self.done = False
         self._joints, self._speeds, self._fastest = start, velocity, fastest
 
-    def step(self, dt: float, here: Stance) -> Floats:
+    def step(self, dt: float, here: JointStance) -> Floats:
         """Return the next joint angles (n,)."""
         rate = 2.0 / self.lookahead * np.sqrt(self.gain / SERVO_GAIN)
         # The filter's exact solution over one cycle: stable however long the cycle.

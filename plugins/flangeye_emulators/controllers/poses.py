@@ -98,7 +98,7 @@ class UnreachableError(ValueError):
     """No joint angles reach the pose from where the arm is."""
 
 
-class Stance(NamedTuple):
+class JointStance(NamedTuple):
     """An arm at given joint angles.
 
     Attributes:
@@ -112,7 +112,7 @@ class Stance(NamedTuple):
     jacobian: Floats
 
 
-class Chain:
+class ToolChain:
     """Forward, differential and inverse kinematics of the tool's point.
 
     Attributes:
@@ -133,16 +133,16 @@ class Chain:
         """Return ``base_T_flange`` (4, 4)."""
         return np.asarray(self._arm.frames(joints)[-1] @ self._link_T_flange)
 
-    def stance(self, joints: Floats) -> Stance:
+    def stance(self, joints: Floats) -> JointStance:
         """Return the tool's pose and Jacobian at joint angles (n,)."""
         frames = self._arm.frames(joints)
         base_T_tcp = frames[-1] @ self._link_T_flange @ self.flange_T_tcp
         turned = frames[self._first_axis : self._first_axis + len(joints)]
         (x, y, z), (dx, dy, dz) = turned[:, :3, 2].T, base_T_tcp[:3, 3, None] - turned[:, :3, 3].T
         jacobian = np.array([y * dz - z * dy, z * dx - x * dz, x * dy - y * dx, x, y, z])
-        return Stance(joints, base_T_tcp, jacobian)
+        return JointStance(joints, base_T_tcp, jacobian)
 
-    def solve(self, base_T_tcp: Floats, near: Stance) -> Stance:
+    def solve(self, base_T_tcp: Floats, near: JointStance) -> JointStance:
         """Return the arm with its tool at a pose, on the branch of ``near``.
 
         Raises:

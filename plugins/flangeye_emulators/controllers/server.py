@@ -27,7 +27,7 @@ from flangeye.errors import FlangeyeError
 from flangeye.files.elsewhere import is_this_machine
 from flangeye.models.graph import EmulatorOptions
 from flangeye.types import Floats
-from flangeye_emulators.controllers.arm import SimulatedArm, Surface, starting_joints
+from flangeye_emulators.controllers.arm import SimulatedArm, SpringSurface, starting_joints
 from flangeye_emulators.controllers.client import PORT
 from flangeye_emulators.controllers.fault_injection import FaultInjector, Schedule, parse_fault
 from flangeye_emulators.controllers.network import LineConnection, Network
@@ -118,7 +118,7 @@ class Server:
         self._fault_injector, self._ports = fault_injector, ports
         self._home = starting_joints(options.robot, options.joints)
         if options.floor is not None:
-            box.arm.surfaces.append(Surface.floor(options.floor))
+            box.arm.surfaces.append(SpringSurface.floor(options.floor))
         self._publish: Callable[[int], None] = lambda cycle: None
         # The control channel has a wire of its own, to which nothing happens. Whoever reaches it
         # moves the arm and causes faults: it does not leave this machine.
@@ -234,7 +234,7 @@ class Server:
         self._box.reset(self._home)
 
     def _set_surfaces(self, request: Mapping[str, Any]) -> None:
-        self._box.arm.surfaces = [Surface(**surface) for surface in request["surfaces"]]
+        self._box.arm.surfaces = [SpringSurface(**surface) for surface in request["surfaces"]]
 
     def _put(self, request: Mapping[str, Any]) -> None:
         self._box.arm.put(starting_joints(self._options.robot, request["joints"]))

@@ -18,7 +18,7 @@ from flangeye.motion.seam_following import ToolPose
 from flangeye.plugin.stage import Params, part
 from flangeye.types import Floats, Image, Seed, Transform
 from flangeye.units import Angle, Duration, Length, param
-from flangeye_emulators.weld_world.groove import Section, Tip
+from flangeye_emulators.weld_world.groove import GrooveSection, Tip
 from flangeye_emulators.weld_world.settings import ToolFile, ToolPath, WorldParams
 from flangeye_emulators.weld_world.world import Nominal, Shutter, WeldWorld
 from flangeye_emulators.world import room
@@ -193,14 +193,14 @@ def _as_planned(finger: ToolFile, params: SimulatedFingerParams) -> tuple[WorkPl
     )
 
 
-def _section(seam: CadSeam, params: SimulatedFingerParams) -> Section:
+def _section(seam: CadSeam, params: SimulatedFingerParams) -> GrooveSection:
     if (told := params.section) is not None:
-        return Section((told.left + told.right) / 2, told.depth, (told.left - told.right) / 2)
+        return GrooveSection((told.left + told.right) / 2, told.depth, (told.left - told.right) / 2)
     if seam.half_angle is None or seam.half_width is None:
         raise StageError(
             f"{params.workpiece}: seam '{params.seam}' needs half_angle and half_width to be felt"
         )
-    return Section(seam.half_angle, seam.half_width / float(np.tan(seam.half_angle)))
+    return GrooveSection(seam.half_angle, seam.half_width / float(np.tan(seam.half_angle)))
 
 
 @part("sensor.simulated_finger")

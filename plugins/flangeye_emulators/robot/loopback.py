@@ -23,7 +23,7 @@ STARTING = 20.0
 """Longest time for a controller to start, on a machine that is busy [s]."""
 
 
-class LoopbackParams(Params):
+class LoopbackRobotParams(Params):
     """Parameters of ``robot.emulator``."""
 
     driver: Annotated[BoundPart, Choose("robot")] = Field(
@@ -45,7 +45,9 @@ class LoopbackParams(Params):
 
 
 @part("robot.emulator")
-def robot_loopback(model: RobotModel, params: LoopbackParams, reads_only: bool = False) -> Robot:
+def robot_loopback(
+    model: RobotModel, params: LoopbackRobotParams, reads_only: bool = False
+) -> Robot:
     """Start a controller on loopback and open it with the arm's own driver.
 
     The controller is ``flangeye emulator``, a process that ends with the run, however that ends.
@@ -70,7 +72,7 @@ def robot_loopback(model: RobotModel, params: LoopbackParams, reads_only: bool =
         raise
 
 
-def _at_address(params: LoopbackParams) -> tuple[BoundPart, str]:
+def _at_address(params: LoopbackRobotParams) -> tuple[BoundPart, str]:
     """Return the arm's driver, its address filled in, and the controller's address."""
     connects = address_of(_host_of(params.driver))
     listens = connects if params.host is None else address_of(params.host)
@@ -84,7 +86,7 @@ def _host_of(driver: BoundPart) -> str:
     return str(getattr(driver.params, "host", AUTO))
 
 
-def _start(model: RobotModel, params: LoopbackParams, host: str) -> subprocess.Popen[str]:
+def _start(model: RobotModel, params: LoopbackRobotParams, host: str) -> subprocess.Popen[str]:
     words = ["emulator", model.model, "--host", host, "--with-input"]
     if params.joints is not None:
         words += ["--joints", " ".join(map(repr, params.joints)) + " rad"]

@@ -22,7 +22,7 @@ from flangeye_emulators.controllers.mover import Mover, Plan
 from flangeye_emulators.world import room
 
 
-class SimulatedParams(Params):
+class SimulatedRobotParams(Params):
     """Parameters of ``robot.simulated``."""
 
     joints: tuple[Angle, ...] | None = param(
@@ -55,7 +55,7 @@ class SimulatedRobot(Device):
         cycles: How many have passed.
     """
 
-    def __init__(self, model: RobotModel, params: SimulatedParams) -> None:
+    def __init__(self, model: RobotModel, params: SimulatedRobotParams) -> None:
         """Stand still at the beginning of time."""
         self.name = f"simulated {model.model}"
         self.period = params.period
@@ -145,6 +145,6 @@ class SimulatedRobot(Device):
 
 
 @part("robot.simulated", simulated=True)
-def robot_simulated(model: RobotModel, params: SimulatedParams) -> Robot:
+def robot_simulated(model: RobotModel, params: SimulatedRobotParams) -> Robot:
     """A simulated arm in simulated time; needs no hardware."""
     return SimulatedRobot(model, params)

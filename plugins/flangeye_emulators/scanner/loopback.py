@@ -24,14 +24,14 @@ from flangeye.plugin.stage import Params, part
 from flangeye.types import BASE, CAMERA, Floats, PointCloud, Transform, Truth
 from flangeye_emulators.controllers.client import AUTO, EmulatorControl, address_of
 from flangeye_emulators.world.cell import SimulatedCell
-from flangeye_emulators.world.raycast import Image, Scene
+from flangeye_emulators.world.raycast import Image, RaycastScene
 from flangeye_emulators.world.scanner import CameraPose, before_camera, scanner_of
 from flangeye_emulators.world.structured_light import StructuredLight
 from flangeye_emulators.world.time_of_flight import TimeOfFlight
 from flangeye_plugins.scanner.opened import OpenScanner
 
 
-class LoopbackParams(Params):
+class LoopbackScannerParams(Params):
     """Parameters of ``scanner.emulator``."""
 
     host: str = Field(
@@ -60,7 +60,7 @@ class LoopbackParams(Params):
 
 
 @part("scanner.emulator")
-def scanner_loopback(model: ScannerModel | None, params: LoopbackParams) -> Scanner:
+def scanner_loopback(model: ScannerModel | None, params: LoopbackScannerParams) -> Scanner:
     """Scan the simulated cell around a controller on loopback.
 
     The model says which scanner to be.
@@ -94,7 +94,7 @@ class LoopbackScanner(OpenScanner):
     """
 
     def __init__(
-        self, model: ScannerModel, params: LoopbackParams, control: EmulatorControl
+        self, model: ScannerModel, params: LoopbackScannerParams, control: EmulatorControl
     ) -> None:
         """Set up the cell.
 
@@ -157,7 +157,7 @@ class LoopbackScanner(OpenScanner):
         if after is not None and self._count >= after:
             raise DeviceError(f"{self.name}: gone after {after} exposures, as lost_after says")
 
-    def _stances(self) -> list[Stance]:
+    def _stances(self) -> list[TrueStance]:
         """Return where the arm was, at even times over the exposure."""
         began = time.monotonic()
         stances = []
@@ -167,19 +167,19 @@ class LoopbackScanner(OpenScanner):
             stances.append(self._stance())
         return stances
 
-    def _stance(self) -> Stance:
+    def _stance(self) -> TrueStance:
         try:
             truth = self._control.truth()
         except (FlangeyeError, ValueError, OSError) as error:
             raise DeviceError(f"{self.name}: lost: {error}") from None
-        return Stance(truth.joints, truth.base_T_flange)
+        return TrueStance(truth.joints, truth.base_T_flange)
 
 
 def _wait_until(moment: float) -> None:
     time.sleep(max(0.0, moment - time.monotonic()))
 
 
-class Stance(NamedTuple):
+class TrueStance(NamedTuple):
     """Where an arm really is: (n,) joint angles [rad], and (4, 4) its flange's pose."""
 
     joints: Floats
@@ -211,14 +211,14 @@ class CellScene:
         self._arm = Arm(robot)
         self._eye, self._base_T_camera = eye, base_T_camera
 
-    def disagreement(self, stance: Stance) -> float:
+    def disagreement(self, stance: TrueStance) -> float:
         """Return how far the flange is from where the model puts it [m]; infinite for another."""
         if len(stance.joints) != self._arm.n:
             return float("inf")
         modelled = self._arm.flange(stance.joints)
         return float(np.linalg.norm((modelled - stance.base_T_flange)[:3, 3]))
 
-    def scan(self, stances: Sequence[Stance], seed: Sequence[int]) -> Image:
+    def scan(self, stances: Sequence[TrueStance], seed: Sequence[int]) -> Image:
         """Return one scan (H, W, 3) in ``camera`` [m] of an arm that was seen at some stances.
 
         A moving arm leaves the mean of what its stances leave, and nothing where one of them does.
@@ -226,19 +226,19 @@ class CellScene:
         looks = [self._look(stance, seed) for stance in _distinct(stances)]
         return looks[0] if len(looks) == 1 else np.mean(looks, axis=0, dtype=np.float32)
 
-    def prepare(self, stance: Stance) -> None:
+    def prepare(self, stance: TrueStance) -> None:
         """Load and compute now, with the arm as it stands, what the first scan would wait for."""
         self._scene(stance)
 
-    def _look(self, stance: Stance, seed: Sequence[int]) -> Image:
+    def _look(self, stance: TrueStance, seed: Sequence[int]) -> Image:
         return self._eye.scan(self._scene(stance), np.random.default_rng(seed))
 
-    def _scene(self, stance: Stance) -> Scene:
+    def _scene(self, stance: TrueStance) -> RaycastScene:
         bodies = self._cell.arm(self._arm.frames(stance.joints), stance.base_T_flange)
         return before_camera([*self._around, *bodies], self._base_T_camera)
 
 
-def _distinct(stances: Sequence[Stance]) -> list[Stance]:
+def _distinct(stances: Sequence[TrueStance]) -> list[TrueStance]:
     kept = [stances[0]]
     for stance in stances[1:]:
         # Of an arm that stands, no entry of its flange's pose changes by more [m, 1]

@@ -32,7 +32,7 @@ class Gap:
 
 
 @dataclass(frozen=True)
-class Section:
+class GrooveSection:
     """The joint's cross-section.
 
     Attributes:
@@ -46,14 +46,14 @@ class Section:
     lean: float = 0.0
 
 
-def square_butt(gap: float, radius: float) -> Section:
+def square_butt(gap: float, radius: float) -> GrooveSection:
     """Return the groove that a ball of a radius meets in a gap between two square edges [m].
 
     Its walls are the tangents at the edges; the ball is out of it where it lies on the plates.
     """
     half_angle = edges_half_angle(gap, radius)
     rise = radius - math.sqrt(radius**2 - gap**2 / 4.0)
-    return Section(half_angle, radius / math.sin(half_angle) + rise - radius)
+    return GrooveSection(half_angle, radius / math.sin(half_angle) + rise - radius)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +95,7 @@ class Groove:
     """
 
     root: Path
-    section: Section
+    section: GrooveSection
     gaps: tuple[Gap, ...] = ()
     relief: Relief = EVEN
 
@@ -128,7 +128,7 @@ class Tip:
     friction: float = 0.1
 
 
-class Contact:
+class TipContact:
     """The tip in the groove, from cycle to cycle.
 
     Attributes:

@@ -11,7 +11,15 @@ import numpy as np
 
 from flangeye.motion.seam_following import Command, ToolPose, turned
 from flangeye.types import Floats
-from flangeye_emulators.weld_world.groove import TICK, Contact, Gap, Groove, Relief, Section, Tip
+from flangeye_emulators.weld_world.groove import (
+    TICK,
+    Gap,
+    Groove,
+    GrooveSection,
+    Relief,
+    Tip,
+    TipContact,
+)
 from flangeye_emulators.weld_world.settings import (
     ArmTruth,
     ClockTruth,
@@ -41,7 +49,7 @@ class Nominal:
     """
 
     seam: Floats
-    section: Section
+    section: GrooveSection
     tip: Tip
     torch: Floats
     level_R_tool: Floats
@@ -61,11 +69,11 @@ class WeldWorld:
     def __init__(self, nominal: Nominal, truth: WorldParams, seed: int | list[int]) -> None:
         rng = np.random.default_rng(seed)
         self.groove: Groove = true_groove(nominal.seam, nominal.section, truth.workpiece, rng)
-        self.contact = Contact(self.groove, _true_tip(nominal.tip, truth))
+        self.contact = TipContact(self.groove, _true_tip(nominal.tip, truth))
         self._arm = ArmError(truth.arm, rng)
         self._tool, self._stands = TrueTool(truth.tool, nominal.torch), nominal.level_R_tool
         self._finger = TrueFinger(truth.finger)
-        self._heat = Distortion(truth.heat, self.groove.root.length)
+        self._heat = SeamDistortion(truth.heat, self.groove.root.length)
         self.tip, self.torch = np.zeros(3), np.zeros(3)
         self.torch_s, self.off = float(nominal.torch[0]), 0.0
 
@@ -99,7 +107,7 @@ def _true_tip(tip: Tip, truth: WorldParams) -> Tip:
     return Tip(tip.radius, tip.lateral * finger.lateral, tip.axial * finger.axial, finger.friction)
 
 
-class Distortion:
+class SeamDistortion:
     """The seam's motion to the left, at a place, while the torch is at another."""
 
     def __init__(self, truth: HeatTruth, length: float) -> None:
@@ -173,7 +181,7 @@ def _follow(behind: Floats, ahead: Floats, half: float) -> Floats:
 
 
 def true_groove(
-    points: Floats, section: Section, truth: WorkpieceTruth, rng: np.random.Generator
+    points: Floats, section: GrooveSection, truth: WorkpieceTruth, rng: np.random.Generator
 ) -> Groove:
     """Return the groove that is really there.
 
@@ -184,7 +192,9 @@ def true_groove(
         rng: Draws spatter, and where waves begin.
     """
     root = _wandered(Path(points), truth, rng.uniform(0.0, 2 * np.pi))
-    real = Section(section.half_angle + truth.half_angle, section.depth, section.lean + truth.lean)
+    real = GrooveSection(
+        section.half_angle + truth.half_angle, section.depth, section.lean + truth.lean
+    )
     gaps = tuple(Gap(gap.start, gap.start + gap.length, gap.side) for gap in truth.gaps)
     return Groove(root, real, gaps, _relief(root.length, real, truth, rng))
 
@@ -201,7 +211,7 @@ def _wandered(path: Path, truth: WorkpieceTruth, phase: float) -> Path:
 
 
 def _relief(
-    length: float, section: Section, truth: WorkpieceTruth, rng: np.random.Generator
+    length: float, section: GrooveSection, truth: WorkpieceTruth, rng: np.random.Generator
 ) -> Relief:
     s = np.arange(0.0, length + TICK, TICK)
     fill = _grains(s, truth.spatter, rng) - truth.root_gap / 2 / np.tan(section.half_angle)

@@ -13,9 +13,9 @@ from flangeye.types import Floats
 from flangeye.units import Angle, Length, param
 from flangeye_emulators.world import materials
 from flangeye_emulators.world.mesh import Mesh, box, capsule
-from flangeye_emulators.world.raycast import Body
+from flangeye_emulators.world.raycast import SolidBody
 
-MARGIN = 0.25
+BENCH_MARGIN = 0.25
 """From the workpiece's box to the edge of the bench, to each side [m]."""
 
 
@@ -62,7 +62,7 @@ def bench_with(
     clutter: int,
     covered: float,
     rng: np.random.Generator,
-) -> list[Body]:
+) -> list[SolidBody]:
     """Return the bodies of the scene, in ``base``.
 
     Args:
@@ -75,8 +75,8 @@ def bench_with(
     part = Mesh(workpiece.vertices, workpiece.triangles).moved(base_T_part)
     low, high = part.vertices.min(axis=0), part.vertices.max(axis=0)
     top = float(low[2])
-    bench = box([*(low[:2] - MARGIN), top - 0.04], [*(high[:2] + MARGIN), top])
-    bodies = [Body(bench, materials.TABLE), Body(part, materials.METAL)]
+    bench = box([*(low[:2] - BENCH_MARGIN), top - 0.04], [*(high[:2] + BENCH_MARGIN), top])
+    bodies = [SolidBody(bench, materials.TABLE), SolidBody(part, materials.METAL)]
     seams = [
         s.points @ base_T_part[:3, :3].T + base_T_part[:3, 3] for s in workpiece.seams.values()
     ]
@@ -88,7 +88,7 @@ def bench_with(
 def _free_place(low: Floats, high: Floats, seams: list[Floats], rng: np.random.Generator) -> Floats:
     """Return (2,) a place around the workpiece that is not over a seam."""
     for _ in range(200):
-        place = rng.uniform(low[:2] - MARGIN / 2, high[:2] + MARGIN / 2)
+        place = rng.uniform(low[:2] - BENCH_MARGIN / 2, high[:2] + BENCH_MARGIN / 2)
         flat = [seam * [1.0, 1.0, 0.0] for seam in seams]
         at = np.array([[*place, 0.0]])
         # From a seam to the middle of anything that lies about: it may touch the part, not the
@@ -98,22 +98,22 @@ def _free_place(low: Floats, high: Floats, seams: list[Floats], rng: np.random.G
     return np.asarray(place)
 
 
-def _thing(place: Floats, floor: float, rng: np.random.Generator) -> Body:
+def _thing(place: Floats, floor: float, rng: np.random.Generator) -> SolidBody:
     """Return a block or a rod on the bench."""
     size = rng.uniform(0.01, 0.03, 3)
     pose = rigid(rotation_from_rpy(0.0, 0.0, rng.uniform(0, np.pi)), np.array([*place, floor]))
     if rng.random() < 0.6:
         block = box([-size[0], -size[1], 0.0], [size[0], size[1], 2 * size[2]])
-        return Body(block.moved(pose), materials.PAINTED)
+        return SolidBody(block.moved(pose), materials.PAINTED)
     radius = float(size[0]) / 2
     ends = np.array([[-size[1] - 0.02, 0, radius], [size[1] + 0.02, 0, radius]])
-    return Body(capsule(ends[0], ends[1], radius).moved(pose), materials.RUBBER)
+    return SolidBody(capsule(ends[0], ends[1], radius).moved(pose), materials.RUBBER)
 
 
-def _sheet(workpiece: Workpiece, base_T_part: Floats, covered: float) -> Body:
+def _sheet(workpiece: Workpiece, base_T_part: Floats, covered: float) -> SolidBody:
     """Return a sheet that hides one end of the workpiece."""
     low, high = workpiece.vertices.min(axis=0), workpiece.vertices.max(axis=0)
     edge = high[0] - covered * (high[0] - low[0])
     above = high[2] + 0.03
     sheet = box([edge, low[1] - 0.02, above], [high[0] + 0.02, high[1] + 0.02, above + 0.002])
-    return Body(sheet.moved(base_T_part), materials.WALL)
+    return SolidBody(sheet.moved(base_T_part), materials.WALL)

@@ -26,7 +26,7 @@ from flangeye_emulators.world.mesh import (
     region,
     wrist_mesh,
 )  # fmt: skip
-from flangeye_emulators.world.raycast import Body
+from flangeye_emulators.world.raycast import SolidBody
 
 SEGMENTS = 360
 """Of the sphere's circles: at a radius of 20 mm its facets are within 1 um of its surface."""
@@ -73,17 +73,17 @@ class SimulatedCell:
     sphere: Sphere | None = None
     body: TargetBody | None = None
 
-    def around(self) -> list[Body]:
+    def around(self) -> list[SolidBody]:
         """Return what does not move."""
         x, y = self.centre[:2]
         far = x + self.size[0] / 2 + 0.13
         return [
-            Body(box([-0.4, y - 0.9, -0.04], [far + 0.3, y + 0.9, 0.0]), materials.TABLE),
-            Body(box([far, y - 0.9, 0.0], [far + 0.02, y + 0.9, 0.7]), materials.WALL),
+            SolidBody(box([-0.4, y - 0.9, -0.04], [far + 0.3, y + 0.9, 0.0]), materials.TABLE),
+            SolidBody(box([far, y - 0.9, 0.0], [far + 0.02, y + 0.9, 0.7]), materials.WALL),
             *self._stand(),
         ]
 
-    def arm(self, frames: Floats, base_T_flange: Floats) -> list[Body]:
+    def arm(self, frames: Floats, base_T_flange: Floats) -> list[SolidBody]:
         """Return the arm and its flange.
 
         Args:
@@ -96,44 +96,44 @@ class SimulatedCell:
             for (start, end), radius in zip(volume.axes(frames), volume.radii, strict=True)
         ]
         return [
-            *([Body(merged(links), materials.PAINTED)] if links else []),
+            *([SolidBody(merged(links), materials.PAINTED)] if links else []),
             *(body.moved(base_T_flange) for body in self._at_flange()),
         ]
 
-    def _at_flange(self) -> list[Body]:
+    def _at_flange(self) -> list[SolidBody]:
         """Return what moves with the flange, in ``flange``."""
         finish = materials.FINISHES[self.flange.details.finish]
-        plate = Body(flange_mesh(self.flange), finish)
-        wrist = Body(wrist_mesh(self.flange), materials.PAINTED)
+        plate = SolidBody(flange_mesh(self.flange), finish)
+        wrist = SolidBody(wrist_mesh(self.flange), materials.PAINTED)
         if self.body is not None:
             tool = Mesh(self.body.vertices, self.body.triangles)
-            return [plate, wrist, Body(tool, materials.METAL)]
+            return [plate, wrist, SolidBody(tool, materials.METAL)]
         if self.sphere is None:
             return [plate, wrist]
-        ball = Body(sphere_mesh(self.sphere), materials.MATT)
-        return [plate, wrist, ball, Body(stub_mesh(self.sphere), finish)]
+        ball = SolidBody(sphere_mesh(self.sphere), materials.MATT)
+        return [plate, wrist, ball, SolidBody(stub_mesh(self.sphere), finish)]
 
-    def board(self, base_T_flange: Floats) -> Body:
+    def board(self, base_T_flange: Floats) -> SolidBody:
         """Return a board held before the flange, so that nothing of it can be seen."""
         half, away = 4 * self.flange.outer, 0.06
         if self.sphere is not None:
             away += self.sphere.centre_in_flange[2] + self.sphere.radius
         if self.body is not None:
             away += float(self.body.vertices[:, 2].max())
-        sheet = Body(box([-half, -half, away], [half, half, away + 0.003]), materials.WALL)
+        sheet = SolidBody(box([-half, -half, away], [half, half, away + 0.003]), materials.WALL)
         return sheet.moved(base_T_flange)
 
-    def _stand(self) -> list[Body]:
+    def _stand(self) -> list[SolidBody]:
         """Return a post with a ring of nearly the flange's size, beside the workspace."""
         foot = self.centre + np.array([0.05, self.size[1] / 2 + 0.1, 0.0])
         top = max(float(self.centre[2] - self.size[2] / 2 - 0.03), 0.05)
         pose = np.eye(4)
         pose[:3, :3] = rotation_from_rpy(0.12, -0.1, 0.0)
         pose[:3, 3] = [foot[0], foot[1], top]
-        ring = Body(_ring(self.flange), materials.POLISHED).moved(pose)
+        ring = SolidBody(_ring(self.flange), materials.POLISHED).moved(pose)
         low = np.array([foot[0], foot[1], 0.0])
         post = capsule(low, np.array([foot[0], foot[1], top - 0.03]), 0.015)
-        return [ring, Body(post, materials.RUBBER)]
+        return [ring, SolidBody(post, materials.RUBBER)]
 
 
 def _ring(flange: Flange) -> Mesh:

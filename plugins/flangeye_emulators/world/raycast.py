@@ -31,15 +31,15 @@ SQUARES = ((0, 0), (0, 1), (1, 0), (1, 1))
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class SolidBody:
     """A thing in the cell: its surface, in some frame, and what it is made of."""
 
     mesh: Mesh
     material: Material
 
-    def moved(self, parent_T_child: Floats) -> Body:
+    def moved(self, parent_T_child: Floats) -> SolidBody:
         """Return the body in another frame, given the (4, 4) transform to it."""
-        return Body(self.mesh.moved(parent_T_child), self.material)
+        return SolidBody(self.mesh.moved(parent_T_child), self.material)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,10 +132,10 @@ class Hits:
         return out
 
 
-class Scene:
+class RaycastScene:
     """Bodies in ``camera``, ready to be looked at."""
 
-    def __init__(self, bodies: Sequence[Body]) -> None:
+    def __init__(self, bodies: Sequence[SolidBody]) -> None:
         """Build the search tree; single-threaded, so that a run keeps to its one core."""
         import open3d as o3d
 

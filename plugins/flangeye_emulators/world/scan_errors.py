@@ -13,7 +13,7 @@ from flangeye.models.scanners import ScannerModel
 from flangeye.types import Floats, Indices, Mask
 from flangeye_emulators.world.raycast import Image, Pixels, bands
 
-STEP = 5.0
+DEPTH_STEP = 5.0
 """A step is a change of depth between neighbours of more than this many widths of a pixel: a
 surface seen at less than 79 degrees to its normal changes less."""
 
@@ -33,7 +33,7 @@ def steps(depth: Image, width: Image) -> Mask:
 
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     return _beyond(
-        lambda part: cv2.morphologyEx(part, cv2.MORPH_GRADIENT, cross), depth, STEP, width
+        lambda part: cv2.morphologyEx(part, cv2.MORPH_GRADIENT, cross), depth, DEPTH_STEP, width
     )
 
 
@@ -126,7 +126,7 @@ def _local_average(depth: Image, at: Indices, width: Image, blur: float) -> Imag
     flat, columns = depth.ravel(), depth.shape[1]
     centre = flat.take(at)
     total, weights = np.zeros_like(centre), np.zeros_like(centre)
-    gates = [np.float32(STEP * max(reach, 1)) * width for reach in range(3)]
+    gates = [np.float32(DEPTH_STEP * max(reach, 1)) * width for reach in range(3)]
     corner = at - (2 * columns + 2)
     for dy, dx in product(range(-2, 3), repeat=2):
         neighbour = flat[(dy + 2) * columns + dx + 2 :].take(corner)

@@ -15,7 +15,7 @@ from flangeye.types import BASE, CAMERA, Floats, Transform
 from flangeye.units import Angle, Length, param
 
 if TYPE_CHECKING:
-    from flangeye_emulators.world.raycast import Body, Scene
+    from flangeye_emulators.world.raycast import RaycastScene, SolidBody
     from flangeye_emulators.world.structured_light import StructuredLight
     from flangeye_emulators.world.time_of_flight import TimeOfFlight
 
@@ -56,9 +56,9 @@ def scanner_of(
     return kind(scanner, resolution, noise, rng)
 
 
-def before_camera(bodies: Sequence[Body], base_T_camera: Floats) -> Scene:
+def before_camera(bodies: Sequence[SolidBody], base_T_camera: Floats) -> RaycastScene:
     """Return the bodies, given in ``base``, as they stand before the camera."""
-    from flangeye_emulators.world.raycast import Scene
+    from flangeye_emulators.world.raycast import RaycastScene
 
     camera_T_base = Transform(BASE, CAMERA, base_T_camera).inverse().matrix
-    return Scene([body.moved(camera_T_base) for body in bodies])
+    return RaycastScene([body.moved(camera_T_base) for body in bodies])

@@ -24,7 +24,7 @@ DRAWS = 4000
 
 
 @dataclass(frozen=True)
-class View:
+class CameraView:
     """What the camera can see.
 
     Attributes:
@@ -161,7 +161,11 @@ def _of_four_axes(first: Floats, spread: float, draws: int, rng: np.random.Gener
 
 
 def close_loop(
-    poses: ArmPoses, view: View, configuration: Configuration, camera: Floats | None, place: Floats
+    poses: ArmPoses,
+    view: CameraView,
+    configuration: Configuration,
+    camera: Floats | None,
+    place: Floats,
 ) -> Places:
     """Return where everything is, such that the camera sees the target at the first pose.
 
@@ -202,7 +206,7 @@ def seen_from(poses: ArmPoses, places: Places) -> Floats:
     return np.asarray(invert(poses.camera @ places.x) @ world)
 
 
-def visible(poses: ArmPoses, places: Places, view: View, count: int) -> ArmPoses:
+def visible(poses: ArmPoses, places: Places, view: CameraView, count: int) -> ArmPoses:
     """Return the poses at which the camera sees the target, ``count`` at least.
 
     Raises:

@@ -9,7 +9,7 @@ import numpy as np
 from flangeye.models.scanners import ScannerModel
 from flangeye.types import Mask
 from flangeye_emulators.world import scan_errors
-from flangeye_emulators.world.raycast import Hits, Image, Scene, bands, pixels_of, through
+from flangeye_emulators.world.raycast import Hits, Image, RaycastScene, bands, pixels_of, through
 from flangeye_emulators.world.scan_errors import Distortion, correlated_normal, normal_quantile
 
 FAINTEST = 0.012
@@ -73,7 +73,7 @@ class StructuredLight:
         self.projector = scanner.baseline * np.array([np.cos(lean), 0.0, np.sin(lean)])
         self._inverse_length: Image = 1 / np.linalg.norm(self.pixels.directions, axis=-1)
 
-    def scan(self, scene: Scene, rng: np.random.Generator) -> Image:
+    def scan(self, scene: RaycastScene, rng: np.random.Generator) -> Image:
         """Return the organised scan, (H, W, 3) in ``camera`` [m], NaN where nothing was measured.
 
         Args:
@@ -101,7 +101,7 @@ class StructuredLight:
         np.copyto(depth, np.float32(np.nan), where=~measured)
         return self._distortion.points(depth)
 
-    def _illuminated(self, scene: Scene, depth: Image) -> Mask:
+    def _illuminated(self, scene: RaycastScene, depth: Image) -> Mask:
         """Return which points (H, W) are in range and see the projector's light."""
         seen = np.empty(depth.shape, dtype=bool)
         for rows in bands(depth.shape):
@@ -126,7 +126,7 @@ class StructuredLight:
         half_x, half_y = np.tan(np.asarray(self.scanner.projection, dtype=np.float32) / 2)
         return np.asarray((np.abs(aside) <= half_x * ahead) & (np.abs(y) <= half_y * ahead))
 
-    def _view(self, scene: Scene, hits: Hits, to_light: Image, rows: slice) -> _View:
+    def _view(self, scene: RaycastScene, hits: Hits, to_light: Image, rows: slice) -> _View:
         """Return what is seen in some rows.
 
         Args:

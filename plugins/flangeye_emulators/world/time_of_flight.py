@@ -7,7 +7,7 @@ import numpy as np
 from flangeye.models.scanners import ScannerModel
 from flangeye.types import Mask
 from flangeye_emulators.world import scan_errors
-from flangeye_emulators.world.raycast import Hits, Image, Scene, pixels_of
+from flangeye_emulators.world.raycast import Hits, Image, RaycastScene, pixels_of
 from flangeye_emulators.world.scan_errors import Distortion, correlated_normal, normal_quantile
 
 FLOOR = 0.3
@@ -40,7 +40,7 @@ class TimeOfFlight:
         self._distortion = Distortion(scanner, self.pixels, noise * scanner.calibration_error, rng)
         self._length = np.linalg.norm(self.pixels.directions, axis=-1)
 
-    def scan(self, scene: Scene, rng: np.random.Generator) -> Image:
+    def scan(self, scene: RaycastScene, rng: np.random.Generator) -> Image:
         """Return the organised scan, (H, W, 3) in ``camera`` [m], NaN where nothing was measured.
 
         Args:
@@ -65,7 +65,7 @@ class TimeOfFlight:
         return points
 
     def _measured(
-        self, scene: Scene, hits: Hits, cosine: Image, strength: Image, grain: Image
+        self, scene: RaycastScene, hits: Hits, cosine: Image, strength: Image, grain: Image
     ) -> Mask:
         out = (hits.depth >= self.scanner.near) & (hits.depth <= self.scanner.far)
         # Least share of the light of a white surface at mid range that still gives a phase
@@ -78,7 +78,7 @@ class TimeOfFlight:
         return np.asarray(out)
 
     def _error(
-        self, scene: Scene, hits: Hits, depth: Image, strength: Image, distance: Image
+        self, scene: RaycastScene, hits: Hits, depth: Image, strength: Image, distance: Image
     ) -> Image:
         """Return what every scan of the same scene is wrong by, along the ray (H, W) [m]."""
         swing = np.float32(self.noise * self.scanner.calibration_error * np.sqrt(2) / 3)
@@ -93,7 +93,7 @@ class TimeOfFlight:
         multipath *= np.exp(-distance / np.float32(6.0))
         return np.asarray(wiggle + multipath + self._distortion.depth_error(depth))
 
-    def _sigma(self, scene: Scene, hits: Hits, depth: Image, strength: Image) -> Image:
+    def _sigma(self, scene: RaycastScene, hits: Hits, depth: Image, strength: Image) -> Image:
         """Return the standard deviation along the ray (H, W) [m]."""
         sigma = np.float32(self.noise * self.scanner.temporal_noise)
         growth = FLOOR + (1 - FLOOR) * (depth * self._length / self._middle) ** 2

@@ -45,7 +45,7 @@ LEAST_TILT = 0.02
 the root mean square of it along the direction in which it changes most."""
 LARGEST_ERROR = 0.01
 """Standard deviation of the focal length, as a share of it, beyond which nothing is believed."""
-ALIKE = (
+TOO_ALIKE = (
     "they are too alike; tilt the board by 20 deg and more to both sides, or write focal_length: "
     "[fx, fy] and principal_point: [cx, cy]"
 )
@@ -80,7 +80,7 @@ class SeenBoardParams(Params):
         return Board(self.kind, *size, self.marker, self.dictionary)
 
 
-class Lens(NamedTuple):
+class CalibratedLens(NamedTuple):
     """A camera calibrated from views of a board.
 
     Attributes:
@@ -132,7 +132,7 @@ class Lens(NamedTuple):
         )
 
 
-def lens_of(images: Mapping[str, Grey], board: Board, start: Image | None = None) -> Lens:
+def lens_of(images: Mapping[str, Grey], board: Board, start: Image | None = None) -> CalibratedLens:
     """Return the camera that saw a board, by least squares over all corners and poses (Zhang 2000).
 
     Args:
@@ -240,7 +240,7 @@ def _outlies(error: float, errors: Floats) -> bool:
 
 def camera_of(
     seen: Mapping[str, Corners], size: tuple[int, ...], start: Image | None
-) -> tuple[Lens, Floats]:
+) -> tuple[CalibratedLens, Floats]:
     """Return the camera, and each view's reprojection error, rms [px]."""
     import cv2
 
@@ -259,7 +259,7 @@ def camera_of(
     total = float(np.sqrt(squares / counts.sum() / 2))
     freedom = max(2 * counts.sum() - 6 * len(points) - 8, 1)
     views = zip(points, turns, moves, strict=True)
-    found = Lens(
+    found = CalibratedLens(
         np.asarray(found_matrix, dtype=np.float64),
         np.asarray(found_lens, dtype=np.float64).ravel()[:4],
         squares / freedom * _spread(views, found_matrix, found_lens), total, len(seen), (),
@@ -286,7 +286,7 @@ def _require_tilted(seen: Mapping[str, Corners]) -> None:
     spread = np.linalg.norm(changes - changes.mean(axis=0), ord=2) / np.sqrt(len(changes))
     if spread < LEAST_TILT:
         raise StageError(
-            f"the {len(seen)} views do not tell the focal length: {ALIKE} (depth changes by "
+            f"the {len(seen)} views do not tell the focal length: {TOO_ALIKE} (depth changes by "
             f"{spread:.1%} across the board between them, {LEAST_TILT:.0%} is needed)"
         )
 
@@ -303,12 +303,12 @@ def _depth_change(corners: Corners) -> Floats:
     return np.asarray(homography[2, :2] / homography[2, 2])
 
 
-def _require_certain(lens: Lens) -> None:
+def _require_certain(lens: CalibratedLens) -> None:
     share = float(lens.deviations[0] / lens.matrix[0, 0])
     if not share <= LARGEST_ERROR:
         raise StageError(
             f"the {lens.views} views tell the focal length to {share:.1%} only (at most "
-            f"{LARGEST_ERROR:.0%} is allowed): {ALIKE}"
+            f"{LARGEST_ERROR:.0%} is allowed): {TOO_ALIKE}"
         )
 
 

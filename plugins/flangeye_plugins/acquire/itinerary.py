@@ -21,7 +21,7 @@ from flangeye.plugin.stage import BoundPart
 from flangeye.types import Floats, Observation, Role
 from flangeye.units import in_mm
 
-FEWEST = 3
+FEWEST_POSES = 3
 """Poses without which no camera pose can be found."""
 
 
@@ -142,10 +142,10 @@ class Itinerary:
         Raises:
             StageError: Says why the others are impossible.
         """
-        if found < FEWEST:
+        if found < FEWEST_POSES:
             raise StageError(
                 f"acquire.live: {found} of {self._plan.wanted} planned poses are possible, "
-                f"{FEWEST} are needed ({self.why_not()}); correct the view, move the plan's "
+                f"{FEWEST_POSES} are needed ({self.why_not()}); correct the view, move the plan's "
                 "centre, or widen robot.limits"
             )
 

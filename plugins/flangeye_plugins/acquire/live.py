@@ -34,7 +34,7 @@ from flangeye.motion.limits import MotionLimits, limits_of
 from flangeye.motion.planning import read_state
 from flangeye.motion.reach import Margins
 from flangeye.motion.route import Barred, Leg, Route
-from flangeye.motion.supervision import Sample
+from flangeye.motion.supervision import RememberedState
 from flangeye.plugin.stage import BoundPart, Choose, Params, stage
 from flangeye.recipe.header import LimitsSection
 from flangeye.types import (
@@ -307,7 +307,7 @@ class LiveSession:
         return partial(self._capture, stop, transfer, self.arm.during(began, time.monotonic_ns()))
 
     def _capture(
-        self, stop: Stop, transfer: Callable[[], Scan], samples: Sequence[Sample]
+        self, stop: Stop, transfer: Callable[[], Scan], samples: Sequence[RememberedState]
     ) -> Capture | Rejection:
         """Return the capture, if the arm stood still during the exposure."""
         try:
@@ -338,7 +338,7 @@ class LiveSession:
         )
 
 
-def within(samples: Sequence[Sample], start_ns: int, end_ns: int) -> list[Sample]:
+def within(samples: Sequence[RememberedState], start_ns: int, end_ns: int) -> list[RememberedState]:
     """Return the samples of an exposure, one on either side; none when they do not cover it."""
     if not samples or samples[0].time_ns > start_ns or samples[-1].time_ns < end_ns:
         return []
@@ -348,7 +348,7 @@ def within(samples: Sequence[Sample], start_ns: int, end_ns: int) -> list[Sample
     return list(samples[first : last + 1])
 
 
-def movement(samples: Sequence[Sample]) -> float:
+def movement(samples: Sequence[RememberedState]) -> float:
     """Return how far a point 0.1 m off the flange's centre moved at most [m]."""
     poses = np.array([sample.base_T_flange for sample in samples])
     moves = np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1)

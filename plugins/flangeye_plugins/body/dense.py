@@ -11,7 +11,7 @@ import numpy as np
 from flangeye.maths.geometry import hat, rigid, rotation_exp
 from flangeye.maths.statistics import SIGMA_OF_MAD
 from flangeye.types import Floats, Indices, Singles
-from flangeye_plugins.body.shape import GRAZING, Oriented, Shape
+from flangeye_plugins.body.shape import GRAZING, OrientedPoints, Shape
 from flangeye_plugins.body.view import spacing_of, view_of
 
 MOST, FEWEST, FEWEST_ENDS = 12_000, 60, 9
@@ -229,7 +229,7 @@ def _rounding(points: Floats, shape: Shape, pose: Floats, spacing: float) -> Flo
 
 
 def _ends(
-    edges: Oriented, shape: Shape, pose: Floats, lost: float, reach: float, spacing: float
+    edges: OrientedPoints, shape: Shape, pose: Floats, lost: float, reach: float, spacing: float
 ) -> _Equations:
     """Return how far ends of the scan's surfaces are off those of the body's faces.
 
@@ -260,7 +260,7 @@ def _ends(
     return _equations(model.points[at], along, residual, pose, shape, (1.0, 0.0))
 
 
-def _visible_ends(shape: Shape, pose: Floats, spacing: float) -> Oriented:
+def _visible_ends(shape: Shape, pose: Floats, spacing: float) -> OrientedPoints:
     """Return the ends of faces that end before the background, as the scanner sees them."""
     ends, origin = shape.outline, -pose[:3, 3] @ pose[:3, :3]
     if not len(ends.points):
@@ -277,12 +277,12 @@ def _visible_ends(shape: Shape, pose: Floats, spacing: float) -> Oriented:
     return ends.take(np.flatnonzero(seen))
 
 
-def _scan_edges(points: Singles, size: float) -> Oriented:
+def _scan_edges(points: Singles, size: float) -> OrientedPoints:
     """Return where the scan's surfaces end, finely."""
     view = view_of(points, size / 200)
     found, directions = view.ends
     found = found & np.isfinite(view.normals[..., 0])
-    return Oriented(view.xyz[found], directions[found], view.normals[found])
+    return OrientedPoints(view.xyz[found], directions[found], view.normals[found])
 
 
 def _equations(

@@ -14,8 +14,8 @@ import numpy as np
 
 from flangeye.types import Floats, Indices
 from flangeye_plugins.body.looks import Looks
-from flangeye_plugins.body.shape import Oriented, thin
-from flangeye_plugins.body.view import View
+from flangeye_plugins.body.shape import OrientedPoints, thin
+from flangeye_plugins.body.view import CoarseImage
 
 SCAN_ENDS, BODY_ENDS = 800, 400
 """Points where faces end that are laid on each other, at most."""
@@ -34,7 +34,7 @@ AT_ONCE = 30_000
 """Poses judged at once: their points stay in a core's cache."""
 
 
-def guesses(view: View, looks: Looks, most: int) -> Floats:
+def guesses(view: CoarseImage, looks: Looks, most: int) -> Floats:
     """Return at most so many (K, 4, 4) ``camera_T_body`` that a scan does not speak against."""
     rng = np.random.default_rng(2)
     scan = view.edges(looks.size)
@@ -49,7 +49,7 @@ def _best_of(scores: Floats, most: int) -> Indices:
     return every if len(scores) <= most else np.argpartition(-scores, most)[:most]
 
 
-def _passed(on: Oriented, at: Indices, view: View, looks: Looks) -> Floats:
+def _passed(on: OrientedPoints, at: Indices, view: CoarseImage, looks: Looks) -> Floats:
     """Return the better of the poses that lay the body's ends at some indices on the scan's."""
     off = looks.ends.take(at)
     scan, body = _frames(on), _frames(off)
@@ -81,14 +81,14 @@ def _chunked(number: Indices, work: Callable[[Indices], Any]) -> Any:
     return np.concatenate([work(number[k : k + AT_ONCE]) for k in chunks])
 
 
-def _some(points: Oriented, count: int, spacing: float, rng: np.random.Generator) -> Indices:
+def _some(points: OrientedPoints, count: int, spacing: float, rng: np.random.Generator) -> Indices:
     """Return the indices of so many points spread over all surfaces."""
     mixed = rng.permutation(len(points.points))
     kept = thin(points.points[mixed], points.directions[mixed], spacing)
     return np.asarray(mixed[rng.permutation(kept)[:count]])
 
 
-def _frames(ends: Oriented) -> Floats:
+def _frames(ends: OrientedPoints) -> Floats:
     """Return (N, 3, 3) rotations to frames of the normals and the directions of ends."""
     third = np.cross(ends.normals, ends.directions)
     return np.stack([ends.normals, ends.directions, third], axis=1)

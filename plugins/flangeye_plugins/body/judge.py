@@ -8,9 +8,9 @@ import numpy as np
 
 from flangeye.types import Floats, Mask
 from flangeye_plugins.body.shape import GRAZING, Shape
-from flangeye_plugins.body.view import View
+from flangeye_plugins.body.view import CoarseImage
 
-NEAR = 0.1
+NEARER_SHARE = 0.1
 """How far in front of the body a surface contradicts it, as a share of the size: what is nearer to
 the scanner hides it."""
 
@@ -28,7 +28,7 @@ PENALTY = 10
 """Rays in favour that one ray against outweighs: of the true pose there are hardly any."""
 
 
-class Verdict(NamedTuple):
+class BodyVerdict(NamedTuple):
     """What speaks for a body's pose and what against it.
 
     Attributes:
@@ -73,7 +73,7 @@ class Verdict(NamedTuple):
         return held - PENALTY * self.against - self.goes_on
 
 
-def judged(shape: Shape, view: View, pose: Floats, tolerance: float) -> Verdict:
+def judged(shape: Shape, view: CoarseImage, pose: Floats, tolerance: float) -> BodyVerdict:
     """Return what speaks for ``camera_T_body`` and what against it.
 
     Args:
@@ -87,14 +87,14 @@ def judged(shape: Shape, view: View, pose: Floats, tolerance: float) -> Verdict:
     window = _window(shape, view, pose)
     rays, scan = view.directions[window], view.xyz[window]
     if not rays.size:
-        return Verdict(*[0] * 7)
+        return BodyVerdict(*[0] * 7)
     depth, normals = _seen_from(shape, rays, pose)
     hit = np.isfinite(depth)
     off = np.einsum("ijk,ijk->ij", normals, scan - np.where(hit, depth, 0.0)[..., None] * rays)
     due = hit & ~_edges(np.where(hit, depth, np.inf), view.angle)
     due &= np.einsum("ijk,ijk->ij", normals, rays) < -GRAZING * np.linalg.norm(rays, axis=-1)
     agree = due & (np.abs(off) < tolerance)
-    before = (off > 2 * tolerance) & (scan[..., 2] > depth - NEAR * shape.size)
+    before = (off > 2 * tolerance) & (scan[..., 2] > depth - NEARER_SHARE * shape.size)
     # A single ray may be a mixed one, at an edge of the body.
     against = ndimage.binary_opening(due & ((off < -2 * tolerance) | before))
     beside = ndimage.binary_dilation(hit, iterations=OUTLINE) & ~ndimage.binary_dilation(hit)
@@ -104,7 +104,7 @@ def judged(shape: Shape, view: View, pose: Floats, tolerance: float) -> Verdict:
     measured = beside & np.isfinite(scan[..., 2])
     ended_there = beside & (scan[..., 2] > depth[row, column] + BEHIND * shape.size)
     counts = (due, agree, against, beside & on, measured, ended_there, beside)
-    return Verdict(*(int(count.sum()) for count in counts))
+    return BodyVerdict(*(int(count.sum()) for count in counts))
 
 
 def _seen_from(shape: Shape, rays: Floats, pose: Floats) -> tuple[Floats, Floats]:
@@ -124,7 +124,7 @@ def _edges(depth: Floats, angle: float) -> Mask:
     )
 
 
-def _window(shape: Shape, view: View, pose: Floats) -> tuple[slice, slice]:
+def _window(shape: Shape, view: CoarseImage, pose: Floats) -> tuple[slice, slice]:
     """Return the rows and columns that a body may be seen in."""
     corners = shape.vertices[shape.hull] @ pose[:3, :3].T + pose[:3, 3]
     if (corners[:, 2] <= 0).any():

@@ -11,8 +11,8 @@ import numpy as np
 from flangeye.maths.geometry import rotation_exp
 from flangeye.models.bodies import TargetBody
 from flangeye.types import Floats, Indices, Mask
-from flangeye_plugins.body.shape import GRAZING, Oriented, Shape, spread_directions
-from flangeye_plugins.body.view import View
+from flangeye_plugins.body.shape import GRAZING, OrientedPoints, Shape, spread_directions
+from flangeye_plugins.body.view import CoarseImage
 
 DIRECTIONS = 128
 """From which a body is looked at to know what hides what."""
@@ -34,7 +34,7 @@ ALIKE, SIMILAR = 0.5, 0.7
 """Cosine of the largest angle between a surface of the body and the scan's there: where a
 candidate is on its way, and where it is judged."""
 
-SHOWN = 1e-4
+LEAST_SHARE = 1e-4
 """Share of the body's points that show a direction: of facets of a cylinder fewer do."""
 
 QUARTERS = np.array([
@@ -67,8 +67,8 @@ class Looks:
 
     size: float
     centre: Floats
-    surface: Oriented
-    ends: Oriented
+    surface: OrientedPoints
+    ends: OrientedPoints
     views: Floats
     seen: Mask
     ends_seen: Mask
@@ -77,7 +77,7 @@ class Looks:
     def _listed(self) -> tuple[Indices, Indices]:
         """(V, LISTED) numbers of surface points and of ends that stand for what is seen."""
 
-        def some(part: Oriented, seen: Mask, view: Floats) -> Indices:
+        def some(part: OrientedPoints, seen: Mask, view: Floats) -> Indices:
             points, at = part.points, np.flatnonzero(seen & (part.normals @ view < -STEEPEST))
             if not len(at):
                 return np.zeros(LISTED, np.int64)
@@ -94,7 +94,7 @@ class Looks:
         )
         return on, ends
 
-    def scores(self, poses: Floats, view: View, count: int, tolerance: float) -> Floats:
+    def scores(self, poses: Floats, view: CoarseImage, count: int, tolerance: float) -> Floats:
         """Return (K,) shares of so many points that are seen as they should be, less the others.
 
         Args:
@@ -110,7 +110,7 @@ class Looks:
             poses, view, off, reach
         )
 
-    def _surface_score(self, poses: Floats, view: View, at: Indices, reach: float) -> Floats:
+    def _surface_score(self, poses: Floats, view: CoarseImage, at: Indices, reach: float) -> Floats:
         placed, facing = _placed(poses, *self._singles[0], at)
         off, behind, cosine = view.compared(placed, facing)
         there = (np.abs(off) < reach) & (cosine > SIMILAR) & (np.abs(behind) < 3 * reach)
@@ -119,7 +119,7 @@ class Looks:
             there.mean(axis=1) - AGAINST * through.mean(axis=1) - 0.5 * wrong.mean(axis=1)
         )
 
-    def _ends_score(self, poses: Floats, view: View, at: Indices, reach: float) -> Floats:
+    def _ends_score(self, poses: Floats, view: CoarseImage, at: Indices, reach: float) -> Floats:
         placed, outwards = _placed(poses, *self._singles[1], at)
         offset, cosine = view.to_end(placed, outwards)
         there = (np.einsum("kni,kni->kn", offset, offset) < reach**2) & (cosine > SIMILAR)
@@ -148,7 +148,7 @@ class Looks:
         along = np.concatenate([self.surface.directions, self.ends.directions])
         jacobian = np.hstack([np.cross(place / self.size, along), along])
         values = np.linalg.eigvalsh(jacobian.T @ jacobian / len(jacobian))
-        return int((values > SHOWN).sum())
+        return int((values > LEAST_SHARE).sum())
 
     def twins(self, pose: Floats) -> Floats:
         """Return (K, 4, 4) poses at which a body often looks nearly the same: quarter turns."""
@@ -158,11 +158,11 @@ class Looks:
         out[:, :3, 3] = middle - QUARTERS @ middle
         return np.asarray(pose @ out)
 
-    def tolerance(self, view: View) -> float:
+    def tolerance(self, view: CoarseImage) -> float:
         """Return how far off the scan may be [m]."""
         return max(TOLERANCE * self.size, 3 * view.noise)
 
-    def settled(self, poses: Floats, view: View, count: int, reach: float) -> Floats:
+    def settled(self, poses: Floats, view: CoarseImage, count: int, reach: float) -> Floats:
         """Return poses (K, 4, 4) moved once towards the scan's surfaces and ends within reach."""
         number = self.view_of(poses)
         on, off = (listed[number, :count] for listed in self._listed)
@@ -231,7 +231,7 @@ def _placed(
     return points @ turned + poses[:, None, :3, 3], directions @ turned
 
 
-def _seen(shape: Shape, at: Oriented, views: Floats) -> Mask:
+def _seen(shape: Shape, at: OrientedPoints, views: Floats) -> Mask:
     """Return (V, N) which points nothing of the body hides, and whose faces face the scanner."""
     out = at.normals @ views.T < -GRAZING
     for view, column in zip(views, out.T, strict=True):

@@ -11,15 +11,15 @@ import numpy as np
 from flangeye.types import Floats, Indices, Singles
 from flangeye_plugins.body.dense import fitted
 from flangeye_plugins.body.guesses import guesses
-from flangeye_plugins.body.judge import Verdict, judged
+from flangeye_plugins.body.judge import BodyVerdict, judged
 from flangeye_plugins.body.looks import Looks
 from flangeye_plugins.body.shape import Shape
-from flangeye_plugins.body.view import View, view_of
+from flangeye_plugins.body.view import CoarseImage, view_of
 
 GUESSES = 1500
 """Poses that are settled."""
 
-STEPS = ((40, (0.08, 0.06, 0.05), 0.03, 300), (160, (0.04, 0.03, 0.02), 0.02, 80))
+SETTLING = ((40, (0.08, 0.06, 0.05), 0.03, 300), (160, (0.04, 0.03, 0.02), 0.02, 80))
 """Points of the body that settle them, how far from the body the scan is taken for it, move by
 move, and how far off it may be where it is judged, as shares of the size, and how many are kept."""
 
@@ -41,7 +41,7 @@ SAME_TURN, SAME_PLACE = float(np.radians(12.0)), 0.06
 """Poses are one where they differ by less: in turn, and in place as a share of the size."""
 
 
-class Found(NamedTuple):
+class FoundPose(NamedTuple):
     """A pose that a body may have.
 
     Attributes:
@@ -51,12 +51,12 @@ class Found(NamedTuple):
     """
 
     pose: Floats
-    verdict: Verdict
+    verdict: BodyVerdict
     weakest: float
 
 
 @dataclass(frozen=True, eq=False)
-class Search:
+class BodySearch:
     """One scan that is searched for one body.
 
     Attributes:
@@ -69,11 +69,11 @@ class Search:
     shape: Shape
     looks: Looks
 
-    def everywhere(self) -> list[Found]:
+    def everywhere(self) -> list[FoundPose]:
         """Return distinct poses that the body may have, the best first."""
         view = view_of(self.points, self.shape.size / ACROSS)
         poses = guesses(view, self.looks, GUESSES)
-        for count, reaches, tolerance, left in STEPS:
+        for count, reaches, tolerance, left in SETTLING:
             for reach in reaches:
                 poses = self.looks.settled(poses, view, count, reach * self.shape.size)
             scores = self.looks.scores(poses, view, count, tolerance)
@@ -81,7 +81,7 @@ class Search:
         found = self.near(poses)
         return self._distinct(found + self.near(self._twins(found[0]))) if found else []
 
-    def near(self, poses: Floats) -> list[Found]:
+    def near(self, poses: Floats) -> list[FoundPose]:
         """Return the best of (K, 4, 4) poses, laid on the scan's own points, the best first."""
         if not len(poses):
             return []
@@ -90,28 +90,28 @@ class Search:
         return self._distinct([one for one in map(self._laid, poses) if one])
 
     @cached_property
-    def _fine(self) -> View:
+    def _fine(self) -> CoarseImage:
         return view_of(self.points, self.shape.size / FINE_ACROSS)
 
     @cached_property
     def _rough(self) -> float:
         return self.looks.tolerance(self._fine)
 
-    def _laid(self, pose: Floats) -> Found | None:
+    def _laid(self, pose: Floats) -> FoundPose | None:
         fit = fitted(around(self.points, self.shape, pose), self.shape, pose, THINNED)
         if fit is None:
             return None
         tolerance = max(FINE * self.shape.size, 3.5 * self._fine.noise)
         verdict = judged(self.shape, self._fine, fit.pose, tolerance)
-        return Found(fit.pose, verdict, fit.weakest(self.looks.freedoms))
+        return FoundPose(fit.pose, verdict, fit.weakest(self.looks.freedoms))
 
-    def _twins(self, best: Found) -> Floats:
+    def _twins(self, best: FoundPose) -> Floats:
         """Return quarter turns of a pose that explain the scan nearly as well."""
         twins, least = self.looks.twins(best.pose), TWIN * best.verdict.agree
         agree = [judged(self.shape, self._fine, pose, self._rough).agree for pose in twins]
         return np.asarray(twins[np.array(agree) > least])
 
-    def _distinct(self, found: list[Found]) -> list[Found]:
+    def _distinct(self, found: list[FoundPose]) -> list[FoundPose]:
         poses = np.array([one.pose for one in found]).reshape(-1, 4, 4)
         scores = np.array([one.verdict.score for one in found])
         return [found[k] for k in distinct(poses, scores, self.looks)]

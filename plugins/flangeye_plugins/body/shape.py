@@ -29,7 +29,7 @@ SPACINGS = 24
 """Spacings of the samples that pairs are made of along the body's size."""
 
 
-class Oriented(NamedTuple):
+class OrientedPoints(NamedTuple):
     """Points with directions.
 
     Attributes:
@@ -43,9 +43,9 @@ class Oriented(NamedTuple):
     directions: Floats
     normals: Floats
 
-    def take(self, at: Indices | Mask) -> Oriented:
+    def take(self, at: Indices | Mask) -> OrientedPoints:
         """Return those at some indices."""
-        return Oriented(self.points[at], self.directions[at], self.normals[at])
+        return OrientedPoints(self.points[at], self.directions[at], self.normals[at])
 
 
 class Met(NamedTuple):
@@ -142,20 +142,20 @@ class Shape:
         return tree
 
     @cached_property
-    def surface(self) -> Oriented:
+    def surface(self) -> OrientedPoints:
         """Points on the outside, some spacings apart for each direction of the surface."""
         points, normals = self.outside
         keep = thin(points, normals, self.size / SPACINGS)
-        return Oriented(points[keep], normals[keep], normals[keep])
+        return OrientedPoints(points[keep], normals[keep], normals[keep])
 
     @cached_property
-    def ends(self) -> Oriented:
+    def ends(self) -> OrientedPoints:
         """Some of the points where faces end, some spacings apart for each direction."""
         ends = self.outline
         return ends.take(thin(ends.points, ends.directions, self.size / SPACINGS))
 
     @cached_property
-    def outline(self) -> Oriented:
+    def outline(self) -> OrientedPoints:
         """Points where faces end at edges of the body that can be seen from outside."""
         from scipy.spatial import cKDTree
 
@@ -182,7 +182,7 @@ class Shape:
             found.append((origin[hit] + met.depth[hit, None] * view, met.normals[hit]))
         return np.concatenate([p for p, _ in found]), np.concatenate([n for _, n in found])
 
-    def _edges(self) -> Oriented:
+    def _edges(self) -> OrientedPoints:
         """Return points along edges, where each face beside them ends."""
         mesh = self._mesh
         normals, edge, facet = mesh.face_normals, mesh.edges_unique_inverse, mesh.edges_face
@@ -201,7 +201,7 @@ class Shape:
         which = np.repeat(np.arange(len(a)), many)
         at = np.arange(len(which)) - np.repeat(np.cumsum(many) - many, many)
         share = ((at + 0.5) / many[which])[:, None]
-        return Oriented(a[which] + share * along[which], outwards[which], normals[which])
+        return OrientedPoints(a[which] + share * along[which], outwards[which], normals[which])
 
 
 def spread_directions(count: int) -> Floats:

@@ -9,15 +9,15 @@ import numpy as np
 
 from flangeye.maths.statistics import SIGMA_OF_MAD
 from flangeye.types import Floats, Indices, Mask, Singles
-from flangeye_plugins.body.shape import Oriented
+from flangeye_plugins.body.shape import OrientedPoints
 
-MOST = 500_000
+MOST_POINTS = 500_000
 """Points that fill the image well."""
 
 SPARSE = 1.6
 """A cell is at least as many times as wide as points are apart."""
 
-STEP = 3.0
+STEEPEST = 3.0
 """Cells of one surface differ in depth by less than so many widths: steeper ones are not seen."""
 
 COPLANAR = 0.08
@@ -33,7 +33,7 @@ LAYER = 1.5
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class CoarseImage:
     """A coarse image.
 
     Attributes:
@@ -168,7 +168,7 @@ class View:
         off = off[np.isfinite(off)]
         return float(SIGMA_OF_MAD * np.median(np.abs(off)) / np.sqrt(2)) if len(off) else 0.0
 
-    def edges(self, size: float) -> Oriented:
+    def edges(self, size: float) -> OrientedPoints:
         """Return where surfaces end, but those that are larger than a body of that size [m].
 
         Where a plane goes on beyond ``size`` in two of eight directions, it is no face of such a
@@ -176,7 +176,9 @@ class View:
         """
         found, directions = self.ends
         found = found & np.isfinite(self.normals[..., 0]) & ~self._goes_on(size)
-        return _along(Oriented(self.xyz[found], directions[found], self.normals[found]), self.angle)
+        return _along(
+            OrientedPoints(self.xyz[found], directions[found], self.normals[found]), self.angle
+        )
 
     def _goes_on(self, size: float) -> Mask:
         """Return in which cells (H, W) the plane is larger than a body of that size [m]."""
@@ -196,14 +198,14 @@ class View:
         return count >= 2
 
 
-def view_of(points: Singles, pitch: float) -> View:
+def view_of(points: Singles, pitch: float) -> CoarseImage:
     """Return a scan's view, its cells ``pitch`` wide [m] at the median depth.
 
     Args:
         points: (N, 3) before the scanner, one at least [m].
         pitch: Wider where the points are too sparse to fill the cells.
     """
-    points = points[:: 1 + len(points) // MOST]
+    points = points[:: 1 + len(points) // MOST_POINTS]
     z = points[:, 2]
     u, v = points[:, 0] / z, points[:, 1] / z
     low = float(u.min()), float(v.min())
@@ -223,10 +225,10 @@ def view_of(points: Singles, pitch: float) -> View:
             [np.bincount(cell, points[:, k], minlength=rows * columns) / count for k in range(3)],
             axis=1,
         )
-    return View(mean.reshape(rows, columns, 3), low, angle)
+    return CoarseImage(mean.reshape(rows, columns, 3), low, angle)
 
 
-def _along(ends: Oriented, angle: float) -> Oriented:
+def _along(ends: OrientedPoints, angle: float) -> OrientedPoints:
     """Return ends whose directions are means over the neighbours along the same edge.
 
     Of a single one the raster alone is off by 10 degrees.
@@ -276,7 +278,7 @@ def _ring(reach: int) -> list[tuple[int, int]]:
 
 
 def _gate(depth: Floats, angle: float, cells: int) -> Floats:
-    return STEP * angle * cells * depth
+    return STEEPEST * angle * cells * depth
 
 
 def _slope(xyz: Floats, axis: int, angle: float) -> Floats:

@@ -25,12 +25,12 @@ TAILS = 4.0
 """Degrees of freedom of the errors' distribution."""
 FINEST_ANGLE = 1e-4
 """No scanner and no arm is better than this [rad]."""
-STEPS = 15
-MARGIN = 1e-9
+FIT_STEPS = 15
+DAMPING = 1e-9
 """Share of the information that is added to every direction, for those nothing is known of."""
 
 
-class Block(NamedTuple):
+class ErrorBlock(NamedTuple):
     """Errors of one kind: residuals (K, N, 3), their squares (K, N), derivatives (K, N, 3, P)."""
 
     residuals: Floats
@@ -79,7 +79,7 @@ def fit(equations: Equations) -> VariantFits:
     unknowns = start_of(equations)
     blocks = _blocks(equations, unknowns)
     scales = [_first_scale(block) for block in blocks]
-    for _ in range(STEPS):
+    for _ in range(FIT_STEPS):
         weights = [_weights(b, s) for b, s in zip(blocks, scales, strict=True)]
         information, gradient = _normal_equations(blocks, weights, scales)
         unknowns = _moved(unknowns, _solved(information, gradient))
@@ -95,7 +95,7 @@ def errors_at(equations: Equations, unknowns: VariantUnknowns) -> Floats:
     return np.stack(np.broadcast_arrays(*lengths), axis=-1)
 
 
-def _blocks(equations: Equations, unknowns: VariantUnknowns) -> list[Block]:
+def _blocks(equations: Equations, unknowns: VariantUnknowns) -> list[ErrorBlock]:
     """Return every kind of error and how the parameters move it.
 
     Parameters: rotation and position of the camera (left perturbation); where the target's place
@@ -109,7 +109,7 @@ def _blocks(equations: Equations, unknowns: VariantUnknowns) -> list[Block]:
     return blocks
 
 
-def _centre_block(equations: Equations, unknowns: VariantUnknowns) -> Block:
+def _centre_block(equations: Equations, unknowns: VariantUnknowns) -> ErrorBlock:
     turned = equations.centres @ unknowns.rotation.swapaxes(-1, -2)
     mounts = equations.carried(unknowns.other)
     expected = (mounts[..., :3, :3] @ unknowns.place[..., None])[..., 0] + mounts[..., :3, 3]
@@ -128,7 +128,7 @@ def _centre_block(equations: Equations, unknowns: VariantUnknowns) -> Block:
     return _block(residuals, parts, 3, 20e-6)
 
 
-def _rotation_block(equations: Equations, unknowns: VariantUnknowns) -> Block:
+def _rotation_block(equations: Equations, unknowns: VariantUnknowns) -> ErrorBlock:
     turns = equations.carried(unknowns.other)[..., :3, :3]
     expected = turns @ unknowns.turn[:, None]
     seen = unknowns.rotation[:, None] @ equations.rotations
@@ -142,7 +142,7 @@ def _rotation_block(equations: Equations, unknowns: VariantUnknowns) -> Block:
     return _block(residuals, parts, 3, FINEST_ANGLE)
 
 
-def _normal_block(equations: Equations, unknowns: VariantUnknowns) -> Block:
+def _normal_block(equations: Equations, unknowns: VariantUnknowns) -> ErrorBlock:
     turned = equations.normals @ unknowns.rotation.swapaxes(-1, -2)
     expected = equations.carried(unknowns.other)[..., :3, 2]
     residuals = turned - expected
@@ -155,34 +155,34 @@ def _normal_block(equations: Equations, unknowns: VariantUnknowns) -> Block:
     return _block(residuals, parts, 2, FINEST_ANGLE)
 
 
-def _block(residuals: Floats, parts: Sequence[Floats], dimension: int, finest: float) -> Block:
+def _block(residuals: Floats, parts: Sequence[Floats], dimension: int, finest: float) -> ErrorBlock:
     """Return errors with what each group of parameters does to them."""
     jacobian = np.empty((*residuals.shape, 3 * len(parts)))
     for i, part in enumerate(parts):
         jacobian[..., 3 * i : 3 * i + 3] = part
     squares = np.asarray((residuals**2).sum(axis=-1))
-    return Block(residuals, squares, jacobian, dimension, finest)
+    return ErrorBlock(residuals, squares, jacobian, dimension, finest)
 
 
-def _first_scale(block: Block) -> Floats:
+def _first_scale(block: ErrorBlock) -> Floats:
     middle = np.nanmedian(block.squares, axis=-1)
     return np.asarray(np.sqrt(np.maximum(middle / block.dimension, block.finest**2)))
 
 
-def _weights(block: Block, scale: Floats) -> Floats:
+def _weights(block: ErrorBlock, scale: Floats) -> Floats:
     """(K, N) what each sample counts: 0 where it was not measured."""
     distances = block.squares / scale[:, None] ** 2
     return np.nan_to_num((TAILS + block.dimension) / (TAILS + distances))
 
 
-def _scale(block: Block, weights: Floats) -> Floats:
+def _scale(block: ErrorBlock, weights: Floats) -> Floats:
     seen = np.isfinite(block.squares).sum(axis=-1)
     total = (weights * np.nan_to_num(block.squares)).sum(axis=-1)
     return np.asarray(np.sqrt(np.maximum(total / (block.dimension * seen), block.finest**2)))
 
 
 def _normal_equations(
-    blocks: list[Block], weights: list[Floats], scales: list[Floats]
+    blocks: list[ErrorBlock], weights: list[Floats], scales: list[Floats]
 ) -> tuple[Floats, Floats]:
     p = blocks[0].jacobian.shape[-1]
     information: Floats = np.zeros((1, p, p))
@@ -202,7 +202,7 @@ def _solved(information: Floats, gradient: Floats) -> Floats:
     diagonal = np.einsum("kii->ki", information)
     size = np.sqrt(np.maximum(diagonal, 1e-300))
     p = information.shape[-1]
-    scaled = information / (size[:, :, None] * size[:, None, :]) + MARGIN * np.eye(p)
+    scaled = information / (size[:, :, None] * size[:, None, :]) + DAMPING * np.eye(p)
     return np.asarray(-np.linalg.solve(scaled, (gradient / size)[..., None])[..., 0] / size)
 
 
@@ -231,7 +231,7 @@ def _moved_base(other: Floats, step: Floats) -> Floats:
 
 
 def _score(
-    blocks: list[Block], scales: list[Floats], unknowns: VariantUnknowns, information: Floats
+    blocks: list[ErrorBlock], scales: list[Floats], unknowns: VariantUnknowns, information: Floats
 ) -> VariantFits:
     likelihood = count = np.zeros(1)
     for block, scale in zip(blocks, scales, strict=True):

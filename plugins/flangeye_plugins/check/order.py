@@ -26,7 +26,7 @@ from flangeye_plugins.check.significance import (
 )
 
 SHIFTS = (1, -1, 2, -2, 3, -3)
-FEWEST = 5
+FEWEST_LEFT = 5
 """Samples with a target that an alternative must leave."""
 DELAYS = 24
 """Delays tried on each side of none, up to the time between samples three times over."""
@@ -43,7 +43,7 @@ _OF: dict[Arms, str] = {
 }  # fmt: skip
 
 
-class Alternative(NamedTuple):
+class OtherOrder(NamedTuple):
     """Poses of other moments: the session with them, and the samples that have one."""
 
     session: RecordedSession
@@ -85,7 +85,7 @@ def _gains(session: RecordedSession, by: int, starts: Indices) -> Floats:
     return np.asarray(found.likelihood - given.likelihood[against])
 
 
-def _shifted(session: RecordedSession, arms: Arms, by: int, start: int) -> Alternative:
+def _shifted(session: RecordedSession, arms: Arms, by: int, start: int) -> OtherOrder:
     where = {"shift_from": session.ids[start]} if start else {}
 
     def change(poses: Floats) -> tuple[Floats, Mask]:
@@ -96,7 +96,7 @@ def _shifted(session: RecordedSession, arms: Arms, by: int, start: int) -> Alter
 
 def _at_other_times(
     session: RecordedSession, change: Change, arms: Arms, **correction: Any
-) -> Alternative:
+) -> OtherOrder:
     """Return the session with what the controllers said at other times, the links with it."""
     moved, known = change(session.poses)
 
@@ -106,7 +106,7 @@ def _at_other_times(
     read = session.corrected(alike, arms, **correction)
     if session.links is not None:
         read = replace(read, links=alike(session.links))
-    return Alternative(read, known, arms)
+    return OtherOrder(read, known, arms)
 
 
 @part("check.clock")
@@ -137,7 +137,7 @@ def clock(session: RecordedSession) -> Findings:
     yield finer.finding("time offset", what, corrected_session)
 
 
-def _delays(session: RecordedSession, delays: Floats, arms: Sequence[Arms]) -> list[Alternative]:
+def _delays(session: RecordedSession, delays: Floats, arms: Sequence[Arms]) -> list[OtherOrder]:
     made: dict[int, Later] = {}
 
     def later_of(poses: Floats) -> Later:
@@ -150,7 +150,7 @@ def _delays(session: RecordedSession, delays: Floats, arms: Sequence[Arms]) -> l
 
 def _delayed(
     session: RecordedSession, later_of: Callable[[Floats], Later], arms: Arms, delay: float
-) -> Alternative:
+) -> OtherOrder:
     def change(poses: Floats) -> tuple[Floats, Mask]:
         if session.motions is None or poses is not session.poses:
             return later_of(poses)(delay)
@@ -162,7 +162,7 @@ def _delayed(
 
 def _evidence(
     session: RecordedSession,
-    others: Sequence[Alternative],
+    others: Sequence[OtherOrder],
     further: int = 0,
     tried: int | None = None,
 ) -> Significance | None:
@@ -175,11 +175,11 @@ def _evidence(
 
 
 def _fits(
-    session: RecordedSession, others: Sequence[Alternative]
+    session: RecordedSession, others: Sequence[OtherOrder]
 ) -> tuple[VariantFits, VariantFits, Indices] | None:
     """Return fits as given, of the others, and which of the former has the samples of each."""
     known = np.array([other.known for other in others])
-    enough = (known & session.seen).sum(axis=1) >= FEWEST
+    enough = (known & session.seen).sum(axis=1) >= FEWEST_LEFT
     if not enough.any():
         return None
     # Those with too few samples are put in as the session is, which is no better than itself.

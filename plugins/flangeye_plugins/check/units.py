@@ -36,7 +36,7 @@ ARMS = (0.1, 4.0)
 """Median distance of a flange from its base [m], from the smallest arm to the largest."""
 
 
-STEPS = (0.1, 1e-2, 1e-3, 1e-4, 1e-5)
+DECIMALS = (0.1, 1e-2, 1e-3, 1e-4, 1e-5)
 """Last decimals of positions in metres, millimetres and so on [m]."""
 
 WHOLE = 1e-3
@@ -50,7 +50,7 @@ SHARE = 0.5
 """Rounding to a step moves a place by half of it, rms; this share of the limit is too much."""
 
 
-class Alternative(NamedTuple):
+class OtherUnit(NamedTuple):
     """Another unit of some of the lengths.
 
     Attributes:
@@ -80,7 +80,7 @@ def units(session: RecordedSession) -> Findings:
         yield both
 
 
-def _alternatives(session: RecordedSession) -> Iterator[Alternative]:
+def _alternatives(session: RecordedSession) -> Iterator[OtherUnit]:
     """Give other units of the arms' positions, and of the target's where that is not the same.
 
     A link's place follows from the arm's model, in metres: then it is not.
@@ -88,11 +88,11 @@ def _alternatives(session: RecordedSession) -> Iterator[Alternative]:
     for said, meant, factor in _ratios():
         if session.uses_poses:
             for arms in session.arms:
-                yield Alternative(_of_arm(session, arms, factor), said, meant, arms)
+                yield OtherUnit(_of_arm(session, arms, factor), said, meant, arms)
         if session.links is not None:
-            yield Alternative(_of_target(session, factor, meant), said, meant, None)
+            yield OtherUnit(_of_target(session, factor, meant), said, meant, None)
     if session.uses_poses:
-        yield Alternative(_of_arm(session, "both", STANDING), "", "", "both")
+        yield OtherUnit(_of_arm(session, "both", STANDING), "", "", "both")
 
 
 def _of_arm(session: RecordedSession, arms: Arms, factor: float) -> RecordedSession:
@@ -115,7 +115,7 @@ def _ratios() -> Iterator[tuple[str, str, float]]:
         given.add(factor)
 
 
-def _finding(session: RecordedSession, found: Alternative, evidence: Significance) -> Finding:
+def _finding(session: RecordedSession, found: OtherUnit, evidence: Significance) -> Finding:
     said, meant = found.said, found.meant
     if found.arms is None or (found.arms == "both" and _rather_target(session, said, meant)):
         return _of_targets_unit(session, found, evidence)
@@ -125,9 +125,7 @@ def _finding(session: RecordedSession, found: Alternative, evidence: Significanc
     return _refitted(what, found.session, evidence)
 
 
-def _of_targets_unit(
-    session: RecordedSession, found: Alternative, evidence: Significance
-) -> Finding:
+def _of_targets_unit(session: RecordedSession, found: OtherUnit, evidence: Significance) -> Finding:
     """Say that the target's lengths are wrong; the arm's in the inverse unit fit as well."""
     said, meant = found.said, found.meant
     if found.arms is not None:
@@ -292,7 +290,7 @@ def rounding(session: RecordedSession) -> Findings:
 
 def _step(places: Floats) -> float | None:
     """Return the coarsest step [m] that all coordinates are multiples of; None for none."""
-    for step in STEPS:
+    for step in DECIMALS:
         multiples = places / step
         if len(places) and np.abs(multiples - np.round(multiples)).max() < WHOLE:
             return step

@@ -16,7 +16,12 @@ from flangeye.types import CalibratedPose, ExportedFile
 from flangeye_plugins.export import documents
 from flangeye_plugins.export.controllers import CONTROLLERS
 from flangeye_plugins.export.urdf import UrdfParams, urdf
-from flangeye_plugins.export.writing import FramesParams, LengthParams, NamedParams, ZividParams
+from flangeye_plugins.export.writing import (
+    FramesParams,
+    LengthParams,
+    NamedParams,
+    ZividExportParams,
+)
 
 
 def _declared(
@@ -40,7 +45,7 @@ _WRITERS: tuple[tuple[Callable[..., ExportedFile], type[NamedParams]], ...] = (
     (documents.moveit, FramesParams),
     (documents.easy_handeye2, FramesParams),
     (documents.opencv, LengthParams),
-    (documents.zivid, ZividParams),
+    (documents.zivid, ZividExportParams),
     (documents.robodk, NamedParams),
     (documents.matrix, LengthParams),
 )

@@ -45,7 +45,7 @@ _VAL3 = _words(
 
 
 @dataclass(frozen=True)
-class Controller:
+class ControllerFormat:
     """One such format.
 
     Attributes:
@@ -84,7 +84,7 @@ class Controller:
 
 
 CONTROLLERS = {
-    "ur": Controller(
+    "ur": ControllerFormat(
         "Write the pose as a URScript variable, as features and pose_trans take it.",
         "{name}.script",
         "#",
@@ -94,7 +94,7 @@ CONTROLLERS = {
         ("the base", "the flange: pose_trans(get_actual_tcp_pose(), …)"),
         reserved=_URSCRIPT,
     ),
-    "kuka": Controller(
+    "kuka": ControllerFormat(
         "Write a KUKA base, or a tool where the arm carries the camera.",
         "{name}.kuka.dat",
         ";",
@@ -105,7 +105,7 @@ CONTROLLERS = {
         ("BASE", "TOOL"),
         NumberedParams,
     ),
-    "abb": Controller(
+    "abb": ControllerFormat(
         "Write a RAPID module with the pose as the user frame of a work object.",
         "{name}.mod",
         "!",
@@ -116,7 +116,7 @@ CONTROLLERS = {
         ("FALSE", "TRUE"),
         reserved=_RAPID,
     ),
-    "fanuc": Controller(
+    "fanuc": ControllerFormat(
         "Write the numbers of a Fanuc user frame, or of a tool frame where the arm carries it.",
         "{name}.fanuc.txt",
         "!",
@@ -127,7 +127,7 @@ CONTROLLERS = {
         ("UFRAME", "UTOOL"),
         NumberedParams,
     ),
-    "yaskawa": Controller(
+    "yaskawa": ControllerFormat(
         "Write the numbers of a Yaskawa user frame, or of a tool where the arm carries the camera.",
         "{name}.yaskawa.txt",
         "'",
@@ -138,7 +138,7 @@ CONTROLLERS = {
         ("USER FRAME", "TOOL"),
         NumberedParams,
     ),
-    "staubli": Controller(
+    "staubli": ControllerFormat(
         "Write the pose as the transformation of a VAL 3 frame or tool.",
         "{name}.val3.txt",
         "//",
@@ -148,7 +148,7 @@ CONTROLLERS = {
         ("frame, its father world", "tool, its father flange"),
         reserved=_VAL3,
     ),
-    "doosan": Controller(
+    "doosan": ControllerFormat(
         "Write the pose as a DRL variable, as user coordinates and tools take it.",
         "{name}.drl",
         "#",
@@ -158,7 +158,7 @@ CONTROLLERS = {
         ("DR_BASE", "the flange"),
         reserved=_PYTHON,
     ),
-    "mech_mind": Controller(
+    "mech_mind": ControllerFormat(
         "Write position and quaternion for Mech-Mind's dialogs; not a file of its own format.",
         "{name}.mech_mind.txt",
         "#",
@@ -167,7 +167,7 @@ CONTROLLERS = {
         "type the numbers in, and mind the unit that the dialog shows",
         "quaternion_wxyz",
     ),
-    "halcon": Controller(
+    "halcon": ControllerFormat(
         "Write a pose file that HALCON's read_pose reads.",
         "{name}.halcon.dat",
         "#",

@@ -85,7 +85,7 @@ class LengthParams(NamedParams):
         return [[rounded(number) for number in row] for row in scaled]
 
 
-class ZividParams(LengthParams):
+class ZividExportParams(LengthParams):
     """What the pose is called, and its unit."""
 
     length: Literal["m", "mm"] = Field("mm", description="Unit; Zivid's points are in mm.")

@@ -25,12 +25,12 @@ from flangeye_plugins.fit.planar import (
 )
 from flangeye_plugins.fit.uncertainty import ScannerErrorParams
 
-CERTAIN = float(np.log(1000))
+LIKELIER = float(np.log(1000))
 """Logarithm of how many times likelier than the other the better of two poses must be."""
 NO_IMAGE = "there is no image; printed targets are found in the scanner's image"
 
 
-class TargetParams(ScannerErrorParams):
+class PrintedTargetParams(ScannerErrorParams):
     """What fits of printed targets share."""
 
     depth: Literal["auto", "off", "only"] = Field(
@@ -44,7 +44,7 @@ class TargetParams(ScannerErrorParams):
     max_error: ClassVar[float] = 1.0
 
 
-class DictionaryParams(TargetParams):
+class DictionaryParams(PrintedTargetParams):
     """What fits of targets with markers share."""
 
     dictionary: Dictionary = Field(
@@ -52,7 +52,7 @@ class DictionaryParams(TargetParams):
     )
 
 
-class SquaresParams(TargetParams):
+class SquaresParams(PrintedTargetParams):
     """What fits of boards of squares share."""
 
     columns: int = Field(ge=3, description="Squares from left to right, inner and outer.")
@@ -96,7 +96,7 @@ class CheckerboardParams(SquaresParams):
         return Board("checkerboard", self.columns, self.rows, self.square)
 
 
-class CirclesParams(TargetParams):
+class CirclesParams(PrintedTargetParams):
     """Parameters of ``fit.circles``."""
 
     columns: int = Field(ge=2, description="Circles per row.")
@@ -179,7 +179,9 @@ def fit_aruco(capture: Capture, params: MarkerParams) -> PoseFeature | Rejected:
     return fit_board(capture, params.board, params)
 
 
-def fit_board(capture: Capture, board: Board, params: TargetParams) -> PoseFeature | Rejected:
+def fit_board(
+    capture: Capture, board: Board, params: PrintedTargetParams
+) -> PoseFeature | Rejected:
     """Return a board's pose with its covariance, or why there is none."""
     if capture.image is None:
         return Rejected(NO_IMAGE)
@@ -190,7 +192,7 @@ def fit_board(capture: Capture, board: Board, params: TargetParams) -> PoseFeatu
 
 
 def _fit_corners(
-    corners: Corners, capture: Capture, image: Image, board: Board, params: TargetParams
+    corners: Corners, capture: Capture, image: Image, board: Board, params: PrintedTargetParams
 ) -> PoseFeature | Rejected:
     by_depth = None if params.depth == "off" else _by_depth(corners, capture, board)
     if isinstance(by_depth, Rejected):
@@ -230,7 +232,10 @@ def _by_depth(corners: Corners, capture: Capture, board: Board) -> PlanarPose | 
 
 
 def _better(
-    poses: list[PlanarPose], by_depth: PlanarPose | None, corners: Corners, params: TargetParams
+    poses: list[PlanarPose],
+    by_depth: PlanarPose | None,
+    corners: Corners,
+    params: PrintedTargetParams,
 ) -> PlanarPose | Rejected:
     """Return the pose with the smaller expected error over the target's corners."""
     best = poses[0]
@@ -253,7 +258,7 @@ def _ambiguity(poses: list[PlanarPose]) -> Rejected | None:
         return None
     best, other = poses
     ratio = (other.misfit - best.misfit) / (2 * best.noise**2)
-    if ratio > CERTAIN:
+    if ratio > LIKELIER:
         return None
     apart = np.degrees(_apart(best, other))
     if apart < 0.1:  # both came to the same pose

@@ -28,7 +28,7 @@ SAMPLES = 2000
 """Triples of points that are tried."""
 
 
-STEPS = 72
+SECTORS = 72
 """Sectors in which the seen share of a circle is counted, 5 degrees each."""
 
 
@@ -54,7 +54,7 @@ class SphereProfileParams(Params):
     scanner_error: ClassVar[float] = 0.03e-3
 
 
-class Arc(NamedTuple):
+class PlanarCircle(NamedTuple):
     """A circle in the laser's plane, and the points on it.
 
     Attributes:
@@ -92,7 +92,7 @@ def fit_sphere_profile(
     if isinstance(arc, Rejected):
         return arc
     away = np.sqrt(max(sphere.radius**2 - arc.radius**2, 0.0))
-    coverage = len(np.unique(sectors(arc.points - arc.circles.centre, STEPS))) / STEPS
+    coverage = len(np.unique(sectors(arc.points - arc.circles.centre, SECTORS))) / SECTORS
     problem = _why_not(away / sphere.radius, coverage, params)
     if problem:
         return Rejected(problem)
@@ -124,7 +124,7 @@ def _why_no_profile(xyz: Floats) -> str | None:
 
 def find_arc(
     points: Floats, radius: float, params: SphereProfileParams, seed: int
-) -> Arc | Rejected:
+) -> PlanarCircle | Rejected:
     """Return the circle that most points of a profile lie on, seen from outside.
 
     Circles through random triples, no larger than the sphere and farther from the scanner than
@@ -163,7 +163,7 @@ def _candidates(
     return centres[fitting][:, [0, 2]], radii[fitting]
 
 
-def _refined(points: Floats, centre: Floats, radius: float, tolerance: float) -> Arc:
+def _refined(points: Floats, centre: Floats, radius: float, tolerance: float) -> PlanarCircle:
     circles = Circles(centre, np.array([radius]))
     scale = tolerance
     for _ in range(5):
@@ -174,7 +174,7 @@ def _refined(points: Floats, centre: Floats, radius: float, tolerance: float) ->
         residuals = circle_residuals(circles, on_arc, ring)
         # Noise below which points are exact [m]
         scale = max(2 * SIGMA_OF_MAD * float(np.median(np.abs(residuals))), 1e-6)
-    return Arc(circles, on_arc, scale)
+    return PlanarCircle(circles, on_arc, scale)
 
 
 def _no_arc(radius: float) -> str:
@@ -196,7 +196,7 @@ def _why_not(offset: float, coverage: float, params: SphereProfileParams) -> str
     return None
 
 
-def _covariance(arc: Arc, y: float, radius: float, params: SphereProfileParams) -> Floats:
+def _covariance(arc: PlanarCircle, y: float, radius: float, params: SphereProfileParams) -> Floats:
     """Return the (3, 3) covariance of the centre [m^2]: of circle, sphere and scanner."""
     ring = np.zeros(len(arc.points), dtype=np.intp)
     residual = circle_residuals(arc.circles, arc.points, ring)

@@ -101,9 +101,9 @@ def _guided(
             latest = LatestState(robot.state())
             sensor: TactileSensor = opened.enter_context(params.sensor(finger, latest, seed))
 
-            def readings(robot: Robot) -> Readings:
+            def readings(robot: Robot) -> ReadingGuide:
                 # The person has moved the arm meanwhile: it is watched from where it stands now.
-                return Readings(Executor(robot, model, limits, latest.tell), sensor, finger)
+                return ReadingGuide(Executor(robot, model, limits, latest.tell), sensor, finger)
 
             ask("Let the finger hang free, so that its tip touches nothing")
             # Readings of the undeformed finger
@@ -177,7 +177,7 @@ def _weld_params(recipe: Recipe) -> WeldTactileParams:
     raise StageError(f"{recipe.name}: has no step weld.tactile, which names finger and sensor")
 
 
-class Readings:
+class ReadingGuide:
     """Takes readings of the finger at rest and at chosen places."""
 
     def __init__(self, drive: Executor, sensor: TactileSensor, finger: Finger) -> None:

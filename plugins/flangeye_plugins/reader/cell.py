@@ -38,7 +38,7 @@ from flangeye_plugins.reader.columns import (
     table_with_rows,
     times_of,
 )
-from flangeye_plugins.reader.pairing import Pair, PairingParams, pair
+from flangeye_plugins.reader.pairing import MatchedPose, PairingParams, pair
 
 
 class JoinedParams(Params):
@@ -320,7 +320,7 @@ def _by_time(
     return found, [f"{seen.text.file.name}: {note}" for note in notes]
 
 
-def _moment(first: Moved, moved: Sequence[Moved], found: Pair) -> Moment:
+def _moment(first: Moved, moved: Sequence[Moved], found: MatchedPose) -> Moment:
     at = {each.name: found.pose if each is first else _at(each, found.time) for each in moved}
     joints = {
         m.name: np.array([np.interp(found.time, np.asarray(m.times), each) for each in m.joints.T])
@@ -330,7 +330,7 @@ def _moment(first: Moved, moved: Sequence[Moved], found: Pair) -> Moment:
     return Moment(at, joints, found.time, _motion(first, moved, found))
 
 
-def _motion(first: Moved, moved: Sequence[Moved], found: Pair) -> Motion | None:
+def _motion(first: Moved, moved: Sequence[Moved], found: MatchedPose) -> Motion | None:
     """Return how all arms, rails and positioners passed; None where the first stood still."""
     if found.motion is None or first.times is None:
         return None
@@ -363,7 +363,7 @@ def _at(each: Moved, time: float) -> Floats:
     return np.asarray(interpolated(times, each.values, np.array([time]))[0])
 
 
-def _stands(each: Moved, found: Pair, events: Floats) -> bool:
+def _stands(each: Moved, found: MatchedPose, events: Floats) -> bool:
     """Whether something stands still while the measurements of one standstill are taken."""
     half = np.ptp(events[list(found.events)]) / 2
     before, after = (_at(each, found.time + side) for side in (-half, half))

@@ -48,7 +48,7 @@ class PairingParams(Params):
 
 
 @dataclass(frozen=True, eq=False)
-class Pair:
+class MatchedPose:
     """A pose of the arm, and which measurements belong to it.
 
     Attributes:
@@ -69,7 +69,7 @@ def pair(
     events: Floats,
     signals: tuple[Signal, Signal] | None,
     params: PairingParams,
-) -> tuple[list[Pair], list[str]]:
+) -> tuple[list[MatchedPose], list[str]]:
     """Return the pairs in time, and notes on how they were made.
 
     Args:
@@ -121,7 +121,9 @@ def _ms(seconds: float) -> str:
     return f"{round(seconds * 1e3, 1) + 0.0:.1f} ms"  # a nought without a minus
 
 
-def _standing(arm: tuple[Floats, Floats], spans: Sequence[Span], moved: Floats) -> list[Pair]:
+def _standing(
+    arm: tuple[Floats, Floats], spans: Sequence[Span], moved: Floats
+) -> list[MatchedPose]:
     times, poses = arm
     found = []
     for span in spans:
@@ -132,11 +134,11 @@ def _standing(arm: tuple[Floats, Floats], spans: Sequence[Span], moved: Floats) 
             held = poses[(times >= span.start + trim) & (times <= span.end - trim)]
             if not len(held):  # a stream so slow that a standstill is its two ends
                 held = poses[(times >= span.start) & (times <= span.end)]
-            found.append(Pair(span.middle, mean_pose(held), tuple(within.tolist())))
+            found.append(MatchedPose(span.middle, mean_pose(held), tuple(within.tolist())))
     return found
 
 
-def _passing(arm: tuple[Floats, Floats], moved: Floats, params: PairingParams) -> list[Pair]:
+def _passing(arm: tuple[Floats, Floats], moved: Floats, params: PairingParams) -> list[MatchedPose]:
     times, poses = arm
     nearest = np.abs(times[_nearest(times, moved)] - moved) <= params.tolerance
     usable = np.flatnonzero(nearest)
@@ -149,7 +151,7 @@ def _passing(arm: tuple[Floats, Floats], moved: Floats, params: PairingParams) -
     between = interpolated(times, poses, at) if len(times) > 1 else poses[[0] * len(at)]
     kept = apart(between, params.distance, params.angle)
     return [
-        Pair(
+        MatchedPose(
             float(at[i]), between[i], (int(usable[i]),),
             None if sparse[i] else passed(times, poses, float(at[i])),
         )

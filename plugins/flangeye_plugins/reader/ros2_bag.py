@@ -26,9 +26,9 @@ from flangeye.maths.streams import mean_pose, turning, with_joints
 from flangeye.models.robots import RobotModel, joints_in_order
 from flangeye.types import FLANGE, Floats, Motion
 from flangeye.units import param
-from flangeye_plugins.reader.pairing import Pair, PairingParams, Signal, pair
+from flangeye_plugins.reader.pairing import MatchedPose, PairingParams, Signal, pair
 from flangeye_plugins.reader.ros2_messages import (
-    Frames,
+    BagFrames,
     Raw,
     Stream,
     bag_files,
@@ -98,7 +98,7 @@ class Bag:
     path: Path
     files: list[Path]
     topics: dict[str, str]
-    frames: Frames = field(default_factory=Frames)
+    frames: BagFrames = field(default_factory=BagFrames)
     poses: dict[str, tuple[list[float], list[Floats]]] = field(default_factory=dict)
     joints: dict[str, tuple[list[float], list[dict[str, float]]]] = field(default_factory=dict)
     stamps: dict[str, list[float]] = field(default_factory=dict)
@@ -285,7 +285,7 @@ class Target:
         enough = len(self.times) > 2 and len(arm[0]) > 2
         return (turning(*arm), turning(self.times, self.poses)) if enough else None
 
-    def recordings(self, pairs: Sequence[Pair], joints: Stream | None) -> list[Recording]:
+    def recordings(self, pairs: Sequence[MatchedPose], joints: Stream | None) -> list[Recording]:
         """Return a recording a pair."""
         return [
             Recording(
@@ -359,7 +359,7 @@ class Scans:
             raise next(iter(self.damaged[topic].values()))
         return found
 
-    def recordings(self, pairs: Sequence[Pair], joints: Stream | None) -> list[Recording]:
+    def recordings(self, pairs: Sequence[MatchedPose], joints: Stream | None) -> list[Recording]:
         """Return a recording a pair, its cloud and image written as files."""
         chosen = [self._middle(found.events) for found in pairs]
         files = self._files(self.first, chosen)
@@ -446,14 +446,14 @@ def _target(bag: Bag, params: BagParams) -> Target:
     return Target(times, np.array([inverted(pose) for pose in poses]))
 
 
-def _motion(joints: Stream | None, found: Pair) -> Motion | None:
+def _motion(joints: Stream | None, found: MatchedPose) -> Motion | None:
     """Return how the arm passed, with its joints where they were recorded."""
     if found.motion is None or joints is None:
         return found.motion
     return with_joints(found.motion, found.time, FLANGE, joints)
 
 
-def _angles(joints: Stream | None, found: Pair) -> Floats | None:
+def _angles(joints: Stream | None, found: MatchedPose) -> Floats | None:
     if joints is None:
         return None
     return np.array([np.interp(found.time, joints[0], each) for each in joints[1].T])

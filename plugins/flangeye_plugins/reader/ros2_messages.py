@@ -237,7 +237,7 @@ def in_order(times: Sequence[float], values: Sequence[Floats]) -> Stream:
 
 
 @dataclass
-class Frames:
+class BagFrames:
     """The transforms of a bag's ``/tf`` and ``/tf_static``.
 
     Attributes:

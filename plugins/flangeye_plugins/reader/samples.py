@@ -50,7 +50,7 @@ class EasyHandeyeParams(Params):
     )
 
 
-class ZividParams(CloudUnitParams):
+class ZividSamplesParams(CloudUnitParams):
     """How the poses are written."""
 
     length: Literal["m", "mm"] = Field(description="Unit of the positions; Zivid's own are mm.")
@@ -93,7 +93,7 @@ def visp(path: Path) -> Archive:
 
 
 @part("reader.zivid")
-def zivid(path: Path, params: ZividParams) -> Archive:
+def zivid(path: Path, params: ZividSamplesParams) -> Archive:
     """Read a folder of posNN.yaml with clouds or images imgNN beside them."""
     pattern = next((p for p in ("pos*.yaml", "pos*.yml") if files_at(path, p)), None)
     if pattern is None:

@@ -43,7 +43,7 @@ from flangeye_plugins.reader.columns import (
     table_with_rows,
     times_of,
 )
-from flangeye_plugins.reader.pairing import Pair, PairingParams, pair
+from flangeye_plugins.reader.pairing import MatchedPose, PairingParams, pair
 
 SCAN = "scan"
 """How the column of the scans' file names is called, if the recipe does not say."""
@@ -339,7 +339,9 @@ def _with_joints(
     ]
 
 
-def _motion(arm: tuple[Floats, Floats], second: Readings | None, found: Pair) -> Motion | None:
+def _motion(
+    arm: tuple[Floats, Floats], second: Readings | None, found: MatchedPose
+) -> Motion | None:
     """Return how the arms passed; None where they stood still."""
     stream = None if second is None else _stream_of(second)
     if found.motion is None or stream is None:
@@ -347,12 +349,12 @@ def _motion(arm: tuple[Floats, Floats], second: Readings | None, found: Pair) ->
     return passed(*arm, found.time, {FLANGE2: stream})
 
 
-def _mean(values: Sequence[Floats], found: Pair) -> Floats:
+def _mean(values: Sequence[Floats], found: MatchedPose) -> Floats:
     seen = np.array([values[i] for i in found.events])
     return mean_pose(seen) if seen.ndim == 3 else np.asarray(seen.mean(axis=0))
 
 
-def _second_at(second: Readings | None, found: Pair) -> Floats | None:
+def _second_at(second: Readings | None, found: MatchedPose) -> Floats | None:
     stream = None if second is None else _stream_of(second)
     return None if stream is None else interpolated(*stream, np.array([found.time]))[0]
 

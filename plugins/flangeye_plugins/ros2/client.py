@@ -42,7 +42,7 @@ MATCHING = 0.5
 """Longest time until what runs is joined to a subscription or a publisher that is new [s]."""
 
 
-class Message(NamedTuple):
+class GraphMessage(NamedTuple):
     """A message as it came.
 
     Attributes:
@@ -58,7 +58,7 @@ class Message(NamedTuple):
     data: bytes
 
 
-Take = Callable[[Message], None]
+Take = Callable[[GraphMessage], None]
 Found = TypeVar("Found")
 
 
@@ -83,7 +83,7 @@ class Bridge(Device):
         types()  # without them nothing that comes can be read
         self.asker = asker
         self._news = threading.Condition()
-        self._newest: dict[str, Message] = {}
+        self._newest: dict[str, GraphMessage] = {}
         self._takers: dict[str, Take] = {}
         self._answers: queue.Queue[dict[str, Any]] = queue.Queue()
         self._triggered: queue.Queue[dict[str, Any]] = queue.Queue()
@@ -152,7 +152,7 @@ class Bridge(Device):
         if not self.awaited(lambda: self._ask("follow", topic=topic, type=kind, always=always)):
             raise DeviceError(f"{self.asker}: nobody publishes {topic}; {self._others(kind)}")
 
-    def newest(self, topic: str) -> Message | None:
+    def newest(self, topic: str) -> GraphMessage | None:
         """Return the newest message of a topic that is followed.
 
         Raises:
@@ -162,7 +162,7 @@ class Bridge(Device):
             raise DeviceError(f"{self.asker}: {self._gone}")
         return self._newest.get(topic)
 
-    def wait(self, topic: str, after: int, patience: float) -> Message | None:
+    def wait(self, topic: str, after: int, patience: float) -> GraphMessage | None:
         """Return a message of a higher number than ``after``; None where none comes in time [s]."""
         with self._news:
             self._news.wait_for(lambda: self._gone or self._count(topic) > after, timeout=patience)
@@ -179,7 +179,7 @@ class Bridge(Device):
         """Return how many messages of a topic came since it was followed, wanted or not."""
         return int(self._ask("heard", topic=topic))
 
-    def local_ns(self, message: Message) -> int:
+    def local_ns(self, message: GraphMessage) -> int:
         """Return the moment of a message's stamp, by ``time.monotonic_ns``.
 
         A stamp of simulated time is held against ``/clock``; a message without a stamp has the
@@ -305,7 +305,7 @@ class Bridge(Device):
         if "topic" in said:
             topic = said["topic"]
             with self._news:
-                message = Message(
+                message = GraphMessage(
                     self._count(topic) + 1, said["received_ns"], said["ahead_ns"], body
                 )
                 self._newest[topic] = message

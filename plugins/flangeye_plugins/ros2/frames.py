@@ -10,7 +10,7 @@ import numpy as np
 from flangeye.devices import DeviceError
 from flangeye.maths.geometry import invert, rigid, rotation_from_quaternion
 from flangeye.types import Floats
-from flangeye_plugins.ros2.client import Bridge, Message
+from flangeye_plugins.ros2.client import Bridge, GraphMessage
 from flangeye_plugins.ros2.messages import decoded
 
 TF, STATIC, TF_TYPE = "/tf", "/tf_static", "tf2_msgs/msg/TFMessage"
@@ -20,7 +20,7 @@ STALE = 0.25
 20 Hz unless it is told otherwise [s]."""
 
 
-class Frame(NamedTuple):
+class StampedFrame(NamedTuple):
     """A frame: its parent, its pose there (4, 4), and when that came; never for one that stands."""
 
     parent: str
@@ -41,7 +41,7 @@ class Frames:
         Raises:
             DeviceError: tf is wanted and nobody publishes it, or this ROS 2 has no tf2_msgs.
         """
-        self.frames: dict[str, Frame] = {}
+        self.frames: dict[str, StampedFrame] = {}
         self._asker, self._bridge = bridge.asker, bridge
         if moving:
             bridge.follow(TF, TF_TYPE, take=self._moving)
@@ -105,13 +105,13 @@ class Frames:
             pose, name = frame.pose @ pose, frame.parent
         return pose
 
-    def _moving(self, message: Message) -> None:
+    def _moving(self, message: GraphMessage) -> None:
         self._take(message, message.received_ns)
 
-    def _standing(self, message: Message) -> None:
+    def _standing(self, message: GraphMessage) -> None:
         self._take(message, None)
 
-    def _take(self, message: Message, received_ns: int | None) -> None:
+    def _take(self, message: GraphMessage, received_ns: int | None) -> None:
         for each in decoded(message.data, TF_TYPE).transforms:
             turn, move = each.transform.rotation, each.transform.translation
             xyzw, place = [turn.x, turn.y, turn.z, turn.w], [move.x, move.y, move.z]
@@ -121,4 +121,4 @@ class Frames:
                 continue
             pose = rigid(rotation_from_quaternion(np.array(xyzw)), place)
             parent, child = (n.lstrip("/") for n in (each.header.frame_id, each.child_frame_id))
-            self.frames[child] = Frame(parent, pose, received_ns)
+            self.frames[child] = StampedFrame(parent, pose, received_ns)

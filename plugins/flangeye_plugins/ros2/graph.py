@@ -19,7 +19,7 @@ from flangeye.maths.kinematics import Arm
 from flangeye.models.graph import Ask, RunningCell, Topic
 from flangeye.models.urdf import MAX_BYTES, NAMED, UrdfArm, arm_of, flange_links, parse_urdf
 from flangeye.types import CAMERA, CalibratedPose, Floats
-from flangeye_plugins.ros2.client import MATCHING, Bridge, Message
+from flangeye_plugins.ros2.client import MATCHING, Bridge, GraphMessage
 from flangeye_plugins.ros2.frames import STATIC, TF, TF_TYPE, Frames
 from flangeye_plugins.ros2.messages import (
     CLOCK,
@@ -210,7 +210,7 @@ class Heard(NamedTuple):
 
     topic: Topic
     rate: float
-    newest: Message | None
+    newest: GraphMessage | None
 
     @property
     def frame(self) -> str:

@@ -17,7 +17,7 @@ from flangeye.devices import DeviceError, FrameDropped, Scan, Scanner, load_sdk
 from flangeye.files.paths import MachineName, find_named
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import part
-from flangeye_plugins.scanner.genicam_nodes import Layout, configure, has_node
+from flangeye_plugins.scanner.genicam_nodes import RangeLayout, configure, has_node
 from flangeye_plugins.scanner.opened import OpenScanner, SerialParams
 
 NAME = "scanner.genicam"
@@ -122,7 +122,7 @@ class GenicamScanner(OpenScanner):
         self,
         harvester: Any,
         acquirer: Any,
-        layout: Layout,
+        layout: RangeLayout,
         model: ScannerModel | None,
         params: GenicamParams,
     ) -> None:

@@ -24,7 +24,7 @@ AXES = ("CoordinateA", "CoordinateB", "CoordinateC")
 
 
 @dataclass(frozen=True, eq=False)
-class Layout:
+class RangeLayout:
     """How the device lays out a range map, in its own words.
 
     Attributes:
@@ -65,7 +65,7 @@ class Layout:
         return np.asarray(xyz, dtype=np.float32)
 
 
-def configure(nodes: Any) -> Layout:
+def configure(nodes: Any) -> RangeLayout:
     """Ask a device for organised range maps, and return what it says it will give.
 
     Settings that the device does not have or does not let go of are left; what matters is read
@@ -105,7 +105,7 @@ def _enable_range(nodes: Any) -> None:
         raise DeviceError(f"{NAME}: the device does not let its component Range be enabled")
 
 
-def _reported(nodes: Any) -> Layout:
+def _reported(nodes: Any) -> RangeLayout:
     mode, unit = _read(nodes, "Scan3dOutputMode"), _read(nodes, "Scan3dDistanceUnit")
     if mode != ORGANISED:
         raise DeviceError(f"{NAME}: Scan3dOutputMode is {mode}, {ORGANISED} is needed")
@@ -124,7 +124,9 @@ def _reported(nodes: Any) -> Layout:
         "layout": f"organised, {columns} x {rows}",
         "trigger": "software" if has_node(nodes, "TriggerSoftware") else "start of acquisition",
     }
-    return Layout((rows, columns), PER_METRE[unit], _row(scale), _row(offset), _row(invalid), facts)
+    return RangeLayout(
+        (rows, columns), PER_METRE[unit], _row(scale), _row(offset), _row(invalid), facts
+    )
 
 
 def _row(values: tuple[float, ...]) -> NDArray[np.float32]:

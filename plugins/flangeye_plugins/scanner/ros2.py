@@ -16,7 +16,7 @@ from flangeye.models.graph import Topic
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import Params, part
 from flangeye.types import Floats, Image
-from flangeye_plugins.ros2.client import Bridge, Message
+from flangeye_plugins.ros2.client import Bridge, GraphMessage
 from flangeye_plugins.ros2.messages import (
     CLOUD,
     COMPRESSED,
@@ -47,7 +47,7 @@ PINHOLES = ("", "plumb_bob", "rational_polynomial")
 """Distortion models of CameraInfo that OpenCV's coefficients mean."""
 
 
-class Ros2Params(Params):
+class Ros2ScannerParams(Params):
     """Parameters of ``scanner.ros2``: a cloud, or a depth image, or an image of a marker alone."""
 
     cloud: str | None = Field(None, description="Topic of the clouds (PointCloud2).")
@@ -68,7 +68,7 @@ class Ros2Params(Params):
     sim_time: bool = Field(False, description="Stamps are simulated time, of the topic /clock.")
 
     @model_validator(mode="after")
-    def _looks_at_something(self) -> Ros2Params:
+    def _looks_at_something(self) -> Ros2ScannerParams:
         if self.cloud and self.depth:
             raise ValueError("give either cloud or depth, not both")
         if not (self.cloud or self.depth or self.image):
@@ -84,7 +84,7 @@ class Ros2Params(Params):
 
 
 @part("scanner.ros2")
-def scanner_ros2(model: ScannerModel | None, params: Ros2Params) -> Scanner:
+def scanner_ros2(model: ScannerModel | None, params: Ros2ScannerParams) -> Scanner:
     """Any camera with a ROS 2 driver; a scan is the first message stamped after it was asked for.
 
     Clouds may be organised or not, of any layout. A scan far out of the model's range is refused.
@@ -111,7 +111,9 @@ class Camera(NamedTuple):
 class Ros2Scanner(OpenScanner):
     """Topics of one camera."""
 
-    def __init__(self, bridge: Bridge, model: ScannerModel | None, params: Ros2Params) -> None:
+    def __init__(
+        self, bridge: Bridge, model: ScannerModel | None, params: Ros2ScannerParams
+    ) -> None:
         """Subscribe.
 
         Raises:
@@ -210,7 +212,7 @@ class Ros2Scanner(OpenScanner):
         elif self._params.trigger:
             self._bridge.publish(self._params.trigger, TRIGGER_MESSAGE)
 
-    def _after(self, topic: str, count: int, started: int, until: float) -> Message:
+    def _after(self, topic: str, count: int, started: int, until: float) -> GraphMessage:
         """Return the first message stamped after a moment; those before it are passed over."""
         late: list[float] = []
         while message := self._bridge.wait(topic, count, max(until - time.monotonic(), 0.0)):
@@ -244,7 +246,7 @@ class Ros2Scanner(OpenScanner):
         by = ", ".join(runs.publishers)
         return f"{by} still runs: does the camera have to be triggered, or was its cable pulled?"
 
-    def _points(self, taken: dict[str, Message]) -> Floats:
+    def _points(self, taken: dict[str, GraphMessage]) -> Floats:
         """Return the scan's points (H, W, 3) or (N, 3) [m]; none where there is an image alone."""
         if cloud := self._params.cloud:
             return cloud_of(decoded(taken[cloud].data, CLOUD))  # type: ignore[return-value]
@@ -260,7 +262,7 @@ class Ros2Scanner(OpenScanner):
         view = DepthView(self._camera.matrix.tolist(), self._camera.distortion.tolist())
         return view.points(depths)  # type: ignore[return-value]
 
-    def _image(self, taken: dict[str, Message]) -> Image | None:
+    def _image(self, taken: dict[str, GraphMessage]) -> Image | None:
         topic, camera = self._params.image, self._camera
         if topic is None or camera is None:
             return None

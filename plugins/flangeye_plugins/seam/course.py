@@ -9,7 +9,7 @@ import numpy as np
 from flangeye.types import Floats
 from flangeye_plugins.seam.planned import resampled
 
-STEP = 1e-3
+FRAME_SPACING = 1e-3
 """From one frame to the next [m]; four thousand at most."""
 SMOOTH = 8e-3
 """Standard deviation of what rounds the corners of a rough line [m]."""
@@ -92,7 +92,7 @@ def course(line: Floats, eyes: Floats, closed: bool, beyond: float) -> Course:
     if closed:
         line = np.vstack([line, line[:1]])
     length = float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
-    step = max(STEP, length / 4000)
+    step = max(FRAME_SPACING, length / 4000)
     points = _smoothed(resampled(line, step), SMOOTH / step, closed)
     if not closed:
         more = np.arange(1, 1 + round(beyond / step))[:, None] * step

@@ -11,7 +11,7 @@ from flangeye.types import Floats, Mask
 from flangeye_plugins.seam.sweep import Swept
 from flangeye_plugins.seam.template import EDGES, Section
 
-FEWEST = 5
+FEWEST_LANES = 5
 """Lanes that an end is known from."""
 LOOSE = 0.5e-3
 """An end that is known less well is not sharp [m]."""
@@ -21,7 +21,7 @@ AROUND = 0.06
 """Directions about a line in which the scanner may look past it: 40 mm at 0.7 m [rad]."""
 SIGMA_OF_IQR = 0.7413
 """Of a normal distribution, from its quartiles' distance."""
-NEAR = 8e-3
+SEAM_WITHIN = 8e-3
 """Lanes this near to the seam say where it ends [m]."""
 
 
@@ -59,8 +59,8 @@ def face_ends(
         on = _on_face(section, q, face, tolerance) & (np.abs(away) < 8 * tolerance)
         on &= (active == face) | (active == edge)
         beside = q[on] @ section.normals[edge] - section.heights[edge]
-        near = (beside > -NEAR) & (beside < NEAR / 2)
-        if near.sum() < 4 * FEWEST:
+        near = (beside > -SEAM_WITHIN) & (beside < SEAM_WITHIN / 2)
+        if near.sum() < 4 * FEWEST_LANES:
             continue
         at = np.flatnonzero(on)[near]
         last, more = last_in_lanes(local[at, 0], beside[near], pitch)
@@ -110,14 +110,16 @@ def surface_end(way: Floats, past: Mask, covered: Mask, pitch: float) -> End | N
         covered: (L,) where something else is before what is behind them.
         pitch: Distance between neighbouring points [m].
     """
-    if len(way) < FEWEST:
+    if len(way) < FEWEST_LANES:
         return None
-    seen = past.sum() >= FEWEST
+    seen = past.sum() >= FEWEST_LANES
     way = way[past] if seen else way
     low, middle, high = np.quantile(way, [0.25, 0.5, 0.75])
     share = 1.25 / np.sqrt(len(way)) if seen and high - low <= TWO * pitch else 1.0
     deviation = float(share * SIGMA_OF_IQR * (high - low))
-    return End(float(middle), deviation, bool(seen), bool(not seen and covered.sum() >= FEWEST))
+    return End(
+        float(middle), deviation, bool(seen), bool(not seen and covered.sum() >= FEWEST_LANES)
+    )
 
 
 def soonest(ends: list[End], limit: float) -> tuple[float, float]:
@@ -200,7 +202,7 @@ def surfaces(swept: Swept, local: Floats, tolerance: float) -> dict[int, Mask]:
     section = swept.section
     q = swept.in_section(local)
     away, active = section.distances(q)
-    near = np.linalg.norm(q, axis=1) < NEAR + section.shape[4:].max()
+    near = np.linalg.norm(q, axis=1) < SEAM_WITHIN + section.shape[4:].max()
     on = near & (np.abs(away) < tolerance)
     unseen = [k for k in EDGES if k in section.joint.unseen]
     return {

@@ -31,15 +31,15 @@ from flangeye_plugins.seam.planned import (
     refuse_outside,
 )
 from flangeye_plugins.seam.points import facing_camera
-from flangeye_plugins.seam.rough import Place, rough_path
+from flangeye_plugins.seam.rough import JointPlace, rough_path
 from flangeye_plugins.seam.stitched import PlacedScan, seen_in_base
 from flangeye_plugins.seam.sweep import WIDE, Spline, Swept, fitted, swept_from
-from flangeye_plugins.seam.template import EDGES, FACES, JOINTS, Joint
+from flangeye_plugins.seam.template import EDGES, FACES, JOINTS, JointShape
 
 STAGE = "seam.joint"
-MOST = 400_000
+MOST_FITTED = 400_000
 """Points that are fitted to; of more, every second, third, ..."""
-FEWEST = 300
+FEWEST_FITTED = 300
 REFITS = 3
 """The second and third time along the line that the first has found."""
 UNSHARED = 0.15
@@ -217,9 +217,9 @@ def _found(seen: PlacedScan, rough: Course, params: JointParams) -> Found:
     box = params.reach + WIDE + 10e-3
     points = seen.points
     at, local = rough.local(points, box)
-    if len(at) < FEWEST:
-        raise StageError(f"{STAGE}: {len(at)} points are near the line; {FEWEST} are needed")
-    pitch, points = _solid(points[at[:: -(-len(at) // MOST)]])
+    if len(at) < FEWEST_FITTED:
+        raise StageError(f"{STAGE}: {len(at)} points are near the line; {FEWEST_FITTED} are needed")
+    pitch, points = _solid(points[at[:: -(-len(at) // MOST_FITTED)]])
     at, local = rough.local(points, box)
     points = points[at]
     places = _placed(rough, local, points, params)
@@ -250,10 +250,10 @@ def _solid(points: Floats) -> tuple[float, Floats]:
     return pitch, points[counts > 3]
 
 
-def _placed(rough: Course, local: Floats, points: Floats, params: JointParams) -> list[Place]:
+def _placed(rough: Course, local: Floats, points: Floats, params: JointParams) -> list[JointPlace]:
     """Return the joint's way along the rough line."""
     joint = JOINTS[params.joint]
-    joints: tuple[Joint, ...] = (joint,)
+    joints: tuple[JointShape, ...] = (joint,)
     if joint.mirrored() != joint and params.joint != "fillet":
         joints = (joint, joint.mirrored())
     normals = facing_camera(points).normals
@@ -274,7 +274,7 @@ def _placed(rough: Course, local: Floats, points: Floats, params: JointParams) -
     return ways[0]
 
 
-def _between(first: list[Place], second: list[Place]) -> float:
+def _between(first: list[JointPlace], second: list[JointPlace]) -> float:
     line = np.array([[p.s, *p.q] for p in first])
     return float(np.median(distances_to_line(np.array([[p.s, *p.q] for p in second]), line)))
 

@@ -14,7 +14,7 @@ from flangeye.files.tables import read_table
 from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.maths.seam_geometry import chained, distances_to_line, sharp_edges
 from flangeye.models.robots import RobotModel
-from flangeye.models.workpiece import MESHES, STEP, read_mesh
+from flangeye.models.workpiece import MESHES, STEP_SUFFIXES, read_mesh
 from flangeye.types import Box, Floats, Seam, VerifiedHandEye
 from flangeye.units import Angle, Length, param
 from flangeye_plugins.seam.planned import (
@@ -113,7 +113,7 @@ def _lines(path: Path, unit: LengthUnit, angle: float) -> list[Floats]:
     if suffix in MESHES:
         # STEP comes in metres, whatever the drawing was in
         vertices, triangles = read_mesh(path)
-        scale = 1.0 if suffix in STEP else PER_METRE[unit]
+        scale = 1.0 if suffix in STEP_SUFFIXES else PER_METRE[unit]
         return chained(sharp_edges(vertices / scale, triangles, angle), MEET)
     known = ", ".join((*TABLES, ".dxf", *MESHES))
     raise StageError(f"{path}: '{path.suffix}' holds no line; known: {known}")

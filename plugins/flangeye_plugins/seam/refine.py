@@ -15,7 +15,7 @@ from flangeye_plugins.seam.points import Oriented
 ITERATIONS = 40
 STILL = 2e-6
 """Converged when no point of the part moves further than this in an iteration [m]."""
-ALIKE = float(np.cos(np.radians(20)))
+ALIKE_NORMAL = float(np.cos(np.radians(20)))
 """Cosine of the angle between a point's normal and that of the surface it may belong to; near an
 edge, where normals mix, no point does."""
 TUKEY = 4.685
@@ -26,7 +26,7 @@ a scanner do; blocks are taken as independent."""
 RIDGE = 1e-9
 LEAST = 1e-6
 """Information on a direction below this share of that on the best is rounding."""
-FEWEST = 40
+FEWEST_SUPPORTING = 40
 """Points that must share in determining a direction: a square of a thirtieth of the diagonal."""
 UNSHARED = 0.1
 """A fit is not believed to better than this share of a point's noise: edges, grain, the CAD's own
@@ -111,7 +111,7 @@ def _equations(scan: Oriented, part: CadPart, pose: Floats, limit: float) -> _Ro
     surface = part.nearest(inside.points)
     distances = np.einsum("ni,ni->n", surface.normals, inside.points - surface.points)
     off = np.linalg.norm(inside.points - surface.points, axis=1)
-    alike = np.einsum("ni,ni->n", surface.normals, inside.normals) > ALIKE
+    alike = np.einsum("ni,ni->n", surface.normals, inside.normals) > ALIKE_NORMAL
     # Beyond an edge the nearest point is not across from it: that says nothing about a plane.
     good = alike & (off < limit) & (np.abs(distances) > 0.7 * off)
     if good.sum() < 100:
@@ -180,7 +180,7 @@ def _with_unknown(rows: _Rows, weights: Floats, meat: Floats, size: float) -> Fl
     values, vectors = np.linalg.eigh(scaled.T @ scaled)
     shares = (scaled @ vectors) ** 2
     points = shares.sum(axis=0) ** 2 / np.maximum((shares**2).sum(axis=0), 1e-300)
-    known = (points >= FEWEST) & (values > LEAST * values[-1])
+    known = (points >= FEWEST_SUPPORTING) & (values > LEAST * values[-1])
     inverse = np.where(known, 1 / np.maximum(values, LEAST * values[-1]), 0.0)
     turned = vectors.T @ (meat * np.outer(units, units)) @ vectors
     covariance = turned * np.outer(inverse, inverse) + np.diag(np.where(known, 0.0, size**2))

@@ -10,13 +10,13 @@ from typing import NamedTuple
 import numpy as np
 
 from flangeye.types import Floats
-from flangeye_plugins.seam.template import EDGES, FACES, OFFSETS, Joint, Section
+from flangeye_plugins.seam.template import EDGES, FACES, OFFSETS, JointShape, Section
 
 SLAB = 10e-3
 """Along the line [m]: a rough line that is 3 deg askew smears an edge by half a millimetre."""
 LINES, TRIED, MOST = 6, 150, 700
 """Lines of a slab, hypotheses of each, and points that are looked at."""
-ALIKE = np.cos(np.radians(25))
+ALIKE_LINE = np.cos(np.radians(25))
 SHORTEST = 2.5e-3
 """Of a line in a section [m]."""
 AROUND = 12e-3
@@ -37,7 +37,7 @@ class Line(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class JointPlace:
     """Where a joint may be in a slab: at (2,) q, rolled, of some shape; its score is at most 1."""
 
     s: float
@@ -45,12 +45,12 @@ class Place:
     roll: float
     shape: Floats
     score: float
-    joint: Joint
+    joint: JointShape
 
 
 def rough_path(
-    local: Floats, normals: Floats, joints: tuple[Joint, ...], tolerance: float, reach: float
-) -> list[list[Place]]:
+    local: Floats, normals: Floats, joints: tuple[JointShape, ...], tolerance: float, reach: float
+) -> list[list[JointPlace]]:
     """Return the best ways of a joint along the line, each a place in most slabs; the best first.
 
     Args:
@@ -63,7 +63,7 @@ def rough_path(
     slabs = (local[:, 0] // SLAB).astype(int)
     order = np.argsort(slabs, kind="stable")
     bounds = np.searchsorted(slabs[order], np.arange(slabs.max() + 2))
-    spots: list[list[Place]] = []
+    spots: list[list[JointPlace]] = []
     for k in range(slabs.max() + 1):
         at = order[bounds[k] : bounds[k + 1]]
         at = at[:: max(1, len(at) // MOST)]
@@ -89,7 +89,7 @@ def _lines(q: Floats, normals: Floats, tolerance: float) -> Iterator[Line]:
         tried = slice(None, None, max(1, len(q) // TRIED))
         offsets = np.einsum("ni,ni->n", flat[tried], q[tried])
         on = np.abs(flat[tried] @ q.T - offsets[:, None]) < tolerance
-        on &= flat[tried] @ flat.T > ALIKE
+        on &= flat[tried] @ flat.T > ALIKE_LINE
         best = on[on.sum(axis=1).argmax()]
         middle = q[best].mean(axis=0)
         spread, axes = np.linalg.eigh(np.cov((q[best] - middle).T))
@@ -98,7 +98,7 @@ def _lines(q: Floats, normals: Floats, tolerance: float) -> Iterator[Line]:
         normal = axes[:, 0] * np.sign(axes[:, 0] @ flat[best].mean(axis=0))
         away = q @ normal - normal @ middle
         yield Line(float(np.arctan2(*normal)), float(normal @ middle), q[np.abs(away) < tolerance])
-        left = (np.abs(away) > tolerance) | (flat @ normal < ALIKE)
+        left = (np.abs(away) > tolerance) | (flat @ normal < ALIKE_LINE)
         q, flat = q[left], flat[left]
 
 
@@ -120,8 +120,8 @@ def _ends(face: Line, right: bool) -> list[Line]:
 
 
 def _places(
-    s: float, q: Floats, lines: list[Line], joint: Joint, tolerance: float, reach: float
-) -> Iterator[Place]:
+    s: float, q: Floats, lines: list[Line], joint: JointShape, tolerance: float, reach: float
+) -> Iterator[JointPlace]:
     """Yield where in a slab the lines fit the joint's half-planes."""
     present = [k for k in range(4) if joint.present[k]]
     for first, second in product(lines, lines):
@@ -141,7 +141,7 @@ def _places(
                     yield place
 
 
-def _agree(joint: Joint, which: list[int], lines: tuple[Line, ...] | list[Line]) -> bool:
+def _agree(joint: JointShape, which: list[int], lines: tuple[Line, ...] | list[Line]) -> bool:
     """Return whether lines have the angles between each other that the joint's half-planes have."""
     off = [line.angle - np.radians(joint.angles[k]) for line, k in zip(lines, which, strict=True)]
     allowed = [np.radians(2 * joint.spread[k] + 4) for k in which]
@@ -152,11 +152,11 @@ def _agree(joint: Joint, which: list[int], lines: tuple[Line, ...] | list[Line])
 def _placed(
     s: float,
     q: Floats,
-    joint: Joint,
+    joint: JointShape,
     present: list[int],
     lines: tuple[Line, ...],
     tolerance: float,
-) -> Place | None:
+) -> JointPlace | None:
     """Return the joint whose half-planes are these lines, or None where that is no joint."""
     nominal, spread = (np.radians([x[k] for k in present]) for x in (joint.angles, joint.spread))
     off = np.array([line.angle for line in lines]) - nominal
@@ -178,7 +178,7 @@ def _placed(
         return None
     section = Section(joint, np.concatenate([angles, np.maximum(lengths, 0.0)]))
     score = explained(section, turn(q - solved[:2], roll), tolerance)
-    return None if score is None else Place(s, solved[:2], roll, section.shape, score, joint)
+    return None if score is None else JointPlace(s, solved[:2], roll, section.shape, score, joint)
 
 
 def turn(q: Floats, roll: Floats | float) -> Floats:
@@ -203,9 +203,9 @@ def explained(section: Section, q: Floats, tolerance: float) -> float | None:
     return float(2 * good.sum() / max(near.sum(), 1) - 1)
 
 
-def _apart(places: list[Place]) -> list[Place]:
+def _apart(places: list[JointPlace]) -> list[JointPlace]:
     """Return the best few places that are not the same."""
-    kept: list[Place] = []
+    kept: list[JointPlace] = []
     for place in sorted(places, key=lambda p: -p.score):
         if all(np.linalg.norm(place.q - other.q) > BESIDE for other in kept):
             kept.append(place)
@@ -214,7 +214,7 @@ def _apart(places: list[Place]) -> list[Place]:
     return kept
 
 
-def _ways(spots: list[list[Place]]) -> list[list[Place]]:
+def _ways(spots: list[list[JointPlace]]) -> list[list[JointPlace]]:
     """Return ways through the slabs, by dynamic programming; none shares a place with a better."""
     nodes = [(k, place) for k, places in enumerate(spots) for place in places]
     best: list[tuple[float, int | None]] = []
@@ -228,7 +228,7 @@ def _ways(spots: list[list[Place]]) -> list[list[Place]]:
             default=(0.0, None),
         )
         best.append((place.score + max(score, 0.0), before if score > 0 else None))
-    ways: list[list[Place]] = []
+    ways: list[list[JointPlace]] = []
     used: set[int] = set()
     for j in np.argsort([-score for score, _ in best], kind="stable"):
         way: list[int] = []
@@ -242,7 +242,7 @@ def _ways(spots: list[list[Place]]) -> list[list[Place]]:
     return ways
 
 
-def _jump(first: Place, second: Place, slabs: int) -> float:
+def _jump(first: JointPlace, second: JointPlace, slabs: int) -> float:
     away = np.linalg.norm(first.q - second.q) / BESIDE
     rolled = np.angle(np.exp(1j * (first.roll - second.roll))) / np.radians(8)
     other = np.abs(first.shape[4:] - second.shape[4:]).max() / BESIDE

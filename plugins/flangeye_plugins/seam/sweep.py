@@ -14,7 +14,7 @@ import numpy as np
 
 from flangeye.maths.statistics import SIGMA_OF_MAD
 from flangeye.types import Floats, Indices
-from flangeye_plugins.seam.rough import Place, turn
+from flangeye_plugins.seam.rough import JointPlace, turn
 from flangeye_plugins.seam.template import OFFSETS, Section
 
 KNOTS = 30e-3
@@ -114,7 +114,7 @@ class Swept:
         return np.asarray(np.einsum("ni,aibj,nj->nab", basis, blocks, basis))
 
 
-def swept_from(places: list[Place], length: float, closed: bool) -> Swept:
+def swept_from(places: list[JointPlace], length: float, closed: bool) -> Swept:
     """Return a start for the fit from places along the line."""
     s = np.array([p.s for p in places])
     values = np.column_stack([[p.q for p in places], np.unwrap([p.roll for p in places])])

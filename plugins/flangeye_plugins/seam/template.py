@@ -25,7 +25,7 @@ OFFSETS[1, 2] = OFFSETS[3, 2] = -0.5
 
 
 @dataclass(frozen=True)
-class Joint:
+class JointShape:
     """One joint.
 
     Attributes:
@@ -53,7 +53,7 @@ class Joint:
         """(7,) which of the shape's numbers are estimated: angles, heights, gap."""
         return np.concatenate([self.present, [*self.heights, self.gap]])
 
-    def mirrored(self) -> Joint:
+    def mirrored(self) -> JointShape:
         """Return the joint with its plates exchanged."""
         first, edge, second, other = self.angles
         spread = (*self.spread[2:], *self.spread[:2])
@@ -67,12 +67,12 @@ class Joint:
 
 
 JOINTS = {
-    "vee": Joint((0, 55, 0, -55), (0.5, 20, 0.5, 20), (True, True)),
-    "bevel": Joint((0, 90, 0, -48), (0.5, 1, 0.5, 12), (True, True), unseen=(1,)),
-    "butt": Joint((0, 90, 0, -90), (0.5, 1, 0.5, 1), gap=True, unseen=(1, 3)),
-    "lap": Joint((0, 90, 0, ABSENT), (0.5, 1, 0.5, 1), (True, False), unseen=(1,)),
-    "fillet": Joint((45, ABSENT, -45, ABSENT), (10, 1, 10, 1)),
-    "corner": Joint((-45, 45, 45, -45), (5, 5, 5, 5), (True, True), unseen=(1, 3)),
+    "vee": JointShape((0, 55, 0, -55), (0.5, 20, 0.5, 20), (True, True)),
+    "bevel": JointShape((0, 90, 0, -48), (0.5, 1, 0.5, 12), (True, True), unseen=(1,)),
+    "butt": JointShape((0, 90, 0, -90), (0.5, 1, 0.5, 1), gap=True, unseen=(1, 3)),
+    "lap": JointShape((0, 90, 0, ABSENT), (0.5, 1, 0.5, 1), (True, False), unseen=(1,)),
+    "fillet": JointShape((45, ABSENT, -45, ABSENT), (10, 1, 10, 1)),
+    "corner": JointShape((-45, 45, 45, -45), (5, 5, 5, 5), (True, True), unseen=(1, 3)),
 }
 
 
@@ -85,7 +85,7 @@ class Section:
         shape: (7,) deviations of the four angles [rad], heights of both faces and root gap [m].
     """
 
-    joint: Joint
+    joint: JointShape
     shape: Floats
 
     @property

@@ -26,7 +26,7 @@ from flangeye.types import (
 from flangeye.units import Length, param
 
 if TYPE_CHECKING:
-    from flangeye_plugins.body.search import Found
+    from flangeye_plugins.body.search import FoundPose
 
 FIRM = 0.004
 """Largest standard deviation of what a scan shows least of a body, in its sizes or radians: what
@@ -77,7 +77,7 @@ def segment_body(
     """
     from flangeye_plugins.body.dense import FEWEST
     from flangeye_plugins.body.looks import prepared
-    from flangeye_plugins.body.search import Search, around
+    from flangeye_plugins.body.search import BodySearch, around
     from flangeye_plugins.segment.scale import check_scale
 
     points = capture.cloud.points()
@@ -92,7 +92,7 @@ def segment_body(
             f"{body.name}: it looks the same however it is turned about an axis, so that a scan "
             "does not show its pose; segment.sphere finds a ball"
         )
-    search, passes = Search(points, shape, looks), partial(_passes, params=params)
+    search, passes = BodySearch(points, shape, looks), partial(_passes, params=params)
     found = list(filter(passes, search.near(_predicted(capture, configuration, earlier))))[:1]
     if not found:
         every = search.everywhere()
@@ -126,7 +126,7 @@ def _predicted(capture: Capture, configuration: Configuration, earlier: Earlier)
     ]).reshape(-1, 4, 4)  # fmt: skip
 
 
-def _passes(found: Found, params: SegmentBodyParams) -> bool:
+def _passes(found: FoundPose, params: SegmentBodyParams) -> bool:
     verdict = found.verdict
     # Rays, a hundredth of the body's size apart, that show it: fewer fit by chance
     # Largest share of the rays beside the body in which its surface goes on: where something is
@@ -141,7 +141,7 @@ def _passes(found: Found, params: SegmentBodyParams) -> bool:
     )
 
 
-def _why_not(every: list[Found], passing: list[Found], body: TargetBody) -> str | None:
+def _why_not(every: list[FoundPose], passing: list[FoundPose], body: TargetBody) -> str | None:
     """Return why no pose is taken; None where one is."""
     if not every:
         return f"nothing of the size of {body.name} is there"

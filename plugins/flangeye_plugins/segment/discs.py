@@ -12,7 +12,7 @@ from flangeye.maths.planes import Plane
 from flangeye.models.targets import Flange
 from flangeye.types import Floats, Singles
 from flangeye_plugins.segment.grid import Grid
-from flangeye_plugins.segment.parts import Part
+from flangeye_plugins.segment.parts import PlanarPiece
 
 SECTORS = 48
 ROUNDS, FEWEST = 8, 6
@@ -62,7 +62,7 @@ class Disc(NamedTuple):
     ratio: float = 0.0
 
 
-def of_size(part: Part, cell: tuple[int, int], pitch: float, flange: Flange) -> Disc:
+def of_size(part: PlanarPiece, cell: tuple[int, int], pitch: float, flange: Flange) -> Disc:
     """Return a flat part as a disc, its width being its flaw if it cannot be the flange's.
 
     Args:

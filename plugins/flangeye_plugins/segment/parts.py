@@ -40,7 +40,7 @@ class SurfacePiece(NamedTuple):
         return np.asarray(rows // self.side * self.columns + columns // self.side)
 
 
-class Part(NamedTuple):
+class PlanarPiece(NamedTuple):
     """Points of a piece that lie on one plane.
 
     Attributes:
@@ -55,7 +55,7 @@ class Part(NamedTuple):
     at: Indices
 
     @classmethod
-    def of(cls, piece: SurfacePiece, plane: Plane, members: Indices) -> Part:
+    def of(cls, piece: SurfacePiece, plane: Plane, members: Indices) -> PlanarPiece:
         """Return the members of a piece that lie on a plane."""
         points = piece.points.take(thinned(members), axis=0)
         return cls(plane, points, piece.at.take(members))
@@ -87,7 +87,9 @@ class Patch(NamedTuple):
         return np.asarray(rest[np.einsum("ij,ij->j", offsets, offsets) < reach**2])
 
 
-def flat_parts(pieces: list[SurfacePiece], reach: float, scatter: float, fewest: int) -> list[Part]:
+def flat_parts(
+    pieces: list[SurfacePiece], reach: float, scatter: float, fewest: int
+) -> list[PlanarPiece]:
     """Return the flat parts of pieces of surface: one of a piece that is flat as a whole.
 
     Where a scan is too coarse or too noisy to show the crease, a piece holds a face joined to
@@ -110,12 +112,12 @@ def flat_parts(pieces: list[SurfacePiece], reach: float, scatter: float, fewest:
         if plane is not None and taken[patch.piece.at[patch.members]].mean() <= 0.5:
             around = patch.around(reach)
             off = _off(plane, patch.piece.points.take(around, axis=0))
-            parts.append(Part.of(patch.piece, plane, around[off <= _thickness(plane)]))
+            parts.append(PlanarPiece.of(patch.piece, plane, around[off <= _thickness(plane)]))
             taken[parts[-1].at] = True
     return parts
 
 
-def _whole(pieces: list[SurfacePiece], scatter: float) -> tuple[list[Part], list[Indices]]:
+def _whole(pieces: list[SurfacePiece], scatter: float) -> tuple[list[PlanarPiece], list[Indices]]:
     """Return the pieces that are flat as a whole, and the remainder of every piece to search."""
     samples = [thinned(piece.points, ENOUGH) for piece in pieces]
     rough = [fit_plane(s.astype(np.float64), -s.mean(axis=0)) for s in samples]
@@ -127,7 +129,7 @@ def _whole(pieces: list[SurfacePiece], scatter: float) -> tuple[list[Part], list
             members = np.flatnonzero(off <= _thickness(plane))
             # Share of a piece's points on one plane above which the piece is flat as a whole
             if len(members) > 0.7 * len(rest):
-                parts.append(Part.of(piece, plane, members))
+                parts.append(PlanarPiece.of(piece, plane, members))
                 rest = np.flatnonzero(off > 3 * scatter + SEARCHED)
         bent.append(rest)
     return parts, bent

@@ -12,7 +12,7 @@ from flangeye.models.targets import Flange, match_holes
 from flangeye.types import Indices, Mask, Singles
 from flangeye_plugins.segment.discs import Disc, DiscLimits, compare, in_box, of_size
 from flangeye_plugins.segment.grid import Grid, cells
-from flangeye_plugins.segment.parts import Part, SurfacePiece, flat_parts
+from flangeye_plugins.segment.parts import PlanarPiece, SurfacePiece, flat_parts
 
 NOISE_GATE = 5.0
 """Robust standard deviations of the grid's own bending above which a point is not smooth."""
@@ -44,7 +44,7 @@ def _piece(view: Grid, index: Indices, flange: Flange) -> SurfacePiece:
     return SurfacePiece(points, index, view.xyz.shape[1], max(3, round(side)))
 
 
-def _disc(part: Part, view: Grid, flange: Flange) -> Disc:
+def _disc(part: PlanarPiece, view: Grid, flange: Flange) -> Disc:
     pitch = view.angle * float(part.plane.point[2])
     rows, columns = cells(thinned(part.at), view.xyz.shape[1])
     middle = int(median(rows.astype(float))), int(median(columns.astype(float)))

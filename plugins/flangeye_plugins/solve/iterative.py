@@ -66,7 +66,7 @@ Evaluate = Callable[[Transform], float]
 
 
 @dataclass
-class Search:
+class SearchState:
     """The state of the search.
 
     Attributes:
@@ -130,9 +130,9 @@ def improve_pool(
     evaluate: Evaluate,
     required: float,
     k_max: int,
-) -> Search:
+) -> SearchState:
     """Run Algorithm 1 from a first pool; pulls from ``stream`` only while it is not good enough."""
-    search = Search(list(first), _cost(first, evaluate))
+    search = SearchState(list(first), _cost(first, evaluate))
     search.history.append(search.cost)
     while search.cost > required and len(search.history) <= k_max:
         newcomer = next(stream, None)
@@ -143,7 +143,7 @@ def improve_pool(
     return search
 
 
-def _try(newcomer: Observation, search: Search, evaluate: Evaluate) -> None:
+def _try(newcomer: Observation, search: SearchState, evaluate: Evaluate) -> None:
     """Put the newcomer in the place where it helps most, if it helps (lines 6 to 15)."""
     pools = [[*search.pool[:i], *search.pool[i + 1 :], newcomer] for i in range(len(search.pool))]
     costs = [_cost(pool, evaluate) for pool in pools]
@@ -169,7 +169,7 @@ def solve_pool(pool: Sequence[Observation]) -> Transform:
     return Transform(BASE, CAMERA, rigid(*kabsch(centres_of(pool), tcps_of(pool))))
 
 
-def _require_finite(search: Search, seen: int) -> None:
+def _require_finite(search: SearchState, seen: int) -> None:
     if not np.isfinite(search.cost):
         raise CalibrationRefused(
             f"no pool of {len(search.pool)} out of {seen} poses could be measured: the error was "
@@ -178,7 +178,7 @@ def _require_finite(search: Search, seen: int) -> None:
         )
 
 
-def _stopped(search: Search, params: IterativeParams) -> str:
+def _stopped(search: SearchState, params: IterativeParams) -> str:
     tried = len(search.history) - 1
     if search.cost <= params.required:
         why = "as required"

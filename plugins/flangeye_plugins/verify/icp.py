@@ -29,7 +29,7 @@ from flangeye.types import (
 from flangeye.units import Angle, Length, param
 from flangeye_plugins.verify.registration import (
     Registration,
-    Surface,
+    SampledSurface,
     read_surface,
     register,
     surface_of,
@@ -73,7 +73,7 @@ class IcpParams(IcpSettings):
 
 
 @dataclass(frozen=True)
-class Comparison:
+class ViewComparison:
     """One verification view against the flange's shape.
 
     Attributes:
@@ -117,7 +117,7 @@ def verify_icp(
     failed = [f"view {view}: {why}" for view, why in found.items() if isinstance(why, str)]
     if failed:
         return Verification(False, f"ICP failed, the error is infinite: {'; '.join(failed)}", {})
-    compared = {view: seen for view, seen in found.items() if isinstance(seen, Comparison)}
+    compared = {view: seen for view, seen in found.items() if isinstance(seen, ViewComparison)}
     return _judge(compared, params)
 
 
@@ -135,7 +135,7 @@ def require_views(views: Views) -> Views:
     return views
 
 
-def shape_of(flange: Flange, settings: IcpSettings) -> Surface:
+def shape_of(flange: Flange, settings: IcpSettings) -> SampledSurface:
     """Return the flange's surface: from its CAD cloud when given, else from its dimensions.
 
     Raises:
@@ -145,14 +145,14 @@ def shape_of(flange: Flange, settings: IcpSettings) -> Surface:
 
 
 @lru_cache(maxsize=4)
-def _read(cad: CadCloud) -> Surface:
+def _read(cad: CadCloud) -> SampledSurface:
     """Read a CAD cloud once: solvers ask for it for every candidate."""
     return read_surface(cad.file, cad.unit, rotation_from_rpy(*cad.rpy), np.array(cad.offset))
 
 
 def compare(
-    base_T_camera: Transform, view: VerificationView, surface: Surface, settings: IcpSettings
-) -> Comparison | str:
+    base_T_camera: Transform, view: VerificationView, surface: SampledSurface, settings: IcpSettings
+) -> ViewComparison | str:
     """Register one view with the surface, or say why ICP failed."""
     camera_T_flange = base_T_camera.inverse() @ view.base_T_flange
     measured = camera_T_flange.inverse().apply(view.flange.cloud.points())
@@ -161,10 +161,10 @@ def compare(
         return found
     predicted = camera_T_flange.matrix
     motion = predicted @ found.motion @ np.linalg.inv(predicted)
-    return Comparison(PoseError(motion, predicted[:3, 3], base_T_camera.rotation), found)
+    return ViewComparison(PoseError(motion, predicted[:3, 3], base_T_camera.rotation), found)
 
 
-def _judge(compared: Mapping[str, Comparison], params: IcpParams) -> Verification:
+def _judge(compared: Mapping[str, ViewComparison], params: IcpParams) -> Verification:
     figures = {view: _figures(comparison) for view, comparison in compared.items()}
     errors = {view: found["translation"] for view, found in figures.items()}
     worst = max(errors, key=lambda view: errors[view])
@@ -178,7 +178,7 @@ def _judge(compared: Mapping[str, Comparison], params: IcpParams) -> Verificatio
     return Verification(passed, reason, {**figures[worst], "views": float(len(errors))}, errors)
 
 
-def _figures(comparison: Comparison) -> dict[str, float]:
+def _figures(comparison: ViewComparison) -> dict[str, float]:
     error, fit = comparison.error, comparison.registration
     at_flange = error.displacement()
     turns = rpy_from_rotation(error.motion[:3, :3])

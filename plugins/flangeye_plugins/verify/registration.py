@@ -25,7 +25,7 @@ FEWEST_POINTS = 100
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class SampledSurface:
     """A sampled surface in ``flange``.
 
     Attributes:
@@ -45,7 +45,7 @@ class Surface:
 
 
 @lru_cache(maxsize=8)
-def surface_of(flange: Flange, spacing: float = 0.5e-3) -> Surface:
+def surface_of(flange: Flange, spacing: float = 0.5e-3) -> SampledSurface:
     """Sample what a scanner can see of a flange: face, chamfers, walls, bore, wrist behind it.
 
     Args:
@@ -59,7 +59,7 @@ def surface_of(flange: Flange, spacing: float = 0.5e-3) -> Surface:
     points = np.concatenate([ring[0] for ring in rings])
     normals = np.concatenate([ring[1] for ring in rings])
     drilled = _in_a_hole(points, flange)
-    return Surface(points[~drilled], normals[~drilled])
+    return SampledSurface(points[~drilled], normals[~drilled])
 
 
 def _profile(flange: Flange) -> list[tuple[float, float]]:
@@ -112,7 +112,7 @@ def _in_a_hole(points: Floats, flange: Flange) -> NDArray[np.bool_]:
     return np.asarray(drilled & (points[:, 2] == 0.0))
 
 
-def read_surface(path: Path, unit: LengthUnit, rotation: Floats, offset: Floats) -> Surface:
+def read_surface(path: Path, unit: LengthUnit, rotation: Floats, offset: Floats) -> SampledSurface:
     """Read a CAD cloud and express it in ``flange``; normals come from the nearest neighbours.
 
     Args:
@@ -128,7 +128,7 @@ def read_surface(path: Path, unit: LengthUnit, rotation: Floats, offset: Floats)
     if len(xyz) < FEWEST_POINTS:
         raise StageError(f"{path}: {len(xyz)} points; a flange needs {FEWEST_POINTS} or more")
     points = xyz @ rotation.T + offset
-    return Surface(points, _normals(points))
+    return SampledSurface(points, _normals(points))
 
 
 def _normals(points: Floats, neighbours: int = 12) -> Floats:
@@ -167,7 +167,7 @@ class Registration:
 
 
 def register(
-    measured: Floats, surface: Surface, reach: float, distance: float
+    measured: Floats, surface: SampledSurface, reach: float, distance: float
 ) -> Registration | str:
     """Move (N, 3) measured points onto a surface, both roughly in ``flange``, or say why not.
 
@@ -200,7 +200,7 @@ def _limits(reach: float, distance: float) -> list[float]:
 
 
 def _converge(
-    source: Floats, surface: Surface, motion: Floats, limit: float, still: float
+    source: Floats, surface: SampledSurface, motion: Floats, limit: float, still: float
 ) -> tuple[Floats, Floats] | str:
     """Iterate at one limit; return the motion and the directions (k, 6) it says nothing about."""
     for _ in range(ITERATIONS):
@@ -215,7 +215,7 @@ def _converge(
 
 
 def _equations(
-    source: Floats, surface: Surface, motion: Floats, limit: float
+    source: Floats, surface: SampledSurface, motion: Floats, limit: float
 ) -> tuple[Floats, Floats]:
     """Return the (K, 6) Jacobian in (rotation, translation) and (K,) point-to-plane distances."""
     moved = source @ motion[:3, :3].T + motion[:3, 3]
@@ -242,7 +242,7 @@ def _least_squares(jacobian: Floats, distances: Floats) -> tuple[Floats, Floats]
 
 
 def _judge(
-    source: Floats, surface: Surface, motion: Floats, unknown: Floats, distance: float
+    source: Floats, surface: SampledSurface, motion: Floats, unknown: Floats, distance: float
 ) -> Registration | str:
     about_axis = unknown[:, 2] ** 2
     if len(unknown) > 1 or (about_axis < 0.5).any():

@@ -16,7 +16,7 @@ from flangeye.types import Floats, HandEye, StageLog, Verification
 from flangeye.units import Length, param
 
 
-class Bar(Params):
+class BallBar(Params):
     """Two balls at a known distance, as one scan shows them."""
 
     first: tuple[Length, Length, Length] = Field(
@@ -30,10 +30,10 @@ FEWEST_PAIRS = 10
 """Pairs of the arm's poses: the 95 % quantile of fewer is their largest."""
 
 
-class SphereParams(Params):
+class SphereCheckParams(Params):
     """Parameters of ``verify.sphere``."""
 
-    bars: tuple[Bar, ...] = Field(
+    bars: tuple[BallBar, ...] = Field(
         (),
         description="Two balls at a known distance, at several places and in several directions: "
         "then the scanner alone is checked, and the arm's poses are not looked at.",
@@ -47,7 +47,7 @@ class SphereParams(Params):
 @stage("verify.sphere")
 def verify_sphere(
     calibration: HandEye,
-    params: SphereParams,
+    params: SphereCheckParams,
     robot: RobotModel | None = None,
     stage_log: StageLog | None = None,
 ) -> Verification:
@@ -84,13 +84,15 @@ def verify_sphere(
     return Verification(passed, reason, figures)
 
 
-def _of_bars(bars: Sequence[Bar]) -> tuple[Floats, Floats]:
+def _of_bars(bars: Sequence[BallBar]) -> tuple[Floats, Floats]:
     """Return (N,) distances as seen, and as they are [m]."""
     seen = np.array([bar.first for bar in bars]) - np.array([bar.second for bar in bars])
     return np.linalg.norm(seen, axis=1), np.array([bar.length for bar in bars])
 
 
-def _of_poses(calibration: HandEye, params: SphereParams, arm: Arm | None) -> tuple[Floats, Floats]:
+def _of_poses(
+    calibration: HandEye, params: SphereCheckParams, arm: Arm | None
+) -> tuple[Floats, Floats]:
     """Return (N,) distances of all pairs of poses as seen, and as driven [m].
 
     Raises:

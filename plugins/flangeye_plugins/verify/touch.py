@@ -12,7 +12,7 @@ from flangeye.types import Floats, HandEye, StageLog, Verification
 from flangeye.units import Angle, Length, param
 
 
-class Touch(Params):
+class TouchedPoint(Params):
     """One point, seen and touched."""
 
     seen: tuple[Length, Length, Length] = Field(
@@ -32,7 +32,7 @@ class TouchParams(Params):
     tip: tuple[Length, Length, Length] = Field(
         description="Tool tip in the flange frame, from the tool's own calibration."
     )
-    touches: tuple[Touch, ...] = Field(
+    touches: tuple[TouchedPoint, ...] = Field(
         min_length=1, description="Three or more at different places and heights tell most."
     )
     accuracy: Length = param(
@@ -88,7 +88,7 @@ def _compared(errors: Floats) -> dict[str, object]:
     return {"x": "point", "y": "predicted less actual [mm]", "series": series}
 
 
-def _touched(touch: Touch, tip: tuple[float, float, float]) -> Floats:
+def _touched(touch: TouchedPoint, tip: tuple[float, float, float]) -> Floats:
     flange = rigid(rotation_from_rpy(*touch.rpy), np.array(touch.position))
     return np.asarray(flange[:3, :3] @ np.array(tip) + flange[:3, 3])
 

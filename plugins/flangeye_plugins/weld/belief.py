@@ -9,7 +9,7 @@ import numpy as np
 
 from flangeye.models.finger import Finger
 from flangeye.types import Floats
-from flangeye_plugins.weld.body import Body
+from flangeye_plugins.weld.body import LeaningTool
 from flangeye_plugins.weld.joint import WeldJoint, joint_of
 from flangeye_plugins.weld.settings import Following
 
@@ -164,7 +164,9 @@ class Belief:
         return max(math.tan(self.half_angle + settings.sign * self.lean), 0.0)
 
 
-def belief_of(finger: Finger, body: Body, half_angle: float | None, settings: Following) -> Belief:
+def belief_of(
+    finger: Finger, body: LeaningTool, half_angle: float | None, settings: Following
+) -> Belief:
     """Return what a finger's file, the tool's stand and the plan say."""
     known = finger.calibration
     lateral, axial = UNCALIBRATED

@@ -16,7 +16,7 @@ from flangeye_plugins.weld.settings import Following
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class LeaningTool:
     """A tool that leans by its work and travel angle.
 
     Attributes:
@@ -43,15 +43,15 @@ def leaning(work: float, travel: float) -> Floats:
     return np.asarray(rotation_from_rpy(work, 0.0, 0.0) @ rotation_from_rpy(0.0, travel, 0.0))
 
 
-def body_of(finger: Finger, settings: Following) -> Body:
+def body_of(finger: Finger, settings: Following) -> LeaningTool:
     """Return the finger's tool as it stands while the seam is followed."""
     work = settings.sign * settings.work_angle
     return body_from(finger.torch_from_tip, work, settings.travel_angle)
 
 
-def body_from(torch: Floats, work: float, travel: float) -> Body:
+def body_from(torch: Floats, work: float, travel: float) -> LeaningTool:
     """Return a leaning tool whose torch is at (3,) from its tip, in the tool's axes [m]."""
     leans = leaning(work, travel)
     x, y, _ = (leans @ torch).tolist()
     turn = rotation_from_rpy(0.0, 0.0, -float(np.arctan2(-y, -x)))
-    return Body(np.asarray(turn @ leans), np.asarray(turn @ leans @ torch))
+    return LeaningTool(np.asarray(turn @ leans), np.asarray(turn @ leans @ torch))

@@ -28,8 +28,8 @@ from flangeye.files.processes import busy, keep_current_folder_out
 from flangeye.types import Floats
 from flangeye_plugins.weld.finger_camera import (
     CameraJob,
+    FingerReader,
     LatestState,
-    Reader,
     TagObservation,
     torch_of,
 )
@@ -55,7 +55,7 @@ class Seeing(NamedTuple):
     """
 
     latest: LatestState
-    reader: Reader
+    reader: FingerReader
     sensor: TactileSensor
     look: Profiler | None
 
@@ -188,7 +188,7 @@ def camera_process(wire: Connection, job: CameraJob) -> None:
     ):
         name = "the finger's camera"
         try:
-            reader = Reader(job.finger)
+            reader = FingerReader(job.finger)
             sensor = opened.enter_context(job.camera(latest))
             name = "the look behind the torch"
             look = job.profiler(latest, sensor)

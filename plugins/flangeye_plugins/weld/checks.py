@@ -12,7 +12,7 @@ from flangeye.motion.limits import MotionLimits
 from flangeye.plugin.stage import BoundPart
 from flangeye.types import Floats, Seam
 from flangeye_plugins.weld.belief import Belief
-from flangeye_plugins.weld.body import Body
+from flangeye_plugins.weld.body import LeaningTool
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.reachability import flange_speed
 from flangeye_plugins.weld.settings import Following, Mode
@@ -70,7 +70,7 @@ def check_controller(mode: Mode, driver: RobotDriver) -> None:
         )
 
 
-def check_tool(body: Body, belief: Belief, settings: Following) -> None:
+def check_tool(body: LeaningTool, belief: Belief, settings: Following) -> None:
     """Refuse a tool that cannot hold its tip, reach the seam or swing as asked.
 
     Raises:
@@ -111,7 +111,7 @@ def check_seat(belief: Belief, settings: Following) -> None:
         )
 
 
-def check_body(body: Body, belief: Belief, settings: Following) -> None:
+def check_body(body: LeaningTool, belief: Belief, settings: Following) -> None:
     """Refuse a tool that leans so that its torch is far above the seam, or below it.
 
     Raises:

@@ -41,7 +41,7 @@ STRIDE = 10e-3
 UP = 1e-3
 """Way over which a tip climbs that is pressed aside by more than it stands [m]."""
 
-ALIKE = 0.5
+NEW_SHARE = 0.5
 """Measurements that follow each other see the same error of what is expected: one in two is new."""
 
 STRAINED = 0.9
@@ -201,7 +201,7 @@ class Contact:
         free = 0.5 * sum(drags) * _normal(up, tall + LIFTS**2)
         climbed = walls[0][1] if felt.deflection > 0.0 else walls[1][1]
         chances = np.array([seated, walls[0][0], walls[1][0], free]) + 1e-12
-        return chances**ALIKE, max(climbed, RISE)
+        return chances**NEW_SHARE, max(climbed, RISE)
 
 
 def _mostly(off: float, variance: float, seldom: float) -> float:

@@ -38,7 +38,7 @@ class TagObservation(NamedTuple):
     feeling: TipDisplacement | None
 
 
-class Reader:
+class FingerReader:
     """From an image to a feeling."""
 
     def __init__(self, finger: Finger) -> None:
@@ -160,7 +160,7 @@ class SteppedReader:
             StageError: It cannot be opened.
         """
         self._latest = LatestState(job.state)
-        self._reader, self._sensor = Reader(job.finger), job.camera(self._latest)
+        self._reader, self._sensor = FingerReader(job.finger), job.camera(self._latest)
         try:
             self._look = job.profiler(self._latest, self._sensor)
         except BaseException:

@@ -17,10 +17,10 @@ from flangeye_plugins.weld.bias import Bias, Trail
 from flangeye_plugins.weld.contact import STRAINED, Contact, Felt
 from flangeye_plugins.weld.motion import SeamReading, Track
 from flangeye_plugins.weld.path import Path
-from flangeye_plugins.weld.probing import MARGIN, SOFTER, Learned, Probing
+from flangeye_plugins.weld.probing import SOFTER, SWEEP_MARGIN, Learned, Probing
 from flangeye_plugins.weld.refined import RefinedPath
 from flangeye_plugins.weld.response import Response
-from flangeye_plugins.weld.search import Search
+from flangeye_plugins.weld.search import SweepSearch
 from flangeye_plugins.weld.settings import INSIDE, Following
 from flangeye_plugins.weld.steering import SLOWEST, Steering
 from flangeye_plugins.weld.striking import Striking
@@ -168,7 +168,7 @@ class Follower:
         self._time: float | None = None
         self._seen = self._heard = self._bridge = self._tried = self._latency = 0.0
         self._place = plan.at(self.tip)
-        self._search = Search(settings, belief)
+        self._search = SweepSearch(settings, belief)
         self._probing = Probing(settings, belief, self.side)
         self._level = np.array(belief.level_R_tool)
         self._response = Response()
@@ -546,7 +546,7 @@ class Follower:
         self._response.dead_time, self._response.lag = found.dead_time, found.lag
         self._began = self._time or 0.0
         if self._belief.two_walls:
-            swept = min(found.swept, MARGIN * settings.deflection)
+            swept = min(found.swept, SWEEP_MARGIN * settings.deflection)
             self.contact.steady = swept / settings.preload
             if settings.probing:
                 self._press = min(max(swept / SOFTER, found.least), settings.deflection)

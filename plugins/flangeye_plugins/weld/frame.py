@@ -10,7 +10,7 @@ from flangeye.maths.geometry import rigid
 from flangeye.models.finger import FingerGeometry
 from flangeye.motion.seam_following import Command, ToolPose
 from flangeye.types import BASE, FLANGE, Floats, Transform
-from flangeye_plugins.weld.body import Body, body_from
+from flangeye_plugins.weld.body import LeaningTool, body_from
 
 UPRIGHT_GAIN = 1.0
 """How fast the tool is brought back to the plane's normal [1/s]."""
@@ -47,7 +47,9 @@ class WorkPlane:
 class Tool:
     """Translates between the flange in the base and the tool in the plane."""
 
-    def __init__(self, finger: FingerGeometry, plane: WorkPlane, body: Body | None = None) -> None:
+    def __init__(
+        self, finger: FingerGeometry, plane: WorkPlane, body: LeaningTool | None = None
+    ) -> None:
         """Take a tool that stands upright, or as its ``body`` does."""
         body = body or body_from(finger.torch_from_tip, 0.0, 0.0)
         self._plane = plane.base_T_plane

@@ -27,7 +27,7 @@ from flangeye_plugins.weld.settings import Following, PassParams
 from flangeye_plugins.weld.striking import Striking
 from flangeye_plugins.weld.weave import Sway, Weave
 
-STEP = 0.5e-3
+PASS_SPACING = 0.5e-3
 """Spacing of the path that the later passes follow [m]."""
 
 GAIN = 2.0
@@ -60,12 +60,12 @@ class Traced:
     def note(self, height: float) -> None:
         """Remember a cycle of the root pass, in which the end point was so high [m]."""
         root = self._root
-        if not self.rows or root.torch >= self.rows[-1][0] + STEP:
+        if not self.rows or root.torch >= self.rows[-1][0] + PASS_SPACING:
             self.rows.append((root.torch, height, root.sigma))
 
     def path(self, chosen: PassParams) -> Path:
         """Return the torch's path of a pass; its height is that of the tool's end point."""
-        s = np.arange(max(chosen.along, 0.0), self._plan.length + STEP / 2, STEP)
+        s = np.arange(max(chosen.along, 0.0), self._plan.length + PASS_SPACING / 2, PASS_SPACING)
         frames = [self._root.refined.frame(x) for x in s.tolist()]
         planar = np.array([point + chosen.across * normal for point, normal in frames])
         self._along, height, self._sigma = np.array(self.rows).T
@@ -245,8 +245,11 @@ class Passes:
 
     def _bend(self) -> float:
         """Return the path's curvature at the torch [1/m], to the left positive."""
-        before, after = self._path.at(self.torch - STEP), self._path.at(self.torch + STEP)
-        return _nearest(_heading(after) - _heading(before)) / (2 * STEP)
+        before, after = (
+            self._path.at(self.torch - PASS_SPACING),
+            self._path.at(self.torch + PASS_SPACING),
+        )
+        return _nearest(_heading(after) - _heading(before)) / (2 * PASS_SPACING)
 
     def _estimate(self, error: float) -> None:
         """State how far the torch may be from where it is to be, and stop where that is too far."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from flangeye.types import Floats
 
-STEP = 0.5e-3
+PATH_SPACING = 0.5e-3
 """Spacing to which a path is resampled [m]; at a radius of 50 mm the chord misses it by 0.6 um."""
 
 CHORD = 5e-3
@@ -47,7 +47,7 @@ class Path:
         chords = np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1)
         along = np.concatenate([[0.0], np.cumsum(chords)])
         self.length = float(along[-1])
-        ticks = np.linspace(0.0, self.length, max(2, round(self.length / STEP)) + 1)
+        ticks = np.linspace(0.0, self.length, max(2, round(self.length / PATH_SPACING)) + 1)
         self.points = np.stack([np.interp(ticks, along, axis) for axis in points.T], axis=1)
         self.step = float(ticks[1])
         slopes = np.gradient(self.points, self.step, axis=0)

@@ -24,7 +24,7 @@ from flangeye_plugins.weld.belief import Belief
 from flangeye_plugins.weld.response import identify
 from flangeye_plugins.weld.settings import Following
 
-MARGIN = 1.25
+SWEEP_MARGIN = 1.25
 """The sweep presses harder than ``deflection`` by this."""
 
 SOFTER = 3.0
@@ -62,7 +62,7 @@ UNEXPLAINED, PLAYS = 0.04e-3, 0.3
 """Gain, play and delay leave less than this of a seated tip unexplained beyond the noise [m], and
 this share of its play."""
 
-FEWEST = 15
+FEWEST_SWEPT = 15
 """Samples of a sweep without which it says nothing."""
 
 RESTS = 0.4
@@ -148,7 +148,7 @@ class Probing:
         self._two_walls, self._settings = belief.two_walls, settings
         self._side, self._noise = side, belief.noise
         self._turned = 0.0
-        self._sweep(MARGIN * settings.deflection)
+        self._sweep(SWEEP_MARGIN * settings.deflection)
 
     def _sweep(self, reach: float) -> None:
         """Begin a sweep by ``reach`` [m]."""
@@ -239,7 +239,7 @@ class Probing:
 
     def learned(self) -> Learned | str | None:
         """Return what was found, or why the weld must not begin; None: it is swept again."""
-        if len(self._felt) < FEWEST:
+        if len(self._felt) < FEWEST_SWEPT:
             return "the tag was seen too seldom while the finger was probed"
         felt, cycles = np.array(self._felt), np.array(self._cycles)
         found, climbs = self._fit(felt, cycles)

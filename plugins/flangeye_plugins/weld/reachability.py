@@ -14,7 +14,7 @@ from flangeye.models.finger import Finger
 from flangeye.models.robots import RobotModel
 from flangeye.motion.clearance import ArmVolume
 from flangeye.motion.limits import MotionLimits
-from flangeye.motion.route import STEP, TABLE, Barred, Route, Router
+from flangeye.motion.route import LARGEST_TURN, TABLE, Barred, Route, Router
 from flangeye.types import Floats, Transform
 from flangeye_plugins.weld.frame import Tool
 from flangeye_plugins.weld.path import Path, Place
@@ -63,7 +63,7 @@ class Station(NamedTuple):
     pose: Transform
 
 
-class Bar(NamedTuple):
+class Barrier(NamedTuple):
     """Why the arm must not be in a posture, and how near it came to being allowed."""
 
     rank: int
@@ -123,7 +123,7 @@ class SeamReach:
 
     def _touches(self, start: Floats, goal: Floats) -> Barred | None:
         """Say where finger or torch would come too near to the work's face."""
-        count = 2 + int(np.abs(goal - start).max() / STEP)
+        count = 2 + int(np.abs(goal - start).max() / LARGEST_TURN)
         postures = start + np.linspace(0.0, 1.0, count)[:, None] * (goal - start)
         task = self._task
         allowed = float(task.plan.points[:, 2].max()) + 0.9 * task.params.clearance
@@ -145,7 +145,7 @@ class SeamReach:
     def _drivable(self, stations: list[Station], postures: list[Floats]) -> list[Floats]:
         """Return the chains of postures (M, n), one for each station, that can be driven."""
         found: list[Floats] = []
-        refusals: list[tuple[int, Bar]] = []
+        refusals: list[tuple[int, Barrier]] = []
         for first in postures[0]:
             chain = [first]
             for i in range(len(stations)):
@@ -169,21 +169,21 @@ class SeamReach:
         allowed = ((chain + turns >= low) & (chain + turns <= high)).all(axis=0)
         return np.asarray(chain + np.where(allowed, turns, 0.0))
 
-    def _bars(self, before: Floats, joints: Floats) -> Bar | None:
+    def _bars(self, before: Floats, joints: Floats) -> Barrier | None:
         """Say why a posture must not be taken after another."""
         # The order matters: of all that was tried, what came farthest in it is told.
         axes = self._volume.axes(self._arm.frames(joints))
         if not self._volume.above(axes, TABLE):
-            return Bar(0, "the arm touches the table")
+            return Barrier(0, "the arm touches the table")
         if not self._volume.apart(axes):
-            return Bar(1, "the arm touches itself")
+            return Barrier(1, "the arm touches itself")
         if why := self._task.limits.beyond(joints, ROOM):
-            return Bar(2, why)
+            return Barrier(2, why)
         if np.abs(joints - before).max() > JUMP:
-            return Bar(3, "the arm would have to change its posture")
+            return Barrier(3, "the arm would have to change its posture")
         fastest, allowed = self._fastest(joints), self._task.limits.joint_speed
         if fastest > allowed:
-            return Bar(
+            return Barrier(
                 4,
                 f"a joint may have to turn at {np.degrees(fastest):.0f} deg/s, "
                 f"robot.limits.joint_speed allows {np.degrees(allowed):.0f} deg/s",

@@ -42,7 +42,7 @@ GRAIN = 1e-3
 BEHIND = 10e-3
 """Places so far behind the torch are not smoothed any more [m]."""
 
-STEPS = 4
+CYCLE_STEPS = 4
 """Places and samples that one control cycle takes in."""
 
 
@@ -113,7 +113,7 @@ class RefinedPath:
         """
         self._sure.append((s, offset, angle, doubt))
 
-    def renew(self, torch: float, steps: int = STEPS) -> None:
+    def renew(self, torch: float, steps: int = CYCLE_STEPS) -> None:
         """Take in a few places and samples that are believed, with the torch at ``torch``."""
         self._low = max(self._index(torch - BEHIND), 0)
         while self._sure and steps > 0:

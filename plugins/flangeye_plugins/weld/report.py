@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from flangeye.motion.seam_following import Controller, turned
 from flangeye.types import Floats, Note, Seam, WeldReport
-from flangeye_plugins.weld.body import Body
+from flangeye_plugins.weld.body import LeaningTool
 from flangeye_plugins.weld.frame import WorkPlane
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.resuming import follower_of
@@ -23,7 +23,7 @@ def report_of(  # noqa: PLR0913  all that a weld had
     seam: Seam,
     plane: WorkPlane,
     plan: Path,
-    body: Body,
+    body: LeaningTool,
     controller: Controller,
     weld_log: WeldLog,
     reason: str,
@@ -124,7 +124,7 @@ def learned_figures(controller: Controller) -> Mapping[str, float]:
 
 
 def _tip_displacements(
-    weld_log: WeldLog, plan: Path, body: Body, kept: NDArray[np.intp]
+    weld_log: WeldLog, plan: Path, body: LeaningTool, kept: NDArray[np.intp]
 ) -> tuple[Floats, Floats]:
     """Return where the tip was (K, 3) in the plane, and its deflection to the wall (K,).
 

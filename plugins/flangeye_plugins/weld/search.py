@@ -13,7 +13,7 @@ from flangeye.types import Floats
 from flangeye_plugins.weld.belief import Belief
 from flangeye_plugins.weld.settings import Following
 
-NEAR = 0.2e-3
+TURNED_WITHIN = 0.2e-3
 """A turning point of the sweep is reached when it is this close [m]."""
 
 SEATED = 0.1
@@ -38,7 +38,7 @@ STEEPER = 1.1
 """What friction gives at most is exceeded by this where there is a wall."""
 
 
-class Search:
+class SweepSearch:
     """A sweep of the tip across the planned start.
 
     Attributes:
@@ -113,7 +113,7 @@ class Search:
         """Return how far to go across [m], from where the end point is, left of the plan."""
         if not self.down:
             return 0.0
-        if self._turns and abs(self._turns[0] - lateral) < NEAR:
+        if self._turns and abs(self._turns[0] - lateral) < TURNED_WITHIN:
             self._turns.pop(0)
         self.over = not self._turns
         return self._turns[0] - lateral if self._turns else 0.0

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from flangeye.estimation.watch.blame import _noise, blame, explained, suspects
-from flangeye.estimation.watch.drift import Information, Sightings, allowance
+from flangeye.estimation.watch.drift import CheckSightings, Information, allowance
 from flangeye.maths.geometry import hat
 from flangeye.types import Floats
 from tools.checked_year import ABOUT, Happening, Year, watch
@@ -20,7 +20,7 @@ SEEN, BEFORE = WATCHED.sightings.of(0, 3), Information.of_covariance(WATCHED.pri
 THOUGHT = np.array([1e-4, -2e-4, 3e-4, 2e-4, -1e-4, 3e-4])
 
 
-def thought(sign: float = 1.0) -> tuple[Information, Sightings]:
+def thought(sign: float = 1.0) -> tuple[Information, CheckSightings]:
     """Return what is known and seen with the scanner thought to stand elsewhere [rad, m]."""
     known = Information(BEFORE.matrix, BEFORE.vector + BEFORE.matrix @ (sign * THOUGHT))
     return known, replace(SEEN, residuals=SEEN.residuals - SEEN.effects @ (sign * THOUGHT))
@@ -74,13 +74,13 @@ def test_blame_is_the_same_with_weights_of_the_arm_that_do_nothing() -> None:
     assert explained(Information.of_covariance(wide), more, ABOUT, WATCHED.scanner, DAILY)
 
 
-def one_sighting(residual: Floats) -> Sightings:
+def one_sighting(residual: Floats) -> CheckSightings:
     """Return one sighting by a scanner that stands a metre above, nothing else being known."""
     own = 1e-8 * np.eye(5)[None]
     effects = np.concatenate([-hat(np.array([[0, 0, -1.0]])), np.eye(3)[None]], axis=2)
     effects = np.concatenate([effects, np.zeros((1, 2, 6))], axis=1)
     turned = np.eye(3)[None]
-    return Sightings(residual[None], effects, own, turned, None, np.zeros(1, dtype=int))
+    return CheckSightings(residual[None], effects, own, turned, None, np.zeros(1, dtype=int))
 
 
 NOTHING = Information.of_covariance(1e-12 * np.eye(6))

@@ -9,10 +9,10 @@ import pytest
 
 from flangeye.estimation.watch.drift import (
     MISFIT,
+    CheckSightings,
     DriftTest,
     Information,
     Prior,
-    Sightings,
     _began,
     _change,
     _deviation,
@@ -102,7 +102,9 @@ def test_a_sighting_is_a_misfit_beyond_what_camera_day_and_scan_allow_together()
     residuals, effects = np.zeros((4, 5)), np.zeros((4, 5, 6))
     residuals[:, 0], effects[:, :3, 3:] = off, np.eye(3)
     own = np.tile(np.diag([scan**2] * 3 + [1e-6] * 2), (4, 1, 1))
-    seen = Sightings(residuals, effects, own, np.tile(np.eye(3), (4, 1, 1)), None, np.arange(4))
+    seen = CheckSightings(
+        residuals, effects, own, np.tile(np.eye(3), (4, 1, 1)), None, np.arange(4)
+    )
     assert misfits(seen, before, DriftTest()).tolist() == [False, True, False, True]
 
 
@@ -125,7 +127,7 @@ def test_weights_of_the_arm_are_told_by_every_check_less_the_days_motion_of_each
     rng, daily = np.random.default_rng(4), 3e-5
     effects, residuals = rng.normal(size=(9, 5, 8)), 1e-4 * rng.normal(size=(9, 5))
     own, check = np.tile(1e-9 * np.eye(5), (9, 1, 1)), np.repeat(np.arange(3), 3)
-    seen = Sightings(residuals, effects, own, np.tile(np.eye(3), (9, 1, 1)), None, check)
+    seen = CheckSightings(residuals, effects, own, np.tile(np.eye(3), (9, 1, 1)), None, check)
     found = information_of(seen, daily)
     assert found.matrix.shape == (3, 8, 8)
     rows = np.zeros((9, 5, 8 + 18))
@@ -231,7 +233,7 @@ def test_a_year_as_the_page_says() -> None:
     assert max(drift_year.slow(20)) < 0.3
 
 
-def a_sighting(motion: Floats, at: Floats, normal: bool = True) -> Sightings:
+def a_sighting(motion: Floats, at: Floats, normal: bool = True) -> CheckSightings:
     """Return four sightings of circles, the camera moved since about 0.5 m before it."""
     rng = np.random.default_rng(3)
     pose = rigid(rotation_exp(np.array([0.2, 2.8, 0.1])), np.array([0.5, 0.1, 1.2]))

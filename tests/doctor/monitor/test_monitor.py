@@ -22,7 +22,7 @@ from typer.testing import CliRunner, Result
 from flangeye.cli.commands import app
 from flangeye.doctor.monitor import History, from_arm, judge, stored_calibration
 from flangeye.doctor.monitor.chart import figure
-from flangeye.doctor.monitor.history import Finding
+from flangeye.doctor.monitor.history import CheckFinding
 from flangeye.doctor.monitor.watchman import write_state
 from flangeye.errors import FlangeyeError, StageError
 from flangeye.estimation.watch.drift import DriftTest
@@ -304,7 +304,7 @@ def test_the_state_is_written_into_an_opc_ua_node() -> None:
         number = await server.nodes.objects.add_variable(f"ns={space};s=code", "code", 7)
         for node in (text, number):
             await node.set_writable()
-        moved = Finding(0, "MOVED", 1e-3, (0.0,) * 6, 0, 2.0)
+        moved = CheckFinding(0, "MOVED", 1e-3, (0.0,) * 6, 0, 2.0)
         async with server:
             for name in ("state", "code"):
                 url = "opc.tcp://127.0.0.1:48411"
@@ -320,7 +320,7 @@ def test_a_plc_that_does_not_answer_is_one_line() -> None:
         StageError, match="opc.tcp://127.0.0.1:1, node 'ns=2;s=x': cannot be written"
     ):
         write_state(
-            "opc.tcp://127.0.0.1:1", "ns=2;s=x", Finding(0, "OK", 0.0, (0.0,) * 6, None, 0.1)
+            "opc.tcp://127.0.0.1:1", "ns=2;s=x", CheckFinding(0, "OK", 0.0, (0.0,) * 6, None, 0.1)
         )
 
 
@@ -348,7 +348,7 @@ def test_a_state_is_written_signed_and_encrypted(tmp_path: Path) -> None:
         await server.load_private_key(str(key))
         node = await server.nodes.objects.add_variable("ns=1;s=state", "state", "")
         await node.set_writable()
-        moved = Finding(0, "MOVED", 1e-3, (0.0,) * 6, 0, 2.0)
+        moved = CheckFinding(0, "MOVED", 1e-3, (0.0,) * 6, 0, 2.0)
         async with server:
             with pytest.raises(StageError, match="cannot be written"):
                 await asyncio.to_thread(write_state, url, "ns=1;s=state", moved, "none")

@@ -8,21 +8,26 @@ from itertools import product
 import numpy as np
 import pytest
 
-from flangeye.estimation.watch.pose_error import PoseError, _unlikelihood, _unsized, pose_error_of
+from flangeye.estimation.watch.pose_error import (
+    ArmPoseErrors,
+    _unlikelihood,
+    _unsized,
+    pose_error_of,
+)
 from flangeye.maths.geometry import hat, rigid, rotation_exp, rotation_log
 from flangeye.types import Floats
 
 NOISE = np.diag([3e-5**2] * 3 + [1e-4**2] * 2)
 
 
-def drawn(seed: int, smooth: float) -> tuple[Floats, Floats, Floats, Floats, PoseError]:
+def drawn(seed: int, smooth: float) -> tuple[Floats, Floats, Floats, Floats, ArmPoseErrors]:
     """Return residuals, effects, own covariances, poses of 40 poses, and what made them."""
     rng = np.random.default_rng(seed)
     turns = rotation_exp(rng.uniform(-0.4, 0.4, (40, 3)))
     poses = np.array([rigid(turn, rng.uniform(-0.2, 0.2, 3) + [0.5, 0, 0.4]) for turn in turns])
     own = np.tile(NOISE, (40, 1, 1))
     bare = pose_error_of(np.zeros((40, 5)), np.zeros((40, 5, 6)), own, poses)
-    made = PoseError(bare.middle, bare.lengths, (smooth, smooth), (1e-4, 2e-4))
+    made = ArmPoseErrors(bare.middle, bare.lengths, (smooth, smooth), (1e-4, 2e-4))
     effects = np.zeros((40, 5, 6))
     across = poses[:, :3, :2].transpose(0, 2, 1)
     effects[:, :3, :3], effects[:, :3, 3:] = -hat(poses[:, :3, 3] - poses[0, :3, 3]), np.eye(3)

@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 
 from flangeye.cli.commands import app
 from flangeye.doctor.monitor import (
-    Check,
     History,
+    MonitorCheck,
     StoredCalibration,
     judge,
     stored_calibration,
@@ -51,7 +51,7 @@ def test_a_real_arm_at_other_poses_is_no_alarm_and_a_knock_is_one(
     history = History(tmp_path / "h.jsonl", stored.key)
     for i in range(4):
         later = seen[3 * i : 3 * i + 3]
-        history.add(Check(str(i), tuple(_aside(o, shift if i > 1 else 0.0) for o in later)))
+        history.add(MonitorCheck(str(i), tuple(_aside(o, shift if i > 1 else 0.0) for o in later)))
         history.findings.append(judge(stored, history, DriftTest()))
     assert [finding.state for finding in history.findings] == states
 

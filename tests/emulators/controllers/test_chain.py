@@ -7,7 +7,12 @@ from hypothesis import strategies as st
 
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
-from flangeye_emulators.controllers.poses import Chain, UnreachableError, pose_matrix, twist_between
+from flangeye_emulators.controllers.poses import (
+    ToolChain,
+    UnreachableError,
+    pose_matrix,
+    twist_between,
+)
 
 MODELS = ["ur3e", "ur5", "ur5e", "ur10e", "aubo-i5", "franka-panda"]
 joint_angles = st.tuples(*[st.floats(-3.0, 3.0)] * 6).map(np.array)
@@ -16,7 +21,7 @@ joint_angles = st.tuples(*[st.floats(-3.0, 3.0)] * 6).map(np.array)
 @pytest.mark.parametrize("model", MODELS)
 def test_a_stance_agrees_with_the_kinematics_of_the_engine(model: str) -> None:
     robot = load_model("robots", model)
-    chain, arm = Chain(robot), Arm(robot)
+    chain, arm = ToolChain(robot), Arm(robot)
     joints = np.random.default_rng(1).uniform(-2, 2, arm.n)
     stance = chain.stance(joints)
     assert np.allclose(stance.base_T_tcp, arm.flange(joints), atol=1e-14)
@@ -24,7 +29,7 @@ def test_a_stance_agrees_with_the_kinematics_of_the_engine(model: str) -> None:
 
 
 def test_the_jacobian_is_the_tools() -> None:
-    chain = Chain(load_model("robots", "ur5e"))
+    chain = ToolChain(load_model("robots", "ur5e"))
     chain.flange_T_tcp = pose_matrix([0.05, 0.0, 0.12, 0.0, 0.3, 0.0])
     joints, step = np.array([0.2, -1.5, 1.4, -1.2, -1.5, 0.4]), 1e-6
     stance = chain.stance(joints)
@@ -34,7 +39,7 @@ def test_the_jacobian_is_the_tools() -> None:
         assert np.allclose(stance.jacobian[:, i], slope, atol=1e-8)
 
 
-CHAIN = Chain(load_model("robots", "ur5e"))
+CHAIN = ToolChain(load_model("robots", "ur5e"))
 
 
 @given(joint_angles, st.tuples(*[st.floats(-0.02, 0.02)] * 6).map(np.array))

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye_emulators.controllers.arm import Surface
+from flangeye_emulators.controllers.arm import SpringSurface
 from flangeye_emulators.controllers.ur.controller import SafetyMode
 from tests.emulators.controllers.desk import Desk, away
 
@@ -16,7 +16,7 @@ DOWN = [0, 0, -1.0, 0, 0, 0]
 @pytest.fixture
 def over_floor(desk: Desk) -> Any:
     """A desk whose tool is 10 mm above a surface of 20 N/mm."""
-    desk.arm.surfaces.append(Surface.floor(desk.pose()[2] - 0.01))
+    desk.arm.surfaces.append(SpringSurface.floor(desk.pose()[2] - 0.01))
     return desk
 
 
@@ -26,7 +26,7 @@ def press(desk, newton, compliant=(0, 0, 1, 0, 0, 0), seconds=2.0):
 
 
 def test_a_surface_is_a_spring_that_never_pulls() -> None:
-    surface = Surface.floor(0.1)
+    surface = SpringSurface.floor(0.1)
     below, still = np.array([0.3, 0.2, 0.0999]), np.zeros(3)
     assert surface.force(below, still) == pytest.approx([0, 0, 2.0])
     assert not surface.force(away(below, 0, 0, 0.1), still).any()
@@ -39,7 +39,7 @@ def test_a_surface_is_a_spring_that_never_pulls() -> None:
 )
 def test_a_surface_that_makes_no_sense_is_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="a surface"):
-        Surface(**{"point": [0, 0, 0], "normal": [0, 0, 1], **wrong})
+        SpringSurface(**{"point": [0, 0, 0], "normal": [0, 0, 1], **wrong})
 
 
 @pytest.mark.parametrize("stiffness", [2e3, 20e3, 200e3])
@@ -47,7 +47,9 @@ def test_force_mode_finds_the_surface_and_holds_the_force(
     over_floor: Any, stiffness: float
 ) -> None:
     desk = over_floor
-    desk.arm.surfaces[:] = [Surface(desk.arm.surfaces[0].point, np.array([0, 0, 1]), stiffness)]
+    desk.arm.surfaces[:] = [
+        SpringSurface(desk.arm.surfaces[0].point, np.array([0, 0, 1]), stiffness)
+    ]
     start = desk.pose()
     press(desk, -15.0, seconds=4.0)
     forces = np.array([felt[2] for *_, felt in desk.trace])

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye_emulators.controllers.arm import Surface
+from flangeye_emulators.controllers.arm import SpringSurface
 from flangeye_emulators.controllers.poses import pose_matrix, twist_between
 from tests.emulators.controllers.desk import HOME, away
 from tests.emulators.controllers.process import Process
@@ -193,7 +193,7 @@ def test_a_servo_follows(cell: Any, how: str) -> None:
 
 def test_touch(cell: Any) -> None:
     floor = cell.pose()[2] - 0.02
-    cell.control.set_surfaces(Surface(np.array([0, 0, floor]), np.array([0, 0, 1])))
+    cell.control.set_surfaces(SpringSurface(np.array([0, 0, floor]), np.array([0, 0, 1])))
     assert cell.robot.zeroFtSensor()
     assert cell.robot.moveUntilContact([0, 0, -0.04, 0, 0, 0])
     assert cell.pose()[2] == pytest.approx(floor, abs=3e-4)

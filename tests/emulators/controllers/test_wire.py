@@ -19,7 +19,7 @@ from flangeye.maths.kinematics import Arm
 from flangeye.models.graph import EmulatorOptions
 from flangeye.models.loading import load_model
 from flangeye_emulators.controllers import server
-from flangeye_emulators.controllers.arm import Surface
+from flangeye_emulators.controllers.arm import SpringSurface
 from flangeye_emulators.controllers.client import EmulatorControl
 from flangeye_emulators.controllers.network import Network
 from flangeye_emulators.controllers.ur.server import serve
@@ -198,7 +198,7 @@ def test_surfaces_can_be_changed(process: Any) -> None:
     process.control.put(HOME)
     height = process.control.truth().base_T_flange[2, 3]
     process.control.set_surfaces(
-        Surface(np.array([0, 0, height + 1e-3]), np.array([0, 0, 1]), 10e3)
+        SpringSurface(np.array([0, 0, height + 1e-3]), np.array([0, 0, 1]), 10e3)
     )
     time.sleep(0.02)
     assert process.control.state()["force"][2] == pytest.approx(10.0)

@@ -15,7 +15,7 @@ from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
 from flangeye.motion.seam_following import ToolPose
 from flangeye_emulators.finger.sensor import SimulatedFingerParams, sensor_simulated_finger
-from flangeye_emulators.robot.simulated import SimulatedParams, SimulatedRobot
+from flangeye_emulators.robot.simulated import SimulatedRobot, SimulatedRobotParams
 from tests.plugins.weld.cell import HOME, MODEL, planned, run, true_line
 
 FINGER = read_model(bundled("data") / "fingers" / "srm.yaml", Finger)
@@ -30,7 +30,7 @@ class Growing(list[Any]):
 
 
 def test_as_many_times_as_places_are_told() -> None:
-    arm = SimulatedParams(period="16 ms", joints=HOME)
+    arm = SimulatedRobotParams(period="16 ms", joints=HOME)
     robot = SimulatedRobot(MODEL, arm)
     sensor: Any = sensor_simulated_finger.function(FINGER, robot, 0, SimulatedFingerParams())
     sensor.frame()
@@ -42,7 +42,7 @@ def test_as_many_times_as_places_are_told() -> None:
 @pytest.mark.parametrize("workpiece", ["v-straight", "v-curved"])
 def test_the_torch_is_told_beside_the_plan_as_it_lies_beside_the_true_seam(workpiece: str) -> None:
     """What scores it knows the planned seam; the true one wanders, and heat moves it."""
-    robot = SimulatedRobot(MODEL, SimulatedParams(period="16 ms", joints=HOME))
+    robot = SimulatedRobot(MODEL, SimulatedRobotParams(period="16 ms", joints=HOME))
     world = {"workpiece": {"wave": "1 mm", "wave_length": "30 mm", "bow": "1 mm"},
              "heat": {"local": "0.5 mm"}}  # fmt: skip
     given = SimulatedFingerParams.model_validate({"workpiece": workpiece, "world": world})
@@ -84,7 +84,7 @@ def edited() -> list[tuple[str, Finger]]:
 
 def happenings(finger: Finger) -> list[Any]:
     """All that a world does while an arm moves through it, as bytes."""
-    robot = SimulatedRobot(MODEL, SimulatedParams(period="16 ms", joints=HOME))
+    robot = SimulatedRobot(MODEL, SimulatedRobotParams(period="16 ms", joints=HOME))
     given = SimulatedFingerParams.model_validate(
         {"world": {"clock": {"latency": "0 ms", "jitter": "0 ms"}}}
     )

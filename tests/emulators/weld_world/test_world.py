@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from flangeye.motion.seam_following import Command, ToolPose
-from flangeye_emulators.weld_world.groove import Contact, Groove, Tip
+from flangeye_emulators.weld_world.groove import Groove, Tip, TipContact
 from flangeye_emulators.weld_world.settings import (
     ArmTruth,
     ClockTruth,
@@ -17,7 +17,7 @@ from flangeye_emulators.weld_world.settings import (
 from flangeye_emulators.weld_world.world import (
     ArmError,
     ArmResponse,
-    Distortion,
+    SeamDistortion,
     Shutter,
     TrueFinger,
     TrueTool,
@@ -128,10 +128,10 @@ def test_the_workpiece_is_not_its_cad() -> None:
 
 
 def test_heat_moves_the_seam_as_a_whole_and_near_the_torch() -> None:
-    whole = Distortion(params(HeatTruth, shift="2 mm"), 0.1)
+    whole = SeamDistortion(params(HeatTruth, shift="2 mm"), 0.1)
     assert whole.at(0.05, -0.01) == 0.0
     assert whole.at(0.09, 0.05) == pytest.approx(1e-3)
-    near = Distortion(params(HeatTruth, local="1 mm"), 0.1)
+    near = SeamDistortion(params(HeatTruth, local="1 mm"), 0.1)
     assert near.at(0.05, 0.05) == pytest.approx(1e-3)
     assert near.at(0.09, 0.05) < 0.05e-3
 
@@ -141,7 +141,7 @@ def test_friction_holds_a_tip_on_a_wall_and_on_the_face() -> None:
     seat = 1.5e-3 / np.sin(SECTION.half_angle)
 
     def settled(friction, ways, height):
-        contact = Contact(groove, Tip(friction=friction))
+        contact = TipContact(groove, Tip(friction=friction))
         return [contact.settle(np.array([0.1, y, height]))[1] for y in ways]
 
     assert settled(0.0, [2e-3], seat - 0.3e-3)[-1] > settled(0.2, [2e-3], seat - 0.3e-3)[-1] > 0

@@ -10,7 +10,7 @@ from flangeye.models.scanners import ScannerModel
 from flangeye.models.targets import Flange, plate_of
 from flangeye_emulators.world import materials
 from flangeye_emulators.world.mesh import box, flange_mesh, wrist_mesh
-from flangeye_emulators.world.raycast import Body, Scene
+from flangeye_emulators.world.raycast import RaycastScene, SolidBody
 
 SCANNER = load_model("scanners", "phoxi-m")
 
@@ -30,17 +30,20 @@ def facing(tilt: float = 0.0, depth: float = 0.7, aside: float = 0.0) -> np.ndar
     return rigid(rotation_from_rpy(np.pi + tilt, 0.0, 0.0), np.array([aside, 0.0, depth]))
 
 
-def plate(depth: float, material=materials.WALL, half: float = 0.5) -> Body:
+def plate(depth: float, material=materials.WALL, half: float = 0.5) -> SolidBody:
     """Return a flat plate across the view."""
-    return Body(box([-half, -half, depth], [half, half, depth + 0.01]), material)
+    return SolidBody(box([-half, -half, depth], [half, half, depth + 0.01]), material)
 
 
-def flange_scene(camera_T_flange: np.ndarray, robot: str = "ur5") -> Scene:
+def flange_scene(camera_T_flange: np.ndarray, robot: str = "ur5") -> RaycastScene:
     """Return a flange on its wrist, 0.3 m before a table."""
     shape = flange(robot)
-    carried = [Body(flange_mesh(shape), materials.METAL), Body(wrist_mesh(shape), materials.METAL)]
+    carried = [
+        SolidBody(flange_mesh(shape), materials.METAL),
+        SolidBody(wrist_mesh(shape), materials.METAL),
+    ]
     behind = float(camera_T_flange[2, 3]) + 0.3
-    return Scene([body.moved(camera_T_flange) for body in carried] + [plate(behind)])
+    return RaycastScene([body.moved(camera_T_flange) for body in carried] + [plate(behind)])
 
 
 def in_flange(points: np.ndarray, camera_T_flange: np.ndarray) -> np.ndarray:

@@ -15,14 +15,14 @@ from flangeye.types import BASE, FLANGE, TARGET, Source, Transform, Truth
 from flangeye_emulators.acquire.planned_session import plan_session
 from flangeye_emulators.acquire.simulated import acquire_simulated
 from flangeye_emulators.acquire.simulated_params import SimulatedParams
-from flangeye_emulators.acquire.simulated_session import MarkerParams
+from flangeye_emulators.acquire.simulated_session import SimulatedMarkerParams
 from flangeye_emulators.world.arm import REAL, ArmErrors, ErrorSizes, ImperfectArm
 from flangeye_emulators.world.scanner import CameraPose
-from flangeye_emulators.world.session import View
+from flangeye_emulators.world.session import CameraView
 from flangeye_plugins.plan.grid import GridParams, grid
 
 HOME = np.radians([0, -90, 90, -90, -90, 0])
-VIEW = View(0.65, 0.3, 2.0, (0.9, 0.7), 0.9)
+VIEW = CameraView(0.65, 0.3, 2.0, (0.9, 0.7), 0.9)
 EYE_IN_HAND = Configuration("eye-in-hand", FLANGE, BASE)
 
 
@@ -138,7 +138,7 @@ def test_no_scale_is_a_perfect_arm() -> None:
 
 
 def planned(errors, configuration=EYE_IN_HAND, **changes):
-    params = MarkerParams(poses=12, arm=errors, **changes)
+    params = SimulatedMarkerParams(poses=12, arm=errors, **changes)
     rng = np.random.default_rng(3)
     return plan_session(load_model("robots", "ur5"), None, configuration, (params, VIEW), rng)
 

@@ -5,7 +5,7 @@ import pytest
 
 from flangeye.models.loading import load_model
 from flangeye_emulators.world.cell import SimulatedCell
-from flangeye_emulators.world.raycast import Pixels, Scene, _rays, pixels_of
+from flangeye_emulators.world.raycast import Pixels, RaycastScene, _rays, pixels_of
 from tests.emulators.world.bench import SCANNER, facing, flange, flange_scene, plate, zoomed
 
 
@@ -62,7 +62,7 @@ def test_shadows_at_every_second_pixel_are_those_at_every_pixel() -> None:
 
 def test_a_gap_shows_nothing() -> None:
     pixels = pixels_of(SCANNER, 0.05)
-    seen = Scene([plate(0.8, half=0.1)]).look(pixels)
+    seen = RaycastScene([plate(0.8, half=0.1)]).look(pixels)
     assert not np.isfinite(seen.depth[0, 0])
     assert seen.depth[38, 51] == pytest.approx(0.8, abs=1e-6)
 

@@ -8,7 +8,7 @@ import pytest
 from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye_emulators.world import materials, scan_errors
 from flangeye_emulators.world.mesh import box
-from flangeye_emulators.world.raycast import Body, Scene, pixels_of
+from flangeye_emulators.world.raycast import RaycastScene, SolidBody, pixels_of
 from flangeye_emulators.world.scan_errors import Distortion, correlated_normal, normal_quantile
 from flangeye_emulators.world.structured_light import StructuredLight
 from tests.emulators.world.bench import (
@@ -34,7 +34,7 @@ def scan(scanner, scene, resolution=1.0, noise=1.0, seed=0):
 def tilted_plate(tilt, material=materials.WALL):
     """A large plate through (0, 0, 0.788 m), turned about the image's y."""
     turn = rigid(rotation_from_rpy(0, tilt, 0), np.array([0, 0, (SCANNER.near + SCANNER.far) / 2]))
-    return Scene([Body(box([-0.6, -0.6, 0], [0.6, 0.6, 0.01]), material).moved(turn)])
+    return RaycastScene([SolidBody(box([-0.6, -0.6, 0], [0.6, 0.6, 0.01]), material).moved(turn)])
 
 
 def test_without_noise_the_face_is_a_plane_and_the_rim_a_circle() -> None:
@@ -65,8 +65,8 @@ def test_a_scan_is_organised_and_missing_points_are_nan() -> None:
 
 
 def test_the_projector_throws_shadows_away_from_itself() -> None:
-    block = Body(box([-0.05, -0.05, 0.7], [0.05, 0.05, 0.72]), materials.WALL)
-    points = scan(quiet(projection=None), Scene([block, plate(0.9)]), 0.2, noise=0.0)
+    block = SolidBody(box([-0.05, -0.05, 0.7], [0.05, 0.05, 0.72]), materials.WALL)
+    points = scan(quiet(projection=None), RaycastScene([block, plate(0.9)]), 0.2, noise=0.0)
     pixels = pixels_of(SCANNER, 0.2)
     row = points[points.shape[0] // 2, :, 2]
     x_behind = pixels.directions[points.shape[0] // 2, :, 0] * 0.9
@@ -85,7 +85,7 @@ def test_the_projector_throws_shadows_away_from_itself() -> None:
 
 
 def test_the_projector_lights_only_its_own_field() -> None:
-    points = scan(quiet(), Scene([plate(1.1, half=1.0)]), 0.1, noise=0.0)
+    points = scan(quiet(), RaycastScene([plate(1.1, half=1.0)]), 0.1, noise=0.0)
     missing = np.isnan(points[..., 2]).mean(axis=0) > 0.5
     assert missing[-1] and not missing[0], "far off, its field lies towards its far side"
 
@@ -106,7 +106,8 @@ def test_noise_is_as_the_data_sheet_says_and_grows_with_incidence(tilt: float) -
 def test_noise_grows_with_the_square_of_the_depth() -> None:
     scanner = zoomed(quiet(calibration_error=0.0))
     deviation = [
-        np.nanstd(scan(scanner, Scene([plate(depth)]))[100:200, 100:300, 2]) for depth in (0.5, 1.0)
+        np.nanstd(scan(scanner, RaycastScene([plate(depth)]))[100:200, 100:300, 2])
+        for depth in (0.5, 1.0)
     ]
     assert deviation[1] / deviation[0] == pytest.approx(4.0, rel=0.04)
 
@@ -114,7 +115,7 @@ def test_noise_grows_with_the_square_of_the_depth() -> None:
 @pytest.mark.parametrize(("material", "grain"), [(materials.METAL, 1.2), (materials.ANODISED, 1.5)])
 def test_metal_is_noisier(material: Any, grain: float) -> None:
     scanner = zoomed(quiet(calibration_error=0.0))
-    points = scan(scanner, Scene([plate(0.788, material)]))[120:180, 160:240, 2]
+    points = scan(scanner, RaycastScene([plate(0.788, material)]))[120:180, 160:240, 2]
     assert np.nanstd(points) == pytest.approx(grain * scanner.temporal_noise, rel=0.05)
 
 

@@ -6,7 +6,7 @@ import pytest
 from flangeye.models.loading import load_model
 from flangeye_emulators.world import materials, time_of_flight
 from flangeye_emulators.world.mesh import box
-from flangeye_emulators.world.raycast import Body, Scene, pixels_of
+from flangeye_emulators.world.raycast import RaycastScene, SolidBody, pixels_of
 from flangeye_emulators.world.time_of_flight import TimeOfFlight
 from tests.emulators.world.bench import plate
 
@@ -16,7 +16,7 @@ KINECT = load_model("scanners", "azure-kinect")
 def scan(bodies, resolution=0.25, noise=1.0, seed=0, **changes):
     scanner = KINECT.model_copy(update={"calibration_error": 0.0, "noise_grain": 0.0, **changes})
     camera = TimeOfFlight(scanner, resolution, noise, np.random.default_rng(7))
-    return camera.scan(Scene(bodies), np.random.default_rng(seed))
+    return camera.scan(RaycastScene(bodies), np.random.default_rng(seed))
 
 
 def middle(points):
@@ -53,7 +53,7 @@ def test_metal_is_much_noisier() -> None:
 
 
 def test_steps_in_metal_are_measured_too_far() -> None:
-    block = Body(box([-0.1, -0.1, 0.75], [0.1, 0.1, 0.8]), materials.METAL)
+    block = SolidBody(box([-0.1, -0.1, 0.75], [0.1, 0.1, 0.8]), materials.METAL)
     points = scan([block, plate(1.0, half=1.0)], resolution=1.0, temporal_noise=0.0)
     rows, columns = points.shape[:2]
     across = points[rows // 2, :, 2] - 0.75
@@ -64,7 +64,7 @@ def test_steps_in_metal_are_measured_too_far() -> None:
 
 
 def test_pixels_at_an_edge_see_both_sides() -> None:
-    block = Body(box([-0.1, -0.1, 0.75], [0.1, 0.1, 0.8]), materials.WALL)
+    block = SolidBody(box([-0.1, -0.1, 0.75], [0.1, 0.1, 0.8]), materials.WALL)
     points = scan([block, plate(1.0, half=1.0)], resolution=1.0)
     depth = points[..., 2]
     between = (depth > 0.77) & (depth < 0.98)

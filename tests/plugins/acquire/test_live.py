@@ -6,14 +6,16 @@ import numpy as np
 import pytest
 
 from flangeye.maths.geometry import rigid, rotation_exp
-from flangeye.motion.supervision import Sample
+from flangeye.motion.supervision import RememberedState
 from flangeye_plugins.acquire.live import Idle, movement, within
 
 
 def samples(*times, move=0.0, turn=0.0):
     """Return samples of an arm that moves and turns by so much from each to the next."""
     return [
-        Sample(time, rigid(rotation_exp([0.0, 0.0, turn * i]), [move * i, 0.0, 0.0]), np.zeros(6))
+        RememberedState(
+            time, rigid(rotation_exp([0.0, 0.0, turn * i]), [move * i, 0.0, 0.0]), np.zeros(6)
+        )
         for i, time in enumerate(times)
     ]
 

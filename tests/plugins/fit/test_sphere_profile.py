@@ -31,7 +31,7 @@ from flangeye_plugins.fit.circles import (
     circle_residuals,
 )
 from flangeye_plugins.fit.sphere_profile import (
-    Arc,
+    PlanarCircle,
     SphereProfileParams,
     _covariance,
     _why_not,
@@ -222,7 +222,10 @@ def test_the_circles_covariance_is_carried_to_the_centre() -> None:
     points = (0.016 + 1e-4 * rng.standard_normal(500))[:, None] * np.stack(
         [np.cos(angle), np.sin(angle)], axis=1
     )
-    arc, ring = Arc(Circles(np.zeros(2), np.array([0.016])), points, 2e-4), np.zeros(500, int)
+    arc, ring = (
+        PlanarCircle(Circles(np.zeros(2), np.array([0.016])), points, 2e-4),
+        np.zeros(500, int),
+    )
     residual = circle_residuals(arc.circles, points, ring)
     of_circle = clustered_covariance(
         circle_jacobian(arc.circles, points, ring), residual, cauchy_weights(residual, 2e-4),

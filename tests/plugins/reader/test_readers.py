@@ -20,7 +20,7 @@ from flangeye.run.runner import Runner
 from flangeye.types import ArchivePath, PointCloud
 from flangeye_plugins.reader.samples import (
     EasyHandeyeParams,
-    ZividParams,
+    ZividSamplesParams,
     easy_handeye,
     moveit,
     zivid,
@@ -116,7 +116,7 @@ def test_a_folder_as_zivid_writes_it(tmp_path: Path, style: str, unit: str, fact
         )
         (tmp_path / f"pos{i:02}.yaml").write_text(text)
         write_cloud(tmp_path / f"img{i:02}.ply", cloud)
-    archive = zivid(tmp_path, ZividParams(length=unit))
+    archive = zivid(tmp_path, ZividSamplesParams(length=unit))
     assert np.allclose([r.base_T_flange for r in archive.recordings], POSES, atol=1e-9)
     assert [r.cloud.name for r in archive.recordings] == [f"img{i:02}.ply" for i in range(1, 6)]
 
@@ -127,7 +127,7 @@ def test_zivids_own_scans_need_its_sdk(tmp_path: Path) -> None:
     )
     (tmp_path / "img01.zdf").write_bytes(b"zdf")
     with pytest.raises(StageError, match="img01.zdf: only Zivid's SDK reads it; export it as .ply"):
-        zivid(tmp_path, ZividParams(length="mm"))
+        zivid(tmp_path, ZividSamplesParams(length="mm"))
 
 
 def write_images(folder, count=5):
@@ -271,7 +271,7 @@ def test_a_mistake_in_samples_is_named(
 @pytest.mark.parametrize(
     ("read", "params"),
     [(easy_handeye, EasyHandeyeParams(calibration="eye_on_base")), (moveit, None), (table, KUKA),
-     (zivid, ZividParams(length="mm"))],
+     (zivid, ZividSamplesParams(length="mm"))],
 )  # fmt: skip
 def test_another_layout_is_not_taken(tmp_path: Path, read: Any, params: Any) -> None:
     (tmp_path / "notes.yaml").write_text("hello: world\n")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from flangeye.devices import GRACE, SILENT, DeviceError, Robot
-from flangeye_emulators.controllers.arm import Surface
+from flangeye_emulators.controllers.arm import SpringSurface
 from tests.plugins.robot.cell import arrived, in_time, moved, until
 
 
@@ -162,7 +162,7 @@ class DrivesAnArm:
 
     def test_what_is_touched_is_felt_at_the_flange(self, robot: Any, controller: Any) -> None:
         start = robot.state().base_T_flange
-        controller.control.set_surfaces(Surface.floor(start.translation[2] - 0.0095))
+        controller.control.set_surfaces(SpringSurface.floor(start.translation[2] - 0.0095))
         down = arrived(robot, lambda: robot.move_linear(moved(start, z=-0.01), 0.01, 0.1))
         np.testing.assert_allclose(down.force, [0, 0, 10, 0, 0, 0], atol=0.1)
 

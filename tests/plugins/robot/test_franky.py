@@ -11,7 +11,7 @@ import pytest
 
 from flangeye.devices import SILENT, DeviceError, Robot
 from flangeye.maths.geometry import rigid, rotation_exp
-from flangeye_emulators.controllers.arm import Surface
+from flangeye_emulators.controllers.arm import SpringSurface
 from flangeye_plugins.robot.franky import (
     FrankyParams,
     FrankyRobot,
@@ -164,7 +164,7 @@ def test_a_motion_that_nobody_looks_at_is_stopped_once(robot: Any, connection: S
 
 def test_what_is_touched_is_felt(robot: Any, connection: StandIn) -> None:
     start = robot.state().base_T_flange
-    connection.arm.surfaces.append(Surface.floor(start.translation[2] - 0.0095))
+    connection.arm.surfaces.append(SpringSurface.floor(start.translation[2] - 0.0095))
     robot.move_linear(moved(start, z=-0.01), 0.01, 0.1)
     np.testing.assert_allclose(settle(robot).force, [0, 0, 10, 0, 0, 0], atol=1e-6)
 

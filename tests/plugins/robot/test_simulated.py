@@ -12,15 +12,15 @@ from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
 from flangeye.types import Transform
-from flangeye_emulators.controllers.arm import Surface
+from flangeye_emulators.controllers.arm import SpringSurface
 from flangeye_emulators.controllers.poses import twist_between
-from flangeye_emulators.robot.simulated import SimulatedParams, robot_simulated
+from flangeye_emulators.robot.simulated import SimulatedRobotParams, robot_simulated
 
 MODELS = ("ur3e", "ur5", "ur5e", "ur10e", "aubo-i5", "franka-panda")
 
 
 def robot_of(model="ur5e", **params):
-    return robot_simulated(load_model("robots", model), SimulatedParams(**params))
+    return robot_simulated(load_model("robots", model), SimulatedRobotParams(**params))
 
 
 @pytest.fixture
@@ -153,7 +153,7 @@ def test_the_same_commands_give_the_same_states() -> None:
 
 def test_what_it_touches_is_felt(robot: Any) -> None:
     start = robot.state().base_T_flange
-    robot.arm.surfaces.append(Surface.floor(start.translation[2] - 0.0095))
+    robot.arm.surfaces.append(SpringSurface.floor(start.translation[2] - 0.0095))
     robot.move_linear(moved(start, z=-0.01), 0.01, 0.1)
     np.testing.assert_allclose(arrive(robot)[-1].force, [0, 0, 10, 0, 0, 0], atol=1e-6)
 
@@ -170,8 +170,8 @@ def test_its_time_passes_faster_than_the_clock(robot: Any) -> None:
 def test_an_arm_of_another_maker_is_told_where_to_start() -> None:
     model = load_model("robots", "ur5e").model_copy(update={"maker": "Acme"})
     with pytest.raises(StageError) as error:
-        robot_simulated(model, SimulatedParams())
+        robot_simulated(model, SimulatedRobotParams())
     assert str(error.value) == "give the joint angles at which a ur5e shall start"
     joints = np.radians([0.0, -90, 90, -90, -90, 0])
-    params = SimulatedParams(joints=tuple(f"{angle} rad" for angle in joints))
+    params = SimulatedRobotParams(joints=tuple(f"{angle} rad" for angle in joints))
     assert robot_simulated(model, params).state().joints == pytest.approx(joints)

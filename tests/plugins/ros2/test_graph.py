@@ -12,12 +12,12 @@ from flangeye.models.loading import load_model
 from flangeye.testing import RobotConformance, ScannerConformance
 from flangeye_plugins.robot.ros2.driver import (
     FreedriveParams,
-    Ros2Params,
+    Ros2RobotParams,
     robot_ros2,
     robot_ros2_freedrive,
 )
 from flangeye_plugins.ros2.graph import Ros2Graph, described_arm
-from flangeye_plugins.scanner.ros2 import Ros2Params as Topics
+from flangeye_plugins.scanner.ros2 import Ros2ScannerParams as Topics
 from flangeye_plugins.scanner.ros2 import scanner_ros2
 from tests.plugins.ros2 import installed
 from tests.plugins.ros2.cell import (
@@ -51,7 +51,7 @@ def cell():
 @pytest.mark.usefixtures("cell")
 class TestRobot(RobotConformance):
     part = robot_ros2
-    params = Ros2Params(joints=JOINTS, trajectory=Controller.topic)
+    params = Ros2RobotParams(joints=JOINTS, trajectory=Controller.topic)
 
     def context(self):
         return {bool: False}
@@ -85,7 +85,7 @@ def test_the_pose_may_come_from_tf_and_is_lost_with_it(env):
 
 def test_simulated_time_drives_arm_and_camera(env):
     with peers(Controller(env, sim_time=True), Camera(env, "zivid", sim_time=True)) as (arm, _):
-        params = Ros2Params(joints=tuple(arm.joints), trajectory=arm.topic, sim_time=True)
+        params = Ros2RobotParams(joints=tuple(arm.joints), trajectory=arm.topic, sim_time=True)
         with robot_ros2.function(ARM, params) as robot:
             goal = robot.state().joints + 0.1
             robot.move_joints(goal, 0.5, 2.0)
@@ -95,7 +95,7 @@ def test_simulated_time_drives_arm_and_camera(env):
         topics = Topics(cloud="/camera/points", trigger="/camera/capture", sim_time=True)
         with scanner_ros2.function(EYE, topics) as eye:
             assert eye.expose()().cloud.xyz.ndim == 3
-        wall = Ros2Params(joints=tuple(arm.joints), trajectory=arm.topic)
+        wall = Ros2RobotParams(joints=tuple(arm.joints), trajectory=arm.topic)
         with pytest.raises(DeviceError, match="sim_time: true where stamps are of /clock"):
             robot_ros2.function(ARM, wall)
 

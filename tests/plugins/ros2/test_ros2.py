@@ -9,11 +9,11 @@ from flangeye.devices import DeviceError
 from flangeye.models.loading import load_model
 from flangeye_plugins.robot.ros2.driver import (
     FreedriveParams,
-    Ros2Params,
+    Ros2RobotParams,
     robot_ros2,
     robot_ros2_freedrive,
 )
-from flangeye_plugins.scanner.ros2 import Ros2Params as Topics
+from flangeye_plugins.scanner.ros2 import Ros2ScannerParams as Topics
 from flangeye_plugins.scanner.ros2 import scanner_ros2
 from tests.plugins.fixed import fixed
 from tests.plugins.ros2.cell import Camera, Controller, peers
@@ -28,7 +28,7 @@ ARM, EYE = load_model("robots", "ur5e"), load_model("scanners", "phoxi-m")
 
 def opened(controller, **params):
     given = {"joints": tuple(controller.joints), "trajectory": controller.topic}
-    return robot_ros2.function(ARM, Ros2Params(**given | params))
+    return robot_ros2.function(ARM, Ros2RobotParams(**given | params))
 
 
 def drive(robot, goal, speed=0.5, seconds=10.0):

@@ -19,7 +19,7 @@ from flangeye.types import (
     VerifiedHandEye,
     WorkpieceScan,
 )
-from flangeye_emulators.robot.simulated import SimulatedParams, SimulatedRobot
+from flangeye_emulators.robot.simulated import SimulatedRobot, SimulatedRobotParams
 from flangeye_emulators.scanner.mounted import MountedParams, scanner_mounted
 from flangeye_plugins.scan.along import AlongParams, scan_along
 
@@ -43,7 +43,7 @@ def on_flange(
 
 
 def simulated_arm(errors: int | None = 1) -> RobotDriver:
-    params = SimulatedParams.model_validate(
+    params = SimulatedRobotParams.model_validate(
         {"period": "16 ms", "joints": HOME, "joint_errors": errors}
     )
     return RobotDriver("robot.simulated", lambda: SimulatedRobot(UR10E, params), simulated=True)

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from flangeye.testing import ScannerConformance
-from flangeye_emulators.scanner.loopback import LoopbackParams, scanner_loopback
+from flangeye_emulators.scanner.loopback import LoopbackScannerParams, scanner_loopback
 from flangeye_plugins.scanner.genicam import GenicamParams, scanner_genicam
 from flangeye_plugins.scanner.realsense import RealsenseParams, scanner_realsense
 from tests.emulators.controllers.process import Process
@@ -53,4 +53,4 @@ def controller(request: pytest.FixtureRequest) -> Iterator[None]:
 @pytest.mark.usefixtures("controller")
 class TestLoopback(ScannerConformance):
     part = scanner_loopback
-    unreachable = LoopbackParams(host="127.0.0.254")
+    unreachable = LoopbackScannerParams(host="127.0.0.254")

@@ -17,7 +17,7 @@ from flangeye.models.targets import plate_of
 from flangeye.motion.reach import Reach
 from flangeye.types import BASE, FLANGE, Capture, Transform, by_frame
 from flangeye.units import SI
-from flangeye_emulators.scanner.loopback import LoopbackParams, scanner_loopback
+from flangeye_emulators.scanner.loopback import LoopbackScannerParams, scanner_loopback
 from flangeye_emulators.world.scanner import CameraPose
 from flangeye_plugins.fit.rim import fit_rim
 from flangeye_plugins.fit.rim_params import RimParams
@@ -51,7 +51,7 @@ def controller() -> Iterator[Any]:
 
 def params(controller, **changes):
     plain = {"resolution": 0.25, "exposure": SI(0.02), "latency": SI(0.0)}
-    return fixed(LoopbackParams, host=controller.host, **plain | changes)
+    return fixed(LoopbackScannerParams, host=controller.host, **plain | changes)
 
 
 def opened(controller, **changes):
@@ -177,7 +177,7 @@ def test_what_cannot_be_opened_is_said(
 
 def test_no_controller_is_said() -> None:
     with pytest.raises(DeviceError) as error:
-        scanner_loopback(PHOXI, LoopbackParams(host="127.0.0.253"))
+        scanner_loopback(PHOXI, LoopbackScannerParams(host="127.0.0.253"))
     assert str(error.value) == (
         "scanner.emulator: no controller on loopback at 127.0.0.253:29998 (Connection refused); "
         "start one: flangeye emulator ur5e --host 127.0.0.253"

@@ -10,7 +10,12 @@ from flangeye.devices import DeviceError
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
 from flangeye_emulators.scanner import loopback
-from flangeye_emulators.scanner.loopback import CellScene, LoopbackParams, Stance, scanner_loopback
+from flangeye_emulators.scanner.loopback import (
+    CellScene,
+    LoopbackScannerParams,
+    TrueStance,
+    scanner_loopback,
+)
 
 PHOXI = load_model("scanners", "phoxi-m")
 JOINTS = np.array([0.1, -1.2, 1.4, -1.7, -1.5, 0.3])
@@ -30,20 +35,20 @@ class Control:
 
 
 @pytest.fixture
-def prepared(monkeypatch: pytest.MonkeyPatch) -> list[Stance]:
+def prepared(monkeypatch: pytest.MonkeyPatch) -> list[TrueStance]:
     """What the scanner computed of the cell, in place of computing it."""
-    stances: list[Stance] = []
+    stances: list[TrueStance] = []
     monkeypatch.setattr(CellScene, "_scene", lambda self, stance: stances.append(stance))
     return stances
 
 
 def opened(monkeypatch: pytest.MonkeyPatch, control: Control) -> Any:
     monkeypatch.setattr(loopback, "EmulatorControl", lambda *_, **__: control)
-    return scanner_loopback(PHOXI, LoopbackParams(host="127.0.0.5", robot="ur5e"))
+    return scanner_loopback(PHOXI, LoopbackScannerParams(host="127.0.0.5", robot="ur5e"))
 
 
 def test_the_cell_is_computed_with_the_arm_as_it_stands_before_the_scanner_is_given_out(
-    monkeypatch: pytest.MonkeyPatch, prepared: list[Stance]
+    monkeypatch: pytest.MonkeyPatch, prepared: list[TrueStance]
 ) -> None:
     control = Control(Arm(load_model("robots", "ur5e")).flange(JOINTS))
     with opened(monkeypatch, control):
@@ -53,7 +58,7 @@ def test_the_cell_is_computed_with_the_arm_as_it_stands_before_the_scanner_is_gi
 
 
 def test_a_controller_that_moves_another_arm_is_refused_and_let_go_of(
-    monkeypatch: pytest.MonkeyPatch, prepared: list[Stance]
+    monkeypatch: pytest.MonkeyPatch, prepared: list[TrueStance]
 ) -> None:
     control = Control(Arm(load_model("robots", "ur10e")).flange(JOINTS))
     with pytest.raises(DeviceError) as refused:
@@ -66,7 +71,7 @@ def test_a_controller_that_moves_another_arm_is_refused_and_let_go_of(
 
 
 def test_a_controller_that_is_lost_meanwhile_is_said_and_let_go_of(
-    monkeypatch: pytest.MonkeyPatch, prepared: list[Stance]
+    monkeypatch: pytest.MonkeyPatch, prepared: list[TrueStance]
 ) -> None:
     control = Control(np.eye(4))
     monkeypatch.setattr(control, "truth", lambda: (_ for _ in ()).throw(OSError("gone")))

@@ -24,7 +24,7 @@ from flangeye_plugins.segment.discs import (
 )
 from flangeye_plugins.segment.flange import SegmentParams
 from flangeye_plugins.segment.grid import Grid
-from flangeye_plugins.segment.parts import Part
+from flangeye_plugins.segment.parts import PlanarPiece
 from flangeye_plugins.segment.scale import check_scale
 from flangeye_plugins.segment.search import _piece, _scatter, choose
 from tests.plugins.bounds import check_bound
@@ -47,7 +47,7 @@ def ring(inner, outer, height=0.0, arc=2 * np.pi) -> np.ndarray:
 
 
 def disc(points, plane=FACING, flange=UR5) -> Disc:
-    part = Part(plane, points.astype(np.float32), np.arange(len(points)))
+    part = PlanarPiece(plane, points.astype(np.float32), np.arange(len(points)))
     return of_size(part, (10, 20), PITCH, flange)
 
 

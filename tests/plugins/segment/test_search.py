@@ -6,7 +6,7 @@ import pytest
 from flangeye.maths.planes import Plane
 from flangeye_plugins.segment.discs import Disc, DiscLimits
 from flangeye_plugins.segment.grid import Grid
-from flangeye_plugins.segment.parts import Part
+from flangeye_plugins.segment.parts import PlanarPiece
 from flangeye_plugins.segment.search import _compared, _disc, _piece
 from tests.plugins.segment.test_choice import BORE, UR5
 
@@ -51,7 +51,9 @@ def test_a_part_may_be_wider_by_four_times_the_distance_of_neighbours(
     half = UR5.outer + spare * ANGLE * DEPTH / 2
     points = np.array([0, 0, DEPTH]) + np.outer([-half, 0, half], [1.0, 0, 0])
     at = 101 * 40 + np.array([10, 20, 30])
-    found = _disc(Part(Plane(points[1], FACING), points.astype(np.float32), at), view(0, 1), UR5)
+    found = _disc(
+        PlanarPiece(Plane(points[1], FACING), points.astype(np.float32), at), view(0, 1), UR5
+    )
     assert (found.flaw is None) is fits
     assert found.cell == (40, 20)
 

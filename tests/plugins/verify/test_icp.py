@@ -37,13 +37,18 @@ from flangeye.types import (
 from flangeye_plugins.error import error_holdout, error_icp
 from flangeye_plugins.verify.icp import (
     CadCloud,
-    Comparison,
     IcpParams,
     IcpSettings,
+    ViewComparison,
     _figures,
     verify_icp,
 )
-from flangeye_plugins.verify.registration import Registration, Surface, read_surface, surface_of
+from flangeye_plugins.verify.registration import (
+    Registration,
+    SampledSurface,
+    read_surface,
+    surface_of,
+)
 
 MM = 1e-3
 TRUTH = Transform(
@@ -132,11 +137,11 @@ def test_a_turn_about_the_flanges_own_axis_is_clocking_and_no_tilt() -> None:
     phi = np.array([3e-3, -4e-3, 7e-3])
     fit = Registration(rigid(rotation_exp(phi), np.zeros(3)), 1e-5, 0.9, True)
     error = PoseError(np.eye(4), np.zeros(3), np.eye(3))
-    figures = _figures(Comparison(error, fit))
+    figures = _figures(ViewComparison(error, fit))
     assert figures["tilt"] == pytest.approx(5e-3)
     assert figures["clocking"] == pytest.approx(7e-3)
     assert (figures["rms"], figures["overlap"]) == (1e-5, 0.9)
-    assert "clocking" not in _figures(Comparison(error, replace(fit, roll_seen=False)))
+    assert "clocking" not in _figures(ViewComparison(error, replace(fit, roll_seen=False)))
 
 
 def test_translations_are_the_lengths_of_their_coordinates() -> None:
@@ -302,7 +307,7 @@ def test_surfaces_read_from_files_have_unit_normals(tmp_path: Path) -> None:
     plane = np.random.default_rng(0).uniform(-1, 1, (500, 3)) * [0.03, 0.03, 0]
     path = tmp_path / "plane.xyz"
     np.savetxt(path, plane)
-    surface: Surface = read_surface(path, "m", np.eye(3), np.zeros(3))
+    surface: SampledSurface = read_surface(path, "m", np.eye(3), np.zeros(3))
     np.testing.assert_allclose(np.abs(surface.normals[:, 2]), 1.0)
 
 

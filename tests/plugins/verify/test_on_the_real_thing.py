@@ -14,9 +14,9 @@ from flangeye.maths.geometry import rigid, rotation_exp, rotation_from_rpy, rpy_
 from flangeye.units import SI
 from flangeye_plugins.verify.drift import DriftParams
 from flangeye_plugins.verify.holdout import HoldoutParams
-from flangeye_plugins.verify.sphere import Bar, SphereParams, verify_sphere
+from flangeye_plugins.verify.sphere import BallBar, SphereCheckParams, verify_sphere
 from flangeye_plugins.verify.stitch import StitchParams, verify_stitch
-from flangeye_plugins.verify.touch import Touch, TouchParams, verify_touch
+from flangeye_plugins.verify.touch import TouchedPoint, TouchParams, verify_touch
 from tests.plugins.bounds import check_bound
 
 TRUTH = rigid(rotation_from_rpy(np.pi - 0.2, 0.1, 0.5), np.array([0.5, -0.1, 1.1]))
@@ -54,7 +54,7 @@ def touches(count: int = 4) -> TouchParams:
         point = pose[:3, :3] @ TIP + pose[:3, 3]
         seen = np.linalg.inv(TRUTH) @ np.append(point, 1.0)
         rpy = [f"{a} rad" for a in rpy_from_rotation(pose[:3, :3])]
-        made.append(Touch(seen=_m(seen[:3]), position=_m(pose[:3, 3]), rpy=tuple(rpy)))
+        made.append(TouchedPoint(seen=_m(seen[:3]), position=_m(pose[:3, 3]), rpy=tuple(rpy)))
     return TouchParams(tip=_m(TIP), touches=tuple(made))
 
 
@@ -103,9 +103,9 @@ def test_stitch_cannot_see_what_all_views_share() -> None:
 
 
 def test_sphere_finds_a_scale_and_cannot_see_the_matrix() -> None:
-    shifted = verify_sphere(calibration(shift=(5e-3, 0, 0)), SphereParams())
+    shifted = verify_sphere(calibration(shift=(5e-3, 0, 0)), SphereCheckParams())
     assert shifted.passed and shifted.figures["max"] < 1e-9
-    stretched = verify_sphere(calibration(scale=1.01), SphereParams())
+    stretched = verify_sphere(calibration(scale=1.01), SphereCheckParams())
     assert not stretched.passed
     assert stretched.figures["scale"] == pytest.approx(0.01, rel=1e-6)
 
@@ -122,7 +122,7 @@ def test_two_balls_at_a_known_distance_show_the_scanners_scale_alone() -> None:
     drawn: dict[str, Any] = {}
     # The arm is of another scale, which must not matter.
     found = verify_sphere(
-        calibration(scale=1.05), SphereParams(bars=bars), stage_log=drawn.__setitem__
+        calibration(scale=1.05), SphereCheckParams(bars=bars), stage_log=drawn.__setitem__
     )
     assert found.passed and found.figures["pairs"] == 20
     assert found.figures["scale"] == pytest.approx(
@@ -146,7 +146,7 @@ def test_what_cannot_be_checked_is_one_line() -> None:
     with pytest.raises(
         StageError, match="0 pairs of poses are 900 mm or more apart, 10 are needed"
     ):
-        verify_sphere(calibration(), SphereParams(shortest="900 mm"))
+        verify_sphere(calibration(), SphereCheckParams(shortest="900 mm"))
 
 
 def test_touchs_figures_are_those_of_the_errors() -> None:
@@ -216,7 +216,7 @@ def test_spheres_figures_are_those_of_the_distances() -> None:
     drawn: dict[str, Any] = {}
     limit = {"bars": bars, "max_error": "0.2 mm"}
     found = verify_sphere(
-        calibration(), SphereParams.model_validate(limit), stage_log=drawn.__setitem__
+        calibration(), SphereCheckParams.model_validate(limit), stage_log=drawn.__setitem__
     )
     assert found.figures == pytest.approx(
         {"pairs": 4, "rms": np.sqrt(np.mean(errors**2)), "mean": 0.25e-4, "p95": 2.85e-4,
@@ -233,7 +233,7 @@ def test_spheres_figures_are_those_of_the_distances() -> None:
 @pytest.mark.parametrize(("limit", "passed"), [("125 mm", True), ("124.999 mm", False)])
 def test_the_limit_of_a_distance_is_within_it(limit: str, passed: bool) -> None:
     bar = {"first": ("0 m", "0 m", "1 m"), "second": ("0.5 m", "0 m", "1 m"), "length": "375 mm"}
-    params = SphereParams.model_validate({"bars": [bar], "max_error": limit})
+    params = SphereCheckParams.model_validate({"bars": [bar], "max_error": limit})
     assert verify_sphere(calibration(), params).passed is passed
 
 
@@ -245,7 +245,7 @@ def test_distances_are_those_of_the_ball_and_not_of_the_flange() -> None:
         seen = np.linalg.inv(TRUTH) @ pose.matrix @ np.append(ball, 1.0)
         feature = replace(pair.observation.circle, centre=seen[:3], centre_in_flange=ball)
         pairs.append(replace(pair, observation=replace(pair.observation, feature=feature)))
-    found = verify_sphere(replace(exact, pairs=tuple(pairs)), SphereParams())
+    found = verify_sphere(replace(exact, pairs=tuple(pairs)), SphereCheckParams())
     assert found.figures["max"] < 1e-12
     assert found.figures["pairs"] > 40
 
@@ -254,20 +254,20 @@ def test_pairs_of_poses_are_counted_once_if_they_are_far_enough_apart() -> None:
     places = np.array([np.linalg.inv(TRUTH) @ pose for pose in poses(12)])[:, :3, 3]
     gaps = np.linalg.norm(places[:, None] - places, axis=2)[np.triu_indices(12, 1)]
     shortest = float(np.median(gaps))
-    found = verify_sphere(calibration(), SphereParams(shortest=SI(shortest)))
+    found = verify_sphere(calibration(), SphereCheckParams(shortest=SI(shortest)))
     assert found.figures["pairs"] == (gaps >= shortest).sum() == 33
     aside = calibration()
     pairs = (replace(aside.pairs[0], used=False), *aside.pairs[1:])
-    assert verify_sphere(replace(aside, pairs=pairs), SphereParams()).figures["pairs"] <= 55
+    assert verify_sphere(replace(aside, pairs=pairs), SphereCheckParams()).figures["pairs"] <= 55
 
 
 @pytest.mark.parametrize(
     ("model", "given", "name", "refused", "taken"),
     [
         (StitchParams, {}, "max_spread", "0 mm", "1 um"),
-        (SphereParams, {}, "max_error", "0 mm", "1 um"),
-        (SphereParams, {}, "shortest", "0 mm", "1 um"),
-        (Bar, {"first": _m(CENTRE), "second": _m(TIP)}, "length", "0 mm", "1 um"),
+        (SphereCheckParams, {}, "max_error", "0 mm", "1 um"),
+        (SphereCheckParams, {}, "shortest", "0 mm", "1 um"),
+        (BallBar, {"first": _m(CENTRE), "second": _m(TIP)}, "length", "0 mm", "1 um"),
         (TouchParams, {"tip": _m(TIP)}, "touches", [], touches(1).touches),
         (TouchParams, {"tip": _m(TIP), "touches": touches(1).touches}, "accuracy", "0 mm", "1 um"),
         (TouchParams, {"tip": _m(TIP), "touches": touches(1).touches}, "max_error", "0 mm", "1 um"),

@@ -7,7 +7,7 @@ from flangeye.maths.geometry import rigid, rotation_exp, rotation_log
 from flangeye_plugins.verify import registration
 from flangeye_plugins.verify.registration import (
     Registration,
-    Surface,
+    SampledSurface,
     _least_squares,
     _limits,
     register,
@@ -16,7 +16,7 @@ from flangeye_plugins.verify.registration import (
 from tests.plugins.verify.test_icp import FLANGE_50, MM
 
 SHAPE = surface_of(FLANGE_50, 0.6 * MM)
-FACE = Surface(SHAPE.points[SHAPE.points[:, 2] == 0], SHAPE.normals[SHAPE.points[:, 2] == 0])
+FACE = SampledSurface(SHAPE.points[SHAPE.points[:, 2] == 0], SHAPE.normals[SHAPE.points[:, 2] == 0])
 MOVED = rigid(rotation_exp([0.02, -0.03, 0.0]), np.array([1.5, -0.8, 2.0]) * MM)
 
 
@@ -24,17 +24,19 @@ def apply(motion: np.ndarray, points: np.ndarray) -> np.ndarray:
     return points @ motion[:3, :3].T + motion[:3, 3]
 
 
-def found(points: np.ndarray, shape: Surface = SHAPE, distance: float = 1 * MM) -> Registration:
+def found(
+    points: np.ndarray, shape: SampledSurface = SHAPE, distance: float = 1 * MM
+) -> Registration:
     registered = register(points, shape, 20 * MM, distance)
     assert isinstance(registered, Registration), registered
     return registered
 
 
-def block(moved: np.ndarray, count: int = 1500) -> tuple[np.ndarray, Surface]:
+def block(moved: np.ndarray, count: int = 1500) -> tuple[np.ndarray, SampledSurface]:
     """Return the points of a block's corner before a motion, and the corner."""
     rng = np.random.default_rng(0)
     sides = [np.insert(rng.uniform(0, 0.05, (count, 2)), k, 0.0, axis=1) for k in range(3)]
-    corner = Surface(np.concatenate(sides), np.repeat(np.eye(3), count, axis=0))
+    corner = SampledSurface(np.concatenate(sides), np.repeat(np.eye(3), count, axis=0))
     return apply(np.linalg.inv(moved), corner.points), corner
 
 
@@ -59,7 +61,7 @@ def test_six_points_are_enough_and_all_of_few_are_looked_at() -> None:
     """Of a block's corner, two on each side and not in a line with the others."""
     places = 1e-3 * np.array([[10.0, 40.0], [45.0, 20.0]])
     sides = [np.insert(places, k, 0.0, axis=1) for k in range(3)]
-    corner = Surface(np.concatenate(sides), np.repeat(np.eye(3), 2, axis=0))
+    corner = SampledSurface(np.concatenate(sides), np.repeat(np.eye(3), 2, axis=0))
     found = register(corner.points, corner, 1 * MM, 1 * MM)
     assert isinstance(found, Registration)
     assert (found.overlap, found.roll_seen) == (1.0, True)
@@ -83,7 +85,9 @@ def test_more_points_than_are_needed_are_thinned() -> None:
 
 
 def test_a_turn_that_the_shape_does_not_show_stays_zero() -> None:
-    round_ = Surface(SHAPE.points[SHAPE.points[:, 2] < 0], SHAPE.normals[SHAPE.points[:, 2] < 0])
+    round_ = SampledSurface(
+        SHAPE.points[SHAPE.points[:, 2] < 0], SHAPE.normals[SHAPE.points[:, 2] < 0]
+    )
     turned = rigid(rotation_exp([0.01, 0.0, 0.05]), np.array([1.0, 0.0, 0.0]) * MM)
     registered = found(apply(np.linalg.inv(turned), round_.points), round_)
     assert not registered.roll_seen
@@ -131,9 +135,9 @@ def test_a_cylinder_or_two_walls_do_not_tell_a_shift_along_them() -> None:
     rng = np.random.default_rng(0)
     angle, height = rng.uniform(-np.pi, np.pi, 1500), rng.uniform(-0.02, 0.02, 1500)
     around = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
-    cylinder = Surface(0.03 * around + height[:, None] * [0, 0, 1], around)
+    cylinder = SampledSurface(0.03 * around + height[:, None] * [0, 0, 1], around)
     _, corner = block(np.eye(4))
-    walls = Surface(corner.points[:3000], corner.normals[:3000])
+    walls = SampledSurface(corner.points[:3000], corner.normals[:3000])
     for shape in (cylinder, walls):
         assert register(shape.points, shape, 1 * MM, 1 * MM) == (
             "the matched points are too flat to tell a shift along the face"

@@ -5,14 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from flangeye.motion.seam_following import ToolPose, Touch, turned
-from flangeye_emulators.weld_world.groove import Contact, Groove, Section, Tip
+from flangeye_emulators.weld_world.groove import Groove, GrooveSection, Tip, TipContact
 from flangeye_plugins.weld.belief import Belief
 from flangeye_plugins.weld.follower import Follower
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following
 
 DISTANCE = 40e-3
-SECTION = Section(np.pi / 6, 8e-3)
+SECTION = GrooveSection(np.pi / 6, 8e-3)
 PERIOD = 8e-3
 FRAME = 1 / 30
 COLUMNS = ("time", "torch_s", "torch", "tip_s", "tip", "robot", "turn", "advance")
@@ -83,7 +83,7 @@ class World:
         angle=0.0, above=12e-3, hidden=None, longest=80.0, period=PERIOD,
     ):  # fmt: skip
         self.root = Path(true)
-        self.contact = Contact(Groove(self.root, SECTION, gaps), Tip())
+        self.contact = TipContact(Groove(self.root, SECTION, gaps), Tip())
         self.controller = controller
         start = Path(plan).at(settings.set_down)
         self.position = np.array([*start.point, start.height + above])

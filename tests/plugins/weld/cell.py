@@ -14,7 +14,7 @@ from flangeye_emulators.finger.sensor import (
     SimulatedFingerParams,
     sensor_simulated_finger,
 )
-from flangeye_emulators.robot.simulated import SimulatedParams, SimulatedRobot
+from flangeye_emulators.robot.simulated import SimulatedRobot, SimulatedRobotParams
 from flangeye_plugins.weld.settings import WeldTactileParams
 from flangeye_plugins.weld.tactile import weld_tactile
 
@@ -63,7 +63,7 @@ def run(
     given["world"] = {**given["world"], "clock": clock}
     simulated = SimulatedFingerParams(workpiece=name, **given)
     chosen = BoundPart(sensor_simulated_finger, simulated)
-    arm = SimulatedParams(period="16 ms", joints=HOME)
+    arm = SimulatedRobotParams(period="16 ms", joints=HOME)
     driver = driver or RobotDriver(
         "robot.simulated", lambda: SimulatedRobot(MODEL, arm), simulated=True
     )

@@ -15,7 +15,7 @@ from flangeye.maths.geometry import nearest_rotation, rigid, rotation_exp
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
 from flangeye.types import Floats, Image
-from flangeye_plugins.weld.finger_camera import Reader
+from flangeye_plugins.weld.finger_camera import FingerReader
 from flangeye_plugins.weld.touch.calibration import Held, calibrate
 from flangeye_plugins.weld.touch.pivot import pivot
 from flangeye_plugins.weld.touch.tag_observation import TagDetector, TagReading
@@ -277,7 +277,7 @@ def test_a_tag_that_is_seen_with_three_tenths_of_confidence_is_felt() -> None:
     """Its corners are then off by 0.7 px at most; what is worth less is no touch."""
     image, corners = Image(np.zeros((60, 90), np.uint8), MATRIX), np.full((4, 2), 30.0)
     for confidence, felt in ((0.29, False), (0.3, True), (0.31, True)):
-        reader: Any = Reader(FINGER)
+        reader: Any = FingerReader(FINGER)
         seen = TagReading(REST, np.zeros(3), np.eye(3), confidence, corners)
         reader._detector = SimpleNamespace(find=lambda piece, seen=seen: seen)
         found = reader.read(SensorFrame(image, 5))

@@ -7,9 +7,9 @@ import pytest
 
 from flangeye.devices import DeviceError, SensorFrame
 from flangeye.types import Image, Seed
-from flangeye_plugins.weld.finger_camera import CameraJob, Reader, SteppedReader
+from flangeye_plugins.weld.finger_camera import CameraJob, FingerReader, SteppedReader
 from flangeye_plugins.weld.touch.region_of_interest import (
-    MARGIN,
+    TAG_MARGIN,
     ImageRegion,
     RegionOfInterest,
     cut,
@@ -36,12 +36,15 @@ def test_then_around_the_tag_and_at_the_whole_only_if_it_is_gone() -> None:
     gaze = RegionOfInterest()
     gaze.follow(ImageRegion(blank(), (0, 0)), CORNERS)
     near, whole = gaze.pieces(blank())
-    assert near.corner == (100 - MARGIN, 60 - MARGIN)
-    assert near.image.pixels.shape == (140 + MARGIN - near.corner[1], 181 + MARGIN - near.corner[0])
+    assert near.corner == (100 - TAG_MARGIN, 60 - TAG_MARGIN)
+    assert near.image.pixels.shape == (
+        140 + TAG_MARGIN - near.corner[1],
+        181 + TAG_MARGIN - near.corner[0],
+    )
     assert whole.corner == (0, 0)
     gaze.follow(near, CORNERS - near.corner + [5.0, 0.0])
     moved, _ = gaze.pieces(blank())
-    assert moved.corner == (105 - MARGIN, 60 - MARGIN)
+    assert moved.corner == (105 - TAG_MARGIN, 60 - TAG_MARGIN)
     gaze.follow(moved, None)
     assert len(list(gaze.pieces(blank()))) == 1
 
@@ -66,16 +69,19 @@ def test_a_piece_keeps_its_place_in_the_camera() -> None:
 
 
 def test_what_is_felt_is_the_same_from_the_piece_as_from_the_whole() -> None:
-    eye, reader = Eye(), Reader(FINGER)
+    eye, reader = Eye(), FingerReader(FINGER)
     for i, place in enumerate(np.linspace([0, -1e-3, 0], [5e-4, 2e-3, 1e-3], 10)):
         image = eye.image(place)
-        part, whole = reader.read(SensorFrame(image, i)), Reader(FINGER).read(SensorFrame(image, i))
+        part, whole = (
+            reader.read(SensorFrame(image, i)),
+            FingerReader(FINGER).read(SensorFrame(image, i)),
+        )
         assert (part.piece.image.pixels.size < 0.6 * image.pixels.size) == (i > 0)
         np.testing.assert_allclose(part.feeling.displacement, whole.feeling.displacement, atol=1e-6)
 
 
 def test_a_tag_that_jumped_is_found_in_the_same_image() -> None:
-    eye, reader = Eye(), Reader(FINGER)
+    eye, reader = Eye(), FingerReader(FINGER)
     reader.read(SensorFrame(eye.image([0, -1.5e-3, 0]), 0))
     sight = reader.read(SensorFrame(eye.image([0, 2.5e-3, 0]), 1))
     assert sight.feeling.displacement[1] == pytest.approx(2.5e-3, abs=0.05e-3)
@@ -83,7 +89,7 @@ def test_a_tag_that_jumped_is_found_in_the_same_image() -> None:
 
 
 def test_a_piece_is_read_again_as_it_was_read() -> None:
-    eye, reader, again = Eye(), Reader(FINGER), Reader(FINGER)
+    eye, reader, again = Eye(), FingerReader(FINGER), FingerReader(FINGER)
     for i, place in enumerate([*displacements(5, 1e-3), [1.0, 0, 0], [0, 0, 0]]):
         sight = reader.read(SensorFrame(eye.image(place), i))
         redone = again.reread(sight.piece, sight.time_ns)

@@ -19,7 +19,7 @@ from flangeye.plugin.registry import load_registry
 from flangeye.recipe.find import find_recipe
 from flangeye.recipe.load import load_recipe
 from flangeye_emulators.finger.sensor import typical_compliance
-from flangeye_emulators.robot.simulated import SimulatedParams, SimulatedRobot
+from flangeye_emulators.robot.simulated import SimulatedRobot, SimulatedRobotParams
 from flangeye_plugins.guide import tactile
 from flangeye_plugins.guide.tactile import guide_tactile
 from tests.plugins.weld.cell import HOME, MODEL
@@ -100,7 +100,7 @@ class FeelingArm(SimulatedRobot):
     STIFFNESS = np.array([800.0, 800.0, 1500.0])
 
     def __init__(self):
-        super().__init__(MODEL, SimulatedParams(period="16 ms", joints=HOME))
+        super().__init__(MODEL, SimulatedRobotParams(period="16 ms", joints=HOME))
         self._rest = super().state().base_T_flange.translation
 
     def state(self):

@@ -8,7 +8,7 @@ import pytest
 from flangeye.errors import StageError
 from flangeye.maths.geometry import rotation_from_rpy
 from flangeye.models.finger import Finger
-from flangeye_emulators.weld_world.groove import Contact, Groove, Section, Tip
+from flangeye_emulators.weld_world.groove import Groove, GrooveSection, Tip, TipContact
 from flangeye_plugins.weld.belief import belief_of
 from flangeye_plugins.weld.body import body_from, body_of, leaning
 from flangeye_plugins.weld.checks import check_body, check_seat
@@ -69,7 +69,9 @@ def test_a_leaning_tool_still_heads_from_its_torch_to_its_tip() -> None:
 
 def test_springs_balance_on_the_wall_of_a_leaning_finger() -> None:
     """Against the least energy, sought on a grid of places along the wall."""
-    contact = Contact(Groove(LINE, Section(np.pi / 4, 0.02, -np.pi / 4)), Tip(friction=0.0))
+    contact = TipContact(
+        Groove(LINE, GrooveSection(np.pi / 4, 0.02, -np.pi / 4)), Tip(friction=0.0)
+    )
     axes = leaning(0.4, 0.0)
     stiff = axes @ np.diag([1000.0, 1000.0, 2000.0]) @ axes.T
     rest = np.array([0.05, 0.0, 0.5e-3])

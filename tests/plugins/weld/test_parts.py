@@ -12,8 +12,8 @@ from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
 from flangeye.motion.seam_following import Command, ToolPose, turned
 from flangeye.types import Transform
-from flangeye_emulators.weld_world.groove import Contact as Tip3D
-from flangeye_emulators.weld_world.groove import Groove, Section, Tip
+from flangeye_emulators.weld_world.groove import Groove, GrooveSection, Tip
+from flangeye_emulators.weld_world.groove import TipContact as Tip3D
 from flangeye_plugins.weld.frame import Tool, WorkPlane
 from flangeye_plugins.weld.motion import Track
 from flangeye_plugins.weld.path import Path
@@ -145,7 +145,7 @@ def test_turning_is_about_the_normal() -> None:
 
 # --- the simulated tip ----------------------------------------------------------------------------
 
-SECTION = Section(np.pi / 6, 8e-3)
+SECTION = GrooveSection(np.pi / 6, 8e-3)
 SEAT = 1.5e-3 / np.sin(np.pi / 6)
 
 

@@ -17,7 +17,7 @@ from flangeye.plugin.registry import load_registry
 from flangeye.recipe.find import find_recipe
 from flangeye.recipe.load import load_recipe
 from flangeye.units import parse_quantity
-from flangeye_emulators.robot.simulated import SimulatedParams, SimulatedRobot
+from flangeye_emulators.robot.simulated import SimulatedRobot, SimulatedRobotParams
 from flangeye_plugins.guide.tactile import ATTITUDES, Pivoted, guide_tool, with_body
 from flangeye_plugins.weld.belief import belief_of
 from flangeye_plugins.weld.body import body_of
@@ -100,7 +100,7 @@ class Person(SimulatedRobot):
     """An arm, and who brings its true tip and torch to the mark when asked to."""
 
     def __init__(self) -> None:
-        super().__init__(MODEL, SimulatedParams(period="16 ms", joints=HOME))
+        super().__init__(MODEL, SimulatedRobotParams(period="16 ms", joints=HOME))
         self.home = self.arm.stance.base_T_tcp.copy()
         self.mark = self.home[:3, :3] @ TIP + self.home[:3, 3]
         self.count = 0

@@ -9,7 +9,7 @@ import pytest
 
 from flangeye_plugins.weld.belief import Belief
 from flangeye_plugins.weld.probing import (
-    MARGIN,
+    SWEEP_MARGIN,
     Learned,
     Probing,
     _dragged,
@@ -59,7 +59,7 @@ def test_the_sweep_presses_as_hard_as_it_says_wherever_it_begins() -> None:
         for noise in (10e-6, 0.15e-3):
             learned, hardest = swept(pressed=pressed, noise=noise)
             assert isinstance(learned, Learned)
-            assert hardest == pytest.approx(MARGIN * SETTINGS.deflection, abs=0.15e-3)
+            assert hardest == pytest.approx(SWEEP_MARGIN * SETTINGS.deflection, abs=0.15e-3)
 
 
 @pytest.mark.parametrize("noise", [10e-6, 60e-6, 0.15e-3])
@@ -73,7 +73,7 @@ def test_a_tip_that_the_preload_hardly_holds_is_swept_again_by_half_as_much(nois
     for seed in range(5):
         found, hardest = swept(held=0.6, noise=noise, seed=seed)
         assert isinstance(found, Learned) and hardest > 1.2 * SETTINGS.deflection
-        assert found.swept == pytest.approx(MARGIN * SETTINGS.deflection / 2)
+        assert found.swept == pytest.approx(SWEEP_MARGIN * SETTINGS.deflection / 2)
     never, _ = swept(held=0.0)
     assert "the tip climbs the wall" in str(never) and "lower 'deflection'" in str(never)
 

@@ -14,16 +14,16 @@ from flangeye.files.paths import bundled
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
 from flangeye.motion.limits import MotionLimits
-from flangeye.motion.route import STEP, Barred, Route
+from flangeye.motion.route import LARGEST_TURN, Barred, Route
 from flangeye_plugins.weld import reachability
 from flangeye_plugins.weld.frame import Tool, WorkPlane
 from flangeye_plugins.weld.path import Path
-from flangeye_plugins.weld.reachability import Bar, SeamReach, Station, _stations, flange_speed
+from flangeye_plugins.weld.reachability import Barrier, SeamReach, Station, _stations, flange_speed
 from flangeye_plugins.weld.settings import Following
 from tests.plugins.weld.bench import straight
 
 FINGER = read_model(bundled("data") / "fingers" / "srm.yaml", Finger)
-FREE = Bar(9, "")
+FREE = Barrier(9, "")
 
 
 def reach_of(**given: Any) -> Any:
@@ -89,14 +89,14 @@ def test_a_joint_turns_as_fast_as_going_and_turning_together_ask_for() -> None:
     assert found._fastest(np.zeros(6)) >= worst
 
 
-def chained(bars: dict[tuple[int, int], Bar], starts: int = 2, stations: int = 3) -> Any:
+def chained(bars: dict[tuple[int, int], Barrier], starts: int = 2, stations: int = 3) -> Any:
     """Chains from postures that start 1 rad apart, of which some are barred at some stations."""
     found = reach_of()
     firsts = np.arange(starts, dtype=float)[:, None]
     postures = [firsts + 0.01 * i for i in range(stations)]
     asked: list[tuple[int, int]] = []
 
-    def bars_of(before: Any, joints: Any) -> Bar | None:
+    def bars_of(before: Any, joints: Any) -> Barrier | None:
         start = round(float(joints[0]))
         asked.append((start, round((float(joints[0]) - start) / 0.01)))
         assert abs(float(joints[0] - before[0])) < 0.011
@@ -113,15 +113,15 @@ def test_every_posture_that_starts_a_whole_chain_is_kept() -> None:
     assert [chain.ravel().tolist() for chain in both] == [
         pytest.approx([0.0, 0.01, 0.02]), pytest.approx([1.0, 1.01, 1.02]),
     ]  # fmt: skip
-    (one,) = chained({(0, 1): Bar(0, "table")})
+    (one,) = chained({(0, 1): Barrier(0, "table")})
     assert one.ravel() == pytest.approx([1.0, 1.01, 1.02])
 
 
 def test_of_several_refusals_the_one_that_came_farthest_is_told() -> None:
     with pytest.raises(StageError, match="weld.tactile: at 2, the arm touches the table"):
-        chained({(0, 1): Bar(3, "posture"), (1, 2): Bar(0, "the arm touches the table")})
+        chained({(0, 1): Barrier(3, "posture"), (1, 2): Barrier(0, "the arm touches the table")})
     with pytest.raises(StageError, match="weld.tactile: at 1, the posture"):
-        chained({(0, 1): Bar(3, "the posture"), (1, 1): Bar(0, "the table")})
+        chained({(0, 1): Barrier(3, "the posture"), (1, 1): Barrier(0, "the table")})
 
 
 def test_a_chain_is_wound_to_where_the_arm_stands_where_its_limits_let_it() -> None:
@@ -251,7 +251,7 @@ def test_neither_finger_nor_torch_comes_nearer_to_the_work_than_nine_tenths_of_t
     found._touches(np.array([0.1, 0.0]), np.array([0.2, -1.0]))
     ways = steps[0]
     assert ways[0] == pytest.approx([0.1, 0.0]) and ways[-1] == pytest.approx([0.2, -1.0])
-    assert np.abs(np.diff(ways, axis=0)).max() <= STEP
+    assert np.abs(np.diff(ways, axis=0)).max() <= LARGEST_TURN
 
 
 # --- the poses that are looked at -----------------------------------------------------------------

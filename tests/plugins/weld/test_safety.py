@@ -13,7 +13,7 @@ from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
 from flangeye.motion.executor import Executor
 from flangeye.motion.seam_following import ToolPose
-from flangeye_emulators.robot.simulated import SimulatedParams, SimulatedRobot
+from flangeye_emulators.robot.simulated import SimulatedRobot, SimulatedRobotParams
 from flangeye_plugins.weld.bounds import Bounds
 from flangeye_plugins.weld.finger_camera import LatestState
 from flangeye_plugins.weld.path import Path
@@ -32,7 +32,7 @@ class Arm(SimulatedRobot):
     """Changes what it says from a time on [s], and keeps whether it was told to stop then."""
 
     def __init__(self, change=None, after=0.0, joints=HOME):
-        super().__init__(MODEL, SimulatedParams(period="16 ms", joints=joints))
+        super().__init__(MODEL, SimulatedRobotParams(period="16 ms", joints=joints))
         self.change, self.after, self.stopped = change, after, False
 
     def state(self):

@@ -9,7 +9,7 @@ import pytest
 
 from flangeye.types import Floats
 from flangeye_plugins.weld.belief import Belief
-from flangeye_plugins.weld.search import Search
+from flangeye_plugins.weld.search import SweepSearch
 from flangeye_plugins.weld.settings import Following
 
 SETTINGS = Following()
@@ -17,23 +17,26 @@ PRELOAD, REACH = SETTINGS.preload, SETTINGS.reach
 QUIET = Belief(40e-3, noise=(1e-9, 1e-9))
 
 
-def rested(belief: Belief = QUIET, rest: Any = (0.0, 0.0, 0.0)) -> Search:
+def rested(belief: Belief = QUIET, rest: Any = (0.0, 0.0, 0.0)) -> SweepSearch:
     """Return a search whose tip was measured in the air."""
-    search = Search(SETTINGS, belief)
+    search = SweepSearch(SETTINGS, belief)
     for _ in range(10):
         assert search.resting
         search.feel(np.array(rest), 0.0, 0.0)
     return search
 
 
-def fed(search: Search, count: int, deflection: float, compression: float) -> Search:
+def fed(search: SweepSearch, count: int, deflection: float, compression: float) -> SweepSearch:
     for _ in range(count):
         search.feel(np.zeros(3), deflection, compression)
     return search
 
 
 def test_the_tip_is_measured_ten_times_in_the_air_and_its_middle_counts() -> None:
-    search, rng = Search(SETTINGS, Belief(40e-3, noise=(10e-6, 60e-6))), np.random.default_rng(0)
+    search, rng = (
+        SweepSearch(SETTINGS, Belief(40e-3, noise=(10e-6, 60e-6))),
+        np.random.default_rng(0),
+    )
     seen: Floats = rng.normal(0.0, [5e-6, 40e-6, 20e-6], (10, 3)) + [1e-4, -2e-4, 3e-4]
     seen[3] += 1e-2
     for i, each in enumerate(seen):
@@ -59,14 +62,14 @@ def test_a_tip_that_is_bent_aside_by_half_a_millimetre_touches_something(
 
 
 def test_a_tip_that_moves_about_in_the_air_is_not_free() -> None:
-    search = Search(SETTINGS, Belief(40e-3))
+    search = SweepSearch(SETTINGS, Belief(40e-3))
     for i in range(10):
         search.feel(np.array([(-1) ** i * 0.6e-3, 0.0, 0.0]), 0.0, 0.0)
     assert np.linalg.norm(search.rest) < 0.5e-3 and search.bent
 
 
 def test_a_tag_that_is_misread_once_bends_nothing() -> None:
-    search = Search(SETTINGS, Belief(40e-3))
+    search = SweepSearch(SETTINGS, Belief(40e-3))
     for i in range(10):
         search.feel(np.array([6e-3 * (i == 4), 0.0, 0.0]), 0.0, 0.0)
     assert not search.bent
@@ -117,7 +120,7 @@ def test_the_sweep_goes_as_far_to_either_side_and_ends() -> None:
 @pytest.mark.parametrize(("side", "sign"), [("left", 1.0), ("right", -1.0)])
 def test_where_one_wall_alone_holds_the_tip_that_one_is_looked_for(side: str, sign: float) -> None:
     settings = Following.model_validate({"side": side})
-    search = Search(settings, Belief(40e-3, noise=(1e-9, 1e-9), two_walls=False))
+    search = SweepSearch(settings, Belief(40e-3, noise=(1e-9, 1e-9), two_walls=False))
     fed(search, 10, 0.0, 0.0)
     fed(search, 3, 0.0, PRELOAD)
     assert search.step(0.0) == pytest.approx(sign * REACH)
@@ -128,7 +131,7 @@ def test_on_a_face_without_friction_a_wall_is_felt_beyond_half_of_what_the_tip_p
     settings = Following.model_validate({"friction": 0.0})
     assert QUIET.sliding(settings) == 0.0
     for share, found in ((0.48, False), (0.52, True), (-0.48, False), (-0.52, True)):
-        search = Search(settings, QUIET)
+        search = SweepSearch(settings, QUIET)
         fed(search, 10, 0.0, 0.0)
         fed(search, 3, 0.0, PRELOAD)
         assert fed(search, 15, share * settings.probe, PRELOAD).found == found

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class ManifestComparison:
     """What became of one manifest.
 
     Attributes:
@@ -54,7 +54,7 @@ def compare(
     workers: int | None,
     registry: Registry,
     console: Console,
-) -> list[Comparison]:
+) -> list[ManifestComparison]:
     """Return how the recordings of manifests compare with what is expected, in their order.
 
     Args:
@@ -78,7 +78,9 @@ def compare(
             file.stem, m.expected, outcomes[sessions[file].id], out / sessions[file].id, registry
         )
         if file in there
-        else Comparison(file.stem, "skipped", f"{_recording(file, m)} is not there; {m.source}")
+        else ManifestComparison(
+            file.stem, "skipped", f"{_recording(file, m)} is not there; {m.source}"
+        )
         for file, m in manifests.items()
     ]
 
@@ -124,7 +126,7 @@ def _run(
 
 def _compared(
     name: str, expected: Expected, outcome: SessionOutcome, run: Path, registry: Registry
-) -> Comparison:
+) -> ManifestComparison:
     told: list[str] = [outcome.status]
     differs: list[str] = []
     if outcome.status != expected.status:
@@ -140,8 +142,8 @@ def _compared(
             line if same else f"{line}, expected {', '.join(expected.findings) or 'none'}"
         )
     if differs:
-        return Comparison(name, "DIFFERS", "; ".join(differs))
-    return Comparison(name, "as expected", "; ".join(told))
+        return ManifestComparison(name, "DIFFERS", "; ".join(differs))
+    return ManifestComparison(name, "as expected", "; ".join(told))
 
 
 def _near(outcome: SessionOutcome, expected: Expected) -> bool:

@@ -11,7 +11,7 @@ import yaml
 from flangeye import types as t
 from flangeye.devices import MotionAllowed
 from flangeye.doctor.monitor.chart import write_chart
-from flangeye.doctor.monitor.history import Check, History, as_json, only_user, prints_of
+from flangeye.doctor.monitor.history import History, MonitorCheck, as_json, only_user, prints_of
 from flangeye.doctor.monitor.stored import StoredCalibration, stored_calibration
 from flangeye.doctor.monitor.watchman import CODES, judge, take
 from flangeye.errors import StageError
@@ -25,8 +25,8 @@ from flangeye.run.session import record_scans
 
 __all__ = [
     "CODES",
-    "Check",
     "History",
+    "MonitorCheck",
     "StoredCalibration",
     "as_json",
     "from_archive",
@@ -45,7 +45,7 @@ READS_RECORDINGS = ("acquire.archive", "acquire.centres")
 
 def from_archive(
     path: Path, stored: StoredCalibration, registry: Registry, overrides: Sequence[str] = ()
-) -> Check:
+) -> MonitorCheck:
     """Return what an archive shows of the flange: one check.
 
     Args:
@@ -81,7 +81,7 @@ def from_arm(
     scans: int,
     move: bool,
     overrides: Sequence[str] = (),
-) -> Check:
+) -> MonitorCheck:
     """Take scans with the arm, as the calibration's own recipe drives it: one check.
 
     They are kept in ``checks/<time>`` beside the calibration's log, as those of any run.
@@ -127,14 +127,14 @@ def _steps(stored: StoredCalibration) -> dict[str, Any]:
 
 def _checked(
     stored: StoredCalibration, path: Path, seen: list[t.Observation], time_ns: int
-) -> Check:
+) -> MonitorCheck:
     circles = [o for o in seen if isinstance(o.feature, t.CircleFeature)]
     if not circles:
         raise StageError(
             f"{path}: the flange was found in none of its scans, so nothing is checked"
         )
     _refuse_own(path, prints_of(circles) & prints_of(stored.used))
-    return Check(str(path), tuple(circles), time_ns)
+    return MonitorCheck(str(path), tuple(circles), time_ns)
 
 
 def _refuse_own(path: Path, shared: Collection[Any]) -> None:

@@ -7,7 +7,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from flangeye.doctor.monitor.history import Finding, History
+from flangeye.doctor.monitor.history import CheckFinding, History
 from flangeye.estimation.watch.drift import DriftTest
 from flangeye.files.regular import write_whole
 from flangeye.report.look import LIGHT, SERIES, css
@@ -45,7 +45,7 @@ def write_chart(history: History, test: DriftTest, path: Path) -> None:
     write_whole(path, page)
 
 
-def sentence(finding: Finding) -> str:
+def sentence(finding: CheckFinding) -> str:
     """Return what a check says, in words."""
     how_far = f"the work is off by {finding.shift * 1e3:.2f} mm at its worst corner"
     if finding.since is None:

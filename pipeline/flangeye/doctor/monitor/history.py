@@ -34,7 +34,7 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 @dataclass(frozen=True, eq=False)
-class Check:
+class MonitorCheck:
     """What was seen at one check.
 
     Attributes:
@@ -49,7 +49,7 @@ class Check:
 
 
 @dataclass(frozen=True)
-class Finding:
+class CheckFinding:
     """What one check says.
 
     Attributes:
@@ -88,8 +88,8 @@ class History:
 
     path: Path
     key: str
-    checks: list[Check] = field(default_factory=list)
-    findings: list[Finding] = field(default_factory=list)
+    checks: list[MonitorCheck] = field(default_factory=list)
+    findings: list[CheckFinding] = field(default_factory=list)
 
     @classmethod
     def read(cls, path: Path, key: str) -> History:
@@ -126,7 +126,7 @@ class History:
         seen = [o for check in self.checks for o in check.seen]
         return seen, np.repeat(np.arange(len(self.checks)), [len(c.seen) for c in self.checks])
 
-    def add(self, check: Check) -> None:
+    def add(self, check: MonitorCheck) -> None:
         """Add a check.
 
         Raises:
@@ -157,8 +157,8 @@ class History:
         number = len(self.checks)
         try:
             record = decode_json(line)
-            check = adapter(Check).validate_python(record["check"])
-            finding = adapter(Finding).validate_python(record["finding"])
+            check = adapter(MonitorCheck).validate_python(record["check"])
+            finding = adapter(CheckFinding).validate_python(record["finding"])
             _require_usable(number, check, finding)
         except Exception as error:  # a made file can be wrong in any way
             raise StageError(f"{self.path}: check {number}: {reason_of(error)}") from None
@@ -201,7 +201,7 @@ def prints_of(seen: Sequence[t.Observation]) -> set[bytes]:
     return {each.feature.centre.tobytes() for each in seen}
 
 
-def as_json(history: History, finding: Finding) -> str:
+def as_json(history: History, finding: CheckFinding) -> str:
     """Return one line about a check, for programs. Millimetres and degrees, named so."""
     check = history.checks[finding.check]
     since = None if finding.since is None else _when(history.checks[finding.since])
@@ -224,7 +224,7 @@ def as_json(history: History, finding: Finding) -> str:
     )
 
 
-def _when(check: Check) -> str | None:
+def _when(check: MonitorCheck) -> str | None:
     if not check.time_ns:
         return None
     return datetime.fromtimestamp(check.time_ns / 1e9, UTC).isoformat(timespec="seconds")
@@ -234,11 +234,11 @@ def _digest(key: str, body: bytes) -> str:
     return hashlib.sha256(key.encode() + b"\n" + body).hexdigest()
 
 
-def _plain(check: Check) -> Any:
-    return adapter(Check).dump_python(check, mode="json")
+def _plain(check: MonitorCheck) -> Any:
+    return adapter(MonitorCheck).dump_python(check, mode="json")
 
 
-def _require_usable(number: int, check: Check, finding: Finding) -> None:
+def _require_usable(number: int, check: MonitorCheck, finding: CheckFinding) -> None:
     """Refuse what no check leaves behind, though each of its values may be one."""
     if finding.check != number or (finding.since or 0) > number:
         raise DamageError("its finding is another check's")

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from flangeye import types as t
 from flangeye.errors import StageError
-from flangeye.estimation.watch.drift import Prior, Sightings, prior_of, sightings_of
-from flangeye.estimation.watch.pose_error import FREE, PoseError, pose_error_of
+from flangeye.estimation.watch.drift import CheckSightings, Prior, prior_of, sightings_of
+from flangeye.estimation.watch.pose_error import FREE, ArmPoseErrors, pose_error_of
 from flangeye.files.yaml_lines import parse_yaml
 from flangeye.log.read import RunLog, read_run
 from flangeye.maths.arm_correction import corrected_flange
@@ -89,7 +89,7 @@ class StoredCalibration:
         return [pair.observation for pair in self.calibration.pairs if pair.used]
 
     @cached_property
-    def pose_error(self) -> PoseError:
+    def pose_error(self) -> ArmPoseErrors:
         """How wrong the arm's poses are, by this calibration's residuals."""
         bare, circles = self._bare(self.used, _one_check(self.used))
         return pose_error_of(bare.residuals, bare.effects, bare.covariances, circles)
@@ -100,7 +100,7 @@ class StoredCalibration:
         variances = np.concatenate([FREE, self.pose_error.variances])
         return prior_of(self.sightings(self.used, _one_check(self.used)), variances)
 
-    def sightings(self, seen: Sequence[t.Observation], check: NDArray[np.intp]) -> Sightings:
+    def sightings(self, seen: Sequence[t.Observation], check: NDArray[np.intp]) -> CheckSightings:
         """Return sightings of the flange with their deviation from this calibration.
 
         Args:
@@ -114,7 +114,7 @@ class StoredCalibration:
 
     def _bare(
         self, seen: Sequence[t.Observation], check: NDArray[np.intp]
-    ) -> tuple[Sightings, Floats]:
+    ) -> tuple[CheckSightings, Floats]:
         """Return sightings with the scans' noise alone, and (N, 4, 4) expected circles."""
         correction = self.calibration.as_reported().correction
         expected = np.array(

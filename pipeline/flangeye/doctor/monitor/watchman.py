@@ -8,15 +8,15 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
-from flangeye.doctor.monitor.history import Check, Finding, History
+from flangeye.doctor.monitor.history import CheckFinding, History, MonitorCheck
 from flangeye.doctor.monitor.stored import StoredCalibration
 from flangeye.errors import StageError
 from flangeye.estimation.watch.blame import blame, explained, suspects
 from flangeye.estimation.watch.drift import (
+    CheckSightings,
     DriftTest,
+    DriftVerdict,
     Information,
-    Sightings,
-    Verdict,
     information_of,
     misfits,
     moved_since,
@@ -26,7 +26,7 @@ from flangeye.files.elsewhere import is_this_machine
 
 CODES = {"OK": 0, "DEGRADED": 1, "MOVED": 2}
 """Exit codes, for a script that stops a cell."""
-FEWEST = 3
+FEWEST_SCANS = 3
 """Scans of a check from which one that differs can be told, and the share of it that may."""
 
 
@@ -34,7 +34,9 @@ OPEN = "none"
 """Instead of a security policy: neither encrypted nor signed."""
 
 
-def take(stored: StoredCalibration, history: History, check: Check, test: DriftTest) -> Finding:
+def take(
+    stored: StoredCalibration, history: History, check: MonitorCheck, test: DriftTest
+) -> CheckFinding:
     """Add a check to the history, without its misfits, and what it says; return that.
 
     Raises:
@@ -47,8 +49,8 @@ def take(stored: StoredCalibration, history: History, check: Check, test: DriftT
 
 
 def _without_misfits(
-    stored: StoredCalibration, history: History, check: Check, test: DriftTest
-) -> tuple[Check, tuple[str, ...]]:
+    stored: StoredCalibration, history: History, check: MonitorCheck, test: DriftTest
+) -> tuple[MonitorCheck, tuple[str, ...]]:
     """Return a check without scans in which something else was found, and their ids.
 
     Only while most of its scans are as if nothing had moved: what moves, all of them show.
@@ -59,7 +61,7 @@ def _without_misfits(
     before = _before(stored, history, test)
     seen = stored.sightings(check.seen, np.zeros(len(check.seen), dtype=np.intp))
     wrong = misfits(seen, before, test)
-    if 0 < FEWEST * wrong.sum() <= len(wrong):
+    if 0 < FEWEST_SCANS * wrong.sum() <= len(wrong):
         fine = tuple(o for o, bad in zip(check.seen, wrong, strict=True) if not bad)
         ids = tuple(o.id for o, bad in zip(check.seen, wrong, strict=True) if bad)
         return replace(check, seen=fine), ids
@@ -82,7 +84,7 @@ def _before(stored: StoredCalibration, history: History, test: DriftTest) -> Inf
     return known.plus(told.summed(max(len(told.matrix) - test.reference, 0), None))
 
 
-def judge(stored: StoredCalibration, history: History, test: DriftTest) -> Finding:
+def judge(stored: StoredCalibration, history: History, test: DriftTest) -> CheckFinding:
     """Return what the history's last check says; what has moved stays moved.
 
     Args:
@@ -99,7 +101,7 @@ def judge(stored: StoredCalibration, history: History, test: DriftTest) -> Findi
     else:
         found = verdict(checks, prior, corners, test)
     part, probability = _blamed(stored, checks, sightings, found, test)
-    return Finding(
+    return CheckFinding(
         len(checks.matrix) - 1, found.state, found.shift, tuple(found.motion.tolist()),
         found.since, found.statistic, part, probability,
     )  # fmt: skip
@@ -108,8 +110,8 @@ def judge(stored: StoredCalibration, history: History, test: DriftTest) -> Findi
 def _blamed(
     stored: StoredCalibration,
     checks: Information,
-    sightings: Sightings,
-    found: Verdict,
+    sightings: CheckSightings,
+    found: DriftVerdict,
     test: DriftTest,
 ) -> tuple[str, float]:
     """Return the likeliest part and its probability, where something changed."""
@@ -142,7 +144,7 @@ def require_secured(url: str, security: str | None) -> None:
         )
 
 
-def write_state(url: str, node: str, finding: Finding, security: str | None = None) -> None:
+def write_state(url: str, node: str, finding: CheckFinding, security: str | None = None) -> None:
     """Write OK, DEGRADED or MOVED into a text node, or 0, 1, 2 into a numeric one.
 
     Args:
@@ -167,7 +169,7 @@ def write_state(url: str, node: str, finding: Finding, security: str | None = No
         raise StageError(f"{url}, node '{node}': cannot be written: {what}") from None
 
 
-async def _write(url: str, node: str, finding: Finding, security: str | None) -> None:
+async def _write(url: str, node: str, finding: CheckFinding, security: str | None) -> None:
     from asyncua import ua
     from asyncua.client.client import Client
 

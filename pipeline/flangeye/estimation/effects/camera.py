@@ -8,7 +8,7 @@ from flangeye.estimation.effects.effect import Block, Effect
 from flangeye.estimation.graph import Linear, Problem
 from flangeye.types import Floats
 
-CERTAIN = 1.05
+VIEWS_TIMES = 1.05
 """By how many times a stated deviation may be more or less, one sigma: views told it."""
 SIZE = 1e-3
 """Typical share by which a printed marker is larger or smaller than was said: a tenth of a
@@ -25,7 +25,7 @@ def camera_effects(problem: Problem, size_unknown: bool = False) -> list[Effect]
     if s.shared.any():
         for camera in dict.fromkeys(camera for camera, _ in problem.ends):
             name = f"intrinsics of {camera}"
-            effects.append(Effect(name, _shared(camera), 1.0, CERTAIN, kind="shared"))
+            effects.append(Effect(name, _shared(camera), 1.0, VIEWS_TIMES, kind="shared"))
     size = UNKNOWN_SIZE if size_unknown else SIZE
     whole = {int(k) for k in s.pairs[s.ranks == 6]}
     pairs = [ends for k, ends in enumerate(problem.ends) if k in whole]

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from flangeye.estimation.watch.drift import MISFIT, Information, Sightings, allowance
+from flangeye.estimation.watch.drift import MISFIT, CheckSightings, Information, allowance
 from flangeye.maths.geometry import adjoint_shift, stack_rows
 from flangeye.maths.statistics import chi2_quantile
 from flangeye.types import Floats
@@ -22,7 +22,7 @@ FARTHEST = 0.1
 
 
 def blame(
-    before: Information, after: Sightings, about: Floats, scanner: Floats, daily: float
+    before: Information, after: CheckSightings, about: Floats, scanner: Floats, daily: float
 ) -> Mapping[str, float]:
     """Return the probability that each part explains what is seen after a change, likeliest first.
 
@@ -47,7 +47,7 @@ def blame(
 
 
 def explained(
-    before: Information, after: Sightings, about: Floats, scanner: Floats, daily: float
+    before: Information, after: CheckSightings, about: Floats, scanner: Floats, daily: float
 ) -> bool:
     """Return whether the scanner, the flange or the arm alone can have moved as sightings say.
 
@@ -73,7 +73,9 @@ def suspects(parts: Mapping[str, float]) -> list[tuple[str, float]]:
     return sorted(of.items(), key=lambda x: -x[1])
 
 
-def _designs(after: Sightings, about: Floats, scanner: Floats) -> dict[str, tuple[Floats, Floats]]:
+def _designs(
+    after: CheckSightings, about: Floats, scanner: Floats
+) -> dict[str, tuple[Floats, Floats]]:
     n = len(after.residuals)
     at_scanner = -after.effects[..., :6] @ adjoint_shift(about - scanner)
     tool = np.concatenate([after.flanges, np.zeros((n, 2, 3))], axis=1)
@@ -94,7 +96,7 @@ def _designs(after: Sightings, about: Floats, scanner: Floats) -> dict[str, tupl
     return found | one | {"arm re-mastered": (columns[:, 1:], scale)}
 
 
-def _noise(before: Information, after: Sightings, daily: float) -> Floats:
+def _noise(before: Information, after: CheckSightings, daily: float) -> Floats:
     """Return the (5N, 5N) covariance of the residuals without a change."""
     stacked = stack_rows(after.effects)
     out = stacked @ before.covariance @ stacked.T

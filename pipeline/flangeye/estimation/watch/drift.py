@@ -49,7 +49,7 @@ State = Literal["OK", "DEGRADED", "MOVED"]
 
 
 @dataclass(frozen=True, eq=False)
-class Sightings:
+class CheckSightings:
     """N sightings of the target, against the stored calibration.
 
     Attributes:
@@ -69,11 +69,11 @@ class Sightings:
     joints: Floats | None
     check: NDArray[np.intp]
 
-    def of(self, first: int, last: int) -> Sightings:
+    def of(self, first: int, last: int) -> CheckSightings:
         """Return those of the checks from ``first`` up to, not with, ``last``."""
         kept = (self.check >= first) & (self.check < last)
         joints = None if self.joints is None else self.joints[kept]
-        return Sightings(
+        return CheckSightings(
             self.residuals[kept], self.effects[kept], self.covariances[kept], self.flanges[kept],
             joints, self.check[kept],
         )  # fmt: skip
@@ -103,7 +103,7 @@ class DriftTest:
 
 
 @dataclass(frozen=True, eq=False)
-class Verdict:
+class DriftVerdict:
     """What the last check says.
 
     Attributes:
@@ -184,7 +184,7 @@ class Prior:
     freedom: float = np.inf
 
 
-def information_of(sightings: Sightings, daily: float) -> Information:
+def information_of(sightings: CheckSightings, daily: float) -> Information:
     """Return what each check tells, its share of the day's motion marginalised."""
     told = _unmarginalised(sightings)
     motions = told.matrix[:, :, :6]
@@ -193,7 +193,7 @@ def information_of(sightings: Sightings, daily: float) -> Information:
     return Information(matrix, told.vector - (taken @ told.vector[:, :6, None])[..., 0])
 
 
-def _unmarginalised(sightings: Sightings) -> Information:
+def _unmarginalised(sightings: CheckSightings) -> Information:
     weights = np.linalg.inv(sightings.covariances)
     weighted = sightings.effects.transpose(0, 2, 1) @ weights
     matrices, vectors = weighted @ sightings.effects, -(weighted @ sightings.residuals[..., None])
@@ -204,7 +204,7 @@ def _unmarginalised(sightings: Sightings) -> Information:
     return Information(matrix, vector[..., 0])
 
 
-def prior_of(sightings: Sightings, variances: Floats) -> Prior:
+def prior_of(sightings: CheckSightings, variances: Floats) -> Prior:
     """Return what a calibration's own sightings tell, all of one check.
 
     Args:
@@ -217,7 +217,7 @@ def prior_of(sightings: Sightings, variances: Floats) -> Prior:
     return Prior(start.plus(told), max(3.0 * len(sightings.check) + 2.0 * tilts - 6.0, 1.0))
 
 
-def verdict(checks: Information, prior: Prior, corners: Floats, test: DriftTest) -> Verdict:
+def verdict(checks: Information, prior: Prior, corners: Floats, test: DriftTest) -> DriftVerdict:
     """Judge the last of the checks; every change found is its first.
 
     Args:
@@ -237,21 +237,21 @@ def verdict(checks: Information, prior: Prior, corners: Floats, test: DriftTest)
     drifted: State = "MOVED" if surely > test.limit else "DEGRADED"
     state = drifted if surely > test.limit / 2 else "OK"
     since = None if state == "OK" else _began(checks, corners, prior, test)
-    return Verdict(state, motion, covariance, shift, since, found[0])
+    return DriftVerdict(state, motion, covariance, shift, since, found[0])
 
 
 def moved_since(
     checks: Information, prior: Prior, corners: Floats, test: DriftTest, since: int, ratio: float
-) -> Verdict:
+) -> DriftVerdict:
     """Return how far the camera is from where it was before check ``since``."""
     start = prior.told.loosened(test.seasonal)
     before = start.plus(checks.summed(max(since - test.reference, 0), since))
     change = _change(checks.summed(since, len(checks.matrix)), before)
     shift = largest_shift(change.mean, corners)
-    return Verdict("MOVED", change.mean, change.covariance, shift, since, ratio)
+    return DriftVerdict("MOVED", change.mean, change.covariance, shift, since, ratio)
 
 
-def misfits(sightings: Sightings, before: Information, test: DriftTest) -> NDArray[np.bool_]:
+def misfits(sightings: CheckSightings, before: Information, test: DriftTest) -> NDArray[np.bool_]:
     """Return which of N sightings (N,) cannot be, by themselves, while nothing moved."""
     effects = sightings.effects
     spread = effects @ before.covariance @ effects.transpose(0, 2, 1) + sightings.covariances
@@ -361,7 +361,7 @@ def sightings_of(  # noqa: PLR0913  one argument a measured quantity
     expected: Floats,
     jacobians: Floats | None,
     check: NDArray[np.intp],
-) -> Sightings:
+) -> CheckSightings:
     """Linearise N sightings of a circle at the stored calibration.
 
     Args:
@@ -389,4 +389,4 @@ def sightings_of(  # noqa: PLR0913  one argument a measured quantity
         turned = across @ -hat(axes) @ jacobians[:, :3] * has[:, None, None]
         joints = np.concatenate([jacobians[:, 3:], turned], axis=1)
     residuals = np.concatenate([mapped - expected[:, :3, 3], tilts], axis=1)
-    return Sightings(residuals, effects, own, expected[:, :3, :3], joints, np.asarray(check))
+    return CheckSightings(residuals, effects, own, expected[:, :3, :3], joints, np.asarray(check))

@@ -40,7 +40,7 @@ FREE = np.ones(6)
 
 
 @dataclass(frozen=True, eq=False)
-class PoseError:
+class ArmPoseErrors:
     """The errors of an arm's poses, with their sizes.
 
     Attributes:
@@ -79,7 +79,7 @@ class PoseError:
         return np.diag(np.repeat(np.square(self.noise), (3, 2)))
 
 
-def pose_error_of(residuals: Floats, effects: Floats, own: Floats, poses: Floats) -> PoseError:
+def pose_error_of(residuals: Floats, effects: Floats, own: Floats, poses: Floats) -> ArmPoseErrors:
     """Return the error of an arm from a calibration's N residuals.
 
     Args:
@@ -104,22 +104,22 @@ def pose_error_of(residuals: Floats, effects: Floats, own: Floats, poses: Floats
     return _sized(bare, best.x)
 
 
-def _unsized(poses: Floats) -> PoseError:
+def _unsized(poses: Floats) -> ArmPoseErrors:
     middle = np.eye(4)
     middle[:3, 3] = poses[:, :3, 3].mean(axis=0)
     middle[:3, :3] = nearest_rotation(poses[:, :3, :3].mean(axis=0))
     radius = np.linalg.norm(poses[:, :3, 3] - middle[:3, 3], axis=1).max()
     angle = np.linalg.norm(rotation_log(poses[:, :3, :3] @ middle[:3, :3].T), axis=1).max()
     lengths = RADII * np.array([max(radius, SHORTEST), max(angle, NARROWEST)])
-    return PoseError(middle, np.repeat(lengths, 3), (0.0, 0.0), (0.0, 0.0))
+    return ArmPoseErrors(middle, np.repeat(lengths, 3), (0.0, 0.0), (0.0, 0.0))
 
 
-def _sized(bare: PoseError, logs: Floats) -> PoseError:
+def _sized(bare: ArmPoseErrors, logs: Floats) -> ArmPoseErrors:
     smooth, tilt, noise, tilt_noise = np.exp(logs).tolist()
-    return PoseError(bare.middle, bare.lengths, (smooth, tilt), (noise, tilt_noise))
+    return ArmPoseErrors(bare.middle, bare.lengths, (smooth, tilt), (noise, tilt_noise))
 
 
-def _unlikelihood(design: Floats, residuals: Floats, own: Floats, error: PoseError) -> float:
+def _unlikelihood(design: Floats, residuals: Floats, own: Floats, error: ArmPoseErrors) -> float:
     """Return minus twice the log of the marginal likelihood, but for a constant."""
     noise = own + error.beyond
     weighted = design.transpose(0, 2, 1) @ np.linalg.inv(noise)

@@ -224,7 +224,7 @@ def _counted(table: Table) -> tuple[str, ...]:
 
 
 @dataclass
-class Block:
+class TextBlock:
     """Rows without a blank line, a comment or a title between them.
 
     Attributes:
@@ -276,9 +276,9 @@ def row_of(file: Path, text: str) -> Rows | None:
     return Rows((), [(str(file), cells)])
 
 
-def _blocks(file: Path, lines: Sequence[str]) -> Iterator[Block]:
+def _blocks(file: Path, lines: Sequence[str]) -> Iterator[TextBlock]:
     split = _splitter([line for line in lines if line.strip() and not _COMMENT.match(line)])
-    block = Block(after_blank=True, marked=split.mark != " ")
+    block = TextBlock(after_blank=True, marked=split.mark != " ")
     for n, line in enumerate(map(str.strip, lines), 1):
         comment = bool(_COMMENT.match(line))
         plain = _COMMENT.sub("", line)
@@ -288,7 +288,7 @@ def _blocks(file: Path, lines: Sequence[str]) -> Iterator[Block]:
             continue
         if block.rows:
             yield block
-            block = Block(marked=block.marked)
+            block = TextBlock(marked=block.marked)
         block.after_blank |= not comment
         if any(cells):
             block.heading, block.title = cells, plain.rstrip(" :")
@@ -296,7 +296,7 @@ def _blocks(file: Path, lines: Sequence[str]) -> Iterator[Block]:
         yield block
 
 
-def _with_matrices(block: Block) -> Block:
+def _with_matrices(block: TextBlock) -> TextBlock:
     """Return a block whose matrices, line by line, are a row of numbers each."""
     widths = {len(cells) for _, cells in block.rows}
     if not (len(block.heading) in widths or (block.marked and len(block.heading) > 2)):
@@ -323,9 +323,9 @@ def _or_nan(cell: str | float) -> float:
     return float("nan") if number is None else number
 
 
-def _merged(blocks: list[Block]) -> list[Block]:
+def _merged(blocks: list[TextBlock]) -> list[TextBlock]:
     """Return blocks of one table as one: short ones, and those that only a comment parts."""
-    sections: list[Block] = []
+    sections: list[TextBlock] = []
     # Rows of a block; fewer between blank lines are a pose each
     short = [block for block in blocks if len(block.rows) < 3]
     all_titled = all(block.title for block in blocks)
@@ -337,13 +337,13 @@ def _merged(blocks: list[Block]) -> list[Block]:
         if short:
             begins = bool(block.title) and not all_titled
         if last is None or not same or begins:
-            sections.append(Block(list(block.rows), block.heading, block.title))
+            sections.append(TextBlock(list(block.rows), block.heading, block.title))
         else:
             last.rows += block.rows
     return sections
 
 
-def _names(block: Block, blocks: Sequence[Block]) -> list[str]:
+def _names(block: TextBlock, blocks: Sequence[TextBlock]) -> list[str]:
     """Return the titles of rows that each have one."""
     titles = [each.title for each in blocks if each.rows[0] in block.rows]
     return titles if len(titles) == len(block.rows) > 1 and all(titles) else []

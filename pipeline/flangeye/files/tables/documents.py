@@ -28,14 +28,14 @@ MATRICES = ((4, 4), (3, 3), (3, 4))
 _OPENCV = re.compile(r"\A%YAML[^\n]*\n(?:---[^\n]*\n)?|!!opencv(?:-nd)?-matrix")
 
 
-class Document(NamedTuple):
+class TableDocument(NamedTuple):
     """What a file holds, and where its records stand, as messages begin with it."""
 
     data: Any
     where: Callable[[int], str]
 
 
-def document_of(file: Path) -> Document | None:
+def document_of(file: Path) -> TableDocument | None:
     """Return what a file holds as mappings, lists, numbers and arrays; None if it is plain text.
 
     Raises:
@@ -53,14 +53,14 @@ def document_of(file: Path) -> Document | None:
         raise StageError(f"{file}: cannot be read: {reason_of(error)}") from None
 
 
-def _json(file: Path) -> Document:
-    return Document(_loaded(str(file), read_text(file)), lambda at: f"{file}: record {at + 1}")
+def _json(file: Path) -> TableDocument:
+    return TableDocument(_loaded(str(file), read_text(file)), lambda at: f"{file}: record {at + 1}")
 
 
-def _json_lines(file: Path) -> Document:
+def _json_lines(file: Path) -> TableDocument:
     lines = [(n, line) for n, line in enumerate(read_text(file).splitlines(), 1) if line.strip()]
     records = [_loaded(f"{file}:{n}", line) for n, line in lines]
-    return Document(records, lambda at: f"{file}:{lines[at][0]}")
+    return TableDocument(records, lambda at: f"{file}:{lines[at][0]}")
 
 
 def _loaded(where: str, text: str) -> Any:
@@ -70,7 +70,7 @@ def _loaded(where: str, text: str) -> Any:
         raise StageError(f"{where}: is no JSON: {reason_of(error)}") from None
 
 
-def _yaml(file: Path) -> Document:
+def _yaml(file: Path) -> TableDocument:
     text = read_text(file)
     if len(text) > MAX_BYTES:
         raise StageError(f"{file}: is larger than {MAX_BYTES} bytes; write it as .json")
@@ -78,15 +78,17 @@ def _yaml(file: Path) -> Document:
         document = parse_yaml(_OPENCV.sub("", text), str(file))
     except RecipeError as error:
         raise StageError(str(error)) from None
-    return Document(document.data, lambda at: f"{file}:{document.line((at,))}")
+    return TableDocument(document.data, lambda at: f"{file}:{document.line((at,))}")
 
 
-def _xml(file: Path) -> Document:
+def _xml(file: Path) -> TableDocument:
     """Return what cv2.FileStorage wrote; entities, which can expand to any length, are refused."""
     text = read_text(file)
     if "<!" in re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL):
         raise StageError(f"{file}: declares a document type or entities, which are not read")
-    return Document(_element(ElementTree.fromstring(text)), lambda at: f"{file}: record {at + 1}")
+    return TableDocument(
+        _element(ElementTree.fromstring(text)), lambda at: f"{file}: record {at + 1}"
+    )
 
 
 def _element(element: ElementTree.Element) -> Any:
@@ -103,13 +105,13 @@ def _element(element: ElementTree.Element) -> Any:
     return numbers[0] if len(numbers) == 1 and element.tag != "data" else numbers
 
 
-def _numpy(file: Path) -> Document:
+def _numpy(file: Path) -> TableDocument:
     arrays = read_arrays(file)
     data: Any = arrays[""] if list(arrays) == [""] else arrays
-    return Document(data, lambda at: f"{file}: row {at + 1}")
+    return TableDocument(data, lambda at: f"{file}: row {at + 1}")
 
 
-def _matlab(file: Path) -> Document:
+def _matlab(file: Path) -> TableDocument:
     """Return the arrays of a .mat file: its parser, which damage can crash, has its own process."""
     command = python_command(matlab_parser.__file__)
     # Longest .mat file [bytes]
@@ -133,10 +135,10 @@ def _matlab(file: Path) -> Document:
         raise ValueError(done.stderr.decode("utf-8", "replace"))
     found = np.load(io.BytesIO(done.stdout), allow_pickle=False)
     arrays = {n.removeprefix(matlab_parser.PREFIX): array for n, array in found.items()}
-    return Document(arrays, lambda at: f"{file}: row {at + 1}")
+    return TableDocument(arrays, lambda at: f"{file}: row {at + 1}")
 
 
-KINDS: Mapping[str, Callable[[Path], Document]] = {
+KINDS: Mapping[str, Callable[[Path], TableDocument]] = {
     ".json": _json, ".jsonl": _json_lines, ".ndjson": _json_lines,
     ".yaml": _yaml, ".yml": _yaml, ".samples": _yaml, ".xml": _xml,
     ".npz": _numpy, ".npy": _numpy, ".mat": _matlab,

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flangeye.errors import StageError
-from flangeye.files.tables.documents import MATRICES, Document
+from flangeye.files.tables.documents import MATRICES, TableDocument
 from flangeye.files.words import nearest
 from flangeye.types import Floats
 
@@ -147,12 +147,12 @@ _NUMBERED = re.compile(r"\d+(?=\D*$)")
 _ENDING = re.compile(r"\.[A-Za-z]\w{1,4}$")
 
 
-def record_of(file: Path, document: Document) -> Rows:
+def record_of(file: Path, document: TableDocument) -> Rows:
     """Return a file that is one record as one row."""
     return _table([(str(file), document.data)])
 
 
-def rows_of(file: Path, document: Document) -> list[Rows]:
+def rows_of(file: Path, document: TableDocument) -> list[Rows]:
     """Return the tables of a document: of each length of its lists one, the commonest first.
 
     Raises:

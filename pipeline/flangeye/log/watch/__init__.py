@@ -10,7 +10,7 @@ from rich.console import Console
 
 from flangeye.errors import StageError
 from flangeye.log.watch.server import foxglove_server
-from flangeye.log.watch.view import View, follow
+from flangeye.log.watch.view import RunView, follow
 
 __all__ = ["watch_run"]
 
@@ -19,7 +19,7 @@ POLL = 0.1
 """Between two looks for something new [s]."""
 
 
-def watch_run(run: Path | None, port: int | None, console: Console, patience: float) -> View:
+def watch_run(run: Path | None, port: int | None, console: Console, patience: float) -> RunView:
     """Show a run until it ends.
 
     Args:
@@ -34,7 +34,7 @@ def watch_run(run: Path | None, port: int | None, console: Console, patience: fl
     from rich.live import Live
 
     log = _log_to_come(run, patience)
-    view = View(log.parent.name)
+    view = RunView(log.parent.name)
     serving = foxglove_server(port) if port else nullcontext(lambda message: None)
     with serving as send, Live(console=console, refresh_per_second=8) as live:
         quiet_since = time.monotonic()

@@ -20,9 +20,9 @@ from contextlib import ExitStack, closing, contextmanager, suppress
 from functools import partial
 
 from flangeye.errors import StageError
-from flangeye.log.watch.view import Channel, Message
+from flangeye.log.watch.view import Channel, LogMessage
 
-Send = Callable[[Message], None]
+Send = Callable[[LogMessage], None]
 
 HERE = "127.0.0.1"
 
@@ -53,7 +53,7 @@ def foxglove_server(port: int) -> Iterator[Send]:
         opened.close()
         raise StageError(f"--foxglove {port}: cannot serve there: {error}") from None
 
-    def send(message: Message) -> None:
+    def send(message: LogMessage) -> None:
         topic = message.channel.topic
         if topic not in channels:
             channels[topic] = _opened(message.channel)

@@ -16,12 +16,12 @@ from flangeye.errors import StageError
 from flangeye.files.regular import open_regular
 from flangeye.files.words import printable
 from flangeye.log.read import decode_json
-from flangeye.log.records import Channel, LogFile, Message, NotMcapError, reason_of
+from flangeye.log.records import Channel, LogFile, LogMessage, NotMcapError, reason_of
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-__all__ = ["Channel", "Message", "follow"]
+__all__ = ["Channel", "LogMessage", "follow"]
 
 
 class WaitingFile(io.RawIOBase):
@@ -50,7 +50,7 @@ class WaitingFile(io.RawIOBase):
 
 def follow(
     path: Path, wait: Callable[[], None], note: Callable[[str], None] = lambda what: None
-) -> Iterator[Message]:
+) -> Iterator[LogMessage]:
     """Yield the messages of a log from its beginning until the run ends.
 
     Args:
@@ -73,7 +73,7 @@ def follow(
 
 
 @dataclass
-class View:
+class RunView:
     """The state of a run.
 
     Attributes:
@@ -100,7 +100,7 @@ class View:
     newest_ns: int = 0
     ended: bool = False
 
-    def take(self, message: Message) -> None:
+    def take(self, message: LogMessage) -> None:
         """Take in one message."""
         self.newest_ns = message.time_ns
         before = vars(self).copy()
@@ -115,7 +115,7 @@ class View:
         """Show a line of our own among the events."""
         self._say(what)
 
-    def _take(self, message: Message) -> None:
+    def _take(self, message: LogMessage) -> None:
         topic, schema = message.channel.topic, message.channel.schema
         if message.channel.encoding != "json":
             return

@@ -172,11 +172,11 @@ def _of_six(table: Table, part: list[int], numbers: Floats, told: str) -> PoseCo
     return PoseColumns(table, tuple(columns), (), guess=told)
 
 
-FEWEST = 5
+FEWEST_PAIRS = 5
 """Poses; fewer fit several conventions."""
-MOST = 60
+MOST_PAIRS = 60
 """Poses whose pairs are looked at: enough to tell frames apart."""
-ALIKE = np.radians(3.0)
+ALIKE_ANGLE = np.radians(3.0)
 """Largest median difference of the angles [rad] at which a convention is taken to fit."""
 CLEARER = 3.0
 """By what factor the next best has to be worse, beyond 0.2 deg or 2 mm."""
@@ -229,7 +229,7 @@ def writing_of(
         target: (N, m) numbers of the target's.
         targets: What those may mean.
     """
-    if len(arm) != len(target) or len(arm) < FEWEST:
+    if len(arm) != len(target) or len(arm) < FEWEST_PAIRS:
         return None
     tried = []
     angles = {id(w): _turned(w.poses(arm)) for w in arms}
@@ -239,7 +239,7 @@ def writing_of(
         if one is not None and other is not None:
             tried.append((_apart(one, other), a, b))
     tried.sort(key=lambda each: each[0])
-    if not tried or tried[0][0] > ALIKE:
+    if not tried or tried[0][0] > ALIKE_ANGLE:
         return None
     best, a, b = tried[0]
     alike = [each for each in tried if each[0] < CLEARER * max(best, LOOSE_ANGLE)]
@@ -256,7 +256,7 @@ def _by_places(
 
     Quaternions whose numbers are all permuted turn by the same angles, so these do not tell.
     """
-    some = np.linspace(0, len(arm) - 1, min(len(arm), MOST)).astype(int)
+    some = np.linspace(0, len(arm) - 1, min(len(arm), MOST_PAIRS)).astype(int)
     tried = []
     for a, b in alike:
         poses, seen = a.poses(arm[some]), b.poses(target[some])
@@ -313,9 +313,9 @@ def mounting_of(
         cameras: What may carry the camera: base, flange.
         targets: What the target's poses may be: camera_T_target, target_T_camera.
     """
-    if len(arm) < FEWEST:
+    if len(arm) < FEWEST_PAIRS:
         return None
-    some = np.linspace(0, len(arm) - 1, min(len(arm), MOST)).astype(int)
+    some = np.linspace(0, len(arm) - 1, min(len(arm), MOST_PAIRS)).astype(int)
     twins = _residuals_by_twins(arm[some], seen[some], cameras, targets)
     if not twins:
         return None

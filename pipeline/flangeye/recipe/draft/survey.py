@@ -101,7 +101,7 @@ class Questions:
 
 
 TABLES = (".csv", ".txt", ".dat", ".tsv", ".tum", ".log", ".mod", ".src", ".ls", ".script", *KINDS)
-FEWEST = 3
+FEWEST_ROWS = 3
 """Rows of a table of poses, and files that are named alike under one pattern."""
 _PART = re.compile(r"(?<![a-z])(r|rot|rotations?|rvecs?|t|trans|translations?|tvecs?|pos)(?![a-z])")
 
@@ -167,9 +167,9 @@ def places(folder: Path, files: Sequence[Path]) -> Iterator[tuple[str, list[Path
         if file.suffix.lower() in TABLES and file.stat().st_size <= 10_000_000:
             alike = re.sub(r"\d+(?=\D*$)", "*", file.stem) + file.suffix
             groups[str(file.relative_to(folder).with_name(alike))].append(file)
-    single = [file for files in groups.values() if len(files) < FEWEST for file in files]
-    one_each = [n for n, count in Counter(f.name for f in single).items() if count >= FEWEST]
-    yield from ((place, files) for place, files in groups.items() if len(files) >= FEWEST)
+    single = [file for files in groups.values() if len(files) < FEWEST_ROWS for file in files]
+    one_each = [n for n, count in Counter(f.name for f in single).items() if count >= FEWEST_ROWS]
+    yield from ((place, files) for place, files in groups.items() if len(files) >= FEWEST_ROWS)
     for file in single:
         if file.name not in one_each:
             yield str(file.relative_to(folder)), [file]
@@ -187,10 +187,10 @@ def _tables(folder: Path, place: str, files: int) -> list[Table]:
 
 
 def _holds_numbers(table: Table) -> bool:
-    if len(table.rows) < FEWEST:
+    if len(table.rows) < FEWEST_ROWS:
         return False
     numbers = sum(number_of(cell) is not None for cell in table.rows[0][1])
-    return numbers >= FEWEST
+    return numbers >= FEWEST_ROWS
 
 
 def _whole(folder: Path, tables: Sequence[Table]) -> list[Table]:

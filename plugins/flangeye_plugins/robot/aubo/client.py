@@ -30,7 +30,7 @@ SHARE = 0.5
 """Of the deceleration allowed, the share that is planned with: a velocity is followed a little
 late, and what it lags behind is made up for with the rest."""
 
-NEAR = 2e-3
+GOAL_WITHIN = 2e-3
 """From here on the controller moves to the goal itself [rad, m]: an arm at 0.5 rad/s^2 needs
 0.13 s for it, so that this end, too, is a piece."""
 
@@ -165,7 +165,7 @@ class Ride:
         passed, self._renewed = now - self._renewed, now
         if self._velocity == 0.0 and fastest > STANDING:
             return  # it comes to rest first
-        if left < NEAR:
+        if left < GOAL_WITHIN:
             self._finish()
         else:
             self._velocity = min(

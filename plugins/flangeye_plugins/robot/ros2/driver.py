@@ -32,7 +32,7 @@ SETTLING = 0.3
 """How long a controller may take to its goal when the motion is over [s]."""
 
 
-class Ros2Params(ListenParams):
+class Ros2RobotParams(ListenParams):
     """Parameters of ``robot.ros2``."""
 
     trajectory: str = Field(
@@ -49,7 +49,7 @@ class FreedriveParams(ListenParams):
 
 
 @part("robot.ros2")
-def robot_ros2(model: RobotModel, params: Ros2Params, reads_only: bool = False) -> Robot:
+def robot_ros2(model: RobotModel, params: Ros2RobotParams, reads_only: bool = False) -> Robot:
     """Any arm with a ROS 2 driver: joint states report it, a joint trajectory moves it.
 
     Motions are published in pieces that lead a third of a second ahead and end by themselves, so an
@@ -58,7 +58,7 @@ def robot_ros2(model: RobotModel, params: Ros2Params, reads_only: bool = False) 
 
     Args:
         model: The arm, as its URDF has it.
-        params: See :class:`Ros2Params`.
+        params: See :class:`Ros2RobotParams`.
         reads_only: Publish nothing.
 
     Raises:
@@ -94,14 +94,16 @@ def robot_ros2_freedrive(model: RobotModel, params: FreedriveParams) -> Robot:
 class Ros2Arm(Listener):
     """An arm that is moved in pieces; see :class:`flangeye.devices.Robot`."""
 
-    def __init__(self, asker: str, model: RobotModel, params: Ros2Params, bridge: Bridge) -> None:
+    def __init__(
+        self, asker: str, model: RobotModel, params: Ros2RobotParams, bridge: Bridge
+    ) -> None:
         """Hear where the arm is, and find the controller.
 
         Raises:
             DeviceError: Joint states do not come, or nobody listens to the trajectories.
         """
         self._topic, self._names = params.trajectory, list(params.joints)
-        self._motion: pieces.Motion | None = None
+        self._motion: pieces.DrivenMotion | None = None
         self._from, self._began, self._renewed = np.zeros(len(params.joints)), 0.0, 0.0
         self._ended = 0.0
         super().__init__(asker, model, params, bridge)
@@ -164,7 +166,7 @@ class Ros2Arm(Listener):
         settles = time.monotonic() < self._ended + SETTLING
         return "moving" if moves or settles or self._motion is not None else "ready"
 
-    def _begin(self, motion: pieces.Motion) -> None:
+    def _begin(self, motion: pieces.DrivenMotion) -> None:
         self._require_listener()
         self._motion, self._from = motion, self._samples[-1].joints
         self._began = self._renewed = time.monotonic()
@@ -180,7 +182,7 @@ class Ros2Arm(Listener):
         self._renewed = now
         if motion.done:
             self._motion, self._ended = None, now + pieces.LAST
-        elif isinstance(motion, pieces.Path) and now - self._began > SET_OFF:
+        elif isinstance(motion, pieces.DrivenPath) and now - self._began > SET_OFF:
             self._require_motion(joints)
 
     def _require_motion(self, joints: Floats) -> None:

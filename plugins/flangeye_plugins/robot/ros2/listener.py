@@ -16,7 +16,7 @@ from flangeye.models.robots import RobotModel
 from flangeye.plugin.stage import Params
 from flangeye.types import BASE, FLANGE, Floats, Transform
 from flangeye_plugins.robot.tool_check import require_model
-from flangeye_plugins.ros2.client import Bridge, Message
+from flangeye_plugins.ros2.client import Bridge, GraphMessage
 from flangeye_plugins.ros2.frames import Frames
 from flangeye_plugins.ros2.messages import JOINT_STATE, decoded
 
@@ -60,7 +60,7 @@ class ListenParams(Params):
     sim_time: bool = Field(False, description="Stamps are simulated time, of the topic /clock.")
 
 
-class Sample(NamedTuple):
+class JointSample(NamedTuple):
     """Joint angles (n,) [rad], when they were so [ns], and when that came [ns]."""
 
     joints: Floats
@@ -89,7 +89,7 @@ class Listener(Device):
         self.arm, self._params, self._bridge = Arm(model), params, bridge
         self._asker, self._model = asker, model
         self._seen = 0
-        self._samples: deque[Sample] = deque()
+        self._samples: deque[JointSample] = deque()
         self._columns: tuple[tuple[str, ...], list[int]] = ((), [])
         if len(params.joints) != self.arm.n:
             raise DeviceError(
@@ -131,7 +131,7 @@ class Listener(Device):
         seconds = 1e-9 * (last.time_ns - first.time_ns)
         return (last.joints - first.joints) / seconds if seconds > 0 else np.zeros(self.arm.n)
 
-    def _flange(self, sample: Sample) -> Floats:
+    def _flange(self, sample: JointSample) -> Floats:
         if self._frames and (tf := self._params.tf):
             return self._frames.pose(tf.base, tf.flange)
         return self.arm.flange(sample.joints)
@@ -169,7 +169,7 @@ class Listener(Device):
                 return True
         return False
 
-    def _keep(self, message: Message) -> bool:
+    def _keep(self, message: GraphMessage) -> bool:
         """Keep a message's angles, if it has those of this arm."""
         told = decoded(message.data, JOINT_STATE)
         names = tuple(told.name)
@@ -178,7 +178,7 @@ class Listener(Device):
                 return False  # a gripper's or a rail's, on the same topic
             self._columns = names, [names.index(joint) for joint in self._params.joints]
         joints = np.asarray(told.position, dtype=float)[self._columns[1]]
-        sample = Sample(joints, self._bridge.local_ns(message), message.received_ns)
+        sample = JointSample(joints, self._bridge.local_ns(message), message.received_ns)
         self._require_forwards(sample)
         self._samples.append(sample)
         # Over which speeds are taken [ns]: what some drivers publish as velocity is noise, or empty
@@ -186,7 +186,7 @@ class Listener(Device):
             self._samples.popleft()
         return True
 
-    def _require_forwards(self, sample: Sample) -> None:
+    def _require_forwards(self, sample: JointSample) -> None:
         back = 1e-9 * (self._samples[-1].time_ns - sample.time_ns) if self._samples else 0.0
         if back > STALE:
             self._samples.clear()
@@ -195,7 +195,7 @@ class Listener(Device):
                 "simulation was started again; start the run again"
             )
 
-    def _fresh(self) -> Sample:
+    def _fresh(self) -> JointSample:
         """Return the newest sample; raise DeviceError for one that is too old."""
         if not self._samples:
             raise DeviceError(f"{self.name}: {self._missing() or NOTHING}")

@@ -39,7 +39,7 @@ BRISK = 3.0
 LAST = 0.03
 """What is left of a motion when its last piece is published: about a renewal [s]."""
 
-STEP = 0.01
+SAMPLE_TIME = 0.01
 """Between the samples of a motion [s]."""
 
 PACE = 0.15
@@ -57,7 +57,7 @@ class Point(NamedTuple):
     after: float
 
 
-class Motion(ABC):
+class DrivenMotion(ABC):
     """What is driven in pieces.
 
     Attributes:
@@ -106,22 +106,22 @@ class Motion(ABC):
         return BRISK
 
 
-class Path(Motion):
+class DrivenPath(DrivenMotion):
     """A motion that is known from its beginning to its end."""
 
     def __init__(self, joints: Floats, acceleration: float) -> None:
-        """Follow (N, n) joint angles, :data:`STEP` apart; brake at ``acceleration`` [rad/s^2].
+        """Follow (N, n) joint angles :data:`SAMPLE_TIME` apart, braking at a rate [rad/s^2].
 
         Its acceleration is spread over :data:`AHEAD`: the controller's cubic across a corner of the
         speed would be faster than either side of it.
         """
         super().__init__()
-        width = round(AHEAD / STEP)
+        width = round(AHEAD / SAMPLE_TIME)
         padded = np.pad(joints, ((width, width), (0, 0)), mode="edge")
         self._joints = sliding_window_view(padded, width + 1, axis=0).mean(axis=-1)
-        self._speeds = np.gradient(self._joints, STEP, axis=0)
+        self._speeds = np.gradient(self._joints, SAMPLE_TIME, axis=0)
         self._speeds[[0, -1]] = 0.0
-        self._end, self._phase = STEP * (len(self._joints) - 1), 0.0
+        self._end, self._phase = SAMPLE_TIME * (len(self._joints) - 1), 0.0
         self._acceleration = acceleration
         self._seen: deque[tuple[float, float]] = deque()
 
@@ -144,14 +144,14 @@ class Path(Motion):
 
     def _reached(self, joints: Floats) -> float:
         """Return the time at which the motion passes nearest to where the arm is [s]."""
-        until = int(self._phase / STEP) + 2
+        until = int(self._phase / SAMPLE_TIME) + 2
         nearest = int(np.argmin(np.abs(self._joints[:until] - joints).max(axis=1)))
-        along = STEP * self._speeds[nearest]
+        along = SAMPLE_TIME * self._speeds[nearest]
         beyond = float((joints - self._joints[nearest]) @ along) / max(float(along @ along), 1e-12)
-        return STEP * (nearest + float(np.clip(beyond, -0.5, 0.5)))
+        return SAMPLE_TIME * (nearest + float(np.clip(beyond, -0.5, 0.5)))
 
     def _point(self, after: float) -> Point:
-        place = min((self._phase + after) / STEP, len(self._joints) - 1.0)
+        place = min((self._phase + after) / SAMPLE_TIME, len(self._joints) - 1.0)
         low = min(int(place), len(self._joints) - 2)
         share = place - low
         joints, speeds = (
@@ -164,14 +164,14 @@ class Path(Motion):
         left = max(self._end - self._phase, LAST)
         knots = [KNOT * i for i in range(1, round(AHEAD / KNOT) + 1) if KNOT * i < left]
         if left <= AHEAD:
-            knots = [*(knot for knot in knots if left - knot > STEP), left]
+            knots = [*(knot for knot in knots if left - knot > SAMPLE_TIME), left]
         return [self._point(after) for after in knots]
 
     def _deceleration(self) -> float:
         return self._acceleration
 
 
-class Velocity(Motion):
+class Velocity(DrivenMotion):
     """A motion at the speeds that were asked for last."""
 
     def __init__(self, joints: Floats) -> None:
@@ -215,15 +215,17 @@ def brake(last: Point, deceleration: float) -> list[Point]:
     return [Point(goal, np.zeros_like(goal), last.after + seconds)]
 
 
-def joint_path(start: Floats, goal: Floats, speed: float, acceleration: float) -> Path:
+def joint_path(start: Floats, goal: Floats, speed: float, acceleration: float) -> DrivenPath:
     """Return a straight motion in joint angles (n,); the leading joint keeps ``speed`` [rad/s]."""
     way = goal - start
     length = float(np.abs(way).max())
     share = _ride(length, speed, acceleration) / max(length, 1e-12)
-    return Path(start + share[:, None] * way, acceleration)
+    return DrivenPath(start + share[:, None] * way, acceleration)
 
 
-def linear_path(arm: Arm, start: Floats, goal: Floats, speed: float, acceleration: float) -> Path:
+def linear_path(
+    arm: Arm, start: Floats, goal: Floats, speed: float, acceleration: float
+) -> DrivenPath:
     """Return a motion of the flange straight to a pose (4, 4) [m/s, m/s^2].
 
     Raises:
@@ -240,23 +242,23 @@ def linear_path(arm: Arm, start: Floats, goal: Floats, speed: float, acceleratio
         pose[:3, 3] = base_T_flange[:3, 3] + share * way
         pose[:3, :3] = base_T_flange[:3, :3] @ rotation_exp(share * turn)
         joints.append(_nearest(arm.inverse(pose), joints[-1]))
-    return Path(np.array(joints), BRISK)
+    return DrivenPath(np.array(joints), BRISK)
 
 
 def _nearest(found: Floats, before: Floats) -> Floats:
     turns = found + 2 * np.pi * np.round((before - found) / (2 * np.pi)) if len(found) else found
     apart = np.abs(turns - before).max(axis=1) if len(found) else np.array([np.inf])
-    if apart.min() > 20 * STEP:  # 20 rad/s: no arm turns so fast, it would fold over
+    if apart.min() > 20 * SAMPLE_TIME:  # 20 rad/s: no arm turns so fast, it would fold over
         raise DeviceError("the arm cannot follow the straight line: a joint would have to jump")
     return np.asarray(turns[apart.argmin()])
 
 
 def _ride(length: float, speed: float, acceleration: float) -> Floats:
-    """Return places along a length, :data:`STEP` apart in time, standing at both ends."""
+    """Return places along a length, :data:`SAMPLE_TIME` apart in time, standing at both ends."""
     ramp = min(speed / acceleration, np.sqrt(length / acceleration))
     top = acceleration * ramp
     seconds = length / max(top, 1e-12) + ramp
-    times = np.minimum(STEP * np.arange(int(np.ceil(seconds / STEP)) + 1), seconds)
+    times = np.minimum(SAMPLE_TIME * np.arange(int(np.ceil(seconds / SAMPLE_TIME)) + 1), seconds)
     places = np.clip(
         top * (times - 0.5 * ramp), 0.5 * acceleration * np.minimum(times, ramp) ** 2, None
     )

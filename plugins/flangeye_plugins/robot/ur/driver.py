@@ -24,7 +24,7 @@ from flangeye_plugins.robot.tool_check import (
     wrench_at_flange,
 )
 from flangeye_plugins.robot.ur import driver
-from flangeye_plugins.robot.ur.link import Link, Sample
+from flangeye_plugins.robot.ur.link import ControllerLink, CycleSample
 from flangeye_plugins.robot.ur.worker import ask_dashboard, read_remote
 
 PATIENCE = 0.5
@@ -74,7 +74,7 @@ SAFETY_NAMES = {
 """The dashboard's words for them."""
 
 
-class Facts(NamedTuple):
+class DashboardFacts(NamedTuple):
     """What the dashboard says.
 
     Attributes:
@@ -86,7 +86,7 @@ class Facts(NamedTuple):
     period: float
 
 
-def facts_of(name: str, host: str, to_drive: bool = True) -> Facts:
+def facts_of(name: str, host: str, to_drive: bool = True) -> DashboardFacts:
     """Return what there is to know of a controller that answers and, if asked, can be driven.
 
     Raises:
@@ -107,7 +107,7 @@ def facts_of(name: str, host: str, to_drive: bool = True) -> Facts:
         raise DeviceError(f"{name}: {trouble}")
     found = _VERSION.search(version)
     # CB3 controllers (version 3) have cycles of 8 ms, all later ones of 2 ms.
-    return Facts(version, 0.008 if found and int(found[1]) < 5 else 0.002)
+    return DashboardFacts(version, 0.008 if found and int(found[1]) < 5 else 0.002)
 
 
 def stop(host: str) -> None:
@@ -158,7 +158,7 @@ class Condition(NamedTuple):
     message: str = ""
 
 
-def condition_of(sample: Sample, commanded: bool) -> Condition:
+def condition_of(sample: CycleSample, commanded: bool) -> Condition:
     """Return what the controller is able to do; the worst comes first.
 
     Args:
@@ -209,7 +209,7 @@ def robot_ur_rtde(model: RobotModel, params: ControllerParams, reads_only: bool 
     facts = driver.facts_of(name, params.host, to_drive=not reads_only)
     # Longest time until the client library is connected, first questions included [s]
     patience = 2.6 - (time.monotonic() - began)
-    link = Link(name, params.host, facts.period, patience, reads_only)
+    link = ControllerLink(name, params.host, facts.period, patience, reads_only)
     expected = params.tool.flange_T_tool(SHOWN)
     try:
         # Which tool is set only the other side tells: a wrong one shows in where the flange is.
@@ -233,7 +233,9 @@ class UrRobot(Device):
         offset: (4, 4) ``flange_T_tool`` as the controller has it.
     """
 
-    def __init__(self, name: str, host: str, period: float, link: Link, offset: Floats) -> None:
+    def __init__(
+        self, name: str, host: str, period: float, link: ControllerLink, offset: Floats
+    ) -> None:
         """Take over a connection to a controller whose tool is ``offset`` (4, 4)."""
         self.name, self.period = name, period
         self._host, self._link = host, link
@@ -306,13 +308,13 @@ class UrRobot(Device):
             self._link.close(hopeless=True)
         self._link.close()
 
-    def _base_T_tool(self, sample: Sample) -> Floats:
+    def _base_T_tool(self, sample: CycleSample) -> Floats:
         """Return the tool's pose (4, 4); a cycle asks twice for that of one sample."""
         if self._posed[0] != sample.number:
             self._posed = sample.number, POSE.matrix(sample.tool_pose)
         return self._posed[1]
 
-    def _fresh(self) -> Sample:
+    def _fresh(self) -> CycleSample:
         """Return the newest sample; wait for one where this computer was too busy to take it."""
         until = time.monotonic() + STALE
         while True:
@@ -341,7 +343,7 @@ class UrRobot(Device):
         newest = self._link.sample()
         self._commanded = newest.number + 1 if newest else 0
 
-    def _require_able(self) -> Sample:
+    def _require_able(self) -> CycleSample:
         """Return the newest sample of an arm that can move; raise DeviceError for another."""
         sample = self._fresh()
         condition = condition_of(sample, commanded=False)

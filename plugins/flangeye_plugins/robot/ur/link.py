@@ -29,7 +29,7 @@ LEAVING = 0.6
 """Longest time until the process has ended by itself [s]."""
 
 
-class Sample(NamedTuple):
+class CycleSample(NamedTuple):
     """What the controller sent in one cycle.
 
     Attributes:
@@ -59,7 +59,7 @@ class Sample(NamedTuple):
     tool_force: Floats
 
 
-class Link:
+class ControllerLink:
     """A connection of the client library to one controller, in a process of its own."""
 
     def __init__(
@@ -102,7 +102,7 @@ class Link:
             self.close()
             raise
 
-    def sample(self) -> Sample | None:
+    def sample(self) -> CycleSample | None:
         """Return the newest sample; None while there is none.
 
         Raises:
@@ -185,13 +185,13 @@ class Link:
         raise DeviceError(self._gone)
 
 
-def _sample_of(body: bytes) -> Sample | None:
+def _sample_of(body: bytes) -> CycleSample | None:
     number, time_ns, *modes = worker.SAMPLE.unpack(body)[:7]
     if not number:
         return None
     joints, speeds, pose, force = np.frombuffer(body, dtype="<f8", offset=VECTORS).reshape(4, 6)
     robot_mode, safety_mode, runtime, remote, busy = modes
-    return Sample(
+    return CycleSample(
         number, time_ns, robot_mode, safety_mode, runtime, remote, bool(busy),
         joints, speeds, pose, force,
     )  # fmt: skip

@@ -52,7 +52,7 @@ ASKING = 0.2
 """Between two questions whether the control is remote [s]."""
 
 
-class Refused(Exception):
+class WorkerRefused(Exception):
     """The library or the controller did not do what it was asked."""
 
 
@@ -225,7 +225,7 @@ class Commander:
     def _require(self, done: bool) -> None:
         if not done:
             self._commanded = -math.inf
-            raise Refused("the controller did not take the command")
+            raise WorkerRefused("the controller did not take the command")
 
 
 class Onlooker:
@@ -350,7 +350,7 @@ def connect(host: str) -> Any:
             time.sleep(0.1)
     # The controller stops the program when it hears less often from this process [Hz]
     if not control.setWatchdog(5.0):
-        raise Refused("the controller did not take the watchdog")
+        raise WorkerRefused("the controller did not take the watchdog")
     return control
 
 

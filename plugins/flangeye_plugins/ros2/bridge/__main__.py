@@ -25,11 +25,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 Request = dict[str, Any]
 
 
-class Refused(Exception):
+class RequestRefused(Exception):
     """What was asked for cannot be done: why."""
 
 
-class Output:
+class FramedOutput:
     """Standard output, one whole frame at a time; what libraries print goes to standard error."""
 
     def __init__(self) -> None:
@@ -48,10 +48,10 @@ class Output:
             os._exit(0)
 
 
-class Bridge:
+class BridgeNode:
     """A node, and what was asked of it."""
 
-    def __init__(self, node: Any, output: Output) -> None:
+    def __init__(self, node: Any, output: FramedOutput) -> None:
         self._node, self._output = node, output
         self._publishers: dict[str, Any] = {}
         self._clients: dict[str, Any] = {}
@@ -87,7 +87,7 @@ class Bridge:
         infos = self._node.get_publishers_info_by_topic(topic)
         others = sorted({info.topic_type for info in infos} - {type})
         if others:
-            raise Refused(f"{topic} carries {others[0]}, {type} is needed")
+            raise RequestRefused(f"{topic} carries {others[0]}, {type} is needed")
         if infos and topic not in self._wanted:
             self._wanted[topic] = always
             self._node.create_subscription(
@@ -123,13 +123,13 @@ class Bridge:
         self._clients[service] = self._node.create_client(kind, service)
         # Longest wait for a service to be found [s]
         if not self._clients[service].wait_for_service(timeout_sec=1.0):
-            raise Refused(f"nobody offers the service {service}")
+            raise RequestRefused(f"nobody offers the service {service}")
 
     def trigger(self, service: str, call: int) -> Any:
         """Call a service that was found; the answer comes as a frame with the call's number."""
         client = self._clients[service]
         if not client.service_is_ready():
-            raise Refused(f"nobody offers the service {service} any more")
+            raise RequestRefused(f"nobody offers the service {service} any more")
 
         def answered(future: Any) -> None:
             done = future.result()
@@ -173,10 +173,10 @@ def type_of(name: str) -> Any:
     try:
         return getattr(importlib.import_module(f"{package}.msg"), kind)
     except (ImportError, AttributeError):
-        raise Refused(f"this ROS 2 has no {name}: install the package {package}") from None
+        raise RequestRefused(f"this ROS 2 has no {name}: install the package {package}") from None
 
 
-def serve(bridge: Bridge, output: Output) -> None:
+def serve(bridge: BridgeNode, output: FramedOutput) -> None:
     """Do what is asked until the input ends; then nothing here is wanted any more."""
     stream = sys.stdin.buffer
     while line := stream.readline():
@@ -189,11 +189,11 @@ def serve(bridge: Bridge, output: Output) -> None:
     rclpy.try_shutdown()
 
 
-def answer(bridge: Bridge, request: Request) -> Request:
+def answer(bridge: BridgeNode, request: Request) -> Request:
     """Return the answer to a request, after doing it."""
     try:
         given = getattr(bridge, request.pop("ask"))(**request)
-    except Refused as refused:
+    except RequestRefused as refused:
         return {"error": str(refused)}
     except Exception as error:
         return {"error": f"{type(error).__name__}: {' '.join(str(error).split())}"}
@@ -212,14 +212,14 @@ def be_punctual() -> None:
 
 def main() -> None:
     """Open a node, say so, and serve."""
-    output = Output()
+    output = FramedOutput()
     be_punctual()
     rclpy.init()
     node = rclpy.create_node(
         f"flangeye_{os.getpid()}", enable_rosout=False, start_parameter_services=False
     )
     output.say({"given": rclpy.get_rmw_implementation_identifier()})
-    threading.Thread(target=serve, args=(Bridge(node, output), output), daemon=True).start()
+    threading.Thread(target=serve, args=(BridgeNode(node, output), output), daemon=True).start()
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     with contextlib.suppress(ExternalShutdownException):

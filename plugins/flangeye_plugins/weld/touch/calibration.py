@@ -18,7 +18,7 @@ from flangeye.types import Floats
 from flangeye.units import SI
 from flangeye_plugins.weld.touch.tag_observation import TagReading
 
-FEWEST = 10
+FEWEST_READINGS = 10
 """Readings at rest, and again with the tip held, without which nothing is estimated."""
 
 CLEAR = 0.2e-3
@@ -54,10 +54,10 @@ def calibrate(rest: Sequence[TagReading], held: Sequence[Held], source: str) -> 
     Raises:
         StageError: Too few readings, an axis that was not moved along, or a tip that slid.
     """
-    if min(len(rest), len(held)) < FEWEST:
+    if min(len(rest), len(held)) < FEWEST_READINGS:
         raise StageError(
             f"calibration: the tag was seen {len(rest)} times at rest and {len(held)} times held; "
-            f"at least {FEWEST} each are needed"
+            f"at least {FEWEST_READINGS} each are needed"
         )
     place = np.mean([r.translation for r in rest], axis=0)
     tag = np.array([h.reading.translation for h in held]) - place

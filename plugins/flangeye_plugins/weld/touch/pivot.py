@@ -15,7 +15,7 @@ import numpy as np
 from flangeye.errors import StageError
 from flangeye.types import Floats
 
-FEWEST = 5
+FEWEST_PIVOTED = 5
 """Poses of a pivot."""
 
 TILTED = np.radians(12.0)
@@ -59,8 +59,10 @@ def pivot(what: str, poses: Sequence[Floats], displaced: Sequence[Floats] | None
     Raises:
         StageError: Too few poses, a motion that is missing, or a point that did not stay.
     """
-    if len(poses) < FEWEST:
-        raise StageError(f"pivot of the {what}: {len(poses)} poses, at least {FEWEST} are needed")
+    if len(poses) < FEWEST_PIVOTED:
+        raise StageError(
+            f"pivot of the {what}: {len(poses)} poses, at least {FEWEST_PIVOTED} are needed"
+        )
     given = np.array(poses)
     rotations, places = given[:, :3, :3], given[:, :3, 3]
     if displaced is not None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from flangeye.types import Floats, Image
 
-MARGIN = 16
+TAG_MARGIN = 16
 """Around the tag [px]: its white border, and how far it moves from image to image."""
 
 
@@ -34,8 +34,8 @@ class RegionOfInterest:
     def pieces(self, image: Image) -> Iterator[ImageRegion]:
         """Yield where to look, one after the other until the tag is found."""
         if self._corners is not None:
-            low = np.maximum(np.floor(self._corners.min(axis=0)).astype(int) - MARGIN, 0)
-            high = np.ceil(self._corners.max(axis=0)).astype(int) + MARGIN
+            low = np.maximum(np.floor(self._corners.min(axis=0)).astype(int) - TAG_MARGIN, 0)
+            high = np.ceil(self._corners.max(axis=0)).astype(int) + TAG_MARGIN
             yield cut(image, (int(low[0]), int(low[1])), (int(high[0]), int(high[1])))
         yield ImageRegion(image, (0, 0))
 

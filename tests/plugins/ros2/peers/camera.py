@@ -25,7 +25,7 @@ from flangeye.maths.kinematics import Arm
 from flangeye.models.boards import Board
 from flangeye.models.loading import load_model
 from flangeye.types import CAMERA, PointCloud
-from flangeye_emulators.scanner.loopback import CellScene, Stance
+from flangeye_emulators.scanner.loopback import CellScene, TrueStance
 from flangeye_emulators.world.board_image import BoardCamera, render_board
 from flangeye_emulators.world.scanner import CameraPose, scanner_of
 from flangeye_plugins.acquire.camera import image_of_cloud
@@ -131,7 +131,7 @@ class Camera:
             target = invert(self.base_T_camera) @ pose @ FLANGE_T_BOARD
             # The board faces the camera: its z points towards it.
             return render_board(BOARD, target, LENS, np.random.default_rng(self.count)).pixels
-        return self.scene.scan([Stance(joints, pose)], (self.options["seed"], self.count))
+        return self.scene.scan([TrueStance(joints, pose)], (self.options["seed"], self.count))
 
     # --- layouts
 
