@@ -1,5 +1,6 @@
 """Calibrations of cameras, as programs write them."""
 
+import json
 from pathlib import Path
 
 import cv2
@@ -64,6 +65,22 @@ def test_arrays_and_nine_numbers(tmp_path: Path) -> None:
         np.savetxt(tmp_path / f"pose_{k}.txt", np.eye(3))
     assert [c.path.name for c in cameras_in(tmp_path)] == ["K.npy", "K.txt", "calib.npz"]
     assert all(np.allclose(c.matrix, K) for c in cameras_in(tmp_path))
+
+
+def test_open3d_writes_the_matrix_column_by_column(tmp_path: Path) -> None:
+    numbers = [*K.T.ravel()]
+    (tmp_path / "camera_intrinsic.json").write_text(json.dumps({"intrinsic_matrix": numbers}))
+    (camera,) = cameras_in(tmp_path)
+    assert np.allclose(camera.matrix, K)
+
+
+def test_nerfstudio_has_its_own_names(tmp_path: Path) -> None:
+    names = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+    values = (K[0, 0], K[1, 1], K[0, 2], K[1, 2], *LENS)
+    (tmp_path / "transforms.json").write_text(json.dumps(dict(zip(names, values, strict=True))))
+    (camera,) = cameras_in(tmp_path)
+    assert np.allclose(camera.matrix, K)
+    assert np.allclose(camera.distortion, LENS)
 
 
 def test_several_cameras_in_a_file_are_said(tmp_path: Path) -> None:

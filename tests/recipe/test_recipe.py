@@ -196,6 +196,8 @@ def test_a_recipe_is_found_by_name_or_path(tmp_path: Path) -> None:
         find_recipe("zzz")
     with pytest.raises(RecipeError, match=r"none.yaml: no such recipe file; .* holds no recipe"):
         find_recipe(str(tmp_path / "none.yaml"))
+    with pytest.raises(RecipeError, match=r"is a folder; write a recipe for it: flangeye init /"):
+        find_recipe(str(tmp_path))
     (tmp_path / "my_cell.yaml").write_text("title: T")
     with pytest.raises(RecipeError, match=r"did you mean .*/my_cell.yaml\?$"):
         find_recipe(str(tmp_path / "my_cel.yaml"))

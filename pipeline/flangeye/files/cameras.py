@@ -30,8 +30,10 @@ DISTORTIONS = (
     "dist", "coeffs", "d", "d1",
 )  # fmt: skip
 """Names of the distortion."""
-PINHOLE = (("fx", "fy", "cx", "cy"), ("fx", "fy", "ppx", "ppy"))
-"""Names of the matrix's entries one by one, the second of RealSense."""
+PINHOLE = (
+    ("fx", "fy", "cx", "cy"), ("fx", "fy", "ppx", "ppy"), ("fl_x", "fl_y", "cx", "cy"),
+)  # fmt: skip
+"""Names of the matrix's entries one by one, the second of RealSense, the third of nerfstudio."""
 ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """OpenCV's coefficients."""
 COLMAP: Mapping[str, tuple[str, ...]] = {
@@ -138,7 +140,9 @@ def _matrix(values: Mapping[str, Any]) -> Floats | None:
             value = _matrix({str(key).lower(): each for key, each in value.items()})
         numbers = _numbers(value)
         if numbers.size == 9:
-            return numbers.reshape(3, 3)
+            matrix = numbers.reshape(3, 3)
+            # Open3D writes it column by column: a camera's last row is 0, 0, 1
+            return matrix.T if (matrix[:2, 2] == 0).all() and matrix[2, 0] > 1 else matrix
         if numbers.size == 4:
             return _pinhole(*numbers)
     return None
@@ -152,6 +156,8 @@ def _distortion(values: Mapping[str, Any]) -> Floats:
             value = known.get("data", [known.get(each, 0.0) for each in ORDER[:5]])
         if (numbers := _numbers(value)).size:
             return numbers
+    if "k1" in values:
+        return _numbers([values.get(name, 0.0) for name in ORDER[:5]])
     return np.zeros(0)
 
 

@@ -34,6 +34,8 @@ def find_recipe(name: str) -> Path:
     known = recipe_names()
     if name in known:
         return known[name]
+    if path.is_dir() and not any(path.glob("*.y*ml")):
+        raise RecipeError(f"{name}: is a folder; write a recipe for it: flangeye init {name}")
     if path.suffix in (".yaml", ".yml") or path.is_dir():
         raise RecipeError(f"{name}: no such recipe file; {_near_file(path, known)}")
     near = nearest(name, known, n=3, cutoff=0.4)
