@@ -336,7 +336,7 @@ def verdict_on(run: RunProcess, capture: str) -> tuple[str, str]:
 
 
 def _nothing(left: Path | None, other: Path | None) -> str:
-    """Return what is so while no run of this page's server goes."""
+    """Return what the page shows while no run of this server is under way."""
     if other:
         return f"{other.name} runs elsewhere: flangeye watch runs/{other.name}"
     if left:

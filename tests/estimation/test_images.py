@@ -103,7 +103,7 @@ def test_with_depth_the_same_markers_have_one_pose(tmp_path: Path) -> None:
 def test_a_print_of_another_size_is_named_by_the_arms_motion(tmp_path: Path) -> None:
     wrong = CHARUCO.replace("30 mm", "29.1 mm").replace("22 mm", "21.34 mm")
     seen = run(tmp_path, f"poses: 10, {HAND}", wrong)
-    assert seen.refused.startswith("by the arm's own motion the target is 1.0")
+    assert seen.refused.startswith("the arm's motion shows that the target is 1.0")
     factor = float(seen.refused.split("target is ")[1].split()[0])
     assert factor == pytest.approx(30 / 29.1, abs=2e-3)
     assert "measure the print; or the camera's focal length is off by as much" in seen.refused

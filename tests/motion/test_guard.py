@@ -376,7 +376,7 @@ def test_a_signal_writes_to_the_alarm_and_what_was_there_before_comes_back() -> 
 def test_an_arm_is_opened_from_the_main_thread_which_alone_hears_of_signals() -> None:
     def opens() -> None:
         with (
-            pytest.raises(DeviceError, match="from the program's main thread"),
+            pytest.raises(DeviceError, match="must be opened in the main thread"),
             _alarmed(multiprocessing.Pipe(duplex=False)[1]),
         ):
             pass

@@ -203,7 +203,7 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Linear:
-    """What is predicted at some places, and how it moves.
+    """Sightings predicted at given places, and their derivatives.
 
     Attributes:
         residuals: (N, 6) measured minus predicted, in ``camera`` [rad, m].

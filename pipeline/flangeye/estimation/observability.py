@@ -476,7 +476,7 @@ def _untold(
     weak: WeakMoves,
     freedoms: Mapping[str, Floats] | None,
 ) -> str:
-    """Return which frames of a cell stay unknown, and which motions or sightings would tell."""
+    """Return which frames are not observable, and the motions or sightings that would help."""
     information, scale = known
     named = _named(problem, weak, scale)
     share = np.abs(weak.moves[:, 0] / scale).reshape(-1, 2, 3).max(axis=(0, 2))

@@ -414,14 +414,14 @@ def _require_size(session: Session) -> None:
     factor = f"{1 + share:.4f} +- {sigma:.4f} times as"
     if kind == "size":
         raise CalibrationRefused(
-            f"by the arm's own motion the target is {factor} large as was said where it was "
-            "fitted: measure the print; or the camera's focal length is off by as much "
-            "(size_limit allows more, target_size: unknown finds it)"
+            f"the arm's motion shows that the target is {factor} large as the fit step says, or "
+            "the camera's focal length wrong by as much: measure the print (size_limit allows "
+            "more, target_size: unknown estimates it)"
         )
     raise CalibrationRefused(
-        f"by the arm's own motion the camera's focal length is {factor} long as was said, for "
-        "distances along its axis are off and those across it are not: calibrate the camera "
-        "(acquire.images does from its views of a board; size_limit allows more)"
+        f"the arm's motion shows that the camera's focal length is {factor} long as its "
+        "calibration says: distances along its axis are off, those across it are not; calibrate "
+        "the camera (acquire.images: {board: …} does; size_limit allows more)"
     )
 
 

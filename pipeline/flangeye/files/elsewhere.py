@@ -222,7 +222,7 @@ def system_of(url: str) -> tuple[Any, str]:
 
 @contextmanager
 def reaching(url: str) -> Iterator[None]:
-    """Say in one line what went wrong with a store.
+    """Turn any error of a remote store into one line.
 
     Raises:
         StageError: Something did.

@@ -228,7 +228,7 @@ def _alarmed(alarm: Connection) -> Iterator[None]:
     """
     with alarm:
         if threading.current_thread() is not threading.main_thread():
-            raise DeviceError("an arm is opened from the program's main thread, or not at all")
+            raise DeviceError("an arm must be opened in the main thread, which receives Ctrl-C")
         os.set_blocking(alarm.fileno(), False)
         before = signal.set_wakeup_fd(alarm.fileno(), warn_on_full_buffer=False)
         suspending = signal.signal(signal.SIGTSTP, _end_instead)

@@ -104,8 +104,9 @@ class RobotSection(NamedSection):
             raise ValueError("give either a model or a urdf, not both")
         if self.urdf and self.factory:
             raise ValueError(
-                "a urdf brings its own calibration: make it with the file, xacro ur.urdf.xacro "
-                "kinematics_params:=FILE, or name a model, model: ur5e, with factory"
+                "a urdf brings its own calibration, so that factory has no effect: make the URDF "
+                "with it (xacro ur.urdf.xacro kinematics_params:=FILE), or name a model, model: "
+                "ur5e, with factory"
             )
         if not self.urdf and (self.base or self.packages):
             raise ValueError("base and packages say where things are in a urdf; name it")

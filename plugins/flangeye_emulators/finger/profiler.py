@@ -32,7 +32,7 @@ class SimulatedProfiler(Device):
         self._look = LookBehind(params, np.random.default_rng([seed, 13]))
 
     def profile(self) -> WeldProfile | None:
-        """Return the next look that has arrived by the arm's newest sample, if any."""
+        """Return the next scan that was ready at the arm's newest sample; None without one."""
         now = self._robot.state().time_ns * 1e-9
         self._look.watch(now, self._world)
         return self._look.profile(now)

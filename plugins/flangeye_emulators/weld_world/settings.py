@@ -25,7 +25,7 @@ ToolPath = Annotated[Path, BeforeValidator(bundled_file("true tool", "worlds")),
 
 
 class ArmTruth(Params):
-    """How the arm moves, and where it really is when it says where it is."""
+    """Errors of the simulated arm: how it follows, and how far its true pose is off."""
 
     lag: Duration = param("0 ms", ge=0, description="Time constant with which it follows.")
     dead_time: Duration = param("0 ms", ge=0, description="Before a command has any effect.")

@@ -116,7 +116,7 @@ class BodyFit:
 
     @property
     def freedoms(self) -> int:
-        """How many of the six the scan shows."""
+        """Degrees of freedom of the pose, of six, that the scan determines."""
         turn = np.linalg.eigvalsh(self.bread[:3, :3])
         shift = np.linalg.eigvalsh(self.bread[3:6, 3:6])
         return int((np.r_[turn, shift] < (KNOWN * UNKNOWN) ** 2).sum())

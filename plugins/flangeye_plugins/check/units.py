@@ -232,7 +232,9 @@ def size(session: RecordedSession) -> Findings:
     if p < 1 and explained(corrected_session):
         evidence = evidence._replace(probability=min(1.0, len(tried) * p))
         if kind == "focal":
-            what = f"the camera's focal length is {factor:.4f} times as long as was said"
+            what = (
+                f"the camera's focal length is {factor:.4f} times as long as its calibration says"
+            )
             yield evidence.finding("focal length", what, corrected_session, CALIBRATE)
             return
         what = f"the marker is {factor:.4f} times as large as the recipe says"

@@ -133,10 +133,10 @@ def _guided(
 
 
 class _Arm:
-    """An arm that a person moves and that is only read then; the guard has it while it is driven.
+    """An arm that a person and the program move in turn.
 
-    A guard stops an arm that moves without being told to. A simulated arm is open all the time, and
-    its time goes on.
+    While the person moves it, it is only read: the guard would stop an arm that moves without a
+    command. While the program moves it, the guard watches. A simulated arm stays open throughout.
     """
 
     def __init__(

@@ -41,7 +41,7 @@ class ControllerParams(Params):
 def require_tool(
     name: str, driver: str, offset: Floats, expected: Floats, shown: PoseConvention
 ) -> None:
-    """Do nothing when the controller's tool is the recipe's.
+    """Refuse a controller whose tool offset differs from the recipe's.
 
     Args:
         name: Name of the robot.

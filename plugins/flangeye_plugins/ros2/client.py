@@ -119,7 +119,7 @@ class Bridge(Device):
         return dict(self._ask("services"))
 
     def until_known(self) -> float:
-        """Return until when it is worth to wait for something, by ``time.monotonic`` [s]."""
+        """Return when discovery has ended, by ``time.monotonic`` [s]: nothing new comes then."""
         return max(self._began + DISCOVERY, time.monotonic() + MATCHING)
 
     def awaited(self, look: Callable[[], Found]) -> Found:

@@ -116,7 +116,11 @@ class DistortionField:
 
     @cached_property
     def _over_volume(self) -> tuple[Floats, float]:
-        """Return the rigid motions (6, K) nearest to each weight's, and the scale to the size."""
+        """Return the rigid part (6, K) of each basis field, and the factor to the file's error.
+
+        The rigid part is no distortion: it only moves the camera. Without it, the field is scaled
+        to the calibration error [m] of the scanner's file.
+        """
         middle, half = self._depths
         depths = middle + half * GRID[:, 2:]
         points = np.concatenate([GRID[:, :2] * self._slopes * depths, depths], axis=1)

@@ -49,7 +49,7 @@ def blame(
 def explained(
     before: Information, after: CheckSightings, about: Floats, scanner: Floats, daily: float
 ) -> bool:
-    """Return whether the scanner, the flange or the arm alone can have moved as sightings say.
+    """Return whether one move, of the scanner, the flange or the arm, explains the sightings.
 
     Args:
         before: As in :func:`blame`.
