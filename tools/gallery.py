@@ -61,7 +61,7 @@ def _row(name, recipe):
     solver = " + ".join(s for s in steps if s.startswith(("solve.", "refine.")))
     cells = [
         f"[{name}]({name}.yaml)",
-        header.robot.model if header.robot else _arms(header.cell),
+        (header.robot.model or header.robot.urdf) if header.robot else _arms(header.cell),
         header.scanner.model if header.scanner else "",
         INPUTS[steps[0]],
         solver,

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,11 @@ from flangeye.errors import RecipeError, StageError
 from flangeye.files.clouds import PER_METRE, LengthUnit
 from flangeye.files.paths import bundled
 from flangeye.files.words import nearest
+from flangeye.maths.geometry import each_applied, invert
+from flangeye.maths.kinematics import Arm
+from flangeye.models.robots import RobotModel
 from flangeye.models.workpiece import MESHES, STEP_SUFFIXES, read_mesh
-from flangeye.types import Floats
+from flangeye.types import Floats, Indices
 
 SMALLEST, LARGEST = 0.02, 3.0
 """Diagonal of a body that an arm carries and a scanner sees [m]; of the robot's base at most."""
@@ -50,6 +54,10 @@ class TargetBody:
         """SHA-256 of its surface: equal bodies, equal digests."""
         return hashlib.sha256(self.vertices.tobytes() + self.triangles.tobytes()).hexdigest()
 
+    def at(self, joints: Floats | None) -> TargetBody:
+        """Return it as it is at an arm's joint angles (n,) [rad]: a rigid one always the same."""
+        return self
+
     def as_ply(self) -> str:
         """Return it as an ASCII PLY file in metres, to 0.1 um."""
         head = (
@@ -60,6 +68,96 @@ class TargetBody:
         )
         points = "".join(f"{x:.7f} {y:.7f} {z:.7f}\n" for x, y, z in self.vertices)
         return head + points + "".join(f"3 {a} {b} {c}\n" for a, b, c in self.triangles)
+
+
+ARM = "robot"
+"""The name of a body that is no file: the arm itself."""
+
+
+@dataclass(frozen=True, eq=False)
+class ArmBody(TargetBody):
+    """The links of an arm, each in its own frame.
+
+    Attributes:
+        links: (V,) number of the frame that each vertex moves with, the base's 0.
+        arm: Its kinematics.
+    """
+
+    links: Indices = field(default_factory=lambda: np.zeros(0, np.intp), kw_only=True)
+    arm: Arm = field(kw_only=True)
+
+    def at(self, joints: Floats | None) -> TargetBody:
+        """Return the arm at joint angles (n,) [rad], drawn in its flange's frame.
+
+        Raises:
+            StageError: They are not known.
+        """
+        if joints is None or len(joints) != self.arm.n:
+            raise StageError(
+                f"{self.name}: how the arm stands follows from its joint angles, and a capture has "
+                "none: record them"
+            )
+        return _posed(self, tuple(map(float, joints)))
+
+    @property
+    def by_link(self) -> dict[int, TargetBody]:
+        """The mesh of each link that has one, in its own frame."""
+        out = {}
+        for k in np.unique(self.links).tolist():
+            own = np.flatnonzero(self.links == k)
+            number = np.searchsorted(own, self.triangles[self.links[self.triangles[:, 0]] == k])
+            out[k] = TargetBody(f"link{k}", self.vertices[own], number.astype(np.int32))
+        return out
+
+
+@lru_cache(maxsize=4)
+def _posed(body: ArmBody, joints: tuple[float, ...]) -> TargetBody:
+    angles = np.array(joints)
+    frames = invert(body.arm.flange(angles)) @ body.arm.frames(angles)
+    return TargetBody(
+        body.name, each_applied(frames[body.links], body.vertices), body.triangles, body.note
+    )
+
+
+def arm_body(robot: RobotModel | None, links: Mapping[int, str], near: Path) -> ArmBody:
+    """Return the surface of an arm: its URDF's meshes, or those of a recipe.
+
+    Args:
+        robot: The arm.
+        links: Meshes in metres by the number of the joint's frame that they are drawn in.
+        near: Folder of the recipe.
+
+    Raises:
+        RecipeError: There is no arm, or nothing is known of how it looks.
+    """
+    if robot is None:
+        raise RecipeError(f"body: {ARM} is the arm itself; name it, robot: {{urdf: arm.urdf}}")
+    if unknown := [number for number in links if not 0 <= number <= len(robot.joints)]:
+        raise RecipeError(f"links: {robot.model} has links 0 to {len(robot.joints)}, no {unknown}")
+    parts = [(k, *_read(near / name)) for k, name in links.items()] or [
+        (k, np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int32))
+        for k, mesh in robot.meshes()
+    ]
+    if not parts:
+        raise RecipeError(
+            f"body: {ARM} needs the meshes of {robot.model}'s links; name its URDF, "
+            "robot: {urdf: arm.urdf}, with its meshes beside it"
+        )
+    before = np.cumsum([0, *(len(vertices) for _, vertices, _ in parts)])
+    return ArmBody(
+        robot.model,
+        np.concatenate([vertices for _, vertices, _ in parts]).astype(np.float64),
+        np.concatenate([t + n for (_, _, t), n in zip(parts, before, strict=False)]),
+        links=np.repeat([k for k, _, _ in parts], np.diff(before)),
+        arm=Arm(robot),
+    )
+
+
+def _read(path: Path) -> tuple[Floats, NDArray[np.int32]]:
+    try:
+        return read_mesh(path)
+    except StageError as error:
+        raise RecipeError(str(error)) from None
 
 
 def body_names() -> list[str]:
@@ -86,10 +184,7 @@ def load_body(name: str, unit: LengthUnit | None, near: Path) -> TargetBody:
             raise RecipeError(
                 f"no body '{name}'; known: {', '.join(close)}, or a file ({', '.join(MESHES)})"
             )
-    try:
-        vertices, triangles = read_mesh(path)
-    except StageError as error:
-        raise RecipeError(str(error)) from None
+    vertices, triangles = _read(path)
     used, note = _unit_of(path, vertices, unit)
     return TargetBody(path.stem, vertices / PER_METRE[used], triangles, note)
 

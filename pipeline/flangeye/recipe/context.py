@@ -16,7 +16,7 @@ import numpy as np
 from flangeye import types as t
 from flangeye.devices import RobotDriver, ScannerDriver
 from flangeye.errors import RecipeError
-from flangeye.models.bodies import TargetBody, load_body
+from flangeye.models.bodies import ARM, TargetBody, arm_body, load_body
 from flangeye.models.cell import Cell
 from flangeye.models.configuration import CARRIERS, LINK, ORIGIN, Configuration, Triple
 from flangeye.models.loading import load_model
@@ -40,6 +40,7 @@ from flangeye.recipe.header import (
     PlaceSection,
     RobotSection,
     ScannerSection,
+    TargetSection,
 )
 from flangeye.units import SI
 
@@ -64,11 +65,11 @@ def context_of(header: Header, folder: Path, complain: Complain) -> Context:
     if sphere := header.feature.sphere:
         size = None if sphere.diameter == "unknown" else sphere.diameter / 2
         context[Sphere] = Sphere(size=size, centre_in_flange=sphere.centre)
-    if target := header.target:
-        offer(TargetBody, ("target", "body"), lambda: load_body(target.body, target.unit, folder))
     if (robot := header.robot) and (robot.model or robot.urdf):
         place = ("robot", "model" if robot.model else "urdf")
         offer(RobotModel, place, lambda: _arm(robot, header.feature.standard, folder))
+    if target := header.target:
+        offer(TargetBody, ("target", "body"), lambda: _body(target, context, folder))
     if scanner := header.scanner:
         offer(ScannerData, ("scanner", "model"), lambda: _scanner(scanner, folder))
         if context[ScannerData] is None or isinstance(context[ScannerData], ScannerModel):
@@ -113,6 +114,16 @@ def _arm(section: RobotSection, standard: str | None, folder: Path) -> RobotMode
     packages = {name: folder / path for name, path in section.packages.items()}
     path = folder / str(section.urdf)
     return robot_from_urdf(path, section.base, section.flange, standard, packages)
+
+
+def _body(target: TargetSection, context: Context, folder: Path) -> TargetBody:
+    if target.body != ARM:
+        if target.links:
+            raise RecipeError(f"links: are those of body: {ARM}")
+        return load_body(target.body, target.unit, folder)
+    if target.at != "flange":
+        raise RecipeError(f"body: {ARM} moves with every joint; leave out at: {target.at}")
+    return arm_body(context.get(RobotModel), target.links, folder)
 
 
 def _as_built(robot: RobotModel, calibration: Path) -> RobotModel:

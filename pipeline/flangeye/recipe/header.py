@@ -177,7 +177,13 @@ class TargetSection(NamedSection):
     word: ClassVar[str] = "body"
 
     body: str = Field(
-        description="A mesh beside the recipe (STL, PLY, OBJ, GLB, 3MF, STEP), or a bundled body."
+        description="A mesh beside the recipe (STL, PLY, OBJ, GLB, 3MF, STEP), a bundled body, or "
+        "robot: the arm's own links at its joint angles, by its URDF's meshes."
+    )
+    links: dict[int, str] = Field(
+        {},
+        description="robot: meshes in metres, by the number of the joint whose frame each is drawn "
+        "in, the base's 0; those of the URDF if not given.",
     )
     unit: LengthUnit | None = Field(
         None, description="Of the mesh's coordinates; judged by its size if not given."

@@ -11,7 +11,7 @@ from typing import Any
 
 import yaml
 
-from flangeye.models.bodies import TargetBody
+from flangeye.models.bodies import ArmBody, TargetBody
 from flangeye.models.cell import Cell
 from flangeye.models.model import Model
 from flangeye.models.robots import RobotModel, SecondRobot
@@ -49,7 +49,11 @@ def written_out(
     for section, key, name, model in _own(data, context, moves):
         files[f"models/{name}.yaml"] = _text(model)
         section[key] = f"models/{name}.yaml"
-    if header.target and Path(header.target.body).suffix:
+    if isinstance(body := context.get(TargetBody), ArmBody):
+        own = {k: f"models/link{k}.ply" for k in body.by_link}
+        files |= {own[k]: mesh.as_ply() for k, mesh in body.by_link.items()}
+        data["target"]["links"] = own
+    elif header.target and Path(header.target.body).suffix:
         files["models/body.ply"] = context[TargetBody].as_ply()
         data["target"] |= {"body": "models/body.ply", "unit": "m"}
     return data, files

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from flangeye.maths.geometry import rigid, rotation_from_rpy
-from flangeye.models.bodies import TargetBody
+from flangeye.models.bodies import ArmBody, TargetBody
 from flangeye.models.robots import RobotModel
 from flangeye.models.targets import Flange, Sphere
 from flangeye.motion.clearance import ArmVolume
@@ -95,6 +95,9 @@ class SimulatedCell:
             capsule(start, end, radius)
             for (start, end), radius in zip(volume.axes(frames), volume.radii, strict=True)
         ]
+        if isinstance(self.body, ArmBody):
+            own = self.body.by_link.items()
+            links = [Mesh(one.vertices, one.triangles).moved(frames[k]) for k, one in own]
         return [
             *([SolidBody(merged(links), materials.PAINTED)] if links else []),
             *(body.moved(base_T_flange) for body in self._at_flange()),
@@ -105,7 +108,7 @@ class SimulatedCell:
         finish = materials.FINISHES[self.flange.details.finish]
         plate = SolidBody(flange_mesh(self.flange), finish)
         wrist = SolidBody(wrist_mesh(self.flange), materials.PAINTED)
-        if self.body is not None:
+        if self.body is not None and not isinstance(self.body, ArmBody):
             tool = Mesh(self.body.vertices, self.body.triangles)
             return [plate, wrist, SolidBody(tool, materials.METAL)]
         if self.sphere is None:
@@ -118,7 +121,7 @@ class SimulatedCell:
         half, away = 4 * self.flange.outer, 0.06
         if self.sphere is not None:
             away += self.sphere.centre_in_flange[2] + self.sphere.radius
-        if self.body is not None:
+        if self.body is not None and not isinstance(self.body, ArmBody):
             away += float(self.body.vertices[:, 2].max())
         sheet = SolidBody(box([-half, -half, away], [half, half, away + 0.003]), materials.WALL)
         return sheet.moved(base_T_flange)

@@ -10,7 +10,16 @@ from flangeye import Params, stage
 from flangeye.estimation.effects.scanner import DistortionField
 from flangeye.models.bodies import TargetBody
 from flangeye.models.scanners import ScannerModel
-from flangeye.types import CAMERA, TARGET, FlangeCloud, Floats, PoseFeature, Rejected, Transform
+from flangeye.types import (
+    CAMERA,
+    TARGET,
+    Capture,
+    FlangeCloud,
+    Floats,
+    PoseFeature,
+    Rejected,
+    Transform,
+)
 from flangeye.units import Length, param
 
 
@@ -41,6 +50,7 @@ def fit_body(
     body: TargetBody,
     params: FitBodyParams,
     scanner: ScannerModel | None = None,
+    capture: Capture | None = None,
 ) -> PoseFeature | Rejected:
     """Lay a body on the scan around it: surface on points, and ends of faces on the scan's edges.
 
@@ -56,6 +66,7 @@ def fit_body(
 
     if cloud.camera_T_target is None:
         return Rejected("nothing says where the body is; segment.body comes before fit.body")
+    body = body.at(capture.joints if capture else None)
     fit = fitted(cloud.cloud.xyz, prepared(body)[0], cloud.camera_T_target)
     if fit is None:
         return Rejected("too few points on the body")

@@ -80,6 +80,7 @@ def segment_body(
     from flangeye_plugins.body.search import BodySearch, around
     from flangeye_plugins.segment.scale import check_scale
 
+    body = body.at(capture.joints)
     points = capture.cloud.points()
     if len(points):
         check_scale(points, capture.id)
