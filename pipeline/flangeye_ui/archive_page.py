@@ -31,8 +31,6 @@ OPENS = """<q-td :props="props">
     {{ props.value }}</a>
 </q-td>"""
 """A run's name, which leads to its result."""
-ROWS = 5_000
-"""Of a batch's table that are sent to the page."""
 
 
 def add(project: Project) -> None:
@@ -106,7 +104,8 @@ def _batch(path: Path) -> None:
     ui.label(f"Batch {path.parent.name}").classes("text-h6")
     try:
         with path.open(newline="", encoding="utf-8") as file:
-            rows = list(islice(csv.DictReader(file), ROWS))
+            # Of a batch's table that are sent to the page
+            rows = list(islice(csv.DictReader(file), 5_000))
     except (OSError, ValueError, csv.Error) as error:
         mistake(f"batches/{path.parent.name}/{path.name}: cannot be read: {error}")
         return

@@ -39,9 +39,6 @@ OPTION = """
 """One line of a list of arms or scanners, with its picture."""
 
 
-PAIRS = ("pixels", "field")
-"""Options of two values."""
-
 PRINCIPLES = get_args(ScannerModel.model_fields["principle"].annotation)
 
 SCANNER: Boxes = {
@@ -287,7 +284,8 @@ class Import:
         words = [f"new-{self._section}", self._name.value or "my_model"]
         for option, box in self._given.items():
             for line in filter(None, (box.value or "").splitlines()):
-                parts = line.split(",") if option in PAIRS else [line]
+                # Options of two values
+                parts = line.split(",") if option in ("pixels", "field") else [line]
                 words += [f"--{option}", *(part.strip() for part in parts)]
         return words
 

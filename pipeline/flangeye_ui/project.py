@@ -24,8 +24,6 @@ from flangeye.recipe.steps import SEVERAL
 from flangeye.report.facts import Facts, facts_of
 from flangeye_ui.process import RunProcess
 
-QUIET = 10.0
-"""A log that did not grow for so long is not being written any more [s]."""
 NEW = """title: My cell
 robot: {model: ur5e}
 scanner: {model: phoxi-m}
@@ -211,7 +209,8 @@ class Project:
         ours = self.run.path if self.run else None
         now = time.time()
         for run in self.runs()[:1]:
-            fresh = now - (run / "run.mcap").stat().st_mtime < QUIET
+            # A log that did not grow for so long is not being written any more [s]
+            fresh = now - (run / "run.mcap").stat().st_mtime < 10.0
             if fresh and run != ours and not (run / "result.json").exists():
                 return run
         return None

@@ -25,8 +25,6 @@ from flangeye.types import CircleFeature, Feature, Floats
 from flangeye_ui.project import Project
 from flangeye_ui.shapes import address_of_arm
 
-ROUND = 90
-"""Points that a circle is drawn with."""
 FLOOR, SQUARES = 4, 16
 """Edge of the floor [m], and squares along it."""
 AXES = 0.25
@@ -191,7 +189,8 @@ def outline_of(feature: Feature) -> Floats:
     """Return (N, 3) points of a fitted circle in the camera; of what is no circle, its centre."""
     if not isinstance(feature, CircleFeature) or feature.normal is None or not feature.radii:
         return np.asarray(feature.centre)[None]
-    angles = np.linspace(0, 2 * np.pi, ROUND)
+    # Points that a circle is drawn with
+    angles = np.linspace(0, 2 * np.pi, 90)
     ring = np.column_stack([np.cos(angles), np.sin(angles)])
     radius = max(feature.radii.values())
     return np.asarray(feature.centre + radius * ring @ basis_of_plane(feature.normal)[:2])

@@ -74,7 +74,7 @@ def test_poses_shifted_against_the_scans(carried: str, by: int) -> None:
 @pytest.mark.parametrize("carried", REPORTED)
 def test_the_base_in_the_flange(carried: str) -> None:
     finding = only(with_arms(session_of(carried), inverted))
-    assert "corrected: {reader: auto, inverted: true}" in finding.fix
+    assert "corrected: {reader: auto, robot: {inverted: true}}" in finding.fix
 
 
 @pytest.mark.parametrize("carried", REPORTED)
@@ -105,7 +105,7 @@ def test_rotations_read_in_another_convention(carried: str) -> None:
 def test_a_mistake_of_one_of_two_arms(arms: str) -> None:
     finding = only(with_arms(session_of("both", "marker"), inverted, arms))
     assert finding.what.startswith(f"the {arms} arm's poses are flange_T_base")
-    assert f"{{reader: auto, arms: {arms}, inverted: true}}" in finding.fix
+    assert f"{{reader: auto, arms: {arms}, robot: {{inverted: true}}}}" in finding.fix
 
 
 def test_a_tool_on_the_second_arm() -> None:
@@ -114,7 +114,7 @@ def test_a_tool_on_the_second_arm() -> None:
     wrong = with_arms(session, lambda poses: without_tool(poses, -offset), "second")
     finding = only(wrong)
     assert finding.name == "tool offset"
-    assert "arms: second, target_offset: " in finding.fix
+    assert "arms: second, offset: " in finding.fix
     assert np.allclose(finding.corrected_session.seconds, session.seconds, atol=5e-4)
 
 

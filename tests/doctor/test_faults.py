@@ -91,7 +91,7 @@ def test_both_in_the_same_wrong_unit() -> None:
     both = replace(session, poses=scaled(session.poses, 1e3), centres=session.centres * 1e3)
     finding = only(both)
     assert finding.what.endswith("both are in mm")
-    assert "scale: 0.001, target_scale: 0.001" in finding.fix
+    assert "robot: {scale: 0.001}, target: {scale: 0.001}" in finding.fix
 
 
 @pytest.mark.parametrize(("kind", "carried"), CONFIGURATIONS)
@@ -99,8 +99,8 @@ def test_the_base_in_the_flange(kind: Any, carried: Any) -> None:
     session = session_of(kind, carried)
     finding = only(session.with_poses(inverted(session.poses)))
     assert "the poses are flange_T_base" in finding.what
-    step = "- acquire.archive: {reader: {corrected: {reader: auto, inverted: true}}}"
-    marker = "- acquire.archive: {reader: {corrected: {reader: auto, target_inverted: true}}}"
+    step = "- acquire.archive: {reader: {corrected: {reader: auto, robot: {inverted: true}}}}"
+    marker = "- acquire.archive: {reader: {corrected: {reader: auto, target: {inverted: true}}}}"
     other = "configuration: {name: eye-on-base, place: unknown}"
     alike = {"marker": [other, step, marker], "point": [other, step]}
     # A camera a metre from the base is not in the hand; one near the hand may be near the base.
@@ -123,7 +123,7 @@ def test_markers_that_no_lens_sees_are_inverted() -> None:
     assert finding.name == "inverted marker"
     assert "the markers' poses are target_T_camera: as they are read, one is" in finding.what
     assert finding.fix == (
-        "- acquire.archive: {reader: {corrected: {reader: auto, target_inverted: true}}}"
+        "- acquire.archive: {reader: {corrected: {reader: auto, target: {inverted: true}}}}"
     )
 
 
@@ -223,10 +223,10 @@ def test_markers_whose_rotations_were_read_in_another_convention(carried: str) -
         "the markers' rotations were read as a quaternion x, y, z, w, and fit as a quaternion w, "
         "x, y, z"
     )
-    assert "target_read_as: xyzw, target_written_as: wxyz}}" in finding.fix
+    assert "target: {rotation: [xyzw, wxyz]}}}" in finding.fix
     finding = only(wrong.with_poses(misread(wrong.poses)))
     assert finding.what.startswith("the rotations of robot and markers were read as")
-    assert "read_as: xyzw, written_as: wxyz, target_read_as: xyzw, target_w" in finding.fix
+    assert "robot: {rotation: [xyzw, wxyz]}, target: {rotation: [xyzw, wxyz]}" in finding.fix
     found = named(replace(wrong, acquire="acquire.images"))  # whose rotations are our own
     assert "pose convention" not in found
 
@@ -238,16 +238,16 @@ def test_markers_whose_rotations_are_transposed(carried: str) -> None:
     assert finding.what == (
         "the markers' rotations are transposed: matrices were stored column by column"
     )
-    assert finding.fix.endswith("}}}, target_transposed: true}}}")
+    assert finding.fix.endswith("}}}, target: {transposed: true}}}}")
     finding = only(wrong.with_poses(transposed(wrong.poses)))
     assert finding.what.startswith("robot's and markers' rotations are transposed")
-    assert "transposed: true, target_transposed: true" in finding.fix
+    assert "robot: {transposed: true}, target: {transposed: true}" in finding.fix
 
 
 def test_a_stated_convention_is_the_one_that_is_corrected() -> None:
     session = replace(session_of(turn=0.4), reader={"poses": {"rotation": "ZYX"}})
     finding = only(session.with_poses(reread(session.poses, "xyz", "ZYX")))
-    assert "read_as: ZYX, written_as: xyz" in finding.fix
+    assert "rotation: [ZYX, xyz]" in finding.fix
 
 
 @pytest.mark.parametrize(("kind", "carried"), SOME)
@@ -432,7 +432,7 @@ def test_two_mistakes_are_both_named_and_one_line_mends_both() -> None:
     findings = examine(session.with_poses(scaled(session.poses, 1e3)), CHECKS).findings
     assert [f.name for f in findings] == ["unit", "outlier"]
     assert findings[-1].fix == (
-        "- acquire.archive: {reader: {corrected: {reader: auto, scale: 0.001}}, leave_out: ['004']}"
+        "- acquire.archive: {reader: {corrected: {reader: auto, robot: {scale: 0.001}}}, leave_out: ['004']}"
     )
 
 
@@ -465,7 +465,7 @@ class Insisting:
         return self
 
     def __call__(self, session):
-        mended = session.read_with(scale=0.001)
+        mended = session.read_with(robot={"scale": 0.001})
         yield Finding("unit", "all in mm", mended.step(), corrected_session=mended)
 
 

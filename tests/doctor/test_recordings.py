@@ -234,7 +234,7 @@ def test_a_finding_is_exit_code_one_and_its_line_mends_it(
     assert "1. pose direction: the poses are flange_T_base" in out
     line = out.split("fix: ")[1].splitlines()[0]
     assert line == (
-        "- acquire.centres: {reader: {corrected: {reader: ancorasir, inverted: true}}, "
+        "- acquire.centres: {reader: {corrected: {reader: ancorasir, robot: {inverted: true}}}, "
         "centre_noise: 0.2 mm}"
     )
     corrected_session = yaml.safe_load(RECIPE)
@@ -296,7 +296,7 @@ def test_scans_are_segmented_and_fitted_whatever_is_wrong_with_their_poses(
         .read_text()
         .replace(
             "{ancorasir: {robot: sample-2019}}",
-            "{corrected: {reader: {ancorasir: {robot: sample-2019}}, scale: 1000}}",
+            "{corrected: {reader: {ancorasir: {robot: sample-2019}}, robot: {scale: 1000}}}",
         )
     )
     path = tmp_path / "r.yaml"

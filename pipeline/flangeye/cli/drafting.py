@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
+from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -21,106 +22,64 @@ TARGETS = re.compile(r"^.*?: steps\.\d+\.fit\.", re.MULTILINE)
 NO_FLANGE = (
     "no scan shows the flange; what is seen instead, 'body: gripper.stl' for a tool by its mesh"
 )
-Answer = str | None
-"""To a question that a person is asked otherwise."""
+ANSWERS = {
+    "robot": "Robot model, its .urdf or .yaml file, or none.",
+    "plate": "Flange plate, for example ISO 9409-1-50-4-M6.",
+    "scanner": "Scanner model, or none.",
+    "camera": "Where the camera is mounted: base or flange.",
+    "target": "Target: flange; 'body: gripper.stl', a tool by its mesh; "
+    "'sphere: {diameter: …, centre: […]}'; 'charuco: {columns: …}' and so on, with the parameters "
+    "of that fit.",
+    "table": "Table or array with the arm's poses.",
+    "columns": "Columns of the arm's pose, position first: X,Y,Z,A,B,C or 1,2,3,4,5,6.",
+    "rotation": "Rotation format: kuka, fanuc, vector, xyzw, …; see flangeye stages reader.table",
+    "length": "Unit of the positions: m or mm.",
+    "angle": "Unit of the angles: deg or rad.",
+    "pose": "Direction of the poses: base_T_flange or flange_T_base.",
+    "target-columns": "Columns of the target in the camera: a point or a pose.",
+    "target-rotation": "Rotation format of the target, as for --rotation.",
+    "target-length": "Unit of the target's positions: m or mm.",
+    "target-angle": "Unit of the target's angles: deg or rad.",
+    "target-pose": "Direction of the target: camera_T_target or target_T_camera.",
+    "reader": "Reader as written in a recipe; replaces the options above.",
+    "flange": "With --ros2: the flange's link, where no name says it.",
+    "trajectory": "With --ros2: topic of the controller that moves the arm, or none.",
+    "scans": "With --ros2: topic of clouds or depth images.",
+    "trigger": "With --ros2: service that takes a scan, or none.",
+    "view": "With --ros2: where the scanner roughly stands: '620, 0, 980 mm'.",
+    "box": "With --ros2: the flange's box, centre; size: '450, 0, 300; 600, 600, 600 mm'.",
+}
+"""Options of ``init`` that answer what a person is asked otherwise, with their help."""
 
-Folder = Annotated[Path, typer.Argument(help="Folder with the recordings.")]
-Robot = Annotated[Answer, typer.Option(help="Robot model, its .urdf or .yaml file, or none.")]
-Plate = Annotated[Answer, typer.Option(help="Flange plate, for example ISO 9409-1-50-4-M6.")]
-Scanner = Annotated[Answer, typer.Option(help="Scanner model, or none.")]
-Camera = Annotated[Answer, typer.Option(help="Where the camera is mounted: base or flange.")]
-Target = Annotated[
-    Answer,
-    typer.Option(
-        help="Target: flange; 'body: gripper.stl', a tool by its mesh; "
-        "'sphere: {diameter: …, centre: […]}'; 'charuco: {columns: …}' and so on, with the "
-        "parameters of that fit."
-    ),
-]
-Table = Annotated[Answer, typer.Option(help="Table or array with the arm's poses.")]
-Columns = Annotated[
-    Answer,
-    typer.Option(help="Columns of the arm's pose, position first: X,Y,Z,A,B,C or 1,2,3,4,5,6."),
-]
-Rotation = Annotated[
-    Answer,
-    typer.Option(
-        help="Rotation format: kuka, fanuc, vector, xyzw, …; see flangeye stages reader.table"
-    ),
-]
-Length = Annotated[Answer, typer.Option(help="Unit of the positions: m or mm.")]
-Angle = Annotated[Answer, typer.Option(help="Unit of the angles: deg or rad.")]
-Pose = Annotated[
-    Answer, typer.Option(help="Direction of the poses: base_T_flange or flange_T_base.")
-]
-TargetColumns = Annotated[
-    Answer, typer.Option(help="Columns of the target in the camera: a point or a pose.")
-]
-TargetRotation = Annotated[
-    Answer, typer.Option(help="Rotation format of the target, as for --rotation.")
-]
-TargetLength = Annotated[Answer, typer.Option(help="Unit of the target's positions: m or mm.")]
-TargetAngle = Annotated[Answer, typer.Option(help="Unit of the target's angles: deg or rad.")]
-TargetPose = Annotated[
-    Answer, typer.Option(help="Direction of the target: camera_T_target or target_T_camera.")
-]
-Reader = Annotated[
-    Answer, typer.Option(help="Reader as written in a recipe; replaces the options above.")
-]
-Ros2 = Annotated[
-    bool, typer.Option("--ros2", help="Look at the arm and the camera that run under ROS 2.")
-]
-FlangeLink = Annotated[
-    Answer, typer.Option("--flange", help="With --ros2: the flange's link, where no name says it.")
-]
-Trajectory = Annotated[
-    Answer, typer.Option(help="With --ros2: topic of the controller that moves the arm, or none.")
-]
-Scans = Annotated[Answer, typer.Option(help="With --ros2: topic of clouds or depth images.")]
-Trigger = Annotated[Answer, typer.Option(help="With --ros2: service that takes a scan, or none.")]
-View = Annotated[
-    Answer, typer.Option(help="With --ros2: where the scanner roughly stands: '620, 0, 980 mm'.")
-]
-LimitBox = Annotated[
-    Answer,
-    typer.Option(
-        "--box",
-        help="With --ros2: the flange's box, centre; size: '450, 0, 300; 600, 600, 600 mm'.",
-    ),
-]
-Yes = Annotated[bool, typer.Option("--yes", help="Do not ask; use the defaults and print them.")]
-Out = Annotated[Path, typer.Option(help="Recipe file to write.")]
+
+def _with_answers(command: Any) -> Any:
+    """Return a command that takes each of ANSWERS as an option of its own."""
+    answers = [
+        Parameter(
+            name.replace("-", "_"), Parameter.KEYWORD_ONLY, default=None,
+            annotation=Annotated[str | None, typer.Option(f"--{name}", help=text)],
+        )
+        for name, text in ANSWERS.items()
+    ]  # fmt: skip
+    folder, ros2, *rest, _ = signature(command, eval_str=True).parameters.values()
+    flags = [each.replace(kind=Parameter.KEYWORD_ONLY) for each in rest]
+    command.__signature__ = Signature([folder, ros2, *answers, *flags])
+    command.__annotations__ |= {each.name: each.annotation for each in answers}
+    return command
 
 
 @app.command()
-def init(  # noqa: PLR0913  one for each option
-    folder: Folder = Path(),
-    robot: Robot = None,
-    plate: Plate = None,
-    scanner: Scanner = None,
-    camera: Camera = None,
-    target: Target = None,
-    table: Table = None,
-    columns: Columns = None,
-    rotation: Rotation = None,
-    length: Length = None,
-    angle: Angle = None,
-    pose: Pose = None,
-    target_columns: TargetColumns = None,
-    target_rotation: TargetRotation = None,
-    target_length: TargetLength = None,
-    target_angle: TargetAngle = None,
-    target_pose: TargetPose = None,
-    reader: Reader = None,
-    ros2: Ros2 = False,
-    flange: FlangeLink = None,
-    trajectory: Trajectory = None,
-    scans: Scans = None,
-    trigger: Trigger = None,
-    view: View = None,
-    box: LimitBox = None,
-    yes: Yes = False,
-    out: Out = Path("recipe.yaml"),
+@_with_answers
+def init(
+    folder: Annotated[Path, typer.Argument(help="Folder with the recordings.")] = Path(),
+    ros2: Annotated[
+        bool, typer.Option("--ros2", help="Look at the arm and the camera that run under ROS 2.")
+    ] = False,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Do not ask; use the defaults and print them.")
+    ] = False,
+    out: Annotated[Path, typer.Option(help="Recipe file to write.")] = Path("recipe.yaml"),
+    **answers: str | None,
 ) -> None:
     """Write a recipe for recordings, or for ROS 2 (--ros2).
 
@@ -132,15 +91,7 @@ def init(  # noqa: PLR0913  one for each option
     if out.exists():
         raise RecipeError(f"{out}: is there already; take another name with --out")
     registry = load_plugins()
-    given = {
-        "robot": robot, "plate": plate, "scanner": scanner, "camera": camera, "target": target,
-        "table": table, "columns": columns, "rotation": rotation, "length": length,
-        "angle": angle, "pose": pose, "target-columns": target_columns,
-        "target-rotation": target_rotation, "target-length": target_length,
-        "target-angle": target_angle, "target-pose": target_pose, "reader": reader,
-        "flange": flange, "trajectory": trajectory, "scans": scans, "trigger": trigger,
-        "view": view, "box": box,
-    }  # fmt: skip
+    given = {name: answers[name.replace("-", "_")] for name in ANSWERS}
     questions = Questions(given, None if yes else _prompt)
     draft = (_of_what_runs if ros2 else _of_folder)(folder, out, questions, registry)
     for path, text in {**draft.files, out: draft.text}.items():

@@ -31,16 +31,10 @@ from flangeye.types import (
     Transform,
 )
 
-HELPS = 0.5
-"""A mistake that is one leaves at most this share of the errors held out once it is mended."""
 ORDINARY = 0.02, np.radians(1.0)
 """Errors of sound sightings, as a share of how far they are apart, and of their rotations [rad]."""
 NEAREST, FARTHEST = 0.02, 10.0
 """Sightings and poses in the middle of a cell are so far from camera and base [m]."""
-GROSS = 5.0
-"""A sighting set aside belongs elsewhere when it is off by so many times what others are."""
-EACH = 12
-"""Sightings of each camera and target that are looked at."""
 UNITS = {"mm": 1e-3, "m": 1e3}
 """Factors on lengths, by the unit they are in if the recipe says the other one."""
 
@@ -94,7 +88,8 @@ def _likeliest(before: Foretold, suspected: Iterator[Suspicion]) -> list[Finding
     if not tried:
         return []
     after, best = min(tried, key=lambda each: each[0].size)
-    if not after.ordinary or after.size > HELPS * before.size:
+    # A mistake that is one leaves at most this share of the errors held out once it is mended
+    if not after.ordinary or after.size > 0.5 * before.size:
         return []
     known = before.misfit if np.isfinite(before.size) else None
     return [Finding(best.name, best.what, best.fix, before=known, after=known and after.misfit)]
@@ -245,7 +240,8 @@ def _mispaired(observations: Sequence[Observation], cell: Cell) -> list[Finding]
     except (FlangeyeError, np.linalg.LinAlgError):
         return []
     errors = np.linalg.norm(found.errors[:, 3:], axis=1)
-    ordinary = GROSS * np.sqrt((errors[found.inliers] ** 2).mean())
+    # A sighting set aside belongs elsewhere when it is off by so many times what others are
+    ordinary = 5.0 * np.sqrt((errors[found.inliers] ** 2).mean())
     wrong = ~found.inliers & (errors > ordinary)
     far = [o.id for o, gone in zip(observations, wrong, strict=True) if gone]
     if not far or 3 * len(far) > len(observations):
@@ -318,10 +314,11 @@ def _by_pair(observations: Sequence[Observation]) -> dict[tuple[str, str], list[
 
 def _thinned(observations: Sequence[Observation]) -> list[Observation]:
     """Return some sightings of each pair, evenly over the session."""
+    # Sightings of each camera and target that are looked at
     return [
         observations[of[i]]
         for of in _by_pair(observations).values()
-        for i in np.unique(np.linspace(0, len(of) - 1, EACH).round().astype(int))
+        for i in np.unique(np.linspace(0, len(of) - 1, 12).round().astype(int))
     ]
 
 

@@ -111,13 +111,6 @@ def _bare(session: RecordedSession, index: int, states: Mapping[str, State]) -> 
     )
 
 
-LISTED = 8
-"""Samples that are written out."""
-
-
-APART = 0.01
-"""Between two stand-in poses [m]."""
-
 _UNITS: Mapping[str, tuple[str, ...]] = {
     "auto": ("m", "mm", "in"), "m": ("auto", "mm", "in"), "mm": ("auto", "m", "in"),
     "in": ("auto", "m", "mm"),
@@ -206,7 +199,8 @@ def _set_aside(log: RunLog) -> Iterator[Finding]:
     gone = [o for o in of_solver if not o["used"]]
     if gone and len(gone) < len(of_solver):
         worst = sorted(gone, key=lambda o: -o["residual"])
-        told = ", ".join(f"'{o['id']}' {1e3 * o['residual']:.1f} mm" for o in worst[:LISTED])
+        # Samples that are written out
+        told = ", ".join(f"'{o['id']}' {1e3 * o['residual']:.1f} mm" for o in worst[:8])
         what = f"the run's solver did not use {len(gone)} of the samples: {told} off"
         fix = f"look at these samples; {worst[0]['reason']}"
         yield Finding("set aside", what, fix, tuple(o["id"] for o in worst), note=True)
@@ -450,10 +444,11 @@ def _found_by(
 
 
 def _with_stand_in_poses(archive: Archive) -> Archive:
+    # Between two stand-in poses [m]
     recordings = [
         replace(
             recording,
-            poses={t.FLANGE: rigid(np.eye(3), np.array([APART * i, 0.0, 0.5]))},
+            poses={t.FLANGE: rigid(np.eye(3), np.array([0.01 * i, 0.0, 0.5]))},
         )
         for i, recording in enumerate(archive.recordings)
     ]

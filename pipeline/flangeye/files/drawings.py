@@ -21,7 +21,6 @@ Entity = tuple[str, list[Group]]
 
 MOST_PIECES = 200_000
 """Straight pieces of one drawing."""
-ARC_STEP = math.radians(3)
 UNITS = {"1": "in", "4": "mm", "6": "m"}
 """``$INSUNITS``, as far as lengths here have such a unit."""
 
@@ -108,7 +107,7 @@ def _upright(path: Path, name: str, groups: list[Group], line: Floats) -> Floats
 
 
 def _arc(radius: float, start: float, sweep: float) -> Floats:
-    angles = start + np.linspace(0.0, sweep, max(2, math.ceil(abs(sweep) / ARC_STEP) + 1))
+    angles = start + np.linspace(0.0, sweep, max(2, math.ceil(abs(sweep) / math.radians(3)) + 1))
     return radius * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
 
 

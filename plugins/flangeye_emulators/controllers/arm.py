@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -322,3 +322,57 @@ def joint_zeros(robot: RobotModel, seed: int | None) -> Floats:
         zeros = robot.joint_accuracy * np.random.default_rng(seed).standard_normal(len(zeros))
         zeros[0] = 0.0
     return zeros
+
+
+class ControlUnit:
+    """What controllers of every make have: an arm advanced cycle by cycle, a log, a force limit.
+
+    Attributes:
+        arm: The arm.
+        cycle: Length of a control cycle [s].
+        unlock_after: Time before a protective stop can be unlocked [s].
+        log: (time, what happened), the last thousand.
+    """
+
+    def __init__(self, arm: SimulatedArm, cycle: float, unlock_after: float) -> None:
+        """Start the clock."""
+        self.arm, self.cycle, self.unlock_after = arm, cycle, unlock_after
+        self.log: deque[tuple[float, str]] = deque(maxlen=1000)
+        self._cycles = self._stopped_at = 0
+
+    @property
+    def time(self) -> float:
+        """Time since it was switched on [s]."""
+        return self._cycles * self.cycle
+
+    @property
+    def since_stop(self) -> float:
+        """Time since the last protective stop [s]."""
+        return (self._cycles - self._stopped_at) * self.cycle
+
+    def note(self, what: str) -> None:
+        """Write a line into the log."""
+        self.log.append((self.time, what))
+
+    def step(self) -> None:
+        """Advance one control cycle."""
+        self._cycles += 1
+        self._advance()
+        # The limit that e-Series arms are shipped with [N]
+        if float(np.linalg.norm(self.arm.wrench[:3])) > 150.0:
+            self.protective_stop("the tool meets more than 150 N")
+
+    def _advance(self) -> None:
+        raise NotImplementedError
+
+    def protective_stop(self, why: str) -> None:
+        """Stop the arm and take no command."""
+        raise NotImplementedError
+
+    def reset(self, joints: Floats) -> None:
+        """Be as after switching on, standing at ``joints`` (n,) [rad]."""
+        raise NotImplementedError
+
+    def modes(self) -> Mapping[str, Any]:
+        """Return its modes by name, for the control channel."""
+        raise NotImplementedError

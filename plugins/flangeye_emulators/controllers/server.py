@@ -17,52 +17,21 @@ import selectors
 import signal
 import sys
 import time
-from collections import deque
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from flangeye.errors import FlangeyeError
 from flangeye.files.elsewhere import is_this_machine
 from flangeye.models.graph import EmulatorOptions
-from flangeye.types import Floats
-from flangeye_emulators.controllers.arm import SimulatedArm, SpringSurface, starting_joints
+from flangeye_emulators.controllers.arm import ControlUnit, SpringSurface, starting_joints
 from flangeye_emulators.controllers.client import PORT
 from flangeye_emulators.controllers.fault_injection import FaultInjector, Schedule, parse_fault
 from flangeye_emulators.controllers.network import LineConnection, Network
 
 KEPT = 60_000
 """Lateness is kept for so many cycles: two minutes at 500 Hz."""
-
-
-class ControllerBox(Protocol):
-    """What a controller has to be, for the process around it.
-
-    Attributes:
-        arm: The arm it moves.
-        cycle: Length of a control cycle [s].
-        log: (time, what happened).
-        unlock_after: Time before a protective stop can be unlocked [s].
-    """
-
-    arm: SimulatedArm
-    cycle: float
-    log: deque[tuple[float, str]]
-    unlock_after: float
-
-    @property
-    def time(self) -> float:
-        """Since it was switched on [s]."""
-
-    def step(self) -> None:
-        """Advance one control cycle."""
-
-    def reset(self, joints: Floats) -> None:
-        """Be as after switching on, standing at ``joints`` (n,)."""
-
-    def modes(self) -> Mapping[str, Any]:
-        """Return its modes by name."""
 
 
 def run_server(server: Server, publish: Callable[[int], None] = lambda cycle: None) -> None:
@@ -108,7 +77,7 @@ class Server:
     def __init__(
         self,
         options: EmulatorOptions,
-        box: ControllerBox,
+        box: ControlUnit,
         network: Network,
         fault_injector: FaultInjector,
         ports: Mapping[str, int],

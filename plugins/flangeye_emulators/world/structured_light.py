@@ -16,8 +16,6 @@ FAINTEST = 0.012
 """Least share of the light that a point must return, of what a white surface at mid range and
 facing both camera and projector returns: black anodising is lost beyond about 65 degrees."""
 
-HIGHLIGHT = float(np.radians(6.0))
-"""Half width of a highlight: angle at which its strength has fallen to 1/e."""
 
 GRAZING = float(np.cos(np.radians(80.0)))
 """Cosine of the incidence beyond which no scanner decodes its pattern."""
@@ -190,4 +188,5 @@ def _highlight(cosines: Image, between: Image) -> Image:
     """
     # The halfway vector is the sum of two unit vectors, of length sqrt(2 + 2 cos).
     halfway = np.minimum(np.abs(cosines) / np.sqrt(2 + 2 * between), np.float32(1.0))
-    return np.asarray(np.exp(-((np.arccos(halfway) / HIGHLIGHT) ** 2)))
+    # Half width of a highlight: angle at which its strength has fallen to 1/e
+    return np.asarray(np.exp(-((np.arccos(halfway) / float(np.radians(6.0))) ** 2)))

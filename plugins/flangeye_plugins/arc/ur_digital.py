@@ -22,8 +22,6 @@ from flangeye.plugin.stage import Params, part
 PORT, VERSION = 30004, 2
 """Of RTDE, by the guide."""
 
-RATE = 125.0
-"""Packages in a second [Hz]: what every generation of controller can send."""
 
 HEADER = struct.Struct(">HB")
 
@@ -103,7 +101,8 @@ class UrDigitalArc(Device):
     def _negotiate(self) -> None:
         """Agree on what is sent: the inputs' bits one way, the outputs' the other."""
         self._asked("V", struct.pack(">H", VERSION))
-        self._asked("O", struct.pack(">d", RATE) + b"actual_digital_input_bits")
+        # Packages in a second [Hz]: what every generation of controller can send
+        self._asked("O", struct.pack(">d", 125.0) + b"actual_digital_input_bits")
         names = b"standard_digital_output_mask,standard_digital_output"
         self._recipe = self._asked("I", names)[:1]
         self._asked("S", b"")

@@ -352,7 +352,7 @@ def tool(session: RecordedSession) -> Findings:
     corrected_session = session.corrected(
         lambda poses: without_tool(poses, -offset),
         "both" if session.seconds is None else "second",
-        target_offset=listed,
+        offset=listed,
     )
     yield evidence._replace(probability=p).finding("tool offset", what, corrected_session)
 

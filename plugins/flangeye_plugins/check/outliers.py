@@ -118,8 +118,6 @@ LITTLE = np.radians(10.0)
 """Poses that differ by less do not turn the target enough [rad]."""
 ERRORS = np.array([3e-3, np.radians(1.0)])
 """Errors beyond these [m, rad] are a mistake's or an outlier's, and no motion makes up for them."""
-OFFSET = 1e-3
-"""An offset of the target that would be known less well cannot be told [m]."""
 
 
 @part("check.motion")
@@ -219,7 +217,8 @@ def _offset_unknown(session: RecordedSession) -> Findings:
         return
     free = fit(equations_of(session).with_free_place())
     known = float(np.sqrt(np.linalg.eigvalsh(_covariance(free.information[0])[6:9, 6:9])[-1]))
-    if known < OFFSET:
+    # An offset of the target that would be known less well cannot be told [m]
+    if known < 1e-3:
         return
     spread, axes = _rotations(session)
     told = f"{known * 1e3:.2g} mm" if known < 1 else "nothing"

@@ -38,8 +38,6 @@ NAMES = {
 
 _CARRIED = {"target": ("marker", "camera"), "camera": ("camera", "marker")}
 
-LENS = np.radians(60)
-"""No lens of a scanner or depth camera sees further from its axis; Azure Kinect's, wide."""
 
 _MOUNTED_OTHERWISE: Mapping[str, tuple[str, str]] = {
     "target": ("in the hand", "eye-in-hand"),
@@ -135,7 +133,7 @@ def _of_arms(session: RecordedSession) -> Iterator[Reading]:
         whose = "the" if session.seconds is None else named(arms, session)
         for read_as, written_as in _readings(_stated(session)):
             reread_session = session.corrected(
-                _rereading(read_as, written_as), arms, read_as=read_as, written_as=written_as
+                _rereading(read_as, written_as), arms, robot={"rotation": [read_as, written_as]}
             )
             yield Reading(reread_session, f"{whose} rotations", _name(read_as), _name(written_as))
 
@@ -147,13 +145,11 @@ def _of_markers(session: RecordedSession) -> Iterator[Reading]:
     stated = _stated(session, "target")
     for read_as, written_as in _readings(stated):
         change = _rereading(read_as, written_as)
-        told = {"target_read_as": read_as, "target_written_as": written_as}
-        alone = _with_markers(session, change).read_with(**told)
+        told = {"rotation": [read_as, written_as]}
+        alone = _with_markers(session, change).read_with(target=told)
         yield Reading(alone, "the markers' rotations", _name(read_as), _name(written_as))
         if stated == _stated(session):
-            both = _with_markers(session, change).corrected(
-                change, "both", read_as=read_as, written_as=written_as, **told
-            )
+            both = _with_markers(session, change).corrected(change, "both", robot=told, target=told)
             whose = "the rotations of robot and markers"
             yield Reading(both, whose, _name(read_as), _name(written_as))
 
@@ -232,7 +228,7 @@ def exchanged(session: RecordedSession) -> Findings:
         raise NotApplicable("camera and target cannot stand for each other")
     carried, standing = _distances(session)
     other = _with_markers(session, inverted).corrected(
-        inverted, inverted=True, target_inverted=True
+        inverted, robot={"inverted": True}, target={"inverted": True}
     )
     if not looks_exchanged(carried, standing) or not explained(session) or _unseen(other):
         return
@@ -260,7 +256,7 @@ def mirrored(session: RecordedSession) -> Findings:
         fix = f"write the scans with their {axis} the other way round: they are mirrored"
         yield evidence.finding("mirrored axis", what, found, fix)
     else:
-        yield evidence.finding("mirrored axis", what, found.read_with(target_mirrored=axis))
+        yield evidence.finding("mirrored axis", what, found.read_with(target={"mirrored": axis}))
 
 
 def _distances(session: RecordedSession) -> tuple[float, float]:
@@ -281,7 +277,7 @@ def _turned_round(session: RecordedSession) -> Iterator[tuple[RecordedSession, s
     for arms in session.arms:
         whose = "the" if session.seconds is None else named(arms, session)
         for way, (change, _) in _WAYS.items():
-            yield session.corrected(change, arms, **{way: True}), whose, way
+            yield session.corrected(change, arms, robot={way: True}), whose, way
 
 
 def _transposed_markers(session: RecordedSession) -> Iterator[tuple[RecordedSession, str, str]]:
@@ -289,8 +285,9 @@ def _transposed_markers(session: RecordedSession) -> Iterator[tuple[RecordedSess
     if not _has_ready_made_markers(session):
         return
     alone = _with_markers(session, transposed)
-    yield alone.read_with(target_transposed=True), "the markers'", "transposed"
-    both = alone.corrected(transposed, transposed=True, target_transposed=True)
+    yield alone.read_with(target={"transposed": True}), "the markers'", "transposed"
+    told = {"transposed": True}
+    both = alone.corrected(transposed, robot=told, target=told)
     yield both, "robot's and markers'", "transposed"
 
 
@@ -329,7 +326,8 @@ def _marker_rather(session: RecordedSession, turned: RecordedSession) -> bool:
         return False
     if looks_exchanged(*reversed(_distances(turned))):
         return False
-    return bool(_off_axis(session) > LENS >= _off_axis(_marker_inverted(session)))
+    # No lens of a scanner or depth camera sees further from its axis; Azure Kinect's, wide
+    return bool(_off_axis(session) > np.radians(60) >= _off_axis(_marker_inverted(session)))
 
 
 def _off_axis(session: RecordedSession) -> float:
@@ -339,7 +337,7 @@ def _off_axis(session: RecordedSession) -> float:
 
 
 def _marker_inverted(session: RecordedSession) -> RecordedSession:
-    return _with_markers(session, inverted).read_with(target_inverted=True)
+    return _with_markers(session, inverted).read_with(target={"inverted": True})
 
 
 def _inverted_marker(session: RecordedSession, evidence: Significance) -> Finding:

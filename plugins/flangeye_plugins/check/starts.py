@@ -16,17 +16,6 @@ from flangeye.maths.geometry import nearest_rotation
 from flangeye.types import Floats
 from flangeye_plugins.check.equations import Equations
 
-LEVER = 1e-3
-"""A normal turns the camera as much as two centres that are this far apart [m]: they decide where
-the centres lie on a line, and do no harm elsewhere where they are all wrong."""
-
-
-STARTS = 2
-"""Random rotations to start from: from one, 99 % of sessions converge."""
-
-ROUNDS = 40
-"""Steps of the alternation; the joint fit does the rest."""
-
 
 class VariantUnknowns(NamedTuple):
     """What a variant leaves to be found.
@@ -84,7 +73,9 @@ def _from_known_places(equations: Equations) -> VariantUnknowns:
     seen = np.isfinite(here[..., :1])
     mean_here, mean_there = _mean(here, seen), _mean(there, seen)
     cross = _outer(there - mean_there[:, None], here - mean_here[:, None])
-    cross = cross + LEVER**2 * _outer(mounts[..., :3, 2], equations.normals)
+    # A normal turns the camera as much as two centres that are this far apart [m]: they decide
+    # where the centres lie on a line, and do no harm elsewhere where they are all wrong
+    cross = cross + 1e-3**2 * _outer(mounts[..., :3, 2], equations.normals)
     rotation = nearest_rotation(cross)
     position = mean_there - (rotation @ mean_here[..., None])[..., 0]
     turn = np.broadcast_to(np.eye(3), rotation.shape)
@@ -167,8 +158,10 @@ def rotations_of_poses(equations: Equations) -> Rotations:
     by_x, by_y, by_z = _by_unknown(*_rotations(equations))
     k = len(by_x)
     rng = np.random.default_rng(0)
-    x, y, z = nearest_rotation(rng.standard_normal((3, STARTS, 1, 3, 3)).repeat(k, axis=2))
-    for _ in range(ROUNDS):
+    # Random rotations to start from: from one, 99 % of sessions converge
+    x, y, z = nearest_rotation(rng.standard_normal((3, 2, 1, 3, 3)).repeat(k, axis=2))
+    # Steps of the alternation; the joint fit does the rest
+    for _ in range(40):
         x = nearest_rotation(_contracted(by_x, y, z))
         y = nearest_rotation(_contracted(by_y, x, z))
         moved = _contracted(by_z, x, y)

@@ -28,10 +28,6 @@ UNITS: Mapping[str, float] = {
 }  # fmt: skip
 """In metres."""
 _METRES: Mapping[str, float] = {"m": 1.0, **UNITS}
-STANDING = 1e-9
-"""With so small positions the target does not move: no unit, if that explains samples better."""
-AGREE = 0.05
-"""Share of the arm's distance by which arm and target differ where they agree."""
 ARMS = (0.1, 4.0)
 """Median distance of a flange from its base [m], from the smallest arm to the largest."""
 
@@ -39,8 +35,6 @@ ARMS = (0.1, 4.0)
 DECIMALS = (0.1, 1e-2, 1e-3, 1e-4, 1e-5)
 """Last decimals of positions in metres, millimetres and so on [m]."""
 
-WHOLE = 1e-3
-"""By what share of the step a position may miss a multiple of it."""
 
 CALIBRATE = (
     "calibrate the camera: add board: {kind: …, columns: …, rows: …, square: …} to acquire.images, "
@@ -92,14 +86,16 @@ def _alternatives(session: RecordedSession) -> Iterator[OtherUnit]:
         if session.links is not None:
             yield OtherUnit(_of_target(session, factor, meant), said, meant, None)
     if session.uses_poses:
-        yield OtherUnit(_of_arm(session, "both", STANDING), "", "", "both")
+        # With so small positions the target does not move: no unit, if that explains samples
+        # better
+        yield OtherUnit(_of_arm(session, "both", 1e-9), "", "", "both")
 
 
 def _of_arm(session: RecordedSession, arms: Arms, factor: float) -> RecordedSession:
     def change(poses: Floats) -> Floats:
         return scaled(poses, factor)
 
-    return session.corrected(change, arms, scale=_number(factor))
+    return session.corrected(change, arms, robot={"scale": _number(factor)})
 
 
 def _ratios() -> Iterator[tuple[str, str, float]]:
@@ -161,7 +157,7 @@ def _of_target(session: RecordedSession, factor: float, unit: str) -> RecordedSe
     corrected_session = replace(session, centres=session.centres * factor)
     if session.acquire == "acquire.archive" and unit in ("m", "mm"):
         return corrected_session.with_changes(unit=unit)
-    return corrected_session.read_with(target_scale=_number(factor))
+    return corrected_session.read_with(target={"scale": _number(factor)})
 
 
 def _both(session: RecordedSession) -> Finding | None:
@@ -174,10 +170,12 @@ def _both(session: RecordedSession) -> Finding | None:
     factor = UNITS[unit]
     if _outside(distance * factor, ARMS) > 0:
         return None
-    if fit_of(session).misfit().position > AGREE * distance:
+    # Share of the arm's distance by which arm and target differ where they agree
+    if fit_of(session).misfit().position > 0.05 * distance:
         return None
+    told = {"scale": _number(factor)}
     corrected_session = replace(session, centres=session.centres * factor).corrected(
-        lambda poses: scaled(poses, factor), scale=_number(factor), target_scale=_number(factor)
+        lambda poses: scaled(poses, factor), robot=told, target=told
     )
     what = (
         f"robot and target agree, but the flange is {distance:.4g} m from the base and the target "
@@ -240,7 +238,7 @@ def size(session: RecordedSession) -> Findings:
         what = f"the marker is {factor:.4f} times as large as the recipe says"
         fix = f"measure it after printing: its lengths in the fit step times {factor:.4f}"
         if session.acquire == "acquire.samples":
-            fix = session.read_with(target_scale=float(f"{factor:.4f}")).step()
+            fix = session.read_with(target={"scale": float(f"{factor:.4f}")}).step()
         yield evidence.finding("target size", what, corrected_session, fix)
 
 
@@ -294,6 +292,7 @@ def _step(places: Floats) -> float | None:
     """Return the coarsest step [m] that all coordinates are multiples of; None for none."""
     for step in DECIMALS:
         multiples = places / step
-        if len(places) and np.abs(multiples - np.round(multiples)).max() < WHOLE:
+        # By what share of the step a position may miss a multiple of it
+        if len(places) and np.abs(multiples - np.round(multiples)).max() < 1e-3:
             return step
     return None

@@ -2,7 +2,7 @@
 
 ``flangeye doctor`` names the mistake and gives the line to put into the recipe::
 
-    - acquire.archive: {reader: {corrected: {reader: folder, inverted: true}}}
+    - acquire.archive: {reader: {corrected: {reader: folder, robot: {inverted: true}}}}
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, field_validator
 
 from flangeye import BoundPart, Choose, Params, StageError, part
 from flangeye.doctor.diagnosis import Arms
@@ -35,6 +35,46 @@ from flangeye.units import Duration, Length, param
 ROTATIONS = ("xyzw", "wxyz", "vector", *EULER_ORDERS)
 
 
+class PoseMistake(Params):
+    """What was wrong with poses, undone in the order of this list."""
+
+    rotation: tuple[str, str] | None = Field(
+        None, description="Conventions of the rotations: the one in which that reader read them, "
+        f"then the one in which they were written; {', '.join(ROTATIONS[:3])}, or axes.",
+    )  # fmt: skip
+    transposed: bool = Field(False, description="The rotations' matrices were transposed.")
+    inverted: bool = Field(
+        False, description="The poses are flange_T_base; of markers, target_T_camera."
+    )
+    scale: float = Field(1.0, gt=0, description="Factor for the positions.")
+    mirrored: Literal["x", "y", "z"] | None = Field(
+        None, description="Axis along which the positions have the wrong sign."
+    )
+
+    @field_validator("rotation")
+    @classmethod
+    def _known(cls, value: tuple[str, str] | None) -> tuple[str, str] | None:
+        for each in value or ():
+            if each not in ROTATIONS:
+                raise ValueError(f"no rotation '{each}'; known: {', '.join(ROTATIONS)}")
+        return value
+
+    @property
+    def factors(self) -> Floats:
+        """(3,) factors of the positions."""
+        return self.scale * np.array([-1.0 if axis == self.mirrored else 1.0 for axis in "xyz"])
+
+    def undone(self, poses: Floats) -> Floats:
+        """Return poses (N, 4, 4) as they should be."""
+        if self.rotation:
+            poses = reread(poses, *self.rotation)
+        if self.transposed:
+            poses = transposed(poses)
+        if self.inverted:
+            poses = inverted(poses)
+        return scaled(poses, self.factors)
+
+
 class CorrectedParams(Params):
     """What was wrong; one level undoes it in the order of this list."""
 
@@ -44,53 +84,20 @@ class CorrectedParams(Params):
     arms: Arms = Field(
         "both", description="Whose poses, where there are two arms; one arm alone is 'both'."
     )
-    read_as: str | None = Field(
-        None, description="Convention in which that reader read the rotations."
+    robot: PoseMistake = Field(
+        default_factory=PoseMistake, description="What was wrong with the robot's poses."
     )
-    written_as: str | None = Field(
-        None, description=f"How they were written: one of {', '.join(ROTATIONS[:3])}, or axes."
+    target: PoseMistake = Field(
+        default_factory=PoseMistake,
+        description="What was wrong with ready-made markers and centres.",
     )
-    target_read_as: str | None = Field(
-        None, description="Convention in which that reader read the markers' rotations."
-    )
-    target_written_as: str | None = Field(
-        None, description="How they were written, as for the robot's."
-    )
-    transposed: bool = Field(False, description="The rotations' matrices were transposed.")
-    target_transposed: bool = Field(False, description="Those of the markers were.")
-    scale: float = Field(1.0, gt=0, description="Factor for the robot's positions.")
-    target_scale: float = Field(
-        1.0,
-        gt=0,
-        description="Factor for the positions of ready-made centres and markers.",
-    )
-    target_mirrored: Literal["x", "y", "z"] | None = Field(
-        None, description="Axis of the camera along which their positions have the wrong sign."
-    )
-    inverted: bool = Field(False, description="The poses are flange_T_base.")
-    target_inverted: bool = Field(False, description="Markers' poses are target_T_camera.")
-    target_offset: tuple[Length, Length, Length] = param(
+    offset: tuple[Length, Length, Length] = param(
         ("0 mm", "0 mm", "0 mm"),
         description="What was seen, from the point whose poses were recorded, in its frame.",
     )
     shift: int = Field(0, description="Number of poses by which each scan's pose follows it.")
     shift_from: str | None = Field(None, description="Id of the first scan that is shifted.")
     delay: Duration = param("0 ms", description="Time from a pose to its scan.")
-
-    @field_validator("read_as", "written_as", "target_read_as", "target_written_as")
-    @classmethod
-    def _known(cls, value: str | None) -> str | None:
-        if value is not None and value not in ROTATIONS:
-            raise ValueError(f"no rotation '{value}'; known: {', '.join(ROTATIONS)}")
-        return value
-
-    @model_validator(mode="after")
-    def _both(self) -> CorrectedParams:
-        if (self.read_as is None) != (self.written_as is None):
-            raise ValueError("read_as and written_as go together")
-        if (self.target_read_as is None) != (self.target_written_as is None):
-            raise ValueError("target_read_as and target_written_as go together")
-        return self
 
 
 @part("reader.corrected")
@@ -115,7 +122,7 @@ def _alone(recording: Recording, params: CorrectedParams) -> Recording:
     }
     centre, target = recording.centre_in_camera, recording.camera_T_target
     if target is not None:
-        target = _corrected_target(target[None], params)[0]
+        target = params.target.undone(target[None])[0]
     motion = recording.motion
     if motion is not None:
         first = motion.poses if spared == FLANGE else _corrected(motion.poses, params)
@@ -128,38 +135,14 @@ def _alone(recording: Recording, params: CorrectedParams) -> Recording:
         recording,
         motion=motion,
         poses=poses,
-        centre_in_camera=None if centre is None else centre * _factors(params),
+        centre_in_camera=None if centre is None else centre * params.target.factors,
         camera_T_target=target,
     )
 
 
-def _factors(params: CorrectedParams) -> Floats:
-    """Return (3,) factors of the target's positions."""
-    sign = [-1.0 if axis == params.target_mirrored else 1.0 for axis in "xyz"]
-    return params.target_scale * np.array(sign)
-
-
-def _corrected_target(poses: Floats, params: CorrectedParams) -> Floats:
-    """Return markers' poses (N, 4, 4) in the camera as they should be."""
-    if params.target_read_as and params.target_written_as:
-        poses = reread(poses, params.target_read_as, params.target_written_as)
-    if params.target_transposed:
-        poses = transposed(poses)
-    if params.target_inverted:
-        poses = inverted(poses)
-    return scaled(poses, _factors(params))
-
-
 def _corrected(poses: Floats, params: CorrectedParams) -> Floats:
     """Return one arm's poses (N, 4, 4) as they should be."""
-    if params.read_as and params.written_as:
-        poses = reread(poses, params.read_as, params.written_as)
-    if params.transposed:
-        poses = transposed(poses)
-    poses = scaled(poses, params.scale)
-    if params.inverted:
-        poses = inverted(poses)
-    return without_tool(poses, -np.array(params.target_offset))
+    return without_tool(params.robot.undone(poses), -np.array(params.offset))
 
 
 def _shift(

@@ -52,8 +52,6 @@ FLANGES = ("flange", "tool0", "tool_flange", "panda_link8", "fr3_link8", "lbr_li
 """Names under which ROS's drivers publish the two frames, the better one first."""
 ARM = "robot: NAME ('flangeye robots' lists them) or robot: {urdf: arm.urdf} in the recipe"
 """How a recipe names its arm."""
-OFTEN = 3.0
-"""From so many measurements a second on, their own change tells when something moved."""
 
 
 class BagParams(Params):
@@ -331,7 +329,8 @@ class Scans:
 
     def signals(self, arm: Stream) -> tuple[Signal, Signal] | None:
         """Difference of each from the one before, where they are frequent enough to compare."""
-        if len(self.times) < 20 or len(arm[0]) < 20 or np.median(np.diff(self.times)) > 1 / OFTEN:
+        # From so many measurements a second on, their own change tells when something moved
+        if len(self.times) < 20 or len(arm[0]) < 20 or np.median(np.diff(self.times)) > 1 / 3.0:
             return None
         looks = self._sound(self.first, range(len(self.times)), lambda _, message: _look(message))
         if len({look.shape for look in looks.values()}) != 1:

@@ -28,15 +28,10 @@ BRIDGE = Path(__file__).with_name("bridge")
 PROGRAM = "ros2"
 """The entry of this machine's settings that names the Python which has rclpy."""
 
-STARTING = 10.0
-"""Longest time until the process has a node: a cold disk reads rclpy's hundred libraries [s]."""
 
 DISCOVERY = 2.0
 """After its start a node knows what runs; on an idle machine it does after half a second [s]."""
 
-LEAVING = 0.5
-"""How long a node may take to say that it leaves: one that is killed is sent messages for 20 s,
-which costs those that are sent to others [s]."""
 
 MATCHING = 0.5
 """Longest time until what runs is joined to a subscription or a publisher that is new [s]."""
@@ -97,7 +92,9 @@ class Bridge(Device):
         self._sim_time = sim_time
         self._calls = 0
         try:
-            self.middleware = str(self._answer(STARTING))
+            # Longest time until the process has a node: a cold disk reads rclpy's hundred
+            # libraries [s]
+            self.middleware = str(self._answer(10.0))
             self._began = time.monotonic()
             if sim_time:
                 self.follow(CLOCK, CLOCK_TYPE)
@@ -249,7 +246,9 @@ class Bridge(Device):
     def close(self) -> None:
         """End the process; safe to call twice."""
         self._gone = self._gone or "is closed"
-        self._pipe.close(LEAVING)
+        # How long a node may take to say that it leaves: one that is killed is sent messages for
+        # 20 s, which costs those that are sent to others [s]
+        self._pipe.close(0.5)
 
     # --- the wire
 

@@ -39,9 +39,6 @@ NAME = "scanner.ros2"
 TRIGGER_MESSAGE = b"\x00\x01\x00\x00\x00"
 """An std_msgs/msg/Empty, serialised: ROS gives a message without fields one byte."""
 
-TICK = 20_000_000
-"""Simulated time stands still between two messages of /clock, at 100 Hz or more; a stamp may be of
-the one before [ns]. The arm has stood for longer."""
 
 PINHOLES = ("", "plumb_bob", "rational_polynomial")
 """Distortion models of CameraInfo that OpenCV's coefficients mean."""
@@ -224,7 +221,9 @@ class Ros2Scanner(OpenScanner):
                     f"{NAME}: {topic} is stamped {early:.2f} s after "
                     "it came: set the clocks of both computers (NTP), or sim_time"
                 )
-            if stamp >= started - TICK * self._params.sim_time:
+            # Simulated time stands still between two messages of /clock, at 100 Hz or more; a
+            # stamp may be of the one before [ns]. The arm has stood for longer
+            if stamp >= started - 20_000_000 * self._params.sim_time:
                 return message
             late.append(1e-9 * (started - stamp))
             count = self._bridge.want(topic)

@@ -117,9 +117,9 @@ def test_the_doctor_tells_the_wrong_type_of_samples(
     )
     told = capsys.readouterr().out
     assert "1. pose direction: the poses are flange_T_base" in told  # the reader turned them round
-    assert told.rstrip().endswith("inverted: true}}}")
+    assert told.rstrip().endswith("robot: {inverted: true}}}}")
     assert "configuration:" not in told  # the distances tell that the camera is in the hand
-    assert "reader: {easy_handeye: {calibration: eye_on_base}}, inverted: true" in told
+    assert "reader: {easy_handeye: {calibration: eye_on_base}}, robot: {inverted: true" in told
 
 
 def test_a_folder_of_images_with_kuka_poses_is_calibrated(

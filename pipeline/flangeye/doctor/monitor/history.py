@@ -25,8 +25,6 @@ from flangeye.log.record import adapter
 from flangeye.log.records import DamageError, reason_of
 
 FORMAT = "flangeye.monitor.2"
-LONGEST = 1 << 30
-"""Longest history that is read [bytes]: a million sightings."""
 PATIENCE = 60.0
 """How long to wait for another program that adds a check [s]; judging takes it about a second."""
 
@@ -101,7 +99,8 @@ class History:
         history = cls(path, key)
         if not path.exists():
             return history
-        head, _, body = read_regular(path, LONGEST).partition(b"\n")
+        # Longest history that is read [bytes]: a million sightings
+        head, _, body = read_regular(path, 1 << 30).partition(b"\n")
         try:
             about = decode_json(head)
         except (ValueError, RecursionError):

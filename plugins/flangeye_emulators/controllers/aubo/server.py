@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import struct
-from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -15,6 +14,7 @@ from flangeye.models.graph import EmulatorOptions
 from flangeye.models.robots import RobotModel
 from flangeye.types import Floats
 from flangeye_emulators.controllers.arm import (
+    ControlUnit,
     MotionFault,
     SimulatedArm,
     joint_zeros,
@@ -33,55 +33,32 @@ POSE = CONVENTIONS["rpy"]
 FASTEST = np.radians([150.0, 150.0, 150.0, 180.0, 180.0, 180.0])
 """Largest joint speeds [rad/s]: data sheet of the i5."""
 
-FORCE_LIMIT = 150.0
-"""Force on the tool that counts as a collision [N]."""
-
 OK, BAD_STATE, INVALID = 0, 1, 5
 """Return values of commands: AUBO_OK, AUBO_BAD_STATE, AUBO_INVL_ARGUMENT."""
 
 
-class AuboController:
+class AuboController(ControlUnit):
     """A controller with its arm.
 
     Attributes:
-        arm: The arm.
-        cycle: Length of a control cycle [s].
         robot_mode: ``Running``, or ``PowerOff``.
         safety: ``Normal``, ``ProtectiveStop`` or ``RobotEmergencyStop``.
-        unlock_after: Time before a protective stop can be unlocked [s].
-        log: (time, what happened), the last thousand.
     """
 
     def __init__(self, robot: RobotModel, joints: Floats, zeros: Floats) -> None:
         """Switch on, with the arm standing at ``joints`` (n,) [rad]."""
         # `RobotConfig.getCycletime` of an i5 [s]
-        self.cycle = 0.005
+        cycle = 0.005
         limits = np.resize(FASTEST, len(joints))
-        self.arm = SimulatedArm(robot, limits, self.cycle, joints, zeros)
+        super().__init__(SimulatedArm(robot, limits, cycle, joints, zeros), cycle, 0.0)
         self.robot_mode, self.safety = "Running", "Normal"
-        self.unlock_after = 0.0
-        self.log: deque[tuple[float, str]] = deque(maxlen=1000)
         self._mover = Mover(self.arm)
-        self._cycles = self._stopped_at = 0
 
-    @property
-    def time(self) -> float:
-        """Since it was switched on [s]."""
-        return self._cycles * self.cycle
-
-    def note(self, what: str) -> None:
-        """Write a line into the log."""
-        self.log.append((self.time, what))
-
-    def step(self) -> None:
-        """Advance one control cycle."""
-        self._cycles += 1
+    def _advance(self) -> None:
         try:
             self._mover.step()
         except MotionFault as fault:
             self.protective_stop(str(fault))
-        if float(np.linalg.norm(self.arm.wrench[:3])) > FORCE_LIMIT:
-            self.protective_stop(f"collision: the tool meets more than {FORCE_LIMIT:g} N")
 
     # Motion
 
@@ -154,8 +131,7 @@ class AuboController:
 
     def unlock(self) -> int:
         """Release a protective stop; return whether it was done."""
-        since = (self._cycles - self._stopped_at) * self.cycle
-        if self.safety != "ProtectiveStop" or since < self.unlock_after:
+        if self.safety != "ProtectiveStop" or self.since_stop < self.unlock_after:
             return BAD_STATE
         self.safety = "Normal"
         return OK

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
@@ -13,13 +12,9 @@ from numpy.typing import NDArray
 
 from flangeye.models.robots import RobotModel
 from flangeye.types import Floats
-from flangeye_emulators.controllers.arm import MotionFault, SimulatedArm
+from flangeye_emulators.controllers.arm import ControlUnit, MotionFault, SimulatedArm
 from flangeye_emulators.controllers.poses import pose_vector
 from flangeye_emulators.controllers.ur.program import Program, ProgramError
-
-FORCE_LIMIT = 150.0
-"""Force on the tool that stops the arm [N]: the safety limit e-Series arms are shipped with."""
-
 
 HALF, THIRD = np.pi, 2 * np.pi / 3
 
@@ -36,56 +31,43 @@ class RefusedError(Exception):
     """The controller does not do what it was asked; the words are the dashboard's."""
 
 
-class URController:
+class URController(ControlUnit):
     """A control box with its arm.
 
     Attributes:
         robot: Which arm.
         box: Which generation of control box.
-        cycle: Length of its control cycle [s].
-        arm: The arm.
-        time: Since it was switched on [s]; the cycle's number times its length.
         registers: The general-purpose registers.
         robot_mode: Power and brakes.
         safety: Which stop is in force.
         runtime: Whether a program runs.
         remote_control: Whether programs may come through the network.
-        unlock_after: Time before a protective stop can be unlocked [s].
         digital_outputs: Bits: standard 0-7, configurable 8-15, tool 16-17.
         wired: Whether standard inputs are as the outputs of their numbers: what an output starts
             says through an input that it runs.
         analog_outputs: Two ratios, 0 to 1.
         payload: Mass [kg] and centre of gravity (3,) [m].
-        log: (time, what happened), the last thousand.
     """
 
     def __init__(self, robot: RobotModel, joints: Floats, zeros: Floats) -> None:
         """Switch on, with the arm standing at ``joints`` (6,) [rad]."""
         self.robot, self.box = robot, control_box_of(robot)
-        self.cycle = self.box.cycle
-        speeds = joint_speeds_of(robot)
-        self.arm = SimulatedArm(robot, speeds, self.box.cycle, joints, zeros)
+        arm = SimulatedArm(robot, joint_speeds_of(robot), self.box.cycle, joints, zeros)
+        # A protective stop cannot be unlocked earlier [s]: the dashboard server's manual
+        super().__init__(arm, self.box.cycle, unlock_after=5.0)
         self.registers = Registers()
         self.robot_mode, self.safety = RobotMode.RUNNING, SafetyMode.NORMAL
         self.runtime = Runtime.STOPPED
         self.remote_control = True
-        # A protective stop cannot be unlocked earlier [s]: the dashboard server's manual
-        self.unlock_after = 5.0
         self.digital_outputs, self.wired = 0, True
         self.analog_outputs = [0.0, 0.0]
         self.payload: tuple[float, Floats] = (0.0, np.zeros(3))
-        self.log: deque[tuple[float, str]] = deque(maxlen=1000)
         self._program: Program | None = None
         self._resumable = True
-        self._cycles = self._program_began = self._stopped_at = 0
+        self._program_began = 0
         self._watchdog: tuple[int, float] | None = None
         self._input_times = [0.0] * Registers.COUNT
         self._posed, self._pose = self.arm.stance, pose_vector(self.arm.stance.base_T_tcp)
-
-    @property
-    def time(self) -> float:
-        """Time since it was switched on [s]."""
-        return self._cycles * self.box.cycle
 
     @property
     def program_time(self) -> float:
@@ -94,13 +76,7 @@ class URController:
             return 0.0
         return (self._cycles - self._program_began) * self.box.cycle
 
-    def note(self, what: str) -> None:
-        """Write a line into the log."""
-        self.log.append((self.time, what))
-
-    def step(self) -> None:
-        """Advance one control cycle."""
-        self._cycles += 1
+    def _advance(self) -> None:
         self._check_watchdog()
         self._run_program()
         try:
@@ -108,8 +84,6 @@ class URController:
         except MotionFault as fault:
             self._resumable = False
             self.protective_stop(str(fault))
-        if float(np.linalg.norm(self.arm.wrench[:3])) > FORCE_LIMIT:
-            self.protective_stop(f"the tool meets more than {FORCE_LIMIT:g} N")
 
     def _run_program(self) -> None:
         if self._program is None or self.runtime is not Runtime.PLAYING:
@@ -212,8 +186,7 @@ class URController:
         """
         if self.safety is not SafetyMode.PROTECTIVE_STOP:
             return
-        since = (self._cycles - self._stopped_at) * self.box.cycle
-        if since < self.unlock_after:
+        if self.since_stop < self.unlock_after:
             raise RefusedError(
                 f"Cannot unlock protective stop until {self.unlock_after:g}s after occurrence. "
                 "Always inspect cause of protective stop before unlocking"

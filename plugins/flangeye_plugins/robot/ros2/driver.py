@@ -28,9 +28,6 @@ BEGINNING = pieces.BEHIND + 2 * RENEWAL
 SET_OFF = 0.8
 """An arm that has not begun to move after this is not being moved by its controller [s]."""
 
-SETTLING = 0.3
-"""How long a controller may take to its goal when the motion is over [s]."""
-
 
 class Ros2RobotParams(ListenParams):
     """Parameters of ``robot.ros2``."""
@@ -163,7 +160,8 @@ class Ros2Arm(Listener):
             super().close()
 
     def _mode(self, moves: bool) -> Mode:
-        settles = time.monotonic() < self._ended + SETTLING
+        # How long a controller may take to its goal when the motion is over [s]
+        settles = time.monotonic() < self._ended + 0.3
         return "moving" if moves or settles or self._motion is not None else "ready"
 
     def _begin(self, motion: pieces.DrivenMotion) -> None:

@@ -29,9 +29,6 @@ SLOWEST = 0.05
 LISTENING = 1.0
 """For how long joint states are counted when an arm is opened [s]."""
 
-STANDING = 1e-3
-"""No joint turns faster on an arm that stands [rad/s]."""
-
 
 NOTHING = "nothing came on it"
 
@@ -108,12 +105,13 @@ class Listener(Device):
         newest = self._fresh()
         pose = self._flange(newest)
         speeds = self.speeds()
+        # No joint turns faster on an arm that stands [rad/s]
         return RobotState(
             base_T_flange=Transform(BASE, FLANGE, pose),
             joints=newest.joints,
             joint_speeds=speeds,
             time_ns=newest.time_ns,
-            mode=self._mode(bool(np.abs(speeds).max() > STANDING)),
+            mode=self._mode(bool(np.abs(speeds).max() > 1e-3)),
         )
 
     def wait_cycle(self) -> None:

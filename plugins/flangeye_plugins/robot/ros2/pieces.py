@@ -45,9 +45,6 @@ SAMPLE_TIME = 0.01
 PACE = 0.15
 """Over which it is seen how fast the arm goes along a motion [s]."""
 
-SLOWEST = 0.1
-"""A motion goes on at least at this share of its speed: an arm that was held up is to go on."""
-
 
 class Point(NamedTuple):
     """A point of a piece: joints (n,) [rad] and their speeds [rad/s], so long after now [s]."""
@@ -140,7 +137,9 @@ class DrivenPath(DrivenMotion):
         (began, start), (now, here) = self._seen[0], self._seen[-1]
         if now < 2 * PACE or now == began:
             return 1.0
-        return float(np.clip((here - start) / (now - began), SLOWEST, 1.0))
+        # A motion goes on at least at this share of its speed: an arm that was held up is to go
+        # on
+        return float(np.clip((here - start) / (now - began), 0.1, 1.0))
 
     def _reached(self, joints: Floats) -> float:
         """Return the time at which the motion passes nearest to where the arm is [s]."""
