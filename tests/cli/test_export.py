@@ -94,7 +94,13 @@ def test_a_recipe_exports_wherever_the_step_stands(exporting: Any, tmp_path: Pat
         (
             TOY_RECIPE,
             ("--to", "kukka"),
-            "no stage 'export.kukka'; did you mean export.kuka or export.ur or export.abb?",
+            "--to kukka: is no format; did you mean kuka? 'flangeye export --list' names the formats",
+        ),
+        (TOY_RECIPE, ("--to", "ros"), "--to ros: is no format; did you mean ros2_command or ros2_"),
+        (
+            TOY_RECIPE,
+            (),
+            "--to: is missing, for example --to ros2_launch; 'flangeye export --list'",
         ),
         (
             TOY_RECIPE,

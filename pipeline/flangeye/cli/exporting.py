@@ -12,14 +12,14 @@ from flangeye.cli.app import LogFile, app, load_plugins, open_graph
 from flangeye.cli.console import say
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from flangeye.log.read import RunLog
+    from flangeye.plugin.registry import Registry
     from flangeye.plugin.stage import Stage
     from flangeye.types import CalibratedPose, ExportedFile
 
 
 ROS2 = "export.ros2_launch"
+FORMATS = "'flangeye export --list' names the formats"
 Camera = Annotated[str | None, typer.Option(help="Camera to export, for a cell with several.")]
 Anyway = Annotated[
     bool,
@@ -38,7 +38,9 @@ def _list_formats(wanted: bool) -> None:
 @app.command()
 def export(
     run: LogFile,
-    to: Annotated[str, typer.Option(help="The format, for example ros2_launch, ur or kuka.")],
+    to: Annotated[
+        str | None, typer.Option(help="The format, for example ros2_launch, ur or kuka.")
+    ] = None,
     values: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="A parameter of the format: parent=base."),
@@ -62,8 +64,11 @@ def export(
 
     Exit codes: 0 written, 1 the calibration was refused, 2 there is none.
     """
+    from flangeye.errors import StageError
     from flangeye.files.regular import write_whole
 
+    if to is None:
+        raise StageError(f"--to: is missing, for example --to ros2_launch; {FORMATS}")
     if to == "tables":
         _write_tables(run, out)
         return
@@ -119,11 +124,24 @@ def _write_tables(run: Path, out: Path | None) -> None:
     say(f"{recipe}: calibrates from {', '.join(file.name for file in files)}")
 
 
-def _format_named(to: str, formats: Sequence[Stage]) -> str:
-    """Return the format of that name, or the only one that speaks of it: ``urscript`` is ``ur``."""
-    names = [each.name for each in formats]
-    spoken = [each.name for each in formats if to.lower() in f"{each.name} {each.summary}".lower()]
-    return spoken[0] if f"export.{to}" not in names and len(spoken) == 1 else f"export.{to}"
+def _format_named(to: str, registry: Registry) -> str:
+    """Return the format of that name, or the only one that speaks of it: ``urscript`` is ``ur``.
+
+    Raises:
+        StageError: There is none, or there are several.
+    """
+    from flangeye.errors import StageError
+    from flangeye.files.words import nearest
+
+    if f"export.{to}" in registry.stages:
+        return f"export.{to}"
+    words = {each.name.partition(".")[2]: each.summary.lower() for each in registry.exports()}
+    spoken = [name for name in words if to.lower() in f"{name} {words[name]}"]
+    if len(spoken) == 1:
+        return f"export.{spoken[0]}"
+    near = [name for name in words if to.lower() in name] or spoken or nearest(to, words)
+    hint = f"did you mean {' or '.join(near[:3])}? " if near else ""
+    raise StageError(f"--to {to}: is no format; {hint}{FORMATS}")
 
 
 def _exported(
@@ -133,7 +151,7 @@ def _exported(
     from flangeye.recipe.overrides import params_given
 
     registry = load_plugins()
-    name = _format_named(to, registry.exports())
+    name = _format_named(to, registry)
     stage = registry.stage(name)
     if stage not in registry.exports():
         raise StageError(
