@@ -237,22 +237,25 @@ KNOWN: Any = Field(
 TO_FIND: Any = Field("unknown", description="Where it is on that: unknown (to be found), or known.")
 
 
-class CellArmSection(NamedSection):
+class MountedSection(RecipeSection):
+    """Where something of a cell is mounted, by default at a known place."""
+
+    on: str = Field("base", description=ON)
+    place: Place = KNOWN
+
+
+class CellArmSection(NamedSection, MountedSection):
     """An arm of a cell."""
 
     model: str = Field(
         description="A model that 'flangeye robots' lists, or a .yaml file of your own."
     )
-    on: str = Field("base", description=ON)
-    place: Place = KNOWN
 
 
-class AxisSection(RecipeSection):
+class AxisSection(MountedSection):
     """What rails and positioners have in common."""
 
     axis: tuple[float, float, float] = Field(description="Its direction in its base.")
-    on: str = Field("base", description=ON)
-    place: Place = KNOWN
 
     @field_validator("axis")
     @classmethod
@@ -274,12 +277,11 @@ class PositionerSection(AxisSection):
     travel: tuple[Angle, Angle] = param(("-180 deg", "180 deg"), description="Lowest and highest.")
 
 
-class StandingSection(NamedSection):
+class StandingSection(NamedSection, MountedSection):
     """A camera or a target of a cell; its one word is what it stands on."""
 
     word: ClassVar[str] = "on"
 
-    on: str = Field("base", description=ON)
     link: int | None = Field(
         None, ge=1, description="Which link of that arm it is on, from 1; its flange if not given."
     )

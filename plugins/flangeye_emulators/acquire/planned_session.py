@@ -86,6 +86,15 @@ class ArmsParams(Params):
     )
 
 
+class SightParams(Params):
+    """What simulated cameras see of markers, and how often they err."""
+
+    field: tuple[Angle, Angle] = param(
+        ("50 deg", "40 deg"), description="Horizontal and vertical field of view of the cameras."
+    )
+    outliers: float = Field(0.0, ge=0, lt=0.5, description="Share of sightings that are outliers.")
+
+
 class SessionParams(ArmsParams):
     """What simulated sessions have in common."""
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
-from pydantic import Field
 
 from flangeye.errors import StageError
 from flangeye.maths.geometry import rigid, rotation_exp
@@ -38,19 +37,16 @@ from flangeye_emulators.acquire.planned_cell import (
     name_of,
     plan_cell,
 )
-from flangeye_emulators.acquire.planned_session import VERSION
+from flangeye_emulators.acquire.planned_session import VERSION, SightParams
 from flangeye_emulators.world import cell as world
 from flangeye_emulators.world.raycast import SolidBody
 from flangeye_emulators.world.scanner import ScannerQuality, before_camera, scanner_of
 from flangeye_emulators.world.session import CameraView
 
 
-class SimulatedCellParams(CellSessionParams):
+class SimulatedCellParams(SightParams, CellSessionParams):
     """Parameters of ``acquire.simulated_cell``."""
 
-    field: tuple[Angle, Angle] = param(
-        ("50 deg", "40 deg"), description="Horizontal and vertical field of view of the cameras."
-    )
     # Nearest that cameras see [m]
     near: ClassVar[float] = 0.3
     far: Length = param("2 m", gt=0, description="Farthest that cameras see.")
@@ -62,7 +58,6 @@ class SimulatedCellParams(CellSessionParams):
     target_position: Length = param(
         "0.1 mm", gt=0, description="Standard deviation of its position along each axis."
     )
-    outliers: float = Field(0.0, ge=0, lt=0.5, description="Share of sightings that are outliers.")
 
     @property
     def view(self) -> CameraView:

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from pydantic import Field
 
 from flangeye.maths.geometry import rotation_exp
 from flangeye.maths.kinematics import Arm
@@ -29,11 +28,11 @@ from flangeye.types import (
     Seed,
     Transform,
 )  # fmt: skip
-from flangeye.units import Angle, param
 from flangeye_emulators.acquire.planned_session import (
     VERSION,
     PlannedSession,
     SessionParams,
+    SightParams,
     plan_session,
     source_of,
 )
@@ -48,15 +47,8 @@ from flangeye_emulators.world.session import (
 )
 
 
-class SimulatedMarkerParams(SessionParams):
+class SimulatedMarkerParams(SightParams, SessionParams):
     """Parameters of ``acquire.simulated_marker``."""
-
-    field: tuple[Angle, Angle] = param(
-        ("50 deg", "40 deg"), description="Horizontal and vertical field of view."
-    )
-    outliers: float = Field(
-        0.0, ge=0, lt=1, description="Share of captures with a wrong marker pose."
-    )
 
 
 class ScanParams(ScannerQuality, SessionParams):
