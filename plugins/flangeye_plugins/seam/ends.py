@@ -35,6 +35,8 @@ def last_in_lanes(lanes: Floats, way: Floats, pitch: float) -> tuple[NDArray[np.
         way: (N,) place along them [m].
         pitch: Distance between neighbouring points [m].
     """
+    if not len(way):
+        return np.zeros(0, dtype=np.intp), np.zeros(0)
     lane = np.floor(lanes / pitch).astype(int)
     order = np.lexsort((way, lane))
     last = np.append(np.diff(lane[order]) != 0, True)
@@ -64,6 +66,8 @@ def face_ends(
             continue
         at = np.flatnonzero(on)[near]
         last, more = last_in_lanes(local[at, 0], beside[near], pitch)
+        if not len(last):
+            continue
         turned = section.angles[edge] + swept.spline.at(local[at[last], 0])[:, 2]
         out = np.zeros((len(last), 5))
         out[:, 1:3] = np.stack([np.sin(turned), np.cos(turned)], axis=1)

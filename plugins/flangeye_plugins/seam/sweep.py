@@ -168,7 +168,8 @@ def _step(
     usable = _usable(swept.section, q, pitch) & (sight > GRAZING)
     weight[:first][~usable[:first]] = 0.0
     used = weight > 0
-    spread = SIGMA_OF_MAD * float(np.median(np.abs(residual[:first][used[:first]])))
+    on = np.abs(residual[:first][used[:first]])
+    spread = SIGMA_OF_MAD * float(np.median(on)) if len(on) else np.inf
     rows = _design(swept, basis[used], line[used], q[used], which[used])
     residual, weight = residual[used], (weight / size**2)[used]
     prior, pull = _prior(swept)

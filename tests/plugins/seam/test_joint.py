@@ -17,6 +17,7 @@ from flangeye.types import (
     VerifiedHandEye,
     WorkpieceScan,
 )
+from flangeye_plugins.seam.ends import last_in_lanes
 from flangeye_plugins.seam.joint import JointParams, seam_joint
 from tests.plugins.seam.raycast import JOINTS, LENGTH, MM, WIDE, Plate, box, prism, scan_of, seen_by
 from tests.plugins.seam.scenes import BASE_T_CAMERA, hand_eye, scanned
@@ -207,3 +208,14 @@ def test_too_few_points_about_the_line_are_refused() -> None:
     scan = WorkpieceScan(PointCloud(CAMERA, np.ones((5, 3), np.float32)), "few")
     with pytest.raises(StageError, match="seam.joint: 0 points are near the line; 300 are needed"):
         seam_joint(hand_eye(), scan, params)
+
+
+def test_a_surface_without_points_has_no_lanes() -> None:
+    empty = np.zeros(0)
+    last, more = last_in_lanes(empty, empty, 0.3 * MM)
+    assert len(last) == len(more) == 0
+
+
+@pytest.mark.slow
+def test_a_corner_of_which_a_face_is_lost_is_refused() -> None:
+    assert "refused" in outcome(238, "corner")
