@@ -99,7 +99,7 @@ def test_a_recipe_exports_wherever_the_step_stands(exporting: Any, tmp_path: Pat
         (TOY_RECIPE, ("--to", "ros"), "--to ros: is no format; did you mean ros2_command or ros2_"),
         (
             TOY_RECIPE,
-            (),
+            ("--anyway",),
             "--to: is missing, for example --to ros2_launch; 'flangeye export --list'",
         ),
         (
