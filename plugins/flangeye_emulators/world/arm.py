@@ -10,7 +10,7 @@ from pydantic import Field
 from flangeye.models.robots import Joint, RobotModel
 from flangeye.plugin.stage import Params
 from flangeye.types import Floats
-from flangeye.units import Angle, Length, param
+from flangeye.units import Angle, param
 
 
 class ErrorSizes(NamedTuple):
@@ -36,32 +36,10 @@ class ArmErrors(Params):
     quality: Literal["kind", "real"] = Field(
         "kind",
         description="kind: joint zeros as small as the robot's joint_accuracy, nothing else; "
-        "real: as published recordings show arms to be. The sizes below replace single ones.",
+        "real: as published recordings show arms to be. The sizes below replace its own.",
     )
     zeros: Angle | None = param(
         None, ge=0, description="Standard deviation of the joints' zeros; real: 1 mrad."
-    )
-    lengths: Length | None = param(
-        None,
-        ge=0,
-        description="Standard deviation of each link length and joint offset; real: 0.15 mm.",
-    )
-    twists: Angle | None = param(
-        None, ge=0, description="Standard deviation of each link's twist; real: 0.2 mrad."
-    )
-    eccentricity: Angle | None = param(
-        None,
-        ge=0,
-        description="Amplitude of each encoder's error, one wave per turn; real: 0.4 mrad.",
-    )
-    sag: Angle | None = param(
-        None,
-        ge=0,
-        description="By what a joint gives way for each metre of horizontal lever of what hangs "
-        "on it; real: 2 mrad.",
-    )
-    backlash: Angle | None = param(
-        None, ge=0, description="Play of a joint, from one side to the other; real: 0.1 mrad."
     )
     drift: Angle | None = param(
         None,
@@ -72,7 +50,7 @@ class ArmErrors(Params):
     def sizes(self, robot: RobotModel) -> ErrorSizes:
         """Return the sizes for an arm."""
         preset = REAL if self.quality == "real" else ErrorSizes(robot.joint_accuracy)
-        given = {name: getattr(self, name) for name in ErrorSizes._fields}
+        given = {"zeros": self.zeros, "drift": self.drift}
         return preset._replace(**{name: x for name, x in given.items() if x is not None})
 
     @property
@@ -93,12 +71,13 @@ class ImperfectArm:
         robot: RobotModel,
         scale: float,
         rng: np.random.Generator,
-        errors: ArmErrors | None = None,
+        errors: ArmErrors | ErrorSizes | None = None,
     ) -> None:
         """Draw the arm's errors; ``scale`` multiplies every one, 0 gives a perfect arm."""
         from flangeye.maths.kinematics import Arm
 
-        sizes = ErrorSizes(*(scale * np.array((errors or ArmErrors()).sizes(robot))))
+        given = errors if isinstance(errors, ErrorSizes) else (errors or ArmErrors()).sizes(robot)
+        sizes = ErrorSizes(*(scale * np.array(given)))
         self._believed = Arm(robot)
         # Data sheets give the mean plus three standard deviations of the distance from the mean
         # position (ISO 9283): 3.6 times the deviation along one axis, when all three are alike

@@ -96,8 +96,7 @@ def test_what_it_leaves_is_smooth() -> None:
 
 @pytest.mark.parametrize("name", ErrorSizes._fields)
 def test_each_error_moves_the_arm_and_none_the_report(name: Any) -> None:
-    unit = "mm" if name == "lengths" else "mrad"
-    errors = ArmErrors(**{"zeros": "0 mrad"} | {name: f"{getattr(REAL, name) * 1e3} {unit}"})
+    errors = ErrorSizes(0.0)._replace(**{name: getattr(REAL, name)})
     model, joints = load_model("robots", "ur5"), session_joints()
     arm = ImperfectArm(model, 1.0, np.random.default_rng(0), errors)
     moved = np.linalg.norm(
@@ -109,7 +108,7 @@ def test_each_error_moves_the_arm_and_none_the_report(name: Any) -> None:
 
 def test_sag_lowers_the_flange_and_more_the_farther_out() -> None:
     model = load_model("robots", "ur5")
-    errors = ArmErrors(zeros="0 mrad", sag="2 mrad")
+    errors = ErrorSizes(zeros=0.0, sag=2e-3)
     arm = ImperfectArm(model, 1.0, np.random.default_rng(0), errors)
     stretched, folded = np.zeros((1, 6)), HOME[None]
 
@@ -123,7 +122,7 @@ def test_sag_lowers_the_flange_and_more_the_farther_out() -> None:
 def test_backlash_depends_on_the_way_there() -> None:
     arm = ImperfectArm(
         load_model("robots", "ur5"), 1.0, np.random.default_rng(0),
-        ArmErrors(zeros="0 mrad", backlash="0.2 mrad"),
+        ErrorSizes(zeros=0.0, backlash=0.2e-3),
     )  # fmt: skip
     visits = HOME + np.array([[-0.1], [0.0], [0.1], [0.0]]) * np.ones(6)
     upwards, downwards = arm.angles(visits)[[1, 3]]
