@@ -1,15 +1,16 @@
 """How often a body is found without a guess, how often wrongly, and how far off, by simulation.
 
-    python -m tools.study_bodies SCANS [BODY…]
+    python -m tools.study_bodies SCANS [BODY…] [--first SEED]
 
 Simulated scans of a PhoXi M at 0.35 of its resolution: the body on a UR5e's flange, turned at random,
-before a table with six other things; in three of ten another body is there. Each body is off its
+before a table with six other things; in three of ten another body is there, or the mesh is mirrored, of
+another scale, or has other jaws. Each body is off its
 CAD, and each scanner distorted, by a field of its own, as large as stated. Beside it Open3D's FPFH,
 RANSAC and ICP on the same scans, which have no way to say that a body is absent: each pose of theirs
 that is not the body's counts as wrong.
 """
 
-import sys
+import argparse
 import time
 from functools import cache
 from pathlib import Path
@@ -19,7 +20,7 @@ import numpy as np
 import trimesh
 
 from flangeye.maths.geometry import rigid, rotation_from_rpy, rotation_log
-from flangeye.models.bodies import load_body
+from flangeye.models.bodies import TargetBody, load_body
 from flangeye.models.configuration import Configuration
 from flangeye.models.loading import load_model
 from flangeye.models.targets import plate_of
@@ -122,16 +123,31 @@ class Trial(NamedTuple):
     peer_seconds: float
 
 
+def wrong(body, turn):
+    """A mesh that is not the body's: mirrored, too large, in inches taken for millimetres, jaws moved."""
+    points = body.vertices.copy()
+    if turn % 4 == 0:
+        points *= [-1, 1, 1]
+    elif turn % 4 == 3 and body.name == "gripper":
+        jaw = points[:, 2] > 0.107
+        points[jaw, 0] += 0.01 * np.sign(points[jaw, 0])
+    else:
+        points *= (1.1, 1 / 1.1, 1 / 25.4)[turn % 4 % 3]
+    return TargetBody(body.name, points, body.triangles)
+
+
 def trial(name, seed):
-    """Search one scan for a body; in three of ten another body is in its place."""
+    """Search one scan for a body; in three of ten another is in its place, or its mesh is wrong."""
     rng = np.random.default_rng(seed)
     body, there = load_body(name, None, Path()), seed % 10 >= 3
     others = [other for other in BODIES if other != name]
-    shown = body if there else load_body(others[seed % 2], None, Path())
+    shown = load_body(others[seed // 10 % 2], None, Path()) if seed % 10 == 0 else body
     bodies, pose = scene(rng, as_made(shown, rng))
     capture = Capture(
         f"{seed:04d}", PointCloud(CAMERA, eye(rng).scan(RaycastScene(bodies), rng)), {}
     )
+    if seed % 10 in (1, 2):
+        body = wrong(body, seed // 10 * 2 + seed % 10 - 1)
     points, shape = capture.cloud.points(), prepared(body)[0]
     view = view_of(points, body.size / FINE_ACROSS)
     tolerance = max(FINE * body.size, 3.5 * view.noise)
@@ -223,10 +239,15 @@ def _median(values):
     return f"{np.median(values):.2f}" if values else "-"
 
 
-def main(scans, names):
+def main(scans, names, first):
     for name in names:
-        print(summary(name, [trial(name, seed) for seed in range(scans)]), flush=True)
+        print(summary(name, [trial(name, first + k) for k in range(scans)]), flush=True)
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]), sys.argv[2:] or BODIES)
+    words = argparse.ArgumentParser()
+    words.add_argument("scans", type=int)
+    words.add_argument("bodies", nargs="*", default=BODIES)
+    words.add_argument("--first", type=int, default=0)
+    asked = words.parse_args()
+    main(asked.scans, asked.bodies, asked.first)

@@ -10,7 +10,7 @@ import numpy as np
 from flangeye import Params, stage
 from flangeye.errors import StageError
 from flangeye.maths.geometry import invert, rotation_log
-from flangeye.models.bodies import TargetBody
+from flangeye.models.bodies import LARGEST, SMALLEST, TargetBody
 from flangeye.models.configuration import Configuration
 from flangeye.types import (
     BASE,
@@ -34,6 +34,9 @@ fits by chance is seldom held in all directions."""
 
 WIDEST = 1.75
 """Tangent of 60 degrees: no scanner sees farther to the side, stray points do."""
+
+INCH = 25.4
+"""Millimetres of an inch."""
 
 ALL = 6
 """Freedoms of a pose; a round body shows fewer."""
@@ -99,7 +102,14 @@ def segment_body(
         every = search.everywhere()
         found = list(filter(passes, every))
         if why := _why_not(every, found, body):
-            return Rejected(why)
+            # Of the first captures only: a body that was seen before is as its mesh says.
+            others = {} if found or earlier.observations else _others(body)
+            fits = (
+                what for what, other in others.items()
+                if any(map(passes, BodySearch(points, *prepared(other)).everywhere()))
+            )  # fmt: skip
+            what = next(fits, None)
+            return Rejected(f"{body.name} is {what}: so it would be found" if what else why)
     pose = found[0].pose
     centre = pose[:3, :3] @ shape.centre + pose[:3, 3]
     cloud = PointCloud(capture.cloud.frame, around(points, shape, pose))
@@ -125,6 +135,21 @@ def _predicted(capture: Capture, configuration: Configuration, earlier: Earlier)
         @ invert(one.poses[configuration.target].matrix @ place) @ now
         for one in recent if isinstance(one.feature, PoseFeature)
     ]).reshape(-1, 4, 4)  # fmt: skip
+
+
+def _others(body: TargetBody) -> dict[str, TargetBody]:
+    """Return what a body's mesh may be in truth, where it is written wrongly."""
+    sizes = {scale: scale * body.size for scale in (1 / INCH, INCH)}
+    changes = {"drawn mirrored": np.array([-1.0, 1.0, 1.0])} | {
+        f"{INCH:g} times too {'large' if scale < 1 else 'small'}, millimetres for inches or the "
+        "reverse": np.full(3, scale)
+        for scale, size in sizes.items()
+        if SMALLEST <= size <= LARGEST
+    }
+    return {
+        what: TargetBody(body.name, body.vertices * change, body.triangles)
+        for what, change in changes.items()
+    }
 
 
 def _passes(found: FoundPose, params: SegmentBodyParams) -> bool:

@@ -163,14 +163,19 @@ def test_a_body_that_is_not_there_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    "change", [np.diag([-1.0, 1.0, 1.0]), 25.4 * np.eye(3), 1.3 * np.eye(3)],
-    ids=["mirrored", "inches", "30 % too large"],
-)  # fmt: skip
-def test_a_model_that_is_not_the_body_is_refused(change) -> None:
-    vertices = load_body("torch", None, Path()).vertices
+    ("change", "why"),
+    [
+        (np.diag([-1.0, 1.0, 1.0]), "torch is drawn mirrored"),
+        (25.4 * np.eye(3), "torch is 25.4 times too large"),
+        (np.eye(3) / 2.54, "no pose of torch"),
+        (1.3 * np.eye(3), "no pose of torch"),
+    ],
+    ids=["mirrored", "inches", "centimetres", "30 % too large"],
+)
+def test_a_model_that_is_not_the_body_is_refused(change, why) -> None:
     torch = load_body("torch", None, Path())
-    wrong = TargetBody("torch", np.ascontiguousarray(vertices @ change), torch.triangles)
-    assert isinstance(found(scan(torch), wrong), Rejected)
+    wrong = TargetBody("torch", np.ascontiguousarray(torch.vertices @ change), torch.triangles)
+    assert why in found(scan(torch), wrong).reason
 
 
 def test_a_cylinder_shows_five_numbers_and_a_sphere_three() -> None:
