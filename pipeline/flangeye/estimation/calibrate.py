@@ -13,6 +13,7 @@ from flangeye.errors import FlangeyeError
 from flangeye.estimation.answers import Answer, as_reported, as_true, expected_error
 from flangeye.estimation.certified import answer_of, certificate_notes, moved_note, verdict_of
 from flangeye.estimation.corrections import CORRECTED, corrections_of
+from flangeye.estimation.effects.arm import COMMON
 from flangeye.estimation.estimate import Estimate, estimate
 from flangeye.estimation.flange_roll import roll_note
 from flangeye.estimation.graph import Places, Problem
@@ -42,6 +43,8 @@ from flangeye.types import (
     TransformEstimate,
 )
 
+EXACT = 1e-9
+"""Size of an effect that is left out [rad, m]."""
 BETTER = 0.9
 """The answer for corrected arms is given where it expects this share of the error or less."""
 
@@ -175,12 +178,15 @@ def _at_best(session: Session) -> Session:
 def _weak(session: Session, options: Options) -> Floats:
     """Return (P, k) moves of the places that the sightings tell nothing of; see ``unobservable``.
 
-    With as much noise as the sightings show, and no less than a camera and an arm have.
+    With as much noise as the sightings show, and no less than a camera and an arm have; of the arm
+    as it is reported.
     """
     found = session.found
     model, sizes = found.posterior.model, found.posterior.mode.sizes.copy()
     own = slice(len(sizes) - len(model.scatter), len(sizes) - len(model.scatter) + 2)
     sizes[own] = np.maximum(sizes[own], LEAST)
+    known = [k for k, effect in enumerate(found.effects) if effect.kind == COMMON]
+    sizes[known] = EXACT
     agreeing = found.problem.where(found.inliers)
     return unobservable(
         agreeing,

@@ -14,7 +14,7 @@ import numpy as np
 
 from flangeye.estimation.effects.arm import QUALITY, Scatter, arm_scatters
 from flangeye.estimation.effects.effect import Effect
-from flangeye.estimation.graph import Places, Problem
+from flangeye.estimation.graph import Places, Problem, Sightings
 from flangeye.estimation.mixed import (
     Fit,
     LinearModel,
@@ -29,7 +29,9 @@ from flangeye.maths.statistics import chi2_quantile
 from flangeye.types import Floats, Mask
 
 SCALE = 2.0
-"""By how many times features may be better or worse than their fits state, one sigma."""
+"""By how many times features may be better or worse than their fits state, one sigma: turns and
+shifts, of whole poses along the line of sight and across it apart, for there cameras differ
+most."""
 FURTHER = 0.05e-3, 0.02e-3
 """Median noise of a sighting beyond its feature's: rotation [rad] and translation [m]: what a
 feature's fit does not state."""
@@ -92,10 +94,10 @@ class Estimate:
 
 
 def prior_of(
-    effects: Sequence[Effect], counts: Sequence[int], scatters: Sequence[Scatter]
+    effects: Sequence[Effect], counts: Sequence[int], scaled: int, scatters: Sequence[Scatter]
 ) -> Sizes:
     """Return the prior of the sizes of effects and noise; those of one cause share its quality."""
-    sized = [*((e.size, e.factor, e.cause) for e in effects), *[(1.0, SCALE, "")] * 2]
+    sized = [*((e.size, e.factor, e.cause) for e in effects), *[(1.0, SCALE, "")] * scaled]
     sized += [
         *((size, TIMES, "") for size in FURTHER),
         *((s.size, s.factor, s.cause) for s in scatters),
@@ -130,17 +132,35 @@ def model_at(
     blocks = [effect.block(problem, linear) for effect in effects]
     if not of_session:
         blocks = [b if e.lasting else 0 * b for b, e in zip(blocks, effects, strict=True)]
-    still, scatters = np.zeros((len(s), 6, 0)), arm_scatters(problem)
+    still, scatters, scaled = np.zeros((len(s), 6, 0)), arm_scatters(problem), _sighted(s)
     return LinearModel(
         (s.projectors @ linear.residuals[..., None])[..., 0],
         np.concatenate([still, *(linear.blocks[name] for name in problem.unknown)], axis=2),
         np.concatenate([still, *blocks], axis=2),
         s.covariances,
+        scaled,
         np.array([*_further(len(s)), *(each.covariances(problem, linear) for each in scatters)]),
         s.projectors,
-        prior_of(effects, [block.shape[2] for block in blocks], scatters),
+        prior_of(effects, [block.shape[2] for block in blocks], len(scaled), scatters),
         shares,
     )
+
+
+def _sighted(seen: Sightings) -> Floats:
+    """Return (D, N, 6, 6) projectors onto turns and shifts; of whole poses along and across apart.
+
+    What a fit to points in space states knows of the line of sight; what is told from an image has
+    one deviation for all directions.
+    """
+    whole, both = seen.ranks == 6, np.kron(np.eye(2)[:, :, None] * np.eye(2), np.eye(3))
+    every = np.repeat(both[:, None], len(seen), axis=1)
+    if not whole.any():
+        return np.asarray(every)
+    far = np.linalg.norm(seen.centres, axis=1)[:, None]
+    ray = np.where(far > 0, seen.centres, [0.0, 0.0, 1.0]) / np.where(far > 0, far, 1.0)
+    along = np.kron(np.eye(2), np.ones((3, 3))) * np.tile(ray[:, :, None] * ray[:, None], (1, 2, 2))
+    along[~whole] = 0.0
+    return np.concatenate([every @ (np.eye(6) - along), every @ along])
 
 
 def _further(count: int) -> Floats:

@@ -6,8 +6,9 @@ The N sightings leave residuals of six numbers each (rotation before translation
     \qquad \delta_k \sim N(0, s_k^2 I), \quad e \sim N(0, R)
 
 where p moves the unknown places and each effect E_k is something that can be wrong with the cell.
-The noise is R = D C D + sum_m t_m^2 T_m: the features' own covariances C, scaled by D for rotations
-and for translations, and what else scatters from sighting to sighting. Sizes s_k, D and t_m
+The noise is R = D C D + sum_m t_m^2 T_m: the features' own covariances C, scaled by D for turns and
+for shifts, along the line of sight and across it, and what else scatters from sighting to sighting.
+Sizes s_k, D and t_m
 maximise the restricted likelihood (REML, Patterson & Thompson 1971) times their priors, and are
 then integrated over by importance sampling about that mode, for a dozen sightings do not determine
 them. Henderson's
@@ -43,8 +44,8 @@ class Sizes:
     """Prior of the logarithms of all sizes: log s = centre + mix @ z, with z standard normal.
 
     Attributes:
-        centre: (S,) medians' logarithms: of the effects [their units], of D for rotations and for
-            translations, and of what else scatters [their units].
+        centre: (S,) medians' logarithms: of the effects [their units], of the parts of D, and of
+            what else scatters [their units].
         mix: (S, Z) what each standard normal number does to them: effects that share a cause, such
             as all errors of one arm, share a column.
         effect: (K,) which size each column of the effects' design has.
@@ -68,6 +69,7 @@ class LinearModel:
         places: (N, 6, P) how the unknown places move what is predicted.
         effects: (N, 6, K) how the effects do, an effect of size one.
         covariances: (N, 6, 6) of the features alone.
+        scaled: (D, N, 6, 6) projectors onto what is scaled apart of those.
         scatter: (M, N, 6, 6) of each other cause that scatters from sighting to sighting, of size
             one.
         projectors: (N, 6, 6) onto what was measured.
@@ -79,6 +81,7 @@ class LinearModel:
     places: Floats
     effects: Floats
     covariances: Floats
+    scaled: Floats
     scatter: Floats
     projectors: Floats
     sizes: Sizes
@@ -107,9 +110,9 @@ class LinearModel:
     def parts(self, sizes: Floats) -> tuple[Floats, Floats]:
         """Return (N, 6, 6) of the features, scaled, and (M, N, 6, 6) of what else scatters."""
         own = len(sizes) - len(self.scatter)
-        scale = np.repeat(sizes[own - 2 : own], 3)
+        scale = np.tensordot(sizes[own - len(self.scaled) : own], self.scaled, axes=1)
         further = sizes[own:, None, None, None] ** 2 * self.scatter
-        return self.covariances * np.outer(scale, scale), further
+        return scale @ self.covariances @ scale, further
 
     def weights(self, bare: Floats) -> Floats:
         """Return (N, 6, 6) of the sightings by the inverse of their noise, each by its share."""
@@ -124,7 +127,8 @@ class LinearModel:
         rows = kept[np.linspace(0, len(kept) - 1, TELLING).round().astype(int)]
         each = ("residuals", "places", "effects", "covariances", "projectors", "shares")
         some = {name: getattr(self, name)[rows] for name in each}
-        return replace(self, scatter=self.scatter[:, rows], **some)
+        both = {name: getattr(self, name)[:, rows] for name in ("scaled", "scatter")}
+        return replace(self, **some, **both)
 
     def weighted(self, shares: Floats) -> LinearModel:
         """Return the model with other weights of its sightings."""
@@ -229,9 +233,11 @@ def _gradient(
         w @ spread @ w
     )
     scaled, further = model.parts(sizes)
-    own, product = len(sizes) - len(further), slope * scaled
-    out[own - 2] = product[:, :3].sum() + product[:, :, :3].sum()
-    out[own - 1] = product[:, 3:].sum() + product[:, :, 3:].sum()
+    own = len(sizes) - len(further)
+    # d(D C D) by log D_j is P_j D C D and its transpose
+    out[own - len(model.scaled) : own] = 2 * np.einsum(
+        "nab,dnac,ncb->d", slope, model.scaled, scaled
+    )
     out[own:] = 2 * (slope * further).sum(axis=(1, 2, 3))
     return out
 

@@ -406,6 +406,11 @@ def _require_size(session: Session) -> None:
     ]
     if not told:
         return
+    if gross := _size_far_off(session):
+        raise CalibrationRefused(
+            f"the target fits the arm's motion far better if it is {gross:.3g} times as large as "
+            "was said where it was fitted: measure the print (target_size: unknown finds it)"
+        )
     share, sigma, kind = max(told, key=lambda each: abs(each[0]) / each[1])
     if abs(share) <= session.asked.size_limit or (share / sigma) ** 2 < chi2_quantile(
         MISTAKE_CERTAIN, 1
@@ -423,6 +428,29 @@ def _require_size(session: Session) -> None:
         "calibration says: distances along its axis are off, those across it are not; calibrate "
         "the camera (acquire.images: {board: …} does; size_limit allows more)"
     )
+
+
+def _size_far_off(session: Session) -> float | None:
+    """Return the size of a marker with which the arm is not as bad as it seems; None without one.
+
+    An arm that may be very bad explains a marker of twice the size as well, and nothing is then
+    known of the camera.
+    """
+    found, observations = session.found, session.observations
+    worse = any(found.outgrown(kind) for kind in ("zeros", "field"))
+    if not worse or len(found.problem.ends) > 1 or not (found.problem.seen.ranks == 6).all():
+        return None
+    try:
+        factor = size_of(found.problem)
+        problem = problem_of(_resized(observations, factor), session.cell, session.asked.normals)
+        problem, places, agree, _ = _begun(problem)
+    except (StageError, CalibrationRefused):
+        return None
+    effects = effects_of(problem, session.scanner, session.asked)
+    other = estimate(problem, places, effects, agree).posterior.mode.cost
+    # The same numbers in another unit of length: three coordinates of each are so much larger.
+    better = found.posterior.mode.cost - other + 6 * len(observations) * np.log(factor)
+    return factor if better > chi2_quantile(MISTAKE_CERTAIN, 1) else None
 
 
 def _with_offset(session: Session) -> Session:

@@ -16,7 +16,7 @@ import numpy as np
 
 from flangeye.estimation.effects.effect import Block, Effect
 from flangeye.estimation.graph import Carrier, Linear, Problem
-from flangeye.maths.geometry import rotation_log
+from flangeye.maths.geometry import hat, rotation_log
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.smooth_field import effects as field_effects
 from flangeye.maths.smooth_field import field_over
@@ -38,6 +38,14 @@ BACKLASH = 0.1
 FIELD, FIELD_TIMES = 0.1, 4.0
 """Likewise what no kind explains, smooth over the workspace [m], and by how many times it may be
 more or less, one sigma: of it nothing is known beforehand."""
+PLACES = ("place of the base", True, (1.0, 0.5)), ("place of the flange", False, (1.2, 0.15))
+ANEW = 0.4, 0.1
+"""Likewise where the joints are not known, of turn [rad] and shift [m] that all poses have in
+common, of the base and in the flange, and that each has of its own: those of a UR5e and a Panda
+with errors of all these kinds (``tests/estimation/foreign.py``), over 240 mm and 20 to 35
+degrees."""
+COMMON = "common"
+"""The kind of what all poses have in common: reported coordinates are right as they are."""
 ACCURACY = 0.3e-3
 """Typical deviation of a joint's zero where no file says it [rad]: that of the catalogue's arms."""
 QUALITY = 4.0
@@ -60,6 +68,12 @@ def arm_effects(problem: Problem, arm: str) -> list[Effect]:
         for kind, (name, ratio) in KINDS.items():
             block = _of_carriers(arm, kind)
             effects.append(Effect(name, block, ratio * accuracy, EACH, arm, True, kind))
+    else:
+        effects += [
+            Effect(name, _in_common(arm, at_base, rows), size * accuracy, EACH, arm, True, COMMON)
+            for name, at_base, sizes in PLACES
+            for rows, size in zip((slice(3), slice(3, 6)), sizes, strict=True)
+        ]
     field = field_over(np.asarray(problem.frames[carriers[0].frame].place)[:, :3, 3])
     block = _by_place(arm, field)
     return [
@@ -86,13 +100,20 @@ class Scatter:
 
 
 def arm_scatters(problem: Problem) -> list[Scatter]:
-    """Return the backlash of each arm's joints: it depends on how the arm came to a pose."""
-    arms = {c.arm: c.accuracy or ACCURACY for c in problem.carriers}
-    return [
-        Scatter(_backlash(arm), BACKLASH * accuracy, EACH, arm)
-        for arm, accuracy in arms.items()
-        if _told(problem, arm)
-    ]
+    """Return what scatters of each arm from pose to pose.
+
+    Backlash depends on how the arm came to a pose. Where its joints are not known, what they do is
+    not known to be smooth either, but by where the flange is.
+    """
+    out = []
+    for arm, accuracy in {c.arm: c.accuracy or ACCURACY for c in problem.carriers}.items():
+        if _told(problem, arm):
+            out.append(Scatter(_backlash(arm), BACKLASH * accuracy, EACH, arm))
+        else:
+            turns, shifts = (_anew(arm, rows) for rows in (slice(3), slice(3, 6)))
+            out.append(Scatter(turns, ANEW[0] * accuracy, EACH, arm))
+            out.append(Scatter(shifts, ANEW[1] * accuracy, EACH, arm))
+    return out
 
 
 def _told(problem: Problem, arm: str) -> bool:
@@ -114,6 +135,16 @@ def _backlash(arm: str) -> Callable[[Problem, Linear], Floats]:
     return covariances
 
 
+def _anew(arm: str, rows: slice) -> Callable[[Problem, Linear], Floats]:
+    """Turns or shifts of what an arm carries, those the more the farther the target is from it."""
+
+    def covariances(problem: Problem, linear: Linear) -> Floats:
+        moved = [linear.blocks[c.frame][:, :, rows] for c in problem.carriers if c.arm == arm]
+        return np.asarray(sum(moves @ np.swapaxes(moves, 1, 2) for moves in moved))
+
+    return covariances
+
+
 def _of_carriers(arm: str, kind: str) -> Block:
     """Return the block of twists (T, 6, K) that all carriers of one arm have at each time."""
 
@@ -121,6 +152,24 @@ def _of_carriers(arm: str, kind: str) -> Block:
         moved = [c for c in problem.carriers if c.arm == arm]
         parts = [linear.blocks[c.frame] @ displacements(c)[kind][problem.seen.times] for c in moved]
         return np.asarray(sum(parts))
+
+    return block
+
+
+def _in_common(arm: str, at_base: bool, rows: slice) -> Block:
+    """Return the block of a turn or a shift of all the flange's poses, at the base or in it."""
+
+    def block(problem: Problem, linear: Linear) -> Floats:
+        out = np.zeros((len(problem.seen), 6, 3))
+        for c in (c for c in problem.carriers if c.arm == arm):
+            poses = np.asarray(problem.frames[c.frame].place)[problem.seen.times]
+            motions = np.tile(np.eye(6), (len(poses), 1, 1))
+            if at_base:
+                motions[:, 3:, :3] = -hat(poses[:, :3, 3])
+            else:
+                motions[:, :3, :3] = motions[:, 3:, 3:] = poses[:, :3, :3]
+            out += linear.blocks[c.frame] @ motions[:, :, rows]
+        return out
 
     return block
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from flangeye.estimation.effects.effect import Block, Effect
 from flangeye.estimation.graph import Linear, Problem
-from flangeye.types import Floats
+from flangeye.types import Floats, Mask
 
 VIEWS_TIMES = 1.05
 """By how many times a stated deviation may be more or less, one sigma: views told it."""
@@ -50,7 +50,7 @@ def _size(target: str) -> Block:
     def block(problem: Problem, linear: Linear) -> Floats:
         s, out = problem.seen, np.zeros((len(problem.seen), 6, 1))
         whose = np.array([problem.ends[k][1] == target for k in s.pairs]) & (s.ranks == 6)
-        out[whose, 3:, 0] = -s.centres[whose]
+        out[whose, 3:, 0] = -_smoothed(problem, linear, whose)[whose]
         return out
 
     return block
@@ -60,7 +60,19 @@ def _focal(camera: str) -> Block:
     def block(problem: Problem, linear: Linear) -> Floats:
         s, out = problem.seen, np.zeros((len(problem.seen), 6, 1))
         whose = np.array([problem.ends[k][0] == camera for k in s.pairs]) & (s.ranks == 6)
-        out[whose, 5, 0] = -s.centres[whose, 2]
+        out[whose, 5, 0] = -_smoothed(problem, linear, whose)[whose, 2]
         return out
 
     return block
+
+
+def _smoothed(problem: Problem, linear: Linear, whose: Mask) -> Floats:
+    """Return (N, 3) where centres are predicted, on the whole as far away as they were measured.
+
+    A share of what was measured itself would take its noise away, and all of it at a size of none.
+    """
+    measured = problem.seen.centres
+    predicted = measured - linear.residuals[:, 3:]
+    size = float((predicted[whose] ** 2).sum())
+    ratio = float((measured * predicted)[whose].sum()) / size if size > 0 else 1.0
+    return np.asarray(ratio * predicted)
