@@ -1,7 +1,7 @@
 """How wrong the mixed model is, and how wrong it says: python -m tools.estimator_table
 
 Sessions by a generator that shares no code with the project (tests/estimation/foreign.py): UR5e and
-Panda in turn, with joints recorded. Of the true camera pose and of the one as reported, each against
+Panda in turn, with joints recorded, or `--no-joints`. Of the true camera pose and of the one as reported, each against
 its own truth: mean of NEES over 6, share inside the stated 95 %, stated over true rms, and the true
 rms over the box [mm]; beside it, of circles, that of least squares on centres (SVD).
 """
@@ -18,10 +18,10 @@ from tests.estimation import foreign
 from tests.estimation.sessions import Score, score
 
 
-def row(kind: str, poses: int, mrad: float, seeds: range) -> str:
+def row(kind: str, poses: int, mrad: float, seeds: range, joints: bool) -> str:
     """Return one row of the table."""
     arms = foreign.UR5E, foreign.PANDA
-    scores = [score(kind, arms[seed % 2], mrad * 1e-3, poses, seed) for seed in seeds]
+    scores = [score(kind, arms[seed % 2], mrad * 1e-3, poses, seed, joints) for seed in seeds]
     each = [_figures([getattr(s, answer) for s in scores]) for answer in ("true", "reported")]
     svd = 1e3 * np.sqrt(np.mean([s.svd for s in scores]))
     outliers = sum(s.outliers for s in scores)
@@ -41,6 +41,7 @@ def table(
     mrad: Annotated[list[float] | None, typer.Option(help="Deviation of joint zeros.")] = None,
     sessions: int = 40,
     first: int = 0,
+    joints: bool = True,
 ) -> None:
     """Print the table."""
     print("| target | poses | mrad | true: NEES, in, width, rms | as reported | SVD | aside |")
@@ -48,7 +49,7 @@ def table(
     for each in kind or ["flange", "centres", "marker", "hand"]:
         for n in poses or [16, 30]:
             for size in mrad or [0.05, 0.3, 1.0, 3.0]:
-                print(row(each, n, size, range(first, first + sessions)), flush=True)
+                print(row(each, n, size, range(first, first + sessions), joints), flush=True)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -75,23 +76,29 @@ def problem_of(s: foreign.Session, kind: str, poses, joints, seen) -> Problem:
     return Problem(frames, [("camera", "target")], sightings, [carrier])
 
 
-def estimated(s: foreign.Session, kind: str) -> Estimate:
-    """Return the estimate of a session, begun 10 mm and 0.6 degrees from the truth."""
+def estimated(s: foreign.Session, kind: str, told: bool = True) -> Estimate:
+    """Return the estimate of a session, begun 10 mm and 0.6 degrees from the truth.
+
+    Without its joints, where they are not ``told``.
+    """
     problem = problem_of(s, kind, s.reported, s.joints, s.seen)
+    if not told:
+        bare = [replace(c, kinematics=None, joints=None) for c in problem.carriers]
+        problem = replace(problem, carriers=bare)
     truth = {"camera": s.camera, "target": s.target}
     start = problem.moved(truth, np.full(6 * len(problem.unknown), 0.01))
     effects = effects_of(problem, None, Asked())
     return estimate(problem, start, effects, np.ones(len(s.seen), dtype=bool))
 
 
-def score(kind: str, arm: dict, s: float, poses: int, seed: int) -> Scores:
+def score(kind: str, arm: dict, s: float, poses: int, seed: int, told: bool = True) -> Scores:
     """Return how wrong both answers of one session are, and how wrong they say.
 
     The estimator is not told the box of the work that it is judged by: its own is where the
     session's poses were.
     """
     session = foreign.session(kind, arm, s, poses, seed)
-    found = estimated(session, kind)
+    found = estimated(session, kind, told)
     work = work_of(found.problem.where(found.inliers), found.places)
     answer = as_reported(found, work)
     reported, real, _ = foreign.work(session)

@@ -72,3 +72,12 @@ def test_what_is_stated_as_reported_is_as_large_as_the_error(kind) -> None:
     assert 0.6 < np.sqrt(stated.mean() / true.mean()) < 1.7
     if kind == "flange":
         assert true.mean() < 1.1**2 * np.mean([s.svd for s in scores])
+
+
+@pytest.mark.parametrize("kind", ["hand", "flange"])
+def test_both_answers_hold_where_no_joints_were_recorded(kind) -> None:
+    arms = foreign.UR5E, foreign.PANDA
+    scores = [score(kind, arms[seed % 2], 0.3e-3, 16, seed, told=False) for seed in range(8)]
+    for answer in ("true", "reported"):
+        nees = np.mean([getattr(s, answer).nees for s in scores])
+        assert 0.3 < nees < 1.7  # 16 and 5 before, of what all poses have in common

@@ -163,3 +163,15 @@ def test_what_a_result_asks_for_whatever_its_steps_noted() -> None:
     seen = [r.ObservationResult(id=str(i), used=i < 2) for i in range(5)]
     poor = found.model_copy(update={"observations": seen})
     assert r.standing_warnings(poor)[0].text == "3 of 5 captures were rejected"
+
+
+@pytest.mark.parametrize(
+    ("expected", "told"),
+    [((0.5e-3, 0.9e-3), None), ((0.2e-3, 0.4e-3), "more than by chance"),
+     ((1.0e-3, 1.8e-3), "less than by chance")],
+)  # fmt: skip
+def test_an_expected_error_that_poses_held_out_contradict_is_said(expected, told) -> None:
+    found = document(calibration(expected=ExpectedError(*expected)), {"poses": 16.0})
+    warnings = [w.text for w in r.standing_warnings(found) if "held out" in w.text]
+    assert len(warnings) == (told is not None)
+    assert all(told in text and "0.50 mm" in text for text in warnings)

@@ -88,8 +88,8 @@ def warnings_result(notes: Iterable[t.Note]) -> list[WarningResult]:
 def standing_warnings(result: Result) -> list[WarningResult]:
     """Return what a finished result asks for, whatever its steps noted.
 
-    An estimate that is arbitrary in some direction, a calibration that nothing judged, and a
-    session most of whose captures were rejected.
+    An estimate that is arbitrary in some direction, a calibration that nothing judged, a session
+    most of whose captures were rejected, and an expected error that poses held out contradict.
     """
     found = []
     if weak := [name for name, each in result.transforms.items() if each.unobservable]:
@@ -102,7 +102,25 @@ def standing_warnings(result: Result) -> list[WarningResult]:
     if used < LEAST_USED * count and not (result.refused and used == 0):
         text = f"{count - used} of {count} captures were rejected"
         found.append((text, "look for the cause: flangeye doctor RUN"))
+    if text := _unlike(result):
+        found.append((text, "trust the held-out error; flangeye doctor RUN looks for the cause"))
     return [WarningResult(text=text, fix=fix) for text, fix in found]
+
+
+def _unlike(result: Result) -> str | None:
+    """Return how the expected and the held-out error differ by more than chance; else None.
+
+    Nineteen errors of twenty are below the bound that is expected of each: the root mean square of
+    all is not above it by chance, nor the measured bound below the expected root mean square.
+    """
+    expected, held = result.expected_error, result.holdout
+    if expected is None or held is None or (expected.rms <= held.p95 and held.rms <= expected.p95):
+        return None
+    more = "more" if held.rms > expected.p95 else "less"
+    return (
+        f"poses held out are off by {held.rms * 1e3:.2f} mm rms, {more} than by chance where "
+        f"{expected.rms * 1e3:.2f} mm is expected"
+    )
 
 
 def expected_error(result: Result) -> tuple[float, float] | None:
