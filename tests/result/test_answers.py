@@ -171,7 +171,8 @@ def test_what_a_result_asks_for_whatever_its_steps_noted() -> None:
      ((1.0e-3, 1.8e-3), "less than by chance")],
 )  # fmt: skip
 def test_an_expected_error_that_poses_held_out_contradict_is_said(expected, told) -> None:
-    found = document(calibration(expected=ExpectedError(*expected)), {"poses": 16.0})
+    stated = r.expected_error_result(calibration(expected=ExpectedError(*expected)))
+    found = document(calibration(), {"poses": 16.0}).model_copy(update={"expected_error": stated})
     warnings = [w.text for w in r.standing_warnings(found) if "held out" in w.text]
     assert len(warnings) == (told is not None)
     assert all(told in text and "0.50 mm" in text for text in warnings)

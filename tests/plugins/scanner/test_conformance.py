@@ -6,10 +6,12 @@ from pathlib import Path
 import pytest
 
 from flangeye.testing import ScannerConformance
+from flangeye.units import SI
 from flangeye_emulators.scanner.loopback import LoopbackScannerParams, scanner_loopback
 from flangeye_plugins.scanner.genicam import GenicamParams, scanner_genicam
 from flangeye_plugins.scanner.realsense import RealsenseParams, scanner_realsense
 from tests.emulators.controllers.process import Process
+from tests.plugins.fixed import fixed
 from tests.plugins.scanner.test_loopback import shown
 
 
@@ -31,7 +33,7 @@ class TestGenicam(ScannerConformance):
 
 @pytest.fixture
 def recorded(request: pytest.FixtureRequest, recording: Path) -> None:
-    request.cls.params = {"recording": str(recording), "timeout": "1 s"}
+    request.cls.params = fixed(RealsenseParams, recording=str(recording), timeout=1.0)
 
 
 @pytest.mark.usefixtures("recorded")
@@ -44,9 +46,10 @@ class TestRealsense(ScannerConformance):
 def controller(request: pytest.FixtureRequest) -> Iterator[None]:
     with Process() as process:
         process.control.put(shown())
-        request.cls.params = {
-            "host": process.host, "resolution": 0.05, "exposure": "20 ms", "latency": "0 ms"
-        }  # fmt: skip
+        request.cls.params = fixed(
+            LoopbackScannerParams, host=process.host, resolution=0.05, exposure=SI(0.02),
+            latency=SI(0.0),
+        )  # fmt: skip
         yield
 
 
