@@ -102,8 +102,8 @@ def standing_warnings(result: Result) -> list[WarningResult]:
     if used < LEAST_USED * count and not (result.refused and used == 0):
         text = f"{count - used} of {count} captures were rejected"
         found.append((text, "look for the cause: flangeye doctor RUN"))
-    if text := _unlike(result):
-        found.append((text, "trust the held-out error; flangeye doctor RUN looks for the cause"))
+    if unlike := _unlike(result):
+        found.append((unlike, "trust the held-out error; flangeye doctor RUN looks for the cause"))
     return [WarningResult(text=text, fix=fix) for text, fix in found]
 
 

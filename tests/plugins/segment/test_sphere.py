@@ -33,6 +33,7 @@ from flangeye_plugins.segment.sphere import (
     surface_normals,
 )
 from tests.plugins.bounds import check_bound
+from tests.plugins.fixed import fixed
 
 SPHERE = Sphere(size=0.01905, centre_in_flange=(0.0, 0.0, 0.06))
 
@@ -56,7 +57,7 @@ def scanned():
 
 
 def segment(capture, sphere=SPHERE, **changes):
-    return segment_sphere(capture, sphere, SegmentSphereParams(**changes))
+    return segment_sphere(capture, sphere, fixed(SegmentSphereParams, **changes))
 
 
 def of(xyz):
