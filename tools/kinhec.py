@@ -4,8 +4,8 @@
     python -m tools.kinhec kinhec
 
 Every sequence is solved as ``acquire.samples`` and ``solve.robust`` would with their defaults, from
-the pairs of poses that the benchmark's own eleven reference solvers are given; X is held against the
-answer for the true arm. Where the camera does not know how far it sees, as in the monocular track,
+the pairs of poses that the benchmark's own eleven reference solvers are given; NEES is of
+the answer for the true arm. Where the camera does not know how far it sees, as in the monocular track,
 with `target_size: unknown`. Three sequences of the motion track turn about one axis exactly: no solver
 can know the translation along it, and what the references leave there is what they guess.
 
@@ -56,7 +56,7 @@ def observations(sequence):
 
 
 def error(sequence):
-    """Return the error of X [mm] and its NEES over 6, or why there is none."""
+    """Return the error of X [mm] and the NEES over 6 of the true X, or why there is none."""
     hand = sequence.eye_in_hand
     cell = Configuration("eye-in-hand", FLANGE, BASE) if hand else Configuration()
     name = "flange_T_camera" if hand else "flange_T_target"
@@ -71,7 +71,7 @@ def error(sequence):
     off = sequence.X @ np.linalg.inv(estimate.transform.matrix)
     moved = off[:3, :3] @ estimate.about + off[:3, 3] - estimate.about
     twist = np.concatenate([rotation_log(off[:3, :3]), moved])
-    place = estimate.transform.translation - sequence.X[:3, 3]
+    place = found.transforms[name].transform.translation - sequence.X[:3, 3]
     nees = float(twist @ np.linalg.solve(estimate.covariance, twist)) / 6
     return 1e3 * float(np.linalg.norm(place)), nees
 
