@@ -43,7 +43,7 @@ from flangeye.types import (
     TransformEstimate,
 )
 
-EXACT = 1e-9
+LEFT_OUT = 1e-9
 """Size of an effect that is left out [rad, m]."""
 BETTER = 0.9
 """The answer for corrected arms is given where it expects this share of the error or less."""
@@ -186,7 +186,7 @@ def _weak(session: Session, options: Options) -> Floats:
     own = slice(len(sizes) - len(model.scatter), len(sizes) - len(model.scatter) + 2)
     sizes[own] = np.maximum(sizes[own], LEAST)
     known = [k for k, effect in enumerate(found.effects) if effect.kind == COMMON]
-    sizes[known] = EXACT
+    sizes[known] = LEFT_OUT
     agreeing = found.problem.where(found.inliers)
     return unobservable(
         agreeing,

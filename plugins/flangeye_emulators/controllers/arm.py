@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -324,7 +325,7 @@ def joint_zeros(robot: RobotModel, seed: int | None) -> Floats:
     return zeros
 
 
-class ControlUnit:
+class ControlUnit(ABC):
     """What controllers of every make have: an arm advanced cycle by cycle, a log, a force limit.
 
     Attributes:
@@ -362,17 +363,18 @@ class ControlUnit:
         if float(np.linalg.norm(self.arm.wrench[:3])) > 150.0:
             self.protective_stop("the tool meets more than 150 N")
 
+    @abstractmethod
     def _advance(self) -> None:
-        raise NotImplementedError
+        """Do what this make does in a cycle."""
 
+    @abstractmethod
     def protective_stop(self, why: str) -> None:
         """Stop the arm and take no command."""
-        raise NotImplementedError
 
+    @abstractmethod
     def reset(self, joints: Floats) -> None:
         """Be as after switching on, standing at ``joints`` (n,) [rad]."""
-        raise NotImplementedError
 
+    @abstractmethod
     def modes(self) -> Mapping[str, Any]:
         """Return its modes by name, for the control channel."""
-        raise NotImplementedError
