@@ -317,7 +317,10 @@ def test_a_defect_is_refused_in_one_line_before_decoding(tmp_path: Path, name: s
 @pytest.mark.parametrize(
     ("array", "message"),
     [
-        (np.zeros((4, 2)), "has shape (4, 2); a point cloud is (N, 3) or (H, W, 3)"),
+        (
+            np.zeros((4, 2)),
+            "has shape (4, 2); a point cloud is (N, 3), (H, W, 3), (3, N) or (3, H, W)",
+        ),
         (np.zeros((4, 3), complex), "holds 'complex128', not numbers"),
         (np.array([{}]), "holds 'object', not numbers"),
     ],
@@ -454,6 +457,13 @@ TABLES_OF_POINTS = {
                                               + lines_of(1e3 * p, "{};{};{}").replace(".", ",")),
     "counted.pts": lambda f, p: f.write_text(f"{len(p)}\n" + lines_of(p)),
     "comma.csv": lambda f, p: f.write_text(lines_of(p, "{:f};{:f};{:f}").replace(".", ",")),
+    "axes_first.npy": lambda f, p: np.save(f, p.T),
+    "image.npy": lambda f, p: np.save(f, p.T.reshape(3, 2, 20)),
+    "remarks.xyz": lambda f, p: f.write_text(
+        "# scan 3 of 12\n# mm\n" + lines_of(p[:20]) + "  # second half\n\n" + lines_of(p[20:])),
+    "heading.txt": lambda f, p: f.write_text(
+        "% exported\n//R X Y Z\n" + lines_of(p, "7 {:f} {:f} {:f}")),
+    "unit.xyz": lambda f, p: f.write_text("# x_mm y_mm z_mm\n" + lines_of(1e3 * p)),
     "tabs.txt": lambda f, p: f.write_text(lines_of(p, "{:f}\t{:f}\t{:f}").replace(".", ",")),
 }  # fmt: skip
 

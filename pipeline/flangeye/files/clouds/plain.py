@@ -15,7 +15,7 @@ from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
 from flangeye.files.clouds.header import axes_of, read_head, refuse
-from flangeye.files.clouds.table import Points, PointTable, Shape, TextTable
+from flangeye.files.clouds.table import Points, PointTable, Shape, TextTable, is_row
 
 HEADER_ERRORS = (ValueError, TypeError, SyntaxError, TokenError)
 """What NumPy raises at a header that is none: it parses a Python literal."""
@@ -23,11 +23,15 @@ HEADER_ERRORS = (ValueError, TypeError, SyntaxError, TokenError)
 NUMBERS = "fiu"
 """Kinds of NumPy's types that are numbers."""
 
+WIDEST = 16
+"""Numbers a point may have: x, y, z, then normals, colours, intensity."""
+
 
 def open_npy(path: Path) -> PointTable:
     """Return the points of an array.
 
-    It is (N, 3) or (H, W, 3), of more columns the first three, or has records with x, y and z.
+    It is (N, 3) or (H, W, 3), of more columns the first three, or (3, N) or (3, H, W), or has
+    records with x, y and z.
 
     Raises:
         StageError: It is not such an array.
@@ -36,10 +40,11 @@ def open_npy(path: Path) -> PointTable:
     if fields:
         axes_of(path, fields)
         return NpyTable(path, shape, tuple(fields))
-    # Columns of an array of points: x, y, z, then normals, colours, intensity
-    if len(shape) not in (2, 3) or not 3 <= shape[-1] <= 16:
-        refuse(path, f"has shape {shape}; a point cloud is (N, 3) or (H, W, 3)")
-    return NpyTable(path, shape[:-1])
+    if len(shape) in (2, 3) and 3 <= shape[-1] <= WIDEST:
+        return NpyTable(path, shape[:-1])
+    if len(shape) in (2, 3) and 3 <= shape[0] <= WIDEST < shape[-1]:
+        return NpyTable(path, shape[1:], axes_first=True)
+    refuse(path, f"has shape {shape}; a point cloud is (N, 3), (H, W, 3), (3, N) or (3, H, W)")
 
 
 def load_npy(path: Path) -> NDArray[Any]:
@@ -121,11 +126,13 @@ class NpyTable:
         path: The file.
         shape: (N,) or (H, W).
         fields: Names of a record's fields; empty for plain numbers.
+        axes_first: Whether x, y and z are the first index and not the last.
     """
 
     path: Path
     shape: Shape
     fields: tuple[str, ...] = ()
+    axes_first: bool = False
 
     def check(self) -> None:
         """Its size was checked against the header when it was opened."""
@@ -137,6 +144,7 @@ class NpyTable:
             if self.fields:
                 named = [self.fields[i] for i in axes_of(self.path, self.fields)]
                 return np.stack([array[name].ravel() for name in named], -1).astype(np.float32)
+            array = np.moveaxis(array, 0, -1) if self.axes_first else array
             xyz: Points = array.reshape(-1, array.shape[-1])[:, :3].astype(np.float32)
             return xyz
 
@@ -145,42 +153,54 @@ def open_text(path: Path) -> PointTable:
     """Return the points of a table as text: x, y, z first, or wherever a heading names them.
 
     Values are separated by blanks, tabs, commas or semicolons; where those are not commas,
-    decimals may stand behind one. A first row with one whole number is the count of points
+    decimals may stand behind one. Lines behind ``#``, ``//`` or ``%`` are remarks; the last one
+    above the points may be the heading. A first row with one whole number is the count of points
     (``.pts``). A unit that the heading states, ``x_mm`` or ``X [mm]``, is that of the file.
 
     Raises:
         StageError: Its first row is neither three numbers or more nor a heading.
     """
-    head = read_head(path)
-    lines = head.split(b"\n", 2)
-    counted = len(lines) > 2 and lines[0].strip().isdigit()  # how many points follow, as .pts has
+    lines = read_head(path).decode("latin-1").splitlines(keepends=True)
+    head = next((i for i, line in enumerate(lines) if is_row(line)), len(lines))
+    above = next((line for line in reversed(lines[:head]) if not line.isspace()), "")
+    lines = lines[head:] or [""]
+    counted = len(lines) > 1 and lines[0].strip().isdigit()  # how many points follow, as .pts has
     first = lines[1] if counted else lines[0]
-    row = first.decode("latin-1").lstrip("#/ ").strip()
+    cells, delimiter, comma = _cells(first)
+    rows, remarks = _rows(path)
+    rows -= counted
+    if counted and rows != int(lines[0]):
+        refuse(path, f"its first row promises {int(lines[0])} points, but it has {rows}")
+    named: list[tuple[str, str]] = []
+    if all(_is_number(cell) for cell in cells):
+        if len(cells) < 3:
+            refuse(path, f"its first row has {len(cells)} values; a point has 3 or more")
+        remark = [_axis(cell) for cell in _cells(above)[0]]
+        if len(remark) == len(cells) and {"x", "y", "z"} <= {name.lower() for name, _ in remark}:
+            named = remark
+    else:
+        named, rows, counted = [_axis(cell) for cell in cells], rows - 1, counted + 1
+        below = next((line for line in lines[1:] if is_row(line)), "")
+        comma = delimiter == ";" and "," in below
+    skipped = int(counted)
+    axes = axes_of(path, [name for name, _ in named]) if named else (0, 1, 2)
+    units = {named[axis][1] for axis in axes if named} - {""}
+    if len(units) > 1:
+        refuse(path, f"its heading states several units: {', '.join(sorted(units))}")
+    return TextTable(
+        path, (rows,), 0, len(cells), axes, skipped, rows + skipped, delimiter,
+        unit=next(iter(units), ""), comma=comma, remarks=remarks,
+    )  # fmt: skip
+
+
+def _cells(line: str) -> tuple[list[str], str | None, bool]:
+    """Return the values of a row, what separates them, and whether decimals are behind a comma."""
+    row = line.lstrip("#/% ").strip()
     delimiter = next((mark for mark in ";\t," if mark in row), None)
     comma = (delimiter != "," and "," in row) or (delimiter == "," and _has_decimal_commas(row))
     delimiter = None if comma and delimiter in (",", "\t") else delimiter
     cells = [cell.strip() for cell in row.split(delimiter)]
-    cells = [cell.replace(",", ".") for cell in cells] if comma else cells
-    rows, skipped = _rows(path) - counted, len(lines[0]) + 1 if counted else 0
-    if counted and rows != int(lines[0]):
-        refuse(path, f"its first row promises {int(lines[0])} points, but it has {rows}")
-    if all(_is_number(cell) for cell in cells):
-        if len(cells) < 3:
-            refuse(path, f"its first row has {len(cells)} values; a point has 3 or more")
-        return TextTable(
-            path, (rows,), skipped, len(cells), (0, 1, 2), 0, rows, delimiter, comma=comma
-        )
-    named = [_axis(cell) for cell in cells]
-    axes, start = axes_of(path, [name for name, _ in named]), skipped + len(first) + 1
-    second = head[start:].partition(b"\n")[0].decode("latin-1")
-    decimal = delimiter == ";" and "," in second
-    units = {named[axis][1] for axis in axes} - {""}
-    if len(units) > 1:
-        refuse(path, f"its heading states several units: {', '.join(sorted(units))}")
-    return TextTable(
-        path, (rows - 1,), start, len(cells), axes, 0, rows - 1, delimiter,
-        unit=next(iter(units), ""), comma=decimal,
-    )  # fmt: skip
+    return [cell.replace(",", ".") for cell in cells] if comma else cells, delimiter, comma
 
 
 _HEADING = re.compile(r"([A-Za-z]\w*?)[\s_]*[\[(]?(mm|m|in)?[\])]?")
@@ -198,9 +218,11 @@ def _has_decimal_commas(row: str) -> bool:
     return len(words) > 2 and all(_is_number(word.replace(",", ".")) for word in words)
 
 
-def _rows(path: Path) -> int:
-    with path.open("rb") as file:
-        return sum(not line.isspace() for line in file)
+def _rows(path: Path) -> tuple[int, bool]:
+    """Return how many rows a text has, and whether it has remarks beside them."""
+    with path.open(encoding="latin-1") as text:
+        lines = [is_row(line) for line in text if not line.isspace()]
+    return sum(lines), not all(lines)
 
 
 def _is_number(text: str) -> bool:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from itertools import filterfalse, islice
+from io import TextIOWrapper
+from itertools import islice
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -60,6 +60,15 @@ def _repeat(out: bytearray, start: int, length: int) -> None:
         out += (out[start:] * (length // period + 1))[:length]
 
 
+REMARKS = ("#", "//", "%")
+"""How lines begin that are remarks: of Python and PCL, of CloudCompare, of MATLAB."""
+
+
+def is_row(line: str) -> bool:
+    """Return whether a line of a text is neither blank nor a remark."""
+    return not line.isspace() and not line.lstrip().startswith(REMARKS)
+
+
 Shape = tuple[int, ...]
 Points = NDArray[np.float32]
 
@@ -96,6 +105,7 @@ class TextTable:
         delimiter: What separates values, white space if None.
         unit: Of the coordinates, where a heading states it; else empty.
         comma: Whether decimals are behind a comma.
+        remarks: Whether lines between the rows are remarks.
         viewpoint: As for :class:`BinaryTable`.
     """
 
@@ -109,39 +119,42 @@ class TextTable:
     delimiter: str | None = None
     unit: str = ""
     comma: bool = False
+    remarks: bool = False
     viewpoint: Any = None
 
     def check(self) -> None:
         """Count the rows, and the values of the last one."""
-        found, last = 0, b""
-        with self.path.open("rb") as file:
-            file.seek(self.offset)
-            for line in file:
-                if not line.isspace():
-                    found, last = found + 1, line
+        found, last = 0, ""
+        with self._rows() as text:
+            for line in filter(is_row, text):
+                found, last = found + 1, line
         if found < self.rows:
             refuse(self.path, f"truncated: its header promises {self.rows} rows, it has {found}")
         if found > self.rows:
             refuse(self.path, f"its header promises {self.rows} rows, but it has {found}")
-        values = len(last.decode("latin-1").split(self.delimiter))
+        values = len(last.split(self.delimiter))
         if self.rows == self.skipped + math.prod(self.shape) and values != self.width:
             refuse(self.path, f"truncated: its last row has {values} of {self.width} values")
 
     def decode(self) -> Points:
         """Parse the rows; every row must be complete."""
         n = math.prod(self.shape)
-        with self.path.open("rb") as file:
-            file.seek(self.offset)
-            text = io.TextIOWrapper(file, encoding="latin-1")
-            if self.rows == n and self.delimiter is None and not self.comma:
+        plain = self.delimiter is None and not self.comma and not self.remarks
+        with self._rows() as text:
+            if self.rows == n and plain:
                 values = self._parse(text)  # NumPy drops blank rows too, and takes half the time
             else:
-                rows: Iterable[str] = filterfalse(str.isspace, text)
+                rows: Iterable[str] = filter(is_row, text)
                 rows = (row.replace(",", ".") for row in rows) if self.comma else rows
                 values = self._parse(islice(rows, self.skipped, self.skipped + n))
         if values.shape != (n, self.width):
             refuse(self.path, f"its rows have {values.shape[1]} values, not {self.width}")
         return np.ascontiguousarray(values[:, list(self.axes)])
+
+    def _rows(self) -> TextIOWrapper:
+        file = self.path.open("rb")
+        file.seek(self.offset)
+        return TextIOWrapper(file, encoding="latin-1")
 
     def _parse(self, rows: Iterable[str]) -> Points:
         try:
