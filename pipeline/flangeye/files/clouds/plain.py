@@ -161,36 +161,39 @@ def open_text(path: Path) -> PointTable:
         StageError: Its first row is neither three numbers or more nor a heading.
     """
     lines = read_head(path).decode("latin-1").splitlines(keepends=True)
-    head = next((i for i, line in enumerate(lines) if is_row(line)), len(lines))
-    above = next((line for line in reversed(lines[:head]) if not line.isspace()), "")
-    lines = lines[head:] or [""]
-    counted = len(lines) > 1 and lines[0].strip().isdigit()  # how many points follow, as .pts has
-    first = lines[1] if counted else lines[0]
-    cells, delimiter, comma = _cells(first)
+    top = next((i for i, line in enumerate(lines) if is_row(line)), len(lines))
+    above = next((line for line in reversed(lines[:top]) if not line.isspace()), "")
+    lines = [line for line in lines[top:] if is_row(line)] or [""]
     rows, remarks = _rows(path)
-    rows -= counted
-    if counted and rows != int(lines[0]):
-        refuse(path, f"its first row promises {int(lines[0])} points, but it has {rows}")
-    named: list[tuple[str, str]] = []
-    if all(_is_number(cell) for cell in cells):
-        if len(cells) < 3:
-            refuse(path, f"its first row has {len(cells)} values; a point has 3 or more")
-        remark = [_axis(cell) for cell in _cells(above)[0]]
-        if len(remark) == len(cells) and {"x", "y", "z"} <= {name.lower() for name, _ in remark}:
-            named = remark
+    skipped = 0
+    if len(lines) > 1 and lines[0].strip().isdigit():  # how many points follow, as .pts has
+        skipped = 1
+        if rows - 1 != int(lines[0]):
+            refuse(path, f"its first row promises {int(lines[0])} points, but it has {rows - 1}")
+    cells, delimiter, comma = _cells(lines[skipped])
+    heading = _heading(cells)
+    if heading:
+        skipped += 1
+        comma = delimiter == ";" and "," in "".join(lines[skipped : skipped + 1])
+    elif len(cells) < 3:
+        refuse(path, f"its first row has {len(cells)} values; a point has 3 or more")
     else:
-        named, rows, counted = [_axis(cell) for cell in cells], rows - 1, counted + 1
-        below = next((line for line in lines[1:] if is_row(line)), "")
-        comma = delimiter == ";" and "," in below
-    skipped = int(counted)
-    axes = axes_of(path, [name for name, _ in named]) if named else (0, 1, 2)
-    units = {named[axis][1] for axis in axes if named} - {""}
+        heading = _heading(_cells(above)[0])
+        known = len(heading) == len(cells) and {"x", "y", "z"} <= {n.lower() for n, _ in heading}
+        heading = heading if known else []
+    axes = axes_of(path, [name for name, _ in heading]) if heading else (0, 1, 2)
+    units = {heading[axis][1] for axis in axes if heading} - {""}
     if len(units) > 1:
         refuse(path, f"its heading states several units: {', '.join(sorted(units))}")
     return TextTable(
-        path, (rows,), 0, len(cells), axes, skipped, rows + skipped, delimiter,
+        path, (rows - skipped,), 0, len(cells), axes, skipped, rows, delimiter,
         unit=next(iter(units), ""), comma=comma, remarks=remarks,
     )  # fmt: skip
+
+
+def _heading(cells: list[str]) -> list[tuple[str, str]]:
+    """Return the name and the unit of each cell; nothing where all are numbers."""
+    return [] if all(map(_is_number, cells)) else [_axis(cell) for cell in cells]
 
 
 def _cells(line: str) -> tuple[list[str], str | None, bool]:
