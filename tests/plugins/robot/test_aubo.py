@@ -196,6 +196,20 @@ def test_a_controller_that_is_lost_is_an_error_in_time(
         controller.control.reset()
 
 
+def test_a_controller_that_froze_is_waited_for_once(controller: Any) -> None:
+    """Each wait keeps the guard from its program, and the piece under way has ended by itself."""
+    with open_aubo(controller.host) as robot:
+        robot.move_linear(moved(robot.state().base_T_flange, z=-0.3), 0.1, 0.5)
+        controller.control.fault("freeze")
+        with pytest.raises(DeviceError, match="timeout"):
+            robot.state()
+        controller.control.clear()
+        for act in (robot.state, robot.stop, lambda: robot.move_joints(np.zeros(6), 0.1, 0.5)):
+            with pytest.raises(DeviceError, match="the connection is lost: look at the controller"):
+                act()
+    assert controller.control.truth().speed == 0.0
+
+
 def test_what_the_arm_cannot_do_is_a_protective_stop(robot: Any) -> None:
     far = moved(robot.state().base_T_flange, x=2.0)
     state = arrived(robot, lambda: robot.move_linear(far, 0.2, 1.0))

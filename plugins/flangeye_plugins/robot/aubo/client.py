@@ -37,9 +37,16 @@ GOAL_WITHIN = 2e-3
 STANDING = 2e-3
 """A joint that is slower than this stands [rad/s]."""
 
+ANSWER = 0.5
+"""Longest wait for one answer [s]; the library then raises, it never hangs."""
+
 
 class AuboClient:
     """A logged-in connection.
+
+    One that gave no answer in time is lost for good: nothing more is asked or commanded on it, for
+    each wait would keep the arm's guard from its program. The arm needs no stop, for every piece of
+    its motion ends by itself.
 
     Attributes:
         state: The library's ``RobotState``.
@@ -60,12 +67,11 @@ class AuboClient:
         Raises:
             DeviceError: Nobody answers, or the login fails.
         """
-        self._name = name
+        self._name, self._lost = name, False
         self._failure = sdk.AuboException
         self._rpc = sdk.RpcClient()
         self._rpc.setLogHandler(_say_nothing)
-        # Longest wait for one answer [ms]; the library then raises, it never hangs
-        self._rpc.setRequestTimeout(500)
+        self._rpc.setRequestTimeout(round(1e3 * ANSWER))
         if self.ask("connect", lambda: self._rpc.connect(host, PORT)) != 0:
             raise DeviceError(
                 f"{name}: nothing answers at {host}:{PORT}: is the controller on, is {host} its "
@@ -86,14 +92,20 @@ class AuboClient:
         Raises:
             DeviceError: It raises: the connection is lost, or the controller refuses.
         """
+        if self._lost:
+            raise self._error(what, "the connection is lost")
+        began = time.monotonic()
         try:
             return question()
         except self._failure as error:
-            said = " ".join(str(error).split())
-            raise DeviceError(
-                f"{self._name}: {what}: {said}: look at the controller and the network, then open "
-                "it again"
-            ) from None
+            self._lost = time.monotonic() - began >= ANSWER
+            raise self._error(what, " ".join(str(error).split())) from None
+
+    def _error(self, what: str, said: str) -> DeviceError:
+        return DeviceError(
+            f"{self._name}: {what}: {said}: look at the controller and the network, then open it "
+            "again"
+        )
 
     def command(self, what: str, order: Callable[[], int]) -> None:
         """Give a command.
