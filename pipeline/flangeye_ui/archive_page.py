@@ -12,18 +12,21 @@ from nicegui import ui
 
 from flangeye.errors import FlangeyeError
 from flangeye.report.units import millimetres
-from flangeye.result import Result
+from flangeye.result import Result, status_of
 from flangeye_ui.charts import FAINT, USED
 from flangeye_ui.foreign import address_of
 from flangeye_ui.layout import command_line, mistake, page
 from flangeye_ui.project import Project
 from flangeye_ui.scene import ScanView
 
+WIDE_ONLY = ("used", "note")
+"""Columns that a phone has no room for; the run's result says both."""
 COLUMNS = [
     {"name": key, "label": label, "field": key, "align": "left", "sortable": True}
+    | (dict.fromkeys(("classes", "headerClasses"), "gt-xs") if key in WIDE_ONLY else {})
     for key, label in (
-        ("run", "Run"), ("status", "Status"), ("used", "Poses used"), ("held", "Held-out rms, mm"),
-        ("predicted", "Predicted rms, mm"), ("note", "Note"),
+        ("run", "Run"), ("status", "Status"), ("used", "Poses used"),
+        ("held", "Held-out error, mm"), ("expected", "Expected error, mm"), ("note", "Note"),
     )
 ]  # fmt: skip
 OPENS = """<q-td :props="props">
@@ -68,10 +71,10 @@ def row_of(run: Path) -> dict[str, Any]:
     used = sum(o.used for o in result.observations)
     return {
         "run": run.name,
-        "status": result.status,
+        "status": status_of(result),
         "used": f"{used} of {len(result.observations)}",
         "held": millimetres(held.rms) if held else "",
-        "predicted": millimetres(result.expected_error.rms) if result.expected_error else "",
+        "expected": millimetres(result.expected_error.rms) if result.expected_error else "",
         "note": result.refused or "",
     }
 
@@ -85,7 +88,7 @@ def comparison(rows: list[dict[str, Any]]) -> dict[str, Any]:
             "data": [float(row[key]) if row.get(key) else None for row in ordered],
         }
         for key, label, colour in (
-            ("held", "held-out rms, mm", USED), ("predicted", "predicted rms, mm", "#3a7ebf")
+            ("held", "held-out error, mm", USED), ("expected", "expected error, mm", "#3a7ebf")
         )
     ]  # fmt: skip
     return {

@@ -207,7 +207,8 @@ def _light(facts: Facts) -> None:
             with ui.column().classes("gap-0"):
                 ui.label(words).classes("title said")
                 _number(facts)
-        ui.label(f"{found.label}: {found.sentence}").classes("q-mt-sm").props('role="status"')
+        label = f"{found.label} (simulated)" if facts.result.simulated else found.label
+        ui.label(f"{label}. {found.sentence}").classes("q-mt-sm").props('role="status"')
 
 
 def _number(facts: Facts) -> None:
@@ -217,7 +218,7 @@ def _number(facts: Facts) -> None:
         return
     rms, p95 = expected
     ui.label(f"{rounded_mm(rms)} mm").classes("number")
-    ui.label("error to expect at the work, rms")
+    ui.label("expected error at the work, rms")
     if p95 is not None:
         ui.label(f"95 % of errors are below {rounded_mm(p95)} mm")
     if limit is not None:

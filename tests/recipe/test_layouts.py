@@ -186,6 +186,30 @@ def wxyz(f, j, a, s):
         (f / f"{name}.csv").write_text(text(quaternion(poses)[:, [0, 1, 2, 6, 3, 4, 5]]))
 
 
+def tf_echo(f, j, a, s):
+    line = "At time {}\n- Translation: [{:.6f}, {:.6f}, {:.6f}]\n- Rotation: in Quaternion "
+    line += "(xyzw) [{:.7f}, {:.7f}, {:.7f}, {:.7f}]\n"
+    for name, poses in (("base_to_tool0", a), ("camera_to_marker", s)):
+        lines = [line.format(k, *row) for k, row in enumerate(quaternion(poses))]
+        (f / f"{name}.txt").write_text("".join(lines))
+
+
+def matrix_headings(f, j, a, s):
+    names = [f"r{row}{column}" for row in "123" for column in "123"]
+    for file, poses in (("robot", a), ("camera", s)):
+        rows = np.hstack([poses[:, :3, :3].reshape(-1, 9), 1e3 * poses[:, :3, 3]])
+        (f / f"{file}.csv").write_text(",".join([*names, "tx", "ty", "tz"]) + "\n" + text(rows))
+
+
+def yaml_nested(f, j, a, s):
+    (f / "poses.yaml").write_text(json.dumps([
+        {name: {"position": dict(zip("xyz", row[:3], strict=True)),
+                "orientation": dict(zip(("roll", "pitch", "yaw"), row[3:], strict=True))}
+         for name, row in (("robot", arm), ("marker", seen))}
+        for arm, seen in zip(euler(a, "xyz").tolist(), euler(s, "xyz").tolist(), strict=True)
+    ]))  # fmt: skip
+
+
 def json_arrays(f, j, a, s):
     (f / "calib.json").write_text(
         json.dumps({"T_base_flange": a.tolist(), "T_cam_board": s.tolist()})
@@ -228,6 +252,9 @@ LAYOUTS: dict[str, Callable[..., None]] = {
     "4×4 matrices line by line in two texts": matrices_in_text,
     "quaternions w, x, y, z without a heading": wxyz,
     "JSON of arrays, `T_base_flange`, `T_cam_board`": json_arrays,
+    "what ROS's `tf_echo` prints, `base_to_tool0`": tf_echo,
+    "headings r11, r12, … r33, tx, ty, tz": matrix_headings,
+    "YAML of records: position, orientation.roll, …": yaml_nested,
     "joint angles without names, and the arm's `.urdf`": joints_alone,
     "joint angles of ROS by alphabet, and the arm's `.urdf`": joints_of_ros,
 }

@@ -109,8 +109,8 @@ def test_an_outlook_is_told_in_millimetres() -> None:
     assert told == [
         "01  1.200 mm",
         "02  set aside: too far",
-        "error to expect: 95 % below 0.500 mm at the work",
+        "expected error: 95 % below 0.500 mm at the work",
     ]
     assert Outlook(missing="move the arm").lines() == [
-        "error to expect: not known yet", "missing: move the arm",
+        "expected error: not known yet", "missing: move the arm",
     ]  # fmt: skip

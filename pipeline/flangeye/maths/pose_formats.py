@@ -311,7 +311,12 @@ CONVENTIONS: Mapping[str, PoseConvention] = {
     "halcon": PoseConvention("HALCON", (*_XYZ, "RX", "RY", "RZ"), "XYZ", "m", "deg"),
     # ROS REP 103, and the URDF: fixed axes.
     "rpy": PoseConvention("roll pitch yaw", (*_XYZ, "ROLL", "PITCH", "YAW"), "xyz", "m"),
-    "quaternion_xyzw": PoseConvention("quaternion", (*_XYZ, "QX", "QY", "QZ", "QW"), "xyzw", "m"),
+    # The program is what ROS's tf_echo prints.
+    "quaternion_xyzw": PoseConvention(
+        "quaternion", (*_XYZ, "QX", "QY", "QZ", "QW"), "xyzw", "m",
+        program=rf"Translation:\s*\[{_list_of(3)}\][-\s]*Rotation:\s*in Quaternion[^\[]*"
+        rf"\[{_list_of(4)}\]", program_length="m",
+    ),
     "quaternion_wxyz": PoseConvention("quaternion", (*_XYZ, "QW", "QX", "QY", "QZ"), "wxyz", "m"),
 }  # fmt: skip
 """The conventions people meet, by name; others are made from :class:`PoseConvention`. Readers,

@@ -39,9 +39,9 @@ class Outlook:
         """Return it for people, a line each."""
         poses = [f"{pose}  {size * 1e3:.3f} mm" for pose, size in self.residuals.items()]
         poses += [f"{pose}  set aside: {why}" for pose, why in self.set_aside.items()]
-        worth = "error to expect: not known yet"
+        worth = "expected error: not known yet"
         if self.error is not None:
-            worth = f"error to expect: 95 % below {self.error * 1e3:.3f} mm at the work"
+            worth = f"expected error: 95 % below {self.error * 1e3:.3f} mm at the work"
         covered = [f"covered: {self.coverage}"] if self.coverage else []
         missing = [f"missing: {self.missing}"] if self.missing else []
         return [*poses, worth, *covered, *missing, *(f"better: {x}" for x in self.better)]

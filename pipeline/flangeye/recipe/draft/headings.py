@@ -39,6 +39,7 @@ _TURNS: Mapping[str, str] = {
     "rvec": "v", "rvecs": "v", "rotvec": "v", "rodrigues": "v", "rpy": "e",
 }  # fmt: skip
 """Names of rotations, and what the names of their columns begin with."""
+_TURN_WORDS = tuple(word for word in _TURNS if len(word) > 1)
 _VECTORS = {
     ("rotation", "vec"): "rotvec", ("rotation", "vector"): "rotvec", ("rot", "vec"): "rotvec",
     ("translation", "vec"): "tvec", ("translation", "vector"): "tvec", ("trans", "vec"): "tvec",
@@ -53,6 +54,8 @@ _JOINT = re.compile(
     r"(?:j_?\d|(?:q|a|axis|theta)_?[1-9])(?:_?(?:rad|deg|pos|position))?"
     r"|(?!.*(?:vel|eff|torque|acc|current|temp)).*joint.*"
 )
+_IN_MATRIX = re.compile(r"(?:r|m|t|rot|mat)([0-3])([0-3])")
+"""Entry of a matrix in row and column: ``r11``, ``m03``."""
 _ENTRY = re.compile(r"(.+?)((?:\.\d+)+)")
 
 
@@ -142,7 +145,7 @@ class PoseColumns:
     @property
     def role(self) -> str | None:
         """``arm`` or ``target``: by the columns, the program or the file; None where none says."""
-        if self.table.convention is not None:
+        if self.table.convention is not None and not self._is_echo:
             return "arm"
         opencv = "target" if self.called.lower() in _OPENCV else None
         of_columns = role_in(self.called)
@@ -154,7 +157,14 @@ class PoseColumns:
     def frames(self) -> tuple[str, str] | None:
         """Frames A and B of A_T_B, as a name says."""
         names = (self.called, *re.split(r"[/:]", self.table.name)[::-1])
-        return next((found for name in names if (found := frames_in(name))), None)
+        found = next((found for name in names if (found := frames_in(name))), None)
+        # ROS's tf_echo prints the pose of the frame that is named last, base_to_tool0 or base2tool0
+        return found[::-1] if found and self._is_echo and _TO.search(self.table.name) else found
+
+    @property
+    def _is_echo(self) -> bool:
+        convention = self.table.convention
+        return convention is not None and not CONVENTIONS[convention].makers
 
 
 def as_joints(pose: PoseColumns) -> PoseColumns:
@@ -280,8 +290,10 @@ def _put(groups: dict[str, Group], name: str, words: list[str], listed: bool) ->
     axis, before = words[-1].lower(), words[:-1]
     if len(axis) == 2 and axis[0] in "pt" and axis[1] in "xyz":
         axis = axis[1]
-    part, before = _without(before, (*_PLACES, *_TURNS) if axis in ("x", "y", "z", "w") else ())
-    axis = _TURNS.get(part, "") + axis
+    plain = axis in ("x", "y", "z", "w")
+    # Behind a name of its own (orientation.roll) only a whole word is no part of the pose's name
+    part, before = _without(before, (*_PLACES, *_TURNS) if plain else _TURN_WORDS)
+    axis = (_TURNS.get(part, "") if plain else "") + axis
     called = "_".join(before) or (part if part in _OPENCV else "")
     group = groups.setdefault("" if called in _OPENCV else called, Group())
     group.words = group.words or called
@@ -320,11 +332,16 @@ def _pose(table: Table, group: Group) -> PoseColumns | None:
         if group.many == 6 and table.convention:
             rotations = (table.convention,)
         return PoseColumns(table, (group.whole,), rotations, *stated)
+    entries = _matrix_entries(group)
+    if len(entries) in (12, 16):
+        return PoseColumns(table, entries, ("matrix",), *stated)
     if not set(POSITION) <= set(group.columns):
         return None
     place = [group.columns[axis] for axis in POSITION]
     if group.rotation is not None:
         return PoseColumns(table, (*place, group.rotation), ("3x3",), *stated)
+    if len(entries) == 9:
+        return PoseColumns(table, (*place, *entries), ("3x3",), *stated)
     fitting = [names for names in ROTATIONS if set(names) <= set(group.columns)]
     names = max(fitting, key=len, default=None)
     if names is None:
@@ -333,6 +350,13 @@ def _pose(table: Table, group: Group) -> PoseColumns | None:
     if not group.ordered and names == ("qx", "qy", "qz", "qw"):
         known = ("quaternion_xyzw", "quaternion_wxyz")
     return PoseColumns(table, (*place, *(group.columns[n] for n in names)), known, *stated)
+
+
+def _matrix_entries(group: Group) -> tuple[Column, ...]:
+    """Return the columns that are named as the entries of a matrix, row by row."""
+    named = {m.groups(): column for name, column in group.columns.items()
+             if (m := _IN_MATRIX.fullmatch(name))}  # fmt: skip
+    return tuple(named[at] for at in sorted(named))
 
 
 def frames_in(name: str) -> tuple[str, str] | None:
