@@ -102,3 +102,20 @@ def test_a_lens_of_another_model_is_refused(tmp_path: Path) -> None:
 def test_what_is_no_camera_is_none(tmp_path: Path, text: str) -> None:
     (tmp_path / "a.yaml").write_text(text)
     assert camera_in(tmp_path / "a.yaml") is None
+
+
+@pytest.mark.parametrize(
+    ("name", "raw"),
+    [
+        ("a.json", b'{"fx": 1' + 400 * b"0" + b', "fy": 600, "cx": 320, "cy": 240}'),
+        ("a.json", b'{"k": [600, 0, 1' + 400 * b"0" + b", 0, 600, 240, 0, 0, 1]}"),
+        ("cameras.txt", b"1 PINHOLE 640 480 600 many 320 240\n"),
+        ("cameras.txt", b"1 PINHOLE 640 480 600 inf 320 240\n"),
+        ("notes.txt", "Gr\xfc\xdfe".encode("latin-1")),
+    ],
+)
+def test_numbers_that_are_none_and_texts_of_others_are_no_camera(
+    tmp_path: Path, name: str, raw: bytes
+) -> None:
+    (tmp_path / name).write_bytes(raw)
+    assert camera_in(tmp_path / name) is None

@@ -568,7 +568,109 @@ def _read_batch(path):
     dataset._read(f"{FOLDER}/000000-a.parquet").to_pylist()
 
 
+def _live(*made):
+    """Return seeds of messages as they come on a running graph, serialised."""
+
+    def serialised(folder):
+        from flangeye_plugins.ros2.messages import encoded
+        from tests.plugins.reader import bags
+
+        return [encoded(message) for message in made_by(bags)]
+
+    def made_by(bags):
+        return [getattr(bags, name)(1.0, *given) for name, *given in made]
+
+    return serialised
+
+
+def _read_live(kind):
+    def read(path):
+        from flangeye_plugins.robot.ros2.listener import _angles
+        from flangeye_plugins.ros2 import messages
+        from flangeye_plugins.scanner.opened import cloud_of
+
+        uses = {
+            messages.CLOUD: lambda told: cloud_of(messages.cloud_of(told), 1.0),
+            messages.IMAGE: lambda told: (messages.values_of(told), messages.pixels_of(told)),
+            messages.COMPRESSED: messages.pixels_of, messages.INFO: messages.intrinsics_of,
+            messages.JOINT_STATE: _angles,
+        }  # fmt: skip
+        data = path.read_bytes()
+        messages.stamp_of(data), messages.frame_of(data)
+        messages.decoded(data, getattr(messages, kind), uses[getattr(messages, kind)])
+
+    return read
+
+
+LINES = [
+    "0\nSECTION\n2\nENTITIES\n0\nLINE\n10\n0\n20\n1\n11\n5\n21\n1\n0\nENDSEC\n0\nEOF\n",
+    "0\nSECTION\n2\nHEADER\n9\n$INSUNITS\n70\n4\n0\nENDSEC\n0\nSECTION\n2\nENTITIES\n"
+    "0\nARC\n10\n0\n20\n0\n40\n2\n50\n0\n51\n90\n0\nLWPOLYLINE\n90\n2\n70\n1\n10\n0\n20\n0\n42\n"
+    "0.5\n10\n1\n20\n1\n0\nPOLYLINE\n0\nVERTEX\n10\n1\n0\nVERTEX\n10\n2\n0\nENDSEC\n0\nEOF\n",
+]  # fmt: skip
+"""Drawings, each of a few lines."""
+
+
+def _read_drawing(path):
+    from flangeye.files.drawings import read_dxf
+
+    read_dxf(path)
+
+
+def _cameras(folder):
+    return [
+        b"camera_matrix:\n  rows: 3\n  cols: 3\n  data: [600, 0, 320, 0, 600, 240, 0, 0, 1]\n"
+        b"distortion_model: plumb_bob\ndistortion_coefficients:\n  data: [0.1, 0, 0, 0, 0]\n",
+        b"cam0:\n  camera_model: pinhole\n  intrinsics: [600, 600, 320, 240]\n"
+        b"  distortion_model: radtan\n  distortion_coeffs: [0.1, 0, 0, 0]\n",
+        b"fx: 600\nfy: 600\nppx: 320\nppy: 240\ncoeffs: [0, 0, 0, 0, 0]\n",
+    ]
+
+
+def _read_camera(path):
+    from flangeye.files.cameras import camera_in
+
+    camera = camera_in(path)
+    assert camera is None or camera.note()
+
+
+def _read_colmap(path):
+    from flangeye.files.cameras import cameras_in
+
+    folder = path.with_suffix("")
+    folder.mkdir(exist_ok=True)
+    (folder / "cameras.txt").write_bytes(path.read_bytes())
+    cameras_in(folder)
+
+
 TARGETS = {
+    "ros2-cloud": Target(".cdr", _live(("point_cloud", np.ones((4, 3)))), _read_live("CLOUD")),
+    "ros2-image": Target(".cdr", _live(("image", np.zeros((4, 5), np.uint8))), _read_live("IMAGE")),
+    "ros2-compressed": Target(
+        ".cdr", _live(("compressed", np.zeros((4, 5), np.uint8))), _read_live("COMPRESSED")
+    ),
+    "ros2-info": Target(
+        ".cdr", _live(("camera_info", np.eye(3), (4, 5), "eye")), _read_live("INFO")
+    ),
+    "ros2-joints": Target(".cdr", _live(("joint_state", np.zeros(6))), _read_live("JOINT_STATE")),
+    "drawing": Target(".dxf", lambda f: [text.encode() for text in LINES], _read_drawing),
+    "camera": Target(".yaml", _cameras, _read_camera),
+    "camera-json": Target(
+        ".json",
+        lambda f: [
+            b'{"fx": 600, "fy": 600, "cx": 320, "cy": 240, "k": [0.1, 0, 0, 0, 0]}',
+            b'{"CameraMatrix": {"FX": 1.0, "FY": 1.0, "CX": 2.0, "CY": 3.0}, "d": [0.1]}',
+        ],
+        _read_camera,
+    ),
+    "colmap": Target(
+        ".txt",
+        lambda f: [
+            b"# Camera list\n1 OPENCV 640 480 600 600 320 240 0.1 0 0 0\n"
+            b"2 SIMPLE_RADIAL 640 480 600 320 240 0.1\n"
+        ],
+        _read_colmap,
+    ),
     "history": Target(".jsonl", _histories, _read_spoilt_history),
     "history-signed": Target(".jsonl", _histories, _read_signed_history),
     "urdf": Target(".urdf", _urdfs, _read_urdf),

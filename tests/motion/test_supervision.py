@@ -75,6 +75,21 @@ def test_a_joint_may_be_a_little_faster_than_told_and_no_more() -> None:
         watch.judge(replace(state, joint_speeds=np.r_[-fast * 1.001, np.zeros(5)]))
 
 
+@pytest.mark.parametrize("what", ["joints", "joint_speeds", "force"])
+@pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
+def test_what_is_no_number_stops_an_arm_that_stands_or_moves(what: str, number: float) -> None:
+    state = moving(SECOND, 0.0)
+    bad = replace(state, **{what: np.r_[np.zeros(5), number]})
+    for led in (False, True):
+        watch = Supervisor(MODEL, LIMITS)
+        assert not watch.judge(state)
+        if led:
+            watch.led()
+        with pytest.raises(SafetyFault, match="joint angles, speeds or forces that are no numbers"):
+            watch.judge(bad)
+        assert len(watch.samples) == 1
+
+
 AT_HOME = moving(5 * SECOND, 0.0)
 GOAL = turned(AT_HOME.joints, j2=0.4)
 

@@ -101,9 +101,10 @@ def camera_in(path: Path) -> CameraFile | None:
     Raises:
         StageError: Its lens is of another model than OpenCV's.
     """
-    if path.suffix.lower() == ".txt":
-        return _colmap(path) if path.name == "cameras.txt" else _text(path)
     try:
+        if path.suffix.lower() == ".txt":
+            lines = read_text(path).splitlines()
+            return _colmap(path, lines) if path.name == "cameras.txt" else _text(path, lines)
         document = document_of(path)
     except StageError:
         return None
@@ -171,25 +172,26 @@ def _require_opencv(path: Path, values: Mapping[str, Any]) -> None:
         )
 
 
-def _colmap(path: Path) -> CameraFile | None:
+def _colmap(path: Path, lines: list[str]) -> CameraFile | None:
     """Return the first camera of COLMAP's list: its id, model, width, height, parameters."""
-    for line in read_text(path).splitlines():
+    for line in lines:
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
         names = COLMAP.get(words[1]) if len(words) > 1 else None
-        if names is None or len(words) != 4 + len(names):
+        given = words[4:]
+        if names is None or len(given) != len(names) or not all(map(_is_number, given)):
             return None
-        known = dict(zip(names, map(float, words[4:]), strict=True))
+        known = dict(zip(names, map(float, given), strict=True))
         fx, fy = known.get("fx", known.get("f", 0.0)), known.get("fy", known.get("f", 0.0))
         matrix = _pinhole(fx, fy, known["cx"] - CORNER, known["cy"] - CORNER)
         return _checked(path, matrix, [known[name] for name in ORDER if name in known])
     return None
 
 
-def _text(path: Path) -> CameraFile | None:
+def _text(path: Path, lines: list[str]) -> CameraFile | None:
     """Return the camera of nine numbers in three rows."""
-    rows = [line.replace(",", " ").split() for line in read_text(path).splitlines()]
+    rows = [line.replace(",", " ").split() for line in lines]
     rows = [row for row in rows if row and not row[0].startswith("#")]
     if [len(row) for row in rows] != [3, 3, 3] or not all(_is_number(w) for r in rows for w in r):
         return None
@@ -220,12 +222,12 @@ def _numbers(value: Any) -> Floats:
         value = value.get("data")
     try:
         return np.asarray([] if value is None else value, dtype=np.float64).ravel()
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return np.zeros(0)
 
 
 def _is_number(value: Any) -> bool:
     try:
         return math.isfinite(float(value))
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return False

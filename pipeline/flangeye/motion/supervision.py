@@ -95,8 +95,9 @@ class Supervisor:
         """Take in a sample; return whether the leg under way has ended and the arm has settled.
 
         Raises:
-            Doubt: The arm must stop.
+            SafetyFault: The arm must stop.
         """
+        _require_numbers(state)
         self._remember(state)
         self._halted_ns = self._halted_ns or state.time_ns
         if state.mode not in ("ready", "moving"):
@@ -118,7 +119,7 @@ class Supervisor:
         """Doubt an arm that is not the model's, or has a tool set that nobody knows of.
 
         Raises:
-            Doubt: The controller's flange and the model's are apart.
+            SafetyFault: The controller's flange and the model's are apart.
         """
         if len(state.joints) != self._arm.n:
             raise SafetyFault(f"the arm has {len(state.joints)} joints, its model {self._arm.n}")
@@ -196,3 +197,13 @@ class Supervisor:
             return False
         self._stood_ns = self._stood_ns or state.time_ns
         return (state.time_ns - self._stood_ns) * 1e-9 >= SETTLED
+
+
+def _require_numbers(state: RobotState) -> None:
+    """Doubt what is no number: every comparison with it is false, as if all were well."""
+    force = np.zeros(0) if state.force is None else state.force
+    if not np.isfinite(np.concatenate([state.joints, state.joint_speeds, force])).all():
+        raise SafetyFault(
+            "the controller reports joint angles, speeds or forces that are no numbers: look at "
+            "it, then start again"
+        )

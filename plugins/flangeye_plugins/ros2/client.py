@@ -90,11 +90,11 @@ class Bridge(Device):
             raise DeviceError(f"{asker}: {words[0]} cannot be run ({error.strerror})") from None
         threading.Thread(target=self._listen, daemon=True).start()
         self._sim_time = sim_time
-        self._calls = 0
+        self._asked = self._calls = 0
         try:
             # Longest time until the process has a node: a cold disk reads rclpy's hundred
             # libraries [s]
-            self.middleware = str(self._answer(10.0))
+            self.middleware = str(self._answer({}, 10.0))
             self._began = time.monotonic()
             if sim_time:
                 self.follow(CLOCK, CLOCK_TYPE)
@@ -155,8 +155,7 @@ class Bridge(Device):
         Raises:
             DeviceError: The bridge is gone.
         """
-        if self._gone:
-            raise DeviceError(f"{self.asker}: {self._gone}")
+        self._require_bridge({"topic": topic})
         return self._newest.get(topic)
 
     def wait(self, topic: str, after: int, patience: float) -> GraphMessage | None:
@@ -268,23 +267,32 @@ class Bridge(Device):
 
     def _ask(self, what: str, **arguments: Any) -> Any:
         with self._asking:
-            self._send({"ask": what, **arguments})
+            self._asked += 1
+            self._send({"ask": what, "number": self._asked, **arguments})
             # Longest time for an answer; finding a service takes the most, a second, and on a busy
             # machine listing the topics [s]
-            return self._answer(2.5)
+            return self._answer(arguments, 2.5)
 
-    def _answer(self, patience: float) -> Any:
-        try:
-            answer = self._answers.get(timeout=patience)
-        except queue.Empty:
-            answer = {"error": f"the bridge to ROS 2 did not answer within {patience:g} s{busy()}"}
+    def _answer(self, about: dict[str, Any], patience: float) -> Any:
+        """Return the answer to what was asked last, about a topic or a service."""
+        until, answer = time.monotonic() + patience, dict[str, Any]()
+        while answer.get("number") != self._asked:  # one to an earlier question came too late
+            try:
+                answer = self._answers.get(timeout=max(until - time.monotonic(), 0.0))
+            except queue.Empty:
+                late = f"the bridge to ROS 2 did not answer within {patience:g} s{busy()}"
+                raise DeviceError(f"{self.asker}: {_named(about)}{late}") from None
+            self._require_bridge(about)
         if "error" in answer:
             raise DeviceError(f"{self.asker}: {answer['error']}")
         return answer["given"]
 
-    def _send(self, request: dict[str, Any], body: bytes = b"") -> None:
+    def _require_bridge(self, about: dict[str, Any]) -> None:
         if self._gone:
-            raise DeviceError(f"{self.asker}: {self._gone}")
+            raise DeviceError(f"{self.asker}: {_named(about)}{self._gone}")
+
+    def _send(self, request: dict[str, Any], body: bytes = b"") -> None:
+        self._require_bridge(request)
         with contextlib.suppress(OSError):  # why it ended is heard where it is read
             self._pipe.write(json.dumps(request).encode() + b"\n" + body)
 
@@ -296,7 +304,7 @@ class Bridge(Device):
                 self._take(said, self._pipe.read(said["size"], None))
         except PipeEndedError as ended:
             self._gone = self._gone or f"the bridge to ROS 2 has ended ({ended})"
-        self._answers.put({"error": self._gone})
+        self._answers.put({})
         with self._news:
             self._news.notify_all()
 
@@ -316,6 +324,12 @@ class Bridge(Device):
             self._triggered.put(said)
         else:
             self._answers.put(said)
+
+
+def _named(about: dict[str, Any]) -> str:
+    """Return which topic or service an error is about."""
+    name = about.get("topic") or about.get("service")
+    return f"{name}: " if name else ""
 
 
 def ros_python(asker: str) -> list[str]:

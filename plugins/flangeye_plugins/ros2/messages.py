@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from functools import cache
 from typing import Any
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from flangeye import StageError
 from flangeye.files.images import decode_image
+from flangeye.files.words import reason_of
 from flangeye.types import Floats, Singles
 
 JOINT_STATE, TRAJECTORY = "sensor_msgs/msg/JointState", "trajectory_msgs/msg/JointTrajectory"
@@ -68,18 +70,18 @@ def types() -> Any:
     return get_typestore(Stores.ROS2_HUMBLE)
 
 
-def decoded(data: bytes, kind: str) -> Any:
-    """Return the message of a type in serialised ``data``.
+def decoded(data: bytes, kind: str, use: Callable[[Any], Any] = lambda message: message) -> Any:
+    """Return what a function makes of the message of a type in serialised ``data``.
 
     Raises:
         StageError: It is damaged, or not of this type.
     """
     try:
-        return types().deserialize_cdr(data, kind)
+        return use(types().deserialize_cdr(data, kind))
     except StageError:
         raise
-    except Exception as error:  # damaged bytes can break the library in any way
-        raise StageError(f"a message is no {kind}: {error}") from None
+    except Exception as error:  # damaged bytes can break the library, and its use, in any way
+        raise StageError(f"a message is no sound {kind}: {reason_of(error)}") from None
 
 
 def encoded(message: Any) -> bytes:

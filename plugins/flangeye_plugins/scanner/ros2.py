@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -162,14 +162,15 @@ class Ros2Scanner(OpenScanner):
         message = self._bridge.wait(topic, 0, self._params.timeout)
         if message is None:
             raise DeviceError(f"{NAME}: nothing came on {topic} within {self._params.timeout:g} s")
+        rectified = "rect" in str(self._params.depth or self._params.image).rpartition("/")[2]
         info = decoded(message.data, INFO)
         if info.distortion_model not in PINHOLES:
             raise DeviceError(
                 f"{NAME}: {topic} has the distortion model {info.distortion_model}; known: "
                 f"{', '.join(PINHOLES[1:])}: rectify the images (image_proc) and name those"
             )
-        rectified = "rect" in str(self._params.depth or self._params.image).rpartition("/")[2]
-        return Camera(*intrinsics_of(info, rectified), frame_of(message.data))
+        lens = decoded(message.data, INFO, partial(intrinsics_of, rectified=rectified))
+        return Camera(*lens, frame_of(message.data))
 
     def _find_trigger(self, trigger: str) -> bool:
         """Return whether the trigger is a service; a topic is offered.
@@ -248,16 +249,10 @@ class Ros2Scanner(OpenScanner):
     def _points(self, taken: dict[str, GraphMessage]) -> Floats:
         """Return the scan's points (H, W, 3) or (N, 3) [m]; none where there is an image alone."""
         if cloud := self._params.cloud:
-            return cloud_of(decoded(taken[cloud].data, CLOUD))  # type: ignore[return-value]
+            return decoded(taken[cloud].data, CLOUD, cloud_of)  # type: ignore[no-any-return]
         if not (depth := self._params.depth) or not self._camera:
             return np.zeros((0, 3))
-        message = decoded(taken[depth].data, IMAGE)
-        if message.encoding not in PER_METRE:
-            known = ", ".join(PER_METRE)
-            raise DeviceError(
-                f"{NAME}: {depth} has the encoding {message.encoding}, depths have one of {known}"
-            )
-        depths = np.nan_to_num(values_of(message) / PER_METRE[message.encoding], posinf=0.0)
+        depths = decoded(taken[depth].data, IMAGE, partial(_metres, depth))
         view = DepthView(self._camera.matrix.tolist(), self._camera.distortion.tolist())
         return view.points(depths)  # type: ignore[return-value]
 
@@ -271,10 +266,20 @@ class Ros2Scanner(OpenScanner):
                 f"{NAME}: the topics are of several cameras, {' and '.join(frames)}: name the "
                 "depths that the driver aligns to the image, or the image alone"
             )
-        pixels = pixels_of(decoded(taken[topic].data, self._kinds[topic]))
+        pixels = decoded(taken[topic].data, self._kinds[topic], pixels_of)
         return Image(
             np.ascontiguousarray(pixels[..., ::-1] if pixels.ndim == 3 else pixels), *camera[:2]
         )
+
+
+def _metres(topic: str, message: Any) -> Floats:
+    """Return the depths (H, W) of an image [m], 0 where there is none."""
+    if message.encoding not in PER_METRE:
+        known = ", ".join(PER_METRE)
+        raise DeviceError(
+            f"{NAME}: {topic} has the encoding {message.encoding}, depths have one of {known}"
+        )
+    return np.nan_to_num(values_of(message) / PER_METRE[message.encoding], posinf=0.0)
 
 
 def _running(bridge: Bridge, topic: str) -> Topic | None:

@@ -1,5 +1,8 @@
 """``robot.ros2`` and ``scanner.ros2`` with the real rclpy in other processes; in realtime."""
 
+import os
+import re
+import signal
 import time
 
 import numpy as np
@@ -13,6 +16,8 @@ from flangeye_plugins.robot.ros2.driver import (
     robot_ros2,
     robot_ros2_freedrive,
 )
+from flangeye_plugins.ros2.client import Bridge
+from flangeye_plugins.ros2.messages import INFO
 from flangeye_plugins.scanner.ros2 import Ros2ScannerParams as Topics
 from flangeye_plugins.scanner.ros2 import scanner_ros2
 from tests.plugins.fixed import fixed
@@ -112,6 +117,39 @@ def test_an_arm_that_others_move_is_ready_when_it_stands_elsewhere(env):
                     assert time.monotonic() < until
                     robot.wait_cycle()
                 assert np.allclose(robot.state().joints, start + turn, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("signal_of", "said"),
+    [
+        (signal.SIGKILL, "the bridge to ROS 2 has ended"),
+        (signal.SIGSTOP, r"the bridge to ROS 2 did not answer within 2.5 s"),
+    ],
+)
+def test_a_camera_whose_bridge_is_killed_or_held_names_its_topic_in_one_line(env, signal_of, said):
+    topics = {"depth": "/camera/image_rect_raw"}
+    with (
+        peers(Controller(env), Camera(env, "depth")),
+        scanner_ros2.function(EYE, Topics(**topics)) as eye,
+    ):
+        eye.expose()()
+        os.kill(eye._bridge._pipe._process.pid, signal_of)
+        with pytest.raises(DeviceError) as error:
+            while True:
+                eye.expose()
+        assert re.match(f"scanner.ros2: /camera/image_rect_raw: {said}", str(error.value))
+        assert "\n" not in str(error.value)
+
+
+def test_an_answer_that_comes_too_late_is_not_that_to_the_next_question(env):
+    with peers(Camera(env, "depth")), Bridge("a test") as bridge:
+        bridge.follow("/camera/camera_info", INFO)
+        process = bridge._pipe._process.pid
+        os.kill(process, signal.SIGSTOP)
+        with pytest.raises(DeviceError, match="a test: the bridge to ROS 2 did not answer"):
+            bridge.services()
+        os.kill(process, signal.SIGCONT)
+        assert bridge.topics()["/camera/camera_info"].type == INFO
 
 
 @pytest.mark.parametrize(

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
 from flangeye.devices import Device, DeviceError, Mode, RobotState
+from flangeye.errors import StageError
 from flangeye.files.processes import busy
 from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import RobotModel
@@ -169,13 +170,15 @@ class Listener(Device):
 
     def _keep(self, message: GraphMessage) -> bool:
         """Keep a message's angles, if it has those of this arm."""
-        told = decoded(message.data, JOINT_STATE)
-        names = tuple(told.name)
+        try:
+            names, angles = decoded(message.data, JOINT_STATE, _angles)
+        except StageError as error:
+            raise DeviceError(f"{self.name}: {error}") from None
         if names != self._columns[0]:
             if not set(self._params.joints) <= set(names):
                 return False  # a gripper's or a rail's, on the same topic
             self._columns = names, [names.index(joint) for joint in self._params.joints]
-        joints = np.asarray(told.position, dtype=float)[self._columns[1]]
+        joints = angles[self._columns[1]]
         sample = JointSample(joints, self._bridge.local_ns(message), message.received_ns)
         self._require_forwards(sample)
         self._samples.append(sample)
@@ -223,3 +226,11 @@ class Listener(Device):
         if not lost:
             return ""
         return f"it has no joint {', '.join(lost)}, but {', '.join(names)}"
+
+
+def _angles(told: Any) -> tuple[tuple[str, ...], Floats]:
+    """Return the names of a joint state, and the angle (n,) of each [rad]."""
+    names, angles = tuple(told.name), np.asarray(told.position, dtype=float)
+    if len(angles) != len(names):
+        raise StageError(f"a joint state names {len(names)} joints and has {len(angles)} positions")
+    return names, angles

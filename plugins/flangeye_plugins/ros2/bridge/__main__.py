@@ -185,7 +185,8 @@ def serve(bridge: BridgeNode, output: FramedOutput) -> None:
         if request["ask"] == "publish":
             bridge.publish(request["topic"], body)
         else:
-            output.say(answer(bridge, request))
+            number = request.pop("number")
+            output.say({"number": number, **answer(bridge, request)})
     rclpy.try_shutdown()
 
 
@@ -218,7 +219,7 @@ def main() -> None:
     node = rclpy.create_node(
         f"flangeye_{os.getpid()}", enable_rosout=False, start_parameter_services=False
     )
-    output.say({"given": rclpy.get_rmw_implementation_identifier()})
+    output.say({"number": 0, "given": rclpy.get_rmw_implementation_identifier()})
     threading.Thread(target=serve, args=(BridgeNode(node, output), output), daemon=True).start()
     executor = SingleThreadedExecutor()
     executor.add_node(node)
