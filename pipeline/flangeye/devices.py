@@ -200,6 +200,15 @@ class Scanner(Device, Protocol):
 
 
 @runtime_checkable
+class HearsLoss(Protocol):
+    """What a scanner has besides that hears at once of its loss: an arm under way then stops."""
+
+    def require_alive(self) -> None:
+        """Raise DeviceError when the scanner is lost; called some times a second, never waits."""
+        ...
+
+
+@runtime_checkable
 class KnowsTruth(Protocol):
     """The truth of a simulated scanner, to score it; no stage can ask for it.
 

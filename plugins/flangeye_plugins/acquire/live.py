@@ -16,6 +16,7 @@ from pydantic import Field
 from flangeye.devices import (
     DeviceError,
     FrameDropped,
+    HearsLoss,
     KnowsTruth,
     MotionAllowed,
     RobotDriver,
@@ -155,8 +156,14 @@ def acquire_live(  # noqa: PLR0913  what it asks the runner for
         start, how = _offline(params, robot, resumed) if motion.offline else _read(arm, allowed)
         text, plan = planned(start).shown(start)
         raise NothingMoved("\n".join([text, how, HOW_TO_MOVE]), plan)
+
+    def told(state: RobotState) -> None:
+        stage_log("arm", state)
+        if isinstance(opened, HearsLoss):
+            opened.require_alive()
+
     with ExitStack() as opening:
-        guard = opening.enter_context(watched(arm, robot, allowed, partial(stage_log, "arm")))
+        guard = opening.enter_context(watched(arm, robot, allowed, told))
         require_inside(guard.state, allowed)
         opened = opening.enter_context(eye.open())
         itinerary = planned(guard.state.joints)

@@ -150,6 +150,11 @@ class Ros2Scanner(OpenScanner):
 
         return decode
 
+    def require_alive(self) -> None:
+        """Raise DeviceError when the bridge has ended; see ``HearsLoss``."""
+        for topic in self._kinds:
+            self._bridge.newest(topic)
+
     def close(self) -> None:
         """Let go of ROS 2."""
         self._bridge.close()
@@ -169,8 +174,8 @@ class Ros2Scanner(OpenScanner):
                 f"{NAME}: {topic} has the distortion model {info.distortion_model}; known: "
                 f"{', '.join(PINHOLES[1:])}: rectify the images (image_proc) and name those"
             )
-        lens = decoded(message.data, INFO, partial(intrinsics_of, rectified=rectified))
-        return Camera(*lens, frame_of(message.data))
+        matrix, lens = decoded(message.data, INFO, partial(intrinsics_of, rectified=rectified))
+        return Camera(matrix, lens, frame_of(message.data))
 
     def _find_trigger(self, trigger: str) -> bool:
         """Return whether the trigger is a service; a topic is offered.
