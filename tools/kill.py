@@ -49,7 +49,8 @@ FEWER = ("--set", "acquire.live.poses={next_best: {count: 6, candidates: 60}}")
 class Kind(NamedTuple):
     """A kind of run: its command, the one that goes on from a folder, and what it writes first.
 
-    ``OUT`` in a command is its folder, ``PARENT`` that one's; a run is given it by ``--out``.
+    ``OUT`` in a command is its folder, ``PARENT`` that one's; a run is given it by ``--out``. A
+    command that begins with ``-c`` is Python's, of a program that starts a run in its folder.
     """
 
     command: tuple[str, ...]
@@ -97,12 +98,33 @@ MONITOR = (
     "monitor", "PARENT/calibration", "--archive", "PARENT/later", "--history", "OUT/h.jsonl",
 )  # fmt: skip
 BATCH = ("batch", "ur5_phoxi-m_simulated", "--repeat", "3", "--workers", "2", "--no-report", *SMALL)
+SERVER = """
+import sys, time
+from pathlib import Path
+from flangeye.plugin.registry import load_registry
+from flangeye_ui.process import RunProcess
+folder = Path("OUT")
+folder.mkdir(exist_ok=True)
+run = RunProcess(folder, sys.argv[1:], False, load_registry())
+while run.code is None:
+    time.sleep(0.05)
+sys.exit(run.code)
+"""
+"""What the page's server does with a run: starts it and follows its log."""
+
+
+def _of_page(out: Path) -> tuple[str, ...] | None:
+    """Return what goes on from the run that a page's server started."""
+    return _solved_again("ur5_phoxi-m_sample")(next(out.glob("runs/*")))
+
+
 KINDS = {
     "archive": _recorded("ur5_phoxi-m_sample"),
     "simulated": _recorded("ur5_phoxi-m_simulated", *SMALL),
     "live": Kind(("run", "ur5e_phoxi-m_loopback", "--move", *FEWER), _resumed),
     "weld": _recorded("ur10e_phoxi-m_weld_simulated", *SMALL),
     "batch": Kind(BATCH, lambda out: (*BATCH, "--out", str(out))),
+    "ui": Kind(("-c", SERVER, "ur5_phoxi-m_sample"), _of_page),
     "monitor": Kind(MONITOR, _checked_again, ".h.jsonl.lock"),
 }
 
@@ -223,10 +245,11 @@ class Trial:
         _temporary(out).mkdir(exist_ok=True)
         environment = {**os.environ, MARK: str(out), "TMPDIR": str(_temporary(out))}
         words = [w.replace("OUT", str(out)).replace("PARENT", str(out.parent)) for w in command]
-        if "--out" not in words and command[0] != "monitor":
+        if "--out" not in words and command[0] not in ("monitor", "-c"):
             words += ["--out", str(out)]
+        program = () if command[0] == "-c" else ("-m", "flangeye.cli")
         return subprocess.Popen(
-            python_command("-m", "flangeye.cli", *words),
+            python_command(*program, *words),
             env=environment, start_new_session=True, stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL, stderr=stderr,
         )  # fmt: skip
