@@ -6,7 +6,6 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,6 @@ import pytest
 from flangeye.devices import DeviceError
 from flangeye.models.loading import load_model
 from flangeye.testing import RobotConformance
-from flangeye_plugins.robot.aubo.client import AuboClient
 from flangeye_plugins.robot.aubo.driver import AuboParams, robot_aubo
 from tests.emulators.controllers.process import Process, free_address
 from tests.plugins.robot.behaviour import DrivesAnArm
@@ -267,17 +265,3 @@ def test_the_wire_refuses_what_it_does_not_know(controller: Any) -> None:
             robot.getRobotState().getControlBoxTemperature()
         assert robot.getMotionControl().moveLine([0.1, 0.2], 0.5, 0.1, 0.0, 0.0) == 5
         assert robot.getMotionControl().moveJoint([float("nan")] * 6, 0.5, 0.1, 0.0, 0.0) == 5
-
-
-@pytest.mark.parametrize("code", [-1, 1, 2])
-def test_a_connection_that_is_not_made_is_refused_whatever_its_code(code: int) -> None:
-    sdk: Any = SimpleNamespace(
-        AuboException=pyaubo_sdk.AuboException,
-        RpcClient=lambda: SimpleNamespace(
-            setLogHandler=lambda _: None,
-            setRequestTimeout=lambda _: None,
-            connect=lambda host, port: code,
-        ),
-    )
-    with pytest.raises(DeviceError, match="nothing answers at 10.0.0.1:30004"):
-        AuboClient(sdk, "aubo-i5", "10.0.0.1", "aubo", "123456")
