@@ -176,7 +176,7 @@ class Keys:
         return f"{self._cookie}={value}; HttpOnly; SameSite=Strict; Path={self.path}"
 
     def known(self, headers: Headers) -> bool:
-        """Return whether one of the cookies is of a browser that was let in."""
+        """Return whether one of the cookies belongs to a browser that has signed in."""
         given = list(cookies(headers, self._cookie))
         return any(secrets.compare_digest(g, s) for g in given for s in self._sessions)
 
@@ -271,7 +271,7 @@ def _same_origin(scope: Scope, headers: Headers) -> bool:
 
 
 def _guarded(send: Any) -> Any:
-    """Return what sends with the headers that keep a page to itself."""
+    """Return a ``send`` that adds the security headers to each response."""
 
     async def guarded(message: dict[str, Any]) -> None:
         if message["type"] == "http.response.start":

@@ -57,7 +57,7 @@ class Side:
         return Side(self.a @ every[self.u], self.u, self.b @ every[self.v], self.v, self.c)
 
     def at(self, places: Floats) -> Floats:
-        """Return what it comes to (N, 4, 4) with the unknowns at places (K, 4, 4)."""
+        """Evaluate this side of the N equations, (N, 4, 4), at values (K, 4, 4) of the unknowns."""
         moved = self.about(places)
         return np.asarray(moved.a @ moved.b @ moved.c)
 

@@ -119,7 +119,9 @@ def _arm(section: RobotSection, standard: str | None, folder: Path) -> RobotMode
 def _body(target: TargetSection, context: Context, folder: Path) -> TargetBody:
     if target.body != ARM:
         if target.links:
-            raise RecipeError(f"links: are those of body: {ARM}")
+            raise RecipeError(
+                f"target.links: is for body: {ARM} only; take it away, or write body: {ARM}"
+            )
         return load_body(target.body, target.unit, folder)
     if target.at != "flange":
         raise RecipeError(f"body: {ARM} moves with every joint; leave out at: {target.at}")

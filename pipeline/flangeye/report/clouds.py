@@ -1,4 +1,4 @@
-"""The segmented flange and the fitted circle of a few telling captures."""
+"""The segmented flange and the fitted circle, drawn for a few captures of interest."""
 
 from __future__ import annotations
 

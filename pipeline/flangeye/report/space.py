@@ -82,7 +82,7 @@ def _predicted(grid: Floats, sigma: Floats) -> Trace:
 
 
 def in_words(frame: str) -> str:
-    """Return what a page calls a frame."""
+    """Return a frame's name as the report writes it."""
     return "the robot's base" if frame == t.BASE else f"the frame {frame}"
 
 

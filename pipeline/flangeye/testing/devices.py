@@ -330,7 +330,7 @@ class SensorConformance(DriverConformance):
         require(inside and matrix[0, 0] > 1, "the camera matrix is not in this image's pixels")
 
     def test_asking_does_not_wait(self) -> None:
-        """The loop at 500 Hz asks in each of its cycles."""
+        """frame() returns at once: the control loop calls it 500 times a second."""
         with self.opened() as sensor:
             self.frames(sensor, 1)
             for _ in range(20):
@@ -368,7 +368,7 @@ class ProfilerConformance(DriverConformance):
         require(0.0 < behind < 0.5, f"it looks {behind} m behind the torch")
 
     def test_asking_does_not_wait(self) -> None:
-        """The loop at 500 Hz asks in each of its cycles."""
+        """The state is read at once: the control loop does so 500 times a second."""
         with self.opened() as profiler:
             self.looks(profiler, 1)
             for _ in range(20):

@@ -46,7 +46,7 @@ class Mover:
         return self.under_way or self.waiting > 0 or not self.arm.standing
 
     def append(self, plan: Plan) -> None:
-        """Let a move follow those that are there; it begins when the arm stands."""
+        """Append a move to the queue; it begins when the arm stands still."""
         if isinstance(self._motion, Speed):
             self._motion = None
         self._queue.append(plan)

@@ -116,7 +116,7 @@ class SimulatedRobot(Device):
         self._mover.halt()
 
     def protective_stop(self, why: str) -> None:
-        """Stop as a controller does when it does not like something."""
+        """Simulate a protective stop of the controller."""
         self._stopped_by = why
         self.stop()
 

@@ -287,7 +287,7 @@ class BagFrames:
         up, down = self.chain(child), self.chain(parent)
         common = next((name for name in up if name in down), None)
         if common is None:
-            raise StageError(f"tf: nothing joins '{parent}' and '{child}'")
+            raise StageError(f"tf: no chain of transforms leads from '{parent}' to '{child}'")
         legs = up[: up.index(common)], down[: down.index(common)]
         times = self._times([*legs[0], *legs[1]])
         return times, np.linalg.inv(self._at(legs[1], times)) @ self._at(legs[0], times)

@@ -166,7 +166,7 @@ class ManualRobot(Device):
 
     def move_velocity(self, twist: Floats, acceleration: float) -> None:
         """Refuse: nobody follows a velocity by hand."""
-        raise DeviceError(f"{self.name}: it goes to poses, not at velocities")
+        raise DeviceError(f"{self.name}: it is moved by hand to poses; it takes no velocities")
 
     def wait_cycle(self) -> None:
         """Wait a little."""

@@ -172,7 +172,7 @@ class Bridge(Device):
         return count
 
     def heard(self, topic: str) -> int:
-        """Return how many messages of a topic came since it was followed, wanted or not."""
+        """Return how many messages of a topic have arrived since it was subscribed to."""
         return int(self._ask("heard", topic=topic))
 
     def local_ns(self, message: GraphMessage) -> int:

@@ -1,4 +1,4 @@
-"""A scan as it stands in the base: from one place beside the arm, or several of its flange.
+"""A workpiece's scan in base coordinates: by a fixed scanner, or joined from several poses.
 
 Clouds of a scanner on the flange are put together by the hand-eye pose and by where the controller
 had the flange. Whatever is wrong with that pose or with the zeros of the joints is wrong in every

@@ -265,7 +265,7 @@ class Follower:
         return Command(velocity, turn if velocity[:2].any() else 0.0)
 
     def _swayed(self, now: float) -> Sway:
-        """Return the swing to command, for the arm to be on it; note where it is to be now."""
+        """Return the weave to command, ahead by the arm's delay; set ``aim`` to the one due now."""
         dead, lag = self._response.dead_time, self._response.lag
         if self._swings is None and self._coming >= max(self._settings.offset_along, 0.0):
             self._swings = now + dead

@@ -117,7 +117,7 @@ RECIPE = (
         ("ur10e", "robot", "body: robot needs the meshes of ur10e's links; name its URDF"),
         (f"{{urdf: {URDF}}}", "{body: robot, at: unknown}", "leave out at: unknown"),
         ("ur10e", "{body: robot, links: {9: a.stl}}", "ur10e has links 0 to 6, no [9]"),
-        ("ur10e", "{body: gripper, links: {0: a.stl}}", "links: are those of body: robot"),
+        ("ur10e", "{body: gripper, links: {0: a.stl}}", "target.links: is for body: robot only"),
     ],
 )
 def test_a_recipe_that_does_not_say_how_the_arm_looks_is_refused(robot, target, message) -> None:

@@ -157,7 +157,10 @@ def test_a_stop_is_told_and_leaves_the_pose_open(person: Person) -> None:
         assert state.message == "it was stopped on its way, and nobody has said where it stands"
         with pytest.raises(DeviceError) as error:
             robot.move_velocity(np.zeros(6), 0.1)
-    assert str(error.value) == "ur5e moved by hand: it goes to poses, not at velocities"
+    assert (
+        str(error.value)
+        == "ur5e moved by hand: it is moved by hand to poses; it takes no velocities"
+    )
 
 
 def test_an_unknown_convention_is_refused() -> None:

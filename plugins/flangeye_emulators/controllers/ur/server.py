@@ -151,7 +151,7 @@ class URFaultInjector(FaultInjector):
         self.kinds["inputs-low"] = Kind(lambda _: setattr(box, "wired", False))
 
     def clear(self) -> None:
-        """End local control too, and wire the inputs again."""
+        """Clear every fault, return to remote control and connect the inputs again."""
         super().clear()
         self._box.remote_control = self._box.wired = True
 
