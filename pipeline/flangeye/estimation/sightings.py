@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 
 import numpy as np
 
 from flangeye.errors import StageError
 from flangeye.estimation.graph import Carrier, Problem, Sightings
-from flangeye.maths.arm_correction import follow
+from flangeye.maths.arm_correction import reached_from
 from flangeye.maths.frame_graph import Frame, chain
 from flangeye.maths.geometry import basis_of_plane, hat
 from flangeye.maths.kinematics import Arm
@@ -22,6 +21,8 @@ REACHED = 5e-3
 """Further from the controller's poses than this [m], the catalogue's arm is another one."""
 STARTS = 48
 """Of the search for the branches of an arm that has no closed form of them."""
+TRIED = 30
+"""Poses on which branches are tried first: most are left within a few."""
 
 
 def problem_of(observations: Sequence[Observation], cell: Cell, normals: bool = True) -> Problem:
@@ -129,6 +130,10 @@ def branches_of(problem: Problem, carrier: Carrier) -> Iterator[Floats]:
         if np.linalg.norm((reached - poses)[:, :3, 3], axis=1).max() < REACHED:
             yield carrier.joints
         return
-    for first in arm.inverse(poses[0], STARTS):
-        with suppress(ValueError):  # this branch does not reach all poses
-            yield follow(arm, poses, first)
+    some = poses[:: max(1, len(poses) // TRIED)]
+    starts = arm.inverse(poses[0], STARTS)[:, None]
+    _, alive = reached_from(arm, np.broadcast_to(some, (len(starts), *some.shape)), starts)
+    for first in starts[alive.all(axis=1), 0]:
+        joints, everywhere = reached_from(arm, poses, first)
+        if everywhere.all():
+            yield joints

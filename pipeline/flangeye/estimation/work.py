@@ -11,6 +11,7 @@ from flangeye.estimation.graph import Carrier, Places, Problem, Sightings
 from flangeye.maths.arm_correction import reached_from
 from flangeye.maths.frame_graph import composed
 from flangeye.maths.geometry import invert
+from flangeye.maths.statistics import spread_evenly
 from flangeye.types import Box, Floats, Mask
 
 COUNT = 256
@@ -87,9 +88,7 @@ def _in_box(problem: Problem, carrier: Carrier, box: Floats) -> Problem:
 
     As they are, where it gets nowhere.
     """
-    from scipy.stats import qmc
-
-    evenly = qmc.Sobol(4, scramble=True, seed=0).random(COUNT)
+    evenly = spread_evenly(COUNT, 4)
     like = (evenly[:, 3] * len(problem.seen)).astype(int)
     session = np.asarray(problem.frames[carrier.frame].place)
     poses = session[problem.seen.times[like]].copy()

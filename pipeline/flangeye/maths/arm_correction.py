@@ -151,16 +151,31 @@ def reached_from(arm: Arm, base_T_flange: Floats, near: Floats) -> tuple[Floats,
 
     See :func:`follow`.
     """
-    joints = np.broadcast_to(near, (*base_T_flange.shape[:-2], arm.n)).astype(np.float64)
+    shape = base_T_flange.shape[:-2]
+    wanted = base_T_flange.reshape(-1, 4, 4)
+    joints = np.array(np.broadcast_to(near, (*shape, arm.n)), dtype=np.float64).reshape(-1, arm.n)
+    far = np.arange(len(wanted))
     for _ in range(STEPS):
-        twist = _twist(base_T_flange, arm.flange(joints))
-        if np.abs(twist).max() < REACHED:
+        frames = arm.frames(joints[far])
+        twist = _twist(wanted[far], arm.flange_of(frames))
+        left = np.abs(twist).max(axis=1) >= REACHED
+        far, frames, twist = far[left], frames[left], twist[left]
+        if not len(far):
             break
-        step = (np.linalg.pinv(arm.jacobian(joints), rcond=1e-6) @ twist[..., None])[..., 0]
-        longest = np.abs(step).max(axis=-1, keepdims=True)
-        joints = joints + step * np.minimum(1.0, LONGEST_STEP / np.maximum(longest, 1e-12))
-    left = np.abs(_twist(base_T_flange, arm.flange(joints))).max(axis=-1)
-    return joints, np.asarray(left < REACHED)
+        step = _least_step(arm.jacobian_of(frames), twist)
+        longest = np.abs(step).max(axis=1, keepdims=True)
+        joints[far] += step * np.minimum(1.0, LONGEST_STEP / np.maximum(longest, 1e-12))
+    reached = np.ones(len(wanted), dtype=bool)
+    reached[far] = False
+    return joints.reshape(*shape, arm.n), reached.reshape(shape)
+
+
+def _least_step(jacobian: Floats, twist: Floats) -> Floats:
+    """Return (N, n) the smallest motions of joints that make (N, 6) twists, by (N, 6, n)."""
+    across = np.swapaxes(jacobian, 1, 2)
+    # Where the arm is singular, so little keeps the equations solvable
+    gram = jacobian @ across + 1e-9 * np.eye(6)
+    return np.asarray((across @ np.linalg.solve(gram, twist[..., None]))[..., 0])
 
 
 def _twist(wanted: Floats, reached: Floats) -> Floats:

@@ -194,7 +194,11 @@ class Arm:
 
     def flange(self, joints: Floats) -> Floats:
         """Return ``base_T_flange``, (..., n) joint values -> (..., 4, 4)."""
-        return np.asarray(self.frames(joints)[..., -1, :, :] @ self._tool)
+        return self.flange_of(self.frames(joints))
+
+    def flange_of(self, frames: Floats) -> Floats:
+        """Return ``base_T_flange`` where the links are in (..., n + 1, 4, 4) frames."""
+        return np.asarray(frames[..., -1, :, :] @ self._tool)
 
     def axes(self, joints: Floats) -> tuple[Floats, Floats]:
         """Return direction and a point of each joint's axis, (..., n) -> two (..., n, 3)."""
@@ -210,8 +214,11 @@ class Arm:
         Column i is the flange's twist in ``base``, taken at the flange's origin, when joint i
         moves at unit speed; or that of a link, which the joints beyond do not move.
         """
-        frames = self.frames(joints)
-        moved = frames[..., -1, :, :] @ self._tool if link is None else frames[..., link, :, :]
+        return self.jacobian_of(self.frames(joints), link)
+
+    def jacobian_of(self, frames: Floats, link: int | None = None) -> Floats:
+        """Return the Jacobian where the links are in (..., n + 1, 4, 4) frames."""
+        moved = self.flange_of(frames) if link is None else frames[..., link, :, :]
         columns = self._columns(frames, moved[..., :3, 3])
         columns[..., link or self.n :] = 0.0
         return columns
@@ -275,7 +282,7 @@ class Arm:
         solved = np.zeros((0, self.n))
         for _ in range(iterations):
             frames = self.frames(joints)
-            reached = frames[..., -1, :, :] @ self._tool
+            reached = self.flange_of(frames)
             error = _pose_error(base_T_flange, reached)
             done = np.linalg.norm(error, axis=-1) < SOLVED
             solved = np.concatenate([solved, joints[done]])

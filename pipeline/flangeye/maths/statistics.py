@@ -44,6 +44,16 @@ def chi2_quantile(probability: float, freedom: int) -> float:
     return float(chdtri(freedom, 1.0 - probability))
 
 
+def spread_evenly(count: int, dims: int) -> Floats:
+    """Return (count, dims) points of the unit cube, each coordinate at every count-th part of it.
+
+    A Latin hypercube (McKay et al. 1979), the same at every call.
+    """
+    rng = np.random.default_rng(0)
+    rows = rng.permuted(np.tile(np.arange(count), (dims, 1)), axis=1)
+    return np.asarray((rows.T + 0.5) / count)
+
+
 def f_quantile(probability: float, freedom: int, noise_freedom: float) -> float:
     """Return the value a mean square of ``freedom`` degrees stays below with ``probability``.
 
