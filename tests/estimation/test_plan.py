@@ -8,9 +8,9 @@ import pytest
 
 from flangeye.estimation.plan import (
     _moved,
+    best_next,
     errors_at_work,
     foreseen,
-    most_telling,
     so_far,
 )
 from flangeye.files.paths import bundled
@@ -53,8 +53,8 @@ def test_the_choice_is_the_one_after_which_least_is_left_unknown(session: Any) -
         return sum(e**2 for e in errors_at_work(with_it, cell, seen).values())
 
     some = candidates[::5]
-    expected = [foreseen([o], found, cell)[0] for o in some]
-    chosen = most_telling(expected, found, cell, seen)
+    expected = [foreseen([o], found.places, cell)[0] for o in some]
+    chosen = best_next(expected, found, cell, seen)
     assert some[chosen].camera == "right"
     states = np.array([left(o) for o in some])
     assert states[chosen] <= np.quantile(states, 0.25)

@@ -230,7 +230,7 @@ def adjoint(pose: Floats) -> Floats:
 
 
 def expected_error(
-    found: Estimate, work: Work, answer: Floats, corrected: bool = False
+    found: Estimate, work: Work, answer: Floats, put_right: Floats | float = 0.0
 ) -> ExpectedError:
     """Return the predictive spread of an answer at new poses of the work.
 
@@ -241,14 +241,12 @@ def expected_error(
         found: The posterior.
         work: Where it is taken.
         answer: (P,) moves of the places.
-        corrected: Whether the arms' errors are corrected by their posterior mean.
+        put_right: (K,) what is corrected of the arms' errors, in numbers of the effects.
     """
     known, rng, at = found.posterior, np.random.default_rng(0), work.poses
     model = model_at(at, found.places, found.effects, np.ones(len(at.seen)), of_session=False)
-    p = model.p
     of_places, of_effects = model.places[:, 3:], model.effects[:, 3:]
-    put_right = np.repeat([corrected and e.of_arm for e in found.effects], found.counts)
-    expected = of_places @ answer + of_effects @ (put_right * known.mean[p:])
+    expected = of_places @ answer + of_effects @ np.broadcast_to(put_right, of_effects.shape[2])
     rows = np.concatenate([of_places, of_effects], axis=2)
     squares, chances = [], []
     for chance, each in zip(known.chances, known.fits, strict=True):

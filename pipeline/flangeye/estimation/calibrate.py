@@ -12,7 +12,7 @@ import numpy as np
 from flangeye.errors import FlangeyeError
 from flangeye.estimation.answers import Answer, as_reported, as_true, expected_error
 from flangeye.estimation.certified import answer_of, certificate_notes, moved_note, verdict_of
-from flangeye.estimation.corrections import CORRECTED, corrections_of
+from flangeye.estimation.corrections import CORRECTED, corrections_of, put_right
 from flangeye.estimation.effects.arm import COMMON
 from flangeye.estimation.estimate import Estimate, estimate
 from flangeye.estimation.flange_roll import roll_note
@@ -92,7 +92,15 @@ def calibrate(
             unknown (it says which motion is missing), or a marker has another size than was said.
     """
     session = session_of(observations, cell, scanner, options.asked)
-    session = _at_best(session) if options.certify else session
+    return answered(_at_best(session) if options.certify else session, options, method)
+
+
+def answered(session: Session, options: Options, method: str) -> HandEye:
+    """Return what :func:`calibrate` does of a session.
+
+    Raises:
+        CalibrationRefused: The motion leaves something unknown.
+    """
     weak = _weak(session, options)
     work = _work(session, options)
     reported = _reported(session, work, weak)
@@ -232,8 +240,7 @@ def _corrected(
     if not corrections or reported is None:
         return None
     answered = as_reported(found, work, without=CORRECTED)
-    likeliest = found.posterior.mean[: found.posterior.model.p]
-    expected = expected_error(found, work, likeliest, corrected=True)
+    expected = expected_error(found, work, answered.mean, put_right(found))
     if expected.rms > BETTER * reported.rms:
         return None
     camera, *others = _estimates(session, answered, weak)

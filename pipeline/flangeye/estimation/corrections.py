@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from flangeye.estimation.effects.arm import displacements
@@ -9,54 +11,79 @@ from flangeye.estimation.estimate import Estimate
 from flangeye.estimation.graph import Carrier
 from flangeye.maths.smooth_field import effects as field_effects
 from flangeye.maths.smooth_field import field_over
-from flangeye.types import ArmCorrection, Floats, SmoothField
+from flangeye.types import ArmCorrection, Floats
 
 CORRECTED = frozenset({"zeros", "lengths", "twists", "field"})
 """Kinds of errors that a correction has numbers for. Of encoders and sag its field takes what is
 not rigid over the work; the rigid part stays in the camera's pose."""
 
 
+def put_right(found: Estimate) -> Floats:
+    """Return (K,) what a correction takes of the effects' numbers.
+
+    Those that it has numbers for, and in its smooth error what else displaces the flange at the
+    session's poses.
+    """
+    kept = np.repeat([e.of_arm and e.kind in CORRECTED for e in found.effects], found.counts)
+    out = np.where(kept, found.posterior.mean[found.posterior.model.p :], 0.0)
+    for carrier in _flanges(found):
+        field = _rows(found, carrier, "field")
+        if field is not None:
+            out[field] += _as_field(found, carrier)
+    return out
+
+
 def corrections_of(found: Estimate, tool_offset: Floats) -> dict[str, ArmCorrection]:
     """Return what to correct, by arm; nothing of what carries neither camera nor target."""
-    flanges = [c for c in found.problem.carriers if c.link is None and not c.axis]
-    return {c.arm: _correction(found, c, tool_offset) for c in flanges}
+    numbers = put_right(found)
+    return {c.arm: _correction(found, c, tool_offset, numbers) for c in _flanges(found)}
 
 
-def _correction(found: Estimate, carrier: Carrier, tool_offset: Floats) -> ArmCorrection:
-    zeros, lengths, twists = (_mean(found, carrier, k) for k in ("zeros", "lengths", "twists"))
-    field = _field(found, carrier)
+def _flanges(found: Estimate) -> list[Carrier]:
+    return [c for c in found.problem.carriers if c.link is None and not c.axis]
+
+
+def _rows(found: Estimate, carrier: Carrier, kind: str) -> slice | None:
+    """Return where an arm's numbers of a kind are; None where it has none."""
+    ends = np.cumsum([0, *found.counts])
+    for k, effect in enumerate(found.effects):
+        if effect.kind == kind and effect.cause == carrier.arm:
+            return slice(int(ends[k]), int(ends[k + 1]))
+    return None
+
+
+def _correction(
+    found: Estimate, carrier: Carrier, tool_offset: Floats, numbers: Floats
+) -> ArmCorrection:
+    def of(kind: str) -> Floats | None:
+        rows = _rows(found, carrier, kind)
+        return None if rows is None else numbers[rows]
+
+    zeros, lengths, twists, weights = map(of, ("zeros", "lengths", "twists", "field"))
+    bare = field_over(_places(found, carrier))
+    field = None if weights is None else replace(bare, weights=weights)
     if zeros is None or lengths is None or twists is None or carrier.joints is None:
         return ArmCorrection(tool_offset, field=field)
     built = np.column_stack([lengths.reshape(-1, 2), twists])
     return ArmCorrection(tool_offset, zeros, carrier.joints[0], field, built)
 
 
-def _mean(found: Estimate, carrier: Carrier, kind: str) -> Floats | None:
-    """Return the mean of an arm's numbers of a kind; None where it has none."""
-    of_arm = [mean for effect, mean, _ in found.numbers(kind) if effect.cause == carrier.arm]
-    return of_arm[0] if of_arm else None
+def _places(found: Estimate, carrier: Carrier) -> Floats:
+    return np.asarray(found.problem.frames[carrier.frame].place)[:, :3, 3]
 
 
-def _field(found: Estimate, carrier: Carrier) -> SmoothField | None:
-    """Return the smooth error, with what the correction has no other numbers for."""
-    weights = _mean(found, carrier, "field")
-    if weights is None:
-        return None
-    places = np.asarray(found.problem.frames[carrier.frame].place)[:, :3, 3]
-    bare = field_over(places)
-    rest = _other_displacement(found, carrier, len(places))
-    effects = field_effects(bare, places).reshape(3 * len(places), -1)
-    own = np.linalg.lstsq(effects, rest.ravel(), rcond=1e-6)[0]
-    return SmoothField(bare.about, bare.length, bare.rigid, weights + own)
+def _as_field(found: Estimate, carrier: Carrier) -> Floats:
+    """Return the weights of the smooth error that displace the flange as other kinds do.
 
-
-def _other_displacement(found: Estimate, carrier: Carrier, count: int) -> Floats:
-    """Return (T, 3) by how much errors of other kinds displace the flange [m]."""
-    out = np.zeros((count, 3))
-    if carrier.joints is None or carrier.kinematics is None:
-        return out
-    for kind, columns in displacements(carrier).items():
-        mean = _mean(found, carrier, kind)
-        if kind not in CORRECTED and mean is not None:
-            out += columns[:, 3:] @ mean
-    return out
+    At the session's poses, by least squares; what is rigid of it stays in the camera's pose.
+    """
+    places = _places(found, carrier)
+    moves = field_effects(field_over(places), places).reshape(3 * len(places), -1)
+    rest = np.zeros((len(places), 3))
+    if carrier.joints is not None and carrier.kinematics is not None:
+        mean = found.posterior.mean[found.posterior.model.p :]
+        for kind, columns in displacements(carrier).items():
+            rows = _rows(found, carrier, kind)
+            if kind not in CORRECTED and rows is not None:
+                rest += columns[:, 3:] @ mean[rows]
+    return np.asarray(np.linalg.lstsq(moves, rest.ravel(), rcond=1e-6)[0])

@@ -66,6 +66,11 @@ class Estimate:
     inliers: Mask
     squares: Floats
 
+    @property
+    def fit(self) -> Fit:
+        """At the most likely sizes."""
+        return self.posterior.mode
+
     def numbers(self, kind: str) -> list[tuple[Effect, Floats, Floats]]:
         """Return the effects of a kind, each with the mean and covariance of its numbers."""
         out, at = [], self.posterior.model.p

@@ -18,7 +18,8 @@ from dataclasses import replace
 import numpy as np
 
 from flangeye.errors import FlangeyeError
-from flangeye.estimation.estimate import model_at
+from flangeye.estimation.estimate import Estimate, model_at
+from flangeye.estimation.graph import Places
 from flangeye.estimation.mixed import fit
 from flangeye.estimation.rough import Rough, rough
 from flangeye.estimation.sightings import problem_of
@@ -31,6 +32,7 @@ from flangeye.types import (
     TARGET,
     Feature,
     Floats,
+    Indices,
     Observation,
     PoseFeature,
     Transform,
@@ -77,6 +79,33 @@ def work_of_frames(found: Rough, cell: Cell, seen: Sequence[Observation]) -> Map
 
 
 def most_telling(
+    rows: Floats, covariance: Floats, levers: Floats, count: int
+) -> tuple[Indices, Floats]:
+    """Choose sightings one after the other, each the one that leaves the least variance.
+
+    Args:
+        rows: (M, 6, U) of M candidates, whitened.
+        covariance: (U, U) of all unknowns before.
+        levers: (A, U) what counts.
+        count: How many to choose; all candidates, if there are fewer.
+
+    Returns:
+        Their indices, and the covariance (U, U) with them.
+    """
+    chosen: list[int] = []
+    for _ in range(min(count, len(rows))):
+        gain = covariance @ np.swapaxes(rows, 1, 2)
+        inner = np.linalg.inv(rows @ gain + np.eye(6))
+        moved = levers @ gain
+        worth = np.einsum("mai,mij,maj->m", moved, inner, moved)
+        worth[chosen] = -np.inf
+        best = int(np.argmax(worth))
+        chosen.append(best)
+        covariance = covariance - gain[best] @ inner[best] @ gain[best].T
+    return np.array(chosen, dtype=np.intp), covariance
+
+
+def best_next(
     candidates: Sequence[Observation], found: Rough, cell: Cell, seen: Sequence[Observation]
 ) -> int:
     """Return which candidate is expected to shrink the error at the work most.
@@ -87,34 +116,31 @@ def most_telling(
         cell: What stands on what.
         seen: The sightings so far.
     """
-    rows, _ = _rows(candidates, found, cell)
-    gain = found.fit.covariance @ np.swapaxes(rows, 1, 2)
-    inner = np.linalg.inv(rows @ gain + np.eye(6))
-    moved = _levers(found, cell, seen) @ gain
-    worth = np.einsum("mai,mij,maj->m", moved, inner, moved)
-    return int(np.argmax(worth))
+    rows, _ = whitened(candidates, found, cell)
+    chosen, _ = most_telling(rows, found.fit.covariance, _levers(found, cell, seen), 1)
+    return int(chosen[0])
 
 
-def foreseen(moments: Sequence[Observation], found: Rough, cell: Cell) -> list[Observation]:
+def foreseen(moments: Sequence[Observation], places: Places, cell: Cell) -> list[Observation]:
     """Return M sightings of one target by one camera as they would be, by what is known so far.
 
     Args:
         moments: Where the controllers would have what moves, the camera, the target, and by a
             feature anywhere what such a sighting measures, and how well.
-        found: What is known so far.
+        places: (4, 4) of each unknown, by what is known so far.
         cell: What stands on what.
     """
-    poses = foreseen_poses(moments, found, cell)
+    poses = foreseen_poses(moments, places, cell)
     return [
         replace(moment, feature=_moved(moment.feature, pose))
         for moment, pose in zip(moments, poses, strict=True)
     ]
 
 
-def foreseen_poses(moments: Sequence[Observation], found: Rough, cell: Cell) -> Floats:
+def foreseen_poses(moments: Sequence[Observation], places: Places, cell: Cell) -> Floats:
     """Return (M, 4, 4) camera_T_target at such moments, by what is known so far."""
     frames = {
-        name: replace(frame, place=found.places.get(name, frame.place))
+        name: replace(frame, place=places.get(name, frame.place))
         for name, frame in cell.graph(moments).items()
     }
     camera, target = (composed(frames, end) for end in (moments[0].camera, moments[0].target))
@@ -132,7 +158,9 @@ def _moved(like: Feature, pose: Floats) -> Feature:
     return replace(like, centre=pose[:3, 3], normal=axis, normal_covariance=across)
 
 
-def _rows(sightings: Sequence[Observation], found: Rough, cell: Cell) -> tuple[Floats, Floats]:
+def whitened(
+    sightings: Sequence[Observation], found: Rough | Estimate, cell: Cell
+) -> tuple[Floats, Floats]:
     """Return (M, 6, P + K) rows of sightings, and (M, 6) their errors, of unit covariance."""
     problem = problem_of(sightings, cell)
     model = model_at(problem, found.places, found.effects, np.ones(len(sightings)))

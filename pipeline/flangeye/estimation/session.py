@@ -112,7 +112,10 @@ class Session:
 
 
 def session_of(
-    observations: Sequence[Observation], cell: Cell, scanner: ScannerModel | None, asked: Asked
+    observations: Sequence[Observation],
+    cell: Cell,
+    scanner: ScannerModel | None,
+    asked: Asked = Asked(),
 ) -> Session:
     """Return what observations of a cell tell.
 

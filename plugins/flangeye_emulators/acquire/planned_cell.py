@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field
 
 from flangeye.errors import StageError
-from flangeye.estimation.plan import foreseen, foreseen_poses, most_telling, so_far
+from flangeye.estimation.plan import best_next, foreseen, foreseen_poses, so_far
 from flangeye.estimation.rough import Rough
 from flangeye.maths.frame_graph import Frame, chain, composed
 from flangeye.maths.geometry import invert
@@ -146,7 +146,7 @@ class NextBest:
         foreseen = [o for like in pairs.values() for o in self._in_view(like, self._found)]
         if not foreseen:
             return None
-        best = foreseen[most_telling(foreseen, self._found, cell, seen)]
+        best = foreseen[best_next(foreseen, self._found, cell, seen)]
         return int(best.id), best.camera, best.target
 
     def _in_view(self, like: Observation, found: Rough) -> list[Observation]:
@@ -159,8 +159,8 @@ class NextBest:
             for i in map(int, drawn)
             if i not in self._taken
         ]
-        foretold = foreseen(reported, found, moments.cell)
-        visible = self._planned.view.sees(foreseen_poses(reported, found, moments.cell))
+        foretold = foreseen(reported, found.places, moments.cell)
+        visible = self._planned.view.sees(foreseen_poses(reported, found.places, moments.cell))
         return [foretold[k] for k in np.flatnonzero(visible)]
 
 

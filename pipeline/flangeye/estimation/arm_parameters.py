@@ -1,0 +1,153 @@
+"""What sightings tell of an arm's own parameters: joint zeros, link lengths and twists."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flangeye.errors import StageError
+from flangeye.estimation.effects.arm import told
+from flangeye.estimation.estimate import Estimate, estimate
+from flangeye.estimation.graph import Carrier
+from flangeye.estimation.mixed import fit
+from flangeye.estimation.plan import most_telling, whitened
+from flangeye.estimation.session import Session
+from flangeye.estimation.sightings import branches_of
+from flangeye.types import FLANGE, Floats, Indices, Mask, Observation
+
+KINDS = ("zeros", "lengths", "twists")
+KNOWN, LOOSE = 0.5, 100.0
+"""A parameter is identified singly when the poses leave this share of its size, or less, although
+each other one may be off by so many times its own: by the poses then, not by what is expected."""
+ALIKE = 0.01
+"""Ways to the poses that are as probable as this, or more, count as alike."""
+
+
+@dataclass(frozen=True, eq=False)
+class ArmParameters:
+    """The n joints' parameters, each (n, 4): zero [rad], a [m], d [m] and alpha [rad].
+
+    Attributes:
+        values: To add to those of the arm's model.
+        deviations: Standard deviations of these.
+        sizes: How large each is in such an arm.
+        told: (4n, 4n) covariance by the poses alone, in units of the sizes.
+        ways: How many ways to the poses fit alike, where no joint angles were recorded; infinity
+            for an arm of more joints than a pose has coordinates.
+    """
+
+    values: Floats
+    deviations: Floats
+    sizes: Floats
+    told: Floats
+    ways: float = 1
+
+    @property
+    def identified(self) -> Mask:
+        """(n, 4) which parameters the poses identify singly."""
+        alone = np.diag(self.told).reshape(self.sizes.shape) <= KNOWN**2
+        return np.asarray(alone & (self.deviations <= KNOWN * self.sizes))
+
+    @property
+    def combinations(self) -> int:
+        """How many combinations of the parameters the poses identify."""
+        return int((np.linalg.eigvalsh(self.told) <= KNOWN**2).sum())
+
+
+def parameters_of(session: Session) -> ArmParameters:
+    """Return what a session tells of the parameters of the arm that moves its flange.
+
+    What all likely ways to the poses agree on, where no joint angles were recorded.
+
+    Raises:
+        StageError: The arm's model does not reach its poses.
+    """
+    carrier = next((c for c in session.found.problem.carriers if told(c)), None)
+    if carrier is None:
+        raise StageError(
+            "refine.arm: the robot's model does not reach the poses; name the arm that was recorded"
+        )
+    ways = _ways(session, carrier)
+    costs = np.array([way.posterior.mode.cost for way in ways])
+    chances = np.exp((costs.min() - costs) / 2)
+    chances /= chances.sum()
+    each = [_of_one_way(way, carrier.arm) for way in ways]
+    best = each[int(np.argmax(chances))]
+    apart = sum(p * (one.values - best.values) ** 2 for p, one in zip(chances, each, strict=True))
+    # Of the endless ways of an arm of more joints, those looked at are a few
+    endless = len(ways) > 1 and len(best.values) > 6
+    spread = np.full_like(apart, np.inf) if endless else np.sqrt(best.deviations**2 + apart)
+    return replace(
+        best, deviations=spread, ways=np.inf if endless else int((chances > ALIKE).sum())
+    )
+
+
+def _ways(session: Session, carrier: Carrier) -> list[Estimate]:
+    """Return the estimate by each way in which an arm may have come to its poses."""
+    found = session.found
+    if carrier.arm in session.cell.joints(session.observations):
+        return [found]
+    carriers, out = found.problem.carriers, []
+    for joints in branches_of(found.problem, replace(carrier, joints=None)):
+        moved = [replace(c, joints=joints) if c.arm == carrier.arm else c for c in carriers]
+        problem = replace(found.problem, carriers=moved)
+        out.append(estimate(problem, found.places, found.effects, found.inliers))
+    return out
+
+
+def _of_one_way(found: Estimate, arm: str) -> ArmParameters:
+    columns, of_size = _columns(found, arm)
+    known, sizes = found.posterior, found.posterior.mode.sizes
+    own = sizes[of_size]
+    poses_alone = _loosely(found, of_size)[np.ix_(columns.ravel(), columns.ravel())]
+    return ArmParameters(
+        known.mean[columns],
+        np.sqrt(np.diag(known.covariance)[columns]),
+        own,
+        poses_alone / np.outer(own.ravel(), own.ravel()),
+    )
+
+
+def _loosely(found: Estimate, of_size: Indices) -> Floats:
+    """Return (P + K, P + K) what is known where the arm's parameters may be off by far more."""
+    sizes = found.posterior.mode.sizes.copy()
+    sizes[np.unique(of_size)] *= LOOSE
+    return fit(found.posterior.model, sizes, with_gradient=False).covariance
+
+
+def _columns(found: Estimate, arm: str) -> tuple[Indices, Indices]:
+    """Return (n, 4) at which column of the unknowns each parameter is, and which size it has."""
+    first = found.posterior.model.p + np.cumsum([0, *found.counts])
+    at = {e.kind: k for k, e in enumerate(found.effects) if e.cause == arm and e.kind in KINDS}
+    zeros, lengths, twists = (at[kind] for kind in KINDS)
+    joint = np.arange(found.counts[zeros])
+    columns = np.column_stack([
+        first[zeros] + joint,
+        first[lengths] + 2 * joint,
+        first[lengths] + 2 * joint + 1,
+        first[twists] + joint,
+    ])  # fmt: skip
+    return columns, np.tile([zeros, lengths, lengths, twists], (len(joint), 1))
+
+
+def most_telling_poses(
+    session: Session, candidates: Sequence[Observation], count: int
+) -> tuple[Indices, ArmParameters]:
+    """Return which sightings would tell most of the arm, and what would be known with them.
+
+    Args:
+        session: What was seen.
+        candidates: As they would be, with joints.
+        count: How many to choose.
+    """
+    found, known = session.found, parameters_of(session)
+    columns, of_size = _columns(found, FLANGE)
+    covariance = _loosely(found, of_size)
+    rows, _ = whitened(candidates, found, session.cell)
+    levers = np.eye(len(covariance))[columns.ravel()] / known.sizes.ravel()[:, None]
+    chosen, after = most_telling(rows, covariance, levers, count)
+    left = levers @ after @ levers.T
+    deviations = known.sizes * np.sqrt(np.diag(left)).reshape(known.sizes.shape)
+    return chosen, replace(known, told=left, deviations=np.minimum(deviations, known.deviations))
