@@ -134,6 +134,21 @@ class Problem:
         """Return the problem of some of the sightings."""
         return replace(self, seen=self.seen.where(chosen))
 
+    def at(self, times: Indices) -> Problem:
+        """Return the problem of some times, in order, and of what was seen then."""
+        seen = self.seen.where(np.isin(self.seen.times, times))
+        frames = {n: f.at(times) for n, f in self.frames.items()}
+        carriers = [
+            replace(
+                c,
+                joints=None if c.joints is None else c.joints[times],
+                rates=None if c.rates is None else c.rates[times],
+            )
+            for c in self.carriers
+        ]
+        seen = replace(seen, times=np.searchsorted(times, seen.times))
+        return replace(self, frames=frames, carriers=carriers, seen=seen)
+
     def of_pair(self, k: int) -> Problem:
         """Return the problem of the sightings of one camera and one target."""
         return self.where(self.seen.pairs == k)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from flangeye.errors import CalibrationRefused, StageError
-from flangeye.estimation.effects.arm import arm_effects
+from flangeye.estimation.effects.arm import arm_effects, known
 from flangeye.estimation.effects.camera import camera_effects
 from flangeye.estimation.effects.clock import clock_effects, delayed
 from flangeye.estimation.effects.drift import drift_effects
@@ -16,8 +16,8 @@ from flangeye.estimation.effects.effect import Effect
 from flangeye.estimation.effects.scanner import scanner_effects
 from flangeye.estimation.effects.target import target_effects, wrong_offset
 from flangeye.estimation.estimate import Estimate, estimate, model_at
-from flangeye.estimation.graph import Places, Problem
-from flangeye.estimation.mixed import fit
+from flangeye.estimation.graph import Carrier, Places, Problem
+from flangeye.estimation.mixed import TELLING, fit
 from flangeye.estimation.observability import (
     IN_LINE,
     fewest,
@@ -27,6 +27,7 @@ from flangeye.estimation.observability import (
 )
 from flangeye.estimation.sightings import branches_of, problem_of
 from flangeye.estimation.start import agreeing, begin, distances, size_of
+from flangeye.maths.arm_correction import reached_from
 from flangeye.maths.geometry import rigid
 from flangeye.maths.statistics import chi2_quantile
 from flangeye.models.cell import Cell
@@ -272,22 +273,32 @@ def _on_branches(problem: Problem, places: Places, agree: Mask) -> tuple[Problem
     for carrier in problem.carriers:
         if carrier.kinematics is None or carrier.link is not None:
             continue
-        tried = list(_tried(problem, carrier.frame))
-        if not tried:
+        problem = _with_joints(problem, carrier.arm, _likeliest(problem, carrier, places, agree))
+        if next(c for c in problem.carriers if c.arm == carrier.arm).joints is None:
             notes.append(
                 f"the model of {carrier.arm} misses the reported poses: errors of its joints are "
                 "not considered"
             )
-            problem = _with_joints(problem, carrier.arm, None)
-            continue
-        problem = min(tried, key=lambda p: _cost(p, places, agree)) if tried[1:] else tried[0]
     return problem, tuple(notes)
 
 
-def _tried(problem: Problem, frame: str) -> Iterator[Problem]:
-    carrier = next(c for c in problem.carriers if c.frame == frame)
-    for joints in branches_of(problem, carrier):
-        yield _with_joints(problem, carrier.arm, joints)
+def _likeliest(problem: Problem, carrier: Carrier, places: Places, agree: Mask) -> Floats | None:
+    """Return an arm's joints (T, n) on the branch that some sightings make likeliest."""
+    if carrier.joints is not None:
+        return next(branches_of(problem, carrier), None)
+    kept = problem.seen.times[agree]
+    times = np.unique(kept[np.linspace(0, len(kept) - 1, TELLING).astype(int)])
+    some = problem.where(agree).at(times)
+    tried = [_with_joints(some, carrier.arm, each) for each in branches_of(some, carrier)]
+    if tried[1:]:
+        tried.sort(key=lambda one: _cost(one, places))
+    poses = np.asarray(problem.frames[carrier.frame].place)
+    for one in tried:
+        arm, near = known(next(c for c in one.carriers if c.frame == carrier.frame))
+        joints, reached = reached_from(arm, poses, near[0])
+        if reached.all():
+            return joints
+    return None
 
 
 def _with_joints(problem: Problem, arm: str, joints: Floats | None) -> Problem:
@@ -295,10 +306,10 @@ def _with_joints(problem: Problem, arm: str, joints: Floats | None) -> Problem:
     return replace(problem, carriers=carriers)
 
 
-def _cost(problem: Problem, places: Places, agree: Mask) -> float:
+def _cost(problem: Problem, places: Places) -> float:
     """Return -2 log of the restricted likelihood at the sizes that are expected beforehand."""
     effects = effects_of(problem, None, Asked())
-    model = model_at(problem, places, effects, agree.astype(float))
+    model = model_at(problem, places, effects, np.ones(len(problem.seen)))
     return fit(model, model.sizes.at(np.zeros(model.sizes.mix.shape[1])), with_gradient=False).cost
 
 

@@ -21,8 +21,6 @@ REACHED = 5e-3
 """Further from the controller's poses than this [m], the catalogue's arm is another one."""
 STARTS = 48
 """Of the search for the branches of an arm that has no closed form of them."""
-TRIED = 30
-"""Poses on which branches are tried first: most are left within a few."""
 
 
 def problem_of(observations: Sequence[Observation], cell: Cell, normals: bool = True) -> Problem:
@@ -130,10 +128,8 @@ def branches_of(problem: Problem, carrier: Carrier) -> Iterator[Floats]:
         if np.linalg.norm((reached - poses)[:, :3, 3], axis=1).max() < REACHED:
             yield carrier.joints
         return
-    some = poses[:: max(1, len(poses) // TRIED)]
     starts = arm.inverse(poses[0], STARTS)[:, None]
-    _, alive = reached_from(arm, np.broadcast_to(some, (len(starts), *some.shape)), starts)
-    for first in starts[alive.all(axis=1), 0]:
-        joints, everywhere = reached_from(arm, poses, first)
-        if everywhere.all():
-            yield joints
+    each, all_reached = reached_from(
+        arm, np.broadcast_to(poses, (len(starts), *poses.shape)), starts
+    )
+    yield from each[all_reached.all(axis=1)]

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from flangeye.errors import StageError
-from flangeye.types import Floats
+from flangeye.types import Floats, Indices
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,6 +23,12 @@ class Frame:
 
     parent: str
     place: Floats | None = None
+
+    def at(self, times: Indices) -> Frame:
+        """Return it at some of the times alone."""
+        if self.place is None or self.place.ndim == 2:
+            return self
+        return replace(self, place=self.place[times])
 
 
 def chain(frames: Mapping[str, Frame], name: str) -> list[str]:
