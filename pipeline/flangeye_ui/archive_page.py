@@ -19,8 +19,8 @@ from flangeye_ui.layout import command_line, mistake, page
 from flangeye_ui.project import Project
 from flangeye_ui.scene import ScanView
 
-WIDE_ONLY = ("used", "note")
-"""Columns that a phone has no room for; the run's result says both."""
+WIDE_ONLY = ("used", "held", "note")
+"""Columns that a phone has no room for; the run's result has them."""
 COLUMNS = [
     {"name": key, "label": label, "field": key, "align": "left", "sortable": True}
     | (dict.fromkeys(("classes", "headerClasses"), "gt-xs") if key in WIDE_ONLY else {})
