@@ -27,6 +27,7 @@ from flangeye.errors import FlangeyeError
 from flangeye.files.processes import python_command
 from flangeye.log.read import read_notes
 from tests.emulators.controllers.process import Process
+from tools.strokes import guard_of, worker_of
 
 RECIPE = "recipes/paper/fig13_straight.yaml"
 FINGER = "steps.5.sensor.simulated_finger"
@@ -112,18 +113,40 @@ class Trial:
         return (stopped or lines or [""])[-1]
 
 
-def killed(trial: Trial) -> float:
-    """The program is killed."""
-    os.kill(trial.run.pid, signal.SIGKILL)
-    return trial.rests()
+Strike = Callable[[Trial], float]
+"""Does something to a weld, and returns how long the arm then goes on moving [s]."""
 
 
-def hung(trial: Trial) -> float:
-    """The program is held."""
-    os.kill(trial.run.pid, signal.SIGSTOP)
-    taken = trial.rests()
-    os.kill(trial.run.pid, signal.SIGKILL)
-    return taken
+def itself(run: int) -> int:
+    """Return the run's own process."""
+    return run
+
+
+def killed(find: Callable[[int], int]) -> Strike:
+    """A process of the weld is killed."""
+
+    def strike(trial: Trial) -> float:
+        os.kill(find(trial.run.pid), signal.SIGKILL)
+        taken = trial.rests()
+        trial.reason = trial.told()
+        return taken
+
+    return strike
+
+
+def hung(find: Callable[[int], int], signals: Callable[[int, int], None] = os.kill) -> Strike:
+    """A process of the weld is held, or the program with its group, until the arm rests."""
+
+    def strike(trial: Trial) -> float:
+        process = find(trial.run.pid)
+        signals(process, signal.SIGSTOP)
+        taken = trial.rests()
+        signals(process, signal.SIGCONT)
+        again = trial.rests()  # it must not move once more
+        trial.reason = trial.told()
+        return taken + again
+
+    return strike
 
 
 def faulted(trial: Trial) -> float:
@@ -164,7 +187,7 @@ def camera(trial: Trial) -> float:
 class Stroke:
     """What is done to a weld, and with what parameters it is started."""
 
-    strike: Callable[[Trial], float]
+    strike: Strike
     given: Callable[[float], tuple[str, ...]] = lambda after: PATIENT
     by_itself: bool = False
     within: float = RESTS
@@ -182,8 +205,13 @@ def _lost(after: float) -> tuple[str, ...]:
 
 
 STROKES = {
-    "program killed": Stroke(killed),
-    "program held": Stroke(hung),
+    "program killed": Stroke(killed(itself)),
+    "program held": Stroke(hung(itself)),
+    "process group held": Stroke(hung(itself, os.killpg)),
+    "guard killed": Stroke(killed(guard_of)),
+    "guard held": Stroke(hung(guard_of)),
+    "worker killed": Stroke(killed(worker_of)),
+    "worker held": Stroke(hung(worker_of)),
     "protective stop": Stroke(faulted),
     "controller frozen": Stroke(frozen),
     "controller killed": Stroke(powerless, within=ENDS),
