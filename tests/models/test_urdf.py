@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from flangeye.errors import RecipeError, StageError
 from flangeye.maths.geometry import rotation_from_rpy
 from flangeye.maths.kinematics import Arm
 from flangeye.models.urdf import robot_from_urdf
-from flangeye.models.urdf_meshes import fit_capsule, vertices
+from flangeye.models.urdf_meshes import capsule_of, fit_capsule, vertices
 from flangeye.motion.clearance import ArmVolume
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.load import describe_recipe, load_recipe
@@ -323,3 +324,10 @@ def test_what_does_not_go_together_is_refused(robot: str, words: str, tmp_path: 
     recipe.write_text(f"title: T\nrobot: {robot}\nsteps: [acquire.samples, solve.shah]\n")
     with pytest.raises(RecipeError, match=words):
         load_recipe(recipe, load_registry())
+
+
+@pytest.mark.parametrize("radius", ["1e308", "2000"])
+def test_a_body_larger_than_any_arm_is_refused_and_not_worked_on_for_ever(radius: str) -> None:
+    body = ElementTree.fromstring(f'<cylinder radius="{radius}" length="0.2" />')
+    with pytest.raises(RecipeError, match=r"a.urdf: a <cylinder> reaches .* m; a URDF's lengths"):
+        capsule_of(body, Path("a.urdf"), {})

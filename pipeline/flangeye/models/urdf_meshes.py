@@ -43,6 +43,12 @@ def capsule_of(body: ET.Element, urdf: Path, packages: Mapping[str, Path]) -> Ca
     if body.tag == "sphere":
         return Capsule(np.zeros(3), np.zeros(3), _number(body, "radius", urdf))
     points = _points(body, urdf, packages)
+    reach = float(np.abs(points).max())
+    # Of numbers that overflow LAPACK's decomposition never ends; no body of an arm is so large [m]
+    if not reach < 1e3:
+        raise RecipeError(
+            f"{urdf}: a <{body.tag}> reaches {reach:.3g} m; a URDF's lengths are in m"
+        )
     capsule = fit_capsule(points)
     outside = float(capsule.distance(points).max())
     if outside > 1e-6:
