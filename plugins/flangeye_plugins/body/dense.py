@@ -38,10 +38,20 @@ STRAIGHT = float(np.cos(np.radians(40.0)))
 LEAST_NOISE = 1e-6
 """Deviation below which points are exact [m]."""
 
-LOST, ROUNDED = 2.0, 10.0
-"""Standard deviations of what a scanner does at edges, before any scan: the width that it loses
-along them, in distances between points, and how much it rounds, see ``_rounding``. Filters of
-scanners reach over a few points."""
+LOST, ROUNDED = 1.0, 10.0
+"""Mean and standard deviation of the width that a scanner loses along edges, in distances between
+points, and standard deviation of how much it rounds, see ``_rounding``; before any scan. Filters
+of scanners reach over a few points."""
+
+RASTER = 1 / 12**0.5
+"""Standard deviation of where an edge lies between two points, in their distance. All points of a
+straight edge along the raster share it."""
+
+CELL = 1 / 200
+"""Width of the cells that the scan's edges are found in, as a share of the size, at least."""
+
+FACINGS = 6
+"""Ways that an edge may look, each with a loss of its own."""
 
 FILTER = 2
 """Distances between points within which a scanner averages most: published scans of planes
@@ -63,10 +73,10 @@ KNOWN = 0.05
 
 
 class _Equations(NamedTuple):
-    """Linearised residuals. Columns: turn [rad], shift in sizes, edges' loss and rounding.
+    """Linearised residuals. Columns: turn [rad], shift in sizes, loss at edges by facing, rounding.
 
     Attributes:
-        jacobian: (N, 8).
+        jacobian: (N, 13).
         residual: (N,) [m].
         place: (N, 3) on the body [m].
         facing: (N, 3) which way the face looks there, on the body.
@@ -89,10 +99,10 @@ class BodyFit:
         edges: How many points of edges do.
         size: Of the body [m].
         centre: (3,) of the body in ``camera`` [m].
-        bread: (8, 8) inverse of the information, with the prior's.
-        meat: (8, 8) covariance of the scores by the scan's noise, and the prior's information.
+        bread: (13, 13) inverse of the information, with the prior's.
+        meat: (13, 13) covariance of the scores by the scan's noise, and the prior's information.
         patches: (P, 3) places on the body that err together, in ``camera`` [m].
-        pulls: (P, 8, 3) derivative of the scores by how far each of them is off [1/m].
+        pulls: (P, 13, 3) derivative of the scores by how far each of them is off [1/m].
     """
 
     pose: Floats
@@ -155,41 +165,100 @@ def fitted(points: Singles, shape: Shape, start: Floats, most: int = MOST) -> Bo
     """
     if len(points) < FEWEST:
         return None
-    some, spacing = points[:: 1 + len(points) // most].astype(np.float64), spacing_of(points)
-    edges = _scan_edges(points, shape.size)
-    prior = _prior(spacing * float(np.median(some[:, 2])))
-    pose, reach, beside = start, REACH * shape.size, REACH * shape.size
-    (lost, rounded), rounding = np.zeros(2), np.zeros(len(some))
-    for _ in range(ROUNDS):
-        surface = _surface(some, shape, pose, reach, rounding, rounded)
-        ends = _ends(edges, shape, pose, lost, beside, spacing)
-        if len(surface.residual) < FEWEST:
-            return None
-        noise = _deviation(surface.residual)
-        few = len(ends.residual) < FEWEST_ENDS
-        spread = np.inf if few else max(_deviation(ends.residual), noise)
-        equations, weights = _weighted(surface, ends, noise, spread)
-        information = (equations.jacobian.T * weights) @ equations.jacobian + prior
-        gradient = (equations.jacobian.T * weights) @ equations.residual
-        step = np.asarray(np.linalg.solve(information, gradient), np.float64)
-        pose, lost, rounded = _moved(pose, shape, step), lost + step[6], rounded + step[7]
-        if reach < 2 * LEAST_REACH * noise:
-            if rounding.any() and np.abs(step[:6]).max() < STILL:
-                break
-            rounding = _rounding(some, shape, pose, spacing)
-        reach = max(0.5 * reach, LEAST_REACH * noise)
-        if not few:
-            beside = max(0.5 * beside, LEAST_REACH * spread)
-    centre = pose[:3, :3] @ shape.centre + pose[:3, 3]
-    left = equations._replace(residual=equations.residual - equations.jacobian @ step)
-    bread: Floats = np.linalg.inv(information).astype(np.float64)
-    cluster = _patches(left, shape)
-    meat = _noise(left, weights, cluster, len(surface.residual)) + prior
-    patches, pulls = _pulls(left, weights, cluster, pose)
-    return BodyFit(
-        pose, noise, len(surface.residual), len(ends.residual), shape.size, centre, bread, meat,
-        patches, pulls,
-    )  # fmt: skip
+    laid = _Laying.of(points, shape, most)
+    rest = laid.settled(start)
+    return rest and laid.fit_of(rest)
+
+
+class _Settled(NamedTuple):
+    """A body at rest on a scan."""
+
+    pose: Floats
+    left: _Equations
+    weights: Floats
+    information: Floats
+    surface: int
+    noise: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Laying:
+    """A scan that a body is laid on.
+
+    Attributes:
+        points: (N, 3) that are used [m].
+        edges: Of the scan.
+        shape: The body.
+        spacing: Between points at unit depth.
+        raster: Standard deviation of a scan's end across its edge [m].
+        usual, prior: (7,) and (7, 7) mean and information of what the scanner does at edges.
+    """
+
+    points: Floats
+    edges: OrientedPoints
+    shape: Shape
+    spacing: float
+    raster: float
+    usual: Floats
+    prior: Floats
+
+    @classmethod
+    def of(cls, points: Singles, shape: Shape, most: int) -> _Laying:
+        some, spacing = points[:: 1 + len(points) // most].astype(np.float64), spacing_of(points)
+        apart = spacing * float(np.median(some[:, 2]))
+        edges, cell = _scan_edges(points, shape.size)
+        usual = np.r_[np.full(FACINGS, -cell / 2 - LOST * apart), 0.0]
+        spread = np.diag(np.r_[np.full(FACINGS, (RASTER * apart) ** 2), ROUNDED**2])
+        spread[:FACINGS, :FACINGS] += (LOST * apart) ** 2
+        return cls(some, edges, shape, spacing, RASTER * cell, usual, np.linalg.inv(spread))
+
+    def settled(self, pose: Floats) -> _Settled | None:
+        """Return the body moved until it rests; None where too few points are on it."""
+        shape, scanner = self.shape, self.usual
+        reach = beside = REACH * shape.size
+        rounding = np.zeros(len(self.points))
+        prior = np.zeros((6 + len(scanner),) * 2)
+        prior[:6, :6] = UNKNOWN**-2.0 * np.eye(6)
+        prior[6:, 6:] = self.prior
+        for _ in range(ROUNDS):
+            surface = _surface(self.points, shape, pose, reach, rounding, scanner[-1])
+            ends = _ends(self.edges, shape, pose, scanner[:-1], beside, self.spacing)
+            if len(surface.residual) < FEWEST:
+                return None
+            noise = _deviation(surface.residual)
+            few = len(ends.residual) < FEWEST_ENDS
+            # By the raster: what ends are off where the body is not there yet is no noise.
+            spread = np.inf if few else max(self.raster, noise)
+            equations, weights = _weighted(surface, ends, noise, spread)
+            information = (equations.jacobian.T * weights) @ equations.jacobian + prior
+            gradient = (equations.jacobian.T * weights) @ equations.residual
+            gradient[6:] += self.prior @ (self.usual - scanner)
+            step = np.asarray(np.linalg.solve(information, gradient), np.float64)
+            pose, scanner = _moved(pose, shape, step), scanner + step[6:]
+            if reach < 2 * LEAST_REACH * noise:
+                if rounding.any() and np.abs(step[:6]).max() < STILL:
+                    break
+                rounding = _rounding(self.points, shape, pose, self.spacing)
+            reach = max(0.5 * reach, LEAST_REACH * noise)
+            if not few:
+                beside = max(0.5 * beside, LEAST_REACH * spread)
+        left = equations._replace(residual=equations.residual - equations.jacobian @ step)
+        return _Settled(pose, left, weights, information, len(surface.residual), noise)
+
+    def fit_of(self, rest: _Settled) -> BodyFit:
+        """Return it with all that its covariance needs."""
+        shape, pose = self.shape, rest.pose
+        centre = pose[:3, :3] @ shape.centre + pose[:3, 3]
+        bread: Floats = np.linalg.inv(rest.information).astype(np.float64)
+        cluster = _patches(rest.left, shape)
+        meat = _noise(rest.left, rest.weights, cluster, rest.surface)
+        meat[:6, :6] += UNKNOWN**-2.0 * np.eye(6)
+        meat[6:, 6:] += self.prior
+        patches, pulls = _pulls(rest.left, rest.weights, cluster, pose)
+        edges = len(rest.left.residual) - rest.surface
+        return BodyFit(
+            pose, rest.noise, rest.surface, edges, shape.size, centre, bread, meat, patches, pulls
+        )
 
 
 def _surface(
@@ -206,7 +275,8 @@ def _surface(
     at = np.flatnonzero(np.isfinite(met.depth) & (facing > GRAZING))
     at = at[np.abs(away[at]) < reach]  # none beside a step, where it is not a number
     place = origin + met.depth[at, None] * rays[at]
-    return _equations(place, met.normals[at], -away[at], pose, shape, (0.0, -bent[at]))
+    errors = np.column_stack([np.zeros((len(at), FACINGS)), -bent[at]])
+    return _equations(place, met.normals[at], -away[at], pose, shape, errors)
 
 
 def _rounding(points: Floats, shape: Shape, pose: Floats, spacing: float) -> Floats:
@@ -229,7 +299,7 @@ def _rounding(points: Floats, shape: Shape, pose: Floats, spacing: float) -> Flo
 
 
 def _ends(
-    edges: OrientedPoints, shape: Shape, pose: Floats, lost: float, reach: float, spacing: float
+    edges: OrientedPoints, shape: Shape, pose: Floats, lost: Floats, reach: float, spacing: float
 ) -> _Equations:
     """Return how far ends of the scan's surfaces are off those of the body's faces.
 
@@ -240,7 +310,8 @@ def _ends(
     model = _visible_ends(shape, pose, spacing)
     placed = model.points @ pose[:3, :3].T + pose[:3, 3]
     outwards = model.directions @ pose[:3, :3].T
-    empty = _equations(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), pose, shape, (1.0, 0.0))
+    nothing = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
+    empty = _equations(*nothing, pose, shape, np.zeros((0, FACINGS + 1)))
     if not len(placed) or not len(edges.points):
         return empty
     gap, nearest = cKDTree(edges.points).query(placed, distance_upper_bound=2 * reach)
@@ -251,13 +322,15 @@ def _ends(
     rays = placed[at] / np.linalg.norm(placed[at], axis=1, keepdims=True)
     across = np.linalg.norm(np.cross(outwards[at], rays), axis=1)
     offset = np.einsum("ni,ni->n", edges.points[number] - placed[at], outwards[at])
-    residual = across * offset - lost
+    facing = _sextants(model.directions[at])
+    residual = across * offset - lost[facing]
     near = np.abs(residual) < reach
-    at, residual, across = at[near], residual[near], across[near]
+    at, residual, across, facing = at[near], residual[near], across[near], facing[near]
     if not len(at):
         return empty
     along = across[:, None] * model.directions[at]
-    return _equations(model.points[at], along, residual, pose, shape, (1.0, 0.0))
+    errors = np.eye(FACINGS, FACINGS + 1)[facing]
+    return _equations(model.points[at], along, residual, pose, shape, errors)
 
 
 def _visible_ends(shape: Shape, pose: Floats, spacing: float) -> OrientedPoints:
@@ -277,12 +350,13 @@ def _visible_ends(shape: Shape, pose: Floats, spacing: float) -> OrientedPoints:
     return ends.take(np.flatnonzero(seen))
 
 
-def _scan_edges(points: Singles, size: float) -> OrientedPoints:
-    """Return where the scan's surfaces end, finely."""
-    view = view_of(points, size / 200)
+def _scan_edges(points: Singles, size: float) -> tuple[OrientedPoints, float]:
+    """Return where the scan's surfaces end, finely, and the width of the cells [m]."""
+    view = view_of(points, CELL * size)
     found, directions = view.ends
     found = found & np.isfinite(view.normals[..., 0])
-    return OrientedPoints(view.xyz[found], directions[found], view.normals[found])
+    cell = view.angle * float(np.median(points[:, 2]))
+    return OrientedPoints(view.xyz[found], directions[found], view.normals[found]), cell
 
 
 def _equations(
@@ -291,45 +365,40 @@ def _equations(
     residual: Floats,
     pose: Floats,
     shape: Shape,
-    scanner: tuple[Floats | float, Floats | float],
+    errors: Floats,
 ) -> _Equations:
     """Return the equations of points (N, 3) on the body that are off along (N, 3) of it.
 
-    The last are what a loss at edges and rounding do to each.
+    The last (N, 7) are what losses at edges and rounding do to each.
     """
     rotation = pose[:3, :3]
     arms = (place - shape.centre) @ rotation.T
     normals = along @ rotation.T
-    errors = [np.broadcast_to(each, len(place)) for each in scanner]
-    jacobian = np.column_stack([np.cross(arms, normals), shape.size * normals, *errors])
+    jacobian = np.column_stack([np.cross(arms, normals), shape.size * normals, errors])
     return _Equations(jacobian, residual, place, along)
 
 
 def _weighted(
     surface: _Equations, ends: _Equations, noise: float, spread: float
 ) -> tuple[_Equations, Floats]:
-    """Return all equations with Cauchy weights over their variances."""
+    """Return all equations with weights (Geman and McClure) over their variances."""
     parts = []
     for part, sigma in ((surface, noise), (ends, spread)):
-        scale = 2.4 * sigma  # 95 % as efficient as least squares where the noise is normal
-        parts.append(1 / (sigma**2 * (1 + (part.residual / scale) ** 2)))
+        # 94 % as efficient as least squares on normal noise; what is far off pulls at nothing
+        scale = 3.6 * sigma
+        parts.append(1 / (sigma**2 * (1 + (part.residual / scale) ** 2) ** 2))
     joined = _Equations(*(np.concatenate(both) for both in zip(surface, ends, strict=True)))
     return joined, np.concatenate(parts)
 
 
-def _prior(spacing: float) -> Floats:
-    """Return the (8, 8) information of what is known without a scan of points so far apart [m]."""
-    return np.diag(np.r_[np.repeat(UNKNOWN, 6), LOST * spacing, ROUNDED] ** -2.0)
-
-
 def _noise(equations: _Equations, weights: Floats, cluster: Indices, surface: int) -> Floats:
-    """Return the (8, 8) covariance of the scores by noise that points of a patch share.
+    """Return the (13, 13) covariance of the scores by noise that points of a patch share.
 
     How many times as much as that of independent ones is one number for surfaces and one for edges:
     a covariance by the patches' own sums would have hardly more of them than columns.
     """
     each = weights * equations.residual
-    out = np.zeros((8, 8))
+    out = np.zeros(2 * equations.jacobian.shape[1:])
     for part in (slice(0, surface), slice(surface, None)):
         own, total = each[part] ** 2, np.bincount(cluster[part], each[part])
         if len(own):
@@ -348,7 +417,7 @@ def _patches(equations: _Equations, shape: Shape) -> Indices:
 def _pulls(
     equations: _Equations, weights: Floats, cluster: Indices, pose: Floats
 ) -> tuple[Floats, Floats]:
-    """Return where patches are (P, 3), and what being off there does to the scores (P, 8, 3)."""
+    """Return where patches are (P, 3), and what being off there does to the scores (P, 13, 3)."""
     many = np.bincount(cluster)
     place = equations.place @ pose[:3, :3].T + pose[:3, 3]
     middles = np.stack([np.bincount(cluster, x) / many for x in place.T], axis=1)
