@@ -173,10 +173,12 @@ def _step(
     rows = _design(swept, basis[used], line[used], q[used], which[used])
     residual, weight = residual[used], (weight / size**2)[used]
     prior, pull = _prior(swept)
-    normal = (rows.T @ rows.multiply(weight[:, None])).toarray() + prior
-    step = np.linalg.solve(normal, -(rows.T @ (weight * residual)) - pull)
+    told = (rows.T @ rows.multiply(weight[:, None])).toarray()
+    inverse = np.linalg.inv(told + prior)
+    step = inverse @ (-(rows.T @ (weight * residual)) - pull)
     shared = _shared(points[used, 0], which[used], weight * residual * size[used])
-    covariance = shared * np.linalg.inv(normal)
+    # Points share their errors with neighbours; what is known beforehand does not.
+    covariance = inverse @ (shared * told + prior) @ inverse
     return replace(_moved(swept, step), sigma=spread, covariance=covariance), spread
 
 
