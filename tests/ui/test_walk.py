@@ -78,7 +78,8 @@ class Walk:
         """Go from a run that goes to a file, and return it."""
         done = self.page.get_by_role("button", name="See the result")
         done.or_(self.page.get_by_text("ended early")).first.wait_for(timeout=WAIT)
-        assert "ended early" not in self.page.locator(".bar").inner_text(), self.page.url
+        ended_early = "ended early" in self.page.locator(".bar").inner_text()
+        assert not ended_early, self.page.locator("body").inner_text()
         self.page.wait_for_timeout(500)
         shot(self.page, f"{self.look}_scanned")
         looked_at(self.page, f"{self.look} scanned")
@@ -164,7 +165,8 @@ def test_the_first_paint_comes_within_a_second(browser: Any, tmp_path: Path) -> 
 
 @pytest.mark.realtime
 @pytest.mark.slow
-def test_the_whole_way_on_an_arm_on_loopback(browser: Any, tmp_path: Path) -> None:
+@pytest.mark.parametrize("size", ["wide", "phone"])
+def test_the_whole_way_on_an_arm_on_loopback(browser: Any, tmp_path: Path, size: str) -> None:
     from tests.live.cell import Cell
 
     with Cell(tmp_path) as cell:
@@ -172,7 +174,9 @@ def test_the_whole_way_on_an_arm_on_loopback(browser: Any, tmp_path: Path) -> No
         served = serve(tmp_path)
         try:
             page = opened(browser, served)
-            walk = Walk(page, "live")
+            width, height = SIZES[size]
+            page.set_viewport_size({"width": width, "height": height})
+            walk = Walk(page, f"live_{size}")
             walk.see("Cell")
             walk.press("Next: check the poses")
             walk.press("Check poses")
