@@ -8,14 +8,9 @@ from flangeye.errors import StageError
 from flangeye.types import Floats
 from flangeye_plugins.weld.execution import WeldCell
 from flangeye_plugins.weld.reachability import SeamReach
+from flangeye_plugins.weld.search import UNTOUCHED
 from flangeye_plugins.weld.settings import Mode
 from flangeye_plugins.weld.weld_log import WeldLog
-
-WATCHED = 2.0
-"""How long the finger is watched before the arm moves [s]."""
-
-AT_REST = 0.5e-3
-"""A tip that touches nothing is displaced by less [m]."""
 
 
 def approach(cell: WeldCell, passage: SeamReach, weld_log: WeldLog, mode: Mode) -> None:
@@ -40,7 +35,8 @@ def _watch(cell: WeldCell, weld_log: WeldLog) -> None:
     began = cell.drive.tick().time_ns
     felt: list[Floats] = []
     seen = 0
-    while cell.drive.tick().time_ns - began < WATCHED * 1e9 and len(felt) < 10:
+    # The finger is watched for at most two seconds before the arm moves.
+    while cell.drive.tick().time_ns - began < 2e9 and len(felt) < 10:
         for sight in cell.eyes.seen():
             seen += 1
             weld_log.before(sight)
@@ -53,7 +49,7 @@ def _watch(cell: WeldCell, weld_log: WeldLog) -> None:
             "one its file names?"
         )
     off = float(np.linalg.norm(np.median(felt, axis=0)))
-    if off > AT_REST:
+    if off > UNTOUCHED:
         raise StageError(
             f"weld.tactile: the tip is displaced by {off * 1e3:.1f} mm though nothing should touch "
             "it; free it, or calibrate the finger again: flangeye tactile calibrate"

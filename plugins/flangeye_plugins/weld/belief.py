@@ -19,21 +19,8 @@ BAND = 2.0
 UNCALIBRATED = (1000.0, 2000.0)
 """Stiffness across and along a finger whose file gives none [N/m]: a soft one."""
 
-CREEP = 0.02
-"""Share of a displacement by which a finger creeps, one standard deviation."""
-
-NEARLY_UPRIGHT = math.radians(1.0)
-"""A wall that leans by less is as good as upright: nothing climbs it."""
-
-MINUTE = 60.0
-
 FLAT = math.radians(60.0)
 """A wall that leans by more does not hold the tip when the tool is moved against it."""
-
-BALL_SIGMA = 0.02e-3
-"""Standard deviation of the radius of the tip's ball [m]."""
-
-UPRIGHT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 @dataclass(frozen=True)
@@ -55,6 +42,12 @@ class Belief:
         level_R_tool: Rows of the tool's axes in level ones; see :mod:`flangeye_plugins.weld.body`.
         behind: How far behind the torch a second look sees the bead [m]; None where nothing does.
         arc: Gas before the arc; standing while it is struck; standing while the crater fills [s].
+        ahead: By how much the tip is ahead of its file, as earlier welds found it [m].
+        ahead_sigma: Its standard deviation; None where there was none: ``tip_sigma`` [m].
+        play: Half the width of the finger's play and hysteresis, as expected [m].
+        play_sigma: Its standard deviation [m].
+        stamp: By how much images' timestamps are late, as expected [s].
+        stamp_sigma: Its standard deviation [s].
     """
 
     distance: float
@@ -68,9 +61,24 @@ class Belief:
     two_walls: bool = True
     lean: float = 0.0
     radius: float = 1.5e-3
-    level_R_tool: tuple[tuple[float, ...], ...] = UPRIGHT
+    level_R_tool: tuple[tuple[float, ...], ...] = (
+        (1.0, 0.0, 0.0),
+        (0.0, 1.0, 0.0),
+        (0.0, 0.0, 1.0),
+    )
     behind: float | None = None
     arc: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    ahead: float = 0.0
+    ahead_sigma: float | None = None
+    play: float = 0.0
+    play_sigma: float = 0.1e-3
+    stamp: float = 0.0
+    stamp_sigma: float = 0.05
+
+    @property
+    def ahead_known(self) -> float:
+        """Standard deviation of how far ahead the tip is, before the sweep [m]."""
+        return self.tip_sigma if self.ahead_sigma is None else self.ahead_sigma
 
     @property
     def joint(self) -> WeldJoint | None:
@@ -104,7 +112,8 @@ class Belief:
         """Return how far a tip goes aside that climbs the wall on a side by one."""
         if self.joint is None:
             return 1.0
-        return math.tan(max(self.joint.left if side > 0 else self.joint.right, NEARLY_UPRIGHT))
+        # Nothing climbs a wall that leans by less than one degree.
+        return math.tan(max(self.joint.left if side > 0 else self.joint.right, math.radians(1.0)))
 
     def seating(self, settings: Following) -> float | None:
         """Return by how much the preload outweighs the deflection on a wall; below 1 it climbs.
@@ -142,7 +151,8 @@ class Belief:
         The arm is off when the tip passes a place and when the torch does: oppositely at worst, as
         one that waves along its way is with both half a wave apart.
         """
-        creep = CREEP * settings.deflection
+        # A finger creeps by 2 % of its deflection, one standard deviation.
+        creep = 0.02 * settings.deflection
         parts = (self.torch_sigma, 2.0 * settings.arm_sigma, settings.distortion, creep)
         return sum(part**2 for part in parts) + self._seat_variance(settings)
 
@@ -155,7 +165,8 @@ class Belief:
         if self.joint is None or not self.lean:
             return 0.0
         walls = settings.joint_sigma * self.joint.seat_slope(self.radius)
-        return float(2.0 * walls**2 + (BALL_SIGMA * self.beside / self.radius) ** 2)
+        # The radius of the tip's ball is known to 0.02 mm.
+        return float(2.0 * walls**2 + (0.02e-3 * self.beside / self.radius) ** 2)
 
     def _steepness(self, settings: Following) -> float:
         """Return the tangent of the pressed wall's angle from the plane's normal; 0 if unknown."""

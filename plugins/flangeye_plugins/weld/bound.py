@@ -16,14 +16,11 @@ import numpy as np
 
 from flangeye.errors import StageError
 from flangeye.types import Floats
-from flangeye_plugins.weld.belief import MINUTE, Belief
+from flangeye_plugins.weld.belief import Belief
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.probing import PIVOTED, SOFTER
 from flangeye_plugins.weld.settings import Following
 from flangeye_plugins.weld.weave import Weave
-
-SPACING = 2e-3
-"""The bound is predicted at places so far from each other [m]."""
 
 REMEDIES = {
     "fixed": ("torch_sigma, arm_sigma and distortion", "calibrate the tool, or 'look' behind it"),
@@ -63,7 +60,7 @@ class Predicted(NamedTuple):
 
 def predicted(plan: Path, belief: Belief, settings: Following) -> Predicted:
     """Return the torch's variances along the plan."""
-    s = np.arange(0.0, plan.length + SPACING / 2, SPACING)
+    s = np.arange(0.0, plan.length + 1e-3, 2e-3)  # every 2 mm
     lets_go = (
         plan.length - settings.ending - settings.speed * settings.deflection / settings.release
     )
@@ -71,11 +68,11 @@ def predicted(plan: Path, belief: Belief, settings: Following) -> Predicted:
     free, _ = _stances(plan, s, belief.distance, 0.0)
     least = np.minimum(np.abs(sine), np.abs(free))
     sine = np.where(s + belief.distance < lets_go, sine, least)
-    minutes = (s + belief.distance) / settings.speed / MINUTE
+    minutes = (s + belief.distance) / settings.speed / 60.0
     weave = Weave(settings.weave_width, settings.weave_frequency)
     # Between two walls the sweep at the start tells how far ahead the tip is.
     softer = settings.probing and belief.two_walls
-    ahead = min(belief.tip_sigma, PIVOTED if softer else math.inf)
+    ahead = min(belief.ahead_known, PIVOTED if softer else math.inf)
     press = settings.deflection / (SOFTER if softer else 1.0)
     drift = settings.gain_drift * minutes * press
     return Predicted(

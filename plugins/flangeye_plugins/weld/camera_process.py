@@ -37,9 +37,6 @@ from flangeye_plugins.weld.finger_camera import (
 OPENING = 30.0
 """Longest time for a camera to open, the start of its process included [s]."""
 
-POLLING = 2e-3
-"""Between two looks for a new image [s]."""
-
 TORCH = "torch"
 """What the process is asked for where the torch was."""
 
@@ -156,7 +153,8 @@ class CameraProcess:
                     self._error = answer
                     return
                 if answer is None:
-                    self._ending.wait(POLLING)
+                    # Every 2 ms, a fraction of the time between two images.
+                    self._ending.wait(2e-3)
                 elif isinstance(answer, WeldProfile):
                     self._looks.put(answer)
                 else:

@@ -16,6 +16,7 @@ from flangeye_plugins.weld.body import LeaningTool
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.reachability import flange_speed
 from flangeye_plugins.weld.settings import Following, Mode
+from flangeye_plugins.weld.steering import Steering
 from flangeye_plugins.weld.touch.tag_observation import TagDetector
 from flangeye_plugins.weld.weave import Weave
 
@@ -28,9 +29,6 @@ SLOPE = np.deg2rad(10.0)
 CROOKED = np.deg2rad(60.0)
 """Largest angle between the tool and the seam at the torch: beyond, it would be pushed."""
 
-
-SWINGING = 0.8
-"""Share of the turn rate that a weave may use; the rest follows the seam."""
 
 SEATING = 1.4
 """The preload holds the tip in the groove by so much more than the deflection pushes it out."""
@@ -133,12 +131,12 @@ def check_weave(distance: float, settings: Following) -> None:
         StageError: How fast, and what would do.
     """
     weave = Weave(settings.weave_width, settings.weave_frequency)
-    asked, allowed = weave.fastest / distance, SWINGING * settings.turn_rate
+    asked, allowed = weave.fastest / distance, Steering.usual * settings.turn_rate
     if asked > allowed:
         raise StageError(
             f"weld.tactile: a weave of {weave.width * 1e3:.3g} mm at "
             f"{weave.frequency:.3g} Hz turns the tool at {np.degrees(asked):.0f} deg/s, "
-            f"{SWINGING:.0%} of turn_rate are {np.degrees(allowed):.0f} deg/s; lower "
+            f"{Steering.usual:.0%} of turn_rate are {np.degrees(allowed):.0f} deg/s; lower "
             f"'weave_frequency' to {weave.frequency * allowed / asked:.2f}, or raise "
             "'turn_rate'"
         )

@@ -17,14 +17,19 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterator
+from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
 
 from flangeye.types import Floats
 
-SEATED, PRESSED, OTHER, FREE = range(4)
-"""The modes: up the wall on the pressed side, on the other one."""
+
+class Mode(IntEnum):
+    """How the tip touches: between the walls, up the pressed one, up the other, or not at all."""
+
+    SEATED, PRESSED, OTHER, FREE = range(4)
+
 
 RISE = 0.5e-3
 """Scale of how far a tip that climbs has risen [m]."""
@@ -32,26 +37,14 @@ RISE = 0.5e-3
 LIFTS = 1.0e-3
 """Scale of the heights of tack welds, and of how far the seam bends off the plan [m]."""
 
-TACKS, BENDS = 0.1, 0.02
-"""Share of a seam that tack welds lift the tip on, and where it bends as the plan does not."""
-
 STRIDE = 10e-3
 """Way over which modes and heights change [m]."""
-
-UP = 1e-3
-"""Way over which a tip climbs that is pressed aside by more than it stands [m]."""
-
-NEW_SHARE = 0.5
-"""Measurements that follow each other see the same error of what is expected: one in two is new."""
 
 STRAINED = 0.9
 """Share of what the tip is known to stand from which it may climb."""
 
 RARE = 1e-3
 """Share of a stride's tips that climb though pressed by little, or lose their wall."""
-
-SETTLING = 0.1
-"""Time constant of the filter on deflection and compression [s]."""
 
 
 class Felt(NamedTuple):
@@ -135,7 +128,7 @@ class Contact:
     @property
     def free(self) -> float:
         """How likely it is that no wall holds the tip."""
-        return float(self.likely[FREE])
+        return float(self.likely[Mode.FREE])
 
     @property
     def strained(self) -> float:
@@ -145,20 +138,22 @@ class Contact:
 
     def take(self, felt: Felt, side: float) -> None:
         """Weigh the modes by a measurement; ``side`` is pressed, 1 for the left."""
-        kept = math.exp(-(felt.time - self._time) / SETTLING)
+        # Deflection and compression are filtered over 0.1 s.
+        kept = math.exp(-(felt.time - self._time) / 0.1)
         self.deflection += (1.0 - kept) * (felt.deflection - self.deflection)
         self.compression += (1.0 - kept) * (felt.compression - self.compression)
         way, self._time, self.at = abs(felt.s - self.at), felt.time, felt.s
         if self._spread == math.inf:
             way, self._height, self._spread = 0.0, felt.height, self.noise[1] ** 2
-        share, soon = (1.0 - math.exp(-(way + 1e-4) / over) for over in (STRIDE, UP))
+        # A tip that is pressed aside by more than it stands climbs within 1 mm.
+        share, soon = (1.0 - math.exp(-(way + 1e-4) / over) for over in (STRIDE, 1e-3))
         self._spread += share * LIFTS**2 / 100.0
         moves = self._moves(share, soon)
         chances, climbed = self._chances(felt, side)
         weighed = (self.likely @ moves) * chances
         self.likely = weighed / weighed.sum()
         self._newest.append(_Weighed(felt, self.likely, moves, chances, climbed))
-        gain = float(self.likely[SEATED]) * self._spread / (self._spread + self.noise[1] ** 2)
+        gain = float(self.likely[Mode.SEATED]) * self._spread / (self._spread + self.noise[1] ** 2)
         self._height += gain * (felt.height - self._height)
         self._spread *= 1.0 - gain
 
@@ -176,24 +171,25 @@ class Contact:
             since /= since.sum()
         while self._newest and self._newest[0].felt.time <= until:
             weighed, likely = self._newest.popleft(), off.pop()
-            if likely[FREE] < 0.5:
-                climbs = float(likely[PRESSED] + likely[OTHER])
+            if likely[Mode.FREE] < 0.5:
+                climbs = float(likely[Mode.PRESSED] + likely[Mode.OTHER])
                 yield weighed.felt, climbs * (self._flat * weighed.climbed) ** 2
 
     def _moves(self, share: float, soon: float) -> Floats:
-        """Return how likely each mode becomes each (4, 4), over shares of STRIDE and of UP."""
+        """Return how likely each mode becomes each (4, 4), over shares of STRIDE and of 1 mm."""
         climbing = share * RARE + soon * min(max(self.strained - STRAINED, 0.0) ** 2, 0.9)
         moves = np.diag([1.0, 1.0 - share, 1.0 - share, 1.0 - share])
-        moves[:, SEATED] += [0.0, share, share, share]
-        moves[SEATED, PRESSED if self.deflection > 0.0 else OTHER] = climbing
-        moves[SEATED, FREE] = share * RARE * 10.0
-        moves[SEATED, SEATED] -= climbing + share * RARE * 10.0
+        moves[:, Mode.SEATED] += [0.0, share, share, share]
+        moves[Mode.SEATED, Mode.PRESSED if self.deflection > 0.0 else Mode.OTHER] = climbing
+        moves[Mode.SEATED, Mode.FREE] = share * RARE * 10.0
+        moves[Mode.SEATED, Mode.SEATED] -= climbing + share * RARE * 10.0
         return moves
 
     def _chances(self, felt: Felt, side: float) -> tuple[Floats, float]:
         """Return the densities (4,) of a measurement in each mode, and how far it has climbed."""
         up, tall = felt.height - self._height, self._spread + self.noise[1] ** 2
-        seated = _mostly(up, tall, TACKS) * _mostly(felt.aside, felt.spread, BENDS)
+        # Tack welds lift the tip on a tenth of a seam; on 2 % it bends as the plan does not.
+        seated = _mostly(up, tall, 0.1) * _mostly(felt.aside, felt.spread, 0.02)
         walls = [
             _up_a_wall(s * side * felt.aside, up, felt.spread, tall, self._flat) for s in (1, -1)
         ]
@@ -201,7 +197,8 @@ class Contact:
         free = 0.5 * sum(drags) * _normal(up, tall + LIFTS**2)
         climbed = walls[0][1] if felt.deflection > 0.0 else walls[1][1]
         chances = np.array([seated, walls[0][0], walls[1][0], free]) + 1e-12
-        return chances**NEW_SHARE, max(climbed, RISE)
+        # Neighbours see the same error of what is expected: one measurement in two is new.
+        return chances**0.5, max(climbed, RISE)
 
 
 def _mostly(off: float, variance: float, seldom: float) -> float:

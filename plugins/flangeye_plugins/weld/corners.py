@@ -20,16 +20,8 @@ import numpy as np
 from flangeye.errors import StageError
 from flangeye.types import Floats, Seam
 from flangeye_plugins.weld.frame import WorkPlane
+from flangeye_plugins.weld.path import CHORD
 from flangeye_plugins.weld.settings import WeldTactileParams
-
-SHARP = np.radians(35.0)
-"""A plan that turns by more within twice :data:`CHORD` has a corner."""
-
-CHORD = 5e-3
-"""Length of the chords to both sides of a corner [m]."""
-
-ARC = 40
-"""Points on the arc that rounds a corner."""
 
 
 class Corner(NamedTuple):
@@ -52,7 +44,8 @@ def corners_of(points: Floats) -> list[Corner]:
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(planar, axis=0), axis=1))])
     turns = np.array([_turn(planar, along, s) for s in along])
     found: list[Corner] = []
-    for index in np.flatnonzero(np.abs(turns) > SHARP).tolist():
+    # A plan that turns by more than 35 degrees within two chords has a corner.
+    for index in np.flatnonzero(np.abs(turns) > np.radians(35.0)).tolist():
         corner = Corner(index, float(along[index]), float(turns[index]))
         if found and corner.along - found[-1].along < 2 * CHORD:
             found[-1] = max(found[-1], corner, key=lambda each: abs(each.turn))
@@ -148,10 +141,10 @@ def _arc(
     A rational quadratic curve of this weight is a circle's (Piegl and Tiller 1997, 7.3).
     """
     first, corner, last = _at(here + cut * np.array([-1.0, 0.0, 1.0]), along, points)
-    t = np.linspace(0.0, 1.0, ARC)[:, None]
+    t = np.linspace(0.0, 1.0, 40)[:, None]
     weights = np.hstack([(1 - t) ** 2, 2 * t * (1 - t) * np.cos(turn / 2.0), t**2])
     arc = weights @ np.stack([first, corner, last]) / weights.sum(axis=1, keepdims=True)
-    return here + cut * np.linspace(-1.0, 1.0, ARC), arc
+    return here + cut * np.linspace(-1.0, 1.0, 40), arc
 
 
 def _at(at: Floats, along: Floats, rows: Floats) -> Floats:

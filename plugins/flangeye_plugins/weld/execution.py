@@ -22,9 +22,6 @@ from flangeye_plugins.weld.frame import Tool
 from flangeye_plugins.weld.touch.tip_displacement import TipDisplacement
 from flangeye_plugins.weld.weld_log import Cycle, WeldLog
 
-SWITCH = 0.2e-3
-"""Longest time for which another thread keeps the interpreter while the loop wants it [s]."""
-
 
 @dataclass(frozen=True, eq=False)
 class WeldCell:
@@ -131,7 +128,7 @@ def _undisturbed() -> Iterator[None]:
     enabled, interval = gc.isenabled(), sys.getswitchinterval()
     gc.collect()
     gc.disable()
-    sys.setswitchinterval(SWITCH)
+    sys.setswitchinterval(0.2e-3)  # a tenth of a cycle at 500 Hz
     try:
         yield
     finally:

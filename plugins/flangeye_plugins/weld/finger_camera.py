@@ -20,9 +20,6 @@ from flangeye_plugins.weld.touch.region_of_interest import ImageRegion, RegionOf
 from flangeye_plugins.weld.touch.tag_observation import TagDetector, TagReading
 from flangeye_plugins.weld.touch.tip_displacement import Interpreter, TipDisplacement
 
-CONFIDENT = 0.3
-"""Readings below this confidence are not used."""
-
 
 class TagObservation(NamedTuple):
     """One image, and what was felt in it.
@@ -66,7 +63,8 @@ class FingerReader:
     def _observation(
         self, piece: ImageRegion, time_ns: int, reading: TagReading | None
     ) -> TagObservation:
-        if reading is None or reading.confidence < CONFIDENT:
+        # Corners that are off by more than 0.7 px are those of no square.
+        if reading is None or reading.confidence < 0.3:
             return TagObservation(time_ns, piece, None)
         return TagObservation(time_ns, piece, self._interpreter.feel(reading, time_ns))
 

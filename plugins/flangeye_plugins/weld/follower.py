@@ -12,9 +12,9 @@ from flangeye.devices import WeldProfile
 from flangeye.motion.arc import OFF
 from flangeye.motion.seam_following import STILL, Command, Phase, ToolPose, Touch, turned
 from flangeye.types import Floats
-from flangeye_plugins.weld.belief import BAND, MINUTE, Belief
+from flangeye_plugins.weld.belief import BAND, Belief
 from flangeye_plugins.weld.bias import Bias, Trail
-from flangeye_plugins.weld.contact import STRAINED, Contact, Felt
+from flangeye_plugins.weld.contact import STRAINED, STRIDE, Contact, Felt
 from flangeye_plugins.weld.motion import SeamReading, Track
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.probing import SOFTER, SWEEP_MARGIN, Learned, Probing
@@ -26,14 +26,8 @@ from flangeye_plugins.weld.steering import SLOWEST, Steering
 from flangeye_plugins.weld.striking import Striking
 from flangeye_plugins.weld.weave import Sway, Weave
 
-BELIEF = 0.3
-"""A sample is believed when contact has not been doubted for so long after it [s]."""
-
 SETTLING = 8e-3
 """Way in which an error of the torch is taken back at speed [m]."""
-
-SEATS = 20
-"""Last measurements of the sweep that the path begins with."""
 
 SHORT = 0.01
 """A weld is done where no larger share of the planned seam was left out."""
@@ -41,39 +35,14 @@ SHORT = 0.01
 STEADY = 0.03e-3
 """A finger that scatters less is followed from one measurement to the next [m]."""
 
-LOST, REGAINED = 0.9, 0.1
-"""A wall is lost where the tip is as likely free, and held again where it no longer is."""
-
-TRIED = 10e-3
-"""So far along the seam a lost wall is sought on one side, then on the other [m]."""
-
-FIRM = 0.7
-"""Share of the wanted deflection below which the tip slows down."""
+LOST = 0.9
+"""A wall is lost where the tip is as likely free, and held again where it is as likely not."""
 
 WAITING = 0.2
 """Share of its speed that it keeps all the same: a wall that has ended is found out by going on."""
 
 COMPARED = 15
 """Measurements that tell whether the seam has moved since the weld was stopped."""
-
-MOVED = 0.2e-3
-"""A seam that has moved by more is another one [m]."""
-
-SWERVE = 0.3e-3
-"""So far the arm may swerve from a curve while it does not know of it [m]."""
-
-CENTRE = 0.7
-"""Share of a curve's radius by which the arm may be off towards its centre: there all places of the
-curve are equally near."""
-
-SWERVE_AHEAD = 10e-3
-"""So far before a curve the tip slows down [m]."""
-
-PATIENT = 4.0
-"""Before the arc burns a tag is waited for so many times longer: the arm stands."""
-
-LATE_SHARE = 0.05
-"""Weight of one image in the mean of their delays."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,8 +106,7 @@ class Follower:
         self.phase: Phase = "seeking" if touch else "following"
         self.reason = ""
         self.tip, self.torch = settings.set_down, settings.set_down - belief.distance
-        self._coming = self.torch
-        self.wanted = 0.0
+        self._coming, self.wanted = self.torch, 0.0
         self._margin = belief.distance + settings.ending + (settings.ends or 0.0)
         self.refined = RefinedPath(plan, self._margin, settings.wander)
         self._before = before
@@ -153,11 +121,12 @@ class Follower:
         self._plan, self._settings, self._touching = plan, settings, touch
         gain = max(settings.cross_track_gain, settings.speed / SETTLING)
         self._steering = Steering(belief.distance, gain, settings.turn_rate)
-        self._belief, self.learned = belief, Learned()
+        self._belief = belief
+        self.learned = Learned(ahead=belief.ahead, ahead_sigma=belief.ahead_known)
         self.bias, self._trail, self._striking = (
             _bias_of(belief, settings), Trail(), Striking(belief.arc)
         )  # fmt: skip
-        self.sigma = self.bound = self.band = 0.0
+        self.sigma = self.bound = self.band = self._elapsed = self._began = 0.0
         self.aim = self._offset = settings.offset_across
         self._weave = Weave(settings.weave_width, settings.weave_frequency)
         self._swings: float | None = None
@@ -173,7 +142,6 @@ class Follower:
         self._level = np.array(belief.level_R_tool)
         self._response = Response()
         self._backed: list[tuple[float, float, float, float]] | None = None
-        self._elapsed = self._began = 0.0
         self._swept: list[tuple[ToolPose, Touch]] = []
         self._sat: list[tuple[float, float, float, float]] = []
 
@@ -345,7 +313,7 @@ class Follower:
             angle: Of the tool [rad].
         """
         settings, learned = self._settings, self.learned
-        aged = settings.gain_drift * ((self._time or 0.0) - self._began) / MINUTE
+        aged = settings.gain_drift * ((self._time or 0.0) - self._began) / 60.0
         gain = (learned.gain_sigma + aged * (self.phase != "seeking")) * self._press
         fixed = self._unseen() + (self._belief.along_sigma * slant) ** 2
         # What the tip is off by is off for the torch too: all but what the tool has turned between.
@@ -385,7 +353,8 @@ class Follower:
             return
         self._seen, self._heard = touch.time, self._time or 0.0
         late = (self._time or 0.0) - touch.time + self.learned.stamp
-        self._latency += LATE_SHARE * (late - self._latency)
+        # A running mean over some twenty images.
+        self._latency += 0.05 * (late - self._latency)
         s, felt, deflection = self._located(pose, touch)
         if self.phase == "seeking":
             self._felt = felt
@@ -465,7 +434,8 @@ class Follower:
         elif self.contact.free < 0.5:
             self._felt = self._smoothed(felt)
             self._compare(s, felt.offset)
-        self._keep(time - BELIEF)
+        # A sample is believed when contact has not been doubted for 0.3 s after it.
+        self._keep(time - 0.3)
 
     def _keep(self, until: float) -> None:
         """Believe what was felt up to a time [s], short of where the seam may end."""
@@ -484,7 +454,8 @@ class Follower:
             return
         self._moved.append(offset - self.refined.offset(s))
         by = float(np.median(self._moved))
-        if len(self._moved) == COMPARED and abs(by) > MOVED:
+        # A seam that has moved by more than 0.2 mm is another one.
+        if len(self._moved) == COMPARED and abs(by) > 0.2e-3:
             self._stop(
                 f"the seam has moved by {abs(by) * 1e3:.2f} mm since the weld was stopped; weld "
                 "the rest as a seam of its own"
@@ -510,7 +481,7 @@ class Follower:
             self._turn_over()
         elif self.phase == "bridging" and self._regained:
             self.phase = "following"
-        elif self.phase == "bridging" and self.tip - self._tried > TRIED:
+        elif self.phase == "bridging" and self.tip - self._tried > STRIDE:
             self._turn_over()
         if self.torch >= self.ends and self.phase != "stopped":
             self._finish()
@@ -552,7 +523,8 @@ class Follower:
                 self._press = min(max(swept / SOFTER, found.least), settings.deflection)
         self.contact.noise = found.noise, float(self._search.sigma[2])
         self._backed = []
-        for pose, touch in self._swept[-SEATS:]:
+        # The path begins with the last measurements of the sweep.
+        for pose, touch in self._swept[-20:]:
             s, self._felt, self.wanted = self._located(self._true(pose), touch)
             self._backed.append((s, self._felt.offset, pose.angle, 0.0))
         self._take_backed()
@@ -583,7 +555,7 @@ class Follower:
     @property
     def _regained(self) -> bool:
         """Whether a wall holds the tip again: a free one seems to where the arm leads it there."""
-        return self.contact.free < REGAINED and self.contact.deflection > self._press / 2.0
+        return self.contact.free < 1.0 - LOST and self.contact.deflection > self._press / 2.0
 
     def _turn_over(self) -> None:
         """Press the other wall, where there is one."""
@@ -595,12 +567,14 @@ class Follower:
         """Stop where going on would be blind."""
         if self.phase in ("done", "stopped"):
             return
-        patience = settings.blind if self.lit is not None else PATIENT * settings.blind
+        # Before the arc burns the arm may stand for longer.
+        patience = settings.blind if self.lit is not None else 4.0 * settings.blind
         if self._touching and self.phase != "ending" and pose.time - self._seen > patience:
             self._stop(f"no tag was seen for {patience * 1e3:.0f} ms")
         elif self.phase == "bridging" and self.tip - self._bridge > settings.longest_gap:
             self._stop(f"no contact for {settings.longest_gap * 1e3:.0f} mm of the seam")
-        elif self.phase in ("following", "bridging") and self._aside(pose) > CENTRE:
+        # There, at 70 % of the radius, all places of a curve are nearly as near.
+        elif self.phase in ("following", "bridging") and self._aside(pose) > 0.7:
             self._stop(
                 f"the plan curves with a radius of {1e3 / abs(self._plan.bend(self.tip)):.1f} mm "
                 "and the arm is off towards its centre: how far along it the tip is cannot be "
@@ -662,7 +636,7 @@ class Follower:
             # Friction holds the tip back: where it was felt counts. The arm stays on the seam as
             # well: a tip that slips comes to where it is.
             gone = self.tip <= self._inside - 2.0 * INSIDE / 3.0
-            if self.contact.at <= self._inside or gone or self.contact.free > REGAINED:
+            if self.contact.at <= self._inside or gone or self.contact.free > 1.0 - LOST:
                 self._take_backed()
             return
         self.tip = advance(coming.position[:2], self.tip, reach)
@@ -696,11 +670,13 @@ class Follower:
         During the delay of images and arm together it goes on straight where the seam curves.
         """
         delay = self._latency + self._response.delay
-        ahead = self.tip + SWERVE_AHEAD
+        # The tip slows down 10 mm before a curve.
+        ahead = self.tip + 10e-3
         sharpest = self._plan.sharpest(self.torch, ahead)
         if delay <= 0.0 or sharpest <= 0.0:
             return math.inf
-        return max(math.sqrt(2.0 * SWERVE / sharpest) / delay, SLOWEST * self._settings.speed)
+        # The arm may swerve from it by 0.3 mm, s = v^2 t^2 k / 2.
+        return max(math.sqrt(2.0 * 0.3e-3 / sharpest) / delay, SLOWEST * self._settings.speed)
 
     def _backwards(self) -> float:
         """Return the speed at which the tip goes back: it ends before it can leave the seam."""
@@ -716,7 +692,8 @@ class Follower:
             return WAITING
         if self.phase not in ("following", "ending") or not self._touching:
             return 1.0
-        firm = self.contact.deflection / (FIRM * max(self.wanted, self._settings.probe))
+        # The tip slows down below 70 % of the wanted deflection.
+        firm = self.contact.deflection / (0.7 * max(self.wanted, self._settings.probe))
         held = (STRAINED - self.contact.strained) / 0.4
         firm = held if self.phase == "ending" else min(firm, held)
         return min(max(firm, WAITING), 1.0)

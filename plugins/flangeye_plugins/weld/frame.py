@@ -12,12 +12,6 @@ from flangeye.motion.seam_following import Command, ToolPose
 from flangeye.types import BASE, FLANGE, Floats, Transform
 from flangeye_plugins.weld.body import LeaningTool, body_from
 
-UPRIGHT_GAIN = 1.0
-"""How fast the tool is brought back to the plane's normal [1/s]."""
-
-CLOSED = 1e-3
-"""A seam whose ends are nearer to each other goes once around [m]."""
-
 
 class WorkPlane:
     """A frame on the work: x along the seam as a whole, z out of the work.
@@ -31,7 +25,8 @@ class WorkPlane:
         z = openings.mean(axis=0)
         z /= np.linalg.norm(z)
         along = points[-1] - points[0]
-        if np.linalg.norm(along) < CLOSED:
+        # Ends nearer than 1 mm to each other: the seam goes once around.
+        if np.linalg.norm(along) < 1e-3:
             along = points[1] - points[0]
         x = along - (along @ z) * z
         x /= np.linalg.norm(x)
@@ -96,7 +91,8 @@ class Tool:
         """Return the flange's twist (6,), along the base's axes, that carries out a command."""
         plane, rotation = self._plane.rotation, base_T_flange.rotation
         normal, up = plane[:, 2], rotation @ self._flange_R_level[:, 2]
-        angular = command.turn * normal + UPRIGHT_GAIN * _cross(up, normal)
+        # The tool is brought back to the plane's normal within a second.
+        angular = command.turn * normal + _cross(up, normal)
         linear = plane @ command.velocity - _cross(angular, rotation @ self._tip)
         return np.concatenate([linear, angular])
 

@@ -21,14 +21,11 @@ from flangeye.motion.seam_following import STILL, Command, Phase, ToolPose, Touc
 from flangeye.types import Floats
 from flangeye_plugins.weld.belief import BAND, Belief
 from flangeye_plugins.weld.follower import Follower, ResumePoint, within
-from flangeye_plugins.weld.path import Path, Place
+from flangeye_plugins.weld.path import PATH_SPACING, Path, Place
 from flangeye_plugins.weld.response import Response
 from flangeye_plugins.weld.settings import Following, PassParams
 from flangeye_plugins.weld.striking import Striking
 from flangeye_plugins.weld.weave import Sway, Weave
-
-PASS_SPACING = 0.5e-3
-"""Spacing of the path that the later passes follow [m]."""
 
 GAIN = 2.0
 """How fast a pass takes back an error of place or heading [1/s]."""
@@ -38,9 +35,6 @@ OVER = 15e-3
 
 THERE = 0.1e-3
 """A place is reached when the tool is as near to it [m]."""
-
-TURNED = math.radians(0.2)
-"""And turned to it as well [rad]."""
 
 
 class Traced:
@@ -60,12 +54,12 @@ class Traced:
     def note(self, height: float) -> None:
         """Remember a cycle of the root pass, in which the end point was so high [m]."""
         root = self._root
-        if not self.rows or root.torch >= self.rows[-1][0] + PASS_SPACING:
+        if not self.rows or root.torch >= self.rows[-1][0] + PATH_SPACING:
             self.rows.append((root.torch, height, root.sigma))
 
     def path(self, chosen: PassParams) -> Path:
         """Return the torch's path of a pass; its height is that of the tool's end point."""
-        s = np.arange(max(chosen.along, 0.0), self._plan.length + PASS_SPACING / 2, PASS_SPACING)
+        s = np.arange(max(chosen.along, 0.0), self._plan.length + PATH_SPACING / 2, PATH_SPACING)
         frames = [self._root.refined.frame(x) for x in s.tolist()]
         planar = np.array([point + chosen.across * normal for point, normal in frames])
         self._along, height, self._sigma = np.array(self.rows).T
@@ -195,7 +189,7 @@ class Passes:
         # The torch is to be there, the tool along the path.
         aside = start.point + self._belief.distance * start.tangent - pose.position[:2]
         turn = _nearest(_heading(start) - pose.angle)
-        there = float(np.hypot(*aside)) < THERE and abs(turn) < TURNED
+        there = float(np.hypot(*aside)) < THERE and abs(turn) < math.radians(0.2)
         goal = start.height if there else self._over
         up = goal - float(pose.position[2])
         if there and abs(up) < THERE:
@@ -246,10 +240,10 @@ class Passes:
     def _bend(self) -> float:
         """Return the path's curvature at the torch [1/m], to the left positive."""
         before, after = (
-            self._path.at(self.torch - PASS_SPACING),
-            self._path.at(self.torch + PASS_SPACING),
+            self._path.at(self.torch - PATH_SPACING),
+            self._path.at(self.torch + PATH_SPACING),
         )
-        return _nearest(_heading(after) - _heading(before)) / (2 * PASS_SPACING)
+        return _nearest(_heading(after) - _heading(before)) / (2 * PATH_SPACING)
 
     def _estimate(self, error: float) -> None:
         """State how far the torch may be from where it is to be, and stop where that is too far."""

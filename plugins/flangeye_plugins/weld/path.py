@@ -13,7 +13,7 @@ PATH_SPACING = 0.5e-3
 """Spacing to which a path is resampled [m]; at a radius of 50 mm the chord misses it by 0.6 um."""
 
 CHORD = 5e-3
-"""Length over which a path's curvature is taken [m]."""
+"""Length over which a path's direction and curvature are taken [m]."""
 
 
 class Place(NamedTuple):

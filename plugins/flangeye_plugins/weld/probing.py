@@ -31,20 +31,8 @@ SOFTER = 3.0
 """The weld presses between two walls by so much less than the tip was seen to stand: friction of
 0.3 holds a tip on a wall of 45 degrees at 3.4 times what lets it slide down again."""
 
-SLOWEST, BEAT = 0.2, 0.8
-"""The sweep's speed swings between this share of it and all of it, with this period [s]."""
-
-USUAL_STAMP, USUAL_WIDTH = 0.05, 0.1e-3
-"""Standard deviations of what is expected of timestamps [s] and of play [m]: priors."""
-
-STAMPS = np.arange(-0.06, 0.121, 0.01)
-"""Errors of the timestamps among which the sweep's is sought [s]."""
-
 REVERSALS = (0.02e-3, 0.05e-3, 0.1e-3, 0.15e-3, 0.2e-3, 0.25e-3, 0.3e-3, 0.4e-3, 0.6e-3, 1e-3)
 """Half widths of play or hysteresis among which the finger's is sought [m]."""
-
-WOBBLE = 0.2e-3
-"""So much the deflection changes back and forth while the tip is pressed to one side [m]."""
 
 PIVOTS = 0.1
 """The tool is turned about the tip to either side by this [rad]."""
@@ -52,26 +40,7 @@ PIVOTS = 0.1
 PIVOTED = 0.02e-3
 """So well the sweep tells how far ahead the tip is, at best [m]."""
 
-CLIMBED, BENT = 0.05e-3, 0.1
-"""A seated tip rises by less when it is pressed [m], and shows less by no larger share."""
-
-LARGEST_GAIN = 0.35
-"""A gain that is off by more is no drift but another finger, or a tip that climbs."""
-
-UNEXPLAINED, PLAYS = 0.04e-3, 0.3
-"""Gain, play and delay leave less than this of a seated tip unexplained beyond the noise [m], and
-this share of its play."""
-
-FEWEST_SWEPT = 15
-"""Samples of a sweep without which it says nothing."""
-
-RESTS = 0.4
-"""No sooner the tip has come to rest where it met the wall [s]."""
-
-STANDING, STANDS = 0.2, 0.02e-3
-"""An arm stands that for so long [s] was nowhere farther aside than this [m]."""
-
-TOLD, LONGEST = 0.03e-3, 4.0
+LONGEST = 4.0
 """So well the mean of what is felt at the hard end is to be known [m]; no longer is awaited [s]."""
 
 
@@ -93,6 +62,8 @@ class Learned:
         swept: Largest deflection at which the tip stayed in its seat [m].
         ahead: The tip is ahead of where its file has it by this [m].
         ahead_sigma: Its standard deviation, as far as the sweep tells it [m].
+        width_sigma: Standard deviation of the width [m].
+        stamp_sigma: Standard deviation of the stamp [s].
     """
 
     gain: float = 0.0
@@ -108,11 +79,14 @@ class Learned:
     swept: float = math.inf
     ahead: float = 0.0
     ahead_sigma: float = math.inf
+    width_sigma: float = 0.1e-3
+    stamp_sigma: float = 0.05
 
     @property
     def kept(self) -> float:
         """How likely play stays where the wall presses it; what wobbles by more goes through it."""
-        return self.reversal / (self.reversal + WOBBLE)
+        # Pressed to one side, the deflection still changes by 0.2 mm back and forth.
+        return self.reversal / (self.reversal + 0.2e-3)
 
     @property
     def systematic(self) -> float:
@@ -144,7 +118,7 @@ class Probing:
 
     def __init__(self, settings: Following, belief: Belief, side: float) -> None:
         self._rate, self._turn_rate = min(settings.lateral_speed, 4e-3), settings.turn_rate / 3.0
-        self._tip_sigma = belief.tip_sigma
+        self._belief = belief
         self._two_walls, self._settings = belief.two_walls, settings
         self._side, self._noise = side, belief.noise
         self._turned = 0.0
@@ -174,7 +148,7 @@ class Probing:
             self._wanted = self._rested()
             return 0.0, 0.0
         # At one speed a delay would look like play: both then shift the tag by the same.
-        rate = self._rate * (SLOWEST + (1.0 - SLOWEST) * math.sin(math.pi * self._time / BEAT) ** 2)
+        rate = self._rate * (0.2 + 0.8 * math.sin(math.pi * self._time / 0.8) ** 2)
         step = float(np.clip(goal - self._wanted, -rate * elapsed, rate * elapsed))
         most = self._turn_rate * elapsed
         turned = float(np.clip(turn - self._turned, -most, most))
@@ -195,7 +169,8 @@ class Probing:
         felt = [-self._side * across for time, across, *_ in self._felt if time >= since]
         rested = felt[len(felt) // 2 :]
         told = bool(rested) and len(rested) >= self._enough
-        if self._time < RESTS or (not told and self._time < LONGEST):
+        # No sooner the tip has come to rest where it met the wall.
+        if self._time < 0.4 or (not told and self._time < LONGEST):
             return None
         return float(np.mean(rested)) if rested else self._reach / SOFTER
 
@@ -207,10 +182,11 @@ class Probing:
         now, _, here, _ = self._cycles[-1] if self._cycles else (0.0, 0.0, 0.0, 0.0)
         since = math.inf
         for time, _, lateral, _ in reversed(self._cycles):
-            if abs(lateral - here) > STANDS:
+            # An arm stands that for 0.2 s was nowhere farther aside than 0.02 mm.
+            if abs(lateral - here) > 0.02e-3:
                 break
             since = time
-        return since if now - since >= STANDING else math.inf
+        return since if now - since >= 0.2 else math.inf
 
     def _settled(self) -> bool:
         """Return whether enough was felt at the highest pressing force."""
@@ -220,7 +196,8 @@ class Probing:
     @property
     def _enough(self) -> float:
         """Measurements whose mean is known as well as it has to be."""
-        return (self._noise[0] / TOLD) ** 2
+        # The mean at the hard end is to be known to 0.03 mm.
+        return (self._noise[0] / 0.03e-3) ** 2
 
     def note(self, time: float, told: float, lateral: float, slant: float = 0.0) -> None:
         """Record a cycle.
@@ -239,7 +216,7 @@ class Probing:
 
     def learned(self) -> Learned | str | None:
         """Return what was found, or why the weld must not begin; None: it is swept again."""
-        if len(self._felt) < FEWEST_SWEPT:
+        if len(self._felt) < 15:  # four unknowns, and as many again for what is unexplained
             return "the tag was seen too seldom while the finger was probed"
         felt, cycles = np.array(self._felt), np.array(self._cycles)
         found, climbs = self._fit(felt, cycles)
@@ -260,13 +237,17 @@ class Probing:
     def _fit(self, felt: Floats, cycles: Floats) -> tuple[Learned, str]:
         """Return what explains the sweep, and whether the tip climbs."""
         noise = max(_scatter(felt[:, 1]), self._noise[0])
-        stamps, widths = (grid.ravel() for grid in np.meshgrid(STAMPS, REVERSALS, indexing="ij"))
+        late = np.arange(-0.06, 0.121, 0.01)  # timestamps, by up to 120 ms, or early by up to 60
+        stamps, widths = (grid.ravel() for grid in np.meshgrid(late, REVERSALS, indexing="ij"))
         at, slant = (
             np.interp(felt[:, 0] - stamps[:, None], cycles[:, 0], cycles[:, i]) for i in (2, 3)
         )
         rms, solutions = _explained(at, slant, widths, felt[:, 1])
-        unlikely = len(felt) * (rms / noise) ** 2 + (stamps / USUAL_STAMP) ** 2
-        best = int(np.argmin(unlikely + (solutions[:, 2] / USUAL_WIDTH) ** 2))
+        belief = self._belief
+        unlikely = len(felt) * (rms / noise) ** 2
+        unlikely += ((stamps - belief.stamp) / belief.stamp_sigma) ** 2
+        unlikely += ((solutions[:, 2] + belief.play) / belief.play_sigma) ** 2
+        best = int(np.argmin(unlikely))
         _, across, play, ahead = solutions[best].tolist()
         slid = felt[:, 3] - felt[:, 3].mean()
         middle = at[best] - at[best].mean()
@@ -276,16 +257,25 @@ class Probing:
         gain = across * (1.0 + askew**2) - 1.0
         left = max(float(rms[best]), noise)
         bend, sigma, told = self._bent(felt, at[best], slant[best], float(widths[best]), left)
-        known = self._tip_sigma**2 / (self._tip_sigma**2 + told**2)
+        known = belief.ahead_known**2 / (belief.ahead_known**2 + told**2)
         # Walls that stand askew may be curved too: the correction is as uncertain as it is large.
         sigma = math.hypot(sigma, askew**2)
         dead, lag = identify(cycles[:, :3])
         found = Learned(
             gain, sigma, -play, float(widths[best]), float(stamps[best]), dead, lag,
             math.sqrt(max(float(rms[best]) ** 2 - noise**2, 0.0)), askew, noise, self._reach,
-            known * ahead / across, math.sqrt(known) * told,
+            belief.ahead + known * ahead / across, math.sqrt(known) * told,
+            *_spread(unlikely, stamps, solutions[:, 2], best),
         )  # fmt: skip
-        left = UNEXPLAINED + noise + PLAYS * abs(play)
+        # Play follows the model to 30 %, all else to 0.04 mm.
+        beyond = 4.0 * math.hypot(belief.ahead_known, told)
+        if belief.ahead_sigma is not None and abs(ahead / across) > beyond:
+            return found, (
+                f"the tip is {ahead / across * 1e3:+.2f} mm ahead of where earlier welds found it, "
+                f"{beyond * 1e3:.2f} mm are allowed: it was bent or changed; delete the file that "
+                "'prior' names"
+            )
+        left = 0.04e-3 + noise + 0.3 * abs(play)
         if found.unexplained > left:
             return found, (
                 f"the finger's displacement is not understood: {found.unexplained * 1e3:.2f} mm "
@@ -309,9 +299,10 @@ class Probing:
 
     def _climbs(self, felt: Floats, at: Floats, gain: float, bend: tuple[float, float]) -> str:
         """Say that the tip rises where it is pressed hard, or shows less there; else nothing."""
-        if abs(gain) > LARGEST_GAIN:
+        # A gain off by more is no drift but another finger, or a tip that climbs.
+        if abs(gain) > 0.35:
             return f"the finger's gain is off by {gain:.0%}, or the tip climbs the wall"
-        if bend[0] > BENT + 3.0 * bend[1]:
+        if bend[0] > 0.1 + 3.0 * bend[1]:
             return f"the tip climbs the wall: pressed hard the finger shows {bend[0]:.0%} less"
         from_wall = self._side * at
         middle = from_wall.min()
@@ -324,7 +315,8 @@ class Probing:
         rise = float(hard.mean() - soft.mean())
         scatter = max(_scatter(felt[:, 2]), self._noise[1])
         sigma = scatter * float(np.sqrt(1 / len(hard) + 1 / len(soft)))
-        if rise <= CLIMBED + 3.0 * sigma:
+        # A seated tip rises by less than 0.05 mm.
+        if rise <= 0.05e-3 + 3.0 * sigma:
             return ""
         return f"the tip climbs the wall by {rise * 1e3:.2f} mm when it is pressed aside"
 
@@ -349,6 +341,17 @@ def _explained(at: Floats, slant: Floats, widths: Floats, felt: Floats) -> tuple
     solutions = np.einsum("cij,cnj,n->ci", np.linalg.pinv(gram, hermitian=True), rows, felt)
     left = felt - np.einsum("cni,ci->cn", rows, solutions)
     return np.sqrt(np.mean(left**2, axis=1)), np.asarray(solutions)
+
+
+def _spread(unlikely: Floats, stamps: Floats, plays: Floats, best: int) -> tuple[float, float]:
+    """Return the standard deviations of play [m] and stamp [s] over the grid (C,) about the best.
+
+    Neither is known better than the grid is fine: 20 um and 10 ms, evenly distributed.
+    """
+    weights = np.exp(-0.5 * (unlikely - unlikely[best]))
+    weights /= weights.sum()
+    play, stamp = (float(weights @ (x - x[best]) ** 2) for x in (plays, stamps))
+    return math.sqrt(play + (20e-6) ** 2 / 12.0), math.sqrt(stamp + 10e-3**2 / 12.0)
 
 
 def _dragged(at: Floats, half: Floats) -> Floats:

@@ -20,12 +20,6 @@ from flangeye_plugins.weld.frame import Tool
 from flangeye_plugins.weld.path import Path, Place
 from flangeye_plugins.weld.settings import Following, WeldTactileParams
 
-SPACING = 10e-3
-"""Poses along the seam are checked at this distance [m]."""
-
-HIGHER = 0.05
-"""The way from joint to joint ends this far above the clearance [m]."""
-
 ROOM = np.radians(2.0)
 """The joints keep this far away from their limits along the seam [rad]."""
 
@@ -221,10 +215,12 @@ def _stations(task: Task) -> list[Station]:
     above = np.array([*aside, start.height + params.clearance])
     count = 1 + int(np.ceil(abs(params.start_angle) / (JUMP / 2)))
     angles = _angle(start) + np.linspace(params.start_angle, 0.0, count)
-    poses = [tool.base_T_flange(above + [0.0, 0.0, HIGHER], float(angles[0]))]
+    # The way from joint to joint ends 50 mm higher.
+    poses = [tool.base_T_flange(above + [0.0, 0.0, 0.05], float(angles[0]))]
     poses += [tool.base_T_flange(above, float(angle)) for angle in angles]
     stations = [Station("above the seam's start", pose) for pose in poses]
-    for s in np.arange(0.0, plan.length + task.finger.torch, SPACING):
+    # Every 10 mm: between these the joints turn by less than a degree or two.
+    for s in np.arange(0.0, plan.length + task.finger.torch, 10e-3):
         place = plan.at(float(s))
         pose = tool.base_T_flange(np.array([*place.point, place.height]), _angle(place))
         name = f"{s * 1e3:.0f} mm along the seam (the tip goes on beyond its end)"

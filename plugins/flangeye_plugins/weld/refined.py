@@ -16,10 +16,7 @@ from collections import deque
 import numpy as np
 
 from flangeye.types import Floats
-from flangeye_plugins.weld.path import Path
-
-BIN = 0.5e-3
-"""Spacing of the places whose offsets are kept [m]."""
+from flangeye_plugins.weld.path import PATH_SPACING, Path
 
 SLOPE = 1.5e-3
 """Half the length over which the path's direction is taken [m]."""
@@ -32,18 +29,6 @@ FORGETS = 0.99
 
 PRIOR = np.array([5e-3, 5e-3, 0.05])
 """Standard deviations of the plan's error: shift along x and y [m], rotation [rad]."""
-
-SAMPLE_SIGMA = 0.01e-3
-"""Standard deviation of one sample, until it is known [m]."""
-
-GRAIN = 1e-3
-"""Samples nearer to each other than this see the same grain of the surface [m]."""
-
-BEHIND = 10e-3
-"""Places so far behind the torch are not smoothed any more [m]."""
-
-CYCLE_STEPS = 4
-"""Places and samples that one control cycle takes in."""
 
 
 class _Field:
@@ -87,12 +72,15 @@ class RefinedPath:
             margin: Room beyond both ends of the plan [m].
             wander: Standard deviation of the seam about the plan's shape, at least [m].
         """
-        self._plan, self.noise, self.empty = plan, SAMPLE_SIGMA, True
+        self._plan, self.empty = plan, True
+        self.noise = 0.01e-3  # until the sweep tells
         sizes, lengths = (grid.ravel() for grid in np.meshgrid(SIZES, LENGTHS, indexing="ij"))
         self._field = _Field(wander * sizes, lengths)
         models, self._start = len(sizes), -margin
-        count = int((plan.length + 2 * margin) / BIN) + 2
-        self._places: Floats = self._start + (np.arange(count, dtype=np.float64) + 0.5) * BIN
+        count = int((plan.length + 2 * margin) / PATH_SPACING) + 2
+        self._places: Floats = (
+            self._start + (np.arange(count, dtype=np.float64) + 0.5) * PATH_SPACING
+        )
         self._means, self._vars = np.zeros((models, count)), np.zeros((models, count))
         self._cross = np.zeros((models, count, 6))
         self._doubts, self._angles = np.zeros(count), np.zeros(count)
@@ -113,9 +101,15 @@ class RefinedPath:
         """
         self._sure.append((s, offset, angle, doubt))
 
-    def renew(self, torch: float, steps: int = CYCLE_STEPS) -> None:
-        """Take in a few places and samples that are believed, with the torch at ``torch``."""
-        self._low = max(self._index(torch - BEHIND), 0)
+    def renew(self, torch: float, steps: int = 4) -> None:
+        """Take in a few places and samples, so many as a control cycle has time for.
+
+        Args:
+            torch: Arc length of the torch [m].
+            steps: How many.
+        """
+        # Places more than 10 mm behind the torch are not smoothed any more.
+        self._low = max(self._index(torch - 10e-3), 0)
         while self._sure and steps > 0:
             s, offset, angle, doubt = self._sure[0]
             steps -= 1
@@ -125,7 +119,7 @@ class RefinedPath:
                 self._pass()
                 continue
             self._sure.popleft()
-            if s > self._at - BIN:
+            if s > self._at - PATH_SPACING:
                 self._move(max(s, self._at))
                 self._measure(s, offset)
                 self._note(s, offset, angle, doubt)
@@ -233,7 +227,7 @@ class RefinedPath:
         weights = np.exp(self._likely)
         middle = weights @ means[:, 0]
         spread = np.maximum(self._excess, 1.0) * variances[:, 0] + (means[:, 0] - middle) ** 2
-        index, near = self._index(s), round(4e-3 / BIN)
+        index, near = self._index(s), round(4e-3 / PATH_SPACING)
         return float(weights @ spread + self._doubts[max(index - near, 0) : index + near + 1].max())
 
     def worst(self, first: float, last: float) -> tuple[float, float]:
@@ -242,7 +236,7 @@ class RefinedPath:
         Up to what later measurements hardly change: the shortest field's length short of the tip.
         """
         last = min(last, self._at - LENGTHS[0])
-        places = np.arange(first, max(first, last) + BIN, SLOPE)
+        places = np.arange(first, max(first, last) + PATH_SPACING, SLOPE)
         variances = [self.variance(s) for s in places.tolist()]
         worst = int(np.argmax(variances))
         return float(places[worst]), variances[worst]
@@ -271,7 +265,7 @@ class RefinedPath:
 
     def _expected(self, s: Floats) -> tuple[Floats, Floats]:
         """Return each field's offsets and variances (M, K) at arc lengths, behind and ahead."""
-        first = (s - self._start) / BIN - 0.5
+        first = (s - self._start) / PATH_SPACING - 0.5
         below = np.clip(first.astype(int), 0, max(self._next - 2, 0))
         share = np.clip(first - below, 0.0, 1.0)
         means = (1 - share) * self._means[:, below] + share * self._means[:, below + 1]
@@ -304,4 +298,4 @@ class RefinedPath:
         return np.column_stack([nx, ny, ny * levers[:, 0] - nx * levers[:, 1]])
 
     def _index(self, s: float) -> int:
-        return min(max(int((s - self._start) / BIN), 0), len(self._places) - 1)
+        return min(max(int((s - self._start) / PATH_SPACING), 0), len(self._places) - 1)

@@ -67,14 +67,11 @@ def report_of(  # noqa: PLR0913  all that a weld had
     )
 
 
-FIXED = 0.5
-"""Share of the torch's variance from which a look behind the torch is recommended."""
-
-
 def _advice(controller: Controller) -> tuple[Note, ...]:
     """Recommend a look behind the torch where what nothing ahead of it measures is most of it."""
     root = follower_of(controller)
-    if root is None or root.bias.looked or root.lit is None or root.share_fixed < FIXED:
+    # Where it is more than half, a look is worth its price.
+    if root is None or root.bias.looked or root.lit is None or root.share_fixed < 0.5:
         return ()
     return (
         f"{root.share_fixed:.0%} of the torch's variance is what the files state of it: "
@@ -91,7 +88,7 @@ def _extent(controller: Controller, plan: Path) -> str:
         return "nothing was welded"
     end = min(root.torch, plan.length)
     return (
-        f"{root.share_welded:.0%} of the seam was welded, from {root.lit * 1e3:.0f} to "
+        f"{root.share_welded:.0%} of the seam was welded, from {max(root.lit, 0.0) * 1e3:.0f} to "
         f"{end * 1e3:.0f} of {plan.length * 1e3:.0f} mm"
     )
 

@@ -16,10 +16,6 @@ import numpy as np
 from flangeye.motion.seam_following import Command, ToolPose
 from flangeye.types import Floats
 
-DEAD_TIMES = np.arange(0.0, 0.161, 0.02)
-LAGS = np.array([1e-3, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3])
-"""Among which the arm's response is sought [s]."""
-
 GRID = 5e-3
 """Times at which commands and motion are compared [s]; dead times are multiples of it."""
 
@@ -92,13 +88,13 @@ def identify(cycles: Floats) -> tuple[float, float]:
     grid = np.arange(clock[0], clock[-1], GRID)
     command, where = (np.interp(grid, clock, column) for column in cycles.T[1:])
     best, found = math.inf, (0.0, 0.0)
-    for lag in LAGS:
-        followed = _lagged(command, float(lag))
-        for dead in DEAD_TIMES:
+    for lag in (1e-3, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3):
+        followed = _lagged(command, lag)
+        for dead in np.arange(0.0, 0.161, 0.02):
             late = np.concatenate([np.zeros(round(dead / GRID)), followed])[: len(grid)]
             spread = float(np.var(where - np.cumsum(late) * GRID))
             if spread < best:
-                best, found = spread, (float(dead), float(lag) if lag > 1e-3 else 0.0)
+                best, found = spread, (float(dead), lag if lag > 1e-3 else 0.0)
     return found
 
 

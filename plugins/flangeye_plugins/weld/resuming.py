@@ -29,12 +29,6 @@ from flangeye_plugins.weld.probing import Learned
 from flangeye_plugins.weld.settings import Following, Mode, WeldTactileParams
 from flangeye_plugins.weld.weld_log import LoggedLooks
 
-SAME_PLAN = 1e-6
-"""Plans that differ by less are the same [m]."""
-
-PRESSING = 5e-3
-"""So far before the tip lets go of the wall it is set down at the latest [m]."""
-
 RUN_IN = 2 * SETTLING
 """Way in which the torch takes back what the sweep has led it aside by, before it is lit [m]."""
 
@@ -181,7 +175,8 @@ class LoggedWeld:
 
 
 def _require_same(log: FilePath, points: Floats, before: Floats) -> None:
-    if points.shape == before.shape and np.abs(points - before).max() < SAME_PLAN:
+    # To rounding: 1 um.
+    if points.shape == before.shape and np.abs(points - before).max() < 1e-6:
         return
     raise StageError(
         f"{log}: was planned on another seam; resume it on its own: --from {log} --at weld.tactile"
@@ -203,7 +198,8 @@ def set_back(
         lit = max(kept.torch - params.overlap, params.passes[kept.number - 1].along)
         return _standing(params, plan, distance, lit, _away(plan, lit, distance))
     release = params.speed * params.deflection / params.release
-    last = plan.length - params.ending - release - PRESSING
+    # At the latest 5 mm before the tip lets go of the wall.
+    last = plan.length - params.ending - release - 5e-3
     lit = kept.torch - params.overlap
     if last < params.set_down:
         raise StageError("weld.tactile: the rest of the seam is too short for the tip to press on")

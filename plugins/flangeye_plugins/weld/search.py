@@ -13,29 +13,11 @@ from flangeye.types import Floats
 from flangeye_plugins.weld.belief import Belief
 from flangeye_plugins.weld.settings import Following
 
-TURNED_WITHIN = 0.2e-3
-"""A turning point of the sweep is reached when it is this close [m]."""
-
-SEATED = 0.1
-"""The tip bears on the groove when its preload is right to this share."""
-
-SURE = 4.0
-"""A mean is compared with a threshold this many standard deviations away."""
-
-FEWEST, MOST = 3, 60
+MOST = 60
 """Measurements to a mean."""
 
-PRESSED = 0.6
-"""The tip is pressed where it is deflected by this share of what is wanted."""
-
-RESTING = 10
-"""Measurements of the tip in the air, before it descends."""
-
-FREE = 0.5e-3
+UNTOUCHED = 0.5e-3
 """A tip that touches nothing is displaced, and scatters, by less [m]."""
-
-STEEPER = 1.1
-"""What friction gives at most is exceeded by this where there is a wall."""
 
 
 class SweepSearch:
@@ -62,7 +44,8 @@ class SweepSearch:
         self.rest = np.zeros(3)
         self.sigma = np.array([belief.noise[0], belief.noise[0], belief.noise[1]])
         self._settings = settings
-        self._wall = max(STEEPER * belief.sliding(settings), settings.probe / 2)
+        # A wall gives more than friction does at most, by a tenth.
+        self._wall = max(1.1 * belief.sliding(settings), settings.probe / 2)
         both = [settings.reach, -settings.reach]
         self._turns = both if belief.two_walls else [settings.sign * settings.reach]
         self._free: list[Floats] = []
@@ -84,28 +67,32 @@ class SweepSearch:
         if not self.down:
             self.down = self._mean(1, preload / 2) > preload / 2
             return
-        self.seated = abs(self._mean(1, SEATED * preload) - preload) < SEATED * preload
+        allowed = 0.1 * preload  # the tip then bears on the groove
+        self.seated = abs(self._mean(1, allowed) - preload) < allowed
         self.found = self.found or abs(self._mean(0, self._wall / 2)) > self._wall
 
     def _rest(self, displacement: Floats) -> None:
         self._free.append(displacement)
-        if len(self._free) < RESTING:
+        # Ten measurements in the air, before the tip descends.
+        if len(self._free) < 10:
             return
         free = np.array(self._free)
         self.resting, self.rest = False, np.median(free, axis=0)
         self.sigma = np.maximum(self.sigma, free.std(axis=0))
         # Half of them: a tag that is misread once does not make the tip move about.
         usual = float(np.median(np.abs(free - self.rest), axis=0)[:2].max())
-        self.bent = max(usual, float(np.linalg.norm(self.rest[:2])) - usual) > FREE
+        self.bent = max(usual, float(np.linalg.norm(self.rest[:2])) - usual) > UNTOUCHED
 
     def seats(self, wanted: float) -> bool:
         """Return whether the tip bears on its seat and is pressed aside as wanted [m]."""
-        return self.found and self.seated and self._mean(0, PRESSED * wanted) > PRESSED * wanted
+        pressed = 0.6 * wanted  # past friction, and short of what the servo still settles
+        return self.found and self.seated and self._mean(0, pressed) > pressed
 
     def _mean(self, axis: int, threshold: float) -> float:
         """Return the mean of as many measurements as make it sure at a threshold [m]."""
         sigma = float(self.sigma[1 + axis])
-        count = int(np.clip(np.ceil((SURE * sigma / threshold) ** 2), FEWEST, MOST))
+        # The mean is four standard deviations away from the threshold.
+        count = int(np.clip(np.ceil((4.0 * sigma / threshold) ** 2), 3, MOST))
         newest = [sample[axis] for sample in self._newest][-count:]
         return sum(newest) / len(newest) if len(newest) == count else 0.0
 
@@ -113,7 +100,8 @@ class SweepSearch:
         """Return how far to go across [m], from where the end point is, left of the plan."""
         if not self.down:
             return 0.0
-        if self._turns and abs(self._turns[0] - lateral) < TURNED_WITHIN:
+        # A turning point is reached within 0.2 mm.
+        if self._turns and abs(self._turns[0] - lateral) < 0.2e-3:
             self._turns.pop(0)
         self.over = not self._turns
         return self._turns[0] - lateral if self._turns else 0.0

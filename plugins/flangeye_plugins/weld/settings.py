@@ -245,6 +245,11 @@ class WeldTactileParams(Following):
         None,
         description="The run.mcap of a weld that was stopped: goes on with what was felt.",
     )
+    prior: RecipePath | None = Field(
+        None,
+        description="A .yaml file of what earlier welds have found of tip, play and clock: read "
+        "where it exists, written when a weld is done; delete it to begin anew.",
+    )
     overlap: Length = param(
         "30 mm", gt=0, description="How far before the stop the torch begins again, to go on."
     )

@@ -22,7 +22,8 @@ class Steering:
         rate: Largest angular velocity [rad/s].
         regular: |n_d . n_t| above which equation (16) alone decides; zero half way below.
         share: Largest part of the tip's speed that taking back an error may use.
-        usual: Share of the rate that following alone may use; the rest takes back errors.
+        usual: Share of the rate that following alone, or a weave alone, may use: the rest is for
+            errors.
     """
 
     distance: float

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from flangeye.devices import MotionAllowed, Robot, RobotDriver
@@ -14,7 +14,7 @@ from flangeye.models.model import read_model
 from flangeye.models.robots import RobotModel
 from flangeye.motion.arc import with_arc
 from flangeye.motion.executor import Executor, led
-from flangeye.motion.limits import limits_of
+from flangeye.motion.limits import MotionLimits, limits_of
 from flangeye.motion.watchdog import LEADING, precedence
 from flangeye.plugin.stage import stage
 from flangeye.recipe.header import LimitsSection
@@ -22,16 +22,17 @@ from flangeye.types import Floats, Seam, Seed, StageLog, VerifiedHandEye, WeldRe
 from flangeye_plugins.weld import checks
 from flangeye_plugins.weld.approach import approach
 from flangeye_plugins.weld.belief import Belief, belief_of
-from flangeye_plugins.weld.body import body_of
+from flangeye_plugins.weld.body import LeaningTool, body_of
 from flangeye_plugins.weld.bound import check_bound
 from flangeye_plugins.weld.bounds import Bounds
 from flangeye_plugins.weld.camera_process import CameraProcess
 from flangeye_plugins.weld.corners import leg_of
 from flangeye_plugins.weld.execution import WeldCell, follow
 from flangeye_plugins.weld.finger_camera import CameraJob, FingerCameraReader, SteppedReader
-from flangeye_plugins.weld.follower import ResumePoint
+from flangeye_plugins.weld.follower import Follower, ResumePoint
 from flangeye_plugins.weld.frame import Tool, WorkPlane
 from flangeye_plugins.weld.path import Path
+from flangeye_plugins.weld.prior import keep_posterior, with_prior
 from flangeye_plugins.weld.reachability import SeamReach, Task
 from flangeye_plugins.weld.report import report_of
 from flangeye_plugins.weld.resuming import (
@@ -65,63 +66,121 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
         DeviceError: Arm or finger cannot be opened, or are lost on the way to the seam.
         RunStopped: The operator stopped the arm.
     """
-    finger: Finger = read_model(params.finger, Finger)
+    allowed = limits_of(limits, model)
+    planned = _planned(seam, driver, allowed, params)
+    params, driver, plan = planned.params, planned.driver, planned.plan
+    aside = planned.belief.set_down(params)
+    task = Task(model, allowed, planned.finger, planned.tool, plan, params, aside)
+    passage = SeamReach(task)
+    checks.check_controller(params.mode, driver)
+    controller_of(plan, planned.belief, params, params.mode, planned.kept)
+    if not (motion.allowed or driver.simulated):
+        raise NothingMoved(_plan_text(plan, params))
+    with ExitStack() as opened:
+        robot: Robot = opened.enter_context(led(driver, model, allowed))
+        job = CameraJob(params.sensor, planned.finger, robot.state(), seed, params.look)
+        reader: FingerCameraReader = SteppedReader(job) if driver.simulated else CameraProcess(job)
+        eyes = opened.enter_context(reader)
+        belief = replace(planned.belief, behind=eyes.behind)
+        controller = controller_of(plan, belief, params, params.mode, planned.kept)
+        weld_log = opened.enter_context(WeldLog(stage_log, not driver.simulated, params.log_images))
+        weld_log.note("start", start_of(planned, belief))
+        cell = WeldCell(
+            Executor(robot, model, allowed, eyes.tell), eyes, planned.tool,
+            Bounds(planned.finger, plan, params),
+            None if params.look is None else follower_of(controller), planned.gas_after,
+        )  # fmt: skip
+        approach(cell, passage, weld_log, params.mode)
+        if not driver.simulated:
+            opened.enter_context(precedence(LEADING))
+        reason = follow(
+            cell, controller, weld_log, _longest(plan.length + planned.body.distance, params)
+        )
+        truth = eyes.true_torch()
+    if not reason:
+        _keep(planned, follower_of(controller))
+    return report_of(
+        planned.seam, planned.plane, plan, planned.body, controller, weld_log, reason, truth
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Planned:
+    """A weld as it is decided on before anything moves.
+
+    Attributes:
+        seam: The leg that is welded.
+        plane: Of the work.
+        points: (N, 3) of the seam, in the plane [m].
+        plan: The seam, in the plane.
+        finger: What the arm carries.
+        body: How it stands.
+        tool: Translates between flange and plane.
+        belief: What is known of all that.
+        params: What was asked for, with what follows for a start in mid-seam.
+        driver: The arm's, with the power source.
+        gas_after: For how long gas flows after the arc [s]; None without one.
+        kept: What a weld that is resumed has left.
+    """
+
+    seam: Seam
+    plane: WorkPlane
+    points: Floats
+    plan: Path
+    finger: Finger
+    body: LeaningTool
+    tool: Tool
+    belief: Belief
+    params: WeldTactileParams
+    driver: RobotDriver
+    gas_after: float | None
+    kept: ResumePoint | None
+
+
+def _planned(
+    seam: Seam, driver: RobotDriver, allowed: MotionLimits, params: WeldTactileParams
+) -> Planned:
+    """Return what is to be welded, and with what.
+
+    Raises:
+        StageError: The seam, the finger or the limits do not allow it.
+    """
+    finger = read_model(params.finger, Finger)
     seam = leg_of(seam, params)
     plane = WorkPlane(seam.points_in_base, seam.openings_in_base)
     points = plane.points(seam.points_in_base)
-    plan = Path(points)
-    body = body_of(finger, params)
-    tool = Tool(finger, plane, body)
-    allowed = limits_of(limits, model)
+    plan, body = Path(points), body_of(finger, params)
     checks.check_finger(finger, params)
+    belief = belief_of(finger, body, seam.half_angle, params)
+    belief = with_prior(belief, params.prior, finger.model)
     checks.check_seam(seam, plan, body.distance, params)
     checks.check_speeds(finger, params, allowed)
     kept = None if params.resume is None else resume_point_of(params.resume, points)
     if kept is not None:
         params = set_back(params, plan, body.distance, kept)
     driver, times = _with_power_source(driver, params)
-    belief = replace(
-        belief_of(finger, body, seam.half_angle, params),
-        arc=(times.gas_before, times.ignition, times.crater),
-    )
+    if times is not None:
+        belief = replace(belief, arc=(times.gas_before, times.ignition, times.crater))
     checks.check_tool(body, belief, params)
     check_bound(plan, belief, params)
-    passage = SeamReach(Task(model, allowed, finger, tool, plan, params, belief.set_down(params)))
-    checks.check_controller(params.mode, driver)
-    controller = controller_of(plan, belief, params, params.mode, kept)
-    if not (motion.allowed or driver.simulated):
-        raise NothingMoved(_plan_text(plan, params))
-    with ExitStack() as opened:
-        robot: Robot = opened.enter_context(led(driver, model, allowed))
-        job = CameraJob(params.sensor, finger, robot.state(), seed, params.look)
-        reader: FingerCameraReader = SteppedReader(job) if driver.simulated else CameraProcess(job)
-        eyes = opened.enter_context(reader)
-        belief = replace(belief, behind=eyes.behind)
-        if eyes.behind is not None:
-            controller = controller_of(plan, belief, params, params.mode, kept)
-        weld_log = opened.enter_context(WeldLog(stage_log, not driver.simulated, params.log_images))
-        weld_log.note("start", start_of(points, plane, finger, belief, params, kept))
-        cell = WeldCell(
-            Executor(robot, model, allowed, eyes.tell), eyes, tool, Bounds(finger, plan, params),
-            None if params.look is None else follower_of(controller),
-            None if params.arc is None else times.gas_after,
-        )  # fmt: skip
-        approach(cell, passage, weld_log, params.mode)
-        if not driver.simulated:
-            opened.enter_context(precedence(LEADING))
-        reason = follow(cell, controller, weld_log, _longest(plan.length + body.distance, params))
-        truth = eyes.true_torch()
-    return report_of(seam, plane, plan, body, controller, weld_log, reason, truth)
+    return Planned(
+        seam, plane, points, plan, finger, body, Tool(finger, plane, body), belief, params, driver,
+        None if times is None else times.gas_after, kept,
+    )  # fmt: skip
+
+
+def _keep(planned: Planned, follower: Follower | None) -> None:
+    """Keep what a weld by touch has found, for the next one."""
+    if planned.params.prior is not None and follower is not None:
+        keep_posterior(planned.params.prior, planned.finger.model, follower.learned)
 
 
 def _with_power_source(
     driver: RobotDriver, params: WeldTactileParams
-) -> tuple[RobotDriver, ArcTimes]:
+) -> tuple[RobotDriver, ArcTimes | None]:
     """Return a driver that opens the power source with the arm, and its times; none without one."""
     if params.arc is None:
-        return driver, ArcTimes.model_construct(
-            gas_before=0.0, ignition=0.0, crater=0.0, gas_after=0.0
-        )
+        return driver, None
     given = params.arc.params
     times = given if isinstance(given, ArcTimes) else ArcTimes()
     return with_arc(driver, params.arc, times), times
@@ -141,19 +200,13 @@ def _plan_text(plan: Path, params: WeldTactileParams) -> str:
     )
 
 
-def start_of(
-    points: Floats,
-    plane: WorkPlane,
-    finger: Finger,
-    belief: Belief,
-    params: WeldTactileParams,
-    kept: ResumePoint | None,
-) -> dict[str, Any]:
+def start_of(planned: Planned, belief: Belief) -> dict[str, Any]:
     """Return all that the decisions of a weld follow from, besides what was measured."""
+    params, kept = planned.params, planned.kept
     return {
-        "points": points.tolist(),
-        "base_T_plane": plane.base_T_plane.matrix.tolist(),
-        "finger": finger.model_dump(mode="json"),
+        "points": planned.points.tolist(),
+        "base_T_plane": planned.plane.base_T_plane.matrix.tolist(),
+        "finger": planned.finger.model_dump(mode="json"),
         "belief": asdict(belief),
         "mode": params.model_dump(mode="json", include={"mode"})["mode"],
         "kept": None if kept is None else kept_value(kept),

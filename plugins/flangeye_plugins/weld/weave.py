@@ -6,9 +6,6 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-TIMING = 10e-3
-"""Standard deviation of what is known of the arm's delay [s]: a swing is early or late by it."""
-
 
 class Sway(NamedTuple):
     """A swing at one time, to the left of the seam.
@@ -60,4 +57,5 @@ class Weave:
     @property
     def variance(self) -> float:
         """Of what it is early or late by, across the seam [m^2]."""
-        return (self.fastest * TIMING) ** 2 / 2.0
+        # The arm's delay is known to 10 ms: a swing is early or late by it.
+        return (self.fastest * 10e-3) ** 2 / 2.0

@@ -17,9 +17,6 @@ from flangeye.types import StageLog
 from flangeye_plugins.weld.finger_camera import TagObservation
 from flangeye_plugins.weld.touch.tip_displacement import TipDisplacement
 
-BLOCK = 25
-"""Cycles to a block."""
-
 
 class Cycle(NamedTuple):
     """One turn of the control loop, in the frame of the work's plane; SI units.
@@ -131,7 +128,7 @@ class WeldLog:
         """Record one control cycle."""
         self.cycles.append(cycle)
         self._block.append(cycle)
-        if len(self._block) >= BLOCK:
+        if len(self._block) >= 25:  # several lines of the log a second
             self._put_block()
 
     def _put_block(self) -> None:

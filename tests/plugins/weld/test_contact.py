@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from flangeye_plugins.weld.contact import FREE, OTHER, PRESSED, SEATED, Contact, Felt
+from flangeye_plugins.weld.contact import Contact, Felt, Mode
 
 NOISE = (20e-6, 120e-6)
 FLAT = math.tan(math.radians(40.0))
@@ -39,13 +39,13 @@ class Tip:
 
 def test_a_tip_that_stays_where_the_seam_leads_is_seated() -> None:
     found = contact()
-    assert Tip(found).feel(100)[SEATED] > 0.99
+    assert Tip(found).feel(100)[Mode.SEATED] > 0.99
     assert found.deflection == pytest.approx(0.8e-3, abs=30e-6)
     assert found.strained == pytest.approx(0.8 / 2.5, abs=0.03)
     assert all(doubt < (20e-6) ** 2 for _, doubt in found.settled(9.0))
 
 
-@pytest.mark.parametrize(("side", "mode"), [(1.0, PRESSED), (-1.0, PRESSED)])
+@pytest.mark.parametrize(("side", "mode"), [(1.0, Mode.PRESSED), (-1.0, Mode.PRESSED)])
 def test_a_tip_that_is_aside_and_up_as_its_wall_leans_has_climbed_it(side, mode) -> None:
     found = contact()
     tip = Tip(found)
@@ -59,20 +59,20 @@ def test_a_tip_that_is_aside_and_up_as_its_wall_leans_has_climbed_it(side, mode)
 def test_a_tip_pressed_to_the_other_side_climbs_the_other_wall() -> None:
     tip = Tip(contact())
     tip.feel(50, deflection=-0.8e-3)
-    assert tip.feel(12, -FLAT * 1e-3, 1e-3, deflection=-0.8e-3)[OTHER] > 0.9
+    assert tip.feel(12, -FLAT * 1e-3, 1e-3, deflection=-0.8e-3)[Mode.OTHER] > 0.9
 
 
 def test_a_tack_weld_lifts_the_tip_straight_up() -> None:
     tip = Tip(contact())
     tip.feel(50)
-    assert tip.feel(30, 0.0, 1.5e-3)[SEATED] > 0.99
+    assert tip.feel(30, 0.0, 1.5e-3)[Mode.SEATED] > 0.99
 
 
 def test_a_tip_that_goes_along_with_the_arm_is_free_and_what_it_felt_does_not_count() -> None:
     found = contact()
     tip = Tip(found)
     tip.feel(50)
-    assert tip.feel(10, 0.8e-3, 0.0, deflection=0.0)[FREE] > 0.99
+    assert tip.feel(10, 0.8e-3, 0.0, deflection=0.0)[Mode.FREE] > 0.99
     assert len(list(found.settled(9.0))) == pytest.approx(50, abs=1)
 
 

@@ -24,7 +24,7 @@ FLAT = math.tan(math.radians(40.0))
 PERIOD, IMAGES = 8e-3, 4
 
 
-def swept(held=2.0, noise=10e-6, pressed=1.2e-3, seed=0, ahead=0.0):
+def swept(held=2.0, noise=10e-6, pressed=1.2e-3, seed=0, ahead=0.0, belief=BELIEF):
     """Sweep a tip; return what is learned, the probing, and the largest true deflection [m].
 
     Args:
@@ -33,8 +33,9 @@ def swept(held=2.0, noise=10e-6, pressed=1.2e-3, seed=0, ahead=0.0):
         pressed: Deflection at which the sweep begins [m].
         seed: Of the noise.
         ahead: The tip is ahead of where its file has it by this [m].
+        belief: What is expected.
     """
-    probing, rng = Probing(SETTINGS, BELIEF, 1.0), np.random.default_rng(seed)
+    probing, rng = Probing(SETTINGS, belief, 1.0), np.random.default_rng(seed)
     probing.begin(noise)
     where, turned, hardest, cycle, found = pressed, 0.0, 0.0, 0, None
     while found is None:

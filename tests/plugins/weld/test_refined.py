@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from flangeye_plugins.weld.path import Path
-from flangeye_plugins.weld.refined import BIN, LENGTHS, PRIOR, SIZES, RefinedPath, _Field
+from flangeye_plugins.weld.path import PATH_SPACING, Path
+from flangeye_plugins.weld.refined import LENGTHS, PRIOR, SIZES, RefinedPath, _Field
 from tests.plugins.weld.bench import curved, straight
 
 ALL = 100_000
@@ -145,7 +145,7 @@ def test_across_a_seam_that_leaves_its_plan_is_a_right_angle_to_the_seam() -> No
 
 
 def test_what_is_felt_again_behind_the_tip_is_left_out() -> None:
-    found = felt(lambda s: 0 * s, np.arange(5e-3, 40e-3, BIN))
+    found = felt(lambda s: 0 * s, np.arange(5e-3, 40e-3, PATH_SPACING))
     before = found.offset(0.02)
     found.add(0.02, 9e-3, 0.0)
     found.renew(-0.05, ALL)

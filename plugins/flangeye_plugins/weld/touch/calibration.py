@@ -24,9 +24,6 @@ FEWEST_READINGS = 10
 CLEAR = 0.2e-3
 """Largest rms of the tip's displacement that the gain leaves unexplained [m]."""
 
-FORCE_FROM = 0.5
-"""A force that never exceeds this says nothing of stiffness [N]."""
-
 
 @dataclass(frozen=True, eq=False)
 class Held:
@@ -106,7 +103,7 @@ def _stiffness(held: Sequence[Held]) -> tuple[SI | None, SI | None]:
     # What the robot holds against the spring: force on the finger is opposite to its displacement.
     force = np.array([h.force for h in known])
     tip = np.array([h.displacement for h in known])
-    if np.abs(force).max() < FORCE_FROM:
+    if np.abs(force).max() < 0.5:  # newtons: what force sensors are off by
         return None, None
     slopes = -np.sum((force - force.mean(0)) * (tip - tip.mean(0)), 0) / np.sum(
         (tip - tip.mean(0)) ** 2, 0

@@ -21,9 +21,6 @@ FEWEST_PIVOTED = 5
 TILTED = np.radians(12.0)
 """So far the tool must have been turned, as a root of the mean of squares, about two axes."""
 
-PLACED = 0.05e-3
-"""Standard deviation with which a person and an arm bring a point to its mark, at the least [m]."""
-
 SLIPPED = 1.0e-3
 """A pose that is off by more was not at the mark [m]."""
 
@@ -77,7 +74,8 @@ def pivot(what: str, poses: Sequence[Floats], displaced: Sequence[Floats] | None
     _require_stayed(what, left)
     free = 3 * len(poses) - 6
     rms = float(np.sqrt(np.sum(left**2) / free))
-    covariance = max(rms, PLACED) ** 2 * inverse
+    # A tip is set into its mark to 0.05 mm at best.
+    covariance = max(rms, 0.05e-3) ** 2 * inverse
     mark = rotations.mean(axis=0) @ point + places.mean(axis=0)
     return Pivot(point, covariance, mark, rms)
 

@@ -12,19 +12,6 @@ from flangeye.errors import StageError
 from flangeye.models.finger import Finger, FingerGeometry
 from flangeye.types import Floats, Image
 
-CORNER_SIGMA = 0.1
-"""Standard deviation of a refined corner in a good image [px]."""
-
-ALLOWED = 1.0
-"""Reprojection error at which a reading is worth nothing [px]."""
-
-SMALLEST = 0.3
-"""Perimeter of the tag, as a share of the image's longer side: noise has smaller outlines. With
-OpenCV's 0.03 these take two thirds of the time."""
-
-WINDOWS = (13, 23)
-"""Of the two thresholds [px]. OpenCV's third one, of 3 px, sees little but noise here."""
-
 
 @dataclass(frozen=True, eq=False)
 class TagReading:
@@ -64,8 +51,11 @@ class TagDetector:
         self._id = finger.tag.id
         parameters = cv2.aruco.DetectorParameters()
         parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-        parameters.minMarkerPerimeterRate = SMALLEST
-        parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax = WINDOWS
+        # Perimeter over the image's longer side: noise has smaller outlines. OpenCV's 0.03 takes
+        # three times as long.
+        parameters.minMarkerPerimeterRate = 0.3
+        # OpenCV's third window, of 3 px, sees little but noise here.
+        parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax = 13, 23
         self._detector = cv2.aruco.ArucoDetector(dictionary_of(finger), parameters)
         self._last: tuple[Any, Any] | None = _rest(finger)
 
@@ -97,12 +87,13 @@ class TagDetector:
         seen, jacobian = cv2.projectPoints(self._square, rotation, translation, matrix, distortion)
         error = float(np.sqrt(np.mean((seen.reshape(4, 2) - corners) ** 2)))
         gram = jacobian[:, :6].T @ jacobian[:, :6]
-        covariance = max(error, CORNER_SIGMA) ** 2 * np.linalg.inv(gram)[3:, 3:]
+        # A refined corner of a good image has 0.1 px.
+        covariance = max(error, 0.1) ** 2 * np.linalg.inv(gram)[3:, 3:]
         return TagReading(
             np.asarray(translation, dtype=np.float64).ravel(),
             np.asarray(rotation, dtype=np.float64).ravel(),
             covariance,
-            max(0.0, 1.0 - error / ALLOWED),
+            max(0.0, 1.0 - error),
             corners,
         )
 

@@ -1,0 +1,71 @@
+"""What a weld has found of tip, play and clock is what the next one expects: a file between them.
+
+The sweep at the start starts from these instead of from the finger's file, and ends with less
+doubt. The file is plain YAML: to read, and to delete when finger or camera were changed. What was
+found a weld ago counts half: so many welds that each know a little never add up to certainty, and a
+tip that creeps is followed.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import yaml
+
+from flangeye.errors import StageError
+from flangeye.files.regular import write_whole
+from flangeye.models.model import Model, read_model
+from flangeye.units import Duration, Length, param
+from flangeye_plugins.weld.belief import Belief
+from flangeye_plugins.weld.probing import Learned
+
+
+class WeldPrior(Model):
+    """Posterior of one weld, prior of the next; each with its standard deviation."""
+
+    finger: str
+    ahead: Length = param(description="The tip is ahead of where the finger's file has it.")
+    ahead_sigma: Length = param(gt=0)
+    play: Length = param(description="Half the width of play and hysteresis.")
+    play_sigma: Length = param(gt=0)
+    stamp: Duration = param(description="The images' timestamps are late.")
+    stamp_sigma: Duration = param(gt=0)
+
+
+def with_prior(belief: Belief, path: Path | None, finger: str) -> Belief:
+    """Return a belief with what earlier welds have found; as it is where there is no file yet.
+
+    Raises:
+        StageError: The file is of another finger.
+        RecipeError: It is no such file.
+    """
+    if path is None or not path.exists():
+        return belief
+    prior = read_model(path, WeldPrior)
+    if prior.finger != finger:
+        raise StageError(
+            f"weld.tactile: {path} is of finger {prior.finger}, this one is {finger}; delete the "
+            "file, or name another one (prior)"
+        )
+    found = prior.model_dump(exclude={"finger"})
+    aged = {name: math.sqrt(2) * x for name, x in found.items() if name.endswith("_sigma")}
+    return replace(belief, **{**found, **aged})
+
+
+def keep_posterior(path: Path, finger: str, learned: Learned) -> None:
+    """Write what a weld has found, for the next one.
+
+    Raises:
+        StageError: The file cannot be written.
+    """
+    found = {
+        "ahead": learned.ahead, "ahead_sigma": learned.ahead_sigma,
+        "play": learned.width, "play_sigma": learned.width_sigma,
+    }  # fmt: skip
+    content = {"finger": finger, **{name: f"{x * 1e3:.6g} mm" for name, x in found.items()}}
+    content["stamp"] = f"{learned.stamp * 1e3:.6g} ms"
+    content["stamp_sigma"] = f"{learned.stamp_sigma * 1e3:.6g} ms"
+    head = "# Found by weld.tactile; its next weld starts from here. Delete it to begin anew.\n"
+    write_whole(path, head + yaml.safe_dump(content, sort_keys=False))
