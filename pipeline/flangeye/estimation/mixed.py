@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cholesky
@@ -157,6 +158,31 @@ class Fit:
     gradient: Floats
 
 
+class Told(NamedTuple):
+    """What the sightings tell by themselves, at one set of sizes of the noise.
+
+    Attributes:
+        noise: (N, 6, 6) its covariances.
+        weights: (N, 6, 6) their inverses, each by its share.
+        information: (P + K, P + K) of places and effects.
+        right: (P + K,) of the normal equations.
+    """
+
+    noise: Floats
+    weights: Floats
+    information: Floats
+    right: Floats
+
+
+def told(model: LinearModel, sizes: Floats) -> Told:
+    """Return what the sightings tell with the noise of (S,) sizes; the effects' take no part."""
+    h, r = model.design, np.asarray((model.projectors @ model.residuals[..., None])[..., 0])
+    noise = model.noise(sizes)
+    weights = model.weights(np.asarray(np.linalg.inv(noise), dtype=np.float64))
+    weighted = (weights @ h).reshape(-1, h.shape[2])
+    return Told(noise, weights, h.reshape(weighted.shape).T @ weighted, weighted.T @ r.ravel())
+
+
 def fit(model: LinearModel, sizes: Floats, with_gradient: bool = True) -> Fit:
     """Solve Henderson's mixed-model equations at (S,) sizes, with the restricted likelihood.
 
@@ -165,33 +191,39 @@ def fit(model: LinearModel, sizes: Floats, with_gradient: bool = True) -> Fit:
     Raises:
         numpy.linalg.LinAlgError: The equations are not positive definite.
     """
-    h, r = model.design, np.asarray((model.projectors @ model.residuals[..., None])[..., 0])
-    noise, share = model.noise(sizes), model.shares
-    bare = np.asarray(np.linalg.inv(noise), dtype=np.float64)
-    weights, count = model.weights(bare), h.shape[2]
-    weighted = weights @ h
-    flat, flat_weighted = h.reshape(-1, count), weighted.reshape(-1, count)
-    right = flat_weighted.T @ r.ravel()
-    prior = np.concatenate([np.full(model.p, 0.0), sizes[model.sizes.effect] ** -2.0])
-    information = flat.T @ flat_weighted + np.diag(prior)
+    known, h = told(model, sizes), model.design
+    mean, covariance, log_information = _solved(model, sizes, known)
+    left = np.asarray((model.projectors @ model.residuals[..., None])[..., 0] - h @ mean)
+    prior = sizes[model.sizes.effect] ** -2.0
+    cost = float(
+        model.shares @ np.linalg.slogdet(known.noise)[1]
+        - np.log(prior).sum()
+        + log_information
+        + np.einsum("na,nab,nb->", left, known.weights, left)
+        + prior @ mean[model.p :] ** 2
+    )
+    found = Fit(sizes, mean, covariance, known.weights, cost, np.zeros(len(sizes)))
+    if not with_gradient:
+        return found
+    bare = np.asarray(np.linalg.inv(known.noise), dtype=np.float64)
+    return replace(found, gradient=_gradient(model, sizes, found, (h, left, bare, prior)))
+
+
+def _solved(model: LinearModel, sizes: Floats, known: Told) -> tuple[Floats, Floats, float]:
+    """Return mean and covariance of places and effects, and log det of their information.
+
+    Raises:
+        numpy.linalg.LinAlgError: The equations are not positive definite.
+    """
+    information = known.information.copy()
+    effects = np.arange(model.p, len(information))
+    information[effects, effects] += sizes[model.sizes.effect] ** -2.0
     scaled, scale = _scaled(information)
     root = cholesky(scaled, lower=True)
     inverse = np.tril(dpotri(root, lower=1)[0])
     covariance = (inverse + np.tril(inverse, -1).T) / np.outer(scale, scale)
-    mean = covariance @ right
-    left = np.asarray(r - h @ mean)
-    log_noise = np.linalg.slogdet(noise)[1]
-    cost = float(
-        share @ log_noise
-        - 2 * np.log(prior[model.p :]).sum() / 2
-        + 2 * (np.log(np.diag(root)) + np.log(scale)).sum()
-        + np.einsum("na,nab,nb->", left, weights, left)
-        + prior @ mean**2
-    )
-    found = Fit(sizes, mean, covariance, weights, cost, np.zeros(len(sizes)))
-    if not with_gradient:
-        return found
-    return replace(found, gradient=_gradient(model, sizes, found, (h, left, bare, prior)))
+    log_information = float(2 * (np.log(np.diag(root)) + np.log(scale)).sum())
+    return covariance @ known.right, covariance, log_information
 
 
 def told_of_places(model: LinearModel, sizes: Floats) -> Floats:
@@ -199,9 +231,7 @@ def told_of_places(model: LinearModel, sizes: Floats) -> Floats:
 
     By the Schur complement, which stays exact where nothing is told; an inverse covariance is not.
     """
-    h, p = model.design, model.p
-    weighted = model.weights(np.asarray(np.linalg.inv(model.noise(sizes)))) @ h
-    whole = h.reshape(-1, h.shape[2]).T @ weighted.reshape(-1, h.shape[2])
+    whole, p = told(model, sizes).information, model.p
     effects = whole[p:, p:] + np.diag(sizes[model.sizes.effect] ** -2.0)
     return np.asarray(whole[:p, :p] - whole[:p, p:] @ np.linalg.solve(effects, whole[p:, :p]))
 
@@ -226,7 +256,7 @@ def _gradient(
     h, left, bare, prior = parts
     out = np.zeros(len(sizes))
     second = np.diag(found.covariance)[model.p :] + found.mean[model.p :] ** 2
-    np.add.at(out, model.sizes.effect, 2 * (1 - second * prior[model.p :]))
+    np.add.at(out, model.sizes.effect, 2 * (1 - second * prior))
     w = found.weights
     spread = spread_of(h, found.covariance) + left[:, :, None] * left[:, None, :]
     # dcost/dR, (N, 6, 6)
@@ -319,17 +349,24 @@ def mode_of(model: LinearModel, start: Floats | None = None, steps: int = 60) ->
 def posterior(model: LinearModel, mode: Floats | None = None) -> Posterior:
     """Return the joint posterior, the sizes integrated over."""
     z, some = mode_of(model) if mode is None else mode, model.telling()
-    spread = _laplace(some, z)
-    draws = _draws(len(z), SAMPLES if some is model else SAMPLES // 4)
-    fits, logs = [], []
-    for draw in draws:
+    spread, prior = _laplace(some, z), model.sizes
+    at_mode = prior.at(z)
+    known, fits, logs = told(model, at_mode), [], []
+    of_noise = np.arange(len(at_mode))[::-1] < len(model.scaled) + len(model.scatter)
+    for draw in _draws(len(z), SAMPLES):
         at = z + spread @ draw
-        found = fit(model, model.sizes.at(at), with_gradient=False)
-        same = found if some is model else fit(some, model.sizes.at(at), with_gradient=False)
+        found = fit(some, prior.at(at), with_gradient=False)
+        logs.append(0.5 * float(draw @ draw - found.cost - at @ at))
+        if some is not model:
+            # So many sightings tell the noise's own sizes to a few percent.
+            sizes = np.where(of_noise, at_mode, found.sizes)
+            mean, covariance, _ = _solved(model, sizes, known)
+            found = replace(
+                found, mean=mean, covariance=covariance, weights=known.weights, sizes=sizes
+            )
         fits.append(found)
-        logs.append(0.5 * float(draw @ draw - same.cost - at @ at))
     chances = np.exp(np.array(logs) - max(logs))
-    mode_fit = fit(model, model.sizes.at(z), with_gradient=False)
+    mode_fit = fit(model, at_mode, with_gradient=False)
     return Posterior(model, mode_fit, tuple(fits), chances / chances.sum())
 
 
