@@ -101,6 +101,10 @@ class BodyFit:
         centre: (3,) of the body in ``camera`` [m].
         bread: (13, 13) inverse of the information, with the prior's.
         meat: (13, 13) covariance of the scores by the scan's noise, and the prior's information.
+        lost: (6,) width that the scan seems to lose at ends of faces, by the way they look: -x, +x,
+            -y, ... of the body [m]; negative where its edge is inside.
+        odd: How unlike a scanner's that and the rounding are: squared, over their prior's
+            covariance, with seven degrees of freedom.
         patches: (P, 3) places on the body that err together, in ``camera`` [m].
         pulls: (P, 13, 3) derivative of the scores by how far each of them is off [1/m].
     """
@@ -113,6 +117,8 @@ class BodyFit:
     centre: Floats
     bread: Floats
     meat: Floats
+    lost: Floats
+    odd: float
     patches: Floats
     pulls: Floats
 
@@ -179,6 +185,7 @@ class _Settled(NamedTuple):
     information: Floats
     surface: int
     noise: float
+    scanner: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,7 +250,7 @@ class _Laying:
             if not few:
                 beside = max(0.5 * beside, LEAST_REACH * spread)
         left = equations._replace(residual=equations.residual - equations.jacobian @ step)
-        return _Settled(pose, left, weights, information, len(surface.residual), noise)
+        return _Settled(pose, left, weights, information, len(surface.residual), noise, scanner)
 
     def fit_of(self, rest: _Settled) -> BodyFit:
         """Return it with all that its covariance needs."""
@@ -255,10 +262,11 @@ class _Laying:
         meat[:6, :6] += UNKNOWN**-2.0 * np.eye(6)
         meat[6:, 6:] += self.prior
         patches, pulls = _pulls(rest.left, rest.weights, cluster, pose)
-        edges = len(rest.left.residual) - rest.surface
+        edges, off = len(rest.left.residual) - rest.surface, rest.scanner - self.usual
         return BodyFit(
-            pose, rest.noise, rest.surface, edges, shape.size, centre, bread, meat, patches, pulls
-        )
+            pose, rest.noise, rest.surface, edges, shape.size, centre, bread, meat,
+            rest.scanner[:FACINGS], float(off @ self.prior @ off), patches, pulls,
+        )  # fmt: skip
 
 
 def _surface(

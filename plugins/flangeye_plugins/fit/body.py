@@ -8,6 +8,7 @@ import numpy as np
 
 from flangeye import Params, stage
 from flangeye.estimation.effects.scanner import DistortionField
+from flangeye.maths.statistics import chi2_quantile
 from flangeye.models.bodies import TargetBody
 from flangeye.models.scanners import ScannerModel
 from flangeye.types import (
@@ -21,6 +22,9 @@ from flangeye.types import (
     Transform,
 )
 from flangeye.units import Length, param
+
+PLAUSIBLE = 0.99
+"""Of good scans this share shows edges as its scanner does; others may rest on wrong edges."""
 
 
 class FitBodyParams(Params):
@@ -74,6 +78,13 @@ def fit_body(
         return Rejected(
             f"the scan is {fit.noise * 1e3:.2f} mm off {body.name}'s surface (limit "
             f"{params.max_rms * 1e3:g} mm): does it move against its mesh, as a gripper's jaws do?"
+        )
+    if fit.odd > chi2_quantile(PLAUSIBLE, len(fit.lost) + 1):
+        low, high = fit.lost.min() * 1e3, fit.lost.max() * 1e3
+        return Rejected(
+            f"the scan's edges are {low:+.1f} to {high:+.1f} mm off the ends of {body.name}, more "
+            "unlike from side to side than a scanner's are: it rests on other edges than its own, "
+            "or its mesh is another body's; scan from where more of its ends are seen"
         )
     alone = partial(_somewhere, params.scanner_error)
     distortion = DistortionField(scanner).at if scanner else alone

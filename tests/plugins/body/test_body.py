@@ -37,7 +37,7 @@ from flangeye_emulators.world.scanner import scanner_of
 from flangeye_plugins.body.looks import prepared
 from flangeye_plugins.fit.body import FitBodyParams, fit_body
 from flangeye_plugins.segment.body import SegmentBodyParams, segment_body
-from tools.study_bodies import SCANNER, as_made
+from tools.study_bodies import SCANNER, as_made, trial
 
 GRIPPER = load_body("gripper", None, Path())
 POSE = rigid(rotation_from_rpy(2.5, 0.6, 0.8), np.array([0.03, -0.02, 0.75]))
@@ -302,3 +302,10 @@ def test_a_mesh_of_ones_own_goes_with_the_run(tmp_path: Path) -> None:
     (tmp_path / "own.ply").unlink()
     again = load_recipe(tmp_path / "run" / "recipe.resolved.yaml", load_registry())
     assert again.context[TargetBody].digest == recipe.context[TargetBody].digest
+
+
+def test_a_fit_that_rests_on_other_edges_is_refused() -> None:
+    """A ring plate laid 1.4 mm aside, where its surfaces fit as well."""
+    told = trial("ring-plate", 23)
+    assert told.feature is None
+    assert "it rests on other edges than its own" in told.why
