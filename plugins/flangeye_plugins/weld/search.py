@@ -9,6 +9,7 @@ from collections import deque
 
 import numpy as np
 
+from flangeye.maths.statistics import SIGMA_OF_MAD
 from flangeye.types import Floats
 from flangeye_plugins.weld.belief import Belief
 from flangeye_plugins.weld.settings import Following
@@ -73,10 +74,13 @@ class SweepSearch:
 
     def _rest(self, displacement: Floats) -> None:
         self._free.append(displacement)
-        # Ten measurements in the air, before the tip descends.
-        if len(self._free) < 10:
-            return
         free = np.array(self._free)
+        usual = np.median(np.abs(free[:, 2] - np.median(free[:, 2])))
+        # Ten measurements in the air, before the tip descends, and as many as tell a quarter of the
+        # preload: a rest that is off is taken for a touch.
+        enough = _needed(SIGMA_OF_MAD * usual, self._settings.preload / 4)
+        if len(free) < np.clip(enough, 10, 5 * MOST):
+            return
         self.resting, self.rest = False, np.median(free, axis=0)
         self.sigma = np.maximum(self.sigma, free.std(axis=0))
         # Half of them: a tag that is misread once does not make the tip move about.
@@ -90,9 +94,7 @@ class SweepSearch:
 
     def _mean(self, axis: int, threshold: float) -> float:
         """Return the mean of as many measurements as make it sure at a threshold [m]."""
-        sigma = float(self.sigma[1 + axis])
-        # The mean is four standard deviations away from the threshold.
-        count = int(np.clip(np.ceil((4.0 * sigma / threshold) ** 2), 3, MOST))
+        count = int(np.clip(_needed(self.sigma[1 + axis], threshold), 3, MOST))
         newest = [sample[axis] for sample in self._newest][-count:]
         return sum(newest) / len(newest) if len(newest) == count else 0.0
 
@@ -105,3 +107,8 @@ class SweepSearch:
             self._turns.pop(0)
         self.over = not self._turns
         return self._turns[0] - lateral if self._turns else 0.0
+
+
+def _needed(sigma: float, threshold: float) -> int:
+    """Return how many measurements have a mean that is four deviations away from a threshold."""
+    return int(np.ceil((4.0 * sigma / threshold) ** 2))

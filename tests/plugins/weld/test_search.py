@@ -46,6 +46,21 @@ def test_the_tip_is_measured_ten_times_in_the_air_and_its_middle_counts() -> Non
     assert search.sigma == pytest.approx(np.maximum([10e-6, 10e-6, 60e-6], seen.std(axis=0)))
 
 
+def test_a_tip_that_scatters_is_measured_longer_and_no_rest_is_taken_for_a_touch() -> None:
+    scatter, false, counts = np.array([0.19e-3, 0.19e-3, 1.14e-3]), 0, []
+    for seed in range(200):
+        search, rng = SweepSearch(SETTINGS, Belief(40e-3)), np.random.default_rng(seed)
+        counts.append(0)
+        while search.resting:
+            search.feel(scatter * rng.normal(size=3), 0.0, 0.0)
+            counts[-1] += 1
+        for _ in range(200):
+            search.feel(np.zeros(3), 0.0, 1.14e-3 * rng.normal() - search.rest[2])
+        false += search.down
+    assert np.median(counts) > 100
+    assert false <= 4  # of 200; 52 are with ten measurements
+
+
 @pytest.mark.parametrize(
     ("rest", "bent"),
     [
