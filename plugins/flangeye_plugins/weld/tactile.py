@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from flangeye.devices import MotionAllowed, Robot, RobotDriver
-from flangeye.errors import NothingMoved
+from flangeye.errors import NothingMoved, StageError
 from flangeye.models.arc import ArcTimes
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
@@ -18,7 +18,16 @@ from flangeye.motion.limits import MotionLimits, limits_of
 from flangeye.motion.watchdog import LEADING, precedence
 from flangeye.plugin.stage import stage
 from flangeye.recipe.header import LimitsSection
-from flangeye.types import Floats, Seam, Seed, StageLog, VerifiedHandEye, WeldReport
+from flangeye.types import (
+    Floats,
+    Note,
+    Seam,
+    Seed,
+    StageLog,
+    VerifiedHandEye,
+    Warn,
+    WeldReport,
+)
 from flangeye_plugins.weld import checks
 from flangeye_plugins.weld.approach import approach
 from flangeye_plugins.weld.belief import Belief, belief_of
@@ -97,11 +106,11 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
             cell, controller, weld_log, _longest(plan.length + planned.body.distance, params)
         )
         truth = eyes.true_torch()
-    if not reason:
-        _keep(planned, follower_of(controller))
-    return report_of(
+    report = report_of(
         planned.seam, planned.plane, plan, planned.body, controller, weld_log, reason, truth
     )
+    kept = () if reason else _kept(planned, follower_of(controller))
+    return replace(report, notes=(*report.notes, *kept))
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,10 +178,19 @@ def _planned(
     )  # fmt: skip
 
 
-def _keep(planned: Planned, follower: Follower | None) -> None:
-    """Keep what a weld by touch has found, for the next one."""
-    if planned.params.prior is not None and follower is not None:
-        keep_posterior(planned.params.prior, planned.finger.model, follower.learned)
+def _kept(planned: Planned, follower: Follower | None) -> tuple[Note, ...]:
+    """Keep what a weld by touch has found, for the next one; say where, or why not."""
+    path = planned.params.prior
+    if path is None or follower is None:
+        return ()
+    try:
+        keep_posterior(path, planned.finger.model, follower.learned)
+    except StageError as error:
+        return (Warn(f"what the weld found is not kept: {error}", "name another file (prior)"),)
+    return (
+        f"what the weld found of tip, play and clock is in {path.name}: the next one starts from "
+        "it; delete the file to begin anew",
+    )
 
 
 def _with_power_source(
