@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flangeye.errors import CalibrationRefused
-from flangeye.estimation.closed.comanipulation import alternate, random_rotations, with_translations
+from flangeye.estimation.closed.comanipulation import best_rotations, with_translations
 from flangeye.estimation.closed.motions import motions_of, place_of
 from flangeye.estimation.closed.separable import park_martin
 from flangeye.estimation.graph import Places, Problem, Sightings
@@ -58,8 +58,6 @@ GOOD = 25.0
 for the estimate judges again."""
 SIZE_ROWS, LARGEST_SIZE = 8, 100.0
 """Poses of a set that a target's size is told from, and the largest factor on it."""
-TWO_ARMS = 20, 200, np.radians(1.0)
-"""Searches for the rotations of two arms, steps of each, and how well one has to agree [rad]."""
 
 
 def begin(problem: Problem) -> tuple[Places, Floats]:
@@ -326,15 +324,7 @@ def _of_two_arms(
 ) -> tuple[Floats, Floats, Floats]:
     """Return X, Y, Z of A X M = Y B Z: rotations by alternation from random starts."""
     rotations = given[0][:, :3, :3], given[1][:, :3, :3], given[2][:, :3, :3]
-    restarts, rounds, enough = TWO_ARMS
-    best, error = alternate(rotations, random_rotations(rng))
-    for _ in range(restarts):
-        if error < enough:
-            break
-        again, its = alternate(rotations, random_rotations(rng), rounds=rounds)
-        if its < error:
-            best, error = again, its
-    return with_translations(given, best)
+    return with_translations(given, best_rotations(rotations, rng))
 
 
 def _of_points(loop: _Loop, rows: Indices) -> dict[str, Floats]:

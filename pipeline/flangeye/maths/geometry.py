@@ -111,16 +111,17 @@ def quaternion_from_rotation(rotation: Floats) -> Floats:
 
 
 def rotation_from_quaternion(xyzw: Floats) -> Floats:
-    """Return the (3, 3) rotation of a quaternion (4,) xyzw; it is normalised first."""
+    """Return the (..., 3, 3) rotations of quaternions (..., 4) xyzw; they are normalised first."""
     q = np.asarray(xyzw, dtype=np.float64)
-    x, y, z, w = q / np.linalg.norm(q)
-    return np.array(
+    x, y, z, w = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
+    entries = np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
             [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
             [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
         ]
     )
+    return np.moveaxis(entries, (0, 1), (-2, -1))
 
 
 def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Floats:
