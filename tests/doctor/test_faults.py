@@ -9,6 +9,7 @@ import pytest
 
 from flangeye.doctor import examine
 from flangeye.doctor.diagnosis import Finding, RecordedSession
+from flangeye.errors import StageError
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.maths.pose_corrections import (
     delayed,
@@ -492,6 +493,21 @@ def random_session(seed):
 @pytest.mark.slow
 def test_no_false_alarm_in_two_hundred_clean_sessions() -> None:
     assert {seed: names for seed in range(200) if (names := named(random_session(seed)))} == {}
+
+
+def test_what_all_scans_share_is_told_alone() -> None:
+    """Whatever else a session with a wrong mesh seems to show is made up."""
+    session = session_of("marker")
+    wrong = Finding("set aside", "segment.body: jig is drawn mirrored", "mirror it", ("a", "b"))
+    aside = Finding("set aside", "segment.body: two poses: c, d", "", ("c", "d"), note=True)
+    spoilt = replace(session, poses=inverted(session.poses), remarks=(wrong, aside))
+    diagnosis = examine(spoilt, CHECKS)
+    assert diagnosis.findings == (wrong,)
+    assert diagnosis.notes == (aside,)
+    nothing = session.centres * np.nan
+    few = replace(session, centres=nothing, remarks=(aside,))
+    with pytest.raises(StageError, match=r"0 of 20 samples .*; 2 of them: segment.body: two poses"):
+        examine(few, CHECKS)
 
 
 def test_too_few_samples_are_refused() -> None:

@@ -204,7 +204,7 @@ def print_log(console: Console, log: RunLog) -> None:
         table.add_row(Text(printable(step)), str(len(entries)), f"{seconds:.2f}", str(count))
     console.print(table)
     for rejection in log.rejections:
-        write(console, f"rejected {rejection.id}: {rejection.stage}: {rejection.reason}")
+        write(console, f"rejected {rejection.id}: {rejection}")
     if log.finished and not log.complete:
         last = [e for e in log.entries if e.capture == log.finished[-1]]
         after = f", last step {last[-1].step}" if last else ""

@@ -188,7 +188,7 @@ class RunProgress:
         """Say which capture was rejected, and why; of those that share a reason, the first."""
         alike = self._rejected.setdefault((rejection.stage, rejection.reason), [])
         if not alike:
-            write(self._console, f"rejected {rejection.id}: {rejection.stage}: {rejection.reason}")
+            write(self._console, f"rejected {rejection.id}: {rejection}")
         alike.append(rejection.id)
 
     @hookimpl

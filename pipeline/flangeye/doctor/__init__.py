@@ -69,7 +69,9 @@ def evidence_of(finding: Finding) -> str:
 
 
 def fix_lines(finding: Finding, indent: str) -> list[str]:
-    """Return what to do, a line for each choice."""
+    """Return what to do, a line for each choice; none where nothing is to be done."""
+    if not finding.fix:
+        return []
     first, *others = finding.choices
     return [f"{indent}fix: {first}", *(f"{indent}or:  {other}" for other in others)]
 

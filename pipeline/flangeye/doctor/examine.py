@@ -51,6 +51,8 @@ def examine(
     bound = [check.bind() for check in checks]
     found, current = [r for r in session.remarks if not r.note], session
     known = tuple(remark for remark in session.remarks if remark.note)
+    if any(remark.hopeless for remark in found):
+        return Diagnosis(session, tuple(found), known, _names(bound), {})
     require_enough(session)
     offered, idle = _offered(current, bound, checked)
     if made_up := [f for f in offered if f.hopeless]:
@@ -102,7 +104,9 @@ def require_enough(session: RecordedSession) -> None:
     """
     seen = int(session.seen.sum())
     if seen < FEWEST_SAMPLES:
+        why = max(session.remarks, key=lambda remark: len(remark.samples), default=None)
         raise StageError(
             f"{seen} of {len(session)} samples have a target in them; at least {FEWEST_SAMPLES} "
             "are needed to tell a mistake from noise"
+            + (f"; {len(why.samples)} of them: {why.what}" if why else "")
         )

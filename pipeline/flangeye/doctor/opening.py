@@ -181,7 +181,8 @@ def _of_log(path: Path, registry: Registry, recipe: Recipe | None) -> RecordedSe
     states = {meta["id"]: _state_of(meta) for meta in calibration}
     if recipe is not None:
         session = replace(_as_recipe(session, recipe, states), again=_archive_again(recipe, found))
-    return replace(session, remarks=(*session.remarks, *_set_aside(log)))
+    remarks = (*session.remarks, *_rejected(log.rejections), *_set_aside(log))
+    return replace(session, remarks=remarks)
 
 
 def _archive_again(recipe: Recipe, found: Mapping[str, t.Feature]) -> ReadAgain | None:
@@ -191,6 +192,16 @@ def _archive_again(recipe: Recipe, found: Mapping[str, t.Feature]) -> ReadAgain 
     if path is None or not isinstance(reader, BoundPart) or not Path(path).exists():
         return None
     return partial(_read_again, Path(path), (reader, recipe), found)
+
+
+def _rejected(rejections: Sequence[t.Rejection]) -> Iterator[Finding]:
+    """Yield a finding for each cause that the whole session shares, and a note on the others."""
+    alike: dict[tuple[str, str, str], list[str]] = {}
+    for one in rejections:
+        alike.setdefault((one.stage, one.reason, one.fix), []).append(one.id)
+    for (stage, reason, fix), ids in alike.items():
+        what = f"{stage}: {reason}" + ("" if fix else f": {', '.join(ids)}")
+        yield Finding("set aside", what, fix, tuple(ids), note=not fix)
 
 
 def _set_aside(log: RunLog) -> Iterator[Finding]:
@@ -240,12 +251,13 @@ def _of_recipe(path: Path, registry: Registry, recipe: Recipe) -> RecordedSessio
         )
     archive: Archive = reader(path)
     check_ids(archive)
-    found, remark = found_in(archive, first, recipe, registry)
+    found, remarks, unit = found_in(archive, first, recipe, registry)
     kept = _kept(archive, first)
     session = _of_recordings(kept, found, recipe)
-    if remark is not None:
-        return _in_other_unit(session, *remark)
-    return replace(session, again=partial(_read_again, path, (reader, recipe), found))
+    if unit is not None:
+        return _in_other_unit(session, *unit)
+    again = partial(_read_again, path, (reader, recipe), found)
+    return replace(session, again=again, remarks=remarks)
 
 
 def _read_again(
@@ -393,54 +405,56 @@ def _given(params: Params, apart_from: Set[str] = frozenset()) -> dict[str, Any]
     return params.model_dump(mode="json", include=stated, exclude_unset=True, exclude_none=True)
 
 
+class _Seen(NamedTuple):
+    """What a recipe's steps saw in scans: features by id, what was set aside, what refused all."""
+
+    features: dict[str, t.Feature]
+    rejections: Sequence[t.Rejection]
+    refused: StageError | None
+
+
 def found_in(
     archive: Archive, first: Step, recipe: Recipe, registry: Registry
-) -> tuple[dict[str, t.Feature], tuple[str, str] | None]:
+) -> tuple[dict[str, t.Feature], tuple[Finding, ...], tuple[str, str] | None]:
     """Return what the recipe's steps find in the scans, in another unit if they find nothing.
 
     Returns:
-        The features by id; the unit they were found in and why not in that of the recipe, if so.
+        The features by id; what the captures set aside tell; the unit they were found in and why
+        not in that of the recipe, if so.
     """
     stated = None if first.params is None else getattr(first.params, "unit", None)
-    refused, found = None, dict[str, t.Feature]()
-    try:
-        found = _found_by(archive, first, recipe, registry)
-    except StageError as error:
-        refused = error
-    if len(found) < FEWEST_SAMPLES and stated is not None:
+    seen = _seen_by(archive, first, recipe, registry)
+    remarks = tuple(_rejected(seen.rejections))
+    if any(remark.fix for remark in remarks):
+        return seen.features, remarks, None
+    if len(seen.features) < FEWEST_SAMPLES and first.params is not None and stated is not None:
         for unit in _UNITS[stated]:
-            others = _in_unit(archive, first, recipe, registry, unit)
+            params = first.params.model_copy(update={"unit": unit})
+            others = _seen_by(archive, replace(first, params=params), recipe, registry).features
             if len(others) >= FEWEST_SAMPLES:
-                few = f"{len(found)} of {len(archive.recordings)} scans show a target with unit: "
-                seen = f"{few}{stated}, {len(others)} do with unit: {unit}"
-                return others, (unit, seen if refused is None else f"{refused}; {seen}")
-    if refused is not None:
-        raise refused
-    return found, None
+                count = f"{len(seen.features)} of {len(archive.recordings)} scans"
+                why = (
+                    f"{count} show a target with unit: {stated}, {len(others)} do with unit: {unit}"
+                )
+                return others, (), (unit, f"{seen.refused}; {why}" if seen.refused else why)
+    if seen.refused is not None:
+        raise seen.refused
+    return seen.features, remarks, None
 
 
-def _in_unit(
-    archive: Archive, first: Step, recipe: Recipe, registry: Registry, unit: str
-) -> dict[str, t.Feature]:
-    """Return what is found in the scans in another unit; nothing where that is refused."""
-    params = None if first.params is None else first.params.model_copy(update={"unit": unit})
-    try:
-        return _found_by(archive, replace(first, params=params), recipe, registry)
-    except StageError:
-        return {}
-
-
-def _found_by(
-    archive: Archive, first: Step, recipe: Recipe, registry: Registry
-) -> dict[str, t.Feature]:
-    """Return what the recipe's own steps find in the archive's scans, by id."""
+def _seen_by(archive: Archive, first: Step, recipe: Recipe, registry: Registry) -> _Seen:
+    """Return what the recipe's own steps see in the archive's scans."""
     stand_in = BoundPart(
         Part("reader.stand_in", lambda _: _with_stand_in_poses(archive), None, {}, (Archive,)), None
     )
     params = first.params.model_copy(update={"reader": stand_in}) if first.params else None
     steps = (replace(first, params=params), *recipe.steps[1:])
     runner = Runner(replace(recipe, steps=steps), registry, t.ArchivePath(archive.root))
-    return {o.id: o.feature for o in runner.observe()}
+    try:
+        features = {o.id: o.feature for o in runner.observe()}
+    except StageError as error:
+        return _Seen({}, runner.rejections, error)
+    return _Seen(features, runner.rejections, None)
 
 
 def _with_stand_in_poses(archive: Archive) -> Archive:

@@ -187,9 +187,7 @@ class Recorder:
     def flangeye_capture_rejected(self, rejection: t.Rejection) -> None:
         """Log a capture that was set aside."""
         self._json("/rejection", "Rejection", _plain(rejection))
-        self._log(
-            f"{rejection.id} set aside by {rejection.stage}: {rejection.reason}", foxglove.WARNING
-        )
+        self._log(f"{rejection.id} set aside by {rejection}", foxglove.WARNING)
 
     @hookimpl
     def flangeye_capture_finished(self, capture: str) -> None:

@@ -192,23 +192,24 @@ def load_body(name: str, unit: LengthUnit | None, near: Path) -> TargetBody:
 def _unit_of(path: Path, vertices: Floats, unit: LengthUnit | None) -> tuple[LengthUnit, str]:
     """Return the unit of a mesh, and how it was judged; empty where it was stated."""
     across = float(np.linalg.norm(np.ptp(vertices, axis=0)))
-    if unit or path.suffix.lower() in IN_METRES:
-        used: LengthUnit = unit or "m"
-        if not SMALLEST <= across / PER_METRE[used] <= LARGEST:
-            raise RecipeError(
-                f"{path.name}: in {used} it is {across / PER_METRE[used]:.4g} m across, and a body "
-                f"to look for is {SMALLEST * 1e3:g} mm to {LARGEST:g} m; is the unit right?"
-            )
-        return used, ""
-    fitting: list[LengthUnit] = [
-        unit for unit in ("mm", "m") if SMALLEST <= across / PER_METRE[unit] <= LARGEST
-    ]
-    if len(fitting) != 1:
-        raise RecipeError(
-            f"{path.name}: {across:.4g} across in its own unit, which may be "
-            f"{' or '.join(fitting) if fitting else 'none known'}; state it, for example unit: mm"
+    sizes = {each: across / PER_METRE[each] for each in PER_METRE}
+    fitting = [each for each, size in sizes.items() if SMALLEST <= size <= LARGEST]
+    in_each = " or ".join(f"{1e3 * sizes[each]:.0f} mm with unit: {each}" for each in fitting)
+    limits = f"a body to look for is {SMALLEST * 1e3:g} mm to {LARGEST:g} m across"
+    stated: LengthUnit | None = unit or ("m" if path.suffix.lower() in IN_METRES else None)
+    if stated in fitting:
+        return stated, ""
+    if stated or not fitting:
+        has = (
+            f"{sizes[stated]:.4g} m across with unit: {stated}"
+            if stated
+            else f"{across:.4g} across"
         )
-    return fitting[0], (
-        f"{path.name}: taken to be in {fitting[0]}, so {across / PER_METRE[fitting[0]] * 1e3:.0f} "
-        "mm across; state unit: where that is wrong"
+        other = f"it would be {in_each}" if fitting else "no unit makes it so"
+        raise RecipeError(f"{path.name}: it is {has}, and {limits}; {other}")
+    # Inches are taken for what neither of the others explains.
+    used = min(fitting, key=lambda each: each == "in")
+    return used, (
+        f"{path.name}: taken to be in {used}, so {sizes[used] * 1e3:.0f} mm across; state unit: "
+        "where that is wrong"
     )

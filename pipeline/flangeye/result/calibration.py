@@ -174,9 +174,7 @@ def observations_result(
     pairs: Sequence[t.Pair], rejections: Sequence[t.Rejection]
 ) -> list[ObservationResult]:
     """Return the section ``observations``: every capture, those set aside early included."""
-    early = [
-        ObservationResult(id=r.id, used=False, reason=f"{r.stage}: {r.reason}") for r in rejections
-    ]
+    early = [ObservationResult(id=r.id, used=False, reason=str(r)) for r in rejections]
     return sorted([*map(_observation, pairs), *early], key=lambda o: o.id)
 
 

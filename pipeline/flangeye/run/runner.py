@@ -90,6 +90,11 @@ class Runner:
         observations: t.Observations = self._values[t.Observations]
         return observations
 
+    @property
+    def rejections(self) -> Sequence[t.Rejection]:
+        """Captures set aside so far."""
+        return self._outcome.rejections
+
     def take(self, count: int | None) -> list[t.Observation]:
         """Return the first ``count`` observations, or all, and let go of the source."""
         try:
@@ -198,11 +203,12 @@ class Runner:
         Raises:
             NothingSeen: None does; with verification views alone there was none to look at.
         """
-        why = [f"{each.stage}: {each.reason}" for each in self._outcome.rejections]
+        why = [(each.stage, each.reason, each.fix) for each in self._outcome.rejections]
         if self._outcome.seen or self._values[t.Views] or not why:
             return
-        usual, share = Counter(why).most_common(1)[0]
+        (stage, reason, fix), share = Counter(why).most_common(1)[0]
         of = f"{share} of the " if share < len(why) else "the "
+        usual = f"{stage}: {reason}" + (f"; {fix}" if fix else "")
         raise NothingSeen(f"no capture can be used; {of}{len(why)} were rejected by {usual}")
 
     def _may_work_ahead(self, stream: t.Captures) -> bool:
@@ -264,7 +270,8 @@ class Runner:
         step = self._steps(kind)[0]
         value = self._call(step, capture, given)
         if isinstance(value, t.Rejected):
-            self._reject(t.Rejection(capture, step.stage.name, value.reason))
+            why = (value.reason, value.figures, value.fix)
+            self._reject(t.Rejection(capture, step.stage.name, *why))
             return None
         return value
 

@@ -106,18 +106,32 @@ Feature = CircleFeature | PoseFeature
 
 @dataclass(frozen=True, eq=False)
 class Rejected:
-    """What a per-capture stage returns instead of a value: the capture is set aside, and why."""
+    """What a per-capture stage returns instead of a value: the capture is set aside, and why.
+
+    Attributes:
+        reason: The same text for all captures that are set aside for it.
+        figures: This capture's own.
+        fix: What to do, where the cause is not the capture's but the whole session's.
+    """
 
     reason: str
+    figures: str = ""
+    fix: str = ""
 
 
 @dataclass(frozen=True, eq=False)
 class Rejection:
-    """A capture that was set aside: which, by which stage, and why."""
+    """A capture that was set aside: which, by which stage, and why, as :class:`Rejected` says."""
 
     id: str
     stage: str
     reason: str
+    figures: str = ""
+    fix: str = ""
+
+    def __str__(self) -> str:
+        figures = f" ({self.figures})" if self.figures else ""
+        return f"{self.stage}: {self.reason}{figures}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flangeye.types import Floats, Mask
+from flangeye.types import Floats, Indices, Mask, Singles
 from flangeye_plugins.body.shape import GRAZING, Shape
-from flangeye_plugins.body.view import CoarseImage
+from flangeye_plugins.body.view import CoarseImage, view_of
 
 NEARER_SHARE = 0.1
 """How far in front of the body a surface contradicts it, as a share of the size: what is nearer to
@@ -26,6 +26,11 @@ behind it that is, as a share of the size: without, any face of a box is a plate
 
 PENALTY = 10
 """Rays in favour that one ray against outweighs: of the true pose there are hardly any."""
+
+
+CELLS, TOLERANCE, OPPOSED = 100, 0.01, 0.1
+"""Where a part is judged: cells across the body, how far off its surface a ray may be, as a share
+of the size, and the share of rays against it from which the part stands elsewhere."""
 
 
 class BodyVerdict(NamedTuple):
@@ -84,19 +89,10 @@ def judged(shape: Shape, view: CoarseImage, pose: Floats, tolerance: float) -> B
     """
     from scipy import ndimage
 
-    window = _window(shape, view, pose)
-    rays, scan = view.directions[window], view.xyz[window]
-    if not rays.size:
+    compared = _compared(shape, view, pose, tolerance)
+    if compared is None:
         return BodyVerdict(*[0] * 7)
-    depth, normals = _seen_from(shape, rays, pose)
-    hit = np.isfinite(depth)
-    off = np.einsum("ijk,ijk->ij", normals, scan - np.where(hit, depth, 0.0)[..., None] * rays)
-    due = hit & ~_edges(np.where(hit, depth, np.inf), view.angle)
-    due &= np.einsum("ijk,ijk->ij", normals, rays) < -GRAZING * np.linalg.norm(rays, axis=-1)
-    agree = due & (np.abs(off) < tolerance)
-    before = (off > 2 * tolerance) & (scan[..., 2] > depth - NEARER_SHARE * shape.size)
-    # A single ray may be a mixed one, at an edge of the body.
-    against = ndimage.binary_opening(due & ((off < -2 * tolerance) | before))
+    rays, scan, depth, normals, hit, due, agree, against, _ = compared
     beside = ndimage.binary_dilation(hit, iterations=OUTLINE) & ~ndimage.binary_dilation(hit)
     row, column = ndimage.distance_transform_edt(~hit, return_distances=False, return_indices=True)
     ended = depth[row, column][..., None] * rays[row, column]
@@ -107,11 +103,64 @@ def judged(shape: Shape, view: CoarseImage, pose: Floats, tolerance: float) -> B
     return BodyVerdict(*(int(count.sum()) for count in counts))
 
 
-def _seen_from(shape: Shape, rays: Floats, pose: Floats) -> tuple[Floats, Floats]:
-    """Return (H, W) depth of the body along rays with z = 1, and (H, W, 3) normals in camera."""
+class _Compared(NamedTuple):
+    """Rays towards a body, all (H, W) or (H, W, 3): as scanned and as the body would be met."""
+
+    rays: Floats
+    scan: Floats
+    depth: Floats
+    normals: Floats
+    hit: Mask
+    due: Mask
+    agree: Mask
+    against: Mask
+    facets: Indices
+
+
+def _compared(shape: Shape, view: CoarseImage, pose: Floats, tolerance: float) -> _Compared | None:
+    """Return the scan beside the body at a pose, ray by ray; None where no ray is near."""
+    from scipy import ndimage
+
+    window = _window(shape, view, pose)
+    rays, scan = view.directions[window], view.xyz[window]
+    if not rays.size:
+        return None
     rotation, origin = pose[:3, :3], -pose[:3, 3] @ pose[:3, :3]
     met = shape.meet(origin, rays.reshape(-1, 3) @ rotation)
-    return met.depth.reshape(rays.shape[:2]), (met.normals @ rotation.T).reshape(rays.shape)
+    depth, facets = met.depth.reshape(rays.shape[:2]), met.facets.reshape(rays.shape[:2])
+    normals = (met.normals @ rotation.T).reshape(rays.shape)
+    hit = np.isfinite(depth)
+    off = np.einsum("ijk,ijk->ij", normals, scan - np.where(hit, depth, 0.0)[..., None] * rays)
+    due = hit & ~_edges(np.where(hit, depth, np.inf), view.angle)
+    due &= np.einsum("ijk,ijk->ij", normals, rays) < -GRAZING * np.linalg.norm(rays, axis=-1)
+    agree = due & (np.abs(off) < tolerance)
+    before = (off > 2 * tolerance) & (scan[..., 2] > depth - NEARER_SHARE * shape.size)
+    # A single ray may be a mixed one, at an edge of the body.
+    against = ndimage.binary_opening(due & ((off < -2 * tolerance) | before))
+    return _Compared(rays, scan, depth, normals, hit, due, agree, against, facets)
+
+
+def opposed(points: Singles, shape: Shape, pose: Floats) -> Mask | None:
+    """Return (T,) the facets of parts that a scan speaks against at a pose; None where of none.
+
+    A part is what hangs together in the mesh; a tenth of what is seen in its place is not it.
+
+    Args:
+        points: (N, 3) of the scan.
+        shape: The body.
+        pose: ``camera_T_body``.
+    """
+    parts, of_facet = shape.parts
+    view = view_of(points, shape.size / CELLS)
+    seen = _compared(shape, view, pose, TOLERANCE * shape.size) if parts > 1 else None
+    if seen is None:
+        return None
+    agree, against = (
+        np.bincount(of_facet[seen.facets[rays]], minlength=parts)
+        for rays in (seen.agree, seen.against)
+    )
+    gone = against > OPPOSED * (agree + against)
+    return gone[of_facet] if gone.any() and not gone.all() else None
 
 
 def _edges(depth: Floats, angle: float) -> Mask:

@@ -54,10 +54,12 @@ class Met(NamedTuple):
     Attributes:
         depth: (N,) in lengths of the directions; infinite where a ray passed.
         normals: (N, 3) of the smooth surface, towards the ray's origin.
+        facets: (N,) the triangle that was met; 0 where a ray passed.
     """
 
     depth: Floats
     normals: Floats
+    facets: Indices
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +108,27 @@ class Shape:
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
         away = np.einsum("nc,nc->n", normals, directions) > 0
         normals[away] *= -1
-        return Met(depth, normals)
+        return Met(depth, normals, facet)
+
+    @property
+    def facets(self) -> tuple[Floats, Indices]:
+        """Vertices (V, 3) and triangles (T, 3) as rays meet them."""
+        mesh = self._smooth[0]
+        return np.asarray(mesh.vertices), np.asarray(mesh.faces)
+
+    @cached_property
+    def parts(self) -> tuple[int, Indices]:
+        """How many parts of facets that hang together the mesh has, and (T,) which has each."""
+        from scipy.sparse import coo_matrix
+        from scipy.sparse.csgraph import connected_components
+
+        vertices, triangles = self.facets
+        corners = np.unique(vertices.round(6), axis=0, return_inverse=True)[1].ravel()
+        a, b, c = corners[triangles].T
+        ones, size = np.ones(2 * len(a)), corners.max() + 1
+        touching = coo_matrix((ones, (np.r_[a, b], np.r_[b, c])), shape=(size, size))
+        count, part = connected_components(touching, directed=False)
+        return count, part[a]
 
     @cached_property
     def _mesh(self) -> Any:

@@ -26,6 +26,8 @@ from flangeye.types import (
 from flangeye.units import Length, param
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
     from flangeye_plugins.body.search import FoundPose
 
 FIRM = 0.004
@@ -103,13 +105,8 @@ def segment_body(
         found = list(filter(passes, every))
         if why := _why_not(every, found, body):
             # Of the first captures only: a body that was seen before is as its mesh says.
-            others = {} if found or earlier.observations else _others(body)
-            fits = (
-                what for what, other in others.items()
-                if any(map(passes, BodySearch(points, *prepared(other)).everywhere()))
-            )  # fmt: skip
-            what = next(fits, None)
-            return Rejected(f"{body.name} is {what}: so it would be found" if what else why)
+            doubtful = not found and not earlier.observations
+            return (doubtful and _misdrawn(points, body, every, passes)) or why
     pose = found[0].pose
     centre = pose[:3, :3] @ shape.centre + pose[:3, 3]
     cloud = PointCloud(capture.cloud.frame, around(points, shape, pose))
@@ -137,19 +134,67 @@ def _predicted(capture: Capture, configuration: Configuration, earlier: Earlier)
     ]).reshape(-1, 4, 4)  # fmt: skip
 
 
-def _others(body: TargetBody) -> dict[str, TargetBody]:
-    """Return what a body's mesh may be in truth, where it is written wrongly."""
-    sizes = {scale: scale * body.size for scale in (1 / INCH, INCH)}
-    changes = {"drawn mirrored": np.array([-1.0, 1.0, 1.0])} | {
-        f"{INCH:g} times too {'large' if scale < 1 else 'small'}, millimetres for inches or the "
-        "reverse": np.full(3, scale)
-        for scale, size in sizes.items()
-        if SMALLEST <= size <= LARGEST
-    }
-    return {
-        what: TargetBody(body.name, body.vertices * change, body.triangles)
-        for what, change in changes.items()
-    }
+def _misdrawn(
+    points: Singles, body: TargetBody, every: list[FoundPose], passes: Callable[[FoundPose], bool]
+) -> Rejected | None:
+    """Return how a mesh is drawn wrongly, where it would be found otherwise; None where not."""
+    from flangeye_plugins.body.judge import opposed
+    from flangeye_plugins.body.looks import prepared
+    from flangeye_plugins.body.search import BodySearch
+
+    for what, fix, vertices in _otherwise(body):
+        other = TargetBody(body.name, vertices, body.triangles)
+        if any(map(passes, BodySearch(points, *prepared(other)).everywhere())):
+            return Rejected(f"{body.name} is {what}: so it would be found", fix=fix)
+    shape = prepared(body)[0]
+    vertices, facets = shape.facets
+    held: list[tuple[float, Floats]] = []
+    for pose in (one.pose for one in every):
+        gone = opposed(points, shape, pose)
+        if gone is not None:
+            rest = TargetBody(body.name, vertices, facets[~gone].astype(np.int32))
+            near = filter(_holds, BodySearch(points, *prepared(rest)).near(pose[None]))
+            held += [(one.verdict.score, vertices[facets[gone]]) for one in near]
+    if not held:
+        return None
+    corners = 1e3 * max(held, key=lambda one: one[0])[1].reshape(-1, 3)
+    spans = zip("xyz", corners.min(axis=0), corners.max(axis=0), strict=True)
+    box = ", ".join(f"{axis} {low:.0f} to {high:.0f}" for axis, low, high in spans)
+    return Rejected(
+        f"{body.name} is there, but not as its mesh has it: a part of it has moved",
+        f"what stands elsewhere is within {box} mm",
+        "draw the part that moves, such as a gripper's jaws, as it was in the session, or leave it "
+        "out of the mesh",
+    )
+
+
+def _holds(found: FoundPose) -> bool:
+    """Whether a body without parts that have moved is there: these still hide some of the rest."""
+    verdict = found.verdict
+    return (
+        verdict.trusted >= 0.93
+        and verdict.agree >= 150
+        and verdict.bounded
+        and verdict.goes_on <= 0.1 * verdict.beside
+        and found.weakest <= FIRM / 2
+    )
+
+
+def _otherwise(body: TargetBody) -> Iterator[tuple[str, str, Floats]]:
+    """Yield how a body's mesh may be written wrongly: what is wrong, what to do, its vertices."""
+    yield (
+        "drawn mirrored",
+        "mirror the mesh, or state the handedness of its axes where it is exported",
+        body.vertices * [-1.0, 1.0, 1.0],
+    )
+    for scale, units in ((INCH, "millimetres for inches"), (10.0, "millimetres for centimetres")):
+        for times, size in ((scale, "small"), (1 / scale, "large")):
+            if SMALLEST <= times * body.size <= LARGEST:
+                yield (
+                    f"{scale:g} times too {size}, {units} or the reverse",
+                    f"state the unit: of the target, or scale the mesh by {times:.4g}",
+                    body.vertices * times,
+                )
 
 
 def _passes(found: FoundPose, params: SegmentBodyParams) -> bool:
@@ -167,22 +212,23 @@ def _passes(found: FoundPose, params: SegmentBodyParams) -> bool:
     )
 
 
-def _why_not(every: list[FoundPose], passing: list[FoundPose], body: TargetBody) -> str | None:
+def _why_not(every: list[FoundPose], passing: list[FoundPose], body: TargetBody) -> Rejected | None:
     """Return why no pose is taken; None where one is."""
     if not every:
-        return f"nothing of the size of {body.name} is there"
+        return Rejected(f"nothing of the size of {body.name} is there")
     best = every[0].verdict
     if not passing:
-        return (
-            f"no pose of {body.name} ({body.size * 1e3:.0f} mm across) explains the scan: the best "
-            f"shows {best.shown:.0%} of it in {best.agree} rays, {best.trusted:.1%} of what is "
-            f"seen there fits, and it holds to {every[0].weakest * body.size * 1e3:.1f} mm; is it "
-            "in view, and the mesh's unit and handedness right?"
+        return Rejected(
+            f"no pose of {body.name} ({body.size * 1e3:.0f} mm across) explains the scan: is it in "
+            "view, and are the mesh's unit and handedness right?",
+            f"the best shows {best.shown:.0%} of it in {best.agree} rays, {best.trusted:.1%} of "
+            f"what is seen there fits, and it holds to {every[0].weakest * body.size * 1e3:.1f} mm",
         )
     if len(passing) > 1:
         turn = rotation_log((passing[0].pose.T @ passing[1].pose)[None, :3, :3])[0]
-        return (
-            f"two poses of {body.name} {np.degrees(np.linalg.norm(turn)):.0f} deg apart explain "
-            f"the scan ({passing[0].verdict.agree} and {passing[1].verdict.agree} rays)"
+        return Rejected(
+            f"two poses of {body.name} explain the scan",
+            f"{np.degrees(np.linalg.norm(turn)):.0f} deg apart, by {passing[0].verdict.agree} and "
+            f"{passing[1].verdict.agree} rays",
         )
     return None

@@ -147,7 +147,9 @@ def test_two_poses_that_explain_a_scan_alike_are_refused_until_the_arms_motion_t
     beside = xyz[..., :2] / xyz[..., 2:] - gland[:2] / gland[2]
     xyz[np.linalg.norm(beside, axis=-1) < 0.06] = np.nan
     capture = replace(scan(GRIPPER, BEHIND), cloud=PointCloud(CAMERA, xyz))
-    assert "two poses of gripper 180 deg apart" in found(capture).reason
+    refused = found(capture)
+    assert refused.reason == "two poses of gripper explain the scan"
+    assert refused.figures.startswith("180 deg apart, by ")
     assert is_at(BEHIND, found(capture, earlier=sighting(POSE)))
 
 
@@ -167,7 +169,7 @@ def test_a_body_that_is_not_there_is_refused() -> None:
     [
         (np.diag([-1.0, 1.0, 1.0]), "torch is drawn mirrored"),
         (25.4 * np.eye(3), "torch is 25.4 times too large"),
-        (np.eye(3) / 2.54, "no pose of torch"),
+        (np.eye(3) / 10, "torch is 10 times too small"),
         (1.3 * np.eye(3), "no pose of torch"),
     ],
     ids=["mirrored", "inches", "centimetres", "30 % too large"],
@@ -220,6 +222,19 @@ def test_a_part_that_moves_is_seen_in_what_the_scan_is_off() -> None:
     assert np.linalg.norm(off(feature)[3:]) < 2e-3
 
 
+@pytest.mark.parametrize("further", [0.01, -0.008])
+def test_a_part_that_stands_elsewhere_is_named(further: float) -> None:
+    moved = GRIPPER.vertices.copy()
+    jaws = (moved[:, 2] > 0.1055) & (np.abs(moved[:, 0]) < 0.04)
+    moved[jaws, 0] += np.where(moved[jaws, 0] > 0, further, -further)
+    pose = rigid(rotation_from_rpy(2.2, 0.1, -0.9), np.array([0.0, 0.05, 0.8]))
+    refused = found(scan(TargetBody("open", moved, GRIPPER.triangles), pose))
+    assert isinstance(refused, Rejected)
+    assert "a part of it has moved" in refused.reason
+    assert "z 106 to 168 mm" in refused.figures
+    assert "as it was in the session" in refused.fix
+
+
 def test_fit_body_needs_segment_body() -> None:
     cloud = FlangeCloud(scan(GRIPPER).cloud, np.zeros(3), np.array([0, 0, -1.0]))
     assert "segment.body" in fit_body(cloud, GRIPPER, FitBodyParams()).reason
@@ -235,12 +250,17 @@ def test_the_unit_is_judged_by_the_size_and_refused_where_it_cannot_be(tmp_path:
     assert judged.size == pytest.approx(GRIPPER.size, rel=1e-5)
     assert "taken to be in mm" in judged.note
     assert load_body("own.stl", "mm", tmp_path).note == ""
-    with pytest.raises(RecipeError, match="is the unit right"):
+    with pytest.raises(
+        RecipeError, match="5.716 m across with unit: in, and .* 225 mm with unit: mm"
+    ):
         load_body("own.stl", "in", tmp_path)
     written(1 / 0.0254)
-    with pytest.raises(RecipeError, match="state it, for example unit: mm"):
+    inches = load_body("own.stl", None, tmp_path)
+    assert inches.size == pytest.approx(GRIPPER.size, rel=1e-5)
+    assert "taken to be in in" in inches.note
+    written(1e5)
+    with pytest.raises(RecipeError, match="2.25e.04 across, .* no unit makes it so"):
         load_body("own.stl", None, tmp_path)
-    assert load_body("own.stl", "in", tmp_path).size == pytest.approx(GRIPPER.size, rel=1e-5)
     with pytest.raises(RecipeError, match=r"no body 'griper'; known: gripper"):
         load_body("griper", None, tmp_path)
 
