@@ -208,7 +208,8 @@ def test_centres_of_an_unknown_place_are_solved_by_what_a_refusal_names(tmp_path
 @pytest.mark.parametrize(
     ("fault", "kind"),
     [("robot's degrees as radians", "marker"), ("both inverted", "hand"),
-     ("marker's y negated", "marker"), ("marker's rpy as vector", "hand")],
+     pytest.param("marker's y negated", "marker", marks=pytest.mark.slow),
+     pytest.param("marker's rpy as vector", "hand", marks=pytest.mark.slow)],
 )  # fmt: skip
 def test_a_fault_in_tables_is_named_and_its_line_cures(fault: str, kind: str) -> None:
     cells = [cell.strip() for cell in injected.row(fault, kind, 1).split("|")[1:-1]]

@@ -63,7 +63,7 @@ def test_a_pose_that_belongs_elsewhere_is_set_aside() -> None:
     assert not inliers[5] and inliers.sum() == 19
 
 
-@pytest.mark.parametrize("kind", ["marker", "flange"])
+@pytest.mark.parametrize("kind", [pytest.param("marker", marks=pytest.mark.slow), "flange"])
 def test_what_is_stated_as_reported_is_as_large_as_the_error(kind) -> None:
     arms = foreign.UR5E, foreign.PANDA
     scores = [score(kind, arms[seed % 2], 0.3e-3, 16, seed) for seed in range(8)]
@@ -74,7 +74,7 @@ def test_what_is_stated_as_reported_is_as_large_as_the_error(kind) -> None:
         assert true.mean() < 1.1**2 * np.mean([s.svd for s in scores])
 
 
-@pytest.mark.parametrize("kind", ["hand", "flange"])
+@pytest.mark.parametrize("kind", [pytest.param("hand", marks=pytest.mark.slow), "flange"])
 def test_both_answers_hold_where_no_joints_were_recorded(kind) -> None:
     arms = foreign.UR5E, foreign.PANDA
     scores = [score(kind, arms[seed % 2], 0.3e-3, 16, seed, told=False) for seed in range(8)]

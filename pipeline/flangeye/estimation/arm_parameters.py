@@ -133,16 +133,17 @@ def _columns(found: Estimate, arm: str) -> tuple[Indices, Indices]:
 
 
 def most_telling_poses(
-    session: Session, candidates: Sequence[Observation], count: int
+    session: Session, known: ArmParameters, candidates: Sequence[Observation], count: int
 ) -> tuple[Indices, ArmParameters]:
     """Return which sightings would tell most of the arm, and what would be known with them.
 
     Args:
         session: What was seen.
+        known: What it tells of the arm.
         candidates: As they would be, with joints.
         count: How many to choose.
     """
-    found, known = session.found, parameters_of(session)
+    found = session.found
     columns, of_size = _columns(found, FLANGE)
     covariance = _loosely(found, of_size)
     rows, _ = whitened(candidates, found, session.cell)

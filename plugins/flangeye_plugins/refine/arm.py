@@ -127,7 +127,7 @@ def _proposed(session: Session, told: ArmParameters, count: int) -> list[str]:
     candidates = _candidates(session)
     if not count or not candidates:
         return []
-    chosen, after = most_telling_poses(session, candidates, count)
+    chosen, after = most_telling_poses(session, told, candidates, count)
     listed = "; ".join(
         ", ".join(f"{x:.0f}" for x in np.degrees(candidates[i].joints)) for i in chosen
     )

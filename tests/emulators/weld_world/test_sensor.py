@@ -106,7 +106,7 @@ def test_no_measure_in_the_controller_s_file_moves_the_world(name: str, finger: 
     assert happenings(finger) == happenings(FINGER), name
 
 
-@pytest.mark.parametrize("wrong", [3, 5])
+@pytest.mark.parametrize("wrong", [3, pytest.param(5, marks=pytest.mark.slow)])
 def test_a_torch_that_the_file_has_wrong_is_scored_as_far_off(wrong: int, tmp_path: Path) -> None:
     text = (bundled("data") / "fingers" / "srm.yaml").read_text()
     file = tmp_path / "wrong.yaml"

@@ -236,7 +236,7 @@ def test_published_clouds_held_out(aubo: list[Observation]) -> None:
     assert held_out(solver(robot), "corrected_rms", 0)[0] <= 0.32
 
 
-@pytest.mark.parametrize("with_joints", [True, False])
+@pytest.mark.parametrize("with_joints", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_the_stated_region_allows_for_joint_zeros(ur5: RobotModel, with_joints: bool) -> None:
     """Zeros within the robot file's accuracy move all poses alike: residuals do not show it."""
     inside = []

@@ -69,7 +69,9 @@ def test_the_end_of_the_seam_makes_no_step() -> None:
         assert abs(lateral[12:] - lateral[:-12]).max() < 0.1e-3
 
 
-@pytest.mark.parametrize("start", [0.085, 0.095, 0.1, 0.105])
+@pytest.mark.parametrize(
+    "start", [0.105, *(pytest.param(at, marks=pytest.mark.slow) for at in (0.085, 0.095, 0.1))]
+)
 def test_a_wall_that_is_missing_at_the_end_does_not_lead_astray(start: float) -> None:
     true = curved()
     length = np.linalg.norm(np.diff(true, axis=0), axis=1).sum()

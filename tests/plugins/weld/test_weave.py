@@ -35,7 +35,7 @@ def test_a_swing_is_a_sine_with_its_derivatives() -> None:
 @pytest.mark.parametrize(
     ("name", "width", "frequency"),
     [
-        ("weave 3 mm at 0.8 Hz", 3e-3, 0.8),
+        pytest.param("weave 3 mm at 0.8 Hz", 3e-3, 0.8, marks=pytest.mark.slow),
         ("weave 2 mm at 1 Hz, arm lag 100 ms + dead time 60 ms", 2e-3, 1.0),
     ],
 )
