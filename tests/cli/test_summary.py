@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 from flangeye import result as r
 from flangeye.cli.app import GROUPS
 from flangeye.cli.commands import app
-from flangeye.cli.console import write
-from flangeye.cli.summary import RunProgress, print_refusal, print_summary, wrapped
+from flangeye.cli.console import wrapped, write
+from flangeye.cli.summary import RunProgress, print_refusal, print_summary
 from flangeye.types import Rejection, Source, Warn
 
 SCALE = {"text": "the target is 1.3 % larger than configured", "fix": "feature.size: 40.52 mm"}

@@ -40,6 +40,7 @@ def test_each_line_that_would_mend_a_recipe_can_be_copied(
     assert code == 1
     lines = [line.strip() for line in out.splitlines()]
     choices = [line[5:] for line in lines if line.startswith(("fix: ", "or:  "))]
+    assert str(tmp_path) not in out  # a line for the recipe names files as the recipe does
     assert len(choices) == 2  # the arm's poses are not inverted: distances would be unlikely
     for line in choices:
         old = "- acquire.samples" if line.startswith("- ") else "configuration"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 import sys
+import textwrap
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -33,6 +34,20 @@ def say(text: object, err: bool = False) -> None:
 def write(console: Console, text: str, style: str = "") -> None:
     """Write lines in a colour, where the output is a terminal; no markup of others is followed."""
     console.print(printable(text), style=style, markup=False, highlight=False, soft_wrap=True)
+
+
+def wrapped(console: Console, text: str, indent: int = 2) -> str:
+    """Return a text in the lines that the terminal shows; commands stay whole."""
+    return textwrap.fill(
+        text, width(console), subsequent_indent=" " * indent, break_long_words=False,
+        break_on_hyphens=False, drop_whitespace=True, replace_whitespace=False,
+    )  # fmt: skip
+
+
+def width(console: Console) -> int:
+    """Return how many columns a line may have."""
+    # Columns of a line that goes to a file or another program, whose width nobody knows
+    return console.width if console.is_terminal else 100
 
 
 def say_notes(notes: Sequence[str]) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from flangeye.cli.console import write
+from flangeye.cli.console import wrapped, write
 from flangeye.files.words import printable
 from flangeye.maths.geometry import rpy_from_rotation
 from flangeye.result import (
@@ -35,14 +35,22 @@ def print_details(console: Console, result: Result) -> None:
     count = f"{used} of {len(result.observations)} captures used"
     lines = [result.title, f"{status_of(result)}: {count}"]
     lines += [f"refused: {result.refused}"] if result.refused else []
-    lines += [f"warning: {each.text}\n  -> {each.fix}" for each in result.warnings]
+    for each in result.warnings:
+        lines += [f"warning: {each.text}", f"  -> {each.fix}"]
     for name, estimate in result.transforms.items():
         lines += ["", f"{name} (maps {name.split('_T_')[1]} to {name.split('_T_')[0]}, metres)"]
         lines += ["  " + "  ".join(f"{x:10.6f}" for x in row) for row in estimate.matrix]
         lines += ["", *_uncertainty(name.partition("_T_")[0], estimate)]
     lines += [*_errors(result), *_idle(result), *_answers(result), *_seam(result), *_weld(result)]
     lines += ["", *(f"note: {note}" for note in result.notes)] if result.notes else []
-    write(console, "\n".join(lines))
+    write(console, "\n".join(_hung(console, line) for line in lines))
+
+
+def _hung(console: Console, line: str) -> str:
+    """Return a line as the terminal shows it, further ones beside its text; commands stay whole."""
+    if line.startswith("  ->"):
+        return line
+    return wrapped(console, line, 21 if line.startswith("  ") else 2)
 
 
 def _uncertainty(parent: str, estimate: TransformResult) -> list[str]:
@@ -182,14 +190,14 @@ def print_log(console: Console, log: RunLog) -> None:
 
     state = _state(log)
     expected = f" of {log.total}" if log.total else ""
-    write(console, f"{log.path}: {state}")
+    write(console, wrapped(console, f"{log.path}: {state}"))
     # Centres or poses of a target that somebody had found already are no captures.
     measured = any(entry.stage.startswith("acquire.") for entry in log.entries)
     arrived = "" if measured else f"{len(log.poses)}{expected} captures arrived, "
     went = f"{len(log.finished)}{expected} measurements" if measured else f"{len(log.finished)}"
     write(console, f"{arrived}{went} went through")
     for note in records_of(log.source.notes) if log.source else ():
-        write(console, f"note: {note}")
+        write(console, wrapped(console, f"note: {note}"))
     table = Table(box=None, pad_edge=False, header_style="bold")
     for column in ("step", "values", "seconds", "rejected"):
         table.add_column(column, justify="left" if column == "step" else "right")
@@ -204,7 +212,7 @@ def print_log(console: Console, log: RunLog) -> None:
         table.add_row(Text(printable(step)), str(len(entries)), f"{seconds:.2f}", str(count))
     console.print(table)
     for rejection in log.rejections:
-        write(console, f"rejected {rejection.id}: {rejection}")
+        write(console, wrapped(console, f"rejected {rejection.id}: {rejection}"))
     if log.finished and not log.complete:
         last = [e for e in log.entries if e.capture == log.finished[-1]]
         after = f", last step {last[-1].step}" if last else ""

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Collection, Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
-from flangeye.cli.console import write
+from flangeye.cli.console import width, wrapped, write
 from flangeye.plugin.hookspecs import hookimpl
 from flangeye.report.units import rounded_mm
 from flangeye.result import Result, expected_error, status_of
@@ -124,20 +123,6 @@ def rows(console: Console, rows: Iterable[tuple[str, str, str]], colour: str = "
         write(console, line, colour)
 
 
-def wrapped(console: Console, text: str, indent: int = 2) -> str:
-    """Return a text in the lines that the terminal shows; commands stay whole."""
-    return textwrap.fill(
-        text, width(console), subsequent_indent=" " * indent, break_long_words=False,
-        break_on_hyphens=False, drop_whitespace=True, replace_whitespace=False,
-    )  # fmt: skip
-
-
-def width(console: Console) -> int:
-    """Return how many columns a line may have."""
-    # Columns of a line that goes to a file or another program, whose width nobody knows
-    return console.width if console.is_terminal else 100
-
-
 class RunProgress:
     """Shows captures, then the steps that run once; a hook implementation like any other.
 
@@ -178,7 +163,8 @@ class RunProgress:
     def flangeye_run_started(self, source: Source, total: int | None) -> None:
         """Start the bar, and print what has to be done about the source."""
         for each in warnings_of(source.notes):
-            write(self._console, f"warning: {each}\n  -> {each.fix}", "yellow")
+            write(self._console, wrapped(self._console, f"warning: {each}"), "yellow")
+            write(self._console, f"  -> {each.fix}", "yellow")
             self.said.append(str(each))
         self._progress.update(self._task, description="captures", total=total)
         self._progress.start()
@@ -188,7 +174,7 @@ class RunProgress:
         """Say which capture was rejected, and why; of those that share a reason, the first."""
         alike = self._rejected.setdefault((rejection.stage, rejection.reason), [])
         if not alike:
-            write(self._console, f"rejected {rejection.id}: {rejection}")
+            write(self._console, wrapped(self._console, f"rejected {rejection.id}: {rejection}"))
         alike.append(rejection.id)
 
     @hookimpl
@@ -226,6 +212,5 @@ class RunProgress:
         self._progress.stop()
         for first, *others in self._rejected.values():
             if others:
-                write(
-                    self._console, f"rejected for the same reason as {first}: {', '.join(others)}"
-                )
+                same = f"rejected for the same reason as {first}: {', '.join(others)}"
+                write(self._console, wrapped(self._console, same))

@@ -28,6 +28,7 @@ from flangeye.doctor.diagnosis import (
 )
 from flangeye.errors import StageError
 from flangeye.files.recording import Archive, NotThisLayout, Recording, check_ids
+from flangeye.files.yaml_lines import parse_yaml
 from flangeye.log.read import RunLog, is_log, log_of, read_run
 from flangeye.maths.geometry import rigid
 from flangeye.maths.kinematics import Arm
@@ -378,8 +379,16 @@ def _as_recipe(
         marks_open=any(getattr(s.params, "unobservable", None) == "mark" for s in recipe.steps),
         reader=reader,
         acquire=first.stage.name,
-        changes={} if first.params is None else _given(first.params, {"reader"}),
+        changes={**_given(first.params, {"reader", "path"}), **_path_in(recipe)},
     )
+
+
+def _path_in(recipe: Recipe) -> dict[str, Any]:
+    """Return the archive's path as the recipe has it, which a line for the recipe keeps."""
+    steps = parse_yaml(recipe.text, recipe.name).data["steps"]
+    params = next(iter(steps[0].values())) if isinstance(steps[0], Mapping) else None
+    path = params.get("path") if isinstance(params, Mapping) else None
+    return {} if path is None else {"path": path}
 
 
 def _limit(recipe: Recipe) -> float:
@@ -395,12 +404,14 @@ def _written(reader: Any) -> Reader:
     if not isinstance(reader, BoundPart):
         return "auto"
     name = reader.part.name.partition(".")[2]
-    params = {} if reader.params is None else _given(reader.params)
+    params = _given(reader.params)
     return {name: params} if params else name
 
 
-def _given(params: Params, apart_from: Set[str] = frozenset()) -> dict[str, Any]:
+def _given(params: Params | None, apart_from: Set[str] = frozenset()) -> dict[str, Any]:
     """Return the parameters that the recipe states, as it may write them."""
+    if params is None:
+        return {}
     stated = set(params.model_fields_set - apart_from)
     return params.model_dump(mode="json", include=stated, exclude_unset=True, exclude_none=True)
 

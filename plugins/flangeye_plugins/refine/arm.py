@@ -83,21 +83,24 @@ def _identifiability(told: ArmParameters, session: Session) -> str:
     cosine = (np.einsum("nij,mij->nm", poses[:, :3, :3], poses[:, :3, :3]).min() - 1) / 2
     widest = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
     one = f" (one orientation: they turn by {widest:.1f} deg at most)" if widest < 10.0 else ""
-    count, combined = told.sizes.size, told.combinations
+    count, combined = told.sizes.size, _combinations(told)
     if told.identified.any():
         return (
             f"the poses identify {told.identified.sum()} of {count} parameters of the arm singly, "
-            f"and {combined} combinations of them{one}"
+            f"and {combined} of them{one}"
         )
     return (
-        f"the poses identify none of the arm's {count} parameters singly{one}, and {combined} "
-        "combinations of them: the correction predicts at poses like these, and says nothing of "
-        "any one joint"
+        f"the poses identify none of the arm's {count} parameters singly{one}, and {combined} of "
+        "them: the correction predicts at poses like these, and says nothing of any one joint"
     )
 
 
+def _combinations(told: ArmParameters) -> str:
+    return f"{told.combinations} combination{'' if told.combinations == 1 else 's'}"
+
+
 def _listed(told: ArmParameters) -> list[str]:
-    """Name what is identified, with value and deviation, and what is not."""
+    """Name what is identified, with value and deviation, and what is not, where anything is."""
     single: list[str] = []
     combined_only: list[str] = []
     for (joint, which), singly in np.ndenumerate(told.identified):
@@ -106,7 +109,9 @@ def _listed(told: ArmParameters) -> list[str]:
         (single if singly else combined_only).append(
             f"{name} {value:+.2f} ± {deviation:.2f} {unit}" if singly else name
         )
-    lines = [f"identified: {'; '.join(single)}"] if single else []
+    if not single:
+        return []
+    lines = [f"identified: {'; '.join(single)}"]
     return lines + ([f"not identified singly: {', '.join(combined_only)}"] if combined_only else [])
 
 
@@ -135,7 +140,7 @@ def _proposed(session: Session, told: ArmParameters, count: int) -> list[str]:
     return [
         f"poses that would tell more, joints in deg: {listed}; with {them} "
         f"{after.identified.sum()} of {after.sizes.size} parameters are identified singly, and "
-        f"{after.combinations} combinations"
+        f"{_combinations(after)}"
     ]
 
 

@@ -172,8 +172,8 @@ def test_it_proposes_poses_that_would_tell_more() -> None:
     listed = said.split("joints in deg: ")[1].split("; with them")[0].split("; ")
     assert len(listed) == 6
     assert all(len(pose.split(", ")) == 6 for pose in listed)
-    known = int(before.split(", and ")[1].split(" combinations")[0])
-    assert int(said.split(", and ")[-1].split(" combinations")[0]) > known
+    known = int(before.split(", and ")[1].split(" combination")[0])
+    assert int(said.split(", and ")[-1].split(" combination")[0]) > known
 
 
 def test_a_perfect_arm_is_left_as_it_is() -> None:
