@@ -44,9 +44,6 @@ class PointsParams(Params):
     )
     outliers: float = Field(0.0, ge=0, lt=1, description="Share of centres 50 to 150 mm off.")
     poses: int = Field(POSES, ge=3, le=POSES, description="Number of the grid's poses to use.")
-    told_noise: Length = param(
-        "0.1 mm", gt=0, description="Standard deviation stated for each centre, whatever its noise."
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,14 +54,12 @@ class PointSource(Source):
         noise: Standard deviation of each coordinate [m].
         outliers: Share of gross outliers.
         poses: How many poses.
-        told_noise: What the centres claim [m].
         seed: The recipe's.
     """
 
     noise: float = 0.0
     outliers: float = 0.0
     poses: int = POSES
-    told_noise: float = 0.0
     seed: int = 0
 
     def draw(self, index: int) -> Realisation:
@@ -102,7 +97,8 @@ def observations_of(drawn: Realisation, source: PointSource) -> Iterator[Observa
             centre=centre,
             normal=None,
             radii={},
-            covariance=source.told_noise**2 * np.eye(3),
+            # What a fit would state, whatever the noise is in truth
+            covariance=0.1e-3**2 * np.eye(3),
             normal_covariance=None,
             arc_coverage=0.0,
         )

@@ -61,9 +61,6 @@ class SimulatedFingerParams(LaidParams):
         3.0, ge=0, description="Noise of the image, standard deviation [grey levels]."
     )
     blur: float = Field(0.7, gt=0, description="Blur of the image, standard deviation [px].")
-    glare: float = Field(
-        60.0, ge=0, description="Brightness of a wandering reflection [grey levels]."
-    )
     world: WorldParams = Field(
         default_factory=WorldParams,
         description="What is true and differs from the files: arm, tool, finger, clock, workpiece, "
@@ -97,7 +94,7 @@ class SimulatedFinger(Device):
         self.tool = Tool(finger, self._plane)
         self._robot, self._params = robot, params
         self._rng = np.random.default_rng([seed, 11])
-        optics = Optics(params.blur, params.noise, params.glare)
+        optics = Optics(params.blur, params.noise)
         self._camera = FingerCamera(finger, optics, self._rng)
         self._compliance = typical_compliance()
         self._shutter: Shutter[Floats] = Shutter(truth.clock, self._rng)

@@ -220,7 +220,7 @@ def _refuse_missing(part: CadPart, what: str, share: float, limits: Registration
     if share > limits.refuted:
         raise CalibrationRefused(
             f"{STAGE}: poor fit: where the scanner looked at {what}, {share:.0%} of the surface is "
-            f"not there, at most {limits.refuted:.0%} may be (max_refuted); {_look(part)}"
+            f"not there, at most {limits.refuted:.0%} may be; {_look(part)}"
         )
 
 

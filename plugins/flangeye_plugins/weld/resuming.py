@@ -50,7 +50,7 @@ def task_of(plan: Path, distance: float, settings: Following) -> FollowingTask:
     """Return what a plugin's controller is asked to do, the torch ``distance`` behind the tip."""
     return FollowingTask(
         plan.points, plan.tangents, plan.step, distance,
-        side=settings.sign,
+        side=settings.sign, height_gain=settings.height_gain,
         **settings.model_dump(include=set(FollowingTask.__dataclass_fields__) - {"side"}),
     )  # fmt: skip
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -36,6 +36,20 @@ class PassParams(Params):
 class Following(Params):
     """The controller's parameters; names in brackets are the paper's."""
 
+    # What no cell needs otherwise. Gains of the preload's control, and by which an error of the
+    # torch is taken back [1/s]; the deflection with which lost contact is felt for [m], twice it
+    # where little is known of where the seam leads, and how fast a wanted deflection is changed,
+    # and ended before the seam ends [m/s].
+    height_gain: ClassVar[float] = 3.0
+    cross_track_gain: ClassVar[float] = 1.0
+    probe: ClassVar[float] = 0.5e-3
+    ramp: ClassVar[float] = 2e-3
+    release: ClassVar[float] = 0.8e-3
+    # Farther from the plan the tip stops the weld; standard deviation of the seam about the plan's
+    # shape [m].
+    astray: ClassVar[float] = 20e-3
+    wander: ClassVar[float] = 0.3e-3
+
     speed: Speed = param("5 mm/s", gt=0, le=0.05, description="Speed of the tip along the seam.")
     side: Literal["left", "right"] = Field(
         "left", description="Which wall of the groove to press, seen along the seam."
@@ -47,10 +61,6 @@ class Following(Params):
         "1.5 mm", gt=0, le=0.01, description="Displacement of the tip into the groove."
     )
     servo_gain: float = Field(3.0, gt=0, le=20, description="k_p of the deflection servo [1/s].")
-    height_gain: float = Field(3.0, ge=0, le=20, description="Gain of the preload's control [1/s].")
-    cross_track_gain: float = Field(
-        1.0, ge=0, le=5, description="How fast an error of the torch is taken back [1/s]."
-    )
     lateral_speed: Speed = param(
         "5 mm/s", gt=0, le=0.05, description="Largest speed across the seam, and in height."
     )
@@ -63,26 +73,11 @@ class Following(Params):
     ending: Length = param(
         "8 mm", ge=0, description="How far before the planned end the tip stops pressing."
     )
-    probe: Length = param(
-        "0.5 mm",
-        gt=0,
-        description="Deflection with which lost contact is felt for; twice it where little is "
-        "known of where the seam leads.",
-    )
     reach: Length = param(
         "8 mm", gt=0, description="How far from the plan the wall is sought at the start."
     )
     longest_gap: Length = param(
         "40 mm", gt=0, description="Without contact for longer, the weld is stopped."
-    )
-    astray: Length = param(
-        "20 mm", gt=0, description="Farther from the plan the tip stops the weld."
-    )
-    ramp: Speed = param("2 mm/s", gt=0, description="Slew rate of the deflection set-point.")
-    release: Speed = param(
-        "0.8 mm/s",
-        gt=0,
-        description="Slew rate at which the deflection set-point ends before the seam does.",
     )
     force: Force = param("10 N", gt=0, description="Largest force of the tip, by its stiffness.")
     stale: Duration = param(
@@ -113,9 +108,6 @@ class Following(Params):
     )  # fmt: skip
     gain_drift: float = Field(
         0.05, ge=0, le=1, description="Standard deviation of the finger's gain after a minute."
-    )
-    wander: Length = param(
-        "0.3 mm", gt=0, description="Standard deviation of the seam about the plan's shape."
     )
     probing: bool = Field(
         True, description="Sweep the seated tip at the start: finger, clock and arm are measured."

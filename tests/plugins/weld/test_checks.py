@@ -227,13 +227,12 @@ def line(length: float, slope: float = 0.0) -> Any:
 
 
 def test_a_seam_is_longer_than_the_tip_needs_to_come_down_and_to_let_go() -> None:
-    asked = {"inset": "6 mm", "ending": "9 mm", "speed": "5 mm/s", "deflection": "2 mm",
-             "release": "0.5 mm/s"}  # fmt: skip
-    used = 6e-3 + 9e-3 + 20e-3
+    asked = {"inset": "6 mm", "ending": "9 mm", "speed": "4 mm/s", "deflection": "2 mm"}
+    used = 6e-3 + 9e-3 + 10e-3  # released by 0.8 mm/s
     assert checked(line(used + 1e-4), given=asked) == ""
     told = checked(line(used - 1e-4), given=asked)
     assert told == (
-        "weld.tactile: the seam is 35 mm long; inset, ending and release alone take 35 mm"
+        "weld.tactile: the seam is 25 mm long; inset, ending and release alone take 25 mm"
     )
 
 

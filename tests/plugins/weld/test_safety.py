@@ -154,8 +154,9 @@ def test_ctrl_c_stops_the_arm_and_the_log_is_kept() -> None:
     assert any(name == "cycles" for name, _ in journal)
 
 
-def test_a_tip_that_strays_from_the_plan_is_stopped() -> None:
-    report, _ = run(planned("v-straight", shift=(0.0, 3e-3, 0.0), end=SHORT), astray="2.5 mm")
+def test_a_tip_that_strays_from_the_plan_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Following, "astray", 2.5e-3)
+    report, _ = run(planned("v-straight", shift=(0.0, 3e-3, 0.0), end=SHORT))
     assert report.reason.startswith("the tip is 3 mm away from the plan, allowed are 2 mm; ")
 
 

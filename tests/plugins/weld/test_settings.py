@@ -14,9 +14,9 @@ from flangeye_plugins.weld.settings import Following, PassParams, WeldTactilePar
 
 SENSOR = BoundPart(sensor_simulated_finger, SimulatedFingerParams())
 SOME = {
-    "m": ("deflection preload probe reach longest_gap astray wander torch_height tip_radius "
+    "m": ("deflection preload reach longest_gap torch_height tip_radius "
           "corner_radius clearance overlap"),
-    "m/s": "speed lateral_speed ramp release return_speed approach_speed",
+    "m/s": "speed lateral_speed return_speed approach_speed",
     "rad/s": "turn_rate approach_joint_speed",
     "s": "stale still blind",
     "N": "force",
@@ -26,15 +26,14 @@ SOME = {
 NONE = {
     "m": "inset ending arm_sigma distortion root_gap weave_width",
     "rad": "joint_sigma",
-    "": "height_gain cross_track_gain friction gain_drift",
+    "": "friction gain_drift",
 }
 """What may be nothing, but not less."""
 MOST = [
     ("speed", 0.05, "m/s"), ("lateral_speed", 0.05, "m/s"), ("return_speed", 0.1, "m/s"),
     ("turn_rate", 2.0, "rad/s"), ("deflection", 0.01, "m"), ("preload", 0.01, "m"),
     ("weave_width", 0.03, "m"), ("weave_frequency", 10.0, ""), ("servo_gain", 20.0, ""),
-    ("height_gain", 20.0, ""), ("cross_track_gain", 5.0, ""), ("friction", 1.0, ""),
-    ("gain_drift", 1.0, ""),
+    ("friction", 1.0, ""), ("gain_drift", 1.0, ""),
 ]  # fmt: skip
 EITHER = [
     ("offset_across", 0.02, "m"), ("work_angle", math.pi / 3, "rad"),
