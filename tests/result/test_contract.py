@@ -9,11 +9,16 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from flangeye.result import TransformResult
+from flangeye.result import TransformResult, WorkspaceResult
 
 SOUND: dict[str, Any] = {
     "matrix": np.eye(4).tolist(), "covariance": np.eye(6).tolist(), "about": [0.0, 0.0, 0.0],
 }  # fmt: skip
+
+
+def test_a_workspace_of_two_coordinates_is_no_result() -> None:
+    with pytest.raises(ValidationError, match="centre\n.* at least 3 items"):
+        WorkspaceResult(centre=[0.0, 1.0], size=[1.0, 1.0, 1.0])
 
 
 @pytest.mark.parametrize(
@@ -22,7 +27,7 @@ SOUND: dict[str, Any] = {
         ({"matrix": np.eye(3).tolist()}, "'matrix' is not 4x4"),
         ({"covariance": [*np.eye(6).tolist()[:5], [0.0]]}, "'covariance' is not 6x6"),
         ({"covariance": np.eye(7).tolist()}, "'covariance' is not 6x6"),
-        ({"about": [0.0]}, "'about' has not 3 coordinates"),
+        ({"about": [0.0]}, "about\n.* at least 3 items"),
         ({"unobservable": [[1.0]]}, "a direction of 'unobservable' has not 6 components"),
     ],
 )

@@ -47,8 +47,8 @@ def print_details(console: Console, result: Result) -> None:
 
 
 def _hung(console: Console, line: str) -> str:
-    """Return a line as the terminal shows it, further ones beside its text; commands stay whole."""
-    if line.startswith("  ->"):
+    """Return a line in as many as a terminal needs; commands stay whole, and all in a file."""
+    if line.startswith("  ->") or not console.is_terminal:
         return line
     return wrapped(console, line, 21 if line.startswith("  ") else 2)
 
@@ -190,14 +190,14 @@ def print_log(console: Console, log: RunLog) -> None:
 
     state = _state(log)
     expected = f" of {log.total}" if log.total else ""
-    write(console, wrapped(console, f"{log.path}: {state}"))
+    write(console, _hung(console, f"{log.path}: {state}"))
     # Centres or poses of a target that somebody had found already are no captures.
     measured = any(entry.stage.startswith("acquire.") for entry in log.entries)
     arrived = "" if measured else f"{len(log.poses)}{expected} captures arrived, "
     went = f"{len(log.finished)}{expected} measurements" if measured else f"{len(log.finished)}"
     write(console, f"{arrived}{went} went through")
     for note in records_of(log.source.notes) if log.source else ():
-        write(console, wrapped(console, f"note: {note}"))
+        write(console, _hung(console, f"note: {note}"))
     table = Table(box=None, pad_edge=False, header_style="bold")
     for column in ("step", "values", "seconds", "rejected"):
         table.add_column(column, justify="left" if column == "step" else "right")
@@ -212,7 +212,7 @@ def print_log(console: Console, log: RunLog) -> None:
         table.add_row(Text(printable(step)), str(len(entries)), f"{seconds:.2f}", str(count))
     console.print(table)
     for rejection in log.rejections:
-        write(console, wrapped(console, f"rejected {rejection.id}: {rejection}"))
+        write(console, _hung(console, f"rejected {rejection.id}: {rejection}"))
     if log.finished and not log.complete:
         last = [e for e in log.entries if e.capture == log.finished[-1]]
         after = f", last step {last[-1].step}" if last else ""

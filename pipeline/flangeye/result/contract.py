@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from flangeye.types import Transform
 
 Vector = list[float]
+Point = Annotated[list[float], Field(min_length=3, max_length=3)]
 Matrix = list[list[float]]
 
 
@@ -25,7 +26,7 @@ class TransformResult(_Part):
         description="6x6, order (rotation [rad], translation [m]), of a left perturbation in the "
         "parent frame, the translation taken at `about`."
     )
-    about: Vector = Field(description="Point in the parent frame [m].")
+    about: Point = Field(description="Point in the parent frame [m].")
     unobservable: Matrix | None = Field(
         None,
         description="Directions (rotation, translation), about the same point, along which the "
@@ -44,8 +45,6 @@ class TransformResult(_Part):
         for name, (rows, count) in sizes.items():
             if len(rows) != count or any(len(row) != count for row in rows):
                 raise ValueError(f"'{name}' is not {count}x{count}")
-        if len(self.about) != 3:
-            raise ValueError("'about' has not 3 coordinates")
         if any(len(direction) != 6 for direction in self.unobservable or []):
             raise ValueError("a direction of 'unobservable' has not 6 components")
         Transform.named("base_T_camera", self.matrix)  # which refuses what is not rigid
@@ -67,17 +66,17 @@ class ObservationResult(_Part):
     """One capture and its outcome; measured values are null if it was rejected early."""
 
     id: str
-    centre_in_camera: Vector | None = None
-    normal_in_camera: Vector | None = None
+    centre_in_camera: Point | None = None
+    normal_in_camera: Point | None = None
     radii: dict[str, float] | None = None
     covariance: Matrix | None = Field(None, description="3x3, of the centre [m^2].")
     arc_coverage: float | None = Field(None, description="Share of the rim that was seen.")
     clocking: float | None = Field(None, description="Angle of the hole pattern [rad], if seen.")
-    tcp_in_base: Vector | None = None
+    tcp_in_base: Point | None = None
     camera: str | None = Field(None, description="Which camera of a cell saw it.")
     target: str | None = Field(None, description="Which target of a cell it saw.")
     residual: float | None = Field(None, description="Distance of mapped centre and TCP [m].")
-    residual_in_base: Vector | None = Field(None, description="Mapped centre minus TCP [m].")
+    residual_in_base: Point | None = Field(None, description="Mapped centre minus TCP [m].")
     used: bool
     reason: str | None = Field(None, description="Why it was not used.")
 
@@ -117,8 +116,8 @@ class VerificationResult(_Part):
 class WorkspaceResult(_Part):
     """Where the work is."""
 
-    centre: Vector
-    size: Vector
+    centre: Point
+    size: Point
 
 
 class ExpectedErrorResult(_Part):
@@ -210,7 +209,7 @@ class WeldResult(_Part):
 class FieldResult(_Part):
     """A smooth displacement over the workspace; flangeye.maths.smooth_field evaluates it."""
 
-    about: Vector = Field(description="Middle of the calibration's poses, in the base [m].")
+    about: Point = Field(description="Middle of the calibration's poses, in the base [m].")
     length: float = Field(description="Correlation length of the field [m].")
     rigid: Matrix = Field(description="6xK, the rigid motion that each feature is less.")
     weights: Vector = Field(description="Weights of the K features [m].")
@@ -219,7 +218,7 @@ class FieldResult(_Part):
 class CorrectionResult(_Part):
     """What is wrong with where the arm says its flange is, estimated with the transforms."""
 
-    tool_offset: Vector = Field(description="The circle's centre in the flange frame [m].")
+    tool_offset: Point = Field(description="The circle's centre in the flange frame [m].")
     joint_offsets: Vector | None = Field(None, description="To add to the joint angles [rad].")
     joints: Vector | None = Field(
         None, description="A configuration on the branch of the arm that was calibrated [rad]."

@@ -105,6 +105,8 @@ def test_a_unit_said_twice_must_agree(tmp_path: Path) -> None:
          "number"),
         (HEADING + ROW.replace("412.5", "nan"),
          ":2: poses.0.position.0: Input should be a finite number"),
+        (HEADING + ROW.replace("a.pcd", "a" * 256),
+         ":2: poses.0.cloud: String should have at most 200 characters"),
         (HEADING + ROW.replace("a.pcd", ""), ":2: poses.0: names no scan; it needs 'cloud' or 'image', "
          "a file beside this one"),
         (HEADING.replace("qx,qy,qz,qw", "id") + "a.pcd,1,2,3,x\n",

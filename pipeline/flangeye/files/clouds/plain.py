@@ -14,7 +14,7 @@ import numpy as np
 from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
-from flangeye.files.clouds.header import axes_of, read_head, refuse
+from flangeye.files.clouds.header import axes_of, count_of, read_head, refuse
 from flangeye.files.clouds.table import Points, PointTable, Shape, TextTable, is_row
 
 HEADER_ERRORS = (ValueError, TypeError, SyntaxError, TokenError)
@@ -167,9 +167,9 @@ def open_text(path: Path) -> PointTable:
     rows, remarks = _rows(path)
     skipped = 0
     if len(lines) > 1 and lines[0].strip().isdigit():  # how many points follow, as .pts has
-        skipped = 1
-        if rows - 1 != int(lines[0]):
-            refuse(path, f"its first row promises {int(lines[0])} points, but it has {rows - 1}")
+        skipped, count = 1, count_of(path, "points", lines[0].strip())
+        if rows - 1 != count:
+            refuse(path, f"its first row promises {count} points, but it has {rows - 1}")
     cells, delimiter, comma = _cells(lines[skipped])
     heading = _heading(cells)
     if heading:
