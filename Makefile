@@ -6,10 +6,9 @@ BIN := $(VENV)/bin
 export PYTHONDONTWRITEBYTECODE :=
 PYTEST := $(BIN)/python -m pytest -q
 TWO := $(PYTEST) -n 2 --dist worksteal
-# Tests in real time wait most of their time, so three run at once. All share the machine with whatever
+# Tests in real time wait most of their time, so three run at once. They share the machine with whatever
 # runs beside them: what fails is tried once more, with nothing of ours beside it.
 THREE := $(PYTEST) -n 3 --dist worksteal
-MOST := -m "not slow and not realtime"
 BESIDE := -m "realtime and not (slow or alone)"
 ALONE := -m "realtime and alone and not slow"
 ALONE_ALL := -m "realtime and (slow or alone)"
@@ -30,7 +29,7 @@ demo: $(VENV)/.run
 	$(BIN)/flangeye run ur5_phoxi-m_simulated
 
 test: $(VENV)/.dev $(VENV)/.ros2
-	$(TWO) $(MOST) || $(PYTEST) $(MOST) --last-failed
+	$(TWO) -m "not slow and not realtime"
 	$(THREE) $(BESIDE) || $(PYTEST) $(BESIDE) --last-failed
 	$(PYTEST) $(ALONE) || $(PYTEST) $(ALONE) --last-failed
 
