@@ -369,6 +369,11 @@ def test_damage_inside_the_data_is_found_when_it_is_decoded(tmp_path: Path) -> N
         assert str(refused.value) == f"{path}: {message}"
 
 
+def test_a_cloud_of_an_endless_name_does_not_exist(tmp_path: Path) -> None:
+    with pytest.raises(StageError, match="a.pcd: does not exist"):
+        read_cloud(tmp_path / f"{'a' * 300}.pcd")
+
+
 @pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
 def test_a_header_of_a_billion_points_allocates_nothing(tmp_path: Path, encoding: str) -> None:
     path = tmp_path / "a.pcd"

@@ -47,7 +47,7 @@ def print_details(console: Console, result: Result) -> None:
 
 
 def _hung(console: Console, line: str) -> str:
-    """Return a line in as many as a terminal needs; commands stay whole, and all in a file."""
+    """Return a line wrapped to the terminal's width; commands and lines for a file stay whole."""
     if line.startswith("  ->") or not console.is_terminal:
         return line
     return wrapped(console, line, 21 if line.startswith("  ") else 2)

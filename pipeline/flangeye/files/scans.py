@@ -176,7 +176,10 @@ def with_companion(recording: Recording) -> Recording:
 
 
 def _beside(scan: Path, suffixes: Sequence[str]) -> Path | None:
-    named_alike = sorted(scan.parent.glob(f"{escape(scan.stem)}.*"))
+    try:
+        named_alike = sorted(scan.parent.glob(f"{escape(scan.stem)}.*"))
+    except OSError as error:  # its folder has a name that no file system takes
+        raise StageError(f"{scan}: {error.strerror}") from None
     found = [path for path in named_alike if path.suffix.lower() in suffixes]
     if len(found) > 1:
         names = " and ".join(path.name for path in found)

@@ -210,6 +210,6 @@ def _unit_of(path: Path, vertices: Floats, unit: LengthUnit | None) -> tuple[Len
     # Inches are taken for what neither of the others explains.
     used = min(fitting, key=lambda each: each == "in")
     return used, (
-        f"{path.name}: taken to be in {used}, so {sizes[used] * 1e3:.0f} mm across; state unit: "
-        "where that is wrong"
+        f"{path.name}: unit: {used} is assumed, by its size of {sizes[used] * 1e3:.0f} mm; state "
+        "the unit where that is wrong"
     )

@@ -30,7 +30,7 @@ import csv
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Any, Literal, Self, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -165,15 +165,11 @@ class ArmPose(BaseModel):
         return self
 
 
-FileName = Annotated[str, Field(min_length=1, max_length=200)]
-"""Of a file beside the poses: no file system knows names beyond 255 bytes."""
-
-
 class PoseRow(ArmPose):
     """One pose, as ``poses.yaml`` has it; ``second`` is that of a second arm, in its own base."""
 
-    cloud: FileName | None = None
-    image: FileName | None = None
+    cloud: str | None = Field(None, min_length=1)
+    image: str | None = Field(None, min_length=1)
     id: str | None = None
     second: ArmPose | None = None
     role: Role = "calibration"

@@ -184,7 +184,7 @@ def _otherwise(body: TargetBody) -> Iterator[tuple[str, str, Floats]]:
     """Yield how a body's mesh may be written wrongly: what is wrong, what to do, its vertices."""
     yield (
         "drawn mirrored",
-        "mirror the mesh, or state the handedness of its axes where it is exported",
+        "mirror the mesh, or export it from CAD with right-handed axes",
         body.vertices * [-1.0, 1.0, 1.0],
     )
     for scale, units in ((INCH, "millimetres for inches"), (10.0, "millimetres for centimetres")):

@@ -105,8 +105,6 @@ def test_a_unit_said_twice_must_agree(tmp_path: Path) -> None:
          "number"),
         (HEADING + ROW.replace("412.5", "nan"),
          ":2: poses.0.position.0: Input should be a finite number"),
-        (HEADING + ROW.replace("a.pcd", "a" * 256),
-         ":2: poses.0.cloud: String should have at most 200 characters"),
         (HEADING + ROW.replace("a.pcd", ""), ":2: poses.0: names no scan; it needs 'cloud' or 'image', "
          "a file beside this one"),
         (HEADING.replace("qx,qy,qz,qw", "id") + "a.pcd,1,2,3,x\n",
@@ -143,6 +141,12 @@ def test_a_heading_alone_is_an_archive_without_poses(tmp_path: Path) -> None:
     with pytest.raises(StageError) as error:
         check_ids(archive)
     assert str(error.value) == f"{tmp_path}: holds no poses"
+
+
+def test_a_folder_of_an_endless_name_is_refused(tmp_path: Path) -> None:
+    said = refused(tmp_path, HEADING + ROW.replace("a.pcd", "a" * 256 + "/b.pcd"))
+    assert said.startswith(f"{tmp_path}/aaa")
+    assert said.endswith("File name too long")
 
 
 @pytest.mark.parametrize("column", ["cloud", "image", "cloud,image"])

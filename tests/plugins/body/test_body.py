@@ -248,7 +248,7 @@ def test_the_unit_is_judged_by_the_size_and_refused_where_it_cannot_be(tmp_path:
     written(1e3)
     judged = load_body("own.stl", None, tmp_path)
     assert judged.size == pytest.approx(GRIPPER.size, rel=1e-5)
-    assert "taken to be in mm" in judged.note
+    assert "unit: mm is assumed" in judged.note
     assert load_body("own.stl", "mm", tmp_path).note == ""
     with pytest.raises(
         RecipeError, match="5.716 m across with unit: in, and .* 225 mm with unit: mm"
@@ -257,7 +257,7 @@ def test_the_unit_is_judged_by_the_size_and_refused_where_it_cannot_be(tmp_path:
     written(1 / 0.0254)
     inches = load_body("own.stl", None, tmp_path)
     assert inches.size == pytest.approx(GRIPPER.size, rel=1e-5)
-    assert "taken to be in in" in inches.note
+    assert "unit: in is assumed" in inches.note
     written(1e5)
     with pytest.raises(RecipeError, match="2.25e.04 across, .* no unit makes it so"):
         load_body("own.stl", None, tmp_path)
