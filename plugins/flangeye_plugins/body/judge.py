@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flangeye.types import Floats, Indices, Mask, Singles
+from flangeye.types import Floats, Indices, Mask
 from flangeye_plugins.body.shape import GRAZING, Shape
-from flangeye_plugins.body.view import CoarseImage, view_of
+from flangeye_plugins.body.view import CoarseImage
 
 NEARER_SHARE = 0.1
 """How far in front of the body a surface contradicts it, as a share of the size: what is nearer to
@@ -28,9 +28,9 @@ PENALTY = 10
 """Rays in favour that one ray against outweighs: of the true pose there are hardly any."""
 
 
-CELLS, TOLERANCE, OPPOSED = 100, 0.01, 0.1
-"""Where a part is judged: cells across the body, how far off its surface a ray may be, as a share
-of the size, and the share of rays against it from which the part stands elsewhere."""
+TOLERANCE, OPPOSED = 0.01, 0.1
+"""Where a part is judged: how far off its surface a ray may be, as a share of the size, and the
+share of rays against it from which the part stands elsewhere."""
 
 
 class BodyVerdict(NamedTuple):
@@ -140,18 +140,17 @@ def _compared(shape: Shape, view: CoarseImage, pose: Floats, tolerance: float) -
     return _Compared(rays, scan, depth, normals, hit, due, agree, against, facets)
 
 
-def opposed(points: Singles, shape: Shape, pose: Floats) -> Mask | None:
+def opposed(shape: Shape, view: CoarseImage, pose: Floats) -> Mask | None:
     """Return (T,) the facets of parts that a scan speaks against at a pose; None where of none.
 
     A part is what hangs together in the mesh; a tenth of what is seen in its place is not it.
 
     Args:
-        points: (N, 3) of the scan.
         shape: The body.
+        view: What the scanner saw, finely.
         pose: ``camera_T_body``.
     """
     parts, of_facet = shape.parts
-    view = view_of(points, shape.size / CELLS)
     seen = _compared(shape, view, pose, TOLERANCE * shape.size) if parts > 1 else None
     if seen is None:
         return None

@@ -98,7 +98,8 @@ def segment_body(
             f"{body.name}: it looks the same however it is turned about an axis, so that a scan "
             "does not show its pose; segment.sphere finds a ball"
         )
-    search, passes = BodySearch(points, shape, looks), partial(_passes, params=params)
+    search = BodySearch(points, shape, looks)
+    passes = partial(_passes, coverage=params.min_coverage, trust=params.min_trust)
     found = list(filter(passes, search.near(_predicted(capture, configuration, earlier))))[:1]
     if not found:
         every = search.everywhere()
@@ -140,7 +141,8 @@ def _misdrawn(
     """Return how a mesh is drawn wrongly, where it would be found otherwise; None where not."""
     from flangeye_plugins.body.judge import opposed
     from flangeye_plugins.body.looks import prepared
-    from flangeye_plugins.body.search import BodySearch
+    from flangeye_plugins.body.search import FINE_ACROSS, BodySearch
+    from flangeye_plugins.body.view import view_of
 
     for what, fix, vertices in _otherwise(body):
         other = TargetBody(body.name, vertices, body.triangles)
@@ -148,12 +150,14 @@ def _misdrawn(
             return Rejected(f"{body.name} is {what}: so it would be found", fix=fix)
     shape = prepared(body)[0]
     vertices, facets = shape.facets
-    held: list[tuple[float, Floats]] = []
+    # Parts that stand elsewhere hide some of the rest, and a rest is found in clutter sooner.
+    holds = partial(_passes, coverage=0.0, trust=0.93, goes_on=0.1, weakest=FIRM / 2)
+    view, held = view_of(points, shape.size / FINE_ACROSS), list[tuple[float, Floats]]()
     for pose in (one.pose for one in every):
-        gone = opposed(points, shape, pose)
+        gone = opposed(shape, view, pose)
         if gone is not None:
             rest = TargetBody(body.name, vertices, facets[~gone].astype(np.int32))
-            near = filter(_holds, BodySearch(points, *prepared(rest)).near(pose[None]))
+            near = filter(holds, BodySearch(points, *prepared(rest)).near(pose[None]))
             held += [(one.verdict.score, vertices[facets[gone]]) for one in near]
     if not held:
         return None
@@ -165,18 +169,6 @@ def _misdrawn(
         f"what stands elsewhere is within {box} mm",
         "draw the part that moves, such as a gripper's jaws, as it was in the session, or leave it "
         "out of the mesh",
-    )
-
-
-def _holds(found: FoundPose) -> bool:
-    """Whether a body without parts that have moved is there: these still hide some of the rest."""
-    verdict = found.verdict
-    return (
-        verdict.trusted >= 0.93
-        and verdict.agree >= 150
-        and verdict.bounded
-        and verdict.goes_on <= 0.1 * verdict.beside
-        and found.weakest <= FIRM / 2
     )
 
 
@@ -197,18 +189,20 @@ def _otherwise(body: TargetBody) -> Iterator[tuple[str, str, Floats]]:
                 )
 
 
-def _passes(found: FoundPose, params: SegmentBodyParams) -> bool:
+def _passes(
+    found: FoundPose, coverage: float, trust: float, goes_on: float = 0.5, weakest: float = FIRM
+) -> bool:
     verdict = found.verdict
     # Rays, a hundredth of the body's size apart, that show it: fewer fit by chance
     # Largest share of the rays beside the body in which its surface goes on: where something is
     # fastened to it
     return (
-        verdict.shown >= params.min_coverage
-        and verdict.trusted >= params.min_trust
+        verdict.shown >= coverage
+        and verdict.trusted >= trust
         and verdict.agree >= 150
         and verdict.bounded
-        and verdict.goes_on <= 0.5 * verdict.beside
-        and found.weakest <= FIRM
+        and verdict.goes_on <= goes_on * verdict.beside
+        and found.weakest <= weakest
     )
 
 
