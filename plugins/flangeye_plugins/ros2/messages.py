@@ -94,6 +94,20 @@ def message(kind: str, **fields: Any) -> Any:
     return types().types[kind](**fields)
 
 
+def positions_of(message: Any) -> dict[str, float]:
+    """Return joint -> position of a ``sensor_msgs/JointState``; of one of speeds alone nothing.
+
+    Raises:
+        StageError: It has fewer positions than names.
+    """
+    names, positions = list(message.name), message.position.tolist()
+    if positions and len(positions) != len(names):
+        raise StageError(
+            f"a joint state names {len(names)} joints and has {len(positions)} positions"
+        )
+    return dict(zip(names, positions, strict=False))
+
+
 def cloud_of(message: Any) -> Singles:
     """Return the points of a ``sensor_msgs/PointCloud2``, (H, W, 3) if organised, else (N, 3) [m].
 
@@ -112,13 +126,28 @@ def cloud_of(message: Any) -> Singles:
             "itemsize": message.point_step,
         }
     )
-    row = message.width * message.point_step  # some drivers leave row_step at 0
-    data = np.frombuffer(bytes(message.data), np.uint8)
-    rows = data.reshape(message.height, message.row_step or row)
-    used = np.ascontiguousarray(rows[:, :row])
+    used = _rows_of(message, message.width * message.point_step, message.row_step)
     points = used.reshape(-1).view(kind)
     xyz = np.stack([points[axis].astype(np.float32) for axis in "xyz"], axis=-1)
-    return xyz.reshape(message.height, message.width, 3) if message.height > 1 else xyz
+    organised = min(message.height, message.width) > 1
+    return xyz.reshape(message.height, message.width, 3) if organised else xyz
+
+
+def _rows_of(message: Any, row: int, step: int) -> NDArray[np.uint8]:
+    """Return the bytes of a cloud or an image, (H, row), without what pads its rows.
+
+    Some drivers state a wrong step: rows that just fill the message are not padded.
+
+    Raises:
+        StageError: It has fewer or more bytes than its size needs.
+    """
+    data = np.frombuffer(bytes(message.data), np.uint8)
+    step = row if len(data) == message.height * row else step
+    if len(data) != message.height * step or step < row:
+        raise StageError(
+            f"it has {len(data)} bytes, and {message.height} rows of {row} bytes (step {step})"
+        )
+    return np.ascontiguousarray(data.reshape(message.height, step)[:, :row])
 
 
 def intrinsics_of(message: Any, rectified: bool = False) -> tuple[Floats, Floats]:
@@ -148,9 +177,8 @@ def values_of(message: Any) -> NDArray[Any]:
         raise StageError(f"an image of encoding '{message.encoding}'; known: {known}")
     name, channels = PIXELS[message.encoding]
     kind = np.dtype((">" if message.is_bigendian else "<") + name)
-    rows = np.frombuffer(bytes(message.data), np.uint8).reshape(message.height, message.step)
-    width = message.width * channels * kind.itemsize
-    pixels = np.ascontiguousarray(rows[:, :width]).view(kind)
+    row = message.width * channels * kind.itemsize
+    pixels = _rows_of(message, row, message.step).view(kind)
     return pixels.reshape(message.height, message.width, channels).squeeze(
         axis=2 if channels == 1 else ()
     )

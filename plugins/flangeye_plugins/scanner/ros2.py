@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -43,6 +43,9 @@ TRIGGER_MESSAGE = b"\x00\x01\x00\x00\x00"
 PINHOLES = ("", "plumb_bob", "rational_polynomial")
 """Distortion models of CameraInfo that OpenCV's coefficients mean."""
 
+LENSES = (0, 4, 5, 8, 12, 14)
+"""Numbers of coefficients that OpenCV takes."""
+
 
 class Ros2ScannerParams(Params):
     """Parameters of ``scanner.ros2``: a cloud, or a depth image, or an image of a marker alone."""
@@ -60,8 +63,6 @@ class Ros2ScannerParams(Params):
         None, description="Service (std_srvs/Trigger) or topic (std_msgs/Empty) that takes a scan; "
         "without one the camera runs by itself.",
     )  # fmt: skip
-    # Longest wait for a scan [s]
-    timeout: ClassVar[float] = 2.5
     sim_time: bool = Field(False, description="Stamps are simulated time, of the topic /clock.")
 
     @model_validator(mode="after")
@@ -75,9 +76,16 @@ class Ros2ScannerParams(Params):
         return self
 
     @property
+    def timeout(self) -> float:
+        """Longest wait for a scan [s]; one that is triggered may take several exposures."""
+        return 10.0 if self.trigger else 2.5
+
+    @property
     def info(self) -> str:
         """Topic of the CameraInfo."""
-        return self.camera_info or f"{str(self.depth or self.image).rpartition('/')[0]}/camera_info"
+        # A compressed image is below the topic of the image, as image_transport names them
+        images = str(self.depth or self.image).removesuffix("/compressed")
+        return self.camera_info or f"{images.rpartition('/')[0]}/camera_info"
 
 
 @part("scanner.ros2")
@@ -98,11 +106,11 @@ def scanner_ros2(model: ScannerModel | None, params: Ros2ScannerParams) -> Scann
 
 
 class Camera(NamedTuple):
-    """A pinhole camera: its matrix (3, 3), OpenCV's distortion (k,), and its frame."""
+    """A pinhole camera: its matrix (3, 3), OpenCV's distortion (k,), and its images' (H, W)."""
 
     matrix: Floats
     distortion: Floats
-    frame: str
+    shape: tuple[int, int]
 
 
 class Ros2Scanner(OpenScanner):
@@ -125,7 +133,11 @@ class Ros2Scanner(OpenScanner):
                 runs = bridge.awaited(partial(_running, bridge, topic))
                 self._kinds[topic] = runs.type if runs and runs.type in kinds else kinds[0]
                 bridge.follow(topic, self._kinds[topic], always=False)
-        self._camera = None if params.cloud and not params.image else self._read_camera()
+        self._looks = bool(params.depth or params.image)
+        if self._looks:
+            bridge.follow(params.info, INFO)
+            if not params.trigger:  # else it may come with the first scan
+                self._camera(time.monotonic() + params.timeout)
         self._calls = bool(params.trigger) and self._find_trigger(str(params.trigger))
         super().__init__(f"{params.cloud or params.depth or params.image}", self._facts(), model)
 
@@ -137,10 +149,12 @@ class Ros2Scanner(OpenScanner):
         self._trigger()
         taken = {t: self._after(t, count, started, until) for t, count in wanted.items()}
         ended = max(message.received_ns for message in taken.values())
+        camera = self._camera(until) if self._looks else None
 
         def decode() -> Scan:
             try:
-                return self._scan(self._points(taken), 1.0, (started, ended), self._image(taken))
+                points, image = self._points(taken, camera), self._image(taken, camera)
+                return self._scan(points, 1.0, (started, ended), image)
             except StageError as error:
                 raise (
                     error
@@ -161,12 +175,19 @@ class Ros2Scanner(OpenScanner):
 
     # --- what is there
 
-    def _read_camera(self) -> Camera:
+    def _camera(self, until: float) -> Camera:
+        """Return what the newest CameraInfo says; the first may come after the image, or with it.
+
+        Raises:
+            DeviceError: None has come by then, or it is of no pinhole camera that was calibrated.
+        """
         topic = self._params.info
-        self._bridge.follow(topic, INFO)
-        message = self._bridge.wait(topic, 0, self._params.timeout)
+        message = self._bridge.wait(topic, 0, max(until - time.monotonic(), 0.0))
         if message is None:
-            raise DeviceError(f"{NAME}: nothing came on {topic} within {self._params.timeout:g} s")
+            raise DeviceError(
+                f"{NAME}: nothing came on {topic} within {self._params.timeout:g} s; camera_info "
+                "names another topic"
+            )
         rectified = "rect" in str(self._params.depth or self._params.image).rpartition("/")[2]
         info = decoded(message.data, INFO)
         if info.distortion_model not in PINHOLES:
@@ -175,7 +196,13 @@ class Ros2Scanner(OpenScanner):
                 f"{', '.join(PINHOLES[1:])}: rectify the images (image_proc) and name those"
             )
         matrix, lens = decoded(message.data, INFO, partial(intrinsics_of, rectified=rectified))
-        return Camera(matrix, lens, frame_of(message.data))
+        if not (matrix[0, 0] > 0 and matrix[1, 1] > 0 and len(lens) in LENSES):
+            raise DeviceError(
+                f"{NAME}: {topic} has focal lengths of {matrix[0, 0]:g} and {matrix[1, 1]:g} px "
+                f"and {len(lens)} distortion coefficients: calibrate the camera "
+                "(camera_calibration)"
+            )
+        return Camera(matrix, lens, (info.height, info.width))
 
     def _find_trigger(self, trigger: str) -> bool:
         """Return whether the trigger is a service; a topic is offered.
@@ -204,8 +231,7 @@ class Ros2Scanner(OpenScanner):
         trigger = self._params.trigger
         how = f"triggered by {trigger}" if trigger else "runs by itself"
         unit = "m" if not self._params.depth else "as the image's encoding has it"
-        frame = {"frame": self._camera.frame} if self._camera else {}
-        return {"unit": unit, "middleware": self._bridge.middleware, "scans": how, **frame}
+        return {"unit": unit, "middleware": self._bridge.middleware, "scans": how}
 
     # --- one scan
 
@@ -251,18 +277,19 @@ class Ros2Scanner(OpenScanner):
         by = ", ".join(runs.publishers)
         return f"{by} still runs: does the camera have to be triggered, or was its cable pulled?"
 
-    def _points(self, taken: dict[str, GraphMessage]) -> Floats:
+    def _points(self, taken: dict[str, GraphMessage], camera: Camera | None) -> Floats:
         """Return the scan's points (H, W, 3) or (N, 3) [m]; none where there is an image alone."""
         if cloud := self._params.cloud:
             return decoded(taken[cloud].data, CLOUD, cloud_of)  # type: ignore[no-any-return]
-        if not (depth := self._params.depth) or not self._camera:
+        if not (depth := self._params.depth) or not camera:
             return np.zeros((0, 3))
         depths = decoded(taken[depth].data, IMAGE, partial(_metres, depth))
-        view = DepthView(self._camera.matrix.tolist(), self._camera.distortion.tolist())
+        self._require_size(depth, depths, camera)
+        view = DepthView(camera.matrix.tolist(), camera.distortion.tolist())
         return view.points(depths)  # type: ignore[return-value]
 
-    def _image(self, taken: dict[str, GraphMessage]) -> Image | None:
-        topic, camera = self._params.image, self._camera
+    def _image(self, taken: dict[str, GraphMessage], camera: Camera | None) -> Image | None:
+        topic = self._params.image
         if topic is None or camera is None:
             return None
         frames = sorted({frame_of(message.data) for message in taken.values()})
@@ -272,9 +299,18 @@ class Ros2Scanner(OpenScanner):
                 "depths that the driver aligns to the image, or the image alone"
             )
         pixels = decoded(taken[topic].data, self._kinds[topic], pixels_of)
+        self._require_size(topic, pixels, camera)
         return Image(
             np.ascontiguousarray(pixels[..., ::-1] if pixels.ndim == 3 else pixels), *camera[:2]
         )
+
+    def _require_size(self, topic: str, pixels: Floats, camera: Camera) -> None:
+        if pixels.shape[:2] != camera.shape:
+            (height, width), (tall, wide) = pixels.shape[:2], camera.shape
+            raise DeviceError(
+                f"{NAME}: {topic} has {width} x {height} pixels and {self._params.info} is of "
+                f"{wide} x {tall}: camera_info names the topic that belongs to these images"
+            )
 
 
 def _metres(topic: str, message: Any) -> Floats:
@@ -284,7 +320,7 @@ def _metres(topic: str, message: Any) -> Floats:
         raise DeviceError(
             f"{NAME}: {topic} has the encoding {message.encoding}, depths have one of {known}"
         )
-    return np.nan_to_num(values_of(message) / PER_METRE[message.encoding], posinf=0.0)
+    return np.nan_to_num(values_of(message) / PER_METRE[message.encoding], posinf=0.0, neginf=0.0)
 
 
 def _running(bridge: Bridge, topic: str) -> Topic | None:

@@ -5,6 +5,7 @@
 ``zivid``: organised xyzrgba with NaN, reliable, captured by a service. ``phoxi``: organised, zeros
 where nothing was measured, captured by a service. ``depth``: 16-bit millimetres with CameraInfo.
 ``image``: a ChArUco board on the flange as JPEG with CameraInfo. ``empty``: triggered by a topic.
+Their CameraInfo comes after the image; with ``triggered`` there is none before the first scan.
 """
 
 import json
@@ -55,7 +56,7 @@ class Camera:
         eye = scanner_of(self.scanner, options["resolution"], 1.0, rng)
         self.scene = CellScene(robot, eye, self.base_T_camera, np.array([0.3, 0.3, 0.2]))
         self.arm, self.joints, self.count, self.seen = Arm(robot), None, 0, (None, None)
-        self.offset, self.silent, self.now, self.scale = 0.0, False, None, 1.0
+        self.offset, self.silent, self.now, self.scale, self.spoilt = 0.0, False, None, 1.0, {}
         self.look(np.radians(options["joints"]))  # what is loaded for the first scan takes seconds
         node.create_subscription(JointState, "/truth", self.hears, 10)
         if options["sim_time"]:
@@ -69,7 +70,7 @@ class Camera:
         self.out = node.create_publisher(
             form, name.get(kind, self.point_topic), SENSOR if kind == "realsense" else 10
         )
-        if kind in ("zivid", "phoxi"):
+        if kind in ("zivid", "phoxi") or options["triggered"]:
             node.create_service(Trigger, f"{space}/capture", self.captures)
         elif kind == "empty":
             node.create_subscription(Empty, f"{space}/trigger", lambda _: self.publish(), 10)
@@ -86,6 +87,7 @@ class Camera:
         self.offset = words.get("offset", self.offset)
         self.silent = words.get("silent", self.silent)
         self.scale = words.get("scale", self.scale)
+        self.spoilt = words.get("info", self.spoilt)
         if "pose" in words:
             say(pose=self.base_T_camera.tolist(), count=self.count)
 
@@ -175,18 +177,20 @@ class Camera:
             height=depth.shape[0], width=depth.shape[1], encoding="16UC1", step=2 * depth.shape[1]
         )
         image.data = depth.tobytes()
-        return [self.as_info(self.lens, depth.shape), image]
+        return [image, self.as_info(self.lens, depth.shape)]
 
     def as_image(self, pixels):
         import cv2
 
         image = CompressedImage(format="jpeg", data=cv2.imencode(".jpg", pixels)[1].tobytes())
-        return [self.as_info(LENS.camera_matrix, pixels.shape), image]
+        return [image, self.as_info(LENS.camera_matrix, pixels.shape)]
 
     def as_info(self, matrix, shape):
         info = CameraInfo(height=shape[0], width=shape[1], distortion_model=self.options["lens"])
         info.k, info.d = matrix.ravel().tolist(), [0.0] * 5
         info.p = np.pad(matrix, ((0, 0), (0, 1))).ravel().tolist()
+        for name, value in self.spoilt.items():
+            setattr(info, name, value)
         return info
 
 
