@@ -585,7 +585,6 @@ def _live(*made):
 
 def _read_live(kind):
     def read(path):
-        from flangeye_plugins.robot.ros2.listener import _angles
         from flangeye_plugins.ros2 import messages
         from flangeye_plugins.scanner.opened import cloud_of
 
@@ -593,7 +592,7 @@ def _read_live(kind):
             messages.CLOUD: lambda told: cloud_of(messages.cloud_of(told), 1.0),
             messages.IMAGE: lambda told: (messages.values_of(told), messages.pixels_of(told)),
             messages.COMPRESSED: messages.pixels_of, messages.INFO: messages.intrinsics_of,
-            messages.JOINT_STATE: _angles,
+            messages.JOINT_STATE: messages.positions_of,
         }  # fmt: skip
         data = path.read_bytes()
         messages.stamp_of(data), messages.frame_of(data)

@@ -92,9 +92,9 @@ class Bridge(Device):
         self._sim_time = sim_time
         self._asked = self._calls = 0
         try:
-            # Longest time until the process has a node: a cold disk reads rclpy's hundred
-            # libraries [s]
-            self.middleware = str(self._answer({}, 10.0))
+            # Longest time until the process has a node: a cold disk, or a busy computer, reads
+            # rclpy's hundred libraries [s]
+            self.middleware = str(self._answer({}, 30.0))
             self._began = time.monotonic()
             if sim_time:
                 self.follow(CLOCK, CLOCK_TYPE)
@@ -103,6 +103,12 @@ class Bridge(Device):
             raise
 
     # --- what is there
+
+    @property
+    def place(self) -> str:
+        """Which graph this is, for people."""
+        domain = os.environ.get("ROS_DOMAIN_ID", "0")
+        return f"(ROS_DOMAIN_ID {domain}, RMW_IMPLEMENTATION {self.middleware})"
 
     def topics(self) -> dict[str, Topic]:
         """Return what is known of the running graph, by topic."""
@@ -139,7 +145,7 @@ class Bridge(Device):
             topic: Its name.
             kind: Its type.
             always: Whether every message is wanted, or those that :meth:`want` asks for.
-            take: Is given each message as it comes, in another thread.
+            take: Is given each message as it comes, in another thread, before :meth:`wait` has it.
 
         Raises:
             DeviceError: Nobody publishes it, or with another type.
@@ -259,11 +265,7 @@ class Bridge(Device):
 
     def _others(self, kind: str) -> str:
         others = [t.name for t in self.topics().values() if t.type == kind and t.publishers]
-        domain = os.environ.get("ROS_DOMAIN_ID", "0")
-        return (
-            f"of type {kind} there are: {', '.join(sorted(others)) or 'none'} "
-            f"(ROS_DOMAIN_ID {domain}, {self.middleware})"
-        )
+        return f"of type {kind} there are: {', '.join(sorted(others)) or 'none'} {self.place}"
 
     def _ask(self, what: str, **arguments: Any) -> Any:
         with self._asking:
@@ -315,11 +317,11 @@ class Bridge(Device):
                 message = GraphMessage(
                     self._count(topic) + 1, said["received_ns"], said["ahead_ns"], body
                 )
+                if topic in self._takers:
+                    with contextlib.suppress(StageError):  # damaged: as if it had not come
+                        self._takers[topic](message)
                 self._newest[topic] = message
                 self._news.notify_all()
-            if topic in self._takers:
-                with contextlib.suppress(StageError):  # damaged: as if it had not come
-                    self._takers[topic](message)
         elif "triggered" in said:
             self._triggered.put(said)
         else:

@@ -71,7 +71,7 @@ class Controller(Peer):
         given = {
             "robot": "ur5e", "joints": FACING, "prefix": "", "namespace": "", "seed": None,
             "controller": "arm_controller", "latency": 0.01, "lag": 0.02, "sim_time": False,
-            "ends": ["tool0"],
+            "ends": ["tool0"], "split": False, "best_effort": False,
         }  # fmt: skip
         super().__init__("controller", given | options, env)
         self.joints = [f"{options.get('prefix', '')}joint_{i}" for i in range(1, 7)]
@@ -93,7 +93,7 @@ class Camera(Peer):
         given = {
             "robot": "ur5e", "scanner": "phoxi-m", "layout": layout, "namespace": "/camera",
             "seed": 1, "resolution": 0.2, "prefix": "", "sim_time": False, "moved": [0.0, 0.0, 0.0],
-            "refuses": "", "lens": "plumb_bob", "joints": FACING,
+            "refuses": "", "lens": "plumb_bob", "joints": FACING, "triggered": False,
         }  # fmt: skip
         super().__init__("camera", given | options, env)
 

@@ -17,7 +17,7 @@ from flangeye_plugins.robot.ros2.driver import (
     robot_ros2_freedrive,
 )
 from flangeye_plugins.ros2.client import Bridge
-from flangeye_plugins.ros2.messages import INFO
+from flangeye_plugins.ros2.messages import INFO, JOINT_STATE, decoded, positions_of
 from flangeye_plugins.scanner.ros2 import Ros2ScannerParams as Topics
 from flangeye_plugins.scanner.ros2 import scanner_ros2
 from tests.plugins.fixed import fixed
@@ -99,10 +99,29 @@ def test_what_goes_wrong_with_an_arm_is_one_line(env):
             with pytest.raises(DeviceError, match="stamps jumped back by"):
                 for _ in range(50):
                     robot.wait_cycle()
+            arm.tell(nan=True)
+            with pytest.raises(DeviceError, match="a joint's position is no number"):
+                for _ in range(50):
+                    robot.wait_cycle()
+
+
+def test_a_publisher_that_comes_later_and_does_not_resend_is_heard(env):
+    heard = set()
+
+    def hear(message):
+        heard.update(decoded(message.data, JOINT_STATE, positions_of))
+
+    with peers(Controller(env, prefix="left_")), Bridge("a test") as bridge:
+        bridge.follow("/joint_states", JOINT_STATE, take=hear)
+        with peers(Controller(env, best_effort=True)):
+            until = time.monotonic() + 10
+            while not {"left_joint_1", "joint_1"} <= heard:
+                assert time.monotonic() < until, heard
+                time.sleep(0.1)
 
 
 def test_an_arm_that_others_move_is_ready_when_it_stands_elsewhere(env):
-    with peers(Controller(env, controller=None)) as (arm,):
+    with peers(Controller(env, controller=None, split=True)) as (arm,):
         params = fixed(FreedriveParams, joints=tuple(arm.joints), still=0.2)
         with robot_ros2_freedrive.function(ARM, params) as robot:
             start = robot.state().joints
@@ -156,6 +175,32 @@ def test_an_answer_that_comes_too_late_is_not_that_to_the_next_question(env):
             bridge.services()
         os.kill(process, signal.SIGCONT)
         assert bridge.topics()["/camera/camera_info"].type == INFO
+
+
+def test_a_camera_info_may_come_with_the_first_scan_and_has_to_fit_it(env):
+    topics = {"depth": "/camera/image_rect_raw", "trigger": "/camera/capture"}
+    with peers(Controller(env), Camera(env, "depth", triggered=True)) as (_, camera):  # noqa: SIM117
+        with scanner_ros2.function(EYE, Topics(**topics)) as eye:
+            assert 0.8 < np.median(eye.expose()().cloud.points()[:, 2]) < 1.1
+            for info, said in (
+                (
+                    {"height": 7, "width": 9},
+                    "and /camera/camera_info is of 9 x 7: camera_info names",
+                ),
+                ({"k": [0.0] * 9, "p": [0.0] * 12}, "camera_info has focal lengths of 0 and 0 px"),
+                ({"d": [0.1]}, "and 1 distortion coefficients: calibrate"),
+            ):
+                camera.ask(info=info | {"p": [0.0] * 12}, pose=True)
+                # The first scan may still be seen with the one before
+                assert any(said in complaint_of(eye) for _ in range(2))
+
+
+def complaint_of(eye):
+    try:
+        eye.expose()()
+    except DeviceError as error:
+        return str(error)
+    return ""
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -19,7 +19,7 @@ from flangeye.types import BASE, FLANGE, Floats, Transform
 from flangeye_plugins.robot.tool_check import require_model
 from flangeye_plugins.ros2.client import Bridge, GraphMessage
 from flangeye_plugins.ros2.frames import Frames
-from flangeye_plugins.ros2.messages import JOINT_STATE, decoded
+from flangeye_plugins.ros2.messages import JOINT_STATE, decoded, positions_of
 
 STALE = 0.1
 """A sample older than this is no news of the arm [s]."""
@@ -86,14 +86,18 @@ class Listener(Device):
         self.name = f"{model.model} on {params.joint_states}"
         self.arm, self._params, self._bridge = Arm(model), params, bridge
         self._asker, self._model = asker, model
-        self._seen = 0
+        self._seen = self._kept = 0
         self._samples: deque[JointSample] = deque()
-        self._columns: tuple[tuple[str, ...], list[int]] = ((), [])
+        # What came and was not taken in yet: not more than a moment of a fast driver's
+        self._arrived: deque[GraphMessage] = deque(maxlen=32)
+        self._heard: set[str] = set()
+        self._angles: dict[str, float] = {}
+        self._begun_ns = 0
         if len(params.joints) != self.arm.n:
             raise DeviceError(
                 f"{asker}: joints names {len(params.joints)}, but a {model.model} has {self.arm.n}"
             )
-        bridge.follow(params.joint_states, JOINT_STATE)
+        bridge.follow(params.joint_states, JOINT_STATE, take=self._arrived.append)
         self._frames = Frames(bridge) if params.tf else None
         if self._frames and params.tf:
             self._frames.wait_for(params.tf.base, params.tf.flange)
@@ -140,14 +144,16 @@ class Listener(Device):
 
     def _measured_period(self) -> float:
         """Return the time between two joint states [s]."""
-        until, times = self._bridge.until_known() + LISTENING, list[int]()
-        while len(times) < 10 and time.monotonic() < until:
-            if self._take(LISTENING / 2):
-                times.append(self._samples[-1].received_ns)
-        if len(times) < 2:
+        until = self._bridge.until_known() + LISTENING
+        while not self._take(LISTENING / 2) and time.monotonic() < until:
+            pass
+        kept, first = self._kept, self._samples[-1].received_ns if self._samples else 0
+        while 0 < self._kept < kept + 10 and time.monotonic() < until:
+            self._take(LISTENING / 2)
+        if self._kept == kept:
             topic = self._params.joint_states
             raise DeviceError(f"{self._asker}: {topic}: {self._missing() or NOTHING}")
-        period = float(np.median(np.diff(times))) * 1e-9
+        period = 1e-9 * (self._samples[-1].received_ns - first) / (self._kept - kept)
         if period > SLOWEST:
             raise DeviceError(
                 f"{self._asker}: {self._params.joint_states} comes {1 / period:.0f} times a "
@@ -158,30 +164,44 @@ class Listener(Device):
     # --- samples
 
     def _take(self, patience: float) -> bool:
-        """Take in the newest message of this arm; return whether there was a new one."""
-        until = time.monotonic() + patience
-        while message := self._bridge.wait(
-            self._params.joint_states, self._seen, max(until - time.monotonic(), 0.0)
-        ):
+        """Take in what came of this arm; return whether a sample is new."""
+        until, new = time.monotonic() + patience, False
+        while not new:
+            left = max(until - time.monotonic(), 0.0)
+            message = self._bridge.wait(self._params.joint_states, self._seen, left)
+            if message is None:
+                return False
             self._seen = message.number
-            if self._keep(message):
-                return True
-        return False
+            while self._arrived:
+                new |= self._keep(self._arrived.popleft())
+        return True
 
     def _keep(self, message: GraphMessage) -> bool:
-        """Keep a message's angles, if it has those of this arm."""
+        """Keep a message's angles; return whether every joint has a new one by now.
+
+        One message may have some of the joints, and another, soon after it, the others.
+        """
         try:
-            names, angles = decoded(message.data, JOINT_STATE, _angles)
+            told = decoded(message.data, JOINT_STATE, positions_of)
         except StageError as error:
             raise DeviceError(f"{self.name}: {error}") from None
-        if names != self._columns[0]:
-            if not set(self._params.joints) <= set(names):
-                return False  # a gripper's or a rail's, on the same topic
-            self._columns = names, [names.index(joint) for joint in self._params.joints]
-        joints = angles[self._columns[1]]
+        self._heard.update(told)
+        mine = {joint: told[joint] for joint in self._params.joints if joint in told}
+        if not self._angles or message.received_ns - self._begun_ns > 1e9 * STALE:
+            self._angles, self._begun_ns = {}, message.received_ns
+        self._angles.update(mine)
+        if len(self._angles) < self.arm.n:
+            return False
+        joints = np.array([self._angles[joint] for joint in self._params.joints])
+        self._angles = {}
+        if not np.isfinite(joints).all():
+            raise DeviceError(
+                f"{self.name}: a joint's position is no number: is the arm's hardware active?"
+            )
         sample = JointSample(joints, self._bridge.local_ns(message), message.received_ns)
         self._require_forwards(sample)
         self._samples.append(sample)
+        self._kept += 1
         # Over which speeds are taken [ns]: what some drivers publish as velocity is noise, or empty
         while len(self._samples) > 2 and sample.time_ns - self._samples[1].time_ns > 50_000_000:
             self._samples.popleft()
@@ -218,19 +238,7 @@ class Listener(Device):
 
     def _missing(self) -> str:
         """Say which joints were looked for, where messages came without them."""
-        last = self._bridge.newest(self._params.joint_states)
-        if last is None or self._samples:
+        lost = [joint for joint in self._params.joints if joint not in self._heard]
+        if not self._heard or not lost:
             return ""
-        names = decoded(last.data, JOINT_STATE).name
-        lost = [joint for joint in self._params.joints if joint not in names]
-        if not lost:
-            return ""
-        return f"it has no joint {', '.join(lost)}, but {', '.join(names)}"
-
-
-def _angles(told: Any) -> tuple[tuple[str, ...], Floats]:
-    """Return the names of a joint state, and the angle (n,) of each [rad]."""
-    names, angles = tuple(told.name), np.asarray(told.position, dtype=float)
-    if len(angles) != len(names):
-        raise StageError(f"a joint state names {len(names)} joints and has {len(angles)} positions")
-    return names, angles
+        return f"it has no joint {', '.join(lost)}, but {', '.join(sorted(self._heard))}"

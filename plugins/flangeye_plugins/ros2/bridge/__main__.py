@@ -22,6 +22,11 @@ import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
+try:
+    from rclpy.event_handler import SubscriptionEventCallbacks
+except ImportError:  # Humble
+    from rclpy.qos_event import SubscriptionEventCallbacks
+
 Request = dict[str, Any]
 
 
@@ -55,6 +60,7 @@ class BridgeNode:
         self._node, self._output = node, output
         self._publishers: dict[str, Any] = {}
         self._clients: dict[str, Any] = {}
+        self._subscriptions: dict[str, list[Any]] = {}
         self._wanted: dict[str, bool] = {}
         self._heard: dict[str, int] = {}
 
@@ -90,10 +96,23 @@ class BridgeNode:
             raise RequestRefused(f"{topic} carries {others[0]}, {type} is needed")
         if infos and topic not in self._wanted:
             self._wanted[topic] = always
-            self._node.create_subscription(
-                kind, topic, self._passes_on(topic, always), matching(infos), raw=True
-            )
+            self._subscribe(kind, topic, self._passes_on(topic, always))
         return len(infos)
+
+    def _subscribe(self, kind: Any, topic: str, take: Callable[[bytes], None]) -> None:
+        """Subscribe to a topic, once more when somebody begins to publish it in another way."""
+        before = self._subscriptions.get(topic, [])
+        events = SubscriptionEventCallbacks(
+            incompatible_qos=lambda _: self._subscribe(kind, topic, take)
+        )
+        self._subscriptions[topic] = [
+            self._node.create_subscription(
+                kind, topic, take, profile, event_callbacks=events, raw=True
+            )
+            for profile in matching(self._node.get_publishers_info_by_topic(topic))
+        ]
+        for each in before:
+            self._node.destroy_subscription(each)
 
     def want(self, topic: str) -> Any:
         """Pass on the next message of a topic."""
@@ -155,16 +174,26 @@ class BridgeNode:
         return passes_on
 
 
-def matching(infos: list[Any]) -> QoSProfile:
-    """Return a quality of service with which a subscription hears all of some publishers."""
-    profiles = [info.qos_profile for info in infos]
-    reliable = all(p.reliability == ReliabilityPolicy.RELIABLE for p in profiles)
-    latched = all(p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in profiles)
-    return QoSProfile(
-        depth=10,
-        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-    )
+def matching(infos: list[Any]) -> list[QoSProfile]:
+    """Return qualities of service with which subscriptions hear all of some publishers.
+
+    Where some keep what they published last and others do not, it takes two subscriptions: what
+    comes from now on may then come twice.
+    """
+    found = []
+    for durability in {info.qos_profile.durability for info in infos}:
+        some = [i.qos_profile for i in infos if i.qos_profile.durability == durability]
+        reliable = all(p.reliability == ReliabilityPolicy.RELIABLE for p in some)
+        found.append(
+            QoSProfile(
+                depth=10,
+                reliability=ReliabilityPolicy.RELIABLE
+                if reliable
+                else ReliabilityPolicy.BEST_EFFORT,
+                durability=durability,
+            )
+        )
+    return found
 
 
 def type_of(name: str) -> Any:

@@ -4,7 +4,8 @@
 It takes joint trajectories as that controller does: those that are not of its joints, run backwards,
 end while moving or began so long ago that they are over are rejected, a new one replaces the one
 before from where the arm is, cubics lead from point to point. It is late by a stated latency. The
-joint states are shuffled, hold a gripper's joint too, and tell angles with the joints' zero errors;
+joint states are shuffled, hold a gripper's joint too, and tell angles with the joints' zero errors,
+whole or split in two messages; another node's speeds come right after each of them;
 where the arm really is goes out on /truth, which no driver listens to.
 """
 
@@ -27,7 +28,7 @@ from trajectory_msgs.msg import JointTrajectory
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
 from flangeye_emulators.controllers.arm import joint_zeros
-from tests.plugins.ros2.peers.node import LATCHED, rclpy, say, serve
+from tests.plugins.ros2.peers.node import LATCHED, SENSOR, rclpy, say, serve
 from tests.plugins.ros2.urdf import names_of, urdf_of
 
 CYCLE = 0.004
@@ -50,7 +51,8 @@ class Controller:
         self.history, self.taken, self.hand = deque(maxlen=REMEMBERED), 0, None
         self.lock = threading.Lock()
         space = options["namespace"]
-        self.states = node.create_publisher(JointState, f"{space}/joint_states", 10)
+        quality = SENSOR if options["best_effort"] else 10
+        self.states = node.create_publisher(JointState, f"{space}/joint_states", quality)
         self.truth = node.create_publisher(JointState, "/truth", 10)
         self.about = node.create_publisher(String, f"{space}/robot_description", LATCHED)
         self.about.publish(String(data=urdf_of(model, options["prefix"], options["ends"])))
@@ -69,6 +71,8 @@ class Controller:
                 self.silent_until = time.monotonic() + words["silent"]
             if "jump" in words:
                 self.jump = words["jump"]
+            if "nan" in words:
+                self.joints = self.joints * np.nan
             if "hand" in words:  # a person moves the arm there, in so many seconds
                 goal = np.array(words["hand"])
                 self.trajectory = self.cubics([(goal, np.zeros_like(goal), words["seconds"])])
@@ -150,12 +154,13 @@ class Controller:
         random.Random(1).shuffle(order)
         message = JointState()
         message.header.stamp.sec, message.header.stamp.nanosec = int(stamp), int(stamp % 1 * 1e9)
-        message.name = ["gripper_finger", *(self.names[i] for i in order)]
-        message.position = [0.01, *(float(self.joints[i]) for i in order)]
-        if count % 25 == 0:  # another node's joints on the same topic
-            other = JointState(header=message.header, name=["rail"], position=[0.0])
-            self.states.publish(other)
-        self.states.publish(message)
+        names = ["gripper_finger", *(self.names[i] for i in order)]
+        angles = [0.01, *(float(self.joints[i]) for i in order)]
+        for some in (slice(3), slice(3, None)) if self.options["split"] else (slice(None),):
+            message.name, message.position = names[some], angles[some]
+            self.states.publish(message)
+        other = JointState(header=message.header, name=["rail"], velocity=[0.0])
+        self.states.publish(other)
         real = JointState(header=message.header, position=(self.joints + self.zeros).tolist())
         self.truth.publish(real)
 
