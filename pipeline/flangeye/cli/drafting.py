@@ -94,12 +94,17 @@ def init(
     given = {name: answers[name.replace("-", "_")] for name in ANSWERS}
     questions = Questions(given, None if yes else _prompt)
     draft = (_of_what_runs if ros2 else _of_folder)(folder, out, questions, registry)
-    for path, text in {**draft.files, out: draft.text}.items():
-        path.write_text(text, "utf-8")
+    texts = {**draft.files, out: draft.text}
+    new = [path for path in texts if not path.exists()]
+    for path in set(texts) - set(new):
+        if path.read_bytes() != texts[path].encode():
+            raise RecipeError(f"{path}: is there already; take another name with --out")
+    for path in new:
+        path.write_bytes(texts[path].encode())
     try:
         checked = load_recipe(out, registry)
     except RecipeError as error:
-        for path in (out, *draft.files):
+        for path in new:
             path.unlink()
         # Of the recipe that is not kept nobody knows: its target is what was asked for.
         raise RecipeError(TARGETS.sub("--target ", str(error))) from None

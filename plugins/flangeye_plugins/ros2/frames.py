@@ -43,6 +43,7 @@ class Frames:
         """
         self.frames: dict[str, StampedFrame] = {}
         self._asker, self._bridge = bridge.asker, bridge
+        bridge.wait_until_known()  # those that stand may be found after those that move
         if moving:
             bridge.follow(TF, TF_TYPE, take=self._moving)
         if STATIC in bridge.topics():

@@ -7,6 +7,7 @@ import re
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,6 +27,7 @@ from flangeye_plugins.ros2.messages import (
     CLOUD,
     IMAGE,
     JOINT_STATE,
+    PER_METRE,
     TEXT,
     TRAJECTORY,
     TRIGGER,
@@ -33,6 +35,7 @@ from flangeye_plugins.ros2.messages import (
     encoded,
     frame_of,
     message,
+    positions_of,
 )
 
 COUNTED = 1.5
@@ -75,6 +78,11 @@ class Ros2Graph(Device):
             RecipeError: The URDF does not tell which link is the base.
         """
         topics = self.topics()
+        if not any(t.publishers and t.type in (TEXT, JOINT_STATE, CLOUD, IMAGE) for t in topics):
+            raise DeviceError(
+                f"ROS 2: no arm and no camera runs {self._bridge.place}: start their drivers, or "
+                "set both variables here as in their terminals"
+            )
         path = Path(f"{name}.urdf")
         text = self._description(topics, ask)
         found, section = described_arm(text, path, ask)
@@ -120,7 +128,7 @@ class Ros2Graph(Device):
             if root == above:
                 raise DeviceError(
                     f"ROS 2: {STATIC} joins {child} to {parent} already: end what publishes that, "
-                    "or choose other frames, --set child=NAME"
+                    "or choose another frame, --child NAME"
                 )
             matrix = each.matrix @ invert(tree.pose(root, child))
             transforms.append(self._stamped(parent, root, matrix))
@@ -156,8 +164,15 @@ class Ros2Graph(Device):
     def _listen(self, topics: Sequence[Topic]) -> list[Heard]:
         """Count the messages of all arms and cameras at once."""
         some = [t for t in topics if t.publishers and t.type in (JOINT_STATE, CLOUD, IMAGE)]
+        joints: dict[str, dict[str, float]] = {topic.name: {} for topic in some}
+
+        def take(name: str, message: GraphMessage) -> None:
+            joints[name].update(decoded(message.data, JOINT_STATE, positions_of))
+
         for topic in some:
-            self._bridge.follow(topic.name, topic.type, always=topic.type == JOINT_STATE)
+            moves = topic.type == JOINT_STATE
+            hears = partial(take, topic.name) if moves else None
+            self._bridge.follow(topic.name, topic.type, always=moves, take=hears)
             self._bridge.want(topic.name)
         time.sleep(MATCHING)
         before = {topic.name: self._bridge.heard(topic.name) for topic in some}
@@ -167,6 +182,7 @@ class Ros2Graph(Device):
                 topic,
                 (self._bridge.heard(topic.name) - before[topic.name]) / COUNTED,
                 self._bridge.newest(topic.name),
+                dict(joints[topic.name]),
             )
             for topic in some
         ]
@@ -206,11 +222,12 @@ class Ros2Graph(Device):
 
 
 class Heard(NamedTuple):
-    """A topic that was listened to: how often it comes [Hz], and its newest message."""
+    """A topic that was listened to: how often it comes [Hz], its newest message, joint -> angle."""
 
     topic: Topic
     rate: float
     newest: GraphMessage | None
+    joints: Mapping[str, float]
 
     @property
     def frame(self) -> str:
@@ -258,17 +275,16 @@ def packages_of(text: str) -> dict[str, Path]:
 def states_of(heard: Sequence[Heard], joints: Sequence[str]) -> tuple[str, Floats]:
     """Return the topic that has all joints of an arm, and their angles (n,) now [rad].
 
+    Of several it is one named joint_states: others may be what the joints are commanded.
+
     Raises:
         DeviceError: None has; says which joints each has.
     """
-    told = []
-    for each in heard:
-        if each.topic.type == JOINT_STATE and each.newest:
-            state = decoded(each.newest.data, JOINT_STATE)
-            angles = dict(zip(state.name, state.position, strict=False))
-            if set(joints) <= set(angles):
-                return each.topic.name, np.array([angles[joint] for joint in joints])
-            told.append(f"{each.topic.name} has {', '.join(state.name) or 'none'}")
+    states = [each for each in heard if each.topic.type == JOINT_STATE and each.newest]
+    for each in sorted(states, key=lambda each: not each.topic.name.endswith("joint_states")):
+        if set(joints) <= set(each.joints):
+            return each.topic.name, np.array([each.joints[joint] for joint in joints])
+    told = [f"{each.topic.name} has {', '.join(each.joints) or 'none'}" for each in states]
     raise DeviceError(
         f"no JointState topic has the joints of the robot_description, {', '.join(joints)}: "
         f"{'; '.join(told) or 'none was heard'}"
@@ -297,17 +313,26 @@ def scans_of(heard: Sequence[Heard], ask: Ask) -> Heard:
     Raises:
         DeviceError: There is none, or not the one that was asked for.
     """
-    clouds = [each for each in heard if each.topic.type == CLOUD]
-    depths = [each for each in heard if each.topic.type == IMAGE and "depth" in each.topic.name]
-    found = {each.topic.name: each for each in clouds or depths}
-    chosen = ask("scans", f"which topic has the scans ({', '.join(found)})", _only([*found], None))
-    every = {each.topic.name: each for each in heard if each.topic.type in (CLOUD, IMAGE)}
+    clouds = {each.topic.name: each for each in heard if each.topic.type == CLOUD}
+    depths = {each.topic.name: each for each in heard if _has_depths(each)}
+    found = [*(clouds or depths)]
+    chosen = ask("scans", f"which topic has the scans ({', '.join(found)})", _only(found, None))
+    every = clouds | depths
     if chosen not in every:
         raise DeviceError(
             f"nobody publishes clouds or depth images on {chosen}; there are: "
-            f"{', '.join(every) or 'none'}"
+            f"{', '.join(every) or 'none'} (images for markers: write scanner.ros2, image, by hand)"
         )
     return every[chosen]
+
+
+def _has_depths(heard: Heard) -> bool:
+    """Return whether images hold depths, by their encoding, or by their name where none came."""
+    if heard.topic.type != IMAGE:
+        return False
+    if heard.newest is None:
+        return "depth" in heard.topic.name
+    return decoded(heard.newest.data, IMAGE).encoding in PER_METRE
 
 
 def scanner_driver(scans: Heard, triggers: Iterable[str], ask: Ask) -> dict[str, Any]:
@@ -320,10 +345,12 @@ def scanner_driver(scans: Heard, triggers: Iterable[str], ask: Ask) -> dict[str,
     """
     params: dict[str, Any] = {"cloud" if scans.topic.type == CLOUD else "depth": scans.topic.name}
     if scans.newest is None:
-        namespace = f"{scans.topic.name.split('/')[1]}/"
-        likely = [t for t in triggers if TRIGGERS.search(t) and t.startswith(f"/{namespace}")]
+        namespace = f"/{scans.topic.name.split('/')[1]}/"
+        named = [t for t in triggers if TRIGGERS.search(t)]
+        likely = [t for t in named if t.startswith(namespace)] or named
+        told = f" ({', '.join(likely)})" if len(likely) > 1 else ""
         question = f"{scans.topic.name} is silent: which service (std_srvs/Trigger) takes a scan"
-        trigger = ask("trigger", question, _only(likely, None), "/camera/capture")
+        trigger = ask("trigger", question + told, _only(likely, None), "/camera/capture")
         if trigger != NONE:
             params["trigger"] = trigger
     return params

@@ -102,8 +102,7 @@ def test_simulated_time_drives_arm_and_camera(env):
 
 def test_a_compressed_image_shows_a_marker_with_its_camera(env):
     with peers(Controller(env), Camera(env, "image")):
-        with scanner_ros2.function(None, Topics(image="/camera/image_raw/compressed",
-                                                camera_info="/camera/camera_info")) as eye:  # fmt: skip
+        with scanner_ros2.function(None, Topics(image="/camera/image_raw/compressed")) as eye:
             image = eye.expose()().image
             assert image.pixels.shape[:2] == (1024, 1280)
             assert np.allclose(np.diag(image.camera_matrix), [1400, 1400, 1])
@@ -118,7 +117,7 @@ def test_a_graph_of_two_cells_is_told_apart(env, tmp_path):
         for side, towards in (("left", FACING), ("right", TOWARDS))
         for peer in (
             Controller(env, namespace=f"/{side}", prefix=f"{side}_", joints=towards,
-                       controller="arm_controller"),
+                       controller="arm_controller", split=side == "right"),
             Camera(env, "realsense", namespace=f"/{side}/eye", prefix=f"{side}_"),
         )
     ]  # fmt: skip
@@ -155,7 +154,7 @@ def test_a_flange_that_no_name_tells_is_asked_for() -> None:
 @pytest.mark.parametrize(
     ("peer", "words", "said"),
     [
-        (None, (), "which robot_description (none runs)"),
+        (None, (), "ROS 2: no arm and no camera runs (ROS_DOMAIN_ID "),
         ({"controller": None}, (), "which topic has the scans ()"),
         ({"joints": TOWARDS}, ("--scans", "/none"), "nobody publishes clouds or depth images on /"),
         ({"joints": TOWARDS}, ("--robot", "none.urdf"), "none.urdf"),
@@ -171,3 +170,21 @@ def test_what_init_cannot_see_is_one_line(env, tmp_path, peer, words, said):
     assert said in wrong
     assert len(wrong.splitlines()) == 1
     assert not [*tmp_path.iterdir()]
+
+
+def test_init_keeps_what_is_there_and_finds_a_service_outside_the_namespace(env, tmp_path):
+    eye = Camera(env, "zivid", namespace="", joints=TOWARDS)
+    with peers(Controller(env, joints=TOWARDS), eye):
+        words = ("init", "--ros2", "--scanner", "phoxi-m", "--yes")
+        mine = tmp_path / "recipe.urdf"
+        mine.write_text("mine")
+        _, wrong = Terminal(tmp_path, env).run(*words, expect=2)
+        assert wrong == "error: recipe.urdf: is there already; take another name with --out\n"
+        assert mine.read_text() == "mine"
+        Terminal(tmp_path, env).run(*words, "--out", "cell.yaml")
+        assert "trigger: /capture" in (tmp_path / "cell.yaml").read_text()
+        # A description that is given as the file it would be written to
+        (tmp_path / "cell.yaml").unlink()
+        own = ("--robot", "cell.urdf", "--plate", "none", "--out", "cell.yaml")
+        Terminal(tmp_path, env).run(*words, *own, expect=2)
+        assert (tmp_path / "cell.urdf").exists()
