@@ -51,7 +51,7 @@ def test_a_run_prints_one_screen_and_nothing_else() -> None:
     assert printed(result()).splitlines() == [
         "A cell",
         "VERIFIED (simulated)   1 of 1 captures used",
-        "Held-out error   0.16 mm   5 folds, poses the solver never saw; limit 0.50 mm",
+        "Held-out error   0.16 mm   5 folds, poses that took no part; limit 0.50 mm",
         "base_T_camera [m]",
         "    1.000000    0.000000    0.000000    0.000000",
         "    0.000000    1.000000    0.000000    0.000000",

@@ -40,6 +40,20 @@ def test_leaving_one_out_in_closed_form_is_leaving_it_out(found) -> None:
     assert left_out(model, everyone)[0][3] == pytest.approx(expected, rel=1e-5, abs=1e-10)
 
 
+@pytest.mark.parametrize("sightings", [16, 200])
+def test_leaving_a_fold_out_is_fitting_the_others_at_the_same_sizes(sightings) -> None:
+    fold = np.arange(1, sightings, 5)
+    session = foreign.session("marker", foreign.UR5E, 1e-3, sightings, 1)
+    posterior = estimated(session, "marker").posterior
+    shares = posterior.model.shares.copy()
+    shares[fold] = 0.0
+    others = posterior.model.weighted(shares)
+    for known, left in zip(posterior.fits, posterior.without(fold).fits, strict=True):
+        again = fit(others, known.sizes)
+        assert left.mean == pytest.approx(again.mean, rel=1e-6, abs=1e-12)
+        assert left.covariance == pytest.approx(again.covariance, rel=1e-6, abs=1e-15)
+
+
 def test_shares_are_what_each_cause_does_to_the_answer(found) -> None:
     known, mode = found.posterior, found.posterior.mode
     model, (n, _, count) = known.model, known.model.design.shape

@@ -141,9 +141,10 @@ def held_out(found: HandEye, keeps: bool) -> float:
     """Return the held-out error [m], with what the features share or, wrongly, without."""
 
     def again(some: Sequence[Observation]) -> HandEye:
-        answer = solved(list(some), 0.1)
+        answer = replace(solved(list(some), 0.1), without=None)
         return answer if keeps else replace(answer, shared=np.zeros(0))
 
+    found = replace(found, without=None)
     return verify_holdout(found, again, HoldoutParams(), configuration=IN_HAND).figures["rms"]
 
 

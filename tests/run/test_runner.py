@@ -291,6 +291,24 @@ def test_what_is_solved_again_is_refined_again(execute: Callable[..., Any]) -> N
     assert len(told[0].pairs) == 5
 
 
+def test_a_solver_does_not_speak_for_what_was_refined(execute: Callable[..., Any]) -> None:
+    told, plain = [], toy.solve.function
+
+    def solve(observations, params):
+        return replace(plain(observations, params), without=lambda poses: told)
+
+    def verify(calibration, solve, views, params):
+        again = solve([pair.observation for pair in calibration.pairs[1:]])
+        told.append((calibration.without, again.without))
+        return t.Verification(True, "as it is", {})
+
+    with replaced(toy.solve, solve), replaced(toy.verify, verify):
+        execute(TOY_RECIPE)
+        execute(TOY_RECIPE.replace("  - verify.toy", "  - refine.toy\n  - verify.toy"))
+    assert all(told[0])
+    assert told[1] == (None, None)
+
+
 @pytest.mark.parametrize(
     ("clouds", "hint"),
     [

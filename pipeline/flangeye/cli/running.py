@@ -177,7 +177,7 @@ def _explain_refusal(log: Path, registry: Registry, result: Result, recipe: Reci
         return
     known = "no mistake was recognised in poses or scans"
     if result.holdout:
-        known = "poses the solver never saw disagree with it; " + known
+        known = "poses that took no part disagree with it; " + known
     more = "add poses turned by 20 deg or more; the arm itself may be off"
     print_refusal(Console(), wrong, known, [doctor, more] if result.holdout else [doctor])
 

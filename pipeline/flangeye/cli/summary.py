@@ -60,7 +60,7 @@ def errors(result: Result) -> Iterator[tuple[str, str, str]]:
         figure = f"{rounded_mm(answers.corrected.expected_rms)} mm"
         yield "  with the arm corrected", figure, "needs its correction too: calibration.yaml"
     if held := result.holdout:
-        over = f"{held.folds} folds, poses the solver never saw"
+        over = f"{held.folds} folds, poses that took no part"
         limit = held.figures.get("limit")
         over += "" if limit is None else f"; limit {rounded_mm(limit)} mm"
         yield "Held-out error", f"{rounded_mm(held.rms)} mm", over

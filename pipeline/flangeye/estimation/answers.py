@@ -88,8 +88,13 @@ def as_reported(found: Estimate, work: Work, without: frozenset[str] = frozenset
         without: Kinds of the arms' errors that are corrected, and so are no part of what they
             report.
     """
+    return functional(found, commanded(found, work, without))
+
+
+def commanded(found: Estimate, work: Work, without: frozenset[str] = frozenset()) -> Floats:
+    """Return (B, P, K) what the effects' numbers add to the places, right over each box."""
     commands = _Commands(found, work.around, without)
-    return functional(found, np.array([commands.answer(box) for box in work.boxes]))
+    return np.array([commands.answer(box) for box in work.boxes])
 
 
 @dataclass(frozen=True, eq=False)

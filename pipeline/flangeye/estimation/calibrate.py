@@ -10,7 +10,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from flangeye.errors import FlangeyeError
-from flangeye.estimation.answers import Answer, as_reported, as_true, expected_error
+from flangeye.estimation.answers import (
+    Answer,
+    as_reported,
+    as_true,
+    commanded,
+    expected_error,
+    functional,
+)
 from flangeye.estimation.certified import answer_of, certificate_notes, moved_note, verdict_of
 from flangeye.estimation.corrections import CORRECTED, corrections_of, put_right
 from flangeye.estimation.effects.arm import COMMON
@@ -33,9 +40,9 @@ from flangeye.types import (
     Box,
     CircleFeature,
     CorrectedArm,
-    ExpectedError,
     Floats,
     HandEye,
+    Indices,
     Note,
     Observation,
     Pair,
@@ -101,16 +108,33 @@ def answered(session: Session, options: Options, method: str) -> HandEye:
     Raises:
         CalibrationRefused: The motion leaves something unknown.
     """
-    weak = _weak(session, options)
-    work = _work(session, options)
-    reported = _reported(session, work, weak)
-    corrected = _corrected(session, work, weak, reported.expected)
+    found, weak, work = session.found, _weak(session, options), _work(session, options)
+    commands = commanded(found, work), commanded(found, work, CORRECTED)
+    uncorrected = functional(found, commands[0])
+    reported = _reported(session, uncorrected, weak)
+    expected = expected_error(found, work, uncorrected.mean)
+    righted = functional(found, commands[1])
+    corrected = _corrected(session, righted, weak)
+    if corrected is not None:
+        then = expected_error(found, work, righted.mean, put_right(found))
+        corrected = replace(corrected, expected=then) if then.rms <= BETTER * expected.rms else None
+
+    def without(poses: Indices) -> HandEye:
+        rest = session.without(poses)
+        weak = _weak(rest, options)
+        uncorrected, righted = (functional(rest.found, each) for each in commands)
+        answer = _reported(rest, uncorrected, weak)
+        return replace(answer, corrected=_corrected(rest, righted, weak))
+
     return replace(
         reported,
         method=method,
+        pairs=_pairs(session, reported),
+        expected=expected,
         corrected=corrected,
-        true=tuple(_estimates(session, as_true(session.found), weak)),
+        true=tuple(_estimates(session, as_true(found), weak)),
         notes=(*session.notes, *_notes(session, weak, options)),
+        without=without,
     )
 
 
@@ -141,14 +165,15 @@ def calibrate_at(
         CalibrationRefused: As of :func:`calibrate`.
     """
     session = session_of(observations, cell, scanner, options.asked)
-    weak = _weak(session, options)
-    work = _work(session, options)
-    answer = _reported(session, work, weak, places)
-    pairs = tuple(replace(pair, used=True, reason=None) for pair in answer.pairs)
-    true = as_true(session.found).at(session.found.problem.moves(session.found.places, places))
+    found, weak, work = session.found, _weak(session, options), _work(session, options)
+    moves = found.problem.moves(found.places, places)
+    answer = _reported(session, as_reported(found, work).at(moves), weak)
+    pairs = _pairs(session, answer)
+    true = as_true(found).at(moves)
     return replace(
         answer,
-        pairs=pairs,
+        pairs=tuple(replace(pair, used=True, reason=None) for pair in pairs),
+        expected=expected_error(found, work, moves),
         method=method,
         true=tuple(_estimates(session, true, weak)),
         notes=session.notes,
@@ -211,47 +236,27 @@ def _work(session: Session, options: Options) -> Work:
     return work_of(found.problem.where(found.inliers), found.places, options.work)
 
 
-def _reported(session: Session, work: Work, weak: Floats, given: Places | None = None) -> HandEye:
-    """Return the answer for the arms as their controllers report them: the likeliest, or given."""
-    found = session.found
-    answered = as_reported(found, work)
-    if given is not None:
-        answered = answered.at(found.problem.moves(found.places, given))
-    camera, *others = _estimates(session, answered, weak)
+def _reported(session: Session, answer: Answer, weak: Floats) -> HandEye:
+    """Return the answer for the arms as their controllers report them."""
+    camera, *others = _estimates(session, answer, weak)
     tool = ArmCorrection(session.tool_offset) if session.tool_offset.any() else None
-    answer = HandEye(
-        camera,
-        (),
-        "",
-        correction=tool,
-        others=tuple(others),
-        expected=expected_error(found, work, answered.mean),
-        shared=_shared(found),
-    )
-    return replace(answer, pairs=_pairs(session, answer))
+    shared = _shared(session.found)
+    return HandEye(camera, (), "", correction=tool, others=tuple(others), shared=shared)
 
 
-def _corrected(
-    session: Session, work: Work, weak: Floats, reported: ExpectedError | None
-) -> CorrectedArm | None:
-    """Return the answer for the arms with their errors corrected, where that is worth its while."""
-    found = session.found
-    corrections = corrections_of(found, session.tool_offset)
-    if not corrections or reported is None:
+def _corrected(session: Session, answer: Answer, weak: Floats) -> CorrectedArm | None:
+    """Return the answer for the arms with their errors corrected; None where no arm is known."""
+    corrections = corrections_of(session.found, session.tool_offset)
+    if not corrections:
         return None
-    answered = as_reported(found, work, without=CORRECTED)
-    expected = expected_error(found, work, answered.mean, put_right(found))
-    if expected.rms > BETTER * reported.rms:
-        return None
-    camera, *others = _estimates(session, answered, weak)
+    camera, *others = _estimates(session, answer, weak)
     alone = list(corrections) == [FLANGE]
     return CorrectedArm(
         camera,
         corrections[FLANGE] if alone else None,
         tuple(others),
         {} if alone else corrections,
-        _shared(found),
-        expected,
+        _shared(session.found),
     )
 
 

@@ -8,7 +8,7 @@ agree.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from flangeye.estimation.mixed import (
     posterior,
 )
 from flangeye.maths.statistics import chi2_quantile
-from flangeye.types import Floats, Mask
+from flangeye.types import Floats, Indices, Mask
 
 SCALE = 2.0
 """By how many times features may be better or worse than their fits state, one sigma: turns and
@@ -90,6 +90,12 @@ class Estimate:
             for k, effect in enumerate(self.effects)
             if effect.kind == kind
         )
+
+    def without(self, rows: Indices) -> Estimate:
+        """Return what all sightings but some tell, with sizes and outliers as all tell them."""
+        inliers = self.inliers.copy()
+        inliers[rows] = False
+        return replace(self, posterior=self.posterior.without(rows), inliers=inliers)
 
     @property
     def counts(self) -> list[int]:

@@ -18,6 +18,7 @@ many unknowns as places and effects have: the cost is linear in N. Arrays only.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -27,7 +28,7 @@ from scipy.linalg import cholesky
 from scipy.linalg.lapack import dpotri
 
 from flangeye.maths.statistics import spread_evenly
-from flangeye.types import Floats
+from flangeye.types import Floats, Indices, Mask
 
 FREE = 1e-10
 """Information of each unknown before anything is seen, as a share of what is most: none, but what
@@ -307,6 +308,14 @@ class Posterior:
         apart = np.array([f.mean - self.mean for f in self.fits])
         return np.asarray(within + (apart.T * self.chances) @ apart)
 
+    def without(self, rows: Indices) -> Posterior:
+        """Return what all sightings but some tell, in closed form: the sizes stay as they are."""
+        shares = self.model.shares.copy()
+        shares[rows] = 0.0
+        model = self.model.weighted(shares)
+        mode, *fits = _anew(model, [self.mode, *self.fits])
+        return Posterior(model, mode, tuple(fits), self.chances)
+
 
 def shares(known: Posterior, rows: Floats) -> tuple[Floats, Floats]:
     """Return what the covariance of (A, P + K) rows of the unknowns is made of.
@@ -350,24 +359,38 @@ def posterior(model: LinearModel, mode: Floats | None = None) -> Posterior:
     """Return the joint posterior, the sizes integrated over."""
     z, some = mode_of(model) if mode is None else mode, model.telling()
     spread, prior = _laplace(some, z), model.sizes
-    at_mode = prior.at(z)
-    known, fits, logs = told(model, at_mode), [], []
-    of_noise = np.arange(len(at_mode))[::-1] < len(model.scaled) + len(model.scatter)
+    at_mode, fits, logs = fit(model, prior.at(z), with_gradient=False), [], []
     for draw in _draws(len(z), SAMPLES):
         at = z + spread @ draw
         found = fit(some, prior.at(at), with_gradient=False)
         logs.append(0.5 * float(draw @ draw - found.cost - at @ at))
-        if some is not model:
-            # So many sightings tell the noise's own sizes to a few percent.
-            sizes = np.where(of_noise, at_mode, found.sizes)
-            mean, covariance, _ = _solved(model, sizes, known)
-            found = replace(
-                found, mean=mean, covariance=covariance, weights=known.weights, sizes=sizes
-            )
         fits.append(found)
+    if some is not model:
+        # So many sightings tell the noise's own sizes to a few percent.
+        noise = _of_noise(model)
+        fits = [replace(f, sizes=np.where(noise, at_mode.sizes, f.sizes)) for f in fits]
+        fits = _anew(model, fits)
     chances = np.exp(np.array(logs) - max(logs))
-    mode_fit = fit(model, at_mode, with_gradient=False)
-    return Posterior(model, mode_fit, tuple(fits), chances / chances.sum())
+    return Posterior(model, at_mode, tuple(fits), chances / chances.sum())
+
+
+def _of_noise(model: LinearModel) -> Mask:
+    """Return (S,) which sizes are of the noise; the others are of effects."""
+    count = len(model.sizes.centre)
+    return np.arange(count) >= count - len(model.scaled) - len(model.scatter)
+
+
+def _anew(model: LinearModel, fits: Sequence[Fit]) -> list[Fit]:
+    """Return places and effects by another model, each at the sizes of a fit."""
+    noise, known, out = _of_noise(model), {}, []
+    for each in fits:
+        key = each.sizes[noise].tobytes()  # what is told depends on the noise's alone
+        if key not in known:
+            known[key] = told(model, each.sizes)
+        mean, covariance, _ = _solved(model, each.sizes, known[key])
+        weights = known[key].weights
+        out.append(replace(each, mean=mean, covariance=covariance, weights=weights))
+    return out
 
 
 def _laplace(model: LinearModel, z: Floats) -> Floats:

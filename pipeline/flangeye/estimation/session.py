@@ -32,7 +32,7 @@ from flangeye.maths.geometry import rigid
 from flangeye.maths.statistics import chi2_quantile
 from flangeye.models.cell import Cell
 from flangeye.models.scanners import ScannerModel
-from flangeye.types import Floats, Mask, Note, Observation, PoseFeature
+from flangeye.types import Floats, Indices, Mask, Note, Observation, PoseFeature
 
 CLOCK_STEPS, EXACT_DELAY = 6, 1e-5
 """Steps to find the time between two clocks, and how small the last one is [s]."""
@@ -111,6 +111,16 @@ class Session:
         found = estimate(problem, self.found.places, self.found.effects, self.found.inliers)
         return replace(self, observations=observations, found=found)
 
+    def without(self, rows: Indices) -> Session:
+        """Return what all observations but some tell, in closed form.
+
+        Raises:
+            StageError: Too few are left.
+        """
+        found = self.found.without(rows)
+        _require_enough(found.problem.where(found.inliers))
+        return replace(self, found=found)
+
 
 def session_of(
     observations: Sequence[Observation],
@@ -127,8 +137,7 @@ def session_of(
             by more than was recorded, or a marker has another size than was said.
     """
     problem = problem_of(observations, cell, asked.normals)
-    if len(problem.ends) == 1:
-        require_enough(problem, fewest(problem))
+    _require_enough(problem)
     require_turns(problem)
     factor = 1.0
     if asked.size_unknown and len(problem.ends) == 1:
@@ -156,6 +165,11 @@ def effects_of(problem: Problem, scanner: ScannerModel | None, asked: Asked) -> 
         *clock_effects(problem),
         *drift_effects(problem),
     ]
+
+
+def _require_enough(problem: Problem) -> None:
+    if len(problem.ends) == 1:
+        require_enough(problem, fewest(problem))
 
 
 # --- where to begin ------------------------------------------------------------------------------

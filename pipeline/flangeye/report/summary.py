@@ -104,7 +104,7 @@ def tiles_of(facts: Facts) -> list[KeyFigure]:
         note = "rms" if bound is None else f"95 % below {rounded_mm(bound)} mm"
         tiles.append(KeyFigure("Expected error at the work", rounded_mm(rms), "mm", note))
     if held := result.holdout:
-        note = f"rms, {held.folds} folds, poses the solver never saw"
+        note = f"rms, {held.folds} folds, poses that took no part"
         tiles.append(KeyFigure("Held-out error", rounded_mm(held.rms), "mm", note))
     return [*tiles, _poses(facts)]
 

@@ -294,7 +294,7 @@ class Runner:
             self._refined.append(step)
 
     def _calibrate(self, step: Step) -> None:
-        found = self._once(step)
+        found = _refined(self._once(step), self._outcome.calibration)
         if found.expected is None:
             found = self._with_expected_error(found)
         self._values[t.HandEye] = self._outcome.calibration = found
@@ -323,7 +323,8 @@ class Runner:
         subset = t.Observations(observations, self._outcome.source, len(observations))
         given: dict[Any, Any] = {t.Observations: subset}
         for step in (self._steps("solve")[0], *self._refined):
-            given[t.HandEye] = step.stage.function(**self._arguments(step, given))
+            found = step.stage.function(**self._arguments(step, given))
+            given[t.HandEye] = _refined(found, given.get(t.HandEye))
         calibration: t.HandEye = given[t.HandEye]
         return calibration
 
@@ -417,6 +418,12 @@ def _given(step: Step, need: Any, value: Any) -> Any:
         name = getattr(need, "__name__", str(need))
         raise StageError(f"{step.label}: needs a {name}, and nothing in this run gives one")
     return value
+
+
+def _refined(found: t.HandEye, before: t.HandEye | None) -> t.HandEye:
+    """Return what a step made of an answer; what the solver knows is not of what it became."""
+    stale = before is not None and found.without is before.without
+    return replace(found, without=None) if stale else found
 
 
 def _unread_joint(capture: t.Capture) -> str | None:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
+from pydantic.json_schema import SkipJsonSchema
 
-from flangeye.types.arrays import Array, Floats, Note, freeze
+from flangeye.types.arrays import Array, Floats, Indices, Note, freeze
 from flangeye.types.features import Observation
 from flangeye.types.frames import BASE, FrameMismatchError, TransformEstimate
 
@@ -147,6 +150,8 @@ class HandEye:
         arms: In a cell, what it found wrong with each arm, by its name.
         shared: (k,) how much it found of each error that the features share (such as the camera's,
             :class:`PoseFeature`), in standard deviations; none where it looked for none.
+        without: Takes indices of pairs and returns the answer that the others give, where the
+            solver knows it without solving again; it raises as the solver does.
     """
 
     camera: TransformEstimate
@@ -160,6 +165,9 @@ class HandEye:
     true: tuple[TransformEstimate, ...] = ()
     arms: Mapping[str, ArmCorrection] = field(default_factory=dict)
     shared: Array = field(default_factory=lambda: np.zeros(0))
+    without: Annotated[SkipJsonSchema[Callable[[Indices], HandEye] | None], Field(exclude=True)] = (
+        None  # no log holds it
+    )
 
     def __post_init__(self) -> None:
         freeze(self, shared=(len(self.shared),))

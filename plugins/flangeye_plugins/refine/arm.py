@@ -68,13 +68,14 @@ def refine_arm(
         *_ways(told),
         *_proposed(session, told, params.propose),
     )
-    corrected = answered(session, Options(), calibration.method).corrected
+    found = answered(session, Options(), calibration.method)
     kept = (
         "the arm's parameters are left out, for correcting them is not expected to help"
-        if corrected is None
+        if found.corrected is None
         else "the arm's parameters are corrected"
     )
-    return replace(calibration, corrected=corrected, notes=(*calibration.notes, *about_arm, kept))
+    notes = (*calibration.notes, *about_arm, kept)
+    return replace(calibration, corrected=found.corrected, notes=notes, without=found.without)
 
 
 def _identifiability(told: ArmParameters, session: Session) -> str:

@@ -1,4 +1,4 @@
-"""Errors on poses that took no part: the step's own solver is run again without them."""
+"""Errors on poses that took no part in the answer."""
 
 from __future__ import annotations
 
@@ -74,7 +74,9 @@ def verify_holdout(  # noqa: PLR0913  what it asks the runner for
     second: SecondRobot | None = None,
     seed: Seed = Seed(0),  # noqa: B008  a NewType is the int itself
 ) -> Verification:
-    """k-fold cross-validation over poses: solve without each fold and measure the error on it.
+    """k-fold cross-validation over poses: the answer without each fold, and its error on it.
+
+    A solver that knows its answer without some poses is asked; any other solves each rest again.
 
     ``rms``, ``median``, ``p95`` and ``max`` are over all poses but outliers, of the pose for the
     arm as its controller reports it; ``rms_inliers`` is the same
@@ -91,7 +93,7 @@ def verify_holdout(  # noqa: PLR0913  what it asks the runner for
         deal_moments(poses, params.folds, seed) if cell else deal(len(poses), params.folds, seed)
     )
     try:
-        solved = solve_without(poses, solve, deals)
+        solved = solve_without(calibration, solve, deals)
     except (StageError, CalibrationRefused) as error:
         return Verification(
             False, f"without one fold of {len(deals)} there is no answer: {error}", {}
@@ -137,17 +139,18 @@ def deal_moments(observations: Sequence[Observation], folds: int, seed: int) -> 
     return [np.sort(np.concatenate([groups[k] for k in fold])) for fold in dealt]
 
 
-def solve_without(
-    observations: Sequence[Observation], solve: Solver, folds: Sequence[Indices]
-) -> list[HandEye]:
+def solve_without(calibration: HandEye, solve: Solver, folds: Sequence[Indices]) -> list[HandEye]:
     """Return the calibration without each fold.
 
     Raises:
         StageError: The rest of some fold cannot be solved.
         CalibrationRefused: The rest of some fold gives no trustworthy answer.
     """
-    kept = [np.setdiff1d(np.arange(len(observations)), fold) for fold in folds]
-    return [solve([observations[i] for i in rest]) for rest in kept]
+    poses = [pair.observation for pair in calibration.pairs]
+    if without := calibration.without or solve(poses).without:  # a log does not hold it
+        return [without(fold) for fold in folds]
+    kept = [np.setdiff1d(np.arange(len(poses)), fold) for fold in folds]
+    return [solve([poses[i] for i in rest]) for rest in kept]
 
 
 def hold_out(

@@ -1,6 +1,7 @@
 """solve.robust: efficiency, outliers, normals, calibrated covariance, what it refuses."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,7 @@ from flangeye.types import (
 )
 from flangeye_plugins.solve.robust import RobustParams, solve_cell, solve_robust
 from flangeye_plugins.solve.svd import SvdParams, solve_svd
+from flangeye_plugins.verify.holdout import HoldoutParams, verify_holdout
 
 MM, DEG = 1e-3, np.pi / 180
 TRUTH = Transform(
@@ -102,6 +104,27 @@ def solve(observations: Sequence[Observation], **params: object) -> HandEye:
 
 def svd(observations: Sequence[Observation]) -> HandEye:
     return solve_svd(Observations(observations, Source("test")), SvdParams())
+
+
+@pytest.mark.parametrize("wrong", [0, 4])
+def test_poses_held_out_in_closed_form_are_off_like_those_solved_without(wrong) -> None:
+    observations = simulate(24, 3, wrong=wrong)
+    found = solve(observations)
+
+    def by_solving_again(some: Sequence[Observation]) -> HandEye:
+        return replace(solve(some), without=None)
+
+    params = HoldoutParams(max_rms="100 mm")
+    closed = verify_holdout(found, solve, params).figures
+    again = verify_holdout(replace(found, without=None), by_solving_again, params).figures
+    assert closed["rms"] == pytest.approx(again["rms"], rel=0.05)
+    # What a log gives back knows nothing of its solver, and is told the same
+    read = verify_holdout(replace(found, without=None), solve, params).figures
+    assert read == closed
+
+
+def test_poses_that_leave_too_few_are_not_held_out() -> None:
+    assert not verify_holdout(solve(simulate(5, 0)), solve, HoldoutParams(folds=2)).passed
 
 
 def rms_at_work(calibration: HandEye) -> float:
