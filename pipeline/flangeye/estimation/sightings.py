@@ -76,12 +76,12 @@ def _by_depth(feature: Feature) -> bool:
 
 def _shared(observations: Sequence[Observation]) -> Floats:
     """Return (N, 6, k) how each of k errors that all share moves what was seen, in ``camera``."""
-    each = [
-        o.feature.shared if isinstance(o.feature, PoseFeature) else np.zeros((6, 0))
-        for o in observations
-    ]
-    most = max(moved.shape[1] for moved in each)
-    return np.array([np.pad(moved, ((0, 0), (0, most - moved.shape[1]))) for moved in each])
+    each = [o.feature.shared if isinstance(o.feature, PoseFeature) else None for o in observations]
+    moves = {i: moved for i, moved in enumerate(each) if moved is not None}
+    out = np.zeros((len(each), 6, max((m.shape[1] for m in moves.values()), default=0)))
+    for i, moved in moves.items():
+        out[i, :, : moved.shape[1]] = moved
+    return out
 
 
 def _carriers(
