@@ -292,7 +292,8 @@ def test_what_is_solved_again_is_refined_again(execute: Callable[..., Any]) -> N
 
 
 def test_a_solver_does_not_speak_for_what_was_refined(execute: Callable[..., Any]) -> None:
-    told, plain = [], toy.solve.function
+    told: list[tuple[Any, Any]] = []
+    plain = toy.solve.function
 
     def solve(observations, params):
         return replace(plain(observations, params), without=lambda poses: told)
