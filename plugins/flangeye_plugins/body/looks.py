@@ -56,41 +56,59 @@ class Looks:
     """What of a body is seen from where.
 
     Attributes:
-        size: Of the body [m].
-        centre: (3,) [m].
-        surface: Points of it.
-        ends: Points where its faces end.
-        views: (V, 3) directions from the scanner to the body.
-        seen, ends_seen: (V, N) which points are seen from there; of the ends, which end before
-            something that is far behind.
+        shape: The body.
     """
 
-    size: float
-    centre: Floats
-    surface: OrientedPoints
-    ends: OrientedPoints
-    views: Floats
-    seen: Mask
-    ends_seen: Mask
+    shape: Shape
+
+    @property
+    def size(self) -> float:
+        """Of the body [m]."""
+        return self.shape.size
+
+    @property
+    def centre(self) -> Floats:
+        """(3,) of the body [m]."""
+        return self.shape.centre
+
+    @property
+    def surface(self) -> OrientedPoints:
+        """Points of the body."""
+        return self.shape.surface
+
+    @property
+    def ends(self) -> OrientedPoints:
+        """Points where its faces end."""
+        return self.shape.ends
+
+    @cached_property
+    def views(self) -> Floats:
+        """(V, 3) directions from the scanner to the body."""
+        return spread_directions(DIRECTIONS)
+
+    @cached_property
+    def _seen(self) -> tuple[Mask, Mask]:
+        """(V, N) which points of the surface are seen from there, and of the ends.
+
+        Of these, which end before something that is far behind.
+        """
+        ends, away = self.ends, BEYOND * self.size
+        beyond = ends._replace(points=ends.points + away * ends.directions)
+        free = ~_before(self.shape, beyond.points, self.views, away)
+        on, off = (_seen(self.shape, part, self.views) for part in (self.surface, beyond))
+        return on, off & free
+
+    @property
+    def ends_seen(self) -> Mask:
+        """(V, N) which ends are seen from each direction."""
+        return self._seen[1]
 
     @cached_property
     def _listed(self) -> tuple[Indices, Indices]:
         """(V, LISTED) numbers of surface points and of ends that stand for what is seen."""
-
-        def some(part: OrientedPoints, seen: Mask, view: Floats) -> Indices:
-            points, at = part.points, np.flatnonzero(seen & (part.normals @ view < -STEEPEST))
-            if not len(at):
-                return np.zeros(LISTED, np.int64)
-            out = [0]
-            gap = np.linalg.norm(points[at] - points[at[0]], axis=1)
-            while len(out) < min(LISTED, len(at)):
-                out.append(int(np.argmax(gap)))
-                gap = np.minimum(gap, np.linalg.norm(points[at] - points[at[out[-1]]], axis=1))
-            return np.asarray(at[np.resize(out, LISTED)])
-
         on, ends = (
-            np.array([some(part, *one) for one in zip(seen, self.views, strict=True)])
-            for part, seen in ((self.surface, self.seen), (self.ends, self.ends_seen))
+            _apart(part.points, seen & (self.views @ part.normals.T < -STEEPEST))
+            for part, seen in zip((self.surface, self.ends), self._seen, strict=True)
         )
         return on, ends
 
@@ -201,24 +219,29 @@ class Looks:
         return np.asarray(np.argmax(towards @ self.views.T.astype(poses.dtype), axis=1))
 
 
-@lru_cache(maxsize=4)
-def prepared(body: TargetBody) -> tuple[Shape, Looks]:
-    """Return a body's shape and looks; computed once."""
-    shape = Shape(body.vertices, body.triangles)
-    return shape, looks_of(shape)
+@lru_cache(maxsize=8)  # a session's body, and how its mesh may be drawn wrongly
+def prepared(body: TargetBody) -> Looks:
+    """Return a body's looks, with its shape; computed once."""
+    return Looks(Shape(body.vertices, body.triangles))
 
 
-def looks_of(shape: Shape) -> Looks:
-    """Return what of a body is seen from where."""
-    views = spread_directions(DIRECTIONS)
-    on, ends = shape.surface, shape.ends
-    away = BEYOND * shape.size
-    beyond = ends._replace(points=ends.points + away * ends.directions)
-    free = ~_before(shape, beyond.points, views, away)
-    return Looks(
-        shape.size, shape.centre, on, ends, views,
-        _seen(shape, on, views), _seen(shape, beyond, views) & free,
-    )  # fmt: skip
+def _apart(points: Floats, seen: Mask) -> Indices:
+    """Return (V, LISTED) numbers of the points seen from each direction, the farthest apart first.
+
+    The first is the first that is seen, and each next the farthest from those before it; where
+    fewer are seen they come again.
+    """
+    rows, first = np.arange(len(seen)), np.argmax(seen, axis=1)
+    out, gap = np.empty((len(seen), LISTED), np.int64), np.where(seen, np.inf, -1.0)
+    many, squares = seen.sum(axis=1), (points**2).sum(axis=1)
+    for k in range(LISTED):
+        last = np.argmax(gap, axis=1) if k else first
+        out[:, k] = last
+        off = squares[last, None] + squares - 2 * points[last] @ points.T
+        gap = np.minimum(gap, np.where(seen, off, -1.0))
+        gap[rows, last] = -1.0
+    again = np.arange(LISTED) % np.maximum(many, 1)[:, None]
+    return np.take_along_axis(out, again, axis=1)
 
 
 def _placed(

@@ -61,13 +61,16 @@ class BodySearch:
 
     Attributes:
         points: (N, 3) of the scan, N at least ``FEWEST``, all before the scanner [m].
-        shape: The body.
-        looks: What of it is seen from where.
+        looks: The body, and what of it is seen from where.
     """
 
     points: Singles
-    shape: Shape
     looks: Looks
+
+    @property
+    def shape(self) -> Shape:
+        """The body."""
+        return self.looks.shape
 
     def everywhere(self) -> list[FoundPose]:
         """Return distinct poses that the body may have, the best first."""

@@ -48,18 +48,34 @@ class OrientedPoints(NamedTuple):
         return OrientedPoints(self.points[at], self.directions[at], self.normals[at])
 
 
-class Met(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Met:
     """Where rays met a body.
 
     Attributes:
+        shape: The body.
+        directions: (N, 3) of the rays.
         depth: (N,) in lengths of the directions; infinite where a ray passed.
-        normals: (N, 3) of the smooth surface, towards the ray's origin.
         facets: (N,) the triangle that was met; 0 where a ray passed.
+        uv: (N, 2) where in it.
     """
 
+    shape: Shape
+    directions: Floats
     depth: Floats
-    normals: Floats
     facets: Indices
+    uv: Floats
+
+    @cached_property
+    def normals(self) -> Floats:
+        """(N, 3) of the smooth surface, towards the ray's origin."""
+        mesh, smooth = self.shape._smooth
+        weights = np.column_stack([1 - self.uv.sum(axis=1), self.uv])
+        normals = np.einsum("nk,nkc->nc", weights, smooth[mesh.faces[self.facets]])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+        away = np.einsum("nc,nc->n", normals, self.directions) > 0
+        normals[away] *= -1
+        return np.asarray(normals)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,13 +118,7 @@ class Shape:
         depth = found["t_hit"].numpy().astype(np.float64)
         facet = np.where(np.isfinite(depth), found["primitive_ids"].numpy(), 0)
         uv = found["primitive_uvs"].numpy().astype(np.float64)
-        weights = np.column_stack([1 - uv.sum(axis=1), uv])
-        mesh, smooth = self._smooth
-        normals = np.einsum("nk,nkc->nc", weights, smooth[mesh.faces[facet]])
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-        away = np.einsum("nc,nc->n", normals, directions) > 0
-        normals[away] *= -1
-        return Met(depth, normals, facet)
+        return Met(self, directions, depth, facet, uv)
 
     @property
     def facets(self) -> tuple[Floats, Indices]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from functools import partial
+from dataclasses import replace
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,7 +27,7 @@ from flangeye.types import (
 from flangeye.units import Length, param
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
 
     from flangeye_plugins.body.search import FoundPose
 
@@ -92,13 +93,14 @@ def segment_body(
     points = _between(points, params.near, params.far)
     if len(points) < FEWEST:
         return Rejected("no point between near and far")
-    shape, looks = prepared(body)
+    looks = prepared(body)
+    shape = looks.shape
     if looks.freedoms < ALL:
         raise StageError(
             f"{body.name}: it looks the same however it is turned about an axis, so that a scan "
             "does not show its pose; segment.sphere finds a ball"
         )
-    search = BodySearch(points, shape, looks)
+    search = BodySearch(points, looks)
     passes = partial(_passes, coverage=params.min_coverage, trust=params.min_trust)
     found = list(filter(passes, search.near(_predicted(capture, configuration, earlier))))[:1]
     if not found:
@@ -140,15 +142,15 @@ def _misdrawn(
 ) -> Rejected | None:
     """Return how a mesh is drawn wrongly, where it would be found otherwise; None where not."""
     from flangeye_plugins.body.judge import opposed
-    from flangeye_plugins.body.looks import prepared
+    from flangeye_plugins.body.looks import Looks, prepared
     from flangeye_plugins.body.search import FINE_ACROSS, BodySearch
+    from flangeye_plugins.body.shape import Shape
     from flangeye_plugins.body.view import view_of
 
-    for what, fix, vertices in _otherwise(body):
-        other = TargetBody(body.name, vertices, body.triangles)
-        if any(map(passes, BodySearch(points, *prepared(other)).everywhere())):
+    for what, fix, other in _otherwise(body):
+        if any(map(passes, BodySearch(points, prepared(other)).everywhere())):
             return Rejected(f"{body.name} is {what}: so it would be found", fix=fix)
-    shape = prepared(body)[0]
+    shape = prepared(body).shape
     vertices, facets = shape.facets
     # Parts that stand elsewhere hide some of the rest, and a rest is found in clutter sooner.
     holds = partial(_passes, coverage=0.0, trust=0.93, goes_on=0.1, weakest=FIRM / 2)
@@ -156,8 +158,8 @@ def _misdrawn(
     for pose in (one.pose for one in every):
         gone = opposed(shape, view, pose)
         if gone is not None:
-            rest = TargetBody(body.name, vertices, facets[~gone].astype(np.int32))
-            near = filter(holds, BodySearch(points, *prepared(rest)).near(pose[None]))
+            rest = Looks(Shape(vertices, facets[~gone].astype(np.int32)))
+            near = filter(holds, BodySearch(points, rest).near(pose[None]))
             held += [(one.verdict.score, vertices[facets[gone]]) for one in near]
     if not held:
         return None
@@ -172,21 +174,23 @@ def _misdrawn(
     )
 
 
-def _otherwise(body: TargetBody) -> Iterator[tuple[str, str, Floats]]:
-    """Yield how a body's mesh may be written wrongly: what is wrong, what to do, its vertices."""
-    yield (
-        "drawn mirrored",
-        "mirror the mesh, or export it from CAD with right-handed axes",
-        body.vertices * [-1.0, 1.0, 1.0],
-    )
+@lru_cache(maxsize=1)
+def _otherwise(body: TargetBody) -> list[tuple[str, str, TargetBody]]:
+    """Return how a body's mesh may be written wrongly: what is wrong, what to do, the right one."""
+    out = [
+        (
+            "drawn mirrored",
+            "mirror the mesh, or export it from CAD with right-handed axes",
+            replace(body, vertices=body.vertices * [-1.0, 1.0, 1.0]),
+        )
+    ]
     for scale, units in ((INCH, "millimetres for inches"), (10.0, "millimetres for centimetres")):
         for times, size in ((scale, "small"), (1 / scale, "large")):
             if SMALLEST <= times * body.size <= LARGEST:
-                yield (
-                    f"{scale:g} times too {size}, {units} or the reverse",
-                    f"state the unit: of the target, or scale the mesh by {times:.4g}",
-                    body.vertices * times,
-                )
+                what = f"{scale:g} times too {size}, {units} or the reverse"
+                fix = f"state the unit: of the target, or scale the mesh by {times:.4g}"
+                out.append((what, fix, replace(body, vertices=body.vertices * times)))
+    return out
 
 
 def _passes(
