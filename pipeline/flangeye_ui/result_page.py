@@ -18,6 +18,7 @@ from flangeye.doctor import examine, open_session
 from flangeye.doctor.diagnosis import Finding
 from flangeye.errors import FlangeyeError
 from flangeye.models.robots import RobotModel
+from flangeye.report.cell import found_body
 from flangeye.report.facts import Facts, set_aside_of
 from flangeye.report.look import SERIES
 from flangeye.report.still import scene_of
@@ -323,9 +324,14 @@ def _in_3d(project: Project, box: ui.expansion, facts: Facts) -> None:
         _cell(project, scene, facts)
         for entry in facts.log.of_kind("fit"):
             scene.cloud(outline_of(entry.value) @ pose[:3, :3].T + pose[:3, 3], RIM, 0.004)
+        body, fits = found_body(facts), "Fitted rims"
+        if body is not None:
+            fits = f"{body.name}, as it was found in {body.capture},"
+            for edge in body.edges @ pose[:3, :3].T + pose[:3, 3]:
+                scene.lines(edge, RIM)
         times = _residuals(scene, facts)
         ui.label(
-            f"Fitted rims red, in the base; residuals as arrows, {times:.0f} times their length: "
+            f"{fits} red, in the base; residuals as arrows, {times:.0f} times their length: "
             "green of poses that were used, orange of others."
         ).classes("note")
 

@@ -7,13 +7,18 @@ import re
 from base64 import b64decode
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 
+from flangeye import types as t
 from flangeye.log.read import RunLog
+from flangeye.maths.geometry import rigid
+from flangeye.models.bodies import load_body
 from flangeye.report import write_report
-from flangeye.report.cell import cell_drawing
+from flangeye.report.cell import cell_drawing, found_body
 from flangeye.report.clouds import cloud_panels
 from flangeye.report.facts import facts_of
 from flangeye.report.page import render
@@ -176,3 +181,20 @@ def test_pieces() -> None:
     lengths = [float(np.linalg.norm(b - a)) for a, b in edges]
     assert sorted(lengths) == [1.0] * 4 + [2.0] * 4 + [3.0] * 4
     assert [round_up(x) for x in (0.9, 1.0, 1.1, 2.3, 7.0, 120.0)] == [1, 1, 2, 5, 10, 200]
+
+
+def test_a_body_is_drawn_where_it_was_found_first() -> None:
+    body, pose = load_body("gripper", None, Path()), rigid(np.eye(3), np.array([0.1, 0.2, 0.9]))
+    feature = t.PoseFeature(t.Transform(t.CAMERA, t.TARGET, pose), 1e-8 * np.eye(6))
+    flange = {t.FLANGE: t.Transform(t.BASE, t.FLANGE, np.eye(4))}
+    seen = [t.Observation(name, feature, flange) for name in ("03", "04")]
+    log: Any = SimpleNamespace(observations=lambda: seen, models={})
+    facts: Any = SimpleNamespace(log=log, recipe="target: {body: gripper, at: flange}")
+    found = found_body(facts)
+    assert found is not None
+    assert (found.name, found.capture) == ("gripper", "03")
+    extent = np.ptp(found.edges.reshape(-1, 3), axis=0)
+    assert extent == pytest.approx(np.ptp(body.vertices, axis=0), rel=0.02)
+    assert found.edges.reshape(-1, 3).mean(axis=0) == pytest.approx(pose[:3, 3], abs=body.size)
+    facts.recipe = "target: {body: of-another-version, at: flange}"
+    assert found_body(facts) is None

@@ -200,7 +200,6 @@ def test_notes_provenance_and_recipe_are_there(make_run: Make) -> None:
 def test_a_run_from_centres_has_no_clouds_but_all_else(make_run: Make) -> None:
     log = make_run(clouds=False, truth=False)
     text = text_of(log)
-    assert "The log holds no clouds with a fitted circle" in text
     assert "True error" not in text
     assert 'id="figure-cell"' in render(log)
     assert 'id="figure-cloud-1"' not in render(log)

@@ -58,6 +58,16 @@ class TargetBody:
         """Return it as it is at an arm's joint angles (n,) [rad]: a rigid one always the same."""
         return self
 
+    def edges(self, most: int) -> Floats:
+        """Return (E, 2, 3) the ends of its sharp edges, the longest of them [m]: a line drawing."""
+        import trimesh
+
+        mesh = trimesh.Trimesh(self.vertices, self.triangles)
+        sharp = mesh.face_adjacency_angles > np.radians(30)
+        ends = np.asarray(mesh.vertices[mesh.face_adjacency_edges[sharp]])
+        length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+        return np.asarray(ends[np.argsort(-length, kind="stable")[:most]])
+
     def as_ply(self) -> str:
         """Return it as an ASCII PLY file in metres, to 0.1 um."""
         head = (

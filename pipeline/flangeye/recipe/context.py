@@ -69,7 +69,9 @@ def context_of(header: Header, folder: Path, complain: Complain) -> Context:
         place = ("robot", "model" if robot.model else "urdf")
         offer(RobotModel, place, lambda: _arm(robot, header.feature.standard, folder))
     if target := header.target:
-        offer(TargetBody, ("target", "body"), lambda: _body(target, context, folder))
+        offer(
+            TargetBody, ("target", "body"), lambda: body_of(target, context.get(RobotModel), folder)
+        )
     if scanner := header.scanner:
         offer(ScannerData, ("scanner", "model"), lambda: _scanner(scanner, folder))
         if context[ScannerData] is None or isinstance(context[ScannerData], ScannerModel):
@@ -116,7 +118,17 @@ def _arm(section: RobotSection, standard: str | None, folder: Path) -> RobotMode
     return robot_from_urdf(path, section.base, section.flange, standard, packages)
 
 
-def _body(target: TargetSection, context: Context, folder: Path) -> TargetBody:
+def body_of(target: TargetSection, robot: RobotModel | None, folder: Path) -> TargetBody:
+    """Return the body that a recipe's target is.
+
+    Args:
+        target: The section.
+        robot: The recipe's arm, whose links may be the body.
+        folder: Folder of the recipe.
+
+    Raises:
+        RecipeError: It cannot be read, or is not where it may be.
+    """
     if target.body != ARM:
         if target.links:
             raise RecipeError(
@@ -125,7 +137,7 @@ def _body(target: TargetSection, context: Context, folder: Path) -> TargetBody:
         return load_body(target.body, target.unit, folder)
     if target.at != "flange":
         raise RecipeError(f"body: {ARM} moves with every joint; leave out at: {target.at}")
-    return arm_body(context.get(RobotModel), target.links, folder)
+    return arm_body(robot, target.links, folder)
 
 
 def _as_built(robot: RobotModel, calibration: Path) -> RobotModel:

@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+from typing import NamedTuple
+
 import numpy as np
 
 from flangeye import types as t
+from flangeye.errors import FlangeyeError
+from flangeye.files.yaml_lines import parse_yaml
 from flangeye.log.foxglove import circle_lines
+from flangeye.models.loading import load_model
+from flangeye.recipe.context import body_of
+from flangeye.recipe.header import TargetSection
+from flangeye.recipe.own_models import carried_files
 from flangeye.report.facts import Facts
 from flangeye.report.plot import (
     AXES as COLOURS,
@@ -46,11 +55,13 @@ def cell_drawing(facts: Facts) -> PlotlyFigure | None:
     seen = "as the robot reports it" if carrier == t.BASE else "as the camera saw it"
     shown = [f"the {'flange' if carrier == t.BASE else 'target'}'s centre {seen}"] if traces else []
     if pose is not None:
+        body = found_body(facts)
         drawn = [
             *_flanges(facts, pose),
-            *_first_scan(facts, pose),
+            *_scan(facts, pose, body and body.capture),
             *_circles(facts, pose),
             *_targets([pose @ m for m in _marker_poses(facts).values()]),
+            *(_body(body, pose) if body else ()),
         ]
         traces += drawn
         shown += list(dict.fromkeys(str(x["name"]) for x in drawn))
@@ -73,7 +84,8 @@ def _from_moving_camera(facts: Facts) -> PlotlyFigure | None:
     cameras = {o.id: o.base_T_flange.matrix @ eye for o in facts.log.observations()}
     if not cameras:
         return None
-    markers = _marker_poses(facts)
+    markers, body = _marker_poses(facts), found_body(facts)
+    shown = body.capture if body else next(iter(cameras))
     centres = [
         mapped(cameras[o.id], o.centre_in_camera)
         for o in facts.measured
@@ -84,10 +96,11 @@ def _from_moving_camera(facts: Facts) -> PlotlyFigure | None:
         points(at, USED, 3, name="the camera at every capture"),
         points(centres, CIRCLE, 3, name="the target's centre as the camera saw it from each"),
         *_targets([cameras[k] @ m for k, m in markers.items() if k in cameras]),
-        *_first_scan(facts, next(iter(cameras.values()))),
+        *_scan(facts, cameras[shown], shown),
+        *(_body(body, cameras[shown]) if body else ()),
     ]
     traces = [*drawn, *frame(np.eye(4), t.BASE, AXES)]
-    traces += frame(next(iter(cameras.values())), t.CAMERA, AXES / 2)
+    traces += frame(cameras[shown], t.CAMERA, AXES / 2)
     return _drawing(traces, list(dict.fromkeys(str(x["name"]) for x in drawn)), t.BASE)
 
 
@@ -117,6 +130,44 @@ def _targets(poses: list[Floats]) -> list[Trace]:
     return named if poses else []
 
 
+def _body(body: FoundBody, camera: Floats) -> list[Trace]:
+    name = f"{plain(body.name, 40)} where it was found"
+    return [lines(list(mapped(camera, body.edges)), CIRCLE, 2, name=name)]
+
+
+class FoundBody(NamedTuple):
+    """A body that is the target, as one capture showed it.
+
+    Attributes:
+        name: For people.
+        capture: Its id.
+        edges: (E, 2, 3) the ends of its edges in the camera [m].
+    """
+
+    name: str
+    capture: str
+    edges: Floats
+
+
+def found_body(facts: Facts) -> FoundBody | None:
+    """Return the body that is the target where it was found first; None where none is one.
+
+    None too where it cannot be read here, as one of another version: the rest of the page stands.
+    """
+    poses, found = _marker_poses(facts), {o.id: o for o in facts.log.observations()}
+    data = parse_yaml(facts.recipe, "recipe").data if facts.recipe else {}
+    if not (data.get("target") or {}).get("body") or not poses:
+        return None
+    capture, pose = next(iter(poses.items()))
+    with suppress(FlangeyeError, ValueError), carried_files(facts.log.models) as folder:
+        target = TargetSection.model_validate(data["target"])
+        model = (data.get("robot") or {}).get("model")
+        robot = load_model("robots", model, folder) if model else None
+        body = body_of(target, robot, folder).at(found[capture].joints)
+        return FoundBody(body.name, capture, mapped(pose, body.edges(600)))
+    return None
+
+
 def _circles(facts: Facts, pose: Floats) -> list[Trace]:
     fitted = [e.value for e in facts.log.of_kind("fit") if isinstance(e.value, t.CircleFeature)]
     rings = [mapped(pose, line) for circle in fitted for line in circle_lines(circle, 36)]
@@ -129,12 +180,14 @@ def _flanges(facts: Facts, pose: Floats) -> list[Trace]:
         return []
     each = max(1, 3_000 // len(entries))
     xyz = np.concatenate([thinned(flange.cloud.xyz, each) for flange in entries])
-    return [points(mapped(pose, xyz), USED, 1.5, name="flange clouds")]
+    name = "flange clouds" if entries[0].camera_T_target is None else "the body's clouds"
+    return [points(mapped(pose, xyz), USED, 1.5, name=name)]
 
 
-def _first_scan(facts: Facts, pose: Floats) -> list[Trace]:
-    """Return the first scan, thinned: the arm must be where the arm is, the table level."""
-    first = next(facts.log.captures(), None)
+def _scan(facts: Facts, pose: Floats, capture: str | None) -> list[Trace]:
+    """Return one scan, the first by default: the arm must be where it is, the table level."""
+    every = facts.log.captures()
+    first = next((each for each in every if capture in (None, each.id)), None)
     if first is None:
         return []
     xyz = thinned(first.cloud.points(), 3_000)
