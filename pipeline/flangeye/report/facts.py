@@ -7,7 +7,7 @@ from what was logged, with the same functions, so that everything after this has
 from __future__ import annotations
 
 import re
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -25,6 +25,8 @@ from flangeye.units import parse_quantity
 
 INCOMPLETE: Literal["incomplete"] = "incomplete"
 UNSOLVED = "the run ended before the solver"
+NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:[.,]\d+)*(?:e[-+]?\d+)?(?!\w)")
+"""Reasons that differ in these alone are one; the 6 of M6 is none."""
 
 
 @dataclass(frozen=True)
@@ -180,7 +182,8 @@ class SetAside:
 
     Attributes:
         rows: One each.
-        counts: (how many, stage, reason with the numbers left out), most frequent first.
+        counts: (how many, stage, why), most frequent first; of reasons that differ in numbers
+            alone the first.
         early: Set aside before the solver.
         late: Set aside by the solver.
     """
@@ -193,22 +196,24 @@ class SetAside:
 
 def set_aside_of(facts: Facts) -> SetAside:
     """Return every capture that was not used, by reason and one by one."""
-    stages = {x.id: x.stage for x in facts.log.rejections}
+    early = {x.id: x for x in facts.log.rejections}
     solver = facts.result.method or "solver"
-    rows = []
+    rows, kinds = [], defaultdict[tuple[str, str], list[str]](list)
     for each in facts.set_aside:
-        stage = stages.get(each.id, solver)
+        by_stage = early.get(each.id)
+        stage = by_stage.stage if by_stage else solver
         reason = (each.reason or "no reason was given").removeprefix(f"{stage}: ")
         rows.append(RejectedRow(each.id, stage, reason))
-    kinds = Counter((x.stage, without_numbers(x.reason)) for x in rows)
-    counts = [(n, stage, reason) for (stage, reason), n in kinds.most_common()]
-    early = sum(x.id in stages for x in rows)
-    return SetAside(rows, counts, early, len(rows) - early)
+        shared = by_stage.reason if by_stage else reason
+        kinds[stage, NUMBER.sub("…", shared)].append(shared)
+    counts = [(len(alike), stage, _first_of(alike)) for (stage, _), alike in kinds.items()]
+    counts.sort(key=lambda each: -each[0])
+    ahead = sum(x.id in early for x in rows)
+    return SetAside(rows, counts, ahead, len(rows) - ahead)
 
 
-def without_numbers(reason: str) -> str:
-    """Return a reason with every number as an ellipsis, so that equal reasons count as one."""
-    return re.sub(r"(?<![\w.])[-+]?\d+(?:[.,]\d+)*(?:e[-+]?\d+)?(?!\w)", "…", reason)
+def _first_of(reasons: list[str]) -> str:
+    return reasons[0] + ("; the others alike" if set(reasons[1:]) - {reasons[0]} else "")
 
 
 @dataclass(frozen=True)
