@@ -114,9 +114,7 @@ COARSER = {
     "acquire.simulated_profiles": [],
     "acquire.simulated_cell_scans": ["steps.0.resolution=0.3"],
     "acquire.simulated_session": ["steps.0.resolution=0.3"],
-    "acquire.simulated_images": [
-        "steps.0.resolution=0.3", "steps.0.lens.size=[800, 640]", "steps.0.lens.focal_length=875",
-    ],
+    "acquire.simulated_images": ["steps.0.resolution=0.5"],
 }  # fmt: skip
 """A quarter of the pixels, or fewer; as they are shipped a slow test runs them."""
 

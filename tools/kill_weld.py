@@ -196,7 +196,7 @@ class Stroke:
 def _silent(after: float) -> tuple[str, ...]:
     return (
         "--set",
-        f"{FINGER}.world.clock.hidden=[{after:.1f} s, 1000 s]",
+        f"{FINGER}.hidden=[{after:.1f} s, 1000 s]",
     )  # at rest after 'still'
 
 

@@ -27,7 +27,7 @@ from flangeye_plugins.plan.next_best import NextBestParams, next_best
 from flangeye_plugins.solve.robust import FEWEST_ONLINE, RobustParams, solve_cell
 
 ROBOT, SCANNER = load_model("robots", "ur5e"), load_model("scanners", "phoxi-m")
-BASE_T_CAMERA = CameraPose().base_T_camera
+BASE_T_CAMERA = CameraPose().matrix
 WORK = np.array([0.3, 0.3, 0.2])
 CENTRE_NOISE = np.array([20e-6, 20e-6, 40e-6])
 NORMAL_NOISE = np.radians(0.01)

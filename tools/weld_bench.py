@@ -11,6 +11,7 @@ from flangeye.models.finger import Finger
 from flangeye.motion.seam_following import Controller
 from flangeye.types import Floats
 from flangeye_emulators.weld_world.groove import GrooveSection, Tip
+from flangeye_emulators.weld_world.truth import WeldTruth
 from flangeye_emulators.weld_world.world import Nominal, WeldWorld
 from flangeye_plugins.weld.belief import Belief, belief_of
 from flangeye_plugins.weld.body import LeaningTool, body_from
@@ -90,11 +91,10 @@ def could_be_welded(condition: Condition, seed: int, length: float, period: floa
     torch = body.level_R_tool.T @ body.torch
     nominal = Nominal(curved(length), section, Tip(), torch, body.level_R_tool)
     seam = WeldWorld(nominal, condition.truth, [seed, 0]).groove.root.points
-    left = ("lag", "dead_time", "backlash", "repeatability")
-    arm = {name: value for name, value in condition.world["arm"].items() if name in left}
+    arm = replace(condition.truth.arm, wave=0.0, scale=0.0, sag=0.0)
     plan = Path(seam)
     controller = controller_of(plan, belief, settings, "vision")
-    truth = Condition({"arm": arm}).truth
+    truth = WeldTruth(arm)
     response = controller._response  # type: ignore[attr-defined]
     response.dead_time, response.lag = truth.arm.dead_time, truth.arm.lag
     start = start_at(plan, belief, settings, period)

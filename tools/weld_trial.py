@@ -10,7 +10,7 @@ import numpy as np
 from flangeye.motion.seam_following import Command, Controller, ToolPose, Touch
 from flangeye.types import Floats
 from flangeye_emulators.finger.profiler import LookBehind
-from flangeye_emulators.weld_world.settings import LookTruth, WorldParams
+from flangeye_emulators.weld_world.truth import LookTruth, WeldTruth
 from flangeye_emulators.weld_world.world import ArmResponse, Nominal, Shutter, WeldWorld
 from flangeye_plugins.weld.follower import Follower
 
@@ -117,7 +117,7 @@ class Start:
 
 
 def run_trial(
-    controller: Controller, nominal: Nominal, truth: WorldParams, start: Start, seed: int
+    controller: Controller, nominal: Nominal, truth: WeldTruth, start: Start, seed: int
 ) -> Trial:
     """Let a controller weld in a world, and watch where the torch really is."""
     world = WeldWorld(nominal, truth, [seed, 0])
@@ -133,7 +133,7 @@ def run_trial(
         age = arm.pose.time - pose.time
         shown = world.settle(arm.pose)
         if shutter.due(age) and not shutter.hidden(age):
-            shutter.expose(arm.pose.time, age, shown + noise * rng.standard_normal(3))
+            shutter.expose(arm.pose.time, shown + noise * rng.standard_normal(3))
         seen = shutter.arrived(arm.pose.time)
         if look is not None and isinstance(controller, Follower):
             look.watch(arm.pose.time, world)

@@ -11,7 +11,6 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from typing import Annotated, Any
@@ -20,6 +19,17 @@ import numpy as np
 import typer
 
 from flangeye.errors import StageError
+from flangeye_emulators.weld_world.groove import Gap
+from flangeye_emulators.weld_world.truth import (
+    ArmTruth,
+    ClockTruth,
+    FingerTruth,
+    HeatTruth,
+    Tack,
+    ToolTruth,
+    WeldTruth,
+    WorkpieceTruth,
+)
 from tools.weld_bench import DISTANCE, could_be_welded, try_condition
 from tools.weld_conditions import Condition
 from tools.weld_trial import Trial
@@ -93,20 +103,19 @@ class _Draw:
     def normal(self, sigma: float) -> float:
         return sigma * float(self.rng.standard_normal())
 
-    def gaps(self) -> list[Mapping[str, Any]]:
+    def gaps(self) -> tuple[Gap, ...]:
         if not self.happens():
-            return []
+            return ()
         start, length = self.between(0.02, 0.04), self.between(5e-3, 50e-3)
-        side = int(self.rng.choice([-1, 1]))
-        return [{"start": _mm(start), "length": _mm(length), "side": side}]
+        return (Gap(start, start + length, int(self.rng.choice([-1, 1]))),)
 
-    def tacks(self) -> list[Mapping[str, Any]]:
+    def tacks(self) -> tuple[Tack, ...]:
         height = self.between(0.5e-3, 2e-3)
-        return [{"start": "30 mm", "height": _mm(height)}] if self.happens() else []
+        return (Tack(30e-3, height),) if self.happens() else ()
 
-    def hidden(self) -> list[str] | None:
+    def hidden(self) -> tuple[float, float] | None:
         start, lasts = self.between(8.0, 20.0), self.between(0.1, 1.2)
-        return [_ms(start), _ms(start + lasts)] if self.happens() else None
+        return (start, start + lasts) if self.happens() else None
 
 
 def drawn(seed: int) -> Condition:
@@ -120,17 +129,17 @@ def drawn(seed: int) -> Condition:
     draw = _Draw(rng)
     torch, arm, heat = np.exp(rng.uniform(math.log(STATED[0]), math.log(STATED[1]), 3)).tolist()
     along, tip_sigma = draw.between(0.1e-3, 0.5e-3), draw.between(0.1e-3, 0.6e-3)
-    world = {
-        "arm": _arm(draw, arm),
-        "tool": _tool(draw, tip_sigma, along, torch),
-        "finger": _finger(draw),
-        "clock": {
-            "latency": _ms(draw.some(0.2)), "stamp": _ms(draw.either(0.1)),
-            "jitter": _ms(draw.some(0.03)), "dropped": draw.some(0.6), "hidden": draw.hidden(),
-        },
-        "workpiece": _workpiece(draw),
-        "heat": {"local": _mm(draw.normal(heat))},
-    }  # fmt: skip
+    world = WeldTruth(
+        _arm(draw, arm),
+        _tool(draw, tip_sigma, along, torch),
+        _finger(draw),
+        ClockTruth(
+            latency=draw.some(0.2), stamp=draw.either(0.1), jitter=draw.some(0.03),
+            dropped=draw.some(0.6), hidden=draw.hidden(),
+        ),
+        _workpiece(draw),
+        HeatTruth(local=draw.normal(heat)),
+    )  # fmt: skip
     settings = {
         "speed": f"{rng.choice([5, 10, 20])} mm/s", "max_error": f"{rng.choice([1, 2])} mm",
         "arm_sigma": _mm(arm), "distortion": _mm(heat),
@@ -142,41 +151,41 @@ def drawn(seed: int) -> Condition:
     return Condition(world, settings, planned, belief)
 
 
-def _arm(draw: _Draw, sigma: float) -> dict[str, Any]:
-    return {
-        "lag": _ms(draw.some(0.4)), "dead_time": _ms(draw.some(0.2)),
-        "wave": _mm(abs(draw.normal(sigma))), "wave_length": _mm(draw.between(40e-3, 200e-3)),
-        "backlash": _mm(draw.some(2 * sigma)), "repeatability": _mm(draw.some(sigma / 2)),
-        "scale": draw.either(sigma / DISTANCE), "sag": _mm(draw.some(0.5e-3)),
-    }  # fmt: skip
+def _arm(draw: _Draw, sigma: float) -> ArmTruth:
+    return ArmTruth(
+        lag=draw.some(0.4), dead_time=draw.some(0.2),
+        wave=abs(draw.normal(sigma)), wave_length=draw.between(40e-3, 200e-3),
+        backlash=draw.some(2 * sigma), repeatability=draw.some(sigma / 2),
+        scale=draw.either(sigma / DISTANCE), sag=draw.some(0.5e-3),
+    )  # fmt: skip
 
 
-def _tool(draw: _Draw, tip: float, along: float, across: float) -> dict[str, Any]:
-    off = [draw.normal(tip) for _ in range(3)]
+def _tool(draw: _Draw, tip: float, along: float, across: float) -> ToolTruth:
+    ahead, aside, up = (draw.normal(tip) for _ in range(3))
     turned = draw.between(0.0, 1.0)  # the share of the yaw in how far the torch is aside
     # What the files state of the torch is where it is relative to the tip.
-    torch = (off[0] + draw.normal(along), off[1] + draw.normal(across * np.sqrt(1.0 - turned)))
-    yaw = np.degrees(draw.normal(across * np.sqrt(turned)) / DISTANCE)
-    return {"tip": [_mm(x) for x in off], "torch": [_mm(x) for x in torch], "yaw": f"{yaw} deg"}
+    torch = (ahead + draw.normal(along), aside + draw.normal(across * math.sqrt(1.0 - turned)))
+    yaw = draw.normal(across * math.sqrt(turned)) / DISTANCE
+    return ToolTruth((ahead, aside, up), torch, yaw)
 
 
-def _finger(draw: _Draw) -> dict[str, Any]:
-    return {
-        "lateral": float(np.exp(draw.either(0.8))), "axial": float(np.exp(draw.either(0.8))),
-        "gain": draw.either(0.4), "drift": draw.either(0.2),
-        "rest": [_mm(draw.either(0.4e-3)) for _ in range(3)], "play": _mm(draw.some(0.6e-3)),
-        "hysteresis": draw.some(0.2), "creep": draw.some(0.06),
-        "friction": draw.between(0.0, 0.3), "noise": _mm(10 ** draw.between(-5.3, -3.7)),
-    }  # fmt: skip
+def _finger(draw: _Draw) -> FingerTruth:
+    return FingerTruth(
+        lateral=math.exp(draw.either(0.8)), axial=math.exp(draw.either(0.8)),
+        gain=draw.either(0.4), drift=draw.either(0.2),
+        rest=(draw.either(0.4e-3), draw.either(0.4e-3), draw.either(0.4e-3)),
+        play=draw.some(0.6e-3), hysteresis=draw.some(0.2), creep=draw.some(0.06),
+        friction=draw.between(0.0, 0.3), noise=10 ** draw.between(-5.3, -3.7),
+    )  # fmt: skip
 
 
-def _workpiece(draw: _Draw) -> dict[str, Any]:
-    return {
-        "wave": _mm(draw.some(2e-3)), "wave_length": _mm(draw.between(8e-3, 60e-3)),
-        "bow": _mm(draw.either(4e-3)), "half_angle": f"{draw.either(25.0)} deg",
-        "half_angle_wave": f"{draw.some(10.0)} deg", "root_gap": _mm(draw.some(2e-3)),
-        "spatter": _mm(draw.some(0.1e-3)), "gaps": draw.gaps(), "tacks": draw.tacks(),
-    }  # fmt: skip
+def _workpiece(draw: _Draw) -> WorkpieceTruth:
+    return WorkpieceTruth(
+        wave=draw.some(2e-3), wave_length=draw.between(8e-3, 60e-3), bow=draw.either(4e-3),
+        half_angle=math.radians(draw.either(25.0)),
+        half_angle_wave=math.radians(draw.some(10.0)), root_gap=draw.some(2e-3),
+        spatter=draw.some(0.1e-3), gaps=draw.gaps(), tacks=draw.tacks(),
+    )  # fmt: skip
 
 
 def compared(seed: int) -> WorldScore:
@@ -210,10 +219,6 @@ def _stated(trial: Trial, name: str) -> Any:
 
 def _mm(metres: float) -> str:
     return f"{metres * 1e3} mm"
-
-
-def _ms(seconds: float) -> str:
-    return f"{seconds * 1e3} ms"
 
 
 def worlds(

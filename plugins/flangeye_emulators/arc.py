@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pydantic import Field
-
 from flangeye.devices import Arc, Device, DeviceError
 from flangeye.models.arc import ArcTimes
 from flangeye.plugin.stage import Params, part
@@ -11,10 +9,6 @@ from flangeye.plugin.stage import Params, part
 
 class SimulatedArcParams(ArcTimes, Params):
     """Parameters of ``arc.simulated``."""
-
-    fails_after: int | None = Field(
-        None, ge=1, description="After so many questions the arc is found to be out."
-    )
 
 
 class SimulatedArc(Device):
@@ -25,11 +19,11 @@ class SimulatedArc(Device):
         history: What was switched: ``gas`` or ``burn``, and whether on.
     """
 
-    def __init__(self, fails_after: int | None = None) -> None:
+    def __init__(self) -> None:
         """Begin, switched off."""
         self.name = "simulated power source"
         self.history: list[tuple[str, bool]] = []
-        self._burns, self._fails_after, self._asked, self._closed = False, fails_after, 0, False
+        self._burns, self._closed = False, False
 
     def gas(self, on: bool) -> None:
         """Remember it."""
@@ -41,10 +35,8 @@ class SimulatedArc(Device):
         self._burns = on
 
     def burning(self) -> bool | None:
-        """Return whether it is commanded on and has not failed."""
-        self._asked += self._burns
-        failed = self._fails_after is not None and self._asked > self._fails_after
-        return self._burns and not failed
+        """Return whether it is commanded on."""
+        return self._burns
 
     def close(self) -> None:
         """Switch all off."""
@@ -62,4 +54,4 @@ class SimulatedArc(Device):
 @part("arc.simulated")
 def arc_simulated(params: SimulatedArcParams) -> Arc:
     """A simulated power source: nothing burns."""
-    return SimulatedArc(params.fails_after)
+    return SimulatedArc()

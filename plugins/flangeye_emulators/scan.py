@@ -7,7 +7,7 @@ import numpy as np
 from flangeye import StageError, stage
 from flangeye.models.workpiece import load_workpiece
 from flangeye.types import Look, Seed, WorkpieceScan
-from flangeye_emulators.world.bench import BenchParams, bench_with
+from flangeye_emulators.world.bench import CLUTTER, BenchParams, bench_with
 
 
 class SimulatedScanParams(BenchParams):
@@ -29,7 +29,7 @@ def scan_simulated(look: Look | None, seed: Seed, params: SimulatedScanParams) -
     workpiece = load_workpiece(params.workpiece)
     # Tells this use of the recipe's seed from others
     rng = np.random.default_rng([7, seed])
-    bodies = bench_with(workpiece, params.base_T_part, params.clutter, params.covered, rng)
-    note = f"workpiece: {workpiece.title}, simulated, with {params.clutter} things about it"
+    bodies = bench_with(workpiece, params.base_T_part, params.covered, rng)
+    note = f"workpiece: {workpiece.title}, simulated, with {CLUTTER} things about it"
     truth = params.true_seams(workpiece)
     return WorkpieceScan(look(bodies), f"simulated {params.workpiece.stem}", (note,), truth)

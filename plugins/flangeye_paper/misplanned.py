@@ -8,12 +8,11 @@ from flangeye import stage
 from flangeye.maths.geometry import rotation_exp
 from flangeye.models.workpiece import load_workpiece
 from flangeye.types import CAMERA, Floats, PointCloud, Seam, Seed, VerifiedHandEye, WorkpieceScan
-from flangeye.units import Angle, Length, param
 from flangeye_emulators.world.bench import LaidParams
 
 
 class AsLaidParams(LaidParams):
-    """Parameters of ``scan.as_laid``."""
+    """Parameters of ``scan.as_laid`` and ``seam.misplanned``."""
 
     def seam(self) -> tuple[Floats, Floats, float | None]:
         """Return the true seam (N, 3) its opening (3,), in base, and its half angle."""
@@ -31,30 +30,19 @@ def scan_as_laid(params: AsLaidParams) -> WorkpieceScan:
     return WorkpieceScan(cloud, f"{params.workpiece.stem}, as laid", (), {"groove": points})
 
 
-class MisplannedParams(AsLaidParams):
-    """Parameters of ``seam.misplanned``."""
-
-    shift: Length = param(
-        "3 mm", ge=0, description="Size of the shift, in a random direction of the plane."
-    )
-    turn: Angle = param(
-        "1 deg", ge=0, description="Size of the rotation about the opening, to a random side."
-    )
-
-
 @stage("seam.misplanned")
-def seam_misplanned(hand_eye: VerifiedHandEye, seed: Seed, params: MisplannedParams) -> Seam:
-    """Plan the true seam, but shifted and turned: an error of known size."""
+def seam_misplanned(hand_eye: VerifiedHandEye, seed: Seed, params: AsLaidParams) -> Seam:
+    """Plan the true seam, but off by 3 mm in a random direction of its plane and by 1 deg."""
     points, opening, half_angle = params.seam()
     rng = np.random.default_rng([seed, 13])
     along = points[-1] - points[0]
     along /= np.linalg.norm(along)
     way = rng.uniform(0.0, 2.0 * np.pi)
     shift = np.cos(way) * along + np.sin(way) * np.cross(opening, along)
-    turn = rotation_exp(rng.choice([-1.0, 1.0]) * params.turn * opening)
+    turn = rotation_exp(rng.choice([-1.0, 1.0]) * np.radians(1.0) * opening)
     middle = points.mean(axis=0)
-    planned = (points - middle) @ turn.T + middle + params.shift * shift
-    each = np.tile(np.eye(3) * (params.shift / 2) ** 2, (len(points), 1, 1))
+    planned = (points - middle) @ turn.T + middle + 3e-3 * shift
+    each = np.tile(np.eye(3) * 1.5e-3**2, (len(points), 1, 1))
     openings = np.tile(opening, (len(points), 1))
     return Seam(planned, openings, each, half_angle, source="misplanned on purpose")
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
@@ -14,31 +14,29 @@ from flangeye.units import Length, param
 
 Place = Literal["work", "camera"]
 
-_AT = "Where the translation is taken: at the work, or at the camera's origin as in the paper."
-
 
 class TranslationParams(Params):
     """Parameters of ``cost.translation``."""
 
-    at: Place = Field("work", description=_AT)
+    at: Place = Field(
+        "work",
+        description="Where the translation is taken: at the work, or at the camera's origin as in "
+        "the paper.",
+    )
 
 
-class AxesParams(Params):
+class AxesParams(TranslationParams):
     """Parameters of ``cost.axes``."""
 
     axes: tuple[Literal["x", "y", "z"], ...] = Field(
-        ("x", "y"), min_length=1, description="Axes to use."
+        ("x", "y"), min_length=1, description="Axes of the base to use."
     )
-    # Frame of the axes
-    frame: ClassVar[str] = "base"
-    at: Place = Field("work", description=_AT)
 
 
-class WorkRadiusParams(Params):
+class WorkRadiusParams(TranslationParams):
     """Parameters of ``cost.work_radius``."""
 
     radius: Length = param("300 mm", ge=0, description="Radius of the work about that point.")
-    at: Place = Field("work", description=_AT)
 
 
 @part("cost.translation")
@@ -49,10 +47,8 @@ def cost_translation(error: PoseError, params: TranslationParams) -> float:
 
 @part("cost.axes")
 def cost_axes(error: PoseError, params: AxesParams) -> float:
-    """The translation error along chosen axes only: x and y for a tool that yields along z."""
-    moved = displacement(error, params.at)
-    if params.frame == "base":
-        moved = error.base_R_camera @ moved
+    """The translation error along axes of the base: x and y for a tool that yields along z."""
+    moved = error.base_R_camera @ displacement(error, params.at)
     return float(np.linalg.norm([moved["xyz".index(axis)] for axis in params.axes]))
 
 

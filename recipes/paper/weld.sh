@@ -14,9 +14,8 @@ batch() { flangeye batch "$@" --vary seed --no-report ${WORKERS:+--workers "$WOR
 
 for seam in straight curved; do
   recipe="$here/fig13_$seam.yaml"
-  gap='[{start: 90 mm, length: 20 mm}]'
   batch "$recipe" --repeat 3 --set-grid steps.5.mode=vision,as_printed --out "fig13-others_$seam"
-  batch "$recipe" --repeat 5 --set steps.5.sensor.simulated_finger.world.workpiece.gaps="$gap" \
+  batch "$recipe" --repeat 5 --set steps.5.sensor.simulated_finger.world=wall_missing \
     --out "fig13-gap_$seam"
   batch "$recipe" --repeat 5 --set steps.5.start_angle='90 deg' --out "fig13-across_$seam"
 done

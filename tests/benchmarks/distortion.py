@@ -17,7 +17,7 @@ from flangeye.models.cell import cell_of
 from flangeye.models.configuration import ORIGIN, Configuration
 from flangeye.models.loading import load_model
 from flangeye.types import CircleFeature, Floats, HandEye, Observation, TransformEstimate
-from flangeye_emulators.acquire.planned_session import PlannedSession, plan_session
+from flangeye_emulators.acquire.planned_session import FACING, PlannedSession, plan_session
 from flangeye_emulators.acquire.simulated_session import ScanParams
 from flangeye_emulators.world.raycast import pixels_of
 from flangeye_emulators.world.scan_errors import Distortion
@@ -64,9 +64,7 @@ def session(name: str, seed: int, scale: float = 1.0) -> tuple[PlannedSession, l
     """Return a session, and what a scanner sees that bends by ``scale`` times its file's size."""
     configuration, given = CONFIGURATIONS[name]
     rng, params = np.random.default_rng(seed), ScanParams.model_validate(given)
-    view = CameraView(
-        params.distance, SCANNER.near, SCANNER.far, SCANNER.field_of_view, params.facing
-    )
+    view = CameraView(params.distance, SCANNER.near, SCANNER.far, SCANNER.field_of_view, FACING)
     planned = plan_session(ROBOT, None, configuration, (params, view), rng)
     size = max(scale * SCANNER.calibration_error, 1e-12)
     distortion, found = Distortion(SCANNER, PIXELS, size, rng), []

@@ -1,6 +1,5 @@
 """Who sees whom at which moment of a simulated cell, and what its controllers report there."""
 
-from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -25,18 +24,9 @@ def session(name: str, *overrides: str) -> tuple[Cell, Any]:
     return recipe.context[Cell], Runner(recipe, REGISTRY, ArchivePath(None)).take(None)
 
 
-@pytest.mark.parametrize(("at_once", "each"), [("true", 2), ("false", 1)])
-def test_all_cameras_see_at_a_moment_or_each_at_its_own(at_once: str, each: int) -> None:
-    _, seen = session("two-scanners", f"steps.0.at_once={at_once}", "steps.0.sightings=20")
-    moments = Counter(o.id.partition("-")[0] for o in seen)
-    assert set(moments.values()) == {each}
-    for o in seen:
-        (same,) = {
-            other.poses["arm"].matrix.tobytes()
-            for other in seen
-            if other.id.partition("-")[0] == o.id.partition("-")[0]
-        }
-        assert same == o.poses["arm"].matrix.tobytes()
+def test_each_sighting_is_of_a_moment_of_its_own() -> None:
+    _, seen = session("two-scanners", "steps.0.sightings=20")
+    assert len({o.id.partition("-")[0] for o in seen}) == len(seen)
 
 
 @pytest.mark.parametrize("name", ["two-arms-three-scanners", "forearm-and-wall"])
@@ -60,12 +50,10 @@ def test_arms_may_keep_their_joints_to_themselves() -> None:
 
 
 def test_a_link_truly_stands_where_the_arms_errors_put_it() -> None:
-    """Some tenths of a millimetre from where its joints say; without errors, nowhere else."""
+    """Millimetres from where its joints say; without errors, by the noise of what is measured."""
     off = {}
-    for zeros in ("0 mrad", "2 mrad"):
-        given = f"steps.0.arm={{zeros: {zeros}}}", "steps.0.robot_position=0 mm"
-        noise = "steps.0.target_position=0.1 um", "steps.0.target_rotation=0.0001 deg"
-        cell, seen = session("forearm-and-wall", *given, "steps.0.robot_rotation=0 deg", *noise)
+    for zeros in ("0 mrad", "20 mrad"):
+        cell, seen = session("forearm-and-wall", f"steps.0.arm={{zeros: {zeros}}}")
         recipe = load_recipe(
             bundled("recipes") / "configurations"
             / "forearm-and-wall_marker_most-likely_simulated.yaml", REGISTRY)  # fmt: skip
@@ -78,4 +66,4 @@ def test_a_link_truly_stands_where_the_arms_errors_put_it() -> None:
             for link, o in zip(links, looks, strict=True)
         ]
         off[zeros] = float(np.linalg.norm((np.array(there) - table)[:, :3, 3], axis=1).max())
-    assert off["0 mrad"] < 3e-6 < 3e-4 < off["2 mrad"]
+    assert off["0 mrad"] < 1.5e-3 < 3e-3 < off["20 mrad"]

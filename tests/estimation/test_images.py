@@ -10,10 +10,7 @@ from flangeye.recipe.load import load_recipe
 from flangeye.run.runner import Runner
 from flangeye.types import ArchivePath
 
-HAND = (
-    "camera: {position: [60 mm, 0 mm, 40 mm], rpy: [0 deg, 0 deg, 90 deg]}, "
-    "lens: {size: [640, 512], focal_length: 700}"
-)
+HAND = "camera: {position: [60 mm, 0 mm, 40 mm], rpy: [0 deg, 0 deg, 90 deg]}, resolution: 0.5"
 CHARUCO = "fit.charuco: {columns: 7, rows: 5, square: 30 mm, marker: 22 mm}"
 
 
@@ -39,9 +36,8 @@ def reasons(result):
 def test_a_board_is_never_taken_for_itself_turned(tmp_path: Path, turn: int) -> None:
     seen = run(
         tmp_path,
-        f"poses: 8, {HAND.replace('90 deg', f'{90 + turn} deg')}, covered: 0, "
-        "board: {kind: checkerboard, columns: 8, rows: 5, square: 30 mm}",
-        "fit.checkerboard: {columns: 8, rows: 5, square: 30 mm}",
+        f"poses: 8, {HAND.replace('90 deg', f'{90 + turn} deg')}, covered: 0, board: checkerboard",
+        "fit.checkerboard: {columns: 8, rows: 5, square: 25 mm}",
     )
     assert seen.truth.rms_over_workspace < 3e-3
     assert all(each.used for each in seen.observations)
@@ -56,9 +52,8 @@ def test_a_board_with_a_hand_before_it_is_found_by_what_is_left(tmp_path: Path) 
 def test_a_covered_checkerboard_is_set_aside_and_never_taken_one_square_off(tmp_path: Path) -> None:
     seen = run(
         tmp_path,
-        f"poses: 16, {HAND}, covered: 0.5, "
-        "board: {kind: checkerboard, columns: 8, rows: 5, square: 30 mm}",
-        "fit.checkerboard: {columns: 8, rows: 5, square: 30 mm}",
+        f"poses: 16, {HAND}, covered: 0.5, board: checkerboard",
+        "fit.checkerboard: {columns: 8, rows: 5, square: 25 mm}",
     )
     assert 8 <= len(reasons(seen)) <= 10  # one or two are cut off by the image besides
     assert all("checkerboard" in r or "squares" in r for r in reasons(seen))
@@ -70,19 +65,17 @@ def test_a_board_of_more_squares_is_named(tmp_path: Path) -> None:
     ):
         run(
             tmp_path,
-            f"poses: 4, {HAND}, board: {{kind: checkerboard, columns: 10, rows: 7}}, covered: 0",
-            "fit.checkerboard: {columns: 8, rows: 5, square: 30 mm}",
+            f"poses: 4, {HAND}, board: checkerboard, covered: 0",
+            "fit.checkerboard: {columns: 7, rows: 4, square: 25 mm}",
         )
 
 
-SMALL = (
-    "board: {kind: marker, square: 25 mm, dictionary: APRILTAG_36h11}, covered: 0, spread: 9 deg"
-)
-OF_SMALL = "fit.aruco: {size: 25 mm, dictionary: APRILTAG_36h11"
+SMALL = "board: marker, covered: 0, spread: 9 deg"
+OF_SMALL = "fit.aruco: {size: 100 mm, dictionary: APRILTAG_36h11, id: 7}"
 
 
 def test_small_markers_seen_frontally_are_set_aside_for_their_second_pose(tmp_path: Path) -> None:
-    seen = run(tmp_path, f"poses: 14, {HAND}, {SMALL}, distance: 400 mm", OF_SMALL + "}")
+    seen = run(tmp_path, f"poses: 14, {HAND}, {SMALL}, distance: 1.6 m", OF_SMALL)
     aside = [reason for reason in reasons(seen) if "fit the corners alike" in reason]
     assert aside
     assert seen.truth.rms_over_workspace < 5 * seen.expected_error.rms
@@ -91,9 +84,9 @@ def test_small_markers_seen_frontally_are_set_aside_for_their_second_pose(tmp_pa
 def test_with_depth_the_same_markers_have_one_pose(tmp_path: Path) -> None:
     seen = run(
         tmp_path,
-        f"poses: 8, depth: true, resolution: 0.5, {SMALL}, distance: 600 mm, "
+        f"poses: 8, depth: true, resolution: 0.12, {SMALL}, distance: 600 mm, "
         "camera: {position: [60 mm, 0 mm, 40 mm]}",
-        OF_SMALL + "}",
+        OF_SMALL,
         scanner="scanner: {model: phoxi-m}\n",
     )
     assert not any("alike" in reason for reason in reasons(seen))

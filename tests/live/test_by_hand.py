@@ -51,7 +51,7 @@ class Person:
     def __init__(self, folder):
         self.folder = folder / "exports"
         self.folder.mkdir()
-        camera = CameraPose().base_T_camera
+        camera = CameraPose().matrix
         eye = scanner_of(SCANNER, 0.2, 1.0, np.random.default_rng(0))
         self.studio = CellScene(ROBOT, eye, camera, np.array([0.3, 0.3, 0.2]))
         self.arm, self.joints, self.count = Arm(ROBOT), START, 0

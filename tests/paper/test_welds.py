@@ -15,7 +15,6 @@ from flangeye_paper import fig13
 from flangeye_paper.fig13 import SeenWeld, seen
 from flangeye_paper.misplanned import (
     AsLaidParams,
-    MisplannedParams,
     scan_as_laid,
     seam_misplanned,
 )
@@ -146,7 +145,7 @@ def test_a_session_that_did_not_weld(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("workpiece", ["v-straight", "v-curved"])
 def test_the_planning_error_is_as_large_as_asked_and_differs_by_seed(workpiece: str) -> None:
-    params = MisplannedParams(workpiece=workpiece)
+    params = AsLaidParams(workpiece=workpiece)
     truth = scan_as_laid.function(AsLaidParams(workpiece=workpiece)).truth["groove"]
     seams = [seam_misplanned.function(None, seed, params) for seed in range(6)]
     ways = set()

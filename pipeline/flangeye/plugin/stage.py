@@ -18,6 +18,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, Union, get_args, get_origin, get_type_hints
 
+import numpy as np
 from pydantic import (
     BaseModel,
     ConfigDict,
@@ -29,8 +30,10 @@ from pydantic_core import InitErrorDetails, PydanticCustomError, core_schema
 
 from flangeye import types as t
 from flangeye.files.validation import EXPLAINED, sentence
+from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.models.configuration import CELL, EVERY
 from flangeye.models.robots import RobotModel
+from flangeye.units import Angle, Length, param
 
 
 class Params(BaseModel):
@@ -48,6 +51,21 @@ class Params(BaseModel):
     def requires(self) -> Mapping[type, str]:
         """Return what these values need of the recipe's header, by type, and what for."""
         return {}
+
+
+class PlaceParams(Params):
+    """A pose, in the frame of what carries it."""
+
+    position: tuple[Length, Length, Length] = param(("0 mm", "0 mm", "0 mm"))
+    rpy: tuple[Angle, Angle, Angle] = param(
+        ("0 deg", "0 deg", "0 deg"),
+        description="Roll, pitch, yaw; a target's z points towards the scanner.",
+    )
+
+    @property
+    def matrix(self) -> t.Floats:
+        """(4, 4), translation in [m]."""
+        return rigid(rotation_from_rpy(*self.rpy), np.asarray(self.position))
 
 
 @dataclass(frozen=True)

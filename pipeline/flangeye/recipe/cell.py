@@ -9,15 +9,14 @@ import numpy as np
 
 from flangeye.errors import RecipeError, StageError
 from flangeye.maths.frame_graph import Frame, chain
-from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.models.cell import Axis, Cell, Link
 from flangeye.models.robots import RobotModel
+from flangeye.plugin.stage import PlaceParams
 from flangeye.recipe.header import (
     CellArmSection,
     CellSection,
     Header,
     Place,
-    PlaceSection,
     PositionerSection,
     RailSection,
     StandingSection,
@@ -175,6 +174,6 @@ def _frames(section: CellSection) -> dict[str, Frame]:
 
 def place_of(given: Place) -> Floats | None:
     """Return (4, 4) of a place as a recipe has it; None where it is to be found."""
-    if isinstance(given, PlaceSection):
-        return rigid(rotation_from_rpy(*given.rpy), np.asarray(given.position))
+    if isinstance(given, PlaceParams):
+        return given.matrix
     return np.eye(4) if given == "known" else None

@@ -31,13 +31,12 @@ from flangeye.models.targets import (
     load_standard,
     wrist_circle_of,
 )
-from flangeye.plugin.stage import BoundPart
+from flangeye.plugin.stage import BoundPart, PlaceParams
 from flangeye.recipe.header import (
     FeatureSection,
     Header,
     LimitsSection,
     Place,
-    PlaceSection,
     RobotSection,
     ScannerSection,
     TargetSection,
@@ -234,7 +233,7 @@ def _configuration(header: Header, context: Context) -> Configuration:
 
 
 def _stands(place: Place) -> tuple[Triple, Triple] | None:
-    if isinstance(place, PlaceSection):
+    if isinstance(place, PlaceParams):
         return place.position, place.rpy
     return ORIGIN if place == "known" else None
 

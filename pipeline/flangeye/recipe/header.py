@@ -13,7 +13,7 @@ from pydantic import (
 from pydantic_core import CoreSchema
 
 from flangeye.files.clouds import LengthUnit
-from flangeye.plugin.stage import BoundPart, Choose, Params
+from flangeye.plugin.stage import BoundPart, Choose, Params, PlaceParams
 from flangeye.units import Acceleration, Angle, AngularSpeed, Length, Speed, param
 
 
@@ -67,7 +67,9 @@ class NamedSection(RecipeSection):
 class SecondRobotSection(NamedSection):
     """The arm that carries the target before the first one's camera."""
 
-    model: str = Field(description="A model of data/robots, or a .yaml file of your own.")
+    model: str = Field(
+        description="A model that 'flangeye robots' lists, or a .yaml file of your own."
+    )
 
 
 class RobotSection(NamedSection):
@@ -195,17 +197,7 @@ class TargetSection(NamedSection):
     )
 
 
-class PlaceSection(RecipeSection):
-    """Where the target is, in the frame that carries it."""
-
-    position: tuple[Length, Length, Length] = param(("0 mm", "0 mm", "0 mm"))
-    rpy: tuple[Angle, Angle, Angle] = param(
-        ("0 deg", "0 deg", "0 deg"),
-        description="Roll, pitch, yaw; the target's z points towards the scanner.",
-    )
-
-
-Place = Literal["known", "unknown"] | PlaceSection
+Place = Literal["known", "unknown"] | PlaceParams
 
 
 class ConfigurationSection(RecipeSection):
@@ -244,12 +236,8 @@ class MountedSection(RecipeSection):
     place: Place = KNOWN
 
 
-class CellArmSection(NamedSection, MountedSection):
+class CellArmSection(SecondRobotSection, MountedSection):
     """An arm of a cell."""
-
-    model: str = Field(
-        description="A model that 'flangeye robots' lists, or a .yaml file of your own."
-    )
 
 
 class AxisSection(MountedSection):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,20 +20,19 @@ from flangeye.maths.frame_graph import Frame, chain, composed
 from flangeye.maths.geometry import invert
 from flangeye.models.cell import Axis, Cell
 from flangeye.models.robots import RobotModel
+from flangeye.plugin.stage import PlaceParams
 from flangeye.types import Floats, Mask, Observation, Poses, Source, Transform, Truth
-from flangeye.units import Angle, Length, param
+from flangeye.units import Angle, param
 from flangeye_emulators.acquire.planned_session import (
     UNSEEN,
+    UPRIGHT,
     VERSION,
     ArmsParams,
-    PlaceParams,
     noise_free,
 )
 from flangeye_emulators.world.arm import ImperfectArm
 from flangeye_emulators.world.session import DRAWS, CameraView, disturbed
 
-UPRIGHT = np.radians([0, -90, 90, -90, -90, 0])
-"""Joints of an arm of which nothing is said."""
 GRID = (-1.0, 0.0, 1.0)
 """Values of each joint on a grid, in shares of the spread."""
 
@@ -60,24 +60,10 @@ class CellSessionParams(ArmsParams):
         "each camera and target; or always the camera, the target and the joints that promise to "
         "tell most of the whole cell, by what was seen so far.",
     )
-    at_once: bool = Field(
-        False,
-        description="What is seen at one moment is seen by every camera that can, of every target, "
-        "so that these sightings share the noise of the arms' poses; else each sighting has a "
-        "moment of its own.",
-    )
     spread: Angle = param("30 deg", gt=0, description="Largest change of a joint from there.")
     joints: bool = Field(
         True,
         description="Whether the arms report their joint angles; a camera on a link needs them.",
-    )
-    robot_rotation: Angle = param(
-        "0.01 deg",
-        ge=0,
-        description="Standard deviation of a reported pose's rotation about each axis.",
-    )
-    robot_position: Length = param(
-        "0.05 mm", ge=0, description="Standard deviation of its position along each axis."
     )
 
 
@@ -175,8 +161,7 @@ def plan_cell(
     """
     _require_places(cell, params)
     moments = _draw(cell, params, rng)
-    schedule = _schedule_at_once if params.at_once else _schedule
-    chosen = schedule(cell, moments, params.sightings, view)
+    chosen = _schedule(cell, moments, params.sightings, view)
     _require_seen(cell, chosen, params.sightings)
     sightings, unseen = chosen[: params.sightings], chosen[params.sightings :]
     truth = Truth(*_true(cell, params), unseen=tuple(moments.exact(*each) for each in unseen))
@@ -267,7 +252,8 @@ def _draw(cell: Cell, params: CellSessionParams, rng: np.random.Generator) -> Mo
     reported = {name: each.reported for name, each in drawn.items()}
     places = {name: each.actual for name, each in drawn.items()}
     places |= {name: drawn[link.arm].links[:, link.number] for name, link in cell.links.items()}
-    noise = params.robot_rotation, params.robot_position
+    # Of a reported pose, about and along each axis [rad, m]
+    noise = math.pi / 18000, 0.05e-3
     actual = {name: disturbed(each, noise, rng) for name, each in places.items()}
     still = {name: place.matrix for name, place in params.places.items()}
     frames = {
@@ -343,16 +329,6 @@ def _schedule(cell: Cell, moments: Moments, sightings: int, view: CameraView) ->
                 taken.add(int(i))
                 chosen.append((int(i), camera, target))
     return chosen
-
-
-def _schedule_at_once(
-    cell: Cell, moments: Moments, sightings: int, view: CameraView
-) -> list[Sighting]:
-    """Choose moments at which most is seen, and all that is."""
-    visible = _visible(cell, moments, view)
-    most = np.argsort(-np.sum([*visible.values()], axis=0), kind="stable")
-    seen = [(int(i), *pair) for i in most for pair, sees in visible.items() if sees[i]]
-    return seen[: sightings + UNSEEN]
 
 
 def _visible(cell: Cell, moments: Moments, view: CameraView) -> dict[tuple[str, str], Mask]:

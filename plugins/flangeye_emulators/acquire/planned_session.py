@@ -5,18 +5,19 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from flangeye.errors import StageError
-from flangeye.maths.geometry import invert, rigid, rotation_from_rpy
+from flangeye.maths.geometry import invert
 from flangeye.maths.kinematics import Arm
 from flangeye.models.configuration import Configuration
 from flangeye.models.robots import RobotModel, SecondRobot
 from flangeye.models.targets import Flange
-from flangeye.plugin.stage import Params
+from flangeye.plugin.stage import Params, PlaceParams
 from flangeye.types import (
     BASE,
     BASE2,
@@ -56,29 +57,17 @@ REPORTED = float(np.radians(0.0115)), 0.05e-3
 sheet of a UR5 gives for repeatability, 0.1 mm."""
 UNSEEN = 60
 """Poses that take no part and show what a calibration is worth, where the arm is not as it says."""
-HOME = ("0 deg", "-90 deg", "90 deg", "-90 deg", "-90 deg", "0 deg")
-
-
-class PlaceParams(Params):
-    """A pose, in the frame of what carries it."""
-
-    position: tuple[Length, Length, Length] = param(("0 mm", "0 mm", "0 mm"))
-    rpy: tuple[Angle, Angle, Angle] = param(
-        ("0 deg", "0 deg", "0 deg"), description="Roll, pitch, yaw."
-    )
-
-    @property
-    def matrix(self) -> Floats:
-        """(4, 4)."""
-        return rigid(rotation_from_rpy(*self.rpy), np.asarray(self.position))
+UPRIGHT = np.radians([0, -90, 90, -90, -90, 0])
+"""Joints of an arm at its first pose."""
+FACING = float(np.radians(50.0))
+"""A camera sees a target whose z is this far from the view at most [rad]."""
+FIELD = float(np.radians(50.0)), float(np.radians(40.0))
+"""Horizontal and vertical field of view of a camera that is no scanner [rad]."""
 
 
 class ArmsParams(Params):
-    """What all simulated sessions say of the arms and of what cameras can see."""
+    """What all simulated sessions say of the arms."""
 
-    facing: Angle = param(
-        "50 deg", gt=0, description="Largest angle between a target's z and the view."
-    )
     arm: ArmErrors = Field(
         default_factory=ArmErrors,
         description="How far the arms are from what their controllers say; by default by the "
@@ -86,24 +75,11 @@ class ArmsParams(Params):
     )
 
 
-class SightParams(Params):
-    """What simulated cameras see of markers, and how often they err."""
-
-    field: tuple[Angle, Angle] = param(
-        ("50 deg", "40 deg"), description="Horizontal and vertical field of view of the cameras."
-    )
-    outliers: float = Field(0.0, ge=0, lt=0.5, description="Share of sightings that are outliers.")
-
-
 class SessionParams(ArmsParams):
     """What simulated sessions have in common."""
 
     poses: int = Field(20, ge=3, description="Number of captures.")
-    home: tuple[Angle, ...] = param(HOME, description="Joints of the first arm at the first pose.")
     spread: Angle = param("17 deg", gt=0, description="Largest change of a joint from there.")
-    distance: Length = param(
-        "650 mm", gt=0, description="Distance from camera to target at the first pose."
-    )
     camera: PlaceParams | None = Field(
         None,
         description="The camera's true place in what carries it; by default wherever it has to be "
@@ -114,14 +90,26 @@ class SessionParams(ArmsParams):
         description="The target's true place in what carries it, where the recipe does not know "
         "it; with camera it follows from the first pose.",
     )
-    four_axes: bool = Field(
-        False,
-        description="The first arm has four axes (SCARA): the flange turns about the vertical.",
+    motion: Literal["together", "in_turns", "four_axes"] = Field(
+        "together",
+        description="together: two arms move at once; in_turns: only one of them moves at a time, "
+        "and the other rests at its first pose; four_axes: the first arm is a SCARA, whose flange "
+        "turns about the vertical.",
     )
-    in_turns: bool = Field(
-        False,
-        description="With two arms, only one moves at a time; the other rests at its first pose.",
+
+
+class ViewParams(SessionParams):
+    """What simulated sessions of cameras that see an area have in common."""
+
+    distance: Length = param(
+        "650 mm", gt=0, description="Distance from camera to target at the first pose."
     )
+
+
+class OutlierParams(Params):
+    """How often simulated cameras err."""
+
+    outliers: float = Field(0.0, ge=0, lt=0.5, description="Share of sightings that are outliers.")
 
 
 def noise_free(
@@ -195,15 +183,16 @@ def plan_session(
     if configuration.other_base and second is None:
         raise StageError("two arms need the recipe's 'second_robot' section: {model: …}")
     other = Arm(second.model) if second and configuration.other_base else None
-    cast = Cast(configuration, Arm(robot), other, params.four_axes, params.in_turns, view.draws)
+    four_axes, in_turns = params.motion == "four_axes", params.motion == "in_turns"
+    cast = Cast(configuration, Arm(robot), other, four_axes, in_turns, view.draws)
     known = configuration.place
     place = params.place.matrix if known is None else np.asarray(known)
     camera = params.camera.matrix if params.camera else None
-    home = np.asarray(params.home)
+    home = UPRIGHT
     closed_by_arm = camera is not None and known is not None and other is None
     if closed_by_arm and camera is not None:
         home = home_of(cast.first, place @ invert(camera @ view.first()))
-    poses = draw_arm_poses(cast, (home, np.asarray(SessionParams().home)), params.spread, rng)
+    poses = draw_arm_poses(cast, (home, UPRIGHT), params.spread, rng)
     places = close_loop(poses, view, configuration, camera, place)
     if closed_by_arm and camera is not None:
         places = Places(camera, np.eye(4), place)

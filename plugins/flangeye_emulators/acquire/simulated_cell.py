@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import ClassVar
 
 import numpy as np
+from pydantic import Field
 
 from flangeye.errors import StageError
 from flangeye.maths.geometry import rigid, rotation_exp
@@ -29,7 +29,6 @@ from flangeye.types import (
     Seed,
     Transform,
 )
-from flangeye.units import Angle, Length, param
 from flangeye_emulators.acquire.planned_cell import (
     CellSessionParams,
     Moments,
@@ -37,32 +36,33 @@ from flangeye_emulators.acquire.planned_cell import (
     name_of,
     plan_cell,
 )
-from flangeye_emulators.acquire.planned_session import VERSION, SightParams
+from flangeye_emulators.acquire.planned_session import FACING, FIELD, VERSION, OutlierParams
 from flangeye_emulators.world import cell as world
 from flangeye_emulators.world.raycast import SolidBody
 from flangeye_emulators.world.scanner import ScannerQuality, before_camera, scanner_of
 from flangeye_emulators.world.session import CameraView
 
+NEAR = 0.3
+"""Nearest that cameras see [m]."""
 
-class SimulatedCellParams(SightParams, CellSessionParams):
+
+class SimulatedCellParams(OutlierParams, CellSessionParams):
     """Parameters of ``acquire.simulated_cell``."""
 
-    # Nearest that cameras see [m]
-    near: ClassVar[float] = 0.3
-    far: Length = param("2 m", gt=0, description="Farthest that cameras see.")
-    target_rotation: Angle = param(
-        "0.05 deg",
-        gt=0,
-        description="Standard deviation of a target's measured rotation about each axis.",
-    )
-    target_position: Length = param(
-        "0.1 mm", gt=0, description="Standard deviation of its position along each axis."
+    wide: bool = Field(
+        False,
+        description="The cameras see 60 x 50 deg, to 2.5 m, and targets turned away by up to "
+        "65 deg; else 50 x 40 deg, to 2 m and 50 deg.",
     )
 
     @property
     def view(self) -> CameraView:
         """What the cameras see."""
-        return CameraView(0.0, self.near, self.far, self.field, self.facing)
+        if self.wide:
+            return CameraView(
+                0.0, NEAR, 2.5, (np.radians(60.0), np.radians(50.0)), np.radians(65.0)
+            )
+        return CameraView(0.0, NEAR, 2.0, FIELD, FACING)
 
 
 @stage("acquire.simulated_cell")
@@ -85,7 +85,8 @@ def _seen(
 ) -> Iterator[Observation]:
     """Yield the sightings with their noise; some are wrong."""
     moments, count, seen = planned.moments, len(planned.scheduled), list[Observation]()
-    deviations = np.repeat([params.target_rotation, params.target_position], 3)
+    # Of a marker's measured pose, about and along each axis [rad, m]
+    deviations = np.repeat([np.radians(0.05), 0.1e-3], 3)
     wrong = set(rng.permutation(count)[: round(params.outliers * count)])
     for i, sighting in enumerate(planned.sightings(lambda: seen)):
         exact, pose = moments.exact(*sighting), moments.pose(*sighting)
@@ -115,7 +116,7 @@ def acquire_simulated_cell_scans(
     """
     _require_flanges(cell)
     rng = np.random.default_rng([VERSION, seed])
-    view = CameraView(0.0, scanner.near, scanner.far, scanner.field_of_view, params.facing)
+    view = CameraView(0.0, scanner.near, scanner.far, scanner.field_of_view, FACING)
     planned = plan_cell(cell, seed, params, view, rng)
     eyes = {
         camera: scanner_of(scanner, params.resolution, params.noise, rng.spawn(1)[0])

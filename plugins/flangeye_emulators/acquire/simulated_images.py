@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from flangeye.errors import StageError
 from flangeye.maths.geometry import invert
-from flangeye.models.boards import Board, Dictionary, Kind
+from flangeye.models.boards import Board
 from flangeye.models.configuration import Configuration
 from flangeye.models.robots import RobotModel, SecondRobot
 from flangeye.models.scanners import ScannerModel
-from flangeye.plugin.stage import Params, stage
+from flangeye.plugin.stage import stage
 from flangeye.types import CAMERA, Capture, Captures, Floats, Image, PointCloud, Seed
-from flangeye.units import Length, param
 from flangeye_emulators.acquire.planned_session import (
+    FACING,
     VERSION,
     PlannedSession,
-    SessionParams,
+    ViewParams,
     plan_session,
     source_of,
 )
@@ -67,61 +67,21 @@ COVERED = (0.05, 0.35)
 """A cover begins this share of the board's smaller side away from its middle."""
 
 
-class BoardParams(Params):
-    """The target as it was really printed; the step that fits it says what is believed of it."""
-
-    kind: Kind = Field("charuco", description="charuco, checkerboard, or one marker alone.")
-    columns: int = Field(7, ge=1, description="Squares from left to right; 1 for a marker.")
-    rows: int = Field(5, ge=1, description="Squares from top to bottom; 1 for a marker.")
-    square: Length = param("30 mm", gt=0, description="Edge of a square, or of the marker.")
-    marker: Length = param("22 mm", gt=0, description="Edge of a ChArUco board's markers.")
-    dictionary: Dictionary = Field("4X4_50", description="Family of the markers.")
-    id: int = Field(0, ge=0, description="Number of the marker, for a single marker.")
-
-    @model_validator(mode="after")
-    def _fits(self) -> BoardParams:
-        if self.kind == "charuco" and self.marker >= self.square:
-            raise ValueError("the markers of a ChArUco board are smaller than its squares")
-        if self.kind != "marker" and min(self.columns, self.rows) < 3:
-            raise ValueError("a board has at least 3 x 3 squares")
-        return self
-
-    @property
-    def board(self) -> Board:
-        """The print."""
-        if self.kind == "marker":
-            return Board("marker", 1, 1, self.square, 0.0, self.dictionary, self.id)
-        size = self.columns, self.rows, self.square
-        return Board(self.kind, *size, self.marker, self.dictionary)
+BOARDS: Mapping[str, Board] = {
+    "charuco": Board("charuco", 7, 5, 30e-3, 22e-3, "4X4_50"),
+    "checkerboard": Board("checkerboard", 8, 5, 25e-3, 0.0, "4X4_50"),
+    "marker": Board("marker", 1, 1, 100e-3, 0.0, "APRILTAG_36h11", 7),
+}
 
 
-class LensParams(Params):
-    """The camera, exactly as configured."""
-
-    size: tuple[int, int] = Field((1280, 1024), description="Columns and rows of the image [px].")
-    focal_length: float = Field(1400.0, gt=0, description="Focal length in both directions [px].")
-    distortion: tuple[float, ...] = Field(
-        (-0.12, 0.08, 0.0005, -0.0003, 0.0),
-        max_length=14,
-        description="Distortion coefficients as in OpenCV.",
-    )
-
-    def camera(self, noise: float) -> BoardCamera:
-        """Return the camera, its principal point in the middle of the image.
-
-        Its lens blurs by 0.7 px, and the darker side of an image loses 0.4 of the light.
-        """
-        (width, height), f = self.size, self.focal_length
-        matrix = np.array([[f, 0, width / 2 - 0.5], [0, f, height / 2 - 0.5], [0, 0, 1]])
-        return BoardCamera(matrix, self.size, np.array(self.distortion), 0.7, noise, 0.4)
-
-
-class SimulatedImagesParams(SessionParams):
+class SimulatedImagesParams(ViewParams):
     """Parameters of ``acquire.simulated_images``."""
 
-    board: BoardParams = Field(default_factory=BoardParams, description="The board as printed.")
-    lens: LensParams = Field(
-        default_factory=LensParams, description="The camera; the scanner's own with depth."
+    board: Literal["charuco", "checkerboard", "marker"] = Field(
+        "charuco",
+        description="What is really printed; the step that fits it says what is believed of it. "
+        "charuco: 7 x 5 squares of 30 mm, markers of 22 mm from 4X4_50; checkerboard: 8 x 5 "
+        "squares of 25 mm; marker: number 7 of APRILTAG_36h11, 100 mm.",
     )
     depth: bool = Field(
         False,
@@ -129,16 +89,26 @@ class SimulatedImagesParams(SessionParams):
         "with an organised cloud.",
     )
     resolution: float = Field(
-        1.0, gt=0, le=1, description="Scale of the scanner's columns and rows."
+        1.0, gt=0, le=1, description="Scale of the camera's and the scanner's columns and rows."
     )
-    # Standard deviation of a pixel's grey value
-    noise: ClassVar[float] = 3.0
     covered: float = Field(
         0.15,
         ge=0,
         le=1,
         description="Share of captures in which one side of the target is occluded.",
     )
+
+
+def camera_at(resolution: float) -> BoardCamera:
+    """Return a camera of 1280 x 1024 px, or of that share of its columns and rows.
+
+    Its principal point is in the middle of the image, its lens blurs by 0.7 px, its noise is 3 grey
+    levels, and the darker side of an image loses 0.4 of the light.
+    """
+    width, height, f = round(1280 * resolution), round(1024 * resolution), 1400.0 * resolution
+    matrix = np.array([[f, 0, width / 2 - 0.5], [0, f, height / 2 - 0.5], [0, 0, 1]])
+    distortion = np.array([-0.12, 0.08, 0.0005, -0.0003, 0.0])
+    return BoardCamera(matrix, (width, height), distortion, 0.7, 3.0, 0.4)
 
 
 @stage("acquire.simulated_images")
@@ -158,14 +128,14 @@ def acquire_simulated_images(
     """
     rng = np.random.default_rng([VERSION, seed])
     eye = _eye(scanner, params, rng)
-    camera = params.lens.camera(params.noise)
+    camera = camera_at(params.resolution)
     near, far = NEAREST, FARTHEST
     if eye is not None:
         camera = camera_of(eye.pixels, camera)
         near, far = eye.scanner.near, eye.scanner.far
-    view = CameraView(params.distance, near, far, _field(camera), params.facing)
+    view = CameraView(params.distance, near, far, _field(camera), FACING)
     session = plan_session(robot, second, configuration, (params, view), rng)
-    studio = _CellScene(params.board.board, camera, eye, session)
+    studio = _CellScene(BOARDS[params.board], camera, eye, session)
     covers = _covers(params, rng)
 
     def captures() -> Iterator[Capture]:
@@ -199,7 +169,7 @@ def _field(camera: BoardCamera) -> tuple[float, float]:
 def _covers(params: SimulatedImagesParams, rng: np.random.Generator) -> list[Cover | None]:
     """Return what lies over the target in each capture."""
     chosen = rng.permutation(params.poses)[: round(params.covered * params.poses)]
-    side = min(params.board.board.size)
+    side = min(BOARDS[params.board].size)
     return [
         Cover(rng.uniform(0, 2 * np.pi), side * rng.uniform(*COVERED)) if i in chosen else None
         for i in range(params.poses)

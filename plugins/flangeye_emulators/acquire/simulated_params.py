@@ -22,9 +22,6 @@ class SimulatedParams(ScannerQuality):
     verification: int = Field(
         1, ge=0, description="Captures that are kept from solving, near the workspace's middle."
     )
-    robot_errors: float = Field(
-        1.0, ge=0, description="Scale of the arm's errors and of its repeatability."
-    )
     arm: ArmErrors = Field(
         default_factory=ArmErrors,
         description="Errors of the arm that its controller does not know of.",

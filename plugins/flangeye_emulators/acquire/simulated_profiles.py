@@ -8,24 +8,20 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from flangeye.models.configuration import Configuration
 from flangeye.models.robots import RobotModel
 from flangeye.models.targets import Sphere
 from flangeye.plugin.stage import stage
 from flangeye.types import CAMERA, Capture, Captures, Floats, PointCloud, Seed
-from flangeye.units import Length, param
 from flangeye_emulators.acquire.planned_session import (
+    FACING,
     VERSION,
-    PlaceParams,
     SessionParams,
     plan_session,
     source_of,
 )
 from flangeye_emulators.world.session import CameraView, seen_from
-
-IN_THE_HAND = {"position": ("60 mm", "0 mm", "40 mm"), "rpy": ("0 deg", "0 deg", "90 deg")}
 
 FAN = float(np.radians(28.0))
 """Full angle of the laser's fan [rad]."""
@@ -36,13 +32,6 @@ PASSES = (0.5, 0.95)
 class ProfilesParams(SessionParams):
     """Parameters of ``acquire.simulated_profiles``."""
 
-    distance: Length = param(
-        "240 mm", gt=0, description="Distance from scanner to sphere at the first pose."
-    )
-    camera: PlaceParams | None = Field(
-        default_factory=lambda: PlaceParams.model_validate(IN_THE_HAND),
-        description="The scanner's true place on what carries it.",
-    )
     # Nearest that the scanner sees [m]
     near: ClassVar[float] = 0.19
     # Farthest that the scanner sees [m]
@@ -89,7 +78,7 @@ def acquire_simulated_profiles(
         StageError: The laser cuts the sphere at too few poses.
     """
     rng = np.random.default_rng([VERSION, seed])
-    seen = params.distance, params.near, params.far, (FAN, 0.0), params.facing
+    seen = (params.near + params.far) / 2, params.near, params.far, (FAN, 0.0), FACING
     # Joint vectors tried: a laser passes a small sphere at few of them
     view = ProfileView(*seen, 60_000, sphere.radius)
     session = plan_session(robot, None, configuration, (params, view), rng)

@@ -29,10 +29,12 @@ from flangeye.types import (
     Transform,
 )  # fmt: skip
 from flangeye_emulators.acquire.planned_session import (
+    FACING,
+    FIELD,
     VERSION,
+    OutlierParams,
     PlannedSession,
-    SessionParams,
-    SightParams,
+    ViewParams,
     plan_session,
     source_of,
 )
@@ -47,11 +49,11 @@ from flangeye_emulators.world.session import (
 )
 
 
-class SimulatedMarkerParams(SightParams, SessionParams):
+class SimulatedMarkerParams(OutlierParams, ViewParams):
     """Parameters of ``acquire.simulated_marker``."""
 
 
-class ScanParams(ScannerQuality, SessionParams):
+class ScanParams(ScannerQuality, ViewParams):
     """Parameters of ``acquire.simulated_session``."""
 
 
@@ -69,7 +71,7 @@ def acquire_simulated_marker(
         StageError: The camera does not see the marker at enough poses.
     """
     rng = np.random.default_rng([VERSION, seed])
-    view = CameraView(params.distance, 0.3, 2.0, params.field, params.facing)
+    view = CameraView(params.distance, 0.3, 2.0, FIELD, FACING)
     session = plan_session(robot, second, configuration, (params, view), rng)
     seen = seen_from(session.actual, session.places)
     # Of a marker's measured pose, about and along each axis [rad, m].
@@ -100,9 +102,7 @@ def acquire_simulated_session(  # noqa: PLR0913  what it asks the runner for
         StageError: The camera does not see it at enough poses.
     """
     rng = np.random.default_rng([VERSION, seed])
-    view = CameraView(
-        params.distance, scanner.near, scanner.far, scanner.field_of_view, params.facing
-    )
+    view = CameraView(params.distance, scanner.near, scanner.far, scanner.field_of_view, FACING)
     session = plan_session(robot, second, configuration, (params, view), rng)
     eye = scanner_of(scanner, params.resolution, params.noise, rng)
     stage_set = _Set(robot, second.model if second else None, flange, session)

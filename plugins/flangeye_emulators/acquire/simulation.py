@@ -80,7 +80,7 @@ def simulate(
     robot, scanner, flange, sphere, body = setting
     plate = flange if flange.bore else plate_of(robot)
     planning, checking, errors, noise, later = np.random.SeedSequence([VERSION, seed]).spawn(5)
-    base_T_camera = params.camera.base_T_camera
+    base_T_camera = params.camera.matrix
     reach = Reach(robot, scanner, base_T_camera, max(plate.outer, plate.details.wrist / 2))
     site = _site(reach, scanner, base_T_camera)
     names = f"{robot.model} can show its flange to {scanner.model}"
@@ -202,7 +202,7 @@ class _Session:
 
     @property
     def base_T_camera(self) -> Floats:
-        return self.params.camera.base_T_camera
+        return self.params.camera.matrix
 
     @property
     def count(self) -> int:
@@ -287,7 +287,7 @@ def _session(
     errors: np.random.SeedSequence,
 ) -> _Session:
     of_arm, of_scanner = errors.spawn(2)
-    arm = ImperfectArm(cell.robot, params.robot_errors, _rng(of_arm), params.arm)
+    arm = ImperfectArm(cell.robot, float(params.arm.quality != "exact"), _rng(of_arm), params.arm)
     joints = np.array([*(pose.joints for pose in stops.all), *unseen])
     return _Session(cell, scanner, stops, params, arm, joints, arm.angles(joints), of_scanner)
 

@@ -8,11 +8,18 @@ import numpy as np
 
 from flangeye.devices import Device, Profiler, StateSource, TactileSensor, WeldProfile
 from flangeye.errors import StageError
-from flangeye.plugin.stage import part
+from flangeye.plugin.stage import Params, part
 from flangeye.types import Seed
+from flangeye.units import Length, param
 from flangeye_emulators.finger.sensor import SimulatedFinger
-from flangeye_emulators.weld_world.settings import LookTruth
+from flangeye_emulators.weld_world.truth import LookTruth
 from flangeye_emulators.weld_world.world import Shutter, WeldWorld
+
+
+class SimulatedProfilerParams(Params):
+    """Parameters of ``profiler.simulated``."""
+
+    behind: Length = param("30 mm", gt=0, le=0.2, description="How far behind the torch it looks.")
 
 
 class SimulatedProfiler(Device):
@@ -24,12 +31,12 @@ class SimulatedProfiler(Device):
     """
 
     def __init__(
-        self, finger: SimulatedFinger, robot: StateSource, seed: Seed, params: LookTruth
+        self, finger: SimulatedFinger, robot: StateSource, seed: Seed, truth: LookTruth
     ) -> None:
         """Mount it behind the finger's torch."""
-        self.name, self.behind = f"look behind the torch of {finger.name}", params.behind
+        self.name, self.behind = f"look behind the torch of {finger.name}", truth.behind
         self._world, self._robot = finger.world, robot
-        self._look = LookBehind(params, np.random.default_rng([seed, 13]))
+        self._look = LookBehind(truth, np.random.default_rng([seed, 13]))
 
     def profile(self) -> WeldProfile | None:
         """Return the next scan that was ready at the arm's newest sample; None without one."""
@@ -43,14 +50,14 @@ class SimulatedProfiler(Device):
 
 @part("profiler.simulated")
 def profiler_simulated(
-    robot: StateSource, sensor: TactileSensor, seed: Seed, params: LookTruth
+    robot: StateSource, sensor: TactileSensor, seed: Seed, params: SimulatedProfilerParams
 ) -> Profiler:
     """A look at the bead of a simulated weld, behind the torch."""
     if not isinstance(sensor, SimulatedFinger):
         raise StageError(
             f"profiler.simulated sees the weld of sensor.simulated_finger, not of {sensor.name}"
         )
-    return SimulatedProfiler(sensor, robot, seed, params)
+    return SimulatedProfiler(sensor, robot, seed, LookTruth(params.behind))
 
 
 class LookBehind:
@@ -76,7 +83,7 @@ class LookBehind:
         seen = self._bead(s - self._truth.behind)
         if self._shutter.due(age) and seen is not None:
             noise = self._truth.noise * float(self._rng.standard_normal())
-            self._shutter.expose(time, age, seen + noise)
+            self._shutter.expose(time, seen + noise)
 
     def profile(self, time: float) -> WeldProfile | None:
         """Return the next look that has arrived at a time [s], if any."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +15,17 @@ from flangeye.models.finger import Finger, FingerGeometry
 from flangeye.models.model import read_model
 from flangeye.models.workpiece import CadSeam, load_workpiece
 from flangeye.motion.seam_following import ToolPose
-from flangeye.plugin.stage import Params, part
+from flangeye.plugin.stage import part
 from flangeye.types import Floats, Image, Seed, Transform
-from flangeye.units import Angle, Duration, Length, param
+from flangeye.units import Duration, Length, param
 from flangeye_emulators.weld_world.groove import GrooveSection, Tip
-from flangeye_emulators.weld_world.settings import ToolFile, ToolPath, WorldParams
+from flangeye_emulators.weld_world.truth import (
+    WORLDS,
+    ToolFile,
+    ToolPath,
+    WeldTruth,
+    WorldName,
+)
 from flangeye_emulators.weld_world.world import Nominal, Shutter, WeldWorld
 from flangeye_emulators.world import room
 from flangeye_emulators.world.bench import LaidParams
@@ -38,14 +44,6 @@ BACKGROUND = 90.0
 """What is behind the tag [grey levels]."""
 
 
-class SectionParams(Params):
-    """A joint's cross-section, as it really is."""
-
-    left: Angle = param(ge=0, le=np.pi / 2, description="The left wall, from the opening.")
-    right: Angle = param(ge=0, le=np.pi / 2, description="The right wall, from the opening.")
-    depth: Length = param(gt=0, description="From the walls' upper edge to the root.")
-
-
 class SimulatedFingerParams(LaidParams):
     """Parameters of ``sensor.simulated_finger``: the world, whatever the controller's files say."""
 
@@ -54,17 +52,17 @@ class SimulatedFingerParams(LaidParams):
     )
     seam: str = Field("groove", description="Name of the seam in that file.")
     leg: int | None = Field(None, ge=1, description="Leg of a seam with sharp corners.")
-    section: SectionParams | None = Field(
-        None, description="The joint's true cross-section, where it is not the file's groove."
+    plate: Length | None = param(
+        None,
+        gt=0,
+        description="Thickness of the upper plate of a lap joint or fillet, in place of a groove.",
     )
-    noise: float = Field(
-        3.0, ge=0, description="Noise of the image, standard deviation [grey levels]."
+    world: WorldName = Field(
+        "as_filed",
+        description="What is true and differs from the files: arm, tool, finger, workpiece, heat.",
     )
-    blur: float = Field(0.7, gt=0, description="Blur of the image, standard deviation [px].")
-    world: WorldParams = Field(
-        default_factory=WorldParams,
-        description="What is true and differs from the files: arm, tool, finger, clock, workpiece, "
-        "heat.",
+    hidden: tuple[Duration, Duration] | None = param(
+        None, description="The tag is out of sight from the first time to the second."
     )
     held: bool = Field(
         False, description="The tip is held where it is first, as in a punch mark: to calibrate."
@@ -83,21 +81,23 @@ class SimulatedFinger(Device):
         tool: Where the tool truly is in the plane of the groove. A stage must not look.
     """
 
-    def __init__(self, robot: StateSource, seed: Seed, params: SimulatedFingerParams) -> None:
-        """Lay the workpiece down and mount the true finger."""
+    def __init__(
+        self, robot: StateSource, seed: Seed, params: SimulatedFingerParams, truth: WeldTruth
+    ) -> None:
+        """Lay the workpiece down and mount the true finger, in a world that has what is true."""
         finger = read_model(params.tool, ToolFile)
         self.name = f"simulated finger {finger.model}"
         self.camera_matrix, self.distortion = finger.camera.matrix, np.array([])
         self._plane, nominal = _as_planned(finger, params)
-        truth = params.world
         self.world, self._planned = WeldWorld(nominal, truth, [seed, 12]), Path(nominal.seam)
         self.tool = Tool(finger, self._plane)
         self._robot, self._params = robot, params
         self._rng = np.random.default_rng([seed, 11])
-        optics = Optics(params.blur, params.noise)
-        self._camera = FingerCamera(finger, optics, self._rng)
+        self._camera = FingerCamera(finger, Optics(), self._rng)
         self._compliance = typical_compliance()
-        self._shutter: Shutter[Floats] = Shutter(truth.clock, self._rng)
+        self._shutter: Shutter[Floats] = Shutter(
+            replace(truth.clock, hidden=params.hidden), self._rng
+        )
         self._started: int | None = None
         self._mark: Floats | None = None
         self._torch: list[tuple[float, Floats]] = []
@@ -120,7 +120,7 @@ class SimulatedFinger(Device):
         if self._shutter.due(age):
             # A tag that something covers: it is as if it were far out of the image.
             hidden = self._shutter.hidden(age)
-            self._shutter.expose(now, age, shown + (np.array([1.0, 0, 0]) if hidden else 0.0))
+            self._shutter.expose(now, shown + (np.array([1.0, 0, 0]) if hidden else 0.0))
         seen = self._shutter.arrived(now)
         return (
             None if seen is None else SensorFrame(self._image(seen.item), round(seen.stamp * 1e9))
@@ -191,8 +191,8 @@ def _as_planned(finger: ToolFile, params: SimulatedFingerParams) -> tuple[WorkPl
 
 
 def _section(seam: CadSeam, params: SimulatedFingerParams) -> GrooveSection:
-    if (told := params.section) is not None:
-        return GrooveSection((told.left + told.right) / 2, told.depth, (told.left - told.right) / 2)
+    if params.plate is not None:
+        return GrooveSection(np.pi / 4, params.plate, -np.pi / 4)
     if seam.half_angle is None or seam.half_width is None:
         raise StageError(
             f"{params.workpiece}: seam '{params.seam}' needs half_angle and half_width to be felt"
@@ -213,7 +213,7 @@ def sensor_simulated_finger(
         params: The world.
     """
     del finger
-    return SimulatedFinger(robot, seed, params)
+    return SimulatedFinger(robot, seed, params, WORLDS[params.world])
 
 
 @dataclass(frozen=True)

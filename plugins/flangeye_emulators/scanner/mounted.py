@@ -68,9 +68,7 @@ class MountedScanner(OpenScanner):
         facts = {"unit": "m", "layout": f"organised, {columns} x {rows}", "simulated": "yes"}
         super().__init__(f"simulated {model.model} on the flange, seed {params.seed}", facts)
         workpiece = load_workpiece(params.workpiece)
-        self._bodies = bench_with(
-            workpiece, params.base_T_part, params.clutter, params.covered, clutter
-        )
+        self._bodies = bench_with(workpiece, params.base_T_part, params.covered, clutter)
         self.true_seams: dict[str, Array] = dict(params.true_seams(workpiece))
         self._flange_T_camera = params.flange_T_camera
 

@@ -13,21 +13,20 @@ from flangeye.motion.seam_following import Command, ToolPose, turned
 from flangeye.types import Floats
 from flangeye_emulators.weld_world.groove import (
     TICK,
-    Gap,
     Groove,
     GrooveSection,
     Relief,
     Tip,
     TipContact,
 )
-from flangeye_emulators.weld_world.settings import (
+from flangeye_emulators.weld_world.truth import (
     ArmTruth,
     ClockTruth,
     FingerTruth,
     HeatTruth,
     ToolTruth,
+    WeldTruth,
     WorkpieceTruth,
-    WorldParams,
 )
 from flangeye_plugins.weld.body import leaning
 from flangeye_plugins.weld.path import Path
@@ -66,7 +65,7 @@ class WeldWorld:
         off: How far the torch is to the left of the seam, where the seam is now [m].
     """
 
-    def __init__(self, nominal: Nominal, truth: WorldParams, seed: int | list[int]) -> None:
+    def __init__(self, nominal: Nominal, truth: WeldTruth, seed: int | list[int]) -> None:
         rng = np.random.default_rng(seed)
         self.groove: Groove = true_groove(nominal.seam, nominal.section, truth.workpiece, rng)
         self.contact = TipContact(self.groove, _true_tip(nominal.tip, truth))
@@ -102,7 +101,7 @@ class WeldWorld:
         return self._finger.shown(pose.time, axes.T @ (self.tip - rest))
 
 
-def _true_tip(tip: Tip, truth: WorldParams) -> Tip:
+def _true_tip(tip: Tip, truth: WeldTruth) -> Tip:
     finger = truth.finger
     return Tip(tip.radius, tip.lateral * finger.lateral, tip.axial * finger.axial, finger.friction)
 
@@ -119,7 +118,7 @@ class SeamDistortion:
         if torch <= 0.0:
             return 0.0
         whole = truth.shift * min(torch / self._length, 1.0)
-        near = (s - torch) / truth.radius
+        near = (s - torch) / 15e-3  # standard deviation of a Gaussian [m]
         return whole + truth.local * math.exp(-0.5 * near**2)
 
 
@@ -130,7 +129,7 @@ class TrueTool:
         """Take the world file's torch (3,) from the tip, in the tool's axes [m]."""
         self._tip = turned(np.asarray(truth.tip, dtype=np.float64), truth.yaw)
         aside = np.array([*truth.torch, truth.tip[2]])
-        self._leans = leaning(truth.work, truth.travel)
+        self._leans = leaning(truth.work, 0.0)
         self._torch = turned(self._leans @ torch + aside, truth.yaw)
 
     def axes(self, pose: ToolPose, level_R_tool: Floats) -> Floats:
@@ -169,7 +168,7 @@ class TrueFinger:
         # Displacement over which the lagging share comes along [m]
         self._lagging = _follow(self._lagging, self._played, 1e-3)
         moved = self._played + truth.hysteresis * (self._lagging - self._played)
-        share = 1.0 - math.exp(-elapsed / truth.creep_time)
+        share = 1.0 - math.exp(-elapsed / 10.0)  # time constant [s]
         self._crept = self._crept + share * (moved - self._crept)
         gain = 1.0 + truth.gain + truth.drift * self._age / 60.0
         return np.asarray(truth.rest) + gain * (moved + truth.creep * self._crept)
@@ -195,8 +194,7 @@ def true_groove(
     real = GrooveSection(
         section.half_angle + truth.half_angle, section.depth, section.lean + truth.lean
     )
-    gaps = tuple(Gap(gap.start, gap.start + gap.length, gap.side) for gap in truth.gaps)
-    return Groove(root, real, gaps, _relief(root.length, real, truth, rng))
+    return Groove(root, real, truth.gaps, _relief(root.length, real, truth, rng))
 
 
 def _wandered(path: Path, truth: WorkpieceTruth, phase: float) -> Path:
@@ -216,7 +214,7 @@ def _relief(
     s = np.arange(0.0, length + TICK, TICK)
     fill = _grains(s, truth.spatter, rng) - truth.root_gap / 2 / np.tan(section.half_angle)
     for tack in truth.tacks:
-        inside = np.clip(np.minimum(s - tack.start, tack.start + tack.length - s) / GRAIN, 0.0, 1.0)
+        inside = np.clip(np.minimum(s - tack.start, tack.start + 8e-3 - s) / GRAIN, 0.0, 1.0)
         fill = fill + tack.height * inside
     # Period with which the half angle varies along the seam [m]
     wider = truth.half_angle_wave * np.sin(2 * np.pi * s / 60e-3 + rng.uniform(0.0, 2 * np.pi))
@@ -304,14 +302,13 @@ class Shutter(Generic[Item]):
         self._count += 1
         return True
 
-    def expose(self, time: float, age: float, item: Item) -> None:
+    def expose(self, time: float, item: Item) -> None:
         """Take an image at ``time`` [s]: it may be lost on the way."""
         truth = self._truth
         late = max(0.0, truth.latency + truth.jitter * float(self._rng.standard_normal()))
         if self._rng.uniform() < truth.dropped:
             return
-        stamp = time + truth.stamp + truth.drift * age
-        self._under_way.append((time + late, Stamped(stamp, item)))
+        self._under_way.append((time + late, Stamped(time + truth.stamp, item)))
 
     def hidden(self, age: float) -> bool:
         """Whether something covers the tag."""

@@ -33,25 +33,21 @@ plain fit: 0.35 to 0.7 mm rms, most of it smooth over the workspace."""
 class ArmErrors(Params):
     """How far the simulated arm is from what its controller believes."""
 
-    quality: Literal["kind", "real"] = Field(
+    quality: Literal["exact", "kind", "real"] = Field(
         "kind",
         description="kind: joint zeros as small as the robot's joint_accuracy, nothing else; "
-        "real: as published recordings show arms to be. The sizes below replace its own.",
+        "exact: no errors, and poses that repeat; real: as published recordings show arms to be. "
+        "The size below replaces its own.",
     )
     zeros: Angle | None = param(
         None, ge=0, description="Standard deviation of the joints' zeros; real: 1 mrad."
     )
-    drift: Angle | None = param(
-        None,
-        ge=0,
-        description="How far a joint's zero moves while the arm warms up; real: 0.1 mrad.",
-    )
 
     def sizes(self, robot: RobotModel) -> ErrorSizes:
         """Return the sizes for an arm."""
-        preset = REAL if self.quality == "real" else ErrorSizes(robot.joint_accuracy)
-        given = {"zeros": self.zeros, "drift": self.drift}
-        return preset._replace(**{name: x for name, x in given.items() if x is not None})
+        kind = ErrorSizes(robot.joint_accuracy)
+        preset = {"exact": ErrorSizes(0.0), "kind": kind, "real": REAL}[self.quality]
+        return preset if self.zeros is None else preset._replace(zeros=self.zeros)
 
     @property
     def is_default(self) -> bool:

@@ -19,6 +19,10 @@ BENCH_MARGIN = 0.25
 """From the workpiece's box to the edge of the bench, to each side [m]."""
 
 
+CLUTTER = 6
+"""Things that lie about on the bench."""
+
+
 class LaidParams(Params):
     """A workpiece as it really lies."""
 
@@ -42,7 +46,6 @@ class LaidParams(Params):
 class BenchParams(LaidParams):
     """A workpiece on a bench."""
 
-    clutter: int = Field(6, ge=0, description="Number of other objects on the bench.")
     covered: float = Field(
         0.0, ge=0, lt=1, description="Share of the workpiece covered by a sheet, at one end."
     )
@@ -59,7 +62,6 @@ class BenchParams(LaidParams):
 def bench_with(
     workpiece: Workpiece,
     base_T_part: Floats,
-    clutter: int,
     covered: float,
     rng: np.random.Generator,
 ) -> list[SolidBody]:
@@ -68,9 +70,8 @@ def bench_with(
     Args:
         workpiece: What is to be welded.
         base_T_part: (4, 4) where it lies; the bench is right below it.
-        clutter: How many things lie about, some of them against the workpiece.
         covered: Share of the workpiece, from its end with the largest x, under a sheet.
-        rng: Draws the clutter.
+        rng: Draws the things that lie about, some of them against the workpiece.
     """
     part = Mesh(workpiece.vertices, workpiece.triangles).moved(base_T_part)
     low, high = part.vertices.min(axis=0), part.vertices.max(axis=0)
@@ -80,7 +81,7 @@ def bench_with(
     seams = [
         s.points @ base_T_part[:3, :3].T + base_T_part[:3, 3] for s in workpiece.seams.values()
     ]
-    for _ in range(clutter):
+    for _ in range(CLUTTER):
         bodies.append(_thing(_free_place(low, high, seams, rng), top, rng))
     return bodies + ([_sheet(workpiece, base_T_part, covered)] if covered > 0 else [])
 

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import Field
 
-from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.models.scanners import ScannerModel
-from flangeye.plugin.stage import Params
+from flangeye.plugin.stage import Params, PlaceParams
 from flangeye.types import BASE, CAMERA, Floats, Transform
 from flangeye.units import Angle, Length, param
 
@@ -20,7 +19,7 @@ if TYPE_CHECKING:
     from flangeye_emulators.world.time_of_flight import TimeOfFlight
 
 
-class CameraPose(Params):
+class CameraPose(PlaceParams):
     """Where the scanner stands, in ``base``."""
 
     position: tuple[Length, Length, Length] = param(
@@ -29,11 +28,6 @@ class CameraPose(Params):
     rpy: tuple[Angle, Angle, Angle] = param(
         ("180 deg", "0 deg", "-90 deg"), description="Roll, pitch, yaw; the default looks down."
     )
-
-    @property
-    def base_T_camera(self) -> Floats:
-        """(4, 4), translation in [m]."""
-        return rigid(rotation_from_rpy(*self.rpy), np.asarray(self.position))
 
 
 class ScannerQuality(Params):

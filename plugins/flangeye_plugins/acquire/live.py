@@ -99,13 +99,6 @@ class LiveParams(Params):
     verification: int = Field(
         1, ge=0, description="Captures that are kept from solving, near the workspace's middle."
     )
-    singularity: float = Field(
-        0.05,
-        ge=0,
-        lt=1,
-        description="Poses keep away from singularities: smallest singular value of the Jacobian, "
-        "lengths in units of the arm's reach.",
-    )
     home: tuple[JointPosition, ...] | None = Field(
         None,
         description="Joint angles of the arm before a run; a plan that does not ask "
@@ -144,7 +137,7 @@ def acquire_live(  # noqa: PLR0913  what it asks the runner for
     """
     allowed = limits_of(limits, robot)
     # Poses keep 5 deg from the limits of the joints: a pose at a limit cannot be approached.
-    margins = Margins(allowed, np.radians(5.0), params.singularity)
+    margins = Margins(allowed, np.radians(5.0), 0.05)
     base_T_camera = params.view(Arm(robot), scanner)
 
     def planned(start: Floats | None) -> Itinerary:

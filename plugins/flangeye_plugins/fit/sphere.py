@@ -36,9 +36,8 @@ class SphereParams(ScannerErrorParams):
     )
     # Points seen more obliquely than this are left out [rad]
     max_incidence: ClassVar[float] = float(np.radians(60))
-    min_coverage: float = Field(
-        0.4, gt=0, le=1, description="Smallest share of the cap within that angle to be seen."
-    )
+    # Smallest share of the cap within that angle to be seen
+    min_coverage: ClassVar[float] = 0.4
     # Largest difference of the fitted radius from the sphere's [m]
     radius_tolerance: ClassVar[float] = 0.5e-3
     # Standard deviation of the sphere's radius as the scanner sees it (make, coating, penetration

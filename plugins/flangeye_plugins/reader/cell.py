@@ -32,7 +32,9 @@ from flangeye_plugins.reader.columns import (
     PER_UNIT,
     POINT,
     ColumnsParams,
+    FlangePoseParams,
     JointsParams,
+    SeenPoseParams,
     TimesParams,
     readings_of,
     table_with_rows,
@@ -67,12 +69,8 @@ class OwnTableParams(JoinedParams, ColumnsParams):
         return self
 
 
-class ArmTableParams(OwnTableParams, JointsParams):
+class ArmTableParams(FlangePoseParams, OwnTableParams, JointsParams):
     """Where an arm's controller had its flange."""
-
-    pose: Literal["base_T_flange", "flange_T_base"] = Field(
-        "base_T_flange", description="Whose pose it is: the flange's in the arm's base, or inverse."
-    )
 
 
 class AxisTableParams(JoinedParams, TimesParams):
@@ -82,17 +80,8 @@ class AxisTableParams(JoinedParams, TimesParams):
     unit: Literal["m", "mm", "rad", "deg"] = Field(description="Unit of the value.")
 
 
-class SightingsParams(SeenParams, OwnTableParams):
+class SightingsParams(SeenParams, SeenPoseParams, OwnTableParams):
     """One target as one camera saw it; empty cells where it did not."""
-
-    pose: Literal["camera_T_target", "target_T_camera"] = Field(
-        "camera_T_target", description="Whose pose it is. rotation: point gives its place alone."
-    )
-
-    @classmethod
-    def more(cls) -> tuple[str, ...]:
-        """A point has no rotation."""
-        return (POINT,)
 
 
 class ScansParams(SeenParams):

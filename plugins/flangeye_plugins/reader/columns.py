@@ -104,6 +104,28 @@ class ColumnsParams(TimesParams, WrittenParams):
     )  # fmt: skip
 
 
+class FlangePoseParams(ColumnsParams):
+    """Where an arm's controller had its flange."""
+
+    pose: Literal["base_T_flange", "flange_T_base"] = Field(
+        "base_T_flange",
+        description="Whose pose it is: the flange's in the base, as controllers show, or inverse.",
+    )
+
+
+class SeenPoseParams(ColumnsParams):
+    """A target as a camera saw it; empty cells where it did not."""
+
+    pose: Literal["camera_T_target", "target_T_camera"] = Field(
+        "camera_T_target", description="Whose pose it is. rotation: point gives its place alone."
+    )
+
+    @classmethod
+    def more(cls) -> tuple[str, ...]:
+        """A point has no rotation."""
+        return (POINT,)
+
+
 class JointsParams(Params):
     """Which columns hold the joint angles of the same poses."""
 

@@ -21,7 +21,7 @@ from flangeye.maths.streams import (
     standstills,
 )
 from flangeye.types import Floats, Motion
-from flangeye.units import Angle, Duration, Length, param
+from flangeye.units import Duration, param
 
 Signal = tuple[Floats, Floats]
 """Times (N,) [s] and how much moved there (N,), in any unit."""
@@ -36,14 +36,6 @@ class PairingParams(Params):
     )
     tolerance: Duration = param(
         "100 ms", gt=0, description="Largest time between a measurement and the arm's next pose."
-    )
-    distance: Length = param(
-        "5 mm",
-        gt=0,
-        description="For an arm that never stands still: distance between the poses taken.",
-    )
-    angle: Angle = param(
-        "2 deg", gt=0, description="Rotation between the poses taken; either is enough."
     )
 
 
@@ -149,7 +141,8 @@ def _passing(arm: tuple[Floats, Floats], moved: Floats, params: PairingParams) -
     sparse = times[after] - times[before] > 2 * params.tolerance
     at = np.where(sparse, times[_nearest(times, moved[usable])], moved[usable])
     between = interpolated(times, poses, at) if len(times) > 1 else poses[[0] * len(at)]
-    kept = apart(between, params.distance, params.angle)
+    # Of an arm that never stands still, poses so far apart are taken: either is enough [m, rad].
+    kept = apart(between, 5e-3, float(np.radians(2.0)))
     return [
         MatchedPose(
             float(at[i]), between[i], (int(usable[i]),),

@@ -37,8 +37,10 @@ from flangeye_plugins.reader.columns import (
     POINT,
     CloudUnitParams,
     ColumnsParams,
+    FlangePoseParams,
     JointsParams,
     Readings,
+    SeenPoseParams,
     readings_of,
     table_with_rows,
     times_of,
@@ -69,17 +71,8 @@ class OtherParams(ColumnsParams):
         return self
 
 
-class TargetParams(OtherParams):
+class TargetParams(SeenPoseParams, OtherParams):
     """The target as the camera saw it; empty cells where it did not."""
-
-    pose: Literal["camera_T_target", "target_T_camera"] = Field(
-        "camera_T_target", description="Whose pose it is. rotation: point gives its place alone."
-    )
-
-    @classmethod
-    def more(cls) -> tuple[str, ...]:
-        """A point has no rotation."""
-        return (POINT,)
 
 
 class SecondParams(OtherParams):
@@ -90,7 +83,7 @@ class SecondParams(OtherParams):
     )
 
 
-class TableParams(ColumnsParams, JointsParams, CloudUnitParams):
+class TableParams(FlangePoseParams, JointsParams, CloudUnitParams):
     """The convention of the poses; nothing of it is guessed."""
 
     file: str | tuple[str, ...] = Field(
@@ -98,10 +91,6 @@ class TableParams(ColumnsParams, JointsParams, CloudUnitParams):
         description="The table: FILE (text, JSON, YAML, OpenCV's storage, .npz, .npy, .mat, a "
         "robot program); FILE:PART, an array or a block of it, or FILE:1/2, half of its rows; "
         "a pattern of files with a row each, poses/*.json; or several, side by side.",
-    )
-    pose: Literal["base_T_flange", "flange_T_base"] = Field(
-        "base_T_flange",
-        description="Whose pose it is: the flange's in the base, as controllers show, or inverse.",
     )
     rotation: str = Field(
         JOINTS, description="How the rotations are written, see below; joints: there are the "

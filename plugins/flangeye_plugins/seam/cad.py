@@ -14,6 +14,7 @@ from flangeye.types import Box, Floats, Seam, Seed, VerifiedHandEye, WorkpieceSc
 from flangeye.units import Length, param
 from flangeye_plugins.seam.part import CadPart
 from flangeye_plugins.seam.planned import (
+    SPACING,
     SeamParams,
     answer_for,
     cloud_around,
@@ -36,12 +37,6 @@ class CadParams(SeamParams):
         description="One of data/workpieces, or a .yaml file of one's own with CAD and seams."
     )
     seam: str | None = Field(None, description="Name of the seam, if the workpiece has several.")
-    min_seen: float = Field(
-        0.35,
-        gt=0,
-        lt=1,
-        description="Smallest share of the CAD's surface facing the scanner that must be seen.",
-    )
     max_residual: Length = param(
         "0.5 mm", gt=0, description="Largest rms distance of the scan from the CAD."
     )
@@ -82,7 +77,7 @@ def seam_cad(  # noqa: PLR0913  what it asks the runner for
     rng = np.random.default_rng([SEED, seed])
     found = register(seen.points, CadPart(workpiece), seam, _limits(params), rng)
     turn, shift = found.fit.pose[:3, :3], found.fit.pose[:3, 3]
-    line = resampled(seam.points, params.spacing) @ turn.T + shift
+    line = resampled(seam.points, SPACING) @ turn.T + shift
     of_fit = found.fit.covariance + scanner_covariance(scanner, float(np.linalg.norm(shift)))
     covariances = covariance_at(of_fit, found.fit.about, line)
     deviation = _deviation(covariances, params.max_deviation)
@@ -142,4 +137,4 @@ def _figures(found: Registered) -> dict[str, float]:
 def _limits(params: CadParams) -> RegistrationLimits:
     # Of what faces the scanner a twentieth may be missing; the best pose is three percent better
     # than the second.
-    return RegistrationLimits(params.min_seen, 0.05, params.max_residual, 0.03)
+    return RegistrationLimits(0.35, 0.05, params.max_residual, 0.03)

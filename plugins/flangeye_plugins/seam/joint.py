@@ -24,6 +24,7 @@ from flangeye_plugins.seam.ends import (
     surfaces,
 )
 from flangeye_plugins.seam.planned import (
+    SPACING,
     SeamParams,
     answer_for,
     cloud_around,
@@ -51,7 +52,6 @@ TURNED = np.cos(np.radians(120))
 """A rough line that turns by more goes back."""
 BEYOND = (1.0, 2.0, 3.0, 4.0)
 """Pixels beyond a surface's last point at which the scanner may look past its end."""
-END = "max_end_deviation"
 CELL = 3e-3
 """Lengths of the seam that are seen or not [m]."""
 PLANE = 0.95
@@ -81,21 +81,6 @@ class JointParams(SeamParams):
     )
     max_deviation: Length = param(
         "0.5 mm", gt=0, description="Largest standard deviation of the seam across it, in the scan."
-    )
-    max_end_deviation: Length = param(
-        "1 mm", gt=0, description="Largest standard deviation along it of where it starts or ends."
-    )
-    max_apart: Length = param(
-        "1 mm",
-        gt=0,
-        description="Largest distance of clouds from neighbouring places where both show the same "
-        "face, median.",
-    )
-    min_explained: float = Field(
-        0.6, gt=0, lt=1, description="Smallest share of the points about the seam on the joint."
-    )
-    min_coverage: float = Field(
-        0.6, gt=0, lt=1, description="Smallest share of the seam's length where both plates show."
     )
 
 
@@ -161,10 +146,10 @@ def seam_joint(  # noqa: PLR0913  what it asks the runner for
     """
     answer = answer_for(STAGE, calibration, params)
     seen = seen_in_base(STAGE, scan, answer, robot)
-    _refuse_apart(seen, params)
+    _refuse_apart(seen)
     found = _found(seen, _rough(seen, params, seam), params)
     figures = _judged(found, params)
-    line, openings, covariances = _line(found, params.spacing)
+    line, openings, covariances = _line(found)
     covariances = covariances + seen.of_scanner(line, scanner)
     mapped, covariance = seen.in_base(line, covariances)
     refuse_outside(STAGE, mapped, workspace)
@@ -183,12 +168,13 @@ def seam_joint(  # noqa: PLR0913  what it asks the runner for
     return for_the_controller(planned, answer, robot, params)
 
 
-def _refuse_apart(seen: PlacedScan, params: JointParams) -> None:
+def _refuse_apart(seen: PlacedScan) -> None:
     """Refuse clouds of several places that do not agree where they show the same face."""
-    if seen.apart is not None and seen.apart > params.max_apart:
+    limit = 1e-3  # more than a calibrated scanner on a real arm leaves between two places [m]
+    if seen.apart is not None and seen.apart > limit:
         raise CalibrationRefused(
             f"{STAGE}: neighbouring clouds are {seen.apart * 1e3:.2f} mm apart where both show the "
-            f"same face, limit {params.max_apart * 1e3:g} mm (max_apart); calibrate the scanner on "
+            f"same face, limit {limit * 1e3:g} mm; calibrate the scanner on "
             "the flange again"
         )
 
@@ -312,10 +298,10 @@ def _end(found: Found, sign: int) -> tuple[float, float]:
     return sign * place, float(np.hypot(deviation, UNSEEN * pitch))
 
 
-def _line(found: Found, spacing: float) -> tuple[Floats, Floats, Floats]:
+def _line(found: Found) -> tuple[Floats, Floats, Floats]:
     """Return the seam (N, 3), its openings (N, 3) and its covariances (N, 3, 3), in ``camera``."""
     start, stop = found.ends
-    count = max(2, round((stop - start) / spacing) + 1)
+    count = max(2, round((stop - start) / SPACING) + 1)
     s = np.linspace(start, stop, count)
     origin, axes = found.course.at(s)
     y, z, roll = found.swept.spline.at(s).T
@@ -354,17 +340,17 @@ def _judged(found: Found, params: JointParams) -> dict[str, float]:
     named = zip(("start", "end"), found.deviations, strict=True)
     ends = {name: value for name, value in named if np.isfinite(value)}
     limits = [
-        (found.swept.sigma, params.max_residual, "points are {} from the joint", "max_residual"),
-        (deviation, params.max_deviation, "the seam is known to {} (1 sigma)", "max_deviation"),
+        (found.swept.sigma, params.max_residual, "points are {} from the joint", " (max_residual)"),
+        (deviation, params.max_deviation, "the seam is known to {} (1 sigma)", " (max_deviation)"),
         *(
-            (value, params.max_end_deviation, f"its {end} is known to {{}} (1 sigma)", END)
+            (value, 1e-3, f"its {end} is known to {{}} (1 sigma)", "")
             for end, value in ends.items()
         ),
     ]
     for value, limit, what, name in limits:
         if not value <= limit:
             told = what.format(f"{value * 1e3:.2g} mm")
-            raise CalibrationRefused(f"{STAGE}: {told}, limit {limit * 1e3:g} mm ({name})")
+            raise CalibrationRefused(f"{STAGE}: {told}, limit {limit * 1e3:g} mm{name}")
     _refuse_plane(found)
     leaning = np.abs(found.swept.section.shape[:4]) - 3 * np.radians(JOINTS[params.joint].spread)
     if leaning.max() > 0:
@@ -372,20 +358,16 @@ def _judged(found: Found, params: JointParams) -> dict[str, float]:
             f"{STAGE}: this is no {params.joint} joint: an angle between its surfaces is off by "
             f"{np.degrees(np.abs(found.swept.section.shape[:4]).max()):.0f} deg"
         )
-    shares = [
-        (
-            explained,
-            params.min_explained,
-            "of the points about the line are on it",
-            "min_explained",
-        ),
-        (coverage, params.min_coverage, "of its length show both plates", "min_coverage"),
-    ]
-    for value, limit, what, name in shares:
-        if value < limit:
+    # Of a joint, most points about its line are on it, and most of its length shows both plates.
+    shares = {
+        "of the points about the line are on it": explained,
+        "of its length show both plates": coverage,
+    }
+    for what, value in shares.items():
+        if value < 0.6:
             raise CalibrationRefused(
-                f"{STAGE}: this is no {params.joint} joint: {value:.0%} {what}, at least "
-                f"{limit:.0%} are needed ({name})"
+                f"{STAGE}: this is no {params.joint} joint: {value:.0%} {what}, at least 60% are "
+                "needed"
             )
     return {
         "residual": found.swept.sigma,

@@ -11,13 +11,14 @@ from flangeye import RecipePath, StageError, stage
 from flangeye.files.clouds import PER_METRE, LengthUnit
 from flangeye.files.drawings import read_dxf
 from flangeye.files.tables import read_table
-from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.maths.seam_geometry import chained, distances_to_line, sharp_edges
 from flangeye.models.robots import RobotModel
 from flangeye.models.workpiece import MESHES, STEP_SUFFIXES, read_mesh
+from flangeye.plugin.stage import PlaceParams
 from flangeye.types import Box, Floats, Seam, VerifiedHandEye
 from flangeye.units import Angle, Length, param
 from flangeye_plugins.seam.planned import (
+    SPACING,
     SeamParams,
     answer_for,
     for_the_controller,
@@ -31,8 +32,8 @@ MEET = 1e-6
 """Pieces of a line whose ends are this near to each other meet [m]."""
 
 
-class LineParams(SeamParams):
-    """Parameters of ``seam.line``."""
+class LineParams(SeamParams, PlaceParams):
+    """Parameters of ``seam.line``; position and rpy are those of the file's frame in the base."""
 
     path: RecipePath = Field(
         description="Points or taught poses in order (CSV, YAML, JSON), a drawing (DXF), or CAD "
@@ -43,12 +44,6 @@ class LineParams(SeamParams):
         None, description="Point in the file's frame; of several lines the nearest to it is used."
     )
     angle: Angle = param("30 deg", gt=0, description="CAD: smallest bend of a sharp edge.")
-    position: tuple[Length, Length, Length] = param(
-        ("0 mm", "0 mm", "0 mm"), description="Origin of the file's frame in the base."
-    )
-    rpy: tuple[Angle, Angle, Angle] = param(
-        ("0 deg", "0 deg", "0 deg"), description="Roll, pitch, yaw of that frame in the base."
-    )
     opening: tuple[float, float, float] = Field(
         (0.0, 0.0, 1.0), description="Out of the work towards the torch, in the file's frame."
     )
@@ -70,8 +65,8 @@ def seam_line(
         StageError: The file cannot be read, or holds no line, or several and no ``near``.
         CalibrationRefused: The seam leaves the workspace.
     """
-    pose = rigid(rotation_from_rpy(*params.rpy), np.asarray(params.position))
-    points = resampled(_line(params), params.spacing) @ pose[:3, :3].T + pose[:3, 3]
+    pose = params.matrix
+    points = resampled(_line(params), SPACING) @ pose[:3, :3].T + pose[:3, 3]
     opening = pose[:3, :3] @ np.asarray(params.opening)
     if not np.linalg.norm(opening) > 0:
         raise StageError(f"{STAGE}: opening has no direction")

@@ -28,6 +28,10 @@ CLOUD_POINTS = 20_000
 """Points of the scan that are kept for people."""
 
 
+SPACING = 2e-3
+"""Between planned points [m]."""
+
+
 class SeamParams(Params):
     """What the stages that plan a seam share."""
 
@@ -40,7 +44,6 @@ class SeamParams(Params):
     tool: Length = param(
         "0 mm", ge=0, description="corrected: from the flange to the tool's tip, along its z."
     )
-    spacing: Length = param("2 mm", gt=0, description="Distance between the planned points.")
 
 
 def scanner_covariance(scanner: ScannerModel | None, distance: float) -> Floats:

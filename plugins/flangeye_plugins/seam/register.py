@@ -200,7 +200,7 @@ def _refuse_poor(
     if seen < limits.seen:
         raise CalibrationRefused(
             f"{STAGE}: poor fit: of the CAD's surface towards the scanner {seen:.0%} was seen, at "
-            f"least {limits.seen:.0%} is needed (min_seen); {_look(part)}"
+            f"least {limits.seen:.0%} is needed; {_look(part)}"
         )
     _refuse_missing(part, "the CAD's surface", refuted / (seen + refuted), limits)
     if fit.noise > limits.residual:

@@ -10,7 +10,6 @@ import numpy as np
 from flangeye import stage
 from flangeye.models.targets import Flange
 from flangeye.types import Capture, FlangeCloud, PointCloud, Rejected
-from flangeye.units import param
 from flangeye_plugins.segment.scale import RangeParams, check_scale
 
 if TYPE_CHECKING:
@@ -22,9 +21,8 @@ class SegmentParams(RangeParams):
 
     # Largest angle between the flange's normal and the view [rad]
     max_incidence: ClassVar[float] = float(np.radians(55))
-    min_coverage: float = param(
-        0.3, gt=0, le=1, description="Smallest share of the rim, and of the bore, to be seen."
-    )
+    # Smallest share of the rim, and of the bore, to be seen
+    min_coverage: ClassVar[float] = 0.3
     # How much depth bends from one coarse point to the next where a surface ends; five times the
     # scan's noise if that is more [m]
     crease: ClassVar[float] = 0.8e-3

@@ -9,7 +9,6 @@ import numpy as np
 from flangeye import stage
 from flangeye.models.targets import Sphere
 from flangeye.types import Capture, FlangeCloud, Floats, Indices, PointCloud, Rejected, Singles
-from flangeye.units import param
 from flangeye_plugins.segment.discs import in_box
 from flangeye_plugins.segment.grid import Grid, coarse_view
 from flangeye_plugins.segment.scale import RangeParams, check_scale
@@ -35,9 +34,8 @@ SEEN_TO = np.sin(np.radians(60.0))
 class SegmentSphereParams(RangeParams):
     """Parameters of ``segment.sphere``."""
 
-    min_coverage: float = param(
-        0.4, gt=0, le=1, description="Smallest share of the face it turns to be seen."
-    )
+    # Smallest share of the face it turns to be seen
+    min_coverage: ClassVar[float] = 0.4
     # Largest distance of a coarse point from the sphere's surface [m]
     tolerance: ClassVar[float] = 1e-3
     # Distance from the surface up to which points are kept [m]

@@ -55,7 +55,7 @@ def solve_closed(
         places = solver(problem)
     except np.linalg.LinAlgError:
         raise CalibrationRefused(f"{method}: its equations have no solution here") from None
-    options = Options((params.rotation_limit, params.translation_limit))
+    options = Options(params.limits)
     return calibrate_at(places, observations, cell, scanner, options, method)
 
 

@@ -18,11 +18,11 @@ from flangeye.types import (
     Transform,
     TransformEstimate,
 )
-from flangeye.units import Angle, Length, param
+from flangeye.units import Angle, param
 
 
-class RotationLimitParams(Params):
-    """When a rotation is not observable."""
+class LimitsParams(Params):
+    """When a calibration is not observable."""
 
     rotation_limit: Angle = param(
         "2 deg",
@@ -30,13 +30,10 @@ class RotationLimitParams(Params):
         description="Refuse when rotation about some axis has a larger standard deviation.",
     )
 
-
-class LimitsParams(RotationLimitParams):
-    """When a calibration is not observable."""
-
-    translation_limit: Length = param(
-        "20 mm", gt=0, description="A translation known less well is not observable."
-    )
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Largest standard deviations of what is observable: of a rotation [rad], a place [m]."""
+        return self.rotation_limit, 20e-3
 
 
 def centres_of(observations: Sequence[Observation]) -> Floats:

@@ -118,7 +118,7 @@ def _options(params: RobustParams, workspace: Box | None) -> Options:
     from flangeye.estimation.session import Asked
 
     return Options(
-        (params.rotation_limit, params.translation_limit),
+        params.limits,
         params.unobservable == "mark",
         params.certify,
         workspace,

@@ -21,7 +21,7 @@ from flangeye.maths.geometry import kabsch, kabsch_covariance
 from flangeye.maths.statistics import covariance_inflation
 from flangeye.types import Floats, HandEye, Observation, Observations, TransformEstimate
 from flangeye_plugins.solve.observations import (
-    RotationLimitParams,
+    LimitsParams,
     centres_of,
     estimate_of,
     hand_eye,
@@ -30,7 +30,7 @@ from flangeye_plugins.solve.observations import (
 )
 
 
-class SvdParams(RotationLimitParams):
+class SvdParams(LimitsParams):
     """Parameters of ``solve.svd``."""
 
 

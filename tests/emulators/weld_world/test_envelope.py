@@ -1,11 +1,13 @@
 """What a weld stays within, what it refuses, and that nothing of the truth leads to a controller."""
 
+from dataclasses import replace
 from types import MethodType
 
 import numpy as np
 import pytest
 
 from flangeye.errors import StageError
+from flangeye_emulators.weld_world.truth import ArmTruth, ToolTruth, WeldTruth, WorkpieceTruth
 from flangeye_plugins.weld.follower import Follower
 from tools import weld_trial as trials
 from tools.weld_bench import could_be_welded, try_condition
@@ -104,7 +106,7 @@ def test_a_wavy_seam_is_followed_as_far_as_it_is_felt() -> None:
 
 def test_a_tip_that_is_not_where_its_file_says_is_in_the_stated_bound() -> None:
     """In a curve the tool turns between the tip's and the torch's passing."""
-    wrong = Condition({"tool": {"tip": ["1.5 mm", "0 mm", "0 mm"], "torch": ["1.5 mm", "0 mm"]}})
+    wrong = Condition(WeldTruth(tool=ToolTruth(tip=(1.5e-3, 0.0, 0.0), torch=(1.5e-3, 0.0))))
     known = wrong._replace(belief={"tip_sigma": 0.8e-3}, settings={"max_error": "4 mm"})
     found = try_condition(known, 0, period=16e-3)
     stated = found.column("bound")[found.beside]
@@ -210,12 +212,14 @@ def test_a_weld_that_is_done_is_welded(seed: int) -> None:
 
 
 def test_one_who_knows_the_truth_is_held_up_by_the_arm_alone() -> None:
-    wave = {"wave": "1 mm", "wave_length": "40 mm"}
-    late = {"lag": "400 ms", "dead_time": "200 ms"}
-    bent = Condition({"workpiece": wave, "tool": {"torch": ["0 mm", "3 mm"]}, "arm": late})
-    assert could_be_welded(bent, 0, 0.1, 16e-3)
-    narrow = bent._replace(
-        world={**bent.world, "workpiece": {"wave": "3 mm", "wave_length": "10 mm"}},
-        settings={"speed": "20 mm/s"},
+    bent = WeldTruth(
+        ArmTruth(lag=0.4, dead_time=0.2),
+        ToolTruth(torch=(0.0, 3e-3)),
+        workpiece=WorkpieceTruth(wave=1e-3, wave_length=40e-3),
+    )
+    assert could_be_welded(Condition(bent), 0, 0.1, 16e-3)
+    narrow = Condition(
+        replace(bent, workpiece=WorkpieceTruth(wave=3e-3, wave_length=10e-3)),
+        {"speed": "20 mm/s"},
     )
     assert not could_be_welded(narrow, 0, 0.1, 16e-3)

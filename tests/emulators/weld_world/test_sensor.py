@@ -14,8 +14,14 @@ from flangeye.maths.seam_geometry import torch_deviation
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
 from flangeye.motion.seam_following import ToolPose
-from flangeye_emulators.finger.sensor import SimulatedFingerParams, sensor_simulated_finger
+from flangeye.types import Seed
+from flangeye_emulators.finger.sensor import (
+    SimulatedFinger,
+    SimulatedFingerParams,
+    sensor_simulated_finger,
+)
 from flangeye_emulators.robot.simulated import SimulatedRobot, SimulatedRobotParams
+from flangeye_emulators.weld_world.truth import HeatTruth, WeldTruth, WorkpieceTruth
 from tests.plugins.weld.cell import HOME, MODEL, planned, run, true_line
 
 FINGER = read_model(bundled("data") / "fingers" / "srm.yaml", Finger)
@@ -43,10 +49,12 @@ def test_as_many_times_as_places_are_told() -> None:
 def test_the_torch_is_told_beside_the_plan_as_it_lies_beside_the_true_seam(workpiece: str) -> None:
     """What scores it knows the planned seam; the true one wanders, and heat moves it."""
     robot = SimulatedRobot(MODEL, SimulatedRobotParams(period="16 ms", joints=HOME))
-    world = {"workpiece": {"wave": "1 mm", "wave_length": "30 mm", "bow": "1 mm"},
-             "heat": {"local": "0.5 mm"}}  # fmt: skip
-    given = SimulatedFingerParams.model_validate({"workpiece": workpiece, "world": world})
-    sensor: Any = sensor_simulated_finger.function(FINGER, robot, 0, given)
+    truth = WeldTruth(
+        workpiece=WorkpieceTruth(wave=1e-3, wave_length=30e-3, bow=1e-3),
+        heat=HeatTruth(local=0.5e-3),
+    )
+    given = SimulatedFingerParams.model_validate({"workpiece": workpiece})
+    sensor: Any = SimulatedFinger(robot, Seed(0), given, truth)
     planned, off, told = sensor._planned, [], []
     for s in np.linspace(0.06, 0.17, 40):
         place = planned.at(s)
@@ -85,10 +93,7 @@ def edited() -> list[tuple[str, Finger]]:
 def happenings(finger: Finger) -> list[Any]:
     """All that a world does while an arm moves through it, as bytes."""
     robot = SimulatedRobot(MODEL, SimulatedRobotParams(period="16 ms", joints=HOME))
-    given = SimulatedFingerParams.model_validate(
-        {"world": {"clock": {"latency": "0 ms", "jitter": "0 ms"}}}
-    )
-    sensor: Any = sensor_simulated_finger.function(finger, robot, 5, given)
+    sensor: Any = sensor_simulated_finger.function(finger, robot, 5, SimulatedFingerParams())
     seen = [sensor.name, sensor.camera_matrix.tobytes()]
     for _ in range(12):
         robot.move_velocity(np.array([0.01, 0.02, -0.03, 0.0, 0.0, 0.1]), 1.0)

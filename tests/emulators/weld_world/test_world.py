@@ -1,18 +1,22 @@
 """The true world of a weld: each of its parts does what it is told, and the controller sees none."""
 
+from typing import get_args
+
 import numpy as np
 import pytest
 
 from flangeye.motion.seam_following import Command, ToolPose
 from flangeye_emulators.weld_world.groove import Groove, Tip, TipContact
-from flangeye_emulators.weld_world.settings import (
+from flangeye_emulators.weld_world.truth import (
+    WORLDS,
     ArmTruth,
     ClockTruth,
     FingerTruth,
     HeatTruth,
+    Tack,
     ToolTruth,
     WorkpieceTruth,
-    WorldParams,
+    WorldName,
 )
 from flangeye_emulators.weld_world.world import (
     ArmError,
@@ -36,12 +40,8 @@ def pose(x=0.0, y=0.0, z=0.0, time=0.0, angle=0.0):
     return ToolPose(time, np.array([x, y, z]), angle)
 
 
-def params(model, **given):
-    return model.model_validate(given)
-
-
 def test_the_arm_follows_late_and_lagging() -> None:
-    truth = params(ArmTruth, lag="100 ms", dead_time="50 ms")
+    truth = ArmTruth(lag=0.1, dead_time=0.05)
     arm = ArmResponse(truth, pose(), 10e-3)
     travelled = []
     for _ in range(100):
@@ -54,84 +54,81 @@ def test_the_arm_follows_late_and_lagging() -> None:
 
 
 def test_the_arm_is_not_where_it_says() -> None:
-    backlash = ArmError(params(ArmTruth, backlash="0.1 mm"), RNG(0))
+    backlash = ArmError(ArmTruth(backlash=0.1e-3), RNG(0))
     ways = [0.0, 1e-3, 2e-3, 1.95e-3, 1e-3]
     off = [backlash.true_pose(pose(y=y)).position[1] - y for y in ways]
     np.testing.assert_allclose(off, [0, -5e-5, -5e-5, 0, 5e-5], atol=1e-12)
-    sag = ArmError(params(ArmTruth, sag="0.5 mm", scale=1e-3), RNG(0))
+    sag = ArmError(ArmTruth(sag=0.5e-3, scale=1e-3), RNG(0))
     sag.true_pose(pose())
     moved = sag.true_pose(pose(x=0.1)).position
     np.testing.assert_allclose(moved, [0.1001, 0.0, -0.5e-3], atol=1e-12)
-    wave = ArmError(params(ArmTruth, wave="0.3 mm"), RNG(0))
+    wave = ArmError(ArmTruth(wave=0.3e-3), RNG(0))
     aside = [wave.true_pose(pose(x=x)).position[1] for x in np.linspace(0, 0.16, 400)]
     assert np.ptp(aside) == pytest.approx(0.6e-3, rel=0.01)
 
 
 def test_the_tool_is_where_the_world_has_it() -> None:
-    tool = TrueTool(
-        params(ToolTruth, tip=["1 mm", "0 mm", "2 mm"], torch=["0 mm", "0.5 mm"]), TORCH
-    )
+    tool = TrueTool(ToolTruth(tip=(1e-3, 0.0, 2e-3), torch=(0.0, 0.5e-3)), TORCH)
     np.testing.assert_allclose(
         tool.rest(pose(angle=np.pi / 2), np.eye(3)), [0, 1e-3, 2e-3], atol=1e-12
     )
     np.testing.assert_allclose(tool.torch(pose(), np.eye(3)), [-40e-3, 0.5e-3, 2e-3], atol=1e-12)
-    turned = TrueTool(params(ToolTruth, yaw="1 deg"), TORCH)
+    turned = TrueTool(ToolTruth(yaw=np.pi / 180), TORCH)
     assert turned.torch(pose(), np.eye(3))[1] == pytest.approx(-40e-3 * np.sin(np.pi / 180))
 
 
 def test_the_finger_shows_less_and_later_than_it_feels() -> None:
-    play = TrueFinger(params(FingerTruth, play="0.4 mm"))
+    play = TrueFinger(FingerTruth(play=0.4e-3))
     shown = [
         play.shown(t, np.array([0.0, y, 0.0]))[1] for t, y in enumerate([1e-3, -1e-3, -0.7e-3])
     ]
     np.testing.assert_allclose(shown, [0.8e-3, -0.8e-3, -0.8e-3])
-    gain = TrueFinger(params(FingerTruth, gain=0.1, drift=0.6, rest=["0 mm", "0.1 mm", "0 mm"]))
+    gain = TrueFinger(FingerTruth(gain=0.1, drift=0.6, rest=(0.0, 0.1e-3, 0.0)))
     assert gain.shown(0.0, np.zeros(3))[1] == pytest.approx(0.1e-3)
     assert gain.shown(10.0, np.array([0, 1e-3, 0]))[1] == pytest.approx(0.1e-3 + 1.2e-3)
-    soft = TrueFinger(params(FingerTruth, creep=0.1, creep_time="1 s"))
-    values = [soft.shown(t / 10, np.array([0, 1e-3, 0]))[1] for t in range(100)]
+    soft = TrueFinger(FingerTruth(creep=0.1))
+    values = [soft.shown(t, np.array([0, 1e-3, 0]))[1] for t in range(100)]
     assert values[0] == pytest.approx(1e-3)
     assert values[-1] == pytest.approx(1.1e-3, rel=1e-3)
-    loop = TrueFinger(params(FingerTruth, hysteresis=0.2))
+    loop = TrueFinger(FingerTruth(hysteresis=0.2))
     up = loop.shown(0.0, np.array([0, 3e-3, 0]))[1]
     loop.shown(1.0, np.array([0, 6e-3, 0]))
     assert loop.shown(2.0, np.array([0, 3e-3, 0]))[1] - up == pytest.approx(0.4e-3)
 
 
 def test_images_are_late_lost_and_wrongly_stamped() -> None:
-    truth = params(ClockTruth, rate=100, latency="50 ms", jitter="0 ms", stamp="20 ms", dropped=0)
+    truth = ClockTruth(rate=100, latency=0.05, jitter=0.0, stamp=0.02, dropped=0)
     shutter: Shutter[str] = Shutter(truth, RNG(0))
     assert shutter.due(0.0)
     assert not shutter.due(0.005)
-    shutter.expose(1.0, 0.0, "image")
+    shutter.expose(1.0, "image")
     assert shutter.arrived(1.04) is None
     assert shutter.arrived(1.06) == (1.02, "image")
-    lossy: Shutter[int] = Shutter(params(ClockTruth, dropped=0.5), RNG(0))
+    lossy: Shutter[int] = Shutter(ClockTruth(dropped=0.5), RNG(0))
     for i in range(200):
-        lossy.expose(float(i), 0.0, i)
+        lossy.expose(float(i), i)
     assert 70 < sum(lossy.arrived(1e9) is not None for _ in range(200)) < 130
 
 
 def test_the_workpiece_is_not_its_cad() -> None:
-    truth = params(
-        WorkpieceTruth, wave="1 mm", wave_length="20 mm", bow="2 mm", root_gap="1 mm",
-        tacks=[{"start": "50 mm"}],
-    )  # fmt: skip
+    truth = WorkpieceTruth(
+        wave=1e-3, wave_length=20e-3, bow=2e-3, root_gap=1e-3, tacks=(Tack(50e-3),)
+    )
     groove = true_groove(LINE, SECTION, truth, RNG(0))
     aside = groove.root.points[:, 1]
     assert 2e-3 < aside.max() < 3e-3
     low, high = groove.relief.at(0.02)[0], groove.relief.at(0.054)[0]
     assert low == pytest.approx(-0.5e-3 / np.tan(SECTION.half_angle))
     assert high - low == pytest.approx(1e-3)
-    rough = true_groove(LINE, SECTION, params(WorkpieceTruth, spatter="0.1 mm"), RNG(0))
+    rough = true_groove(LINE, SECTION, WorkpieceTruth(spatter=0.1e-3), RNG(0))
     assert np.std(rough.relief.fill) == pytest.approx(0.1e-3 * 0.8, rel=0.2)
 
 
 def test_heat_moves_the_seam_as_a_whole_and_near_the_torch() -> None:
-    whole = SeamDistortion(params(HeatTruth, shift="2 mm"), 0.1)
+    whole = SeamDistortion(HeatTruth(shift=2e-3), 0.1)
     assert whole.at(0.05, -0.01) == 0.0
     assert whole.at(0.09, 0.05) == pytest.approx(1e-3)
-    near = SeamDistortion(params(HeatTruth, local="1 mm"), 0.1)
+    near = SeamDistortion(HeatTruth(local=1e-3), 0.1)
     assert near.at(0.05, 0.05) == pytest.approx(1e-3)
     assert near.at(0.09, 0.05) < 0.05e-3
 
@@ -162,10 +159,9 @@ def test_friction_holds_a_tip_on_a_wall_and_on_the_face() -> None:
 )
 def test_the_torch_is_scored_where_it_truly_is(name: str, rms: float) -> None:
     told = CONDITIONS[name]
-    trial = try_condition(Condition(told.world, {}, (0.0, 0.0)), seed=0, length=0.06)
+    trial = try_condition(Condition(told.truth, {}, (0.0, 0.0)), seed=0, length=0.06)
     assert np.sqrt(np.mean(trial.errors**2)) == pytest.approx(rms, rel=0.1)
 
 
-def test_every_condition_is_a_world() -> None:
-    for condition in CONDITIONS.values():
-        assert isinstance(condition.truth, WorldParams)
+def test_every_world_that_a_recipe_may_name_is_there() -> None:
+    assert set(get_args(WorldName)) == set(WORLDS)

@@ -15,8 +15,11 @@ from flangeye.plugin.stage import KINDS
 from flangeye.types import CAMERA
 from flangeye_emulators.acquire.simulated import acquire_simulated
 from flangeye_emulators.acquire.simulated_params import SimulatedParams
+from flangeye_emulators.world.arm import ArmErrors
 from flangeye_emulators.world.scanner import CameraPose
 from flangeye_plugins.plan.grid import GridParams, grid
+
+EXACT = ArmErrors(quality="exact")
 
 SMALL = {"counts": (2, 2, 1)}
 
@@ -71,7 +74,7 @@ def test_the_truth_is_the_papers_camera_pose() -> None:
 
 
 def test_the_flange_is_where_the_robot_says() -> None:
-    captures = acquire(robot_errors=0.0, noise=0.0, resolution=0.25)
+    captures = acquire(arm=EXACT, noise=0.0, resolution=0.25)
     for capture in captures:
         points = in_flange(capture, captures.source.truth)
         radius = np.hypot(points[:, 0], points[:, 1])
@@ -90,14 +93,14 @@ def test_the_reported_pose_is_that_of_the_reported_joints() -> None:
 
 def test_robot_errors_move_the_flange_by_tenths_of_a_millimetre() -> None:
     def heights(errors):
-        captures = acquire(robot_errors=errors, noise=0.0, resolution=0.15)
+        captures = acquire(arm=errors, noise=0.0, resolution=0.15)
         for capture in captures:
             points = in_flange(capture, captures.source.truth)
             radius = np.hypot(points[:, 0], points[:, 1])
             near = (radius > 0.018) & (radius < 0.029) & (np.abs(points[:, 2]) < 3e-3)
             yield np.median(points[near, 2])
 
-    exact, wrong = np.array(list(heights(0.0))), np.array(list(heights(1.0)))
+    exact, wrong = np.array(list(heights(EXACT))), np.array(list(heights(ArmErrors())))
     assert np.abs(exact).max() < 2e-6
     assert 2e-5 < np.abs(wrong).max() < 1e-3
 
@@ -134,7 +137,7 @@ def test_nothing_is_scanned_before_it_is_asked_for_and_nothing_is_kept() -> None
 
 
 def test_covered_flanges_are_outliers() -> None:
-    captures = acquire(plan={"counts": (2, 2, 2)}, outliers=0.5, robot_errors=0.0)
+    captures = acquire(plan={"counts": (2, 2, 2)}, outliers=0.5, arm=EXACT)
     seen = []
     for capture in captures:
         points = in_flange(capture, captures.source.truth)

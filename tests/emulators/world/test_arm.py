@@ -167,7 +167,7 @@ def test_a_link_that_carries_the_camera_is_off_too() -> None:
 
 def test_four_axes_have_no_joints_to_be_wrong() -> None:
     with pytest.raises(StageError, match="four axes has no joints to be wrong; leave 'arm' out"):
-        planned(ArmErrors(quality="real"), four_axes=True)
+        planned(ArmErrors(quality="real"), motion="four_axes")
 
 
 def test_a_size_replaces_that_of_the_quality() -> None:

@@ -95,7 +95,10 @@ def test_whatever_else_the_arm_is_told_ends_the_arc(stop: Any) -> None:
 
 
 def test_an_arc_that_goes_out_is_no_weld() -> None:
-    arm = arced(SimulatedArc(fails_after=20), ignition="0 s")
+    arc = SimulatedArc()
+    arm = arced(arc, ignition="0 s")
+    lead(arm, BURN, 20)
+    arc.burn(False)
     with pytest.raises(DeviceError, match="simulated power source: the arc does not burn"):
         lead(arm, BURN, 400)
     assert not arm.arc.burning()

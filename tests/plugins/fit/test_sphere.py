@@ -1,7 +1,5 @@
 """fit.sphere: a cap of a sphere, from any side, with what a scanner does to it."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -231,14 +229,8 @@ def test_fifty_points_are_enough() -> None:
     assert isinstance(fit(points[:49], rough, min_coverage=0.1), Rejected)
 
 
-@pytest.mark.parametrize(
-    ("name", "refused", "taken"),
-    [
-        ("min_coverage", 0, 0.01), ("min_coverage", 1.01, 1), ("scanner_error", "-1 um", "0 mm"),
-    ],
-)  # fmt: skip
-def test_a_parameter_has_its_bounds(name: str, refused: Any, taken: Any) -> None:
-    check_bound(SphereParams, name, refused, taken)
+def test_a_parameter_has_its_bounds() -> None:
+    check_bound(SphereParams, "scanner_error", "-1 um", "0 mm")
 
 
 def test_four_points_are_enough_for_a_sphere() -> None:

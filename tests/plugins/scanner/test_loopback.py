@@ -34,7 +34,7 @@ FLANGE_5E = plate_of(UR5E)
 
 def shown():
     """Joint angles at which the flange faces the scanner."""
-    base_T_camera = CameraPose().base_T_camera
+    base_T_camera = CameraPose().matrix
     reach = Reach(UR5E, PHOXI, base_T_camera, UR5E.flange.wrist / 2)
     middle = middle_of_view(PHOXI, base_T_camera)
     facing = reach.facing(middle)

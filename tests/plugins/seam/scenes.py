@@ -11,7 +11,7 @@ from flangeye_emulators.scan import SimulatedScanParams, scan_simulated
 from flangeye_emulators.world.scanner import CameraPose, before_camera, scanner_of
 from tools.workpieces import Plate, _description, write_stl
 
-BASE_T_CAMERA = Transform(BASE, CAMERA, CameraPose().base_T_camera)
+BASE_T_CAMERA = Transform(BASE, CAMERA, CameraPose().matrix)
 RESOLUTION = 0.3
 
 

@@ -253,8 +253,7 @@ def test_a_depth_is_between_a_centimetre_and_thirty_metres(depth: float, unit: s
 @pytest.mark.parametrize(
     ("name", "refused", "taken"),
     [
-        ("near", "-1 mm", "0 mm"), ("far", "0 mm", "1 mm"), ("min_coverage", 0, 0.01),
-        ("min_coverage", 1.01, 1),
+        ("near", "-1 mm", "0 mm"), ("far", "0 mm", "1 mm"),
     ],
 )  # fmt: skip
 def test_a_parameter_has_its_bounds(name: str, refused: Any, taken: Any) -> None:

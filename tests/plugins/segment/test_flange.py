@@ -20,7 +20,7 @@ title: Segmentation
 robot: {model: ur5}
 scanner: {model: phoxi-m}
 steps:
-  - acquire.simulated: {resolution: 0.4, robot_errors: 0, verification: 0, outliers: OUT}
+  - acquire.simulated: {resolution: 0.4, arm: {quality: exact}, verification: 0, outliers: OUT}
   - segment.flange
   - fit.rim
   - solve.svd

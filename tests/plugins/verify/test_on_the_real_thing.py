@@ -269,7 +269,6 @@ def test_pairs_of_poses_are_counted_once_if_they_are_far_enough_apart() -> None:
         (SphereCheckParams, {}, "shortest", "0 mm", "1 um"),
         (BallBar, {"first": _m(CENTRE), "second": _m(TIP)}, "length", "0 mm", "1 um"),
         (TouchParams, {"tip": _m(TIP)}, "touches", [], touches(1).touches),
-        (TouchParams, {"tip": _m(TIP), "touches": touches(1).touches}, "accuracy", "0 mm", "1 um"),
         (TouchParams, {"tip": _m(TIP), "touches": touches(1).touches}, "max_error", "0 mm", "1 um"),
         (HoldoutParams, {}, "folds", 1, 2),
         (HoldoutParams, {}, "max_rms", "0 mm", "1 um"),

@@ -2,19 +2,21 @@
 
 import numpy as np
 
-from flangeye.devices import MotionAllowed, RobotDriver
+from flangeye.devices import MotionAllowed, RobotDriver, StateSource, TactileSensor
 from flangeye.files.paths import bundled
 from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.models.loading import load_model
 from flangeye.models.workpiece import load_workpiece
-from flangeye.plugin.stage import BoundPart
+from flangeye.plugin.stage import BoundPart, part
 from flangeye.recipe.header import LimitsSection
-from flangeye.types import Seam
+from flangeye.types import Seam, Seed
 from flangeye_emulators.finger.sensor import (
+    SimulatedFinger,
     SimulatedFingerParams,
     sensor_simulated_finger,
 )
 from flangeye_emulators.robot.simulated import SimulatedRobot, SimulatedRobotParams
+from flangeye_emulators.weld_world.truth import WeldTruth
 from flangeye_plugins.weld.settings import WeldTactileParams
 from flangeye_plugins.weld.tactile import weld_tactile
 
@@ -53,16 +55,25 @@ def planning_error(name, seed, end=None):
     return planned(name, shift, side * np.deg2rad(1.0), end)
 
 
+def finger_in(truth):
+    """The simulated finger in a world that no recipe names."""
+
+    @part("sensor.in_a_world")
+    def sensor(robot: StateSource, seed: Seed, params: SimulatedFingerParams) -> TactileSensor:
+        return SimulatedFinger(robot, seed, params, truth)
+
+    return sensor
+
+
 def run(
     seam, name="v-straight", *, sensor=None, seed=0, box=BOX, limits=None, driver=None,
     journal=None, **params,
 ):  # fmt: skip
     """Run the stage; return its report and what it wrote into its journal."""
-    given = {"world": {}, **(sensor or {})}
-    clock = {"rate": 15.0, **given["world"].get("clock", {})}
-    given["world"] = {**given["world"], "clock": clock}
-    simulated = SimulatedFingerParams(workpiece=name, **given)
-    chosen = BoundPart(sensor_simulated_finger, simulated)
+    given = dict(sensor or {})
+    own = isinstance(given.get("world"), WeldTruth)
+    finger = finger_in(given.pop("world")) if own else sensor_simulated_finger
+    chosen = BoundPart(finger, SimulatedFingerParams(workpiece=name, **given))
     arm = SimulatedRobotParams(period="16 ms", joints=HOME)
     driver = driver or RobotDriver(
         "robot.simulated", lambda: SimulatedRobot(MODEL, arm), simulated=True

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from flangeye.errors import StageError
+from flangeye_emulators.weld_world.truth import WeldTruth
 from flangeye_plugins.weld.belief import Belief
 from flangeye_plugins.weld.bound import check_bound, predicted
 from flangeye_plugins.weld.path import Path
@@ -72,7 +73,7 @@ def test_what_is_largest_and_what_lessens_it_is_said(belief: Any, asked: Any, to
 def test_the_follower_states_no_less_than_was_predicted() -> None:
     """And little more where nothing is wrong: what it feels is all that comes on top."""
     condition = Condition(
-        {}, {"max_error": "2 mm"}, (0.0, 0.0), {"along_sigma": 1e-3, "tip_sigma": 0.2e-3}
+        WeldTruth(), {"max_error": "2 mm"}, (0.0, 0.0), {"along_sigma": 1e-3, "tip_sigma": 0.2e-3}
     )
     found = try_condition(condition, 0, 0.1, 16e-3)
     expected = predicted(Path(curved(0.1)), Belief(DISTANCE, **condition.belief), Following())

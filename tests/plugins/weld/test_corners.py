@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from flangeye.errors import StageError
 from flangeye.types import Seam
 from flangeye_emulators.weld_world.groove import Tip
-from flangeye_emulators.weld_world.settings import WorldParams
+from flangeye_emulators.weld_world.truth import WeldTruth
 from flangeye_emulators.weld_world.world import Nominal
 from flangeye_plugins.weld.checks import check_seam
 from flangeye_plugins.weld.corners import corners_of, leg_of
@@ -157,7 +157,7 @@ def round_a_corner(turn, joint, shift, plan_turn=0.01, **given):
     check_seam(misplanned, plan, belief.distance, asked)
     seam = Nominal(true, section, Tip(), body.level_R_tool.T @ body.torch, body.level_R_tool)
     controller = controller_of(plan, belief, asked, "tactile")
-    return run_trial(controller, seam, WorldParams(), start_at(plan, belief, asked, 16e-3), 0)
+    return run_trial(controller, seam, WeldTruth(), start_at(plan, belief, asked, 16e-3), 0)
 
 
 JOINTS = {"lap": LAP, "groove": None}
@@ -201,8 +201,8 @@ def test_the_torch_comes_to_the_corner_and_goes_on_from_it(bent: FilePath, leg: 
     line = np.array(BENT) * 1e-3 @ cell.HERE[:3, :3].T + cell.HERE[:3, 3]
     off = np.array([1e-3, -0.7e-3, 0.0])
     seam = seam_of(line + off)
-    section = {"left": "0 deg", "right": "90 deg", "depth": "5 mm"}
-    report, _ = cell.run(seam, bent, sensor={"section": section, "leg": leg}, joint="lap", leg=leg)
+    sensor = {"plate": "5 mm", "leg": leg}
+    report, _ = cell.run(seam, bent, sensor=sensor, joint="lap", leg=leg)
     assert report.completed, report.reason
     start, end = line[leg - 1], line[leg]
     along = (end - start) / np.linalg.norm(end - start)

@@ -82,7 +82,7 @@ def test_a_tip_that_slides_calibrates_nothing(tmp_path: Path) -> None:
 
 
 def test_a_tag_out_of_view_calibrates_nothing(tmp_path: Path) -> None:
-    hidden = "steps.7.sensor.simulated_finger.world.clock.hidden=[0 s, 999 s]"
+    hidden = "steps.7.sensor.simulated_finger.hidden=[0 s, 999 s]"
     with pytest.raises(StageError, match="the tag was seen 0 times at rest and 0 times held"):
         guided(loaded(HELD, hidden), tmp_path)
 

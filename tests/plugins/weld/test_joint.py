@@ -144,10 +144,7 @@ def test_a_leaning_tool_on_an_arm_and_a_fillet_on_an_inclined_plate() -> None:
     )  # fmt: skip
     report, _ = cell.run(
         seam, joint="fillet", work_angle="25 deg", preload="1.2 mm",
-        sensor={
-            "section": {"left": "0 deg", "right": "90 deg", "depth": "20 mm"},
-            "rpy": ["12 deg", "-8 deg", "20 deg"],
-        },
+        sensor={"plate": "20 mm", "rpy": ["12 deg", "-8 deg", "20 deg"]},
     )  # fmt: skip
     assert report.completed, report.reason
     line = _about(cell.true_line("v-straight", 0.06), turned)

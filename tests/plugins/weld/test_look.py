@@ -14,8 +14,8 @@ from flangeye.plugin.registry import Lookup, load_registry
 from flangeye.plugin.stage import BoundPart
 from flangeye.run.replay import replay_steps
 from flangeye.types import Seed
-from flangeye_emulators.finger.profiler import profiler_simulated
-from flangeye_emulators.weld_world.settings import LookTruth
+from flangeye_emulators.finger.profiler import SimulatedProfilerParams, profiler_simulated
+from flangeye_emulators.weld_world.truth import RENDERED, LookTruth, ToolTruth, WeldTruth
 from flangeye_plugins.weld.camera_process import CameraProcess
 from flangeye_plugins.weld.finger_camera import CameraJob
 from flangeye_plugins.weld.follower import Follower
@@ -27,8 +27,8 @@ from tests.plugins.weld.test_touch import FINGER
 from tools.weld_bench import try_condition
 from tools.weld_conditions import CONDITIONS, Condition
 
-ASIDE = {"tool": {"torch": ["0 mm", "0.3 mm"]}}
-LOOK = BoundPart(profiler_simulated, LookTruth.model_validate({"behind": "10 mm"}))
+ASIDE = WeldTruth(tool=ToolTruth(torch=(0.0, 0.3e-3)), clock=RENDERED)
+LOOK = BoundPart(profiler_simulated, SimulatedProfilerParams(behind="10 mm"))
 SETTINGS = {"distortion": "0.15 mm", "max_error": "2 mm"}
 SHORT = 0.09
 
@@ -185,7 +185,7 @@ def test_heat_around_the_torch_is_made_up_for_once_it_was_seen() -> None:
 
 
 def test_a_torch_that_the_files_have_elsewhere_is_told() -> None:
-    world = {"tool": {"torch": ["0 mm", "1.5 mm"]}}
+    world = WeldTruth(tool=ToolTruth(torch=(0.0, 1.5e-3)))
     found = try_condition(Condition(world, look=LookTruth()), 0, SHORT, 16e-3)
     assert not found.done
     assert "the look behind the torch sees the bead +1." in found.controller.reason

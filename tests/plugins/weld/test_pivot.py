@@ -124,7 +124,7 @@ class Person(SimulatedRobot):
 
 def test_the_guided_procedure_finds_tip_and_torch(tmp_path: Path) -> None:
     """The finger's file has the tip at (0, 0, 180) mm and the torch 40 mm behind it."""
-    wrong = [HELD, "steps.7.sensor.simulated_finger.world={tool: {tip: [1.5 mm, 0.8 mm, -1 mm]}}"]
+    wrong = [HELD, "steps.7.sensor.simulated_finger.world=tip_astray"]
     recipe = load_recipe(find_recipe(WELD), load_registry(), wrong)
     person = Person()
     recipe.context[RobotDriver] = RobotDriver("robot.simulated", lambda: person, simulated=True)

@@ -37,7 +37,7 @@ def test_the_torch_stays_in_the_seam_in_real_time(tmp_path: Path) -> None:
     seam = planned("v-straight", shift=(1e-3, -1.5e-3, 0.0), turn=np.deg2rad(1.0), end=0.05)
     sensor = BoundPart(
         sensor_simulated_finger,
-        SimulatedFingerParams.model_validate({"world": {"clock": {"rate": 15.0}}}),
+        SimulatedFingerParams(),
     )
     params = WeldTactileParams(sensor=sensor, speed="10 mm/s", **PATIENT)
     journal = []

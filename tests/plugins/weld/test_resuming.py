@@ -29,7 +29,7 @@ PLAN = WorkPlane(SEAM.points_in_base, SEAM.openings_in_base).points(SEAM.points_
 
 @pytest.fixture(scope="module")
 def stopped(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    hidden = {"world": {"clock": {"hidden": ("29 s", "90 s")}}}
+    hidden = {"hidden": ("29 s", "90 s")}
     report, journal = run(SEAM, sensor=hidden, seed=3, speed="10 mm/s")
     assert report.reason.startswith("no tag was seen for 500 ms; ")
     return report, logged(journal, tmp_path_factory.mktemp("stopped") / "run.mcap")
@@ -72,7 +72,7 @@ def test_what_cannot_be_gone_on_with_is_refused(stopped: Any, tmp_path: Any) -> 
 
 
 def test_before_the_torch_was_on_the_seam_there_is_nothing_to_keep(tmp_path: Any) -> None:
-    hidden = {"world": {"clock": {"hidden": ("12 s", "60 s")}}}
+    hidden = {"hidden": ("12 s", "60 s")}
     _, journal = run(SEAM, sensor=hidden, seed=3, speed="10 mm/s")
     assert resume_point_of(logged(journal, tmp_path / "run.mcap"), PLAN) is None
 

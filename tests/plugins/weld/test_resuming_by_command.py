@@ -44,7 +44,7 @@ def test_a_run_killed_in_its_weld_goes_on_where_it_was(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_weld_that_stopped_by_itself_is_gone_on_with_too(tmp_path: Path) -> None:
     # The recipe hides the tag of the second run too; the tip then lets go of the wall already.
-    hidden = "steps.7.sensor.simulated_finger.world.clock.hidden=[50 s, 52 s]"
+    hidden = "steps.7.sensor.simulated_finger.hidden=[50 s, 52 s]"
     small = "steps.0.resolution=0.3"
     stopped = flangeye(tmp_path, SEAM, "--set", small, "--set", hidden, "--out", "stopped")
     assert stopped.returncode == 1

@@ -34,12 +34,24 @@ def test_without_a_power_source_nothing_waits() -> None:
     assert not arc.stands(1.0) and arc.filled(9.0)
 
 
+class Failing(SimulatedArc):
+    """An arc that is found to be out once it was asked after so often."""
+
+    def __init__(self, after: int | None) -> None:
+        super().__init__()
+        self.left = float("inf") if after is None else after
+
+    def burning(self) -> bool | None:
+        self.left -= self._burns
+        return self._burns and self.left >= 0
+
+
 def welded(
     monkeypatch: pytest.MonkeyPatch, **given: Any
 ) -> tuple[Any, dict[str, list[Any]], SimulatedArc]:
     """Weld 5 cm with a simulated power source; return report, cycles and source."""
-    source = SimulatedArc(given.pop("fails_after", None))
-    monkeypatch.setattr("flangeye_emulators.arc.SimulatedArc", lambda fails_after: source)
+    source = Failing(given.pop("fails_after", None))
+    monkeypatch.setattr("flangeye_emulators.arc.SimulatedArc", lambda: source)
     arc = BoundPart(arc_simulated, SimulatedArcParams.model_validate(given.pop("times", {})))
     report, journal = run(planned("v-straight", end=0.05), arc=arc, **given)
     cycles = [value for what, value in journal if what == "cycles"]

@@ -11,6 +11,8 @@ from flangeye.motion.seam_following import Controller, FollowingTask
 from flangeye.plugin.registry import Lookup, load_registry
 from flangeye.plugin.stage import BoundPart, part
 from flangeye.types import Seam
+from flangeye_emulators.weld_world.groove import Gap
+from flangeye_emulators.weld_world.truth import RENDERED, ClockTruth, WeldTruth, WorkpieceTruth
 from flangeye_plugins.weld.settings import WeldTactileParams
 from tests.plugins.weld.cell import planned, planning_error, run, true_line
 
@@ -44,7 +46,7 @@ def test_equal_runs_are_equal() -> None:
 @pytest.mark.parametrize("name", ["v-straight", "v-curved"])
 def test_both_workpieces_with_the_planning_error_of_the_issue(name: str) -> None:
     seam = planning_error(name, seed=0)
-    report, _ = run(seam, name, sensor={"world": {"clock": {"rate": 30.0}}})
+    report, _ = run(seam, name, sensor={"world": WeldTruth()})
     errors = deviation(report, name)
     assert report.completed
     assert np.sqrt(np.mean(errors**2)) < 0.15e-3
@@ -55,7 +57,8 @@ def test_both_workpieces_with_the_planning_error_of_the_issue(name: str) -> None
 
 @pytest.mark.slow
 def test_a_gap_is_bridged_with_real_images() -> None:
-    gap = {"world": {"workpiece": {"gaps": ({"start": "80 mm", "length": "20 mm"},)}}}
+    missing = WorkpieceTruth(gaps=(Gap(80e-3, 100e-3, 1),))
+    gap = {"world": WeldTruth(workpiece=missing, clock=RENDERED)}
     report, _ = run(planning_error("v-curved", seed=0), "v-curved", sensor=gap)
     assert "bridging" in report.phases
     assert report.phases.index("bridging") < len(report.phases) - report.phases[::-1].index(
@@ -147,14 +150,14 @@ def test_a_plan_too_uncertain_to_search() -> None:
 
 
 def test_no_tag_in_view() -> None:
-    assert refused(sensor={"world": {"clock": {"hidden": ("0 s", "100 s")}}}) == (
+    assert refused(sensor={"hidden": ("0 s", "100 s")}) == (
         "weld.tactile: no tag is in view; is the finger's light on, the lens clean, and is the tag "
         "the one its file names?"
     )
 
 
 def test_a_camera_that_gives_nothing() -> None:
-    assert refused(sensor={"world": {"clock": {"latency": "60 s"}}}).startswith(
+    assert refused(sensor={"world": WeldTruth(clock=ClockTruth(latency=60.0))}).startswith(
         "weld.tactile: the camera gives no images;"
     )
 
@@ -201,8 +204,7 @@ def test_a_mode_that_no_plugin_offers_is_named_with_those_that_are_there() -> No
 
 
 def test_the_torch_is_scored_where_it_truly_is_and_not_where_it_is_believed() -> None:
-    world = {"tool": {"torch": ["0 mm", "0.6 mm"]}}
-    report, _ = run(planned("v-straight", end=SHORT), sensor={"world": world})
+    report, _ = run(planned("v-straight", end=SHORT), sensor={"world": "torch_aside"})
     assert report.completed
     believed = torch_deviation(report.torch, true_line("v-straight"), report.opening)
     true = torch_deviation(report.true_torch, true_line("v-straight"), report.opening)
@@ -225,10 +227,7 @@ def stopped(seam=None, **more):
 
 
 def test_a_tag_that_is_lost_for_too_long() -> None:
-    assert (
-        stopped(sensor={"world": {"clock": {"hidden": ("10 s", "60 s")}}})
-        == "no tag was seen for 2000 ms"
-    )
+    assert stopped(sensor={"hidden": ("10 s", "60 s")}) == "no tag was seen for 2000 ms"
 
 
 def test_a_camera_that_stops() -> None:

@@ -51,7 +51,7 @@ class Camera:
         robot = load_model("robots", options["robot"])
         self.scanner = load_model("scanners", options["scanner"])
         rng = np.random.default_rng(options["seed"])
-        self.base_T_camera = CameraPose().base_T_camera
+        self.base_T_camera = CameraPose().matrix
         self.base_T_camera[:3, 3] += options["moved"]
         eye = scanner_of(self.scanner, options["resolution"], 1.0, rng)
         self.scene = CellScene(robot, eye, self.base_T_camera, np.array([0.3, 0.3, 0.2]))
