@@ -112,7 +112,7 @@ def test_a_recipe_loads_no_library(flangeye: Callable[..., Any], tmp_path: Path)
 def test_a_device_of_the_finger_is_a_camera_and_no_pipeline_of_programs() -> None:
     from pydantic import ValidationError
 
-    from flangeye_plugins.sensor.opencv import OpenCVParams
+    from flangeye_plugins.sensor import OpenCVParams
 
     for device in ("0", "/dev/video12", "rtsp://camera/1", "http://10.0.0.2/stream"):
         assert OpenCVParams(device=device).device == device

@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from flangeye.errors import FlangeyeError, RecipeError, StageError
-from flangeye.files.yaml_edit import edited
-from flangeye.files.yaml_lines import parse_yaml
+from flangeye.files.yaml_lines import edited, parse_yaml
 from flangeye.log.read import read_run
 from flangeye.plugin.registry import Registry
 from flangeye.plugin.stage import KINDS

@@ -28,10 +28,10 @@ STAGES = {
 }
 
 PARTS = {
-    "scanner.emulator": "flangeye_emulators.scanner.loopback:scanner_loopback",
-    "scanner.mounted": "flangeye_emulators.scanner.mounted:scanner_mounted",
-    "robot.emulator": "flangeye_emulators.robot.loopback:robot_loopback",
-    "robot.simulated": "flangeye_emulators.robot.simulated:robot_simulated",
+    "scanner.emulator": "flangeye_emulators.scanner:scanner_loopback",
+    "scanner.mounted": "flangeye_emulators.scanner:scanner_mounted",
+    "robot.emulator": "flangeye_emulators.robot:robot_loopback",
+    "robot.simulated": "flangeye_emulators.robot:robot_simulated",
     "arc.simulated": "flangeye_emulators.arc:arc_simulated",
     "profiler.simulated": "flangeye_emulators.finger.profiler:profiler_simulated",
     "sensor.simulated_finger": "flangeye_emulators.finger.sensor:sensor_simulated_finger",
@@ -57,7 +57,7 @@ def _serve_ur(options: "EmulatorOptions") -> None:
 
 
 def _serve_aubo(options: "EmulatorOptions") -> None:
-    from flangeye_emulators.controllers.aubo.server import serve
+    from flangeye_emulators.controllers.aubo import serve
 
     serve(options)
 

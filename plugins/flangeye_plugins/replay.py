@@ -15,7 +15,7 @@ from flangeye.models.finger import Finger
 from flangeye.motion.seam_following import Command
 from flangeye.plugin.stage import part
 from flangeye.run.replay import ReplayedStep
-from flangeye_plugins.sensor.recorded import piece_of
+from flangeye_plugins.sensor import piece_of
 from flangeye_plugins.weld.execution import touch_of
 from flangeye_plugins.weld.finger_camera import FingerReader
 from flangeye_plugins.weld.resuming import LoggedWeld

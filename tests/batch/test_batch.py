@@ -19,8 +19,8 @@ import pytest
 from flangeye.batch import cluster
 from flangeye.batch.dataset import Dataset, Ledger, columns_of
 from flangeye.batch.keys import Software, software_of
+from flangeye.batch.outcome import BatchError, Request
 from flangeye.batch.plan import plan
-from flangeye.batch.request import BatchError, Request
 from flangeye.batch.work import READY, STARTS, WORKER_DIED, Job
 
 SLURM = Path(__file__).parents[2] / "docs/examples/slurm_cluster.py"
@@ -298,7 +298,7 @@ def test_500_sessions_keep_memory_flat(recipe: Path, registry: Any, tmp_path: Pa
 
 
 def test_files_for_tls_go_together_and_exist(batch: Callable[..., Any], tmp_path: Path) -> None:
-    from flangeye.batch.request import Tls
+    from flangeye.batch.outcome import Tls
 
     missing = Tls(tmp_path / "ca.pem", tmp_path / "cert.pem", tmp_path / "key.pem")
     with pytest.raises(

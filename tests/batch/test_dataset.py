@@ -11,7 +11,7 @@ from flangeye.batch import dataset as module
 from flangeye.batch.dataset import Dataset, Ledger, columns_of, row_of
 from flangeye.batch.outcome import SessionOutcome
 from flangeye.batch.plan import BatchSession
-from flangeye.files.place import place_at
+from flangeye.files.paths import place_at
 
 COLUMNS = columns_of({})
 

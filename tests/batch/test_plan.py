@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from flangeye.batch import plan as batch_plan
 from flangeye.batch.keys import Software, _code_of, check_software, software_of
+from flangeye.batch.outcome import BatchError, Request
 from flangeye.batch.plan import plan, split_values
-from flangeye.batch.request import BatchError, Request
 from flangeye.errors import FlangeyeError, StageError
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.load import load_recipe

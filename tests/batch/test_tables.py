@@ -19,9 +19,9 @@ from flangeye.batch.outcome import SessionOutcome
 from flangeye.batch.page import drawings_of, write_page
 from flangeye.batch.page import render as rendered
 from flangeye.batch.plan import BatchSession
-from flangeye.batch.tally import Tally
+from flangeye.batch.progress import Tally
 from flangeye.batch.work import Job
-from flangeye.files.place import place_at
+from flangeye.files.paths import place_at
 
 EVIL = "<script>alert(1)</script>"
 

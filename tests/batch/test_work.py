@@ -11,9 +11,8 @@ import pytest
 
 from flangeye.batch.dataset import columns_of
 from flangeye.batch.keys import software_of
-from flangeye.batch.outcome import MARKER, SessionOutcome, finished_outcome
+from flangeye.batch.outcome import MARKER, Request, SessionOutcome, finished_outcome
 from flangeye.batch.plan import plan
-from flangeye.batch.request import Request
 from flangeye.batch.work import (
     READY,
     STARTS,

@@ -21,7 +21,7 @@ from flangeye.batch.dataset import BLOCK, Dataset, columns_of, row_of
 from flangeye.batch.keys import software_of
 from flangeye.batch.outcome import SessionOutcome
 from flangeye.batch.plan import plan
-from flangeye.files.place import place_at
+from flangeye.files.paths import place_at
 from flangeye.plugin.registry import Registry, load_registry
 
 OUTCOME = SessionOutcome(

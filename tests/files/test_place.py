@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from flangeye.errors import StageError
-from flangeye.files.place import place_at
+from flangeye.files.paths import place_at
 
 
 @pytest.mark.parametrize("elsewhere", [False, True], ids=["here", "elsewhere"])

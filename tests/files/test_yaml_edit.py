@@ -7,8 +7,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flangeye.files.yaml_edit import edited
-from flangeye.files.yaml_lines import parse_yaml
+from flangeye.files.yaml_lines import edited, parse_yaml
 
 RECIPE = """\
 # my cell, measured on Monday

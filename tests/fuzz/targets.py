@@ -558,7 +558,7 @@ def _batch_columns():
 
 def _read_batch(path):
     from flangeye.batch.dataset import FOLDER, Dataset
-    from flangeye.files.place import place_at
+    from flangeye.files.paths import place_at
 
     folder = path.with_suffix("")
     (folder / FOLDER).mkdir(parents=True, exist_ok=True)

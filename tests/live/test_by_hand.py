@@ -14,7 +14,7 @@ from flangeye.maths.kinematics import Arm
 from flangeye.maths.pose_formats import CONVENTIONS
 from flangeye.models.loading import load_model
 from flangeye.types import CAMERA, PointCloud
-from flangeye_emulators.scanner.loopback import CellScene, TrueStance
+from flangeye_emulators.scanner import CellScene, TrueStance
 from flangeye_emulators.world.scanner import CameraPose, scanner_of
 
 pytestmark = [pytest.mark.realtime, pytest.mark.slow]

@@ -13,8 +13,7 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from flangeye import types as t
-from flangeye.log.foxglove import points_of
-from flangeye.log.layouts import APPLICATION, CLOUDS, foxglove_layout
+from flangeye.log.foxglove import APPLICATION, CLOUDS, foxglove_layout, points_of
 from flangeye.log.record import Recorder
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import parse_recipe

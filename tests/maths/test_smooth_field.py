@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from flangeye.maths.arm_correction import corrected_flange
-from flangeye.maths.geometry import hat, kabsch, rigid
-from flangeye.maths.smooth_field import (
+from flangeye.maths.arm_correction import (
+    corrected_flange,
     displacement,
     effects,
     field_over,
 )
+from flangeye.maths.geometry import hat, kabsch, rigid
 from flangeye.types import ArmCorrection
 
 RNG = np.random.default_rng(0)

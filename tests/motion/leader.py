@@ -10,7 +10,7 @@ from flangeye.models.arc import ArcTimes
 from flangeye.motion.arc import BURN, with_arc
 from flangeye.motion.executor import led
 from flangeye.plugin.stage import BoundPart
-from flangeye_plugins.arc.ur_digital import UrDigitalParams, arc_ur_digital
+from flangeye_plugins.arc import UrDigitalParams, arc_ur_digital
 from tests.motion.stand_in import LIMITS, MODEL
 from tests.plugins.robot.cell import open_ur
 

@@ -17,7 +17,7 @@ from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
 from flangeye.motion.limits import MotionLimits
 from flangeye.motion.touching import Toucher
-from flangeye_emulators.robot.simulated import SimulatedRobot, SimulatedRobotParams
+from flangeye_emulators.robot import SimulatedRobot, SimulatedRobotParams
 
 UR5E = load_model("robots", "ur5e")
 ARM = Arm(UR5E)

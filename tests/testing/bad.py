@@ -34,7 +34,7 @@ from flangeye.run.replay import ReplayedStep
 from flangeye.testing.solving import reference_solution
 from flangeye.types import FLANGE
 from flangeye_emulators.arc import SimulatedArc, SimulatedArcParams
-from flangeye_emulators.robot.simulated import SimulatedRobot, SimulatedRobotParams
+from flangeye_emulators.robot import SimulatedRobot, SimulatedRobotParams
 from flangeye_plugins.fit.rim import fit_rim
 from flangeye_plugins.fit.rim_params import RimParams
 from flangeye_plugins.plan.grid import GridParams, grid

@@ -41,7 +41,7 @@ from flangeye.types import (
 from flangeye.units import SI
 from flangeye_emulators.acquire.simulated import acquire_simulated
 from flangeye_emulators.acquire.simulated_params import SimulatedParams
-from flangeye_emulators.robot.simulated import robot_simulated
+from flangeye_emulators.robot import robot_simulated
 from flangeye_emulators.world.structured_light import StructuredLight
 from flangeye_plugins.acquire.archive import ArchiveParams, acquire_archive
 from flangeye_plugins.cost import cost_axes, cost_translation, cost_work_radius
@@ -51,7 +51,7 @@ from flangeye_plugins.fit.rim import fit_rim
 from flangeye_plugins.fit.sphere import fit_sphere
 from flangeye_plugins.plan.grid import GridParams, grid
 from flangeye_plugins.reader.folder import FolderParams, folder
-from flangeye_plugins.refine.compensate import refine_compensate
+from flangeye_plugins.refine import refine_compensate
 from flangeye_plugins.scanner.watched_folder import (
     WatchedFolderParams,
     scanner_watched_folder,

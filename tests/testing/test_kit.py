@@ -15,7 +15,7 @@ from flangeye.files.recording import Recording
 from flangeye.motion.seam_following import Command
 from flangeye.testing import KITS, devices
 from flangeye.types import CAMERA, FLANGE, PointCloud
-from flangeye_emulators.robot.simulated import SimulatedRobot
+from flangeye_emulators.robot import SimulatedRobot
 from flangeye_plugins.cost import cost_translation
 from flangeye_plugins.fit.rim import fit_rim
 from tests.testing import bad

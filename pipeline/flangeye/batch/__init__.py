@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from flangeye.batch.command import run_batch
+from flangeye.batch.outcome import Request
 from flangeye.batch.progress import summary_text
-from flangeye.batch.request import Request
 
 __all__ = ["Request", "run_batch", "summary_text"]

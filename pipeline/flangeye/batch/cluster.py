@@ -22,9 +22,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from flangeye.batch.dataset import BLOCK
-from flangeye.batch.outcome import SessionOutcome
+from flangeye.batch.outcome import BatchError, SessionOutcome, Tls
 from flangeye.batch.plan import BatchSession
-from flangeye.batch.request import BatchError, Tls
 from flangeye.batch.work import WORKER_DIED, Chunk, ChunkTold, Job, run_chunk, write_rows
 from flangeye.errors import FlangeyeError
 from flangeye.files.processes import keep_current_folder_out, python_command

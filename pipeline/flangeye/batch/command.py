@@ -19,11 +19,10 @@ from flangeye.batch.cluster import (
 )
 from flangeye.batch.dataset import Dataset, Ledger, columns_of
 from flangeye.batch.keys import Software, software_of
+from flangeye.batch.outcome import BatchError, Request
 from flangeye.batch.page import write_page
 from flangeye.batch.plan import BatchPlan, BatchSession, plan
-from flangeye.batch.progress import BatchProgress
-from flangeye.batch.request import BatchError, Request
-from flangeye.batch.tally import Batch, Tally
+from flangeye.batch.progress import Batch, BatchProgress, Tally
 from flangeye.batch.work import READY, STARTS, Job
 from flangeye.errors import FlangeyeError
 from flangeye.files.elsewhere import is_url

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from flangeye.batch.outcome import FINISHED, SessionOutcome
 from flangeye.batch.plan import BatchSession
-from flangeye.files.place import Storage
+from flangeye.files.paths import Storage
 from flangeye.files.yaml_lines import parse_value
 
 if TYPE_CHECKING:

@@ -13,9 +13,8 @@ from urllib.parse import quote
 
 from flangeye import report as run_report
 from flangeye.batch.dataset import Row
-from flangeye.batch.tally import Tally
-from flangeye.files.paths import VERSION
-from flangeye.files.place import Storage
+from flangeye.batch.progress import Tally
+from flangeye.files.paths import VERSION, Storage
 from flangeye.report.look import css
 from flangeye.report.page import packed_plotly
 from flangeye.report.units import degrees, duration, millimetres

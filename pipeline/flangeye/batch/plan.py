@@ -10,7 +10,7 @@ from pathlib import Path, PurePath
 
 from flangeye import types as t
 from flangeye.batch.keys import Fingerprints, Software, common_key, session_key
-from flangeye.batch.request import SEED, BatchError, Request
+from flangeye.batch.outcome import SEED, BatchError, Request
 from flangeye.errors import RecipeError
 from flangeye.files.elsewhere import is_url
 from flangeye.plugin.registry import Registry

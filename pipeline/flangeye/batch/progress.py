@@ -1,22 +1,207 @@
-"""What people see while a batch runs, and at its end."""
+"""What people see while a batch runs, and at its end: the tally of its sessions."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flangeye.batch.outcome import STATUSES, SessionOutcome, Status
+from flangeye.batch.dataset import Kind, Row
+from flangeye.batch.outcome import ACCEPTED, STATUSES, Status
+from flangeye.files.elsewhere import is_url
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+from collections import Counter
+from typing import TYPE_CHECKING
+
+from flangeye.batch.outcome import SessionOutcome
 from flangeye.files.words import printable
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from flangeye.batch.tally import Batch
     from flangeye.batch.work import ChunkTold
+
+
+FIGURES = ("holdout_rms_m", "expected_p95_m", "true_rms_m")
+"""Of which medians are told."""
+
+MOST_LISTED = 1000
+"""Sessions, and variants, in the page's tables, and about as many dots in its plots."""
+
+Names = tuple[Any, ...]
+
+
+@dataclass(frozen=True)
+class VariantTold:
+    """What the sessions of one variant came to.
+
+    Attributes:
+        names: Its values, in the order of :meth:`Tally.by`.
+        counts: Status -> sessions.
+        medians: Figure -> median over the accepted sessions [m]; None without any.
+    """
+
+    names: Names
+    counts: Mapping[Status, int]
+    medians: Mapping[str, float | None]
+
+
+class Tally:
+    """Aggregates of rows; of each row it holds three figures, its status and its variant.
+
+    Attributes:
+        columns: Names, in order.
+        varied: Those of them that the grid sets.
+        total: How many sessions there are.
+        seconds: What all of them took [s].
+        recipe: The first one's, for the title.
+        told: Columns in which any of them says anything.
+        sample: Rows of every so many.
+        common: Folder that all archives have in common; None for URLs, or without archives.
+    """
+
+    def __init__(self, columns: Mapping[str, Kind], varied: Sequence[str], about: int) -> None:
+        self.columns, self.varied = tuple(columns), tuple(varied)
+        self.total, self.seconds, self.recipe = 0, 0.0, "nothing"
+        self.told: set[str] = set()
+        self.sample: list[Row] = []
+        self.common: Path | None = None
+        self._step = 1 + about // MOST_LISTED
+        self._archive: str | None = None
+        self._archives = self._urls = False
+        self._worst: pa.Table | None = None
+        self._variants: dict[Names, int] = {}
+        self._members: list[NDArray[np.int32]] = []
+        self._statuses: list[NDArray[np.int8]] = []
+        self._figures: list[NDArray[np.float64]] = []
+
+    def add(self, table: pa.Table) -> None:
+        """Take in a block, in the order in which its sessions are asked for."""
+        if not len(table):
+            return
+        if not self.total:
+            self.recipe = table["recipe"][0].as_py()
+            self._archive = table["archive"][0].as_py()
+        self.seconds += float(np.sum(table["seconds"].to_numpy()))
+        self.told |= {name for name in self.columns if table[name].null_count < len(table)}
+        every = np.arange(-self.total % self._step, len(table), self._step)
+        self.sample += table.take(every).to_pylist()
+        self.total += len(table)
+        self._add_archives(table)
+        self._add_figures(table)
+        self._add_variants(table)
+        self._add_worst(table)
+
+    @property
+    def counts(self) -> dict[Status, int]:
+        """Status -> sessions."""
+        return _counts(np.concatenate(self._statuses)) if self._statuses else {}
+
+    @property
+    def accepted(self) -> bool:
+        """Whether every session gave a calibration."""
+        return all(status in ACCEPTED for status, n in self.counts.items() if n)
+
+    def figures(self) -> dict[str, NDArray[np.float64]]:
+        """Return what the accepted sessions have: figure -> values [m]."""
+        whole = np.concatenate([np.empty((len(FIGURES), 0)), *self._figures], axis=1)
+        return {name: v[~np.isnan(v)] for name, v in zip(FIGURES, whole, strict=True)}
+
+    def shown(self) -> list[Row]:
+        """Return all rows while they are few, else those without a calibration, then the worst."""
+        return [] if self._worst is None else list(self._worst.to_pylist())
+
+    def by(self) -> list[str]:
+        """Return the columns in which variants differ."""
+        return [*(["archive"] if self._archives else []), *self.varied]
+
+    def variants(self) -> list[VariantTold]:
+        """Return what each variant came to; none where nothing was repeated, or they are many."""
+        if len(self._variants) > MOST_LISTED or len(self._variants) == self.total:
+            return []
+        members, statuses = np.concatenate(self._members), np.concatenate(self._statuses)
+        figures = np.concatenate(self._figures, axis=1)
+        ends = np.flatnonzero(np.diff(np.sort(members))) + 1
+        groups = np.split(np.argsort(members, kind="stable"), ends)
+        return [
+            VariantTold(
+                names if self._archives else names[1:],
+                _counts(statuses[group]),
+                {n: _median(v[group]) for n, v in zip(FIGURES, figures, strict=True)},
+            )
+            for names, group in zip(self._variants, groups, strict=True)
+        ]
+
+    def _add_archives(self, table: pa.Table) -> None:
+        archives = {a for a in table["archive"].unique().to_pylist() if a is not None}
+        self._archives |= bool(archives - {self._archive})
+        self._urls |= any(map(is_url, archives))
+        known = [self.common] if self.common else []
+        paths = [*known, *(Path(archive).parent for archive in archives)]
+        self.common = Path(os.path.commonpath(paths)) if paths and not self._urls else None
+
+    def _add_figures(self, table: pa.Table) -> None:
+        statuses = np.array([STATUSES.index(s) for s in table["status"].to_pylist()], np.int8)
+        figures = [table[name].to_numpy().astype(float) for name in FIGURES]
+        self._statuses.append(statuses)
+        self._figures.append(np.where(statuses < len(ACCEPTED), figures, np.nan))
+
+    def _add_variants(self, table: pa.Table) -> None:
+        if len(self._variants) > MOST_LISTED:
+            return
+        values = [table[name].to_pylist() for name in ("archive", *self.varied)]
+        known = self._variants
+        numbers = [known.setdefault(names, len(known)) for names in zip(*values, strict=True)]
+        self._members.append(np.array(numbers, np.int32))
+
+    def _add_worst(self, table: pa.Table) -> None:
+        import pyarrow as pa
+
+        worst = table if self._worst is None else pa.concat_tables([self._worst, table])
+        if len(worst) > MOST_LISTED:
+            accepted = np.isin(worst["status"].to_pylist(), ACCEPTED)
+            error = np.nan_to_num(worst["holdout_rms_m"].to_numpy().astype(float))
+            worst = worst.take(np.lexsort((-error, accepted))[:MOST_LISTED])
+        self._worst = worst
+
+
+@dataclass(frozen=True)
+class Batch:
+    """What a batch came to.
+
+    Attributes:
+        out: Its folder, path or URL.
+        tally: Aggregates of all sessions.
+        known: How many of them had finished at an earlier start.
+    """
+
+    out: str
+    tally: Tally
+    known: int
+
+    @property
+    def accepted(self) -> bool:
+        """Whether every session gave a calibration."""
+        return self.tally.accepted
+
+
+def _counts(statuses: NDArray[np.int8]) -> dict[Status, int]:
+    numbers = np.bincount(statuses, minlength=len(STATUSES)).tolist()
+    return dict(zip(STATUSES, numbers, strict=True))
+
+
+def _median(values: NDArray[np.float64]) -> float | None:
+    known = values[~np.isnan(values)]
+    return float(np.median(known)) if len(known) else None
 
 
 TOLD_AT_MOST = 10

@@ -33,7 +33,7 @@ from flangeye.batch.outcome import (
 from flangeye.batch.plan import BatchSession
 from flangeye.errors import FlangeyeError, StageError
 from flangeye.files.elsewhere import archive_at, is_url, results_at
-from flangeye.files.place import Storage, place_at
+from flangeye.files.paths import Storage, place_at
 from flangeye.plugin.registry import Registry, load_registry
 from flangeye.recipe.load import Recipe, load_recipe
 from flangeye.run.folder import RunFolder

@@ -148,7 +148,7 @@ def layout(
 ) -> None:
     """Write a layout for logs in Foxglove or Rerun."""
     from flangeye.errors import StageError
-    from flangeye.log.layouts import foxglove_layout, write_rerun_blueprint
+    from flangeye.log.foxglove import foxglove_layout, write_rerun_blueprint
 
     if viewer not in ("foxglove", "rerun"):
         raise StageError(f"no layout for '{viewer}'; known: foxglove, rerun")

@@ -17,7 +17,7 @@ from flangeye.cli.console import at_work, say
 from flangeye.errors import FlangeyeError, NothingMoved
 
 if TYPE_CHECKING:
-    from flangeye.batch.request import Tls
+    from flangeye.batch.outcome import Tls
     from flangeye.doctor.diagnosis import Finding
     from flangeye.plugin.registry import Registry
     from flangeye.recipe.load import Recipe
@@ -284,7 +284,7 @@ def _say_how_to_go_on(recipe: Recipe, called: str, folder: RunFolder, start: Sta
 
 
 def _tls(ca: Path | None, cert: Path | None, key: Path | None) -> Tls | None:
-    from flangeye.batch.request import BatchError, Tls
+    from flangeye.batch.outcome import BatchError, Tls
 
     if ca is None and cert is None and key is None:
         return None

@@ -9,8 +9,8 @@ import numpy as np
 from flangeye.estimation.effects.arm import displacements
 from flangeye.estimation.estimate import Estimate
 from flangeye.estimation.graph import Carrier
-from flangeye.maths.smooth_field import effects as field_effects
-from flangeye.maths.smooth_field import field_over
+from flangeye.maths.arm_correction import effects as field_effects
+from flangeye.maths.arm_correction import field_over
 from flangeye.types import ArmCorrection, Floats
 
 CORRECTED = frozenset({"zeros", "lengths", "twists", "field"})

@@ -207,7 +207,7 @@ class WeldResult(_Part):
 
 
 class FieldResult(_Part):
-    """A smooth displacement over the workspace; flangeye.maths.smooth_field evaluates it."""
+    """A smooth displacement over the workspace; flangeye.maths.arm_correction evaluates it."""
 
     about: Point = Field(description="Middle of the calibration's poses, in the base [m].")
     length: float = Field(description="Correlation length of the field [m].")

@@ -43,7 +43,7 @@ class SmoothField:
     A Gaussian process of low order: the features of the squared-exponential kernel up to the
     second power of the place, less the rigid motion that comes nearest to each over the
     calibration's poses, for that one belongs to the camera's pose. Evaluated by
-    :mod:`flangeye.maths.smooth_field`.
+    :mod:`flangeye.maths.arm_correction`.
 
     Attributes:
         about: (3,) middle of the calibration's poses, in ``base`` [m].

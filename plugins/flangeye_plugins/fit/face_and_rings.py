@@ -17,9 +17,9 @@ from flangeye_plugins.fit.circles import (
     cauchy_weights,
     circle_jacobian,
     circle_residuals,
+    disc_face,
     fit_concentric,
 )
-from flangeye_plugins.fit.face import disc_face
 from flangeye_plugins.fit.rim_params import RimParams
 from flangeye_plugins.fit.uncertainty import STRETCHES, clustered_covariance, plane_covariance
 

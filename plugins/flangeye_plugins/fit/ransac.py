@@ -14,7 +14,7 @@ from flangeye.maths.planes import Plane
 from flangeye.models.targets import Flange
 from flangeye.types import CircleFeature, FlangeCloud, Floats, Rejected, Seed
 from flangeye.units import Length, param
-from flangeye_plugins.fit.face import disc_face
+from flangeye_plugins.fit.circles import disc_face
 from flangeye_plugins.fit.uncertainty import plane_covariance
 
 

@@ -14,7 +14,6 @@ from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
 from flangeye.types import Box, Floats, Seam, VerifiedHandEye, WorkpieceScan
 from flangeye.units import Length, param
-from flangeye_plugins.seam.course import Course, course
 from flangeye_plugins.seam.ends import (
     Rays,
     face_ends,
@@ -32,7 +31,7 @@ from flangeye_plugins.seam.planned import (
     refuse_outside,
 )
 from flangeye_plugins.seam.points import facing_camera
-from flangeye_plugins.seam.rough import JointPlace, rough_path
+from flangeye_plugins.seam.rough import Course, JointPlace, course, rough_path
 from flangeye_plugins.seam.stitched import PlacedScan, seen_in_base
 from flangeye_plugins.seam.sweep import WIDE, Spline, Swept, fitted, swept_from
 from flangeye_plugins.seam.template import EDGES, FACES, JOINTS, JointShape

@@ -20,7 +20,7 @@ from flangeye_emulators.finger.sensor import (
     SimulatedFingerParams,
     sensor_simulated_finger,
 )
-from flangeye_emulators.robot.simulated import SimulatedRobot, SimulatedRobotParams
+from flangeye_emulators.robot import SimulatedRobot, SimulatedRobotParams
 from flangeye_emulators.weld_world.truth import HeatTruth, WeldTruth, WorkpieceTruth
 from tests.plugins.weld.cell import HOME, MODEL, planned, run, true_line
 

@@ -15,8 +15,13 @@ from flangeye.motion.arc import BURN, GAS, OFF, ArcedArm, with_arc
 from flangeye.plugin.stage import BoundPart
 from flangeye.testing import ArcConformance
 from flangeye_emulators.arc import SimulatedArc, SimulatedArcParams, arc_simulated
-from flangeye_plugins.arc.manual import ManualArcParams, arc_manual
-from flangeye_plugins.arc.ur_digital import UrDigitalArc, UrDigitalParams, arc_ur_digital
+from flangeye_plugins.arc import (
+    ManualArcParams,
+    UrDigitalArc,
+    UrDigitalParams,
+    arc_manual,
+    arc_ur_digital,
+)
 from tests.emulators.controllers.process import Process, free_address
 from tests.motion.stand_in import StandIn
 from tests.plugins.robot.cell import until

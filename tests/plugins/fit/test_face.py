@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flangeye.maths.planes import Plane, robust_plane
-from flangeye_plugins.fit.face import _patches, _planes_of_patches, disc_face, likeliest_plane
+from flangeye_plugins.fit.circles import _patches, _planes_of_patches, disc_face, likeliest_plane
 
 NORMAL = np.array([0.0, 0.0, -1.0])
 AT = np.array([0.0, 0.0, 0.6])

@@ -27,9 +27,9 @@ from flangeye.types import (
     by_frame,
 )
 from flangeye_emulators.world.arm import ArmErrors, ImperfectArm
-from flangeye_plugins.export.robot import export_robot
+from flangeye_plugins.export.controllers import export_robot
 from flangeye_plugins.export.writing import NamedParams
-from flangeye_plugins.refine.arm import ArmParams, refine_arm
+from flangeye_plugins.refine import ArmParams, refine_arm
 from flangeye_plugins.solve.robust import RobustParams, solve_robust
 from tests.plugins.fixed import fixed
 

@@ -29,7 +29,7 @@ from flangeye.types import (
     by_frame,
 )
 from flangeye_plugins.error import error_icp
-from flangeye_plugins.refine.compensate import (
+from flangeye_plugins.refine import (
     CompensateParams,
     compensated,
     refine_compensate,

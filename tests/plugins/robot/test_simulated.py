@@ -14,7 +14,7 @@ from flangeye.models.loading import load_model
 from flangeye.types import Transform
 from flangeye_emulators.controllers.arm import SpringSurface
 from flangeye_emulators.controllers.poses import twist_between
-from flangeye_emulators.robot.simulated import SimulatedRobotParams, robot_simulated
+from flangeye_emulators.robot import SimulatedRobotParams, robot_simulated
 
 MODELS = ("ur3e", "ur5", "ur5e", "ur10e", "aubo-i5", "franka-panda")
 

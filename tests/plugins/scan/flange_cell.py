@@ -19,9 +19,9 @@ from flangeye.types import (
     VerifiedHandEye,
     WorkpieceScan,
 )
-from flangeye_emulators.robot.simulated import SimulatedRobot, SimulatedRobotParams
-from flangeye_emulators.scanner.mounted import MountedParams, scanner_mounted
-from flangeye_plugins.scan.along import AlongParams, scan_along
+from flangeye_emulators.robot import SimulatedRobot, SimulatedRobotParams
+from flangeye_emulators.scanner import MountedParams, scanner_mounted
+from flangeye_plugins.scan import AlongParams, scan_along
 
 UR10E, PHOXI = load_model("robots", "ur10e"), load_model("scanners", "phoxi-m")
 HOME = ("90 deg", "-90 deg", "90 deg", "-90 deg", "-90 deg", "0 deg")

@@ -12,7 +12,7 @@ from flangeye.devices import DeviceError
 from flangeye.errors import NothingMoved
 from flangeye.maths.kinematics import Arm
 from flangeye.types import Transform
-from flangeye_emulators.scanner.mounted import MountedParams, scanner_mounted
+from flangeye_emulators.scanner import MountedParams, scanner_mounted
 from flangeye_emulators.world import room
 from tests.plugins.scan.flange_cell import (
     BOX,

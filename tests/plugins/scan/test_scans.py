@@ -11,7 +11,7 @@ from flangeye.devices import Scan, Scanner, ScannerDriver
 from flangeye.files.clouds import write_cloud
 from flangeye.types import CAMERA, PointCloud, Seed
 from flangeye_emulators.scan import SimulatedScanParams, scan_simulated
-from flangeye_plugins.scan.scans import FileScanParams, scan_file, scan_live
+from flangeye_plugins.scan import FileScanParams, scan_file, scan_live
 from tests.plugins.seam.scenes import BASE_T_CAMERA, scanned
 
 CLOUD = PointCloud(CAMERA, np.arange(12, dtype=np.float32).reshape(4, 3))

@@ -7,7 +7,7 @@ import pytest
 
 from flangeye.testing import ScannerConformance
 from flangeye.units import SI
-from flangeye_emulators.scanner.loopback import LoopbackScannerParams, scanner_loopback
+from flangeye_emulators.scanner import LoopbackScannerParams, scanner_loopback
 from flangeye_plugins.scanner.genicam import GenicamParams, scanner_genicam
 from flangeye_plugins.scanner.realsense import RealsenseParams, scanner_realsense
 from tests.emulators.controllers.process import Process

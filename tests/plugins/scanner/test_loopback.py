@@ -17,7 +17,7 @@ from flangeye.models.targets import plate_of
 from flangeye.motion.reach import Reach
 from flangeye.types import BASE, FLANGE, Capture, Transform, by_frame
 from flangeye.units import SI
-from flangeye_emulators.scanner.loopback import LoopbackScannerParams, scanner_loopback
+from flangeye_emulators.scanner import LoopbackScannerParams, scanner_loopback
 from flangeye_emulators.world.scanner import CameraPose
 from flangeye_plugins.fit.rim import fit_rim
 from flangeye_plugins.fit.rim_params import RimParams

@@ -9,8 +9,8 @@ import pytest
 from flangeye.devices import DeviceError
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
-from flangeye_emulators.scanner import loopback
-from flangeye_emulators.scanner.loopback import (
+from flangeye_emulators import scanner as scanners
+from flangeye_emulators.scanner import (
     CellScene,
     LoopbackScannerParams,
     TrueStance,
@@ -43,7 +43,7 @@ def prepared(monkeypatch: pytest.MonkeyPatch) -> list[TrueStance]:
 
 
 def opened(monkeypatch: pytest.MonkeyPatch, control: Control) -> Any:
-    monkeypatch.setattr(loopback, "EmulatorControl", lambda *_, **__: control)
+    monkeypatch.setattr(scanners, "EmulatorControl", lambda *_, **__: control)
     return scanner_loopback(PHOXI, LoopbackScannerParams(host="127.0.0.5", robot="ur5e"))
 
 

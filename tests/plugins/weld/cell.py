@@ -15,7 +15,7 @@ from flangeye_emulators.finger.sensor import (
     SimulatedFingerParams,
     sensor_simulated_finger,
 )
-from flangeye_emulators.robot.simulated import SimulatedRobot, SimulatedRobotParams
+from flangeye_emulators.robot import SimulatedRobot, SimulatedRobotParams
 from flangeye_emulators.weld_world.truth import WeldTruth
 from flangeye_plugins.weld.settings import WeldTactileParams
 from flangeye_plugins.weld.tactile import weld_tactile

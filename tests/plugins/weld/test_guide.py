@@ -19,9 +19,9 @@ from flangeye.plugin.registry import load_registry
 from flangeye.recipe.find import find_recipe
 from flangeye.recipe.load import load_recipe
 from flangeye_emulators.finger.sensor import typical_compliance
-from flangeye_emulators.robot.simulated import SimulatedRobot, SimulatedRobotParams
-from flangeye_plugins.guide import tactile
-from flangeye_plugins.guide.tactile import guide_tactile
+from flangeye_emulators.robot import SimulatedRobot, SimulatedRobotParams
+from flangeye_plugins import guide
+from flangeye_plugins.guide import guide_tactile
 from tests.plugins.weld.cell import HOME, MODEL
 from tools.readme import same
 
@@ -135,7 +135,7 @@ def test_the_guard_has_a_real_arm_while_it_is_driven_and_only_then(
         yield arm
         happened.append("guard ends")
 
-    monkeypatch.setattr(tactile, "led", guarding)
+    monkeypatch.setattr(guide, "led", guarding)
     recipe = loaded(HELD)
     recipe.context[RobotDriver] = RobotDriver("robot.ur_rtde", lambda: arm)
     guide_tactile.function(

@@ -17,8 +17,8 @@ from flangeye.plugin.registry import load_registry
 from flangeye.recipe.find import find_recipe
 from flangeye.recipe.load import load_recipe
 from flangeye.units import parse_quantity
-from flangeye_emulators.robot.simulated import SimulatedRobot, SimulatedRobotParams
-from flangeye_plugins.guide.tactile import ATTITUDES, Pivoted, guide_tool, with_body
+from flangeye_emulators.robot import SimulatedRobot, SimulatedRobotParams
+from flangeye_plugins.guide import ATTITUDES, Pivoted, guide_tool, with_body
 from flangeye_plugins.weld.belief import belief_of
 from flangeye_plugins.weld.body import body_of
 from flangeye_plugins.weld.settings import Following

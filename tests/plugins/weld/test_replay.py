@@ -16,7 +16,7 @@ from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
 from flangeye.plugin.registry import load_registry
 from flangeye.run.replay import replay_steps
-from flangeye_plugins.sensor.recorded import McapParams, sensor_mcap
+from flangeye_plugins.sensor import McapParams, sensor_mcap
 from flangeye_plugins.weld.touch.tag_observation import TagDetector
 from tests.plugins.weld.cell import planned, run
 

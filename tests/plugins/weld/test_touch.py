@@ -15,12 +15,13 @@ from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
 from flangeye.types import Image
 from flangeye_emulators.finger.sensor import FingerCamera, Optics, typical_compliance
-from flangeye_plugins.sensor.opencv import OpenCVParams, sensor_opencv
-from flangeye_plugins.sensor.recorded import (
+from flangeye_plugins.sensor import (
     ImageFolderParams,
     McapParams,
+    OpenCVParams,
     sensor_image_folder,
     sensor_mcap,
+    sensor_opencv,
 )
 from flangeye_plugins.weld.touch.calibration import Held, calibrate
 from flangeye_plugins.weld.touch.tag_observation import TagDetector

@@ -16,10 +16,10 @@ import numpy as np
 
 from flangeye.estimation.effects.effect import Block, Effect
 from flangeye.estimation.graph import Carrier, Linear, Problem
+from flangeye.maths.arm_correction import effects as field_effects
+from flangeye.maths.arm_correction import field_over
 from flangeye.maths.geometry import hat, rotation_log
 from flangeye.maths.kinematics import Arm
-from flangeye.maths.smooth_field import effects as field_effects
-from flangeye.maths.smooth_field import field_over
 from flangeye.types import Floats, SmoothField
 
 KINDS = {

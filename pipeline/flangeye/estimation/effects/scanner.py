@@ -1,7 +1,7 @@
 r"""Errors of a depth scanner that are the same at every pose: a smooth distortion, rounded edges.
 
 Poses held out do not show them, for they err alike; only the size is known, by the scanner's model.
-The distortion is a field of :mod:`flangeye.maths.smooth_field` over the view (right, down, depth,
+The distortion is a field of :mod:`flangeye.maths.arm_correction` over the view (right, down, depth,
 each from -1 to 1), without the rigid motion nearest to it over the whole volume: that part is where
 the camera is.
 """
@@ -16,8 +16,8 @@ import numpy as np
 
 from flangeye.estimation.effects.effect import Effect
 from flangeye.estimation.graph import Linear, Problem, Sightings
+from flangeye.maths.arm_correction import features
 from flangeye.maths.geometry import hat, stack_rows
-from flangeye.maths.smooth_field import features
 from flangeye.models.scanners import ScannerModel
 from flangeye.types import Floats
 

@@ -7,7 +7,7 @@ place and orientation, with weights :math:`w`, and independent noise beyond:
 .. math:: e(u) = \sum_k f_k(u) w_k + \varepsilon, \quad w_k \sim N(0, s^2), \quad
     \varepsilon \sim N(0, n^2)
 
-with the features of :mod:`flangeye.maths.smooth_field`, to second order in place and first in
+with the features of :mod:`flangeye.maths.arm_correction`, to second order in place and first in
 orientation. The sizes :math:`s` and :math:`n`, of places and of tilts, are those that make the
 calibration's residuals likeliest while the camera is free.
 """
@@ -19,8 +19,8 @@ from itertools import product
 
 import numpy as np
 
+from flangeye.maths.arm_correction import RADII, features
 from flangeye.maths.geometry import hat, nearest_rotation, rotation_log
-from flangeye.maths.smooth_field import RADII, features
 from flangeye.types import Floats
 
 POWERS = tuple(

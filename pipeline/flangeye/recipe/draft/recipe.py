@@ -15,8 +15,7 @@ from flangeye.files.clouds import CONVERSIONS, read_cloud
 from flangeye.files.recording import Archive, NotThisLayout
 from flangeye.files.scans import CLOUDS, IMAGES
 from flangeye.files.tables import tables_in
-from flangeye.files.yaml_edit import entry, flow
-from flangeye.files.yaml_lines import parse_value
+from flangeye.files.yaml_lines import entry, flow, parse_value
 from flangeye.models.loading import load_model
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerData, detect_unit, median_distance

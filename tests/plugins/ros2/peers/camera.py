@@ -26,7 +26,7 @@ from flangeye.maths.kinematics import Arm
 from flangeye.models.boards import Board
 from flangeye.models.loading import load_model
 from flangeye.types import CAMERA, PointCloud
-from flangeye_emulators.scanner.loopback import CellScene, TrueStance
+from flangeye_emulators.scanner import CellScene, TrueStance
 from flangeye_emulators.world.board_image import BoardCamera, render_board
 from flangeye_emulators.world.scanner import CameraPose, scanner_of
 from flangeye_plugins.acquire.camera import image_of_cloud

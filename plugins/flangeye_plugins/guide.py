@@ -1,4 +1,4 @@
-"""``flangeye tactile calibrate``: a person, an arm and a finger find out how the finger moves."""
+"""``guide.tactile``: lead a person through the calibration of a finger."""
 
 from __future__ import annotations
 

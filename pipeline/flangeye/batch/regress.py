@@ -1,4 +1,4 @@
-"""Run the recordings that exist as one batch, and compare each with its manifest."""
+"""``flangeye regress``: recordings with what is known of them, run as a batch and compared."""
 
 from __future__ import annotations
 
@@ -14,12 +14,11 @@ from pydantic import Field
 from flangeye.batch.command import run_sessions
 from flangeye.batch.dataset import Dataset, Ledger, columns_of
 from flangeye.batch.keys import software_of
-from flangeye.batch.outcome import SessionOutcome
+from flangeye.batch.outcome import Request, SessionOutcome
 from flangeye.batch.plan import BatchSession, plan
-from flangeye.batch.request import Request
 from flangeye.doctor import examine, open_session
 from flangeye.errors import FlangeyeError, RecipeError
-from flangeye.files.place import place_at
+from flangeye.files.paths import place_at
 from flangeye.models.model import Model, read_model
 from flangeye.units import Length
 
@@ -220,3 +219,6 @@ def _checked(file: Path) -> Manifest:
     if (manifest.expected.closure is None) != (manifest.expected.tolerance is None):
         raise RecipeError(f"{file}: expected.closure and expected.tolerance go together")
     return manifest
+
+
+__all__ = ["Manifest", "ManifestComparison", "compare", "read_manifests"]

@@ -1,1 +1,0 @@
-"""``robot.simulated`` and ``robot.emulator``: arms without hardware."""

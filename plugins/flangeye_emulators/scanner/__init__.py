@@ -1,1 +1,0 @@
-"""``scanner.emulator``: a scanner that sees a simulated cell."""

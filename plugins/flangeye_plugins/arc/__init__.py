@@ -1,1 +1,0 @@
-"""Kind ``arc``: welding power sources, for weld.tactile."""

@@ -1,1 +1,0 @@
-"""``guide.*``: procedures that guide a person in measuring. Add one: a new module here."""

@@ -1,1 +1,0 @@
-"""``refine.*``: change a calibration after solving. Add a refinement: a new module here."""
