@@ -51,8 +51,6 @@ TAKEN, LEFT_OUT = "#2e9e5b", "#d64545"
 """Colours of poses and of what is left at them."""
 SHAFT, TIP = 0.002, 0.006
 """Radii of an arrow [m]."""
-MOST_SENT = 2_500
-"""Points of a cloud that are sent: 20,000 held a browser up for a second on two busy cores."""
 DARK = "body.body--dark .scene canvas {filter: invert(0.88) hue-rotate(180deg)}"
 """At night what is light is dark and colours keep their hue: a scene has one background only."""
 
@@ -171,7 +169,9 @@ class Scene3D(ui.scene):
 
     def cloud(self, points: Floats, colour: str, size: float = 0.002) -> None:
         """Draw a cloud, thinned and to 0.1 mm, in one colour, its points of a size [m]."""
-        few = np.round(points[:: 1 + len(points) // MOST_SENT], 4)
+        # Points of a cloud that are sent: 20,000 held a browser up for a second on two busy cores
+        most_sent = 2_500
+        few = np.round(points[:: 1 + len(points) // most_sent], 4)
         with self:
             self.point_cloud(few.tolist(), point_size=size).material(colour)
 

@@ -29,9 +29,6 @@ PUBLISHED = {
     "franka-panda": "panda_description/urdf/panda.urdf",
 }  # fmt: skip
 """URDFs of the package ``example-robot-data`` that have the meshes of an arm, by model."""
-PUBLISHED_WITHIN = 5e-3
-"""An arm whose flange stands farther than this from the published one's is not drawn by its meshes:
-ten times what a correction of an arm's lengths changes [m]."""
 KEPT = {"cache-control": "private, max-age=3600"}
 
 
@@ -94,7 +91,10 @@ def _published(robot: RobotModel, joints: Floats) -> RobotModel | None:
     if found is None or len(found.joints) != len(robot.joints):
         return None
     apart = Arm(found).flange(joints) - Arm(robot).flange(joints)
-    return found if np.linalg.norm(apart[:3, 3]) < PUBLISHED_WITHIN else None
+    # An arm whose flange stands farther than this from the published one's is not drawn by its
+    # meshes: ten times what a correction of an arm's lengths changes [m]
+    published_within = 5e-3
+    return found if np.linalg.norm(apart[:3, 3]) < published_within else None
 
 
 @cache

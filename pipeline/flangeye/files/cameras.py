@@ -45,8 +45,6 @@ COLMAP: Mapping[str, tuple[str, ...]] = {
     "FULL_OPENCV": ("fx", "fy", "cx", "cy", *ORDER),
 }
 """Parameters of COLMAP's models that are OpenCV's (COLMAP, camera models)."""
-MOST_COEFFICIENTS = 14
-"""OpenCV's longest row of coefficients."""
 CORNER = 0.5
 """In COLMAP the centre of the first pixel is at this [px]; in OpenCV at 0."""
 OTHER_LENSES = ("equidistant", "fisheye", "kannala", "fov", "inverse", "omni", "ds", "eucm")
@@ -201,7 +199,9 @@ def _text(path: Path, lines: list[str]) -> CameraFile | None:
 def _checked(path: Path, matrix: Floats, lens: Iterable[float]) -> CameraFile | None:
     """Return a calibration; None where the matrix is no camera's."""
     coefficients = np.asarray(lens, dtype=np.float64).ravel()
-    sound = len(coefficients) <= MOST_COEFFICIENTS and np.isfinite(coefficients).all()
+    # OpenCV's longest row of coefficients
+    most_coefficients = 14
+    sound = len(coefficients) <= most_coefficients and np.isfinite(coefficients).all()
     return CameraFile(path, matrix, coefficients) if sound and _is_camera(matrix) else None
 
 

@@ -36,10 +36,6 @@ FINER = 16
 """Samples for one, where a root may hide."""
 
 
-ROOT_STEPS = 12
-"""Steps from a bracket to a root at most; most take two."""
-
-
 # One sample more at each end: each has both its neighbours.
 _PITCH = 2 * np.pi / SAMPLES
 _COARSE = np.arange(-1.0, SAMPLES + 1)
@@ -165,7 +161,9 @@ class OffsetWrist:
         """
         way, (a, b, fa, fb) = brackets[0].astype(int), brackets[1:]
         at = a + (b - a) * fa / (fa - fb)
-        for _ in range(ROOT_STEPS):
+        # Steps from a bracket to a root at most; most take two
+        root_steps = 12
+        for _ in range(root_steps):
             value = self._posture(orbits, at, way)[0]
             same = value * fa > 0
             c, fc = np.where(same, a, b), np.where(same, fa, fb)

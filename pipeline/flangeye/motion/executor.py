@@ -22,9 +22,6 @@ from flangeye.motion.route import Leg, Route
 from flangeye.motion.supervision import STANDING, SafetyFault, Supervisor
 from flangeye.types import Floats, Transform
 
-PATIENT = 10.0
-"""Longest time for an arm to come to rest [s]."""
-
 
 class Executor:
     """An open arm under watch.
@@ -108,7 +105,9 @@ class Executor:
         )
         began = self.tick().time_ns
         while (state := self.tick()).mode == "moving" or _moves(state):
-            if state.time_ns - began > PATIENT * 1e9:
+            # Longest time for an arm to come to rest [s]
+            patient = 10.0
+            if state.time_ns - began > patient * 1e9:
                 raise DeviceError(f"{self.robot.name}: does not come to rest")
         return state
 

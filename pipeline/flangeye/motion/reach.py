@@ -15,12 +15,6 @@ from flangeye.motion.clearance import ArmVolume
 from flangeye.motion.limits import MotionLimits
 from flangeye.types import Floats
 
-VIEW_SHARE = 0.95
-"""Share of the field of view, to either side, that a planned flange keeps to."""
-
-FOLD = np.radians(120.0)
-"""An arm that is under way does not turn a joint farther from home: it would fold over."""
-
 ROLLS = 8
 """How many directions of the flange's x axis are tried for the one the arm likes best."""
 
@@ -153,7 +147,9 @@ class Reach:
         if nearest is None:
             self._refuse(base_T_flange, self._why_not(reachable))
             return None
-        if self._start is not None and _turn(nearest, self.home) > FOLD:
+        # An arm that is under way does not turn a joint farther from home: it would fold over
+        fold = np.radians(120.0)
+        if self._start is not None and _turn(nearest, self.home) > fold:
             self._refuse(base_T_flange, "only with the arm folded over")
             return None
         return nearest
@@ -233,5 +229,7 @@ def _turn(first: Floats, second: Floats) -> float:
 
 def _within(points: Floats, field: tuple[float, float]) -> bool:
     """Return whether (N, 3) points before a pinhole lie in its field of view, with a margin."""
-    half = np.tan(np.asarray(field) / 2) * VIEW_SHARE
+    # Share of the field of view, to either side, that a planned flange keeps to
+    view_share = 0.95
+    half = np.tan(np.asarray(field) / 2) * view_share
     return bool((np.abs(points[:, :2]) <= half * points[:, 2:]).all())

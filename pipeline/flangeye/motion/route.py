@@ -16,11 +16,6 @@ from flangeye.units import in_mm
 LARGEST_TURN = np.radians(2.0)
 """Largest turn of a joint between two checked postures [rad]."""
 
-JOINT_ACCELERATION = np.radians(60.0)
-"""Of the leading joint [rad/s^2]: a slow default, below what any arm here can do."""
-
-FINER = 8
-"""Postures timed for each that is checked: between those the flange may be a percent faster."""
 
 TABLE = 0.0
 """Height of the table the arm stands on, in ``base`` [m]."""
@@ -91,7 +86,9 @@ class Router:
         for posture, frame, place in zip(postures, frames, places, strict=True):
             if why := self._bars(posture, frame, place):
                 return Barred(why)
-        return self._timed(start, goal, FINER * count)
+        # Postures timed for each that is checked: between those the flange may be a percent faster
+        finer = 8
+        return self._timed(start, goal, finer * count)
 
     def _bars(self, joints: Floats, frames: Floats, place: Floats) -> str | None:
         """Say why the arm must not be in a posture."""
@@ -111,6 +108,8 @@ class Router:
         lever = float(np.linalg.norm(np.diff(places, axis=0), axis=1).max()) / max(each, 1e-9)
         limits = self._limits
         speed = min(limits.joint_speed, limits.speed / max(lever, 1e-6))
-        acceleration = min(JOINT_ACCELERATION, limits.acceleration / max(lever, 1e-6))
+        # Of the leading joint [rad/s^2]: a slow default, below what any arm here can do
+        joint_acceleration = np.radians(60.0)
+        acceleration = min(joint_acceleration, limits.acceleration / max(lever, 1e-6))
         ramp = min(speed / acceleration, np.sqrt(turn / acceleration))
         return Leg(goal, speed, acceleration, turn / speed + ramp)

@@ -14,9 +14,6 @@ from flangeye.motion.limits import MotionLimits
 from flangeye.motion.route import Leg
 from flangeye.types import Floats
 
-SETTLED = 0.1
-"""An arm has settled when it stood for this long [s]."""
-
 STANDING = 1e-3
 """No joint turns faster on an arm that stands [rad/s]."""
 
@@ -34,12 +31,6 @@ SLACK = 0.003
 
 FAST = 1.3
 """A joint faster than its limit, and this much, is a safety fault."""
-
-BRAKING = 2.0
-"""An arm that still moves so long after it was stopped is moved by somebody else [s]."""
-
-AGREE = 0.01
-"""The controller's flange and that of the arm's model are one place to within this [m]."""
 
 
 class SafetyFault(Exception):
@@ -125,7 +116,9 @@ class Supervisor:
             raise SafetyFault(f"the arm has {len(state.joints)} joints, its model {self._arm.n}")
         modelled = self._arm.flange(state.joints)[:3, 3]
         apart = float(np.linalg.norm(modelled - state.base_T_flange.translation))
-        if apart > AGREE:
+        # The controller's flange and that of the arm's model are one place to within this [m]
+        agree = 0.01
+        if apart > agree:
             raise SafetyFault(
                 f"the controller's flange is {apart * 1e3:.0f} mm from where the robot's model "
                 "has it: is a tool set in the controller, or is it another model?"
@@ -141,7 +134,9 @@ class Supervisor:
 
     def _keep_still(self, state: RobotState) -> None:
         moves = np.abs(state.joint_speeds).max() > 10 * STANDING
-        if moves and (state.time_ns - self._halted_ns) * 1e-9 > BRAKING:
+        # An arm that still moves so long after it was stopped is moved by somebody else [s]
+        braking = 2.0
+        if moves and (state.time_ns - self._halted_ns) * 1e-9 > braking:
             raise SafetyFault(
                 "the arm moves without a command from here: another program drives it and goes on; "
                 "stop it at the controller, then start again"
@@ -196,7 +191,9 @@ class Supervisor:
             self._stood_ns = 0
             return False
         self._stood_ns = self._stood_ns or state.time_ns
-        return (state.time_ns - self._stood_ns) * 1e-9 >= SETTLED
+        # An arm has settled when it stood for this long [s]
+        settled = 0.1
+        return (state.time_ns - self._stood_ns) * 1e-9 >= settled
 
 
 def _require_numbers(state: RobotState) -> None:

@@ -18,8 +18,6 @@ from flangeye.motion.planning import read_state
 from flangeye.motion.route import Barred, Route, Router
 from flangeye.types import Floats
 
-ABOVE = 0.05
-"""The tip goes to this distance before a point first, then on along the tool [m]."""
 SHORT = 0.005
 """It stops this far before the point [m]: a wrong matrix must not drive it into the work."""
 SLOW = 0.02
@@ -111,7 +109,9 @@ class Toucher:
         arm, router = Arm(self.model), Router(self.model, self._slowly(), joints)
         along = turn @ (self.tip / np.linalg.norm(self.tip))
         ways = []
-        for before in (ABOVE, SHORT):
+        # The tip goes to this distance before a point first, then on along the tool [m]
+        above = 0.05
+        for before in (above, SHORT):
             pose = rigid(turn, point - before * along - turn @ self.tip)
             found = arm.inverse_near(pose, joints[None])
             way = router.route(joints, found[0]) if len(found) else Barred("out of the arm's reach")

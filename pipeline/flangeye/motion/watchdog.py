@@ -67,9 +67,6 @@ AT_REST = 1.0
 SLOW, HUNG = 2.0 * GRACE, 10.0 * GRACE
 """A program that leads the arm and is late: the arm is stopped, and is led no more [s]."""
 
-LISTENING = 0.5
-"""Share of a cycle in which a guard that is asked for states waits for the next word."""
-
 
 class Charge(NamedTuple):
     """What a guard is given.
@@ -200,7 +197,9 @@ class Watchdog:
     def _tell_cycle(self, state: RobotState) -> None:
         """Answer who waits for the next cycle: never unasked, a full wire would hold the guard."""
         if self._asked:
-            self._asked, self._listens = False, LISTENING * self._robot.period
+            # Share of a cycle in which a guard that is asked for states waits for the next word
+            listening = 0.5
+            self._asked, self._listens = False, listening * self._robot.period
             self._wire.send(Report("cycle", state))
 
     def _keep_led(self) -> None:

@@ -32,8 +32,6 @@ from flangeye.result.contract import (
     WorkspaceResult,
 )
 
-LEAST_USED = 0.5
-"""Share of captures that a sound session uses at least. Of our choice."""
 Robots = tuple[Layout, Arm | None]
 
 
@@ -99,7 +97,9 @@ def standing_warnings(result: Result) -> list[WarningResult]:
         fix = "add '- verify.holdout' after the solver"
         found.append(("no verify step judged this calibration", fix))
     used, count = sum(o.used for o in result.observations), len(result.observations)
-    if used < LEAST_USED * count and not (result.refused and used == 0):
+    # Share of captures that a sound session uses at least. Of our choice
+    least_used = 0.5
+    if used < least_used * count and not (result.refused and used == 0):
         text = f"{count - used} of {count} captures were rejected"
         found.append((text, "look for the cause: flangeye doctor RUN"))
     if unlike := _unlike(result):

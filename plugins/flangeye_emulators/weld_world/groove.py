@@ -214,7 +214,9 @@ class TipContact:
         beside, seat = joint.seat(self._tip.radius)
         top = self._groove.section.depth + self._tip.radius
         wall = joint.left if across >= beside else joint.right
-        edge = (top - seat) * math.tan(wall) if wall < FLAT else math.inf
+        # A wall that leans by more has no end: it is the plate itself
+        flat = math.radians(80.0)
+        edge = (top - seat) * math.tan(wall) if wall < flat else math.inf
         if not self._in_groove and abs(across - beside) > edge:
             return self._on_face(across, up, top)
         y, z = self._between_walls(across - beside, up - seat, joint, stiff)
@@ -287,10 +289,6 @@ class TipContact:
         lag = min(max(self._stuck - self._s, -most), most)
         self._stuck = self._s + lag
         return lag
-
-
-FLAT = math.radians(80.0)
-"""A wall that leans by more has no end: it is the plate itself."""
 
 
 def _wall(side: int, angle: float) -> tuple[Floats, Floats]:

@@ -18,9 +18,6 @@ MIXING = 0.6
 """Standard deviation of the spot that one pixel sees [px]: what makes pixels fly at edges."""
 
 
-HIGHLIGHT = float(np.radians(3.0))
-"""Half width of the mirror image of the lamp, which saturates pixels."""
-
 DIGIT = 1e-3
 """Depths are whole millimetres."""
 
@@ -72,7 +69,9 @@ class TimeOfFlight:
         out &= strength > 0.01
         angle = np.arccos(np.minimum(cosine, 1.0))
         # The lamp is beside the lens: a mirror returns its light where it faces the camera.
-        dazzled = scene.figure("gloss", hits.body) * np.exp(-((angle / HIGHLIGHT) ** 2))
+        # Half width of the mirror image of the lamp, which saturates pixels
+        highlight = float(np.radians(3.0))
+        dazzled = scene.figure("gloss", hits.body) * np.exp(-((angle / highlight) ** 2))
         at = np.nonzero(out & (dazzled > 0.01))
         out[at] = grain[::-1][at] > normal_quantile(dazzled[at])
         return np.asarray(out)

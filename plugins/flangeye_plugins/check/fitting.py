@@ -25,9 +25,6 @@ TAILS = 4.0
 """Degrees of freedom of the errors' distribution."""
 FINEST_ANGLE = 1e-4
 """No scanner and no arm is better than this [rad]."""
-FIT_STEPS = 15
-DAMPING = 1e-9
-"""Share of the information that is added to every direction, for those nothing is known of."""
 
 
 class ErrorBlock(NamedTuple):
@@ -79,7 +76,8 @@ def fit(equations: Equations) -> VariantFits:
     unknowns = start_of(equations)
     blocks = _blocks(equations, unknowns)
     scales = [_first_scale(block) for block in blocks]
-    for _ in range(FIT_STEPS):
+    fit_steps = 15
+    for _ in range(fit_steps):
         weights = [_weights(b, s) for b, s in zip(blocks, scales, strict=True)]
         information, gradient = _normal_equations(blocks, weights, scales)
         unknowns = _moved(unknowns, _solved(information, gradient))
@@ -202,7 +200,9 @@ def _solved(information: Floats, gradient: Floats) -> Floats:
     diagonal = np.einsum("kii->ki", information)
     size = np.sqrt(np.maximum(diagonal, 1e-300))
     p = information.shape[-1]
-    scaled = information / (size[:, :, None] * size[:, None, :]) + DAMPING * np.eye(p)
+    # Share of the information that is added to every direction, for those nothing is known of
+    damping = 1e-9
+    scaled = information / (size[:, :, None] * size[:, None, :]) + damping * np.eye(p)
     return np.asarray(-np.linalg.solve(scaled, (gradient / size)[..., None])[..., 0] / size)
 
 

@@ -26,8 +26,6 @@ from flangeye_plugins.check.significance import (
 )
 
 SHIFTS = (1, -1, 2, -2, 3, -3)
-FEWEST_LEFT = 5
-"""Samples with a target that an alternative must leave."""
 DELAYS = 24
 """Delays tried on each side of none, up to the time between samples three times over."""
 
@@ -179,7 +177,9 @@ def _fits(
 ) -> tuple[VariantFits, VariantFits, Indices] | None:
     """Return fits as given, of the others, and which of the former has the samples of each."""
     known = np.array([other.known for other in others])
-    enough = (known & session.seen).sum(axis=1) >= FEWEST_LEFT
+    # Samples with a target that an alternative must leave
+    fewest_left = 5
+    enough = (known & session.seen).sum(axis=1) >= fewest_left
     if not enough.any():
         return None
     # Those with too few samples are put in as the session is, which is no better than itself.
@@ -271,8 +271,6 @@ def _left_out(session: RecordedSession, wrong: NDArray[np.bool_], name: str, wha
     )
 
 
-SPARE = 2
-"""Samples on each side of a move beyond those that a calibration takes up."""
 OFFSET = 1e-3
 """A seen circle further than this from where the arm has it is a mistake [m]."""
 
@@ -283,7 +281,9 @@ def moved(session: RecordedSession) -> Findings:
     session.require_samples()
     null = fit_of(session)
     seen = np.flatnonzero(session.seen)
-    each = SPARE + int(np.ceil(null.parameters * len(seen) / null.count[0]))
+    # Samples on each side of a move beyond those that a calibration takes up
+    spare = 2
+    each = spare + int(np.ceil(null.parameters * len(seen) / null.count[0]))
     starts = seen[each : len(seen) - each + 1]
     if not len(starts):
         raise NotApplicable(f"{len(seen)} samples are too few for two calibrations")

@@ -21,10 +21,6 @@ FLIPS: dict[str, Floats] = {
     "a quarter turn about its normal": rotation_exp(np.array([0, 0, np.pi / 2])),
     "a quarter turn back about its normal": rotation_exp(np.array([0, 0, -np.pi / 2])),
 }
-FLIP_WITHIN = 0.2
-"""A flip explains a rotation that is within this of it [rad]."""
-LARGEST_SHARE = 0.5
-"""If more of the samples are wrong, it is not they."""
 
 
 @part("check.outlier")
@@ -74,7 +70,9 @@ def flips(session: RecordedSession) -> Findings:
         raise NotApplicable("no marker's whole pose was measured")
     null = fit_of(session)
     which = _flipped(session, null)
-    if not (which >= 0).any() or (which >= 0).sum() > LARGEST_SHARE * session.seen.sum():
+    # If more of the samples are wrong, it is not they
+    largest_share = 0.5
+    if not (which >= 0).any() or (which >= 0).sum() > largest_share * session.seen.sum():
         return
     turned = np.array(session.rotations)
     for index, flip in zip(np.flatnonzero(which >= 0), which[which >= 0], strict=True):
@@ -106,7 +104,9 @@ def _flipped(
     candidates = np.stack(list(FLIPS.values()))
     cosines = (np.einsum("nij,fij->nf", apart, candidates) - 1) / 2
     best = np.argmax(cosines, axis=1)
-    near = cosines[np.arange(len(best)), best] > np.cos(FLIP_WITHIN)
+    # A flip explains a rotation that is within this of it [rad]
+    flip_within = 0.2
+    near = cosines[np.arange(len(best)), best] > np.cos(flip_within)
     return np.where(near, best, -1)
 
 

@@ -32,10 +32,6 @@ ARMS = (0.1, 4.0)
 """Median distance of a flange from its base [m], from the smallest arm to the largest."""
 
 
-DECIMALS = (0.1, 1e-2, 1e-3, 1e-4, 1e-5)
-"""Last decimals of positions in metres, millimetres and so on [m]."""
-
-
 CALIBRATE = (
     "calibrate the camera: add board: {kind: …, columns: …, rows: …, square: …} to acquire.images, "
     "which finds it by its views of the board"
@@ -290,7 +286,9 @@ def rounding(session: RecordedSession) -> Findings:
 
 def _step(places: Floats) -> float | None:
     """Return the coarsest step [m] that all coordinates are multiples of; None for none."""
-    for step in DECIMALS:
+    # Last decimals of positions in metres, millimetres and so on [m]
+    decimals = (0.1, 1e-2, 1e-3, 1e-4, 1e-5)
+    for step in decimals:
         multiples = places / step
         # By what share of the step a position may miss a multiple of it
         if len(places) and np.abs(multiples - np.round(multiples)).max() < 1e-3:

@@ -21,7 +21,6 @@ from flangeye.types import Floats, Image, PointCloud
 
 PRIOR_FREEDOM = 8
 """What is expected of the corners' noise counts as much as so many coordinates."""
-REFINE_STEPS = 10
 REACH = 3
 """Half the window about a corner whose points give its depth [px]."""
 
@@ -88,7 +87,8 @@ def _vector(column: object) -> Floats:
 def _least_squares(corners: Corners, image: Image, start: Floats, expected: float) -> PlanarPose:
     """Refine a pose by Gauss-Newton on the reprojection errors."""
     pose = start
-    for _ in range(REFINE_STEPS):
+    refine_steps = 10
+    for _ in range(refine_steps):
         errors, jacobian = reprojection(corners, image, pose)
         step = np.asarray(-np.linalg.lstsq(jacobian, errors, rcond=None)[0], dtype=np.float64)
         pose = rigid(rotation_exp(step[:3]) @ pose[:3, :3], pose[:3, 3] + step[3:])

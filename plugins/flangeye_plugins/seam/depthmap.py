@@ -10,9 +10,6 @@ from flangeye.types import Floats, Singles
 
 COARSE_CELLS = 128
 """Cells along the longer side, in which the density of the points is taken."""
-PER_CELL = 4.0
-"""Points a pixel of the map should get, so that none is empty by chance."""
-MOST_PIXELS = 2000
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,4 +67,7 @@ def _pitch(rays: Singles, low: Singles, high: Singles) -> float:
     cells = ((rays - low) / np.float32(cell)).astype(int) @ [2 * COARSE_CELLS, 1]
     counts = np.unique(cells, return_counts=True)[1]
     spacing = cell / np.sqrt(max(float(np.median(counts)), 1.0))
-    return float(max(spacing * np.sqrt(PER_CELL), float((high - low).max()) / MOST_PIXELS))
+    # Points a pixel of the map should get, so that none is empty by chance
+    per_cell = 4.0
+    most_pixels = 2000
+    return float(max(spacing * np.sqrt(per_cell), float((high - low).max()) / most_pixels))

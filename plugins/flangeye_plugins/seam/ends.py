@@ -13,14 +13,10 @@ from flangeye_plugins.seam.template import EDGES, Section
 
 FEWEST_LANES = 5
 """Lanes that an end is known from."""
-LOOSE = 0.5e-3
-"""An end that is known less well is not sharp [m]."""
 TWO = 2.0
 """Lanes whose middle half is spread over more pixels end at two places."""
 AROUND = 0.06
 """Directions about a line in which the scanner may look past it: 40 mm at 0.7 m [rad]."""
-SIGMA_OF_IQR = 0.7413
-"""Of a normal distribution, from its quartiles' distance."""
 SEAM_WITHIN = 8e-3
 """Lanes this near to the seam say where it ends [m]."""
 
@@ -99,7 +95,9 @@ class End:
     @property
     def sharp(self) -> bool:
         """Whether the last points of the surface are at one place, and nothing is over it there."""
-        return self.deviation < LOOSE and not self.covered
+        # An end that is known less well is not sharp [m]
+        loose = 0.5e-3
+        return self.deviation < loose and not self.covered
 
 
 def surface_end(way: Floats, past: Mask, covered: Mask, pitch: float) -> End | None:
@@ -120,7 +118,9 @@ def surface_end(way: Floats, past: Mask, covered: Mask, pitch: float) -> End | N
     way = way[past] if seen else way
     low, middle, high = np.quantile(way, [0.25, 0.5, 0.75])
     share = 1.25 / np.sqrt(len(way)) if seen and high - low <= TWO * pitch else 1.0
-    deviation = float(share * SIGMA_OF_IQR * (high - low))
+    # Of a normal distribution, from its quartiles' distance
+    sigma_of_iqr = 0.7413
+    deviation = float(share * sigma_of_iqr * (high - low))
     return End(
         float(middle), deviation, bool(seen), bool(not seen and covered.sum() >= FEWEST_LANES)
     )

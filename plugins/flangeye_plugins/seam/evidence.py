@@ -18,12 +18,8 @@ from flangeye_plugins.seam.search import agreement, model_of, shares
 
 FINE = 200
 """How many times the finest thing looked at goes into the part's diagonal."""
-AROUND = 0.05
-"""How far around a seam the surface is its own, at least, as a share of the diagonal."""
 SLIDES, STEPS = (0.2, 0.03), 101
 """How far a part is slid, either way, as shares of the diagonal, and in how many steps each."""
-SLIDING = 3000
-"""Samples of the part that are looked at on the way."""
 TOP = 0.3
 """The part of the peak of the agreement that is taken for where its middle is."""
 
@@ -36,9 +32,13 @@ class RayEvidence:
     ) -> None:
         self.part, self.floor = part, part.diagonal / FINE
         self._model, self._seen = model_of(part, rng, 2 * self.floor), seen
-        self._few = self._model.thinned(SLIDING, rng)
+        # Samples of the part that are looked at on the way
+        sliding = 3000
+        self._few = self._model.thinned(sliding, rng)
         surface = self._model.surface
-        reach = max(2 * (seam.half_width or 0.0), AROUND * part.diagonal)
+        # How far around a seam the surface is its own, at least, as a share of the diagonal
+        around = 0.05
+        reach = max(2 * (seam.half_width or 0.0), around * part.diagonal)
         self._near_seam = surface.take(distances_to_line(surface.points, seam.points) < reach)
 
     def of(self, fit: CadFit) -> tuple[float, float]:

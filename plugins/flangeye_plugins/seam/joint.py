@@ -37,26 +37,16 @@ from flangeye_plugins.seam.sweep import WIDE, Spline, Swept, fitted, swept_from
 from flangeye_plugins.seam.template import EDGES, FACES, JOINTS, JointShape
 
 STAGE = "seam.joint"
-MOST_FITTED = 400_000
-"""Points that are fitted to; of more, every second, third, ..."""
 FEWEST_FITTED = 300
-REFITS = 3
-"""The second and third time along the line that the first has found."""
-UNSHARED = 0.15
-"""Of a pixel, what an edge may be off for how pixels there are measured."""
 UNSEEN = 0.5
 """Of a pixel, standard deviation of an end for pixels that scanners drop or invent beside a jump of
 depth: the simulated PhoXi M drops 0.7 to 1.2 of one."""
-TURNED = np.cos(np.radians(120))
-"""A rough line that turns by more goes back."""
 BEYOND = (1.0, 2.0, 3.0, 4.0)
 """Pixels beyond a surface's last point at which the scanner may look past its end."""
 CELL = 3e-3
 """Lengths of the seam that are seen or not [m]."""
 PLANE = 0.95
 """What explains this share of the points of a joint is as good as the joint."""
-EQUAL = 0.8
-"""A joint that explains this share of what the best one explains is its equal."""
 
 
 class JointParams(SeamParams):
@@ -187,7 +177,9 @@ def _rough(seen: PlacedScan, params: JointParams, seam: Seam | None) -> Course:
     lengths = np.linalg.norm(steps, axis=1)
     if not (lengths > 0).all():
         raise StageError(f"{STAGE}: line has the same point twice in a row")
-    back = np.einsum("ni,ni->n", steps[:-1], steps[1:]) < TURNED * lengths[:-1] * lengths[1:]
+    # A rough line that turns by more goes back
+    turned = np.cos(np.radians(120))
+    back = np.einsum("ni,ni->n", steps[:-1], steps[1:]) < turned * lengths[:-1] * lengths[1:]
     if back.any():
         raise StageError(
             f"{STAGE}: line turns back at its point {int(np.argmax(back)) + 2}; give its points in "
@@ -204,7 +196,9 @@ def _found(seen: PlacedScan, rough: Course, params: JointParams) -> Found:
     at, local = rough.local(points, box)
     if len(at) < FEWEST_FITTED:
         raise StageError(f"{STAGE}: {len(at)} points are near the line; {FEWEST_FITTED} are needed")
-    pitch, points = _solid(points[at[:: -(-len(at) // MOST_FITTED)]])
+    # Points that are fitted to; of more, every second, third,
+    most_fitted = 400_000
+    pitch, points = _solid(points[at[:: -(-len(at) // most_fitted)]])
     at, local = rough.local(points, box)
     points = points[at]
     places = _placed(rough, local, points, params)
@@ -212,7 +206,9 @@ def _found(seen: PlacedScan, rough: Course, params: JointParams) -> Found:
     line = rough
     rays = Rays(seen.eyes, seen.clouds, rough.points)
     found = Found(line, swept, local, pitch, rays, (0.0, line.length))
-    for k in range(REFITS):
+    # The second and third time along the line that the first has found
+    refits = 3
+    for k in range(refits):
         found = found.again(points, box) if k else found
         edges = face_ends(found.swept, found.inside, pitch, params.max_residual)
         swept = fitted(found.swept, found.local, pitch, params.max_residual, edges)
@@ -250,7 +246,9 @@ def _placed(rough: Course, local: Floats, points: Floats, params: JointParams) -
             "(reach); is it the right joint, and seen?"
         )
     scores = [sum(place.score for place in way) for way in ways]
-    if len(ways) > 1 and scores[1] > EQUAL * scores[0]:
+    # A joint that explains this share of what the best one explains is its equal
+    equal = 0.8
+    if len(ways) > 1 and scores[1] > equal * scores[0]:
         raise CalibrationRefused(
             f"{STAGE}: ambiguous: a second {params.joint} joint is as good, "
             f"{_between(ways[0], ways[1]) * 1e3:.0f} mm beside the first; move the line nearer to "
@@ -307,7 +305,9 @@ def _line(found: Found) -> tuple[Floats, Floats, Floats]:
     line = origin + y[:, None] * axes[:, 1] + z[:, None] * axes[:, 2]
     turned = roll + found.swept.section.opening
     openings = np.sin(turned)[:, None] * axes[:, 1] + np.cos(turned)[:, None] * axes[:, 2]
-    floor = (UNSHARED * found.pitch) ** 2
+    # Of a pixel, what an edge may be off for how pixels there are measured
+    unshared = 0.15
+    floor = (unshared * found.pitch) ** 2
     across = found.swept.line_covariance(s) + floor * np.eye(2)
     covariance = np.einsum("nai,nab,nbj->nij", axes[:, 1:], across, axes[:, 1:])
     for k, deviation in zip((0, -1), found.deviations, strict=True):

@@ -24,10 +24,6 @@ from flangeye.types import (
 )
 from flangeye.units import Length, param
 
-CLOUD_POINTS = 20_000
-"""Points of the scan that are kept for people."""
-
-
 SPACING = 2e-3
 """Between planned points [m]."""
 
@@ -152,5 +148,7 @@ def cloud_around(points: Floats, seam: Floats, base_T_camera: Transform) -> Poin
     low, high = seam.min(axis=0), seam.max(axis=0)
     margin = 0.3 * np.linalg.norm(high - low) + 0.03
     points = points[((points > low - margin) & (points < high + margin)).all(axis=1)]
-    points = points[:: max(1, -(-len(points) // CLOUD_POINTS))]
+    # Points of the scan that are kept for people
+    cloud_points = 20_000
+    points = points[:: max(1, -(-len(points) // cloud_points))]
     return PointCloud(BASE, base_T_camera.apply(points).astype(np.float32))

@@ -10,9 +10,6 @@ from numpy.typing import NDArray
 
 from flangeye.types import Floats
 
-NEIGHBOURS = 20
-"""Points a normal is taken from."""
-
 
 @dataclass(frozen=True, eq=False)
 class Oriented:
@@ -48,7 +45,9 @@ def facing_camera(points: Floats) -> Oriented:
     import open3d as o3d
 
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(NEIGHBOURS))
+    # Points a normal is taken from
+    neighbours = 20
+    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(neighbours))
     normals = np.asarray(cloud.normals)
     away = np.einsum("ni,ni->n", normals, points) > 0
     normals[away] *= -1

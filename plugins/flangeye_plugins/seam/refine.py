@@ -12,25 +12,15 @@ from flangeye.types import Floats
 from flangeye_plugins.seam.part import CadPart
 from flangeye_plugins.seam.points import Oriented
 
-ITERATIONS = 40
 STILL = 2e-6
 """Converged when no point of the part moves further than this in an iteration [m]."""
-ALIKE_NORMAL = float(np.cos(np.radians(20)))
-"""Cosine of the angle between a point's normal and that of the surface it may belong to; near an
-edge, where normals mix, no point does."""
 TUKEY = 4.685
 """Tukey's constant: 95 % efficient on Gaussian residuals."""
 BLOCKS = 10
 """Blocks the part's diagonal is cut into. Points of one block may share their error, as those of
 a scanner do; blocks are taken as independent."""
-RIDGE = 1e-9
 LEAST = 1e-6
 """Information on a direction below this share of that on the best is rounding."""
-FEWEST_SUPPORTING = 40
-"""Points that must share in determining a direction: a square of a thirtieth of the diagonal."""
-UNSHARED = 0.1
-"""A fit is not believed to better than this share of a point's noise: edges, grain, the CAD's own
-tolerance do not average out. Monte Carlo finds 0.08 (tests/plugins/seam)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +58,8 @@ def refine(scan: Oriented, part: CadPart, pose: Floats, reach: float) -> CadFit 
         reach: How far off that may be [m].
     """
     scale = reach / TUKEY
-    for _ in range(ITERATIONS):
+    iterations = 40
+    for _ in range(iterations):
         rows = _equations(scan, part, pose, TUKEY * scale)
         if rows is None:
             return None
@@ -111,7 +102,10 @@ def _equations(scan: Oriented, part: CadPart, pose: Floats, limit: float) -> _Ro
     surface = part.nearest(inside.points)
     distances = np.einsum("ni,ni->n", surface.normals, inside.points - surface.points)
     off = np.linalg.norm(inside.points - surface.points, axis=1)
-    alike = np.einsum("ni,ni->n", surface.normals, inside.normals) > ALIKE_NORMAL
+    # Cosine of the angle between a point's normal and that of the surface it may belong to; near an
+    # edge, where normals mix, no point does
+    alike_normal = float(np.cos(np.radians(20)))
+    alike = np.einsum("ni,ni->n", surface.normals, inside.normals) > alike_normal
     # Beyond an edge the nearest point is not across from it: that says nothing about a plane.
     good = alike & (off < limit) & (np.abs(distances) > 0.7 * off)
     if good.sum() < 100:
@@ -134,7 +128,8 @@ def _step(rows: _Rows, scale: float, size: float) -> Floats:
     scaled = rows.jacobian * units
     normal = (scaled * weights[:, None]).T @ scaled
     gradient = (scaled * weights[:, None]).T @ rows.distances
-    normal += RIDGE * np.trace(normal) * np.eye(6)
+    ridge = 1e-9
+    normal += ridge * np.trace(normal) * np.eye(6)
     return np.asarray(np.linalg.solve(normal, gradient) * units)
 
 
@@ -148,7 +143,10 @@ def _result(rows: _Rows, pose: Floats, scale: float, part: CadPart) -> CadFit:
     weights = _weights(rows.distances, scale)
     covariance, blocks = _sandwich(rows, weights, part)
     noise = float(np.sqrt(np.average(rows.distances**2, weights=weights)))
-    covariance[3:, 3:] += (UNSHARED * noise) ** 2 * np.eye(3)
+    # A fit is not believed to better than this share of a point's noise: edges, grain, the CAD's
+    # own tolerance do not average out. Monte Carlo finds 0.08 (tests/plugins/seam)
+    unshared = 0.1
+    covariance[3:, 3:] += (unshared * noise) ** 2 * np.eye(3)
     return CadFit(pose, covariance, rows.about, noise, int((weights > 0).sum()), blocks)
 
 
@@ -180,7 +178,9 @@ def _with_unknown(rows: _Rows, weights: Floats, meat: Floats, size: float) -> Fl
     values, vectors = np.linalg.eigh(scaled.T @ scaled)
     shares = (scaled @ vectors) ** 2
     points = shares.sum(axis=0) ** 2 / np.maximum((shares**2).sum(axis=0), 1e-300)
-    known = (points >= FEWEST_SUPPORTING) & (values > LEAST * values[-1])
+    # Points that must share in determining a direction: a square of a thirtieth of the diagonal
+    fewest_supporting = 40
+    known = (points >= fewest_supporting) & (values > LEAST * values[-1])
     inverse = np.where(known, 1 / np.maximum(values, LEAST * values[-1]), 0.0)
     turned = vectors.T @ (meat * np.outer(units, units)) @ vectors
     covariance = turned * np.outer(inverse, inverse) + np.diag(np.where(known, 0.0, size**2))

@@ -24,12 +24,8 @@ COARSE = 80
 """Voxels along the part's diagonal to search in."""
 QUICK = 4000
 """Points that candidates are fitted with before the best is fitted with all."""
-TRIED = 6
-"""Candidates that are fitted."""
 WORTH = 0.4
 """Candidates below this share of the best one's score are not."""
-REACH = 0.05
-"""How far off a candidate may be, as a share of the diagonal."""
 LARGER, FEWEST = 3.0, 300
 """A part this many times larger than all of the scan, or with fewer points, has a wrong unit."""
 SAME = 1e-3
@@ -89,7 +85,9 @@ def register(
     found = find_poses(coarse, part, seen, rng)
     worth = found.scores > WORTH * max(found.scores.max(initial=0.0), 0.0)
     evidence = RayEvidence(part, seam, seen, rng)
-    fits = _fits(points, found.poses[worth][:TRIED], evidence, rng)
+    # Candidates that are fitted
+    tried = 6
+    fits = _fits(points, found.poses[worth][:tried], evidence, rng)
     if not fits:
         raise CalibrationRefused(f"{STAGE}: the part is nowhere in the scan; {_look(part)}")
     return _judged(_with_turned(points, fits, evidence, rng), seam, evidence, limits)
@@ -136,7 +134,9 @@ def _fits(
     for pose in poses:
         around = _around(points, part, pose)
         few = around.take(rng.permutation(len(around))[:QUICK])
-        quick = refine(few, part, pose, REACH * part.diagonal)
+        # How far off a candidate may be, as a share of the diagonal
+        reach = 0.05
+        quick = refine(few, part, pose, reach * part.diagonal)
         if quick and all(_apart(quick.pose, fit.pose, part.corners) > SAME for fit in fits):
             whole = refine(around, part, quick.pose, 8 * quick.noise)
             fits += [slid(whole, evidence)] if whole else []

@@ -18,15 +18,10 @@ SLAB = 10e-3
 LINES, TRIED, MOST = 6, 150, 700
 """Lines of a slab, hypotheses of each, and points that are looked at."""
 ALIKE_LINE = np.cos(np.radians(25))
-SHORTEST = 2.5e-3
-"""Of a line in a section [m]."""
-AROUND = 12e-3
-"""From the seam, what of a slab must be explained [m]."""
 KEPT = 6
 """Places in a slab that are followed on to the next."""
 BESIDE = 2e-3
 """Standard deviation of a rough line's error from one slab to the next [m]."""
-SKIPPED = 5
 
 
 class Line(NamedTuple):
@@ -94,7 +89,9 @@ def _lines(q: Floats, normals: Floats, tolerance: float) -> Iterator[Line]:
         best = on[on.sum(axis=1).argmax()]
         middle = q[best].mean(axis=0)
         spread, axes = np.linalg.eigh(np.cov((q[best] - middle).T))
-        if best.sum() < 12 or 3.4 * np.sqrt(spread[1]) < SHORTEST:
+        # Of a line in a section [m]
+        shortest = 2.5e-3
+        if best.sum() < 12 or 3.4 * np.sqrt(spread[1]) < shortest:
             return
         normal = axes[:, 0] * np.sign(axes[:, 0] @ flat[best].mean(axis=0))
         away = q @ normal - normal @ middle
@@ -194,7 +191,9 @@ def explained(section: Section, q: Floats, tolerance: float) -> float | None:
     None where one of its faces, or an edge that should be seen, has too few of them.
     """
     away, active = section.distances(q)
-    near = np.linalg.norm(q, axis=1) < AROUND + section.shape[4:6].max()
+    # From the seam, what of a slab must be explained [m]
+    around = 12e-3
+    near = np.linalg.norm(q, axis=1) < around + section.shape[4:6].max()
     good = near & (np.abs(away) < tolerance)
     counts = np.bincount(active[good], minlength=4)
     needed = [k for k in FACES if section.joint.present[k]]
@@ -220,11 +219,12 @@ def _ways(spots: list[list[JointPlace]]) -> list[list[JointPlace]]:
     nodes = [(k, place) for k, places in enumerate(spots) for place in places]
     best: list[tuple[float, int | None]] = []
     for k, place in nodes:
+        skipped = 5
         score, before = max(
             (
                 (best[j][0] - _jump(other, place, k - i), j)
                 for j, (i, other) in enumerate(nodes[: len(best)])
-                if 0 < k - i <= SKIPPED
+                if 0 < k - i <= skipped
             ),
             default=(0.0, None),
         )
@@ -250,12 +250,6 @@ def _jump(first: JointPlace, second: JointPlace, slabs: int) -> float:
     return float(
         0.3 * (away**2 + rolled**2 + other**2) / slabs + 10 * (first.joint is not second.joint)
     )
-
-
-FRAME_SPACING = 1e-3
-"""From one frame to the next [m]; four thousand at most."""
-SMOOTH = 8e-3
-"""Standard deviation of what rounds the corners of a rough line [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -335,8 +329,12 @@ def course(line: Floats, eyes: Floats, closed: bool, beyond: float) -> Course:
     if closed:
         line = np.vstack([line, line[:1]])
     length = float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
-    step = max(FRAME_SPACING, length / 4000)
-    points = _smoothed(resampled(line, step), SMOOTH / step, closed)
+    # From one frame to the next [m]; four thousand at most
+    frame_spacing = 1e-3
+    step = max(frame_spacing, length / 4000)
+    # Standard deviation of what rounds the corners of a rough line [m]
+    smooth = 8e-3
+    points = _smoothed(resampled(line, step), smooth / step, closed)
     if not closed:
         more = np.arange(1, 1 + round(beyond / step))[:, None] * step
         first, last = (

@@ -21,13 +21,8 @@ Ints = NDArray[np.intp]
 
 POINTS = 700
 """Oriented points that pairs are made of, on the scan and on the CAD."""
-SCAN_PAIRS = 6000
 MATCHES = 16
 """Pairs of the CAD that are tried for a pair of the scan."""
-SHORTEST = 0.12
-"""A pair is at least this share of the part's diagonal apart: closer ones give no direction."""
-TURNED = float(np.radians(20))
-"""The normals of a pair differ by this at least: pairs on one plane say nothing."""
 DISTANCE_BINS, ANGLE_BIN = 40, float(np.radians(12))
 FIRST_LOOK, SECOND_LOOK = 100, 1000
 """Samples of the CAD a pose is judged by, at first and for the best."""
@@ -144,7 +139,8 @@ def _shares(
 def _hypotheses(scan: Oriented, model: Oriented, size: float, rng: np.random.Generator) -> Floats:
     """Return (K, 4, 4) poses that lay a pair of the CAD on a pair of the scan."""
     i, j = _pairs(scan, size)
-    chosen = rng.permutation(len(i))[:SCAN_PAIRS]
+    scan_pairs = 6000
+    chosen = rng.permutation(len(i))[:scan_pairs]
     i, j = i[chosen], j[chosen]
     k, m = _pairs(model, size)
     first, second = _alike(_keys(scan, i, j, size), _keys(model, k, m, size), rng)
@@ -158,8 +154,12 @@ def _pairs(surface: Oriented, size: float) -> tuple[Ints, Ints]:
     points, normals = surface.points, surface.normals
     squares = (points**2).sum(axis=1)
     apart = np.sqrt(np.maximum(squares[:, None] + squares - 2 * points @ points.T, 0.0))
-    good = (apart > SHORTEST * size) & (apart < size)
-    good &= normals @ normals.T < np.cos(TURNED)
+    # A pair is at least this share of the part's diagonal apart: closer ones give no direction
+    shortest = 0.12
+    good = (apart > shortest * size) & (apart < size)
+    # The normals of a pair differ by this at least: pairs on one plane say nothing
+    turned = float(np.radians(20))
+    good &= normals @ normals.T < np.cos(turned)
     i, j = np.nonzero(good)
     return i, j
 

@@ -33,14 +33,10 @@ from flangeye.types import (
 from flangeye_plugins.seam.planned import scanner_covariance
 from flangeye_plugins.seam.points import facing_camera, thinned
 
-CLOUD_WITHIN = 10e-3
-"""A cloud takes part in a point of the seam by how many of its points are so near [m]."""
 CELL = 3e-3
 """Clouds are thinned to this before they are compared with each other [m]."""
 SAME = 10e-3
 """Points of two clouds so near to each other may show the same face [m]."""
-FEWEST_SHARED = 200
-"""Points that two clouds share, for their agreement to be known."""
 
 
 class OfPose(Protocol):
@@ -185,8 +181,10 @@ class _AsSeveral:
         from scipy.spatial import cKDTree
 
         trees = [cKDTree(cloud) for cloud in self.shown]
+        # A cloud takes part in a point of the seam by how many of its points are so near [m]
+        cloud_within = 10e-3
         counts = np.array(
-            [tree.query_ball_point(points, CLOUD_WITHIN, return_length=True) for tree in trees],
+            [tree.query_ball_point(points, cloud_within, return_length=True) for tree in trees],
             float,
         )
         nearest = np.argmin([tree.query(points)[0] for tree in trees], axis=0)
@@ -208,7 +206,9 @@ def _apart(clouds: Sequence[Floats]) -> float | None:
         surface = facing_camera(first)
         away, at = cKDTree(first).query(second, distance_upper_bound=SAME)
         both = np.isfinite(away)
-        if both.sum() >= FEWEST_SHARED:
+        # Points that two clouds share, for their agreement to be known
+        fewest_shared = 200
+        if both.sum() >= fewest_shared:
             at = at[both]
             across = np.einsum("ni,ni->n", second[both] - first[at], surface.normals[at])
             found.append(float(np.median(np.abs(across))))

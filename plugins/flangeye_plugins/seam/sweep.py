@@ -17,14 +17,10 @@ from flangeye.types import Floats, Indices
 from flangeye_plugins.seam.rough import JointPlace, turn
 from flangeye_plugins.seam.template import OFFSETS, Section
 
-KNOTS = 30e-3
-"""Between the knots of the line [m]."""
 BEND = np.array([1e-3, 1e-3, 0.05])
 """Standard deviations of second differences of coefficients: across, out [m], and roll [rad]."""
-TUKEY = 4.685
 WIDE = 18e-3
 """From a face's end, what of it takes part [m]: plates are flat so far."""
-ROUNDS = 12
 GRAZING = 0.14
 """Sine of the angle to the line of sight below which a surface is not seen: 8 deg. Pixels that see
 both sides of a jump in depth look like one."""
@@ -49,7 +45,9 @@ class Spline:
     @classmethod
     def through(cls, length: float, closed: bool, s: Floats, values: Floats) -> Spline:
         """Return the smooth line nearest to values (N, 3) at s [m]."""
-        count = max(round(length / KNOTS), 8 if closed else 1) + (0 if closed else 3)
+        # Between the knots of the line [m]
+        knots = 30e-3
+        count = max(round(length / knots), 8 if closed else 1) + (0 if closed else 3)
         empty = cls(length, closed, np.zeros((count, 3)))
         design = empty.basis(s).toarray()
         bends = empty.bends()
@@ -139,7 +137,8 @@ def fitted(
     swept, sigma = start, tolerance / 2
     points = np.vstack([local, edges[0]])
     basis = start.spline.basis(points[:, 0])
-    for k in range(ROUNDS):
+    rounds = 12
+    for k in range(rounds):
         swept, spread = _step(swept, points, edges[1], basis, pitch, sigma)
         if k > 1:
             done, sigma = spread > 0.99 * sigma, max(min(spread, sigma), 1e-5)
@@ -163,7 +162,8 @@ def _step(
     normals = swept.section.normals[edges]
     residual[first:] = np.einsum("ni,ni->n", normals, q[first:]) - swept.section.heights[edges]
     size = np.where(np.arange(len(points)) < first, sigma, 0.5 * pitch)
-    weight = np.maximum(1 - (residual / (TUKEY * size)) ** 2, 0.0) ** 2
+    tukey = 4.685
+    weight = np.maximum(1 - (residual / (tukey * size)) ** 2, 0.0) ** 2
     sight = np.einsum("ni,ni->n", swept.section.normals[which], turn(points[:, 3:], line[:, 2]))
     usable = _usable(swept.section, q, pitch) & (sight > GRAZING)
     weight[:first][~usable[:first]] = 0.0

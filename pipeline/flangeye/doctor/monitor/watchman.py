@@ -26,8 +26,6 @@ from flangeye.files.elsewhere import is_this_machine
 
 CODES = {"OK": 0, "DEGRADED": 1, "MOVED": 2}
 """Exit codes, for a script that stops a cell."""
-FEWEST_SCANS = 3
-"""Scans of a check from which one that differs can be told, and the share of it that may."""
 
 
 OPEN = "none"
@@ -61,7 +59,9 @@ def _without_misfits(
     before = _before(stored, history, test)
     seen = stored.sightings(check.seen, np.zeros(len(check.seen), dtype=np.intp))
     wrong = misfits(seen, before, test)
-    if 0 < FEWEST_SCANS * wrong.sum() <= len(wrong):
+    # Scans of a check from which one that differs can be told, and the share of it that may
+    fewest_scans = 3
+    if 0 < fewest_scans * wrong.sum() <= len(wrong):
         fine = tuple(o for o, bad in zip(check.seen, wrong, strict=True) if not bad)
         ids = tuple(o.id for o, bad in zip(check.seen, wrong, strict=True) if bad)
         return replace(check, seen=fine), ids

@@ -176,8 +176,6 @@ FEWEST_PAIRS = 5
 """Poses; fewer fit several conventions."""
 MOST_PAIRS = 60
 """Poses whose pairs are looked at: enough to tell frames apart."""
-ALIKE_ANGLE = np.radians(3.0)
-"""Largest median difference of the angles [rad] at which a convention is taken to fit."""
 CLEARER = 3.0
 """By what factor the next best has to be worse, beyond 0.2 deg or 2 mm."""
 LOOSE_ANGLE, LOOSE_PLACE = np.radians(0.2), 2e-3
@@ -239,7 +237,9 @@ def writing_of(
         if one is not None and other is not None:
             tried.append((_apart(one, other), a, b))
     tried.sort(key=lambda each: each[0])
-    if not tried or tried[0][0] > ALIKE_ANGLE:
+    # Largest median difference of the angles [rad] at which a convention is taken to fit
+    alike_angle = np.radians(3.0)
+    if not tried or tried[0][0] > alike_angle:
         return None
     best, a, b = tried[0]
     alike = [each for each in tried if each[0] < CLEARER * max(best, LOOSE_ANGLE)]
