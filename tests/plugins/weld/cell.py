@@ -5,6 +5,7 @@ import numpy as np
 from flangeye.devices import MotionAllowed, RobotDriver, StateSource, TactileSensor
 from flangeye.files.paths import bundled
 from flangeye.maths.geometry import rigid, rotation_from_rpy
+from flangeye.models.finger import Finger
 from flangeye.models.loading import load_model
 from flangeye.models.workpiece import load_workpiece
 from flangeye.plugin.stage import BoundPart, part
@@ -59,7 +60,10 @@ def finger_in(truth):
     """The simulated finger in a world that no recipe names."""
 
     @part("sensor.in_a_world")
-    def sensor(robot: StateSource, seed: Seed, params: SimulatedFingerParams) -> TactileSensor:
+    def sensor(
+        finger: Finger, robot: StateSource, seed: Seed, params: SimulatedFingerParams
+    ) -> TactileSensor:
+        """The simulated finger, in that world."""
         return SimulatedFinger(robot, seed, params, truth)
 
     return sensor
