@@ -26,7 +26,7 @@ from flangeye_plugins.scan import AlongParams, scan_along
 UR10E, PHOXI = load_model("robots", "ur10e"), load_model("scanners", "phoxi-m")
 HOME = ("90 deg", "-90 deg", "90 deg", "-90 deg", "-90 deg", "0 deg")
 PLATE = {"position": ["550 mm", "0 mm", "60 mm"], "rpy": ["0 deg", "0 deg", "90 deg"]}
-MOUNTED = MountedParams.model_validate({**PLATE, "resolution": 0.25, "clutter": 0})
+MOUNTED = MountedParams.model_validate({**PLATE, "resolution": 0.25})
 ALONG = {"start": ["560 mm", "-100 mm", "80 mm"], "end": ["560 mm", "100 mm", "80 mm"]}
 BOX = {"centre": ["500 mm", "0 mm", "600 mm"], "size": ["1400 mm", "2400 mm", "1200 mm"]}
 
