@@ -181,15 +181,20 @@ class Bridge(Device):
         """Return how many messages of a topic have arrived since it was subscribed to."""
         return int(self._ask("heard", topic=topic))
 
-    def local_ns(self, message: GraphMessage) -> int:
+    def local_ns(self, topic: str, message: GraphMessage) -> int:
         """Return the moment of a message's stamp, by ``time.monotonic_ns``.
 
-        A stamp of simulated time is held against ``/clock``; a message without a stamp has the
-        moment at which it came.
+        A stamp of simulated time is held against ``/clock``.
+
+        Raises:
+            DeviceError: It has no stamp.
         """
         stamp = stamp_of(message.data)
         if not stamp:
-            return message.received_ns
+            raise DeviceError(
+                f"{self.asker}: {topic} is stamped 0, so nobody knows when it was measured: let "
+                "its driver fill in header.stamp"
+            )
         if not self._sim_time:
             return stamp - message.ahead_ns
         tick = self.newest(CLOCK)

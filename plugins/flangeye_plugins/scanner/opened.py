@@ -10,7 +10,13 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flangeye.devices import Device, DeviceError, Scan
-from flangeye.models.scanners import STATED_LIMIT, ScannerModel, median_distance, times_outside
+from flangeye.models.scanners import (
+    DETECTED_LIMIT,
+    STATED_LIMIT,
+    ScannerModel,
+    median_distance,
+    times_outside,
+)
 from flangeye.plugin.stage import Params
 from flangeye.types import CAMERA, Image, PointCloud
 
@@ -109,9 +115,12 @@ def require_in_range(name: str, cloud: PointCloud, model: ScannerModel | None) -
         return
     distance = median_distance(cloud)
     if times_outside(distance, model) > STATED_LIMIT:
+        cure = "is it this scanner, and its unit as it says?"
+        if times_outside(distance / 1e3, model) <= DETECTED_LIMIT:
+            cure = "these look like millimetres: let its driver give metres"
         raise DeviceError(
-            f"{name}: median distance {distance:.3g} m, but {model.model} sees {model.near:.3f} "
-            f"to {model.far:.3f} m; is it this scanner, and its unit as it says?"
+            f"{name}: median distance {distance:.4g} m, but {model.model} sees {model.near:.3f} "
+            f"to {model.far:.3f} m; {cure}"
         )
 
 

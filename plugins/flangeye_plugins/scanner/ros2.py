@@ -245,7 +245,7 @@ class Ros2Scanner(OpenScanner):
         """Return the first message stamped after a moment; those before it are passed over."""
         late: list[float] = []
         while message := self._bridge.wait(topic, count, max(until - time.monotonic(), 0.0)):
-            stamp = self._bridge.local_ns(message)
+            stamp = self._bridge.local_ns(topic, message)
             early = 1e-9 * (stamp - message.received_ns)
             # A stamp so long after the message came is of another clock [s]
             if early > 0.1:

@@ -99,7 +99,11 @@ def test_what_goes_wrong_with_an_arm_is_one_line(env):
             with pytest.raises(DeviceError, match="stamps jumped back by"):
                 for _ in range(50):
                     robot.wait_cycle()
-            arm.tell(nan=True)
+            arm.tell(jump=0.0, stamped=False)
+            with pytest.raises(DeviceError, match="robot.ros2: /joint_states is stamped 0, so nob"):
+                for _ in range(50):
+                    robot.wait_cycle()
+            arm.tell(stamped=True, nan=True)
             with pytest.raises(DeviceError, match="a joint's position is no number"):
                 for _ in range(50):
                     robot.wait_cycle()
@@ -193,6 +197,24 @@ def test_a_camera_info_may_come_with_the_first_scan_and_has_to_fit_it(env):
                 camera.ask(info=info | {"p": [0.0] * 12}, pose=True)
                 # The first scan may still be seen with the one before
                 assert any(said in complaint_of(eye) for _ in range(2))
+
+
+def test_a_cloud_in_millimetres_or_without_a_stamp_is_refused_in_one_line(env):
+    topics = Topics(cloud="/camera/points", trigger="/camera/capture")
+    with peers(Controller(env), Camera(env, "zivid")) as (_, camera):  # noqa: SIM117
+        with scanner_ros2.function(EYE, topics) as eye:
+            camera.ask(scale=1000.0, pose=True)
+            assert re.fullmatch(
+                r"/camera/points: median distance \d+ m, but phoxi-m sees 0.458 to 1.118 m; these "
+                "look like millimetres: let its driver give metres", complaint_of(eye),
+            )  # fmt: skip
+            camera.ask(scale=1.0, stamped=False, pose=True)
+            assert complaint_of(eye) == (
+                "scanner.ros2: /camera/points is stamped 0, so nobody knows when it was measured: "
+                "let its driver fill in header.stamp"
+            )
+            camera.ask(stamped=True, pose=True)
+            assert not complaint_of(eye)
 
 
 def complaint_of(eye):

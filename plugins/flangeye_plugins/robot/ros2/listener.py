@@ -198,7 +198,8 @@ class Listener(Device):
             raise DeviceError(
                 f"{self.name}: a joint's position is no number: is the arm's hardware active?"
             )
-        sample = JointSample(joints, self._bridge.local_ns(message), message.received_ns)
+        time_ns = self._bridge.local_ns(self._params.joint_states, message)
+        sample = JointSample(joints, time_ns, message.received_ns)
         self._require_forwards(sample)
         self._samples.append(sample)
         self._kept += 1

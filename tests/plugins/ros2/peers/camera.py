@@ -57,6 +57,7 @@ class Camera:
         self.scene = CellScene(robot, eye, self.base_T_camera, np.array([0.3, 0.3, 0.2]))
         self.arm, self.joints, self.count, self.seen = Arm(robot), None, 0, (None, None)
         self.offset, self.silent, self.now, self.scale, self.spoilt = 0.0, False, None, 1.0, {}
+        self.stamped = True
         self.look(np.radians(options["joints"]))  # what is loaded for the first scan takes seconds
         node.create_subscription(JointState, "/truth", self.hears, 10)
         if options["sim_time"]:
@@ -87,6 +88,7 @@ class Camera:
         self.offset = words.get("offset", self.offset)
         self.silent = words.get("silent", self.silent)
         self.scale = words.get("scale", self.scale)
+        self.stamped = words.get("stamped", self.stamped)
         self.spoilt = words.get("info", self.spoilt)
         if "pose" in words:
             say(pose=self.base_T_camera.tolist(), count=self.count)
@@ -121,7 +123,7 @@ class Camera:
         if self.silent:
             return
         self.count += 1
-        stamp += self.offset
+        stamp = (stamp + self.offset) * self.stamped
         for each in message:
             each.header.stamp.sec, each.header.stamp.nanosec = int(stamp), int(stamp % 1 * 1e9)
             each.header.frame_id = f"{self.options['prefix']}optical_frame"

@@ -45,7 +45,7 @@ class Controller:
         self.arm = Arm(model)
         self.zeros = joint_zeros(model, options["seed"])
         self.trajectory, self.queue = [], deque()
-        self.silent_until, self.rejects, self.jump, self.dead = 0.0, False, 0.0, False
+        self.silent_until, self.rejects, self.jump, self.stamped = 0.0, False, 0.0, True
         self.now = time.monotonic()
         self.clock = 100.0 if options["sim_time"] else time.time()
         self.history, self.taken, self.hand = deque(maxlen=REMEMBERED), 0, None
@@ -77,6 +77,7 @@ class Controller:
                 goal = np.array(words["hand"])
                 self.trajectory = self.cubics([(goal, np.zeros_like(goal), words["seconds"])])
             self.rejects = words.get("rejects", self.rejects)
+            self.stamped = words.get("stamped", self.stamped)
             if "truth" in words:
                 twist = self.arm.jacobian(self.joints) @ self.speeds
                 say(time=self.now, speed=float(np.linalg.norm(twist[3:])))
@@ -145,7 +146,7 @@ class Controller:
     def tell(self, count):
         if time.monotonic() < self.silent_until:
             return
-        stamp = self.clock + self.jump
+        stamp = (self.clock + self.jump) * self.stamped
         if self.ticks:
             tick = Clock()
             tick.clock.sec, tick.clock.nanosec = int(stamp), int(stamp % 1 * 1e9)
