@@ -246,7 +246,7 @@ def npy(array: np.ndarray, tmp_path: Path) -> bytes:
 
 DEFECTS = {
     "empty": ("a.pcd", b"", "is empty (0 bytes)"),
-    "another format": ("a.abc", b"solid", "'.abc' is not a point cloud; known: .csv, .npy, .pcd, "
+    "another format": ("a.abc", b"solid", "'.abc' is not a point cloud; known: .asc, .csv, .npy, .pcd, "
                        ".ply, .pts, .txt, .xyz"),
     "not pcd": ("a.pcd", b"hello\nworld\n", "is not a PCD file: its header has no DATA line"),
     "not ply": ("a.ply", b"hello\nworld\n", "is not a PLY file: its header has no end_header line"),

@@ -15,8 +15,9 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from flangeye.cli.commands import app
-from flangeye.errors import StageError
+from flangeye.errors import RecipeError, StageError
 from flangeye.maths.geometry import rigid
+from flangeye.models.boards import Board, print_of
 from flangeye.models.bodies import TargetBody
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.draft.headings import frames_in
@@ -193,6 +194,55 @@ def test_images_need_to_know_the_target(folder: Path) -> None:
     names = [step.stage.name for step in recipe(folder).steps]
     assert recipe(folder).steps[0].params.board.columns == 8  # it tells the camera too
     assert names == ["acquire.images", "fit.charuco", "solve.robust", "verify.holdout"]
+
+
+def test_the_board_in_the_images_is_proposed(folder: Path) -> None:
+    table(folder, "x,y,z,qx,qy,qz,qw", quaternion)
+    page = np.pad(print_of(Board("charuco", 7, 5, 0.03, 0.022), 60), 60, constant_values=255)
+    for k in range(5):
+        cv2.imwrite(str(folder / f"{k}.png"), page)
+    with pytest.raises(RecipeError, match="0.png shows a ChArUco board of 7 x 5 squares") as asked:
+        init()
+    line = str(asked.value).split("'")[1]
+    assert line.endswith("square: 30 mm, marker: 22 mm}")
+    init("--target", line)
+    board = recipe(folder).steps[1].params
+    assert (board.columns, board.rows, board.dictionary) == (7, 5, "4X4_250")
+
+
+@pytest.mark.parametrize(
+    ("scan", "heading", "separator"),
+    [
+        ("scans/S{}.csv", "x_mm,y_mm,z_mm,intensity", ","),
+        ("cloud_{}.csv", "X [mm];Y [mm];Z [mm]", ";"),
+        ("scans/points{}.txt", "", " "),
+        ("{}.asc", "# exported", " "),
+    ],
+)
+def test_texts_of_points_are_scans(folder: Path, scan: str, heading: str, separator: str) -> None:
+    table(folder, "X;Y;Z;A;B;C", kuka, name="arm.csv", separator=";")
+    (folder / "scans").mkdir()
+    for k in range(5):
+        rows = 1e3 * np.random.default_rng(k).uniform(0.4, 0.6, (200, heading.count(separator) + 1))
+        rows = rows if rows.shape[1] > 2 else np.column_stack([rows[:, :1]] * 3)
+        lines = [separator.join(f"{x:.3f}" for x in row) for row in rows]
+        text = "\n".join([heading, *lines] if heading else lines)
+        decimals = text.replace(".", ",") if separator == ";" else text
+        (folder / scan.format(k + 1)).write_text(decimals + "\n")
+    assert f"clouds: 5 {Path(scan).suffix}" in init()
+    first = recipe(folder).steps[0].params
+    names = [r.cloud.name for r in first.reader(first.path).recordings]
+    assert names == [Path(scan.format(k + 1)).name for k in range(5)]
+
+
+def test_columns_that_are_named_keep_what_their_names_say(folder: Path) -> None:
+    clouds(folder)
+    heading = "flange_T_base.x,flange_T_base.y,flange_T_base.z," + ",".join(
+        f"flange_T_base.q{axis}" for axis in "xyzw"
+    )
+    table(folder, heading, quaternion)
+    init("--columns", heading)
+    assert recipe(folder).steps[0].params.reader.params.pose == "flange_T_base"
 
 
 @pytest.mark.parametrize("suffix", [".yml", ".npz"])
@@ -431,6 +481,12 @@ def odd_heading(folder):
     table(folder, "u,v,w,alpha,beta,gamma", kuka)
 
 
+def meshes(folder):
+    table(folder, "X,Y,Z,A,B,C", kuka)
+    for k in range(5):
+        (folder / f"scan_{k}.stl").write_text("solid")
+
+
 def angles_of_nobody(folder):
     clouds(folder)
     table(folder, "x,y,z,rx,ry,rz", vector)
@@ -481,13 +537,13 @@ def two_poses_of_nobody(folder):
          "1,2,3,4,5,6 --rotation joints"),
         (odd_heading, ["--columns", "u,v,ww,4,5,6"],
          "rec/log.csv: has no column 'ww'; known: w"),
-        (angles_of_nobody, [], "how the rotation in columns rx, ry, rz of log.csv is written (ur, "
+        (angles_of_nobody, [], "not known: how the rotation in columns rx, ry, rz of log.csv is written (ur, "
          "kuka, fanuc, abb, yaskawa, staubli, kawasaki, doosan, halcon, rpy, quaternion_xyzw, "
-         "quaternion_wxyz, vector, xyz, ZYX, …): nothing tells; add --rotation vector"),
-        (images, [], "which printed target is seen: nothing tells; add --target 'charuco: "
+         "quaternion_wxyz, vector, xyz, ZYX, …); add --rotation vector"),
+        (images, [], "not known: which printed target is seen; add --target 'charuco: "
          "{columns: 8, rows: 6, square: 30 mm, marker: 22 mm}'"),
-        (arrays_of_nobody, [], "which poses are the arm's (poses.npz:A, poses.npz:B): "
-         "nothing tells; add --table poses.npz:A"),
+        (arrays_of_nobody, [], "not known: which poses are the arm's (poses.npz:A, poses.npz:B); "
+         "add --table poses.npz:A"),
         (arrays_of_nobody, ["--table", "A"],
          "--table A: is no table of poses; known: poses.npz:A, poses.npz:B"),
         (arrays_of_the_arm, [], "rec/robot.npy: has poses of the arm, but there are no scans beside "
@@ -500,11 +556,12 @@ def two_poses_of_nobody(folder):
         (lambda folder: (folder / "demo.bag").write_text("x"), [],
          "rec/demo.bag: is a ROS 1 bag; convert it: pip install rosbags && rosbags-convert --src "
          "rec/demo.bag --dst rec/demo; then flangeye init rec again"),
+        (meshes, [], "rec/scan_0.stl: is a mesh, not a scan; sample it to points as .ply: "),
         (lambda folder: (folder / "scan.e57").write_text("x"), [],
          "rec/scan.e57: is an E57 scan, which is not read; save it as .ply"),
-        (two_tables_of_nobody, [], "which poses are the arm's (a.csv, b.csv): nothing tells; add "
+        (two_tables_of_nobody, [], "not known: which poses are the arm's (a.csv, b.csv); add "
          "--table a.csv"),
-        (two_poses_of_nobody, [], "which poses are the arm's (log.csv:a, log.csv:b): nothing tells; "
+        (two_poses_of_nobody, [], "not known: which poses are the arm's (log.csv:a, log.csv:b); "
          "add --table log.csv:a"),
         (lambda folder: (folder / "notes.md").write_text("x"), [],
          "rec: holds no scans and no table of poses; rec: no reader knows this layout"),

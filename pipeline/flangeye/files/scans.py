@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+import re
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from glob import escape
 from itertools import chain
 from pathlib import Path
 
 from flangeye.errors import StageError
+from flangeye.files.clouds.header import read_head
+from flangeye.files.clouds.plain import open_text
 from flangeye.files.pairs import in_order, natural, partners
 from flangeye.files.recording import Recording
 from flangeye.types import FLANGE, Floats
 
-CLOUDS = (".pcd", ".ply", ".npy", ".xyz", ".pts")
+CLOUDS = (".pcd", ".ply", ".npy", ".xyz", ".pts", ".asc")
+POINTS = (".csv", ".txt")
+"""Texts that hold points, or poses: their content tells."""
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 VENDOR = {".zdf": "Zivid's SDK", ".praw": "Photoneo's PhoXi Control", ".mraw": "Mech-Mind's SDK"}
 """Files that only their maker can read, and with what to turn them into others."""
@@ -22,11 +28,14 @@ VENDOR = {".zdf": "Zivid's SDK", ".praw": "Photoneo's PhoXi Control", ".mraw": "
 def scans_in(folder: Path, stem: str = "*") -> list[Path]:
     """Return the scans of a folder in natural order, clouds before images of the same name.
 
+    Texts are scans where :func:`texts_of_points` says so.
+
     Raises:
         StageError: There are only scans that their maker alone can read.
     """
     files = sorted(folder.glob(f"{stem}.*"), key=lambda p: (natural(p.stem), p.suffix))
-    found = [p for p in files if p.suffix.lower() in (*CLOUDS, *IMAGES)]
+    points = texts_of_points(files)
+    found = [p for p in files if p.suffix.lower() in (*CLOUDS, *IMAGES) or p in points]
     foreign = [p for p in files if p.suffix.lower() in VENDOR]
     if foreign and not found:
         first = foreign[0]
@@ -34,6 +43,29 @@ def scans_in(folder: Path, stem: str = "*") -> list[Path]:
             f"{first}: only {VENDOR[first.suffix.lower()]} reads it; export it as .ply or .pcd"
         )
     return found
+
+
+def texts_of_points(files: Iterable[Path]) -> set[Path]:
+    """Return the texts that hold a cloud each: three or more, named alike but for a number."""
+    alike: dict[str, list[Path]] = defaultdict(list)
+    for path in files:
+        if path.suffix.lower() in POINTS:
+            alike[re.sub(r"\d+", "*", str(path))].append(path)
+    groups = [group for group in alike.values() if len(group) > 2 and _holds_points(group[0])]
+    return {path for group in groups for path in group}
+
+
+def _holds_points(path: Path) -> bool:
+    """Return whether a text holds more points than one capture has poses or a camera numbers."""
+    try:
+        table = open_text(path)
+        rotation = re.search(r"\b(qx|rx|roll|yaw)", read_head(path)[:500].decode("latin-1").lower())
+    except StageError:
+        return False
+    # x, y, z; intensity; a normal or a colour. Seven are a pose, and eight with its time
+    return (
+        not rotation and len(table.shape) == 1 and table.shape[0] > 100 and table.width in (3, 4, 6)
+    )
 
 
 @dataclass(frozen=True)
@@ -104,8 +136,8 @@ def _scans_by_stem(folder: Path, taken: Collection[Path]) -> dict[str, list[Path
 def _paired(poses: Poses, scans: dict[str, list[Path]]) -> tuple[list[list[Path]], list[str]]:
     """Return the scans of each pose: of one name, or a cloud and an image of one number."""
     kinds = [
-        {stem: [p for p in found if p.suffix.lower() in kind] for stem, found in scans.items()}
-        for kind in (CLOUDS, IMAGES)
+        {stem: [p for p in found if is_cloud(p) is kind] for stem, found in scans.items()}
+        for kind in (True, False)
     ]
     split = [{stem: found for stem, found in kind.items() if found} for kind in kinds]
     try:
@@ -141,7 +173,12 @@ def _together(
 
 
 def _kinds(scans: Sequence[Path]) -> set[bool]:
-    return {path.suffix.lower() in CLOUDS for path in scans}
+    return {is_cloud(path) for path in scans}
+
+
+def is_cloud(path: Path) -> bool:
+    """Return whether a scan is a cloud, by its ending."""
+    return path.suffix.lower() in (*CLOUDS, *POINTS)
 
 
 def recording_of(name: str, pose: Floats, scans: Sequence[Path]) -> Recording:
@@ -150,7 +187,7 @@ def recording_of(name: str, pose: Floats, scans: Sequence[Path]) -> Recording:
     Raises:
         StageError: It has two of one sort, or a file is neither.
     """
-    clouds = [p for p in scans if p.suffix.lower() in CLOUDS]
+    clouds = [p for p in scans if is_cloud(p)]
     images = [p for p in scans if p.suffix.lower() in IMAGES]
     if len(clouds) > 1 or len(images) > 1:
         names = ", ".join(p.name for p in scans)

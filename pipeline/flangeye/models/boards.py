@@ -94,11 +94,11 @@ class Board:
         return np.stack([x, y, np.zeros(len(x))], axis=1)
 
 
-def dictionary_of(board: Board) -> Any:
-    """Return OpenCV's dictionary of the board's markers."""
+def dictionary_of(name: str) -> Any:
+    """Return OpenCV's dictionary of a family of markers, one of :data:`DICTIONARIES`."""
     import cv2
 
-    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{board.dictionary}"))
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}"))
 
 
 def charuco_of(board: Board) -> Any:
@@ -106,7 +106,7 @@ def charuco_of(board: Board) -> Any:
     import cv2
 
     size = (board.columns, board.rows)
-    return cv2.aruco.CharucoBoard(size, board.square, board.marker, dictionary_of(board))
+    return cv2.aruco.CharucoBoard(size, board.square, board.marker, dictionary_of(board.dictionary))
 
 
 def print_of(board: Board, per_square: int = 120) -> Pixels:
@@ -117,7 +117,8 @@ def print_of(board: Board, per_square: int = 120) -> Pixels:
     if board.kind == "charuco":
         return np.asarray(charuco_of(board).generateImage(size, marginSize=0), dtype=np.uint8)
     if board.kind == "marker":
-        marker = cv2.aruco.generateImageMarker(dictionary_of(board), board.marker_id, size[0])
+        family = dictionary_of(board.dictionary)
+        marker = cv2.aruco.generateImageMarker(family, board.marker_id, size[0])
         return np.asarray(marker, dtype=np.uint8)
     if board.kind == "circles":
         return _discs(board, per_square)

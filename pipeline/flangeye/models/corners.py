@@ -10,13 +10,12 @@ distortion: a side of 200 px away from the middle is bent by half a pixel.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flangeye.models.boards import DICTIONARIES, Board, charuco_of, dictionary_of
+from flangeye.models.boards import DICTIONARIES, Board, Kind, charuco_of, dictionary_of
 from flangeye.types import Floats, Image, Rejected
 
 Grey = NDArray[np.uint8]
@@ -68,14 +67,37 @@ def find_corners(board: Board, image: Image, thorough: bool = True) -> Corners |
     return finders[board.kind](board, grey, image)
 
 
-def board_seen(image: Image) -> str:
-    """Return which board an image shows, of any that is known, and what to write for it."""
+class SeenBoard(NamedTuple):
+    """A board of unknown size in an image.
+
+    Attributes:
+        kind: Which kind of board.
+        params: What the image shows of its parameters: columns, rows, dictionary, id.
+        what: The same for people.
+    """
+
+    kind: Kind
+    params: dict[str, Any]
+    what: str
+
+    @property
+    def fit(self) -> str:
+        """The stage that finds it, with what is known of its parameters, as a recipe writes it."""
+        name = "aruco" if self.kind == "marker" else self.kind
+        return f"{name}: {{{', '.join(f'{key}: {value}' for key, value in self.params.items())}}}"
+
+
+def board_seen(view: Grey) -> SeenBoard | None:
+    """Return the board that an image shows, of any family and size; None where it shows none.
+
+    Args:
+        view: (H, W) grey or (H, W, 3) RGB.
+    """
     import cv2
 
-    grey = _grey(image)
-    markers = _of_other_families(Board("charuco", 3, 3, 1.0, 0.5), grey)
-    if markers:
-        return markers.removeprefix("; ") + " and kind: charuco, or fit.aruco"
+    grey = _grey(Image(view, np.eye(3)))
+    if markers := _family_in(grey):
+        return _board_of(*markers, grey)
     by = min(1.0, 2 * WIDTH / grey.shape[1])
     small: Grey = cv2.resize(grey, None, fx=by, fy=by, interpolation=cv2.INTER_AREA).astype(
         np.uint8
@@ -89,11 +111,30 @@ def board_seen(image: Image) -> str:
         upright = Corners(_upright(pixels, small).reshape(-1, 2), board.inner_corners())
         if not _wrong_squares(upright, board, small):
             long, short = max(columns, rows), min(columns, rows)
-            return (
-                f"a checkerboard of {long} x {short} squares is seen: write kind: checkerboard, "
-                f"columns: {long}, rows: {short}"
-            )
-    return "no board that is known is seen in it"
+            what = f"a checkerboard of {long} x {short} squares"
+            return SeenBoard("checkerboard", {"columns": long, "rows": short}, what)
+    return None
+
+
+def _board_of(dictionary: str, ids: list[int], grey: Grey) -> SeenBoard:
+    """Return the board that markers belong to: the ChArUco board whose corners are found.
+
+    The markers of a board are numbered row by row, so their count leaves few sizes, and corners
+    between them are found with the right one only. Others are markers alone.
+    """
+    count = max(ids) + 1
+    sizes = [(c, count * 2 // c + more) for c in range(3, count) for more in (0, 1)]
+    boards = [Board("charuco", c, r, 1.0, 0.75, dictionary) for c, r in sizes
+              if r >= 3 and c * r // 2 == count]  # fmt: skip
+    found = {board: len(_charuco_corners(board, grey)[1]) for board in boards}
+    best = max(found, key=lambda board: found[board], default=None)
+    if best is not None and found[best] >= FEWEST_CHARUCO:
+        params = {"columns": best.columns, "rows": best.rows, "dictionary": dictionary}
+        what = f"a ChArUco board of {best.columns} x {best.rows} squares, markers of {dictionary}"
+        return SeenBoard("charuco", params, what)
+    listed = ", ".join(map(str, ids[:8])) + (", …" if len(ids) > 8 else "")
+    what = f"{len(ids)} markers of {dictionary} (id {listed})"
+    return SeenBoard("marker", {"id": ids[0], "dictionary": dictionary}, what)
 
 
 def _grey(image: Image) -> Grey:
@@ -104,20 +145,36 @@ def _grey(image: Image) -> Grey:
 
 
 def _charuco(board: Board, grey: Grey, _image: Image) -> Corners | Rejected:
-    import cv2
-
-    detector = cv2.aruco.CharucoDetector(charuco_of(board))
-    corners, ids, _, markers = detector.detectBoard(grey)
-    count = 0 if ids is None else len(ids)
-    if count < FEWEST_CHARUCO:
-        seen = [] if markers is None else [int(each) for each in np.asarray(markers).ravel()]
-        told = _of_other_size(board, seen) if seen else _of_other_families(board, grey)
+    pixels, ids, seen = _charuco_corners(board, grey)
+    if len(ids) < FEWEST_CHARUCO:
+        told = _of_other_size(board, seen) if seen else _of_other_families(grey)
         return Rejected(
-            f"{count} corners of the ChArUco board found, at least {FEWEST_CHARUCO} are needed "
+            f"{len(ids)} corners of the ChArUco board found, at least {FEWEST_CHARUCO} are needed "
             f"({len(seen)} of its markers were{told})"
         )
-    pixels = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
-    return Corners(pixels, board.inner_corners()[np.asarray(ids).ravel()])
+    return Corners(pixels, board.inner_corners()[ids])
+
+
+def _charuco_corners(board: Board, grey: Grey) -> tuple[Floats, list[int], list[int]]:
+    """Return the corners (n, 2) [px], which of the board's they are, and the markers' ids.
+
+    OpenCV before 4.6 printed boards with an even number of rows with a marker at the top left,
+    where now a black square is; the corners are the same.
+    """
+    import cv2
+
+    print_ = charuco_of(board)
+    for legacy in (False, True)[: 1 + (board.rows % 2 == 0)]:
+        print_.setLegacyPattern(legacy)
+        corners, ids, _, markers = cv2.aruco.CharucoDetector(print_).detectBoard(grey)
+        if ids is not None and len(ids) >= FEWEST_CHARUCO:
+            break
+    pixels = np.asarray(() if corners is None else corners, dtype=np.float64).reshape(-1, 2)
+    return pixels, _ids(ids), _ids(markers)
+
+
+def _ids(found: Any) -> list[int]:
+    return [] if found is None else [int(each) for each in np.asarray(found).ravel()]
 
 
 def _of_other_size(board: Board, seen: Sequence[int]) -> str:
@@ -135,18 +192,24 @@ def _of_other_size(board: Board, seen: Sequence[int]) -> str:
     )
 
 
-def _of_other_families(board: Board, grey: Grey) -> str:
+def _of_other_families(grey: Grey) -> str:
     """Return what to write where the image shows markers, and none of the board's family."""
+    if found := _family_in(grey):
+        return f"; {len(found[1])} of {found[0]} are seen: write dictionary: {found[0]}"
+    return ""
+
+
+def _family_in(grey: Grey) -> tuple[str, list[int]] | None:
+    """Return the first family of which an image shows markers, and their ids in order."""
     import cv2
 
     by = min(1.0, WIDTH / grey.shape[1])
     small = cv2.resize(grey, None, fx=by, fy=by, interpolation=cv2.INTER_AREA)
     for name in FAMILIES:
-        family = cv2.aruco.ArucoDetector(dictionary_of(replace(board, dictionary=name)))
-        _, ids, _ = family.detectMarkers(small)
-        if ids is not None:
-            return f"; {len(ids)} of {name} are seen: write dictionary: {name}"
-    return ""
+        family = cv2.aruco.ArucoDetector(dictionary_of(name))
+        if ids := _ids(family.detectMarkers(small)[1]):
+            return name, sorted(ids)
+    return None
 
 
 def _marker(board: Board, grey: Grey, image: Image) -> Corners | Rejected:
@@ -154,11 +217,11 @@ def _marker(board: Board, grey: Grey, image: Image) -> Corners | Rejected:
 
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    detector = cv2.aruco.ArucoDetector(dictionary_of(board), parameters)
+    detector = cv2.aruco.ArucoDetector(dictionary_of(board.dictionary), parameters)
     corners, ids, _ = detector.detectMarkers(grey)
-    found = [] if ids is None else [int(each) for each in np.asarray(ids).ravel()]
+    found = _ids(ids)
     if found.count(board.marker_id) != 1:
-        others = ", ".join(map(str, sorted(found))) or f"none{_of_other_families(board, grey)}"
+        others = ", ".join(map(str, sorted(found))) or f"none{_of_other_families(grey)}"
         return Rejected(
             f"marker {board.marker_id} found {found.count(board.marker_id)} times, once is needed "
             f"(found: {others})"

@@ -7,6 +7,7 @@ per-capture steps. When the solver stops pulling, nothing more is acquired.
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing
@@ -206,7 +207,10 @@ class Runner:
         why = [(each.stage, each.reason, each.fix) for each in self._outcome.rejections]
         if self._outcome.seen or self._values[t.Views] or not why:
             return
-        (stage, reason, fix), share = Counter(why).most_common(1)[0]
+        # Reasons that differ in their numbers alone are one
+        alike = [(stage, re.sub(r"\(.*\)|\d+", "", reason), fix) for stage, reason, fix in why]
+        common, share = Counter(alike).most_common(1)[0]
+        stage, reason, fix = why[alike.index(common)]
         of = f"{share} of the " if share < len(why) else "the "
         usual = f"{stage}: {reason}" + (f"; {fix}" if fix else "")
         raise NothingSeen(f"no capture can be used; {of}{len(why)} were rejected by {usual}")

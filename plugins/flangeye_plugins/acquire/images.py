@@ -71,6 +71,8 @@ class SeenBoardParams(Params):
             raise ValueError("four corners do not tell a camera; use a board")
         if self.kind == "charuco" and not 0 < self.marker < self.square:
             raise ValueError("marker: a ChArUco board's markers are smaller than its squares")
+        if self.kind == "checkerboard" and min(self.columns, self.rows) < 4:
+            raise ValueError("OpenCV finds checkerboards of at least 4 x 4 squares")
         return self
 
     @property
@@ -192,7 +194,8 @@ def _not_shown(
 ) -> StageError:
     """Return the error that no image shows the board, with what the first of them shows."""
     name, found = next(iter(missed.items()))
-    instead = found.reason if board.kind in ("charuco", "marker") else board_seen(first)
+    seen = board_seen(first.pixels)
+    instead = f"it shows {seen.what}: write fit.{seen.fit}" if seen else found.reason
     what = board.kind if board.kind == "marker" else f"{board.kind}, {board.columns} x {board.rows}"
     return StageError(
         f"none of {len(missed)} of the {count} images, spread over all, shows the board ({what}); "

@@ -81,6 +81,10 @@ class CharucoParams(SquaresParams, DictionaryParams):
 class CheckerboardParams(SquaresParams):
     """Parameters of ``fit.checkerboard``."""
 
+    # OpenCV finds no grid of fewer than three inner corners a side
+    columns: int = Field(ge=4, description="Squares from left to right, inner and outer.")
+    rows: int = Field(ge=4, description="Squares from top to bottom.")
+
     @model_validator(mode="after")
     def _asymmetric(self) -> CheckerboardParams:
         if (self.columns + self.rows) % 2 == 0:

@@ -91,11 +91,12 @@ OTHER = Board("checkerboard", 9, 6, 0.02)
 @pytest.mark.parametrize(
     ("shown", "said"),
     [
-        (BOARD, "of 4X4_250 are seen: write dictionary: 4X4_250 and kind: charuco, or fit.aruco"),
-        (OTHER, "a checkerboard of 9 x 6 squares is seen: write kind: checkerboard, columns: 9,"),
-        (None, "0: no board that is known is seen in it"),
+        (BOARD, "it shows a ChArUco board of 7 x 5 squares, markers of 4X4_250: write "
+         "fit.charuco: {columns: 7, rows: 5, dictionary: 4X4_250}"),
+        (OTHER, "it shows a checkerboard of 9 x 6 squares: write fit.checkerboard: {columns: 9, "),
+        (None, "0: no checkerboard of 10 x 7 squares found"),
     ],
-)
+)  # fmt: skip
 def test_a_board_that_is_in_no_image_ends_early_and_the_one_that_is_seen_is_named(
     shown: Board | None, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -186,6 +187,10 @@ def table_reader():
         (
             {"kind": "charuco", "columns": 7, "rows": 5},
             "marker: a ChArUco board's markers are smaller",
+        ),
+        (
+            {"kind": "checkerboard", "columns": 6, "rows": 3},
+            "OpenCV finds checkerboards of at least 4 x 4 squares",
         ),
     ],
 )

@@ -9,8 +9,8 @@ import pytest
 from pydantic import ValidationError
 
 from flangeye.maths.geometry import rigid, rotation_exp, rotation_log
-from flangeye.models.boards import Board, print_of
-from flangeye.models.corners import Corners
+from flangeye.models.boards import Board, charuco_of, print_of
+from flangeye.models.corners import Corners, board_seen
 from flangeye.types import CAMERA, Capture, Floats, Image, PointCloud, Rejected, Transform, by_frame
 from flangeye.units import SI
 from flangeye_emulators.world.board_image import BoardCamera, Cover, render_board, scan_board
@@ -224,6 +224,36 @@ def test_a_charuco_board_of_another_size_is_told_by_its_markers() -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("board", "fit"),
+    [
+        (CHARUCO, "charuco: {columns: 7, rows: 5, dictionary: 4X4_250}"),
+        (Board("charuco", 6, 8, 0.02, 0.014, "5X5_100"),
+         "charuco: {columns: 6, rows: 8, dictionary: 5X5_250}"),
+        (CHECKER, "checkerboard: {columns: 8, rows: 5}"),
+        (MARKER, "aruco: {id: 3, dictionary: APRILTAG_36h11}"),
+    ],
+)  # fmt: skip
+def test_an_image_shows_its_board_up_to_its_lengths(board: Board, fit: str) -> None:
+    seen = board_seen(capture(board, looking()).image.pixels)
+    assert seen is not None
+    assert seen.fit == fit
+
+
+def test_a_board_as_opencv_printed_it_before_4_6_is_found() -> None:
+    import cv2
+
+    old = charuco_of(Board("charuco", 8, 6, 0.03, 0.022))
+    old.setLegacyPattern(True)
+    page = np.full((800, 1000), 255, np.uint8)
+    page[100:700, 100:900] = old.generateImage((800, 600), marginSize=0)
+    seen = Capture("0", PointCloud(CAMERA, np.zeros((0, 3))), by_frame(POSE), image=Image(
+        np.asarray(cv2.GaussianBlur(page, (5, 5), 0), np.uint8), np.array([[1000.0, 0, 500], [0, 1000, 400], [0, 0, 1]])
+    ))  # fmt: skip
+    found = fit_charuco(seen, OF_CHARUCO.model_copy(update={"columns": 8, "rows": 6}))
+    assert np.allclose(found.camera_T_target.translation, [0, 0, 0.3], atol=1e-3)
+
+
 def test_a_family_may_be_written_in_small_letters() -> None:
     assert MarkerParams(size=SI(0.02), dictionary="5x5_100").dictionary == "5X5_100"
     assert MarkerParams(size=SI(0.02), dictionary="apriltag_36H11").dictionary == "APRILTAG_36h11"
@@ -330,8 +360,8 @@ def test_a_scanners_distortion_turns_a_small_target_more() -> None:
         (CharucoParams, {"columns": 5, "square": "30 mm", "marker": "20 mm"}, "rows", 2, 3),
         (CharucoParams, {"columns": 5, "rows": 5, "square": "9 mm"}, "marker", "0 mm", "1 um"),
         (CharucoParams, {"columns": 5, "rows": 5, "marker": "9 mm"}, "square", "0 mm", "9.1 mm"),
-        (CheckerboardParams, {"rows": 6, "square": "30 mm"}, "columns", 2, 3),
-        (CheckerboardParams, {"columns": 6, "square": "30 mm"}, "rows", 2, 3),
+        (CheckerboardParams, {"rows": 5, "square": "30 mm"}, "columns", 3, 4),
+        (CheckerboardParams, {"columns": 5, "square": "30 mm"}, "rows", 3, 4),
         (CheckerboardParams, {"columns": 6, "rows": 5}, "square", "0 mm", "1 um"),
         (CirclesParams, {"rows": 5, "spacing": "9 mm", "diameter": "9 mm"}, "columns", 1, 2),
         (CirclesParams, {"columns": 5, "spacing": "9 mm", "diameter": "9 mm"}, "rows", 1, 3),

@@ -85,6 +85,7 @@ PER_METRE: Mapping[LengthUnit, float] = {"m": 1, "mm": 1000, "in": 1 / 0.0254}
 """How many of a unit are in a metre."""
 
 _OPENERS: Mapping[str, Callable[[Path], PointTable]] = {
+    ".asc": open_text,
     ".csv": open_text,
     ".npy": open_npy,
     ".pcd": open_pcd,

@@ -149,7 +149,7 @@ class NpyTable:
             return xyz
 
 
-def open_text(path: Path) -> PointTable:
+def open_text(path: Path) -> TextTable:
     """Return the points of a table as text: x, y, z first, or wherever a heading names them.
 
     Values are separated by blanks, tabs, commas or semicolons; where those are not commas,

@@ -222,9 +222,9 @@ def _named(
     many = len(table.indices(columns))
     usual = {3: ("point",), 12: (MATRIX,), 16: (MATRIX,), 7: ("xyzw", "wxyz")}.get(many, ())
     same = next((p for p in known if set(p.columns) == set(columns)), None)
-    length, angle = (same.length, same.angle) if same else (None, None)
-    kept = same.rotations if same and not rotations else ()
-    return PoseColumns(table, tuple(columns), rotations or kept or usual, "", length, angle)
+    named = same or PoseColumns(table, (), usual)
+    kept = rotations or named.rotations or usual
+    return replace(named, columns=tuple(columns), rotations=kept, guess="")
 
 
 def _target(

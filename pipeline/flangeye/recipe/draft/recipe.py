@@ -12,8 +12,10 @@ from typing import Any
 from flangeye.errors import RecipeError, StageError
 from flangeye.files.cameras import cameras_in
 from flangeye.files.clouds import CONVERSIONS, read_cloud
-from flangeye.files.recording import Archive, NotThisLayout
-from flangeye.files.scans import CLOUDS, IMAGES
+from flangeye.files.images import MAX_FILE, ImageError, decode_image
+from flangeye.files.recording import Archive, NotThisLayout, Recording
+from flangeye.files.regular import read_regular
+from flangeye.files.scans import IMAGES
 from flangeye.files.tables import tables_in
 from flangeye.files.yaml_lines import entry, flow, parse_value
 from flangeye.models.loading import load_model
@@ -123,9 +125,13 @@ def _reader(
     if any(p.name.startswith("pos0") and p.suffix in (".yaml", ".yml") for p in survey.files):
         return {"zivid": {"length": _length_of_files(questions)}}
     if survey.tables:
-        scans = bool(survey.of(CLOUDS) or survey.of(IMAGES))
-        params = table_params(survey.tables, questions, _model(robot), scans)
-        return {"table": params}
+        scans = bool(survey.clouds or survey.of(IMAGES))
+        try:
+            return {"table": table_params(survey.tables, questions, _model(robot), scans)}
+        except RecipeError as error:
+            # Scans in a form that is not read are what is missing beside poses
+            many = len(survey.tables[0].rows)
+            raise (None if scans else _convertible(survey, many)) or error from None
     raise StageError(_missing(survey, reason))
 
 
@@ -161,22 +167,30 @@ def _missing(survey: FolderSurvey, reason: StageError) -> str:
             tables_in(path.parent, path.name)
         except StageError as error:
             return str(error)
-    scans = survey.of(CLOUDS) or survey.of(IMAGES)
+    scans = survey.clouds or survey.of(IMAGES)
     if scans:
-        column = "cloud" if survey.of(CLOUDS) else "image"
+        column = "cloud" if survey.clouds else "image"
         return (
             f"{survey.folder}: holds {len(scans)} scans, but nothing that says where the flange "
             f"was; put poses.csv beside them, its first line: {column},{POSES_LINE}; then a line "
             f"for each, {scans[0].name},412.1,-33.0,501.7,2.91,0.12,-0.03"
         )
-    for suffix, way in CONVERTED.items():
-        if others := survey.of((suffix,)):
-            named = way.format(file=others[0], stem=others[0].with_suffix(""))
-            return f"{others[0]}: {named}; then flangeye init {survey.folder} again"
+    if other := _convertible(survey, 1):
+        return str(other)
     closed = survey.of(CLOSED)
     if closed:
         return f"{survey.folder}: {closed[0].name} is a table that is not read; save it as .csv"
     return f"{survey.folder}: holds no scans and no table of poses; {reason}"
+
+
+def _convertible(survey: FolderSurvey, count: int) -> RecipeError | None:
+    """Return the error that recordings have to be converted; None where there are not as many."""
+    for suffix, way in CONVERTED.items():
+        others = survey.of((suffix,))
+        if len(others) >= count:
+            named = way.format(file=others[0], stem=others[0].with_suffix(""))
+            return RecipeError(f"{others[0]}: {named}; then flangeye init {survey.folder} again")
+    return None
 
 
 # --- what is in it
@@ -195,14 +209,38 @@ def _what(archive: Archive, questions: Questions) -> tuple[str, dict[str, Any]]:
         )
         return "acquire.archive", _target(answer)
     if any(r.image for r in records):
-        example = "'charuco: {columns: 8, rows: 6, square: 30 mm, marker: 22 mm}'"
-        answer = questions.ask("target", "which printed target is seen", None, example, _target)
+        shown, example = ("", "") if questions.given.get("target") else _printed(records)
+        question = f"which printed target is seen{shown}"
+        answer = questions.ask("target", question, None, example, _target)
         return "acquire.images", _target(answer)
     if any(r.camera_T_target is not None for r in records):
         return "acquire.samples", {}
     if any(r.centre_in_camera is not None for r in records):
         return "acquire.centres", {}
     raise StageError(f"{archive.root}: holds poses, but neither scans nor what the camera measured")
+
+
+def _printed(records: Sequence[Recording]) -> tuple[str, str]:
+    """Return what the first, middle and last image show of a printed target, and how to write it.
+
+    Its lengths are those of the print, and have to be measured.
+    """
+    import cv2
+
+    from flangeye.models.corners import board_seen
+
+    paths = [r.image for r in records if r.image is not None]
+    for path in dict.fromkeys((paths[0], paths[len(paths) // 2], paths[-1])):
+        try:
+            pixels = decode_image(read_regular(path, MAX_FILE), cv2.IMREAD_GRAYSCALE)
+        except (ImageError, StageError):
+            continue
+        if seen := board_seen(pixels):
+            lengths = {"charuco": "square: 30 mm, marker: 22 mm", "marker": "size: 50 mm"}
+            measured = lengths.get(seen.kind, "square: 30 mm")
+            told = f" ({path.name} shows {seen.what}), with the lengths measured on the print"
+            return told, f"'{seen.fit[:-1]}, {measured}}}'"
+    return "", "'charuco: {columns: 8, rows: 6, square: 30 mm, marker: 22 mm}'"
 
 
 def _target(answer: str) -> dict[str, Any]:

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from flangeye.errors import FlangeyeError, RecipeError, StageError
 from flangeye.files.cameras import cameras_in
+from flangeye.files.clouds import CONVERSIONS
 from flangeye.files.pairs import natural
-from flangeye.files.scans import CLOUDS, IMAGES, VENDOR
+from flangeye.files.scans import CLOUDS, IMAGES, VENDOR, texts_of_points
 from flangeye.files.tables import KINDS, Table, number_of, read_table, tables_in
 from flangeye.recipe.draft.headings import list_name, list_sizes
 
@@ -87,7 +88,7 @@ class Questions:
         self, flag: str, question: str, default: str | None, example: str, check: Check | None
     ) -> str:
         if self.prompt is None:
-            raise RecipeError(f"{question}: nothing tells; add --{flag} {example}".rstrip())
+            raise RecipeError(f"not known: {question}; add --{flag} {example}".rstrip())
         refused = ""
         while True:
             answer = self.prompt(f"{refused}{question} (--{flag})", default)
@@ -114,11 +115,21 @@ class FolderSurvey:
         folder: Where.
         files: All files of the folder, and of the folders in it.
         tables: Those that are tables of numbers.
+        points: Texts that hold a cloud each.
+        cameras: Calibrations of a camera.
     """
 
     folder: Path
     files: Sequence[Path]
     tables: Sequence[Table]
+    points: Collection[Path] = ()
+    cameras: Collection[Path] = ()
+
+    @property
+    def clouds(self) -> list[Path]:
+        """The clouds, those in texts too."""
+        found = {*self.of(CLOUDS), *self.points}
+        return [path for path in self.files if path in found]
 
     def of(self, suffixes: Sequence[str]) -> list[Path]:
         """Return the files that end so; tables of poses are no clouds."""
@@ -127,14 +138,15 @@ class FolderSurvey:
 
     def lines(self) -> list[str]:
         """Return what was seen, a line each for people."""
+        unread = (".npz", ".mat", *CONVERSIONS, *VENDOR)
         told = [
             f"{what}: {', '.join(f'{n} {suffix}' for suffix, n in sorted(kinds.items()))}"
-            for what, suffixes in (
-                ("clouds", CLOUDS),
-                ("images", IMAGES),
-                ("closed", tuple(VENDOR)),
+            for what, paths in (
+                ("clouds", self.clouds),
+                ("images", self.of(IMAGES)),
+                ("not read", [p for p in self.of(unread) if p not in self.cameras]),
             )
-            if (kinds := Counter(p.suffix.lower() for p in self.of(suffixes)))
+            if (kinds := Counter(p.suffix.lower() for p in paths))
         ]
         return [*told, *(f"table: {_of_table(table)}" for table in self.tables)]
 
@@ -154,9 +166,10 @@ def look(folder: Path) -> FolderSurvey:
         raise RecipeError(f"{folder}: is empty; put the clouds or images and their poses there")
     with suppress(StageError):
         cameras = {camera.path for camera in cameras_in(folder)}
-    others = [file for file in files if file not in cameras]
+    points = texts_of_points(files)
+    others = [file for file in files if file not in {*cameras, *points}]
     tables = [t for place, of in places(folder, others) for t in _tables(folder, place, len(of))]
-    return FolderSurvey(folder, files, _whole(folder, tables))
+    return FolderSurvey(folder, files, _whole(folder, tables), points, cameras)
 
 
 def places(folder: Path, files: Sequence[Path]) -> Iterator[tuple[str, list[Path]]]:
