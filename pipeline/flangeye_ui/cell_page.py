@@ -5,13 +5,16 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Mapping
 from functools import cache
+from itertools import count
 from typing import Any, get_args
 
 import yaml
 from nicegui import ui
 
+from flangeye.errors import FlangeyeError
 from flangeye.files.paths import bundled
 from flangeye.files.yaml_lines import read_yaml
+from flangeye.models.graph import Running
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import Stage
 from flangeye.recipe.find import find_recipe, recipe_names
@@ -77,6 +80,8 @@ class Form:
             with ui.expansion("Not in the lists?").classes("w-full"):
                 Import(project, self, "robot", ARM)
                 Import(project, self, "scanner", SCANNER)
+            with ui.expansion("Does it run under ROS 2?").classes("w-full"):
+                WhatRuns(project, self)
             self._advanced()
         with ui.column().classes("col-12 col-md gap-2"):
             self.picture()
@@ -248,6 +253,10 @@ class Form:
 
     def _write(self, data: dict[str, Any]) -> None:
         self._project.edit(data)
+        self.reload()
+
+    def reload(self) -> None:
+        """Show the recipe that is on disk now."""
         self._yaml.value = self._project.text
 
     def _typed(self, event: Any) -> None:
@@ -302,6 +311,95 @@ class Import:
             ui.label(said).props('role="status"')
         self._form.choose(self._section, f"{self._words()[1]}.yaml")
 
+
+class WhatRuns:
+    """What runs under ROS 2, to choose from: ``flangeye init --ros2`` then writes the recipe."""
+
+    def __init__(self, project: Project, form: Form) -> None:
+        self._project, self._form = project, form
+        self._chosen: dict[str, str] = {}
+        button = ui.button("Look at what runs", on_click=self._look).props("outline no-caps")
+        button.tooltip("Listens for a few seconds; publishes nothing and calls no service")
+        self._rows = ui.column().classes("w-full gap-1")
+
+    async def _look(self) -> None:
+        with self._again():
+            ui.label("Listening …").props('role="status"')
+        try:
+            found = await asyncio.to_thread(self._running)
+        except FlangeyeError as error:
+            with self._again():
+                mistake(str(error))
+            return
+        self._chosen = {}
+        with self._again():
+            for option, title in OF_WHAT_RUNS.items():
+                lines = {each.name: each.line for each in found if each.answers == option}
+                self._choice(option, title, lines)
+            for each in found:
+                if not each.answers:
+                    ui.label(each.line).classes("note")
+            self._line = command_line(self._project.command(*self._words("running")))
+            ui.button("Write the recipe", on_click=self._draft).props("outline no-caps")
+            self._told = ui.column().classes("w-full gap-0")
+
+    def _running(self) -> list[Running]:
+        with self._project.registry.graph() as graph:
+            return graph.running()
+
+    def _again(self) -> ui.column:
+        self._rows.clear()
+        return self._rows
+
+    def _choice(self, option: str, title: str, lines: dict[str, str]) -> None:
+        """Show what may answer an option of the command; the only one is chosen."""
+        none = {NONE: f"{NONE} of these"} if option in ("trajectory", "trigger") else {}
+        ui.label(title if lines else f"{title}: none runs")
+        if lines:
+            chosen = next(iter(lines)) if len(lines) == 1 else None
+            ui.radio(
+                lines | none, value=chosen, on_change=lambda e: self._choose(option, e.value)
+            ).props("dense").classes("topics")
+            if chosen:
+                self._chosen[option] = chosen
+
+    def _choose(self, option: str, name: str) -> None:
+        self._chosen[option] = name
+        self._line.text = self._project.command(*self._words("running"))
+
+    def _words(self, name: str) -> list[str]:
+        model = (self._project.data().get("scanner") or {}).get("model")
+        given = {"scanner": model, **self._chosen} if model else self._chosen
+        options = [word for option in given.items() for word in (f"--{option[0]}", option[1])]
+        return ["init", "--ros2", "--yes", *options, "--out", f"{name}.yaml"]
+
+    async def _draft(self) -> None:
+        """Let the command write a recipe of a new name, and take it over."""
+        folder = self._project.folder
+        names = (f"running{i or ''}" for i in count())
+        name = next(n for n in names if not (folder / f"{n}.urdf").exists())
+        said = await asyncio.to_thread(self._project.run_command, self._words(name))
+        self._told.clear()
+        drafted = folder / f"{name}.yaml"
+        with self._told:
+            if not drafted.exists():
+                mistake(said.removeprefix("error: "))
+                return
+            for line in said.splitlines()[:-1]:
+                ui.label(line).classes("note")
+        self._project.text = drafted.read_text(encoding="utf-8")
+        drafted.unlink()
+        self._form.reload()
+
+
+OF_WHAT_RUNS = {
+    "robot": "The arm's description", "scans": "The scans", "trigger": "What takes a scan",
+    "trajectory": "What moves the arm",
+}  # fmt: skip
+"""Options of ``flangeye init --ros2`` that what runs may answer, as people call them."""
+
+NONE = "none"
+"""Answers that others move the arm, or that the camera runs by itself."""
 
 Boxes = Mapping[str, tuple[str, Callable[[str], Any]]]
 """By option of a command: what its box is called, and what it is."""

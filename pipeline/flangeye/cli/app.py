@@ -12,9 +12,8 @@ from flangeye.cli.console import say, say_notes
 from flangeye.errors import FlangeyeError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
-    from flangeye.models.graph import Graph
     from flangeye.plugin.registry import Registry
     from flangeye.recipe.load import Recipe
 
@@ -109,18 +108,6 @@ def load_plugins() -> Registry:
     from flangeye.plugin.registry import load_registry
 
     return load_registry()
-
-
-def open_graph(registry: Registry, name: str = "ros2") -> Graph:
-    """Return a network of nodes, joined.
-
-    Raises:
-        FlangeyeError: It is not there.
-    """
-    offered: dict[str, Callable[[], Graph]] = {}
-    for each in registry.hooks.hook.flangeye_graphs():
-        offered |= each
-    return offered[name]()
 
 
 def read_recipe(name: str, registry: Registry, overrides: Sequence[str] | None = None) -> Recipe:

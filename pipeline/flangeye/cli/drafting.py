@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flangeye.cli.app import app, ask, load_plugins, open_graph
+from flangeye.cli.app import app, ask, load_plugins
 from flangeye.cli.console import say
 from flangeye.errors import RecipeError
 
@@ -148,7 +148,7 @@ def _of_what_runs(folder: Path, out: Path, questions: Questions, registry: Regis
     from flangeye.recipe.draft import draft_live
 
     del folder
-    with open_graph(registry) as graph:
+    with registry.graph() as graph:
         cell = graph.cell(questions.ask, out.stem)
     for line in cell.seen:
         say(line)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flangeye.cli.app import LogFile, app, load_plugins, open_graph
+from flangeye.cli.app import LogFile, app, load_plugins
 from flangeye.cli.console import say
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ def publish(
         pose.transform.parent: parent or (named and named.parent),
         pose.transform.child: child or (named and named.child),
     }
-    with open_graph(registry) as graph, suppress(KeyboardInterrupt):
+    with registry.graph() as graph, suppress(KeyboardInterrupt):
         for line in graph.publish(pose, {own: name for own, name in frames.items() if name}):
             say(f"{line}: published until Ctrl-C")
         graph.stay()

@@ -33,6 +33,20 @@ class Topic(NamedTuple):
     subscribers: int
 
 
+class Running(NamedTuple):
+    """A topic or a service that runs and that a recipe may use.
+
+    Attributes:
+        name: With its namespace.
+        line: What it is, for people: its type, how often it comes, by whom.
+        answers: The option of ``flangeye init`` that may name it; empty where none does.
+    """
+
+    name: str
+    line: str
+    answers: str
+
+
 @dataclass(frozen=True, eq=False)
 class RunningCell:
     """An arm and a camera that run, as a recipe names them.
@@ -73,6 +87,10 @@ class Graph(Device, Protocol):
 
     def topics(self) -> list[Topic]:
         """Return the topics that run, by name."""
+        ...
+
+    def running(self) -> list[Running]:
+        """Return what runs and is of use to a recipe; publishes nothing and calls no service."""
         ...
 
     def cell(self, ask: Ask, name: str) -> RunningCell:

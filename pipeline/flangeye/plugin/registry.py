@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Iterator, Mapping, MutableMapping
+from collections.abc import Callable, Iterator, Mapping, MutableMapping
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import Distribution, EntryPoint, entry_points
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import pluggy
 
@@ -19,6 +19,9 @@ from flangeye.models.robots import RobotModel
 from flangeye.plugin import hookspecs
 from flangeye.plugin.hookspecs import NAME
 from flangeye.plugin.stage import Part, Plugin, Siblings, Stage
+
+if TYPE_CHECKING:
+    from flangeye.models.graph import Graph
 
 
 class PluginNotFoundError(FlangeyeError, LookupError):
@@ -124,6 +127,17 @@ class Registry:
         if name not in self.parts:
             raise self._missing("part", name)
         return self.parts[name]
+
+    def graph(self, name: str = "ros2") -> Graph:
+        """Return a network of nodes, joined.
+
+        Raises:
+            FlangeyeError: It is not there.
+        """
+        offered: dict[str, Callable[[], Graph]] = {}
+        for each in self.hooks.hook.flangeye_graphs():
+            offered |= each
+        return offered[name]()
 
     def exports(self) -> list[Stage]:
         """Return the formats that ask for the camera's pose alone, in the order of their offering.

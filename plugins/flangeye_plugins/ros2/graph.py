@@ -17,7 +17,7 @@ from flangeye.devices import Device, DeviceError
 from flangeye.files.regular import read_text
 from flangeye.maths.geometry import invert, quaternion_from_rotation
 from flangeye.maths.kinematics import Arm
-from flangeye.models.graph import Ask, RunningCell, Topic
+from flangeye.models.graph import Ask, Running, RunningCell, Topic
 from flangeye.models.urdf import MAX_BYTES, NAMED, UrdfArm, arm_of, flange_links, parse_urdf
 from flangeye.types import CAMERA, CalibratedPose, Floats
 from flangeye_plugins.ros2.client import MATCHING, Bridge, GraphMessage
@@ -70,6 +70,22 @@ class Ros2Graph(Device):
         known = self._bridge.topics()
         return [known[n] for n in sorted(known) if known[n].publishers or known[n].subscribers]
 
+    def running(self) -> list[Running]:
+        """Return what runs and is of use; see :class:`flangeye.models.graph.Graph`."""
+        topics = self.topics()
+        found = [Running(name, f"{name}: String", "robot") for name in descriptions_in(topics)]
+        found += [
+            Running(each.topic.name, each.line, "scans" if each.has_scans else "")
+            for each in self._listen(topics)
+        ]
+        found += [
+            Running(name, f"{name}: JointTrajectory, a controller listens", "trajectory")
+            for name in controllers_in(topics)
+        ]
+        return found + [
+            Running(name, f"{name}: Trigger, a service", "trigger") for name in self._triggers()
+        ]
+
     def cell(self, ask: Ask, name: str) -> RunningCell:
         """Return the arm and the camera that run; publishes nothing and calls no service.
 
@@ -90,8 +106,7 @@ class Ros2Graph(Device):
         states, angles = states_of(heard, found.joints)
         scans = scans_of(heard, ask)
         driver = arm_driver(topics, found.joints, states, ask)
-        triggers = [s for s, kind in self._bridge.services().items() if kind == TRIGGER]
-        camera = scanner_driver(scans, triggers, ask)
+        camera = scanner_driver(scans, self._triggers(), ask)
         if any(topic.name == CLOCK and topic.publishers for topic in topics):
             for params in (camera, *driver.values()):
                 params["sim_time"] = True
@@ -144,13 +159,14 @@ class Ros2Graph(Device):
 
     # --- what runs
 
+    def _triggers(self) -> list[str]:
+        """Return the services that may take a scan, by their type and their name."""
+        services = self._bridge.services().items()
+        return [s for s, kind in services if kind == TRIGGER and TRIGGERS.search(s)]
+
     def _description(self, topics: Sequence[Topic], ask: Ask) -> str:
         """Return the URDF that a node publishes, or of a file."""
-        known = [
-            t.name
-            for t in topics
-            if t.type == TEXT and t.publishers and t.name.endswith("robot_description")
-        ]
+        known = descriptions_in(topics)
         question = f"which robot_description ({', '.join(known) or 'none runs'}), or a .urdf file"
         chosen = ask("robot", question, known[0] if len(known) == 1 else None, "arm.urdf")
         if chosen not in known:
@@ -235,12 +251,32 @@ class Heard(NamedTuple):
         return frame_of(self.newest.data) if self.newest else ""
 
     @property
+    def has_scans(self) -> bool:
+        """Whether it has clouds or depths: by an image's encoding, or its name where none came."""
+        if self.topic.type != IMAGE:
+            return self.topic.type == CLOUD
+        if self.newest is None:
+            return "depth" in self.topic.name
+        return decoded(self.newest.data, IMAGE).encoding in PER_METRE
+
+    @property
     def line(self) -> str:
         """What it is, for people."""
         name, kind = self.topic.name, self.topic.type.rpartition("/")[2]
         often = f"{self.rate:.3g} Hz" if self.newest else "silent"
         frame = f", frame {self.frame}" if self.frame else ""
         return f"{name}: {kind}, {often}{frame}, by {' and '.join(self.topic.publishers)}"
+
+
+def descriptions_in(topics: Iterable[Topic]) -> list[str]:
+    """Return the topics that have an arm's URDF."""
+    texts = (t.name for t in topics if t.type == TEXT and t.publishers)
+    return [name for name in texts if name.endswith("robot_description")]
+
+
+def controllers_in(topics: Iterable[Topic]) -> list[str]:
+    """Return the topics on which a controller takes joint trajectories."""
+    return [t.name for t in topics if t.type == TRAJECTORY and t.subscribers]
 
 
 def described_arm(text: str, path: Path, ask: Ask) -> tuple[UrdfArm, dict[str, Any]]:
@@ -295,7 +331,7 @@ def arm_driver(
     topics: Iterable[Topic], joints: Sequence[str], states: str, ask: Ask
 ) -> dict[str, Any]:
     """Return the driver of an arm as a recipe names it, with its parameters."""
-    listening = [t.name for t in topics if t.type == TRAJECTORY and t.subscribers]
+    listening = controllers_in(topics)
     question = f"which controller moves the arm; {NONE}: others do, by hand or by a program"
     told = f" ({', '.join(listening)})" if len(listening) > 1 else ""
     chosen = ask("trajectory", question + told, _only(listening, NONE))
@@ -313,26 +349,15 @@ def scans_of(heard: Sequence[Heard], ask: Ask) -> Heard:
     Raises:
         DeviceError: There is none, or not the one that was asked for.
     """
-    clouds = {each.topic.name: each for each in heard if each.topic.type == CLOUD}
-    depths = {each.topic.name: each for each in heard if _has_depths(each)}
-    found = [*(clouds or depths)]
+    every = {each.topic.name: each for each in heard if each.has_scans}
+    found = [n for n, each in every.items() if each.topic.type == CLOUD] or [*every]
     chosen = ask("scans", f"which topic has the scans ({', '.join(found)})", _only(found, None))
-    every = clouds | depths
     if chosen not in every:
         raise DeviceError(
             f"nobody publishes clouds or depth images on {chosen}; there are: "
             f"{', '.join(every) or 'none'} (images for markers: write scanner.ros2, image, by hand)"
         )
     return every[chosen]
-
-
-def _has_depths(heard: Heard) -> bool:
-    """Return whether images hold depths, by their encoding, or by their name where none came."""
-    if heard.topic.type != IMAGE:
-        return False
-    if heard.newest is None:
-        return "depth" in heard.topic.name
-    return decoded(heard.newest.data, IMAGE).encoding in PER_METRE
 
 
 def scanner_driver(scans: Heard, triggers: Iterable[str], ask: Ask) -> dict[str, Any]:
@@ -346,8 +371,7 @@ def scanner_driver(scans: Heard, triggers: Iterable[str], ask: Ask) -> dict[str,
     params: dict[str, Any] = {"cloud" if scans.topic.type == CLOUD else "depth": scans.topic.name}
     if scans.newest is None:
         namespace = f"/{scans.topic.name.split('/')[1]}/"
-        named = [t for t in triggers if TRIGGERS.search(t)]
-        likely = [t for t in named if t.startswith(namespace)] or named
+        likely = [t for t in triggers if t.startswith(namespace)] or [*triggers]
         told = f" ({', '.join(likely)})" if len(likely) > 1 else ""
         question = f"{scans.topic.name} is silent: which service (std_srvs/Trigger) takes a scan"
         trigger = ask("trigger", question + told, _only(likely, None), "/camera/capture")
