@@ -209,6 +209,23 @@ class HearsLoss(Protocol):
 
 
 @runtime_checkable
+class Overhears(Protocol):
+    """What a scanner has besides that takes scans which others asked for.
+
+    Where others move the arm, their program may trigger the scanner as well.
+    """
+
+    def overhear(self, since_ns: int) -> Callable[[], Scan]:
+        """Return the newest scan taken since a moment, or the next one; see ``Scanner.expose``.
+
+        Raises:
+            FrameDropped: Nobody took one in time.
+            DeviceError: The scanner is lost.
+        """
+        ...
+
+
+@runtime_checkable
 class KnowsTruth(Protocol):
     """The truth of a simulated scanner, to score it; no stage can ask for it.
 

@@ -1,5 +1,6 @@
 """A run as it goes, read from a log that is still being written."""
 
+import os
 import socket
 import threading
 import time
@@ -107,6 +108,16 @@ def test_a_run_that_failed_is_not_waited_for(tmp_path: Path) -> None:
     watch_run(tmp_path, None, plain(), patience=60)
     assert time.monotonic() - began < 5
     assert read_run(tmp_path).messages == ["step 3 failed"]
+
+
+def test_of_a_calibration_that_is_checked_the_newest_check_is_watched(tmp_path: Path) -> None:
+    for folder, why in ((tmp_path, "a calibration"), (tmp_path / "checks" / "one", "a check")):
+        folder.mkdir(parents=True, exist_ok=True)
+        recorder = Recorder(folder / "run.mcap", {"recipe.yaml": TOY_RECIPE}, False)
+        recorder.ended(why)
+        recorder.close()
+    os.utime(tmp_path / "run.mcap", (0, 0))
+    assert watch_run(tmp_path, None, plain(), patience=5).rows()[0] == ("run", "one, ended")
 
 
 def test_a_journal_and_a_solvers_progress_are_shown(log: Any) -> None:

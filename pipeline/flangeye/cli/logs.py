@@ -166,7 +166,8 @@ def watch(
     run: Annotated[
         Path | None,
         typer.Argument(
-            metavar="[RUN]", help="A run's folder or log; default the newest in ./runs."
+            metavar="[RUN]",
+            help="A run's folder, with its newest check, or log; default the newest in ./runs.",
         ),
     ] = None,
     foxglove: Annotated[

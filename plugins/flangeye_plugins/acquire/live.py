@@ -19,6 +19,7 @@ from flangeye.devices import (
     HearsLoss,
     KnowsTruth,
     MotionAllowed,
+    Overhears,
     RobotDriver,
     RobotState,
     Scan,
@@ -157,7 +158,8 @@ def acquire_live(  # noqa: PLR0913  what it asks the runner for
 
     with ExitStack() as opening:
         guard = opening.enter_context(watched(arm, robot, allowed, told))
-        require_inside(guard.state, allowed)
+        if not arm.passive:  # nobody here plans where others move it
+            require_inside(guard.state, allowed)
         opened = opening.enter_context(eye.open())
         itinerary = planned(guard.state.joints)
         release = opening.pop_all()
@@ -299,12 +301,22 @@ class LiveSession:
         """Expose at a stop; what is returned waits for the data."""
         began = time.monotonic_ns()
         try:
-            transfer = self.scanner.expose()
+            if self.passive and isinstance(self.scanner, Overhears):
+                began = self._stands_since(arrived_ns)
+                transfer = self.scanner.overhear(began)
+            else:
+                transfer = self.scanner.expose()
         except FrameDropped as dropped:
             return partial(_rejected, stop, str(dropped))
         finally:
             self.idle.exposed(arrived_ns, began, time.monotonic_ns())
         return partial(self._capture, stop, transfer, self.arm.during(began, time.monotonic_ns()))
+
+    def _stands_since(self, arrived_ns: int) -> int:
+        """Return since when the arm stands, ten seconds ago at most [ns]."""
+        samples = self.arm.during(arrived_ns - 10_000_000_000, arrived_ns)
+        away = np.flatnonzero(movements(samples[::-1]) > 0.5 * self.moved)
+        return samples[len(samples) - away[0] if len(away) else 0].time_ns
 
     def _capture(
         self, stop: Stop, transfer: Callable[[], Scan], samples: Sequence[RememberedState]
@@ -350,10 +362,15 @@ def within(samples: Sequence[RememberedState], start_ns: int, end_ns: int) -> li
 
 def movement(samples: Sequence[RememberedState]) -> float:
     """Return how far a point 0.1 m off the flange's centre moved at most [m]."""
+    return float(movements(samples).max())
+
+
+def movements(samples: Sequence[RememberedState]) -> Floats:
+    """Return how far such a point is in each of N samples from the first (N,) [m]."""
     poses = np.array([sample.base_T_flange for sample in samples])
     moves = np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1)
     turns = np.linalg.norm(poses[:, :3, :3] - poses[0, :3, :3], axis=(1, 2)) / np.sqrt(2)
-    return float((moves + 0.1 * turns).max())
+    return np.asarray(moves + 0.1 * turns)
 
 
 def _rejected(stop: Stop, reason: str) -> Rejection:

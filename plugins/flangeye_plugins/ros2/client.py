@@ -171,10 +171,14 @@ class Bridge(Device):
         found = self.newest(topic)
         return found if found and found.number > after else None
 
-    def want(self, topic: str) -> int:
-        """Ask for the next message of a topic; return the number after which it comes."""
+    def want(self, topic: str, since_ns: int | None = None) -> int:
+        """Ask for a topic's newest message since a moment, or else, or without one, for the next.
+
+        Returns:
+            The number after which it comes.
+        """
         count = self._count(topic)
-        self._ask("want", topic=topic)
+        self._ask("want", topic=topic, since_ns=since_ns or time.monotonic_ns())
         return count
 
     def heard(self, topic: str) -> int:

@@ -105,6 +105,10 @@ def scanner_ros2(model: ScannerModel | None, params: Ros2ScannerParams) -> Scann
         raise
 
 
+class NothingCame(DeviceError):
+    """No message of a topic could be taken in time, though its publisher runs."""
+
+
 class Camera(NamedTuple):
     """A pinhole camera: its matrix (3, 3), OpenCV's distortion (k,), and its images' (H, W)."""
 
@@ -143,11 +147,23 @@ class Ros2Scanner(OpenScanner):
 
     def expose(self) -> Callable[[], Scan]:
         """Take the first message stamped from now on; the arm waits until it is here."""
-        started = time.monotonic_ns()
+        return self._exposed(time.monotonic_ns(), DeviceError)
+
+    def overhear(self, since_ns: int) -> Callable[[], Scan]:
+        """Take a message stamped since a moment, where nobody here triggers; see ``Overhears``."""
+        if self._params.trigger:
+            return self.expose()
+        return self._exposed(since_ns, FrameDropped)
+
+    def _exposed(self, started: int, silent: type[DeviceError]) -> Callable[[], Scan]:
+        """Return what waits for the scan; raises ``silent`` where none comes from one that runs."""
         until = time.monotonic() + self._params.timeout
-        wanted = {topic: self._bridge.want(topic) for topic in self._kinds}
+        wanted = {topic: self._bridge.want(topic, started) for topic in self._kinds}
         self._trigger()
-        taken = {t: self._after(t, count, started, until) for t, count in wanted.items()}
+        try:
+            taken = {t: self._after(t, count, started, until) for t, count in wanted.items()}
+        except NothingCame as nothing:
+            raise silent(str(nothing)) from None
         ended = max(message.received_ns for message in taken.values())
         camera = self._camera(until) if self._looks else None
 
@@ -261,21 +277,21 @@ class Ros2Scanner(OpenScanner):
             count = self._bridge.want(topic)
         waited = f"within {self._params.timeout:g} s"
         if not late:
-            raise DeviceError(
-                f"{NAME}: nothing came on {topic} {waited}; {self._why_silent(topic)}"
-            )
-        raise DeviceError(
+            raise self._silence(f"{NAME}: nothing came on {topic} {waited}; ", topic)
+        raise NothingCame(
             f"{NAME}: {len(late)} messages came on {topic} {waited}, all stamped before they were "
             f"asked for, the last by {late[-1]:.2f} s: set the camera's clock (NTP), or let its "
             "driver stamp with the system's time"
         )
 
-    def _why_silent(self, topic: str) -> str:
+    def _silence(self, what: str, topic: str) -> DeviceError:
         runs = self._bridge.topics().get(topic)
         if runs is None or not runs.publishers:
-            return "its publisher has ended: start the camera's driver again"
+            return DeviceError(f"{what}its publisher has ended: start the camera's driver again")
         by = ", ".join(runs.publishers)
-        return f"{by} still runs: does the camera have to be triggered, or was its cable pulled?"
+        return NothingCame(
+            f"{what}{by} still runs: does the camera have to be triggered, or was its cable pulled?"
+        )
 
     def _points(self, taken: dict[str, GraphMessage], camera: Camera | None) -> Floats:
         """Return the scan's points (H, W, 3) or (N, 3) [m]; none where there is an image alone."""

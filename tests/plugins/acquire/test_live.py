@@ -7,7 +7,7 @@ import pytest
 
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.motion.supervision import RememberedState
-from flangeye_plugins.acquire.live import Idle, movement, within
+from flangeye_plugins.acquire.live import Idle, LiveSession, movement, within
 
 
 def samples(*times, move=0.0, turn=0.0):
@@ -50,3 +50,20 @@ def test_an_arm_is_idle_while_it_stands_and_nothing_is_exposed() -> None:
     idle.leaves(118)  # 3 were spent on choosing where to go
     idle.exposed(130, 120, 150)  # another clock may tell the arrival a little late
     assert idle.share == 5 / 50
+
+
+def test_since_when_an_arm_stands_is_told_by_its_samples() -> None:
+    class Arm:
+        seen: list[RememberedState]
+
+        def during(self, start_ns: int, end_ns: int) -> list[RememberedState]:
+            assert (start_ns, end_ns) == (60 - 10_000_000_000, 60)
+            return self.seen
+
+    nothing: Any = None
+    arm: Any = Arm()
+    session = LiveSession(nothing, arm, nothing, 0.05e-3, frozenset(), nothing)
+    *moving, arrived = samples(0, 10, 20, move=1e-3)
+    stands = [arrived._replace(time_ns=time) for time in (20, 40, 60)]
+    for arm.seen, since in ((moving + stands, 20), (stands[1:], 40)):
+        assert session._stands_since(60) == since

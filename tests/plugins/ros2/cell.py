@@ -94,6 +94,7 @@ class Camera(Peer):
             "robot": "ur5e", "scanner": "phoxi-m", "layout": layout, "namespace": "/camera",
             "seed": 1, "resolution": 0.2, "prefix": "", "sim_time": False, "moved": [0.0, 0.0, 0.0],
             "refuses": "", "lens": "plumb_bob", "joints": FACING, "triggered": False,
+            "production": False,
         }  # fmt: skip
         super().__init__("camera", given | options, env)
 

@@ -3,6 +3,7 @@
 import itertools
 import json
 import signal
+import time
 
 import numpy as np
 import pytest
@@ -24,6 +25,10 @@ pytestmark = [pytest.mark.realtime, pytest.mark.ros2]
 
 QUICK = ("--set", "robot.limits.speed=500 mm/s", "--set", "robot.limits.joint_speed=60 deg/s")
 FEW = ("--set", "acquire.live.poses.next_best.count=8")
+PRODUCTION = ("--set", "scanner.driver={ros2: {cloud: /cell/eye/points}}")
+OUTSIDE = np.radians([-90.0, -90.0, 90.0, -90.0, -90.0, 0.0]).tolist()
+"""Where the cell's program takes the arm besides: out of the box, and the camera sees no flange."""
+DRIFT = "  - verify.drift: {reference: run/run.mcap}\n  - export"
 LINK = [0.01, 0.02, -0.03, -0.5, 0.5, -0.5, 0.5]
 
 
@@ -71,32 +76,54 @@ def test_two_commands_lead_to_a_verified_matrix_and_a_third_to_the_graph(termina
 
 def test_an_arm_that_others_move_is_calibrated_and_then_watched(terminal):
     poses, eye = leaning(), {"layout": "phoxi", "resolution": 0.4, "namespace": "/cell/eye"}
-    check = ("monitor", "run", "--live", "--scans", "2")
     with peers(
         Controller(terminal.env, controller=None, joints=TOWARDS, prefix="left_",
                    namespace="/cell"), Camera(terminal.env, **eye),
     ) as (arm, camera):  # fmt: skip
         terminal.run("init", "--ros2", "--scanner", "phoxi-m", "--yes",
                      "--trigger", "/cell/eye/capture")  # fmt: skip
-        by_hand(terminal, arm, poses, 0, "run", "recipe.yaml", "--out", "run", *FEW)
+        by_hand(terminal, arm, poses, "run", "recipe.yaml", "--out", "run", *FEW)
         require_near(found(terminal), camera.pose())
-        assert by_hand(terminal, arm, poses, 0, *check)["state"] == "OK"
         camera.kill()
-        with peers(Camera(terminal.env, **eye, moved=[0.005, 0.0, 0.0])):
-            assert by_hand(terminal, arm, poses, 2, *check)["state"] == "MOVED"
+        # From here on the cell works: its own program moves the arm and triggers the camera
+        places = [next(poses).tolist() for _ in range(6)]
+        arm.tell(program=[*places[:3], OUTSIDE, *places[3:]], stands=1.5)
+        with peers(Camera(terminal.env, **eye, production=True)):
+            checked, watched = check_a_running_cell(terminal, 0)
+            assert checked["state"] == "OK"
+            assert "live: ur5e on /cell/joint_states and /cell/eye/points" in watched
+        with peers(Camera(terminal.env, **eye, production=True, moved=[0.005, 0.0, 0.0])):
+            assert check_a_running_cell(terminal, 2)[0]["state"] == "MOVED"
+            recipe = (terminal.folder / "recipe.yaml").read_text()
+            (terminal.folder / "again.yaml").write_text(recipe.replace("  - export", DRIFT, 1))
+            terminal.run("run", "again.yaml", "--out", "again", *FEW, *PRODUCTION, expect=1)
+            drift = terminal.result("again")["verifications"]["5.verify.drift"]
+            assert not drift["passed"]
+            assert drift["reason"].startswith("the cell has moved since")
 
 
-def by_hand(terminal, arm, poses, code, *words):
-    """Run a command, move the arm whenever it asks for it, and return the JSON it printed, if any."""
+def check_a_running_cell(terminal, code):
+    """Return what a check of a cell that goes on printed, and what watching it showed."""
+    check = ("monitor", "run", "--live", "--scans", "2", *PRODUCTION)
+    with terminal.start(*check) as checking:
+        while not [*terminal.folder.glob("run/checks/*_check/run.mcap")]:
+            assert checking.poll() is None, checking.stderr.read()
+            time.sleep(0.1)
+        watched, _ = terminal.run("watch", "run")
+        said, wrong = checking.communicate(timeout=120)
+    assert checking.returncode == code, wrong
+    return json.loads(said), watched
+
+
+def by_hand(terminal, arm, poses, *words):
+    """Run a command, and move the arm whenever it asks for it."""
     told = []
     with terminal.start(*words) as run:
         for line in run.stderr:
             told.append(line)
             if line.startswith("Move the flange on"):
                 arm.tell(hand=next(poses).tolist(), seconds=1.0)
-        said = run.stdout.read()
-    assert run.returncode == code, told
-    return json.loads(said) if said.startswith("{") else None
+    assert run.returncode == 0, told
 
 
 def leaning():

@@ -23,7 +23,8 @@ def watch_run(run: Path | None, port: int | None, console: Console, patience: fl
     """Show a run until it ends.
 
     Args:
-        run: Its folder or log, which may be still to come; the newest in ``runs/`` when not given.
+        run: Its folder or log, which may be still to come; of a folder with later checks of the
+            calibration, the newest. The newest in ``runs/`` when not given.
         port: Serve Foxglove there, if given.
         console: Where to show it.
         patience: Give up when nothing new came for so long [s].
@@ -68,8 +69,10 @@ def _log_to_come(run: Path | None, patience: float) -> Path:
 
 
 def _log_of(run: Path | None) -> Path | None:
-    if run is not None:
-        log = run if run.suffix == ".mcap" else run / "run.mcap"
-        return log if log.exists() else None
-    logs = sorted(Path("runs").glob("*/run.mcap"), key=lambda path: path.stat().st_mtime)
-    return logs[-1] if logs else None
+    if run is None:
+        logs = [*Path("runs").glob("*/run.mcap")]
+    elif run.suffix == ".mcap":
+        logs = [run] if run.exists() else []
+    else:
+        logs = [*run.glob("run.mcap"), *run.glob("checks/*/run.mcap")]
+    return max(logs, key=lambda path: path.stat().st_mtime, default=None)

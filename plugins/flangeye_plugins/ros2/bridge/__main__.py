@@ -63,6 +63,7 @@ class BridgeNode:
         self._subscriptions: dict[str, list[Any]] = {}
         self._wanted: dict[str, bool] = {}
         self._heard: dict[str, int] = {}
+        self._newest: dict[str, tuple[int, bytes]] = {}
 
     def graph(self) -> Any:
         """Return topic -> type, nodes that publish, and the number of those that listen."""
@@ -114,9 +115,11 @@ class BridgeNode:
         for each in before:
             self._node.destroy_subscription(each)
 
-    def want(self, topic: str) -> Any:
-        """Pass on the next message of a topic."""
-        self._wanted[topic] = True
+    def want(self, topic: str, since_ns: int) -> Any:
+        """Pass on a topic's newest message, if it came since a moment, or else the next one."""
+        self._wanted[topic] = True  # first: one that comes meanwhile is not to be missed
+        if topic in self._newest and self._newest[topic][0] >= since_ns:
+            self._pass_on(topic)
 
     def offer(self, topic: str, type: str, latched: bool) -> Any:
         """Create a publisher."""
@@ -165,13 +168,17 @@ class BridgeNode:
     def _passes_on(self, topic: str, always: bool) -> Callable[[bytes], None]:
         def passes_on(body: bytes) -> None:
             self._heard[topic] = self._heard.get(topic, 0) + 1
+            self._newest[topic] = time.monotonic_ns(), body
             if self._wanted[topic]:
                 self._wanted[topic] = always
-                now = time.monotonic_ns()
-                head = {"topic": topic, "received_ns": now, "ahead_ns": time.time_ns() - now}
-                self._output.say(head, body)
+                self._pass_on(topic)
 
         return passes_on
+
+    def _pass_on(self, topic: str) -> None:
+        received_ns, body = self._newest[topic]
+        ahead_ns = time.time_ns() - time.monotonic_ns()
+        self._output.say({"topic": topic, "received_ns": received_ns, "ahead_ns": ahead_ns}, body)
 
 
 def matching(infos: list[Any]) -> list[QoSProfile]:

@@ -5,7 +5,8 @@
 ``zivid``: organised xyzrgba with NaN, reliable, captured by a service. ``phoxi``: organised, zeros
 where nothing was measured, captured by a service. ``depth``: 16-bit millimetres with CameraInfo.
 ``image``: a ChArUco board on the flange as JPEG with CameraInfo. ``empty``: triggered by a topic.
-Their CameraInfo comes after the image; with ``triggered`` there is none before the first scan.
+Their CameraInfo comes after the image; with ``triggered`` there is none before the first scan. With
+``production`` the cell's own program captures, as soon as the arm stands at a new place.
 """
 
 import json
@@ -71,7 +72,9 @@ class Camera:
         self.out = node.create_publisher(
             form, name.get(kind, self.point_topic), SENSOR if kind == "realsense" else 10
         )
-        if kind in ("zivid", "phoxi") or options["triggered"]:
+        if options["production"]:
+            threading.Thread(target=self.produces, daemon=True).start()
+        elif kind in ("zivid", "phoxi") or options["triggered"]:
             node.create_service(Trigger, f"{space}/capture", self.captures)
         elif kind == "empty":
             node.create_subscription(Empty, f"{space}/trigger", lambda _: self.publish(), 10)
@@ -106,6 +109,16 @@ class Camera:
             began = time.monotonic()
             self.publish()
             time.sleep(max(0.0, PERIOD - (time.monotonic() - began)))
+
+    def produces(self):
+        before = None
+        while True:
+            joints = self.joints
+            time.sleep(0.1)
+            stands = joints is not None and np.abs(self.joints - joints).max() < 1e-6
+            if stands and (before is None or np.abs(joints - before).max() > 0.02):
+                before = joints
+                self.publish()
 
     def publish(self):
         while self.joints is None or (self.options["sim_time"] and self.now is None):

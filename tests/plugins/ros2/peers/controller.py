@@ -6,7 +6,8 @@ end while moving or began so long ago that they are over are rejected, a new one
 before from where the arm is, cubics lead from point to point. It is late by a stated latency. The
 joint states are shuffled, hold a gripper's joint too, and tell angles with the joints' zero errors,
 whole or split in two messages; another node's speeds come right after each of them;
-where the arm really is goes out on /truth, which no driver listens to.
+where the arm really is goes out on /truth, which no driver listens to. It may run a program of its
+own, from place to place, as in production.
 """
 
 import json
@@ -48,7 +49,8 @@ class Controller:
         self.silent_until, self.rejects, self.jump, self.stamped = 0.0, False, 0.0, True
         self.now = time.monotonic()
         self.clock = 100.0 if options["sim_time"] else time.time()
-        self.history, self.taken, self.hand = deque(maxlen=REMEMBERED), 0, None
+        self.history, self.taken = deque(maxlen=REMEMBERED), 0
+        self.program, self.next_move = deque(), 0.0
         self.lock = threading.Lock()
         space = options["namespace"]
         quality = SENSOR if options["best_effort"] else 10
@@ -76,6 +78,8 @@ class Controller:
             if "hand" in words:  # a person moves the arm there, in so many seconds
                 goal = np.array(words["hand"])
                 self.trajectory = self.cubics([(goal, np.zeros_like(goal), words["seconds"])])
+            if "program" in words:  # over and over, two seconds of motion and so many at rest
+                self.program, self.stands = deque(map(np.array, words["program"])), words["stands"]
             self.rejects = words.get("rejects", self.rejects)
             self.stamped = words.get("stamped", self.stamped)
             if "truth" in words:
@@ -118,6 +122,10 @@ class Controller:
         now, before = time.monotonic(), self.joints
         self.clock += (now - self.now) if self.options["sim_time"] else time.time() - self.clock
         self.now = now
+        if self.program and now > self.next_move:
+            goal, self.next_move = self.program[0], now + 2.0 + self.stands
+            self.trajectory = self.cubics([(goal, np.zeros_like(goal), 2.0)])
+            self.program.rotate(-1)
         while self.queue and self.queue[0][0] <= now:
             self.accept(self.queue.popleft()[1])
         last = self.command
