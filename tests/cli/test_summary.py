@@ -119,10 +119,15 @@ def test_warnings_of_the_source_are_printed_before_the_run() -> None:
 def test_captures_rejected_for_one_reason_are_told_together() -> None:
     out = io.StringIO()
     with RunProgress(Console(file=out), ["0.acquire.toy"]) as progress:
-        for name, why in (("a", "dark"), ("b", "dark"), ("c", "far"), ("d", "dark")):
+        for name, why in (
+            ("a", "dark, 2 px"),
+            ("b", "dark, 3.1 px"),
+            ("c", "far"),
+            ("d", "dark, 4 px"),
+        ):
             progress.flangeye_capture_rejected(rejection=Rejection(name, "fit.toy", why))
     assert out.getvalue().splitlines() == [
-        "rejected a: fit.toy: dark", "rejected c: fit.toy: far", "rejected for the same reason as a: b, d",
+        "rejected a: fit.toy: dark, 2 px", "rejected c: fit.toy: far", "rejected for the same reason as a: b, d",
     ]  # fmt: skip
 
 

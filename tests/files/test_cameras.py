@@ -14,6 +14,12 @@ K = np.array([[1201.5, 0, 639.25], [0, 1203.5, 363.75], [0, 0, 1.0]])
 LENS = [-0.11, 0.07, 0.0011, -0.0012, 0.01]
 ROWS = ", ".join(map(str, K.ravel()))
 FOUR = "1201.5, 1203.5, 639.25, 363.75"
+
+
+def text_of(rows):
+    return "\n".join(" ".join(map(str, row)) for row in rows)
+
+
 WRITTEN = {
     "camera_info.yaml": "image_width: 1280\nimage_height: 720\ncamera_name: a\ncamera_matrix:\n"
     f"  rows: 3\n  cols: 3\n  data: [{ROWS}]\ndistortion_model: plumb_bob\n"
@@ -27,6 +33,16 @@ WRITTEN = {
     "realsense.json": '{"color": {"width": 1280, "height": 720, "ppx": 639.25, "ppy": 363.75, "fx": '
     f'1201.5, "fy": 1203.5, "model": "distortion.brown_conrady", "coeffs": {LENS}}}}}',
     "plain.json": f'{{"K": {K.tolist()}, "dist": [{LENS}], "rms": 0.2}}',
+    "echoed.yaml": f"header:\n  frame_id: a\nheight: 720\nwidth: 1280\ndistortion_model: plumb_bob\n"
+    f"d: {LENS}\nk: [{ROWS}]\np: [{', '.join(['7'] * 12)}]\n---\n",
+    "ost.txt": "# oST version 5.0 parameters\n\n\n[image]\n\nwidth\n1280\n\n[narrow_stereo]\n\ncamera "
+    f"matrix\n{text_of(K)}\n\ndistortion\n{text_of([LENS])}\n\nrectification\n{text_of(np.eye(3))}\n",
+    "left.ini": "[left]\nfx = 1201.5\nfy = 1203.5\ncx = 639.25\ncy = 363.75\nk1 = -.11\nk2 = 0.07\n"
+    "p1 = 1.1e-3\np2 = -1.2e-3\nk3 = 0.01\n",
+    "cam.toml": f"[camera]\nmatrix = {K.tolist()}\ndistortions = {LENS}\n",
+    "printed.txt": f"camera matrix:\n{K}\ndistortion:\n[{LENS}]\n",
+    "own.yaml": f"focal_length: [1201.5, 1203.5]\nprincipal_point: [639.25, 363.75]\ndist: {LENS}\n",
+    "odd.json": f'{{"K": {K.tolist()}, "dist_coeff": [{LENS}]}}',
     "cameras.txt": "# Camera list\n# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
     "1 FULL_OPENCV 1280 720 1201.5 1203.5 639.75 364.25 -0.11 0.07 0.0011 -0.0012 0.01 0 0 0\n",
 }
@@ -65,6 +81,28 @@ def test_arrays_and_nine_numbers(tmp_path: Path) -> None:
         np.savetxt(tmp_path / f"pose_{k}.txt", np.eye(3))
     assert [c.path.name for c in cameras_in(tmp_path)] == ["K.npy", "K.txt", "calib.npz"]
     assert all(np.allclose(c.matrix, K) for c in cameras_in(tmp_path))
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".txt"])
+def test_a_distortion_beside_the_matrix_is_its_own(tmp_path: Path, suffix: str) -> None:
+    for name, rows in (("camera_matrix", K), ("dist_coeffs", np.array([LENS]))):
+        if suffix == ".npy":
+            np.save(tmp_path / f"{name}.npy", rows)
+        else:
+            np.savetxt(tmp_path / f"{name}.txt", rows)
+    (camera,) = cameras_in(tmp_path)
+    assert np.allclose(camera.distortion, LENS)
+    assert camera.note().endswith(f"5 coefficients of dist_coeffs{suffix}")
+
+
+def test_a_rational_lens_keeps_all_its_coefficients(tmp_path: Path) -> None:
+    names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+    lens = {name: 0.1 + 0.01 * i for i, name in enumerate(names)}
+    values = {"fx": 600.0, "fy": 600.0, "cx": 640.0, "cy": 360.0, **lens}
+    (tmp_path / "kinect.json").write_text(json.dumps({"color": {"parameters": values}}))
+    camera = camera_in(tmp_path / "kinect.json")
+    assert camera is not None
+    assert camera.distortion == pytest.approx(list(lens.values()))
 
 
 def test_open3d_writes_the_matrix_column_by_column(tmp_path: Path) -> None:

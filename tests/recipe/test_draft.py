@@ -629,6 +629,12 @@ def test_a_recipe_is_not_written_over(folder: Path) -> None:
     assert str(done.exception) == "recipe.yaml: is there already; take another name with --out"
 
 
+def test_a_folder_of_one_bag_is_refused_before_a_question(folder: Path) -> None:
+    (folder / "demo.bag").write_text("x")
+    with pytest.raises(RecipeError, match="is a ROS 1 bag; convert it"):
+        init(typed="")
+
+
 def test_a_question_without_an_answer_names_the_option(folder: Path) -> None:
     sample(folder)
     done = CliRunner().invoke(app, ["init", "rec"], input="")

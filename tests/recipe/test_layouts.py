@@ -210,6 +210,16 @@ def yaml_nested(f, j, a, s):
     ]))  # fmt: skip
 
 
+def topic_echo(f, j, a, s):
+    for name, poses in (("tcp_pose", a), ("marker_pose", s)):
+        text = ""
+        for *place, x, y, z, w in quaternion(poses).tolist():
+            turn = dict(zip("xyzw", (x, y, z, w), strict=True))
+            pose = {"position": dict(zip("xyz", place, strict=True)), "orientation": turn}
+            text += f"header: {{frame_id: a}}\npose: {json.dumps(pose)}\n---\n"
+        (f / f"{name}.yaml").write_text(text)
+
+
 def json_arrays(f, j, a, s):
     (f / "calib.json").write_text(
         json.dumps({"T_base_flange": a.tolist(), "T_cam_board": s.tolist()})
@@ -251,6 +261,7 @@ LAYOUTS: dict[str, Callable[..., None]] = {
     "URScript positions and a table of matrices": urscript,
     "4×4 matrices line by line in two texts": matrices_in_text,
     "quaternions w, x, y, z without a heading": wxyz,
+    "what `ros2 topic echo` prints of two poses": topic_echo,
     "JSON of arrays, `T_base_flange`, `T_cam_board`": json_arrays,
     "what ROS's `tf_echo` prints, `base_to_tool0`": tf_echo,
     "headings r11, r12, … r33, tx, ty, tz": matrix_headings,

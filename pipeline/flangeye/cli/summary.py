@@ -144,7 +144,7 @@ class RunProgress:
         self.said: list[str] = []
         self._console = console
         self._once = list(steps)
-        self._rejected: dict[tuple[str, str], list[str]] = {}
+        self._rejected: dict[tuple[str, str, str], list[str]] = {}
         # 60 columns at most: the name, a bar of 12, the count, and both times.
         self._progress = progress.Progress(
             progress.TextColumn("{task.description:<16.16}", markup=False),
@@ -172,7 +172,7 @@ class RunProgress:
     @hookimpl
     def flangeye_capture_rejected(self, rejection: Rejection) -> None:
         """Say which capture was rejected, and why; of those that share a reason, the first."""
-        alike = self._rejected.setdefault((rejection.stage, rejection.reason), [])
+        alike = self._rejected.setdefault(rejection.kind, [])
         if not alike:
             write(self._console, wrapped(self._console, f"rejected {rejection.id}: {rejection}"))
         alike.append(rejection.id)

@@ -1,7 +1,7 @@
 """The calibration of a camera, from the files in which programs keep one.
 
 ``camera_info`` of ROS, OpenCV's storage, kalibr's camchain, COLMAP's ``cameras.txt``, RealSense's
-and Zivid's intrinsics, and arrays of NumPy: each by its own names.
+and Zivid's intrinsics, arrays of NumPy, and text with labels: each by its own names.
 """
 
 from __future__ import annotations
@@ -29,13 +29,15 @@ DISTORTIONS = (
     "distortion_coefficients", "distortion_coeffs", "dist_coeffs", "distcoeffs", "distortion",
     "dist", "coeffs", "d", "d1",
 )  # fmt: skip
-"""Names of the distortion."""
+"""Names of the distortion; other names that begin with ``dist`` follow them."""
 PINHOLE = (
     ("fx", "fy", "cx", "cy"), ("fx", "fy", "ppx", "ppy"), ("fl_x", "fl_y", "cx", "cy"),
 )  # fmt: skip
 """Names of the matrix's entries one by one, the second of RealSense, the third of nerfstudio."""
 ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """OpenCV's coefficients."""
+LABELLED = (".txt", ".csv", ".ini", ".cfg", ".toml")
+"""Endings of texts with a matrix alone, or with numbers behind labels."""
 COLMAP: Mapping[str, tuple[str, ...]] = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
     "PINHOLE": ("fx", "fy", "cx", "cy"),
@@ -59,17 +61,20 @@ class CameraFile(NamedTuple):
         matrix: (3, 3) [px].
         distortion: (k,) OpenCV's coefficients.
         others: How many more cameras the file holds.
+        lens_of: Name of the file that the distortion is from, where it has one of its own.
     """
 
     path: Path
     matrix: Floats
     distortion: Floats
     others: int = 0
+    lens_of: str = ""
 
     def note(self) -> str:
         """Return what to say of it."""
         (fx, _, cx), (_, fy, cy), _ = self.matrix
         lens = f"{len(self.distortion)} coefficients" if self.distortion.any() else "no distortion"
+        lens += f" of {self.lens_of}" if self.lens_of else ""
         lens += f"; the first of {self.others + 1} in it" if self.others else ""
         return (
             f"camera of {self.path}: focal length {fx:.1f}, {fy:.1f} px, principal point {cx:.1f}, "
@@ -83,7 +88,7 @@ def cameras_in(folder: Path) -> list[CameraFile]:
     Raises:
         StageError: As :func:`camera_in`.
     """
-    names = (*KINDS, ".txt")
+    names = (*KINDS, *LABELLED)
     inside = (p for p in (*folder.glob("*"), *folder.glob("*/*")) if p.suffix.lower() in names)
     # A file that is larger [bytes] holds recordings, and is not looked into
     files = sorted(p for p in inside if p.is_file() and p.stat().st_size <= 1_000_000)
@@ -100,17 +105,15 @@ def camera_in(path: Path) -> CameraFile | None:
         StageError: Its lens is of another model than OpenCV's.
     """
     try:
-        if path.suffix.lower() == ".txt":
-            lines = read_text(path).splitlines()
-            return _colmap(path, lines) if path.name == "cameras.txt" else _text(path, lines)
-        document = document_of(path)
+        data = _document(path)
     except StageError:
         return None
-    if document is None:
-        return None
-    if isinstance(document.data, np.ndarray):
-        return _checked(path, document.data, ())
-    found = [(values, matrix) for values in _mappings(document.data)
+    if isinstance(data, CameraFile):
+        return data
+    if isinstance(data, np.ndarray):
+        camera = _checked(path, data, ())
+        return camera and _with_lens_beside(camera)
+    found = [(values, matrix) for values in _mappings(data)
              if (matrix := _matrix(values)) is not None and _is_camera(matrix)]  # fmt: skip
     if not found:
         return None
@@ -121,18 +124,66 @@ def camera_in(path: Path) -> CameraFile | None:
     return camera and camera._replace(others=others)
 
 
+def _document(path: Path) -> Any:
+    """Return what a file holds: mappings, a bare matrix, or COLMAP's camera; None for others."""
+    if path.suffix.lower() not in LABELLED:
+        document = document_of(path)
+        return None if document is None else document.data
+    lines = read_text(path).splitlines()
+    if path.name == "cameras.txt":
+        return _colmap(path, lines)
+    rows = [line.replace(",", " ").split() for line in lines]
+    rows = [row for row in rows if row and not row[0].startswith("#")]
+    if [len(row) for row in rows] == [3, 3, 3] and all(_is_number(w) for r in rows for w in r):
+        return np.array(rows, dtype=np.float64)
+    return _labelled(lines)
+
+
+def _labelled(lines: Iterable[str]) -> dict[str, Any]:
+    """Return the numbers behind each label: ``fx = 900``, or the rows under ``camera matrix``."""
+    found: dict[str, list[float]] = {}
+    label = ""
+    for line in lines:
+        words = re.match(r"[\s\[]*([A-Za-z][\w ]*?)\s*([\]=:]|$)", line)
+        if words:
+            label = words[1].lower().replace(" ", "_")
+        rest = line[words.end() :] if words else line
+        numbers = re.findall(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?!\w)", rest)
+        found.setdefault(label, []).extend(map(float, numbers))
+    return {name: n[0] if len(n) == 1 else n for name, n in found.items() if n}
+
+
+def _with_lens_beside(camera: CameraFile) -> CameraFile:
+    """Return a matrix with the distortion that the one file called ``dist…`` beside it holds."""
+    beside = [p for p in camera.path.parent.iterdir() if p.stem.lower().startswith("dist")]
+    if len(beside) != 1:
+        return camera
+    try:
+        document = document_of(beside[0])
+        data = read_text(beside[0]).replace(",", " ").split() if document is None else document.data
+    except StageError:
+        return camera
+    lens = _numbers(data)
+    fits = len(lens) >= 4 and _checked(beside[0], camera.matrix, lens) is not None
+    return camera._replace(distortion=lens, lens_of=beside[0].name) if fits else camera
+
+
 def _mappings(data: Any) -> Iterator[dict[str, Any]]:
     """Yield the mappings in a document, the outer first, names in small letters."""
     if isinstance(data, Mapping):
         yield {str(name).lower(): value for name, value in data.items()}
-        for value in data.values():
-            yield from _mappings(value)
+    values = data.values() if isinstance(data, Mapping) else data if isinstance(data, list) else ()
+    for value in values:
+        yield from _mappings(value)
 
 
 def _matrix(values: Mapping[str, Any]) -> Floats | None:
     for names in PINHOLE:
         if all(_is_number(values.get(name)) for name in names):
             return _pinhole(*(float(values[name]) for name in names))
+    if (focal := _numbers(values.get("focal_length"))).size == 2:
+        middle = _numbers(values.get("principal_point"))
+        return _pinhole(*focal, *middle) if middle.size == 2 else None
     for name in MATRICES:
         value = values.get(name)
         if isinstance(value, Mapping):
@@ -148,16 +199,23 @@ def _matrix(values: Mapping[str, Any]) -> Floats | None:
 
 
 def _distortion(values: Mapping[str, Any]) -> Floats:
-    for name in DISTORTIONS:
+    others = [name for name in values if name.startswith("dist") and name != "distortion_model"]
+    for name in (*DISTORTIONS, *others):
         value = values.get(name)
         if isinstance(value, Mapping):
             known = {str(key).lower(): each for key, each in value.items()}
-            value = known.get("data", [known.get(each, 0.0) for each in ORDER[:5]])
+            value = known.get("data", _in_order(known))
         if (numbers := _numbers(value)).size:
             return numbers
     if "k1" in values:
-        return _numbers([values.get(name, 0.0) for name in ORDER[:5]])
+        return _numbers(_in_order(values))
     return np.zeros(0)
+
+
+def _in_order(values: Mapping[str, Any]) -> list[Any]:
+    """Return coefficients that are named one by one, those of OpenCV's longer model too."""
+    count = len(ORDER) if any(values.get(name) for name in ORDER[5:]) else 5
+    return [values.get(name, 0.0) for name in ORDER[:count]]
 
 
 def _require_opencv(path: Path, values: Mapping[str, Any]) -> None:
@@ -185,15 +243,6 @@ def _colmap(path: Path, lines: list[str]) -> CameraFile | None:
         matrix = _pinhole(fx, fy, known["cx"] - CORNER, known["cy"] - CORNER)
         return _checked(path, matrix, [known[name] for name in ORDER if name in known])
     return None
-
-
-def _text(path: Path, lines: list[str]) -> CameraFile | None:
-    """Return the camera of nine numbers in three rows."""
-    rows = [line.replace(",", " ").split() for line in lines]
-    rows = [row for row in rows if row and not row[0].startswith("#")]
-    if [len(row) for row in rows] != [3, 3, 3] or not all(_is_number(w) for r in rows for w in r):
-        return None
-    return _checked(path, np.array(rows, dtype=np.float64), ())
 
 
 def _checked(path: Path, matrix: Floats, lens: Iterable[float]) -> CameraFile | None:

@@ -333,7 +333,7 @@ def _sideways(urdf: Urdf, robot: RobotModel, flange: str) -> Warn | None:
     # A flange's z is along the last axis; beyond this angle [rad] it is another frame of the link
     if off < np.radians(5.0) or joint.slides:
         return None
-    rpy = " ".join(f"{angle:z.6g}" for angle in rpy_from_rotation(basis_of_plane(seen).T))
+    rpy = " ".join(f"{round(angle, 6):z.6g}" for angle in rpy_from_rotation(basis_of_plane(seen).T))
     name = f"{flange}_face"
     return Warn(
         f"{urdf.path}: z of flange '{flange}' is {np.degrees(off):.0f} deg to the last axis, "

@@ -7,7 +7,6 @@ per-capture steps. When the solver stops pulling, nothing more is acquired.
 from __future__ import annotations
 
 import math
-import re
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing
@@ -204,15 +203,13 @@ class Runner:
         Raises:
             NothingSeen: None does; with verification views alone there was none to look at.
         """
-        why = [(each.stage, each.reason, each.fix) for each in self._outcome.rejections]
+        why = self._outcome.rejections
         if self._outcome.seen or self._values[t.Views] or not why:
             return
-        # Reasons that differ in their numbers alone are one
-        alike = [(stage, re.sub(r"\(.*\)|\d+", "", reason), fix) for stage, reason, fix in why]
-        common, share = Counter(alike).most_common(1)[0]
-        stage, reason, fix = why[alike.index(common)]
+        common, share = Counter(each.kind for each in why).most_common(1)[0]
+        first = next(each for each in why if each.kind == common)
         of = f"{share} of the " if share < len(why) else "the "
-        usual = f"{stage}: {reason}" + (f"; {fix}" if fix else "")
+        usual = f"{first.stage}: {first.reason}" + (f"; {first.fix}" if first.fix else "")
         raise NothingSeen(f"no capture can be used; {of}{len(why)} were rejected by {usual}")
 
     def _may_work_ahead(self, stream: t.Captures) -> bool:

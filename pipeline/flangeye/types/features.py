@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -132,6 +133,11 @@ class Rejection:
     def __str__(self) -> str:
         figures = f" ({self.figures})" if self.figures else ""
         return f"{self.stage}: {self.reason}{figures}"
+
+    @property
+    def kind(self) -> tuple[str, str, str]:
+        """What rejections for one reason share: stage, reason without its numbers, fix."""
+        return self.stage, re.sub(r"\(.*\)|\d[\d.]*", "", self.reason), self.fix
 
 
 @dataclass(frozen=True, eq=False)

@@ -390,7 +390,8 @@ def _cameras(
                 "them, write focal_length: [fx, fy] and principal_point: [cx, cy], or board: "
                 "{kind: charuco, …} to find it"
             )
-        return {n: c for n, c in cameras.items() if c}, [filed.note()] if filed else []
+        notes = [filed.note(), *_off_centre(usable, filed)] if filed else []
+        return {n: c for n, c in cameras.items() if c}, notes
     images = {r.id: read_image(r.image) for r in usable if r.image is not None}
     known = given.get(usable[0].id) or (filed and filed[1:3])
     start = None if known is None else Image(images[usable[0].id], *known[:2])
@@ -402,6 +403,23 @@ def _cameras(
     told += [odd] if known and (odd := lens.against(known[0])) else []
     camera = lens.matrix, lens.distortion, lens.covariance
     return dict.fromkeys(images, camera), [*told, lens.note()]
+
+
+def _off_centre(usable: Sequence[Recording], camera: CameraFile) -> list[Warn]:
+    """Return a warning where a calibration is of images of another size."""
+    first = next(r.image for r in usable if r.image is not None)
+    height, width = read_image(first).shape
+    middle = camera.matrix[:2, 2] / [0.5 * width, 0.5 * height]
+    # Lenses are centred to a few per cent, and a cropped image seldom moves it by a quarter
+    if (np.abs(np.log2(middle)) < 0.4).all():
+        return []
+    cx, cy = camera.matrix[:2, 2]
+    text = (
+        f"{camera.path.name} has its principal point at {cx:.0f}, {cy:.0f} px, far from the middle "
+        f"of {width} x {height} px: it is of images of about {2 * cx:.0f} x {2 * cy:.0f} px"
+    )
+    fix = f"calibrate at {width} x {height} px, or scale its matrix by {1 / middle.mean():.3g}"
+    return [Warn(text, fix)]
 
 
 def _filed(root: Path, name: str | None) -> CameraFile | None:

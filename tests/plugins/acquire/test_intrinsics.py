@@ -12,7 +12,7 @@ from flangeye import StageError
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.models.boards import Board
 from flangeye.models.corners import find_corners
-from flangeye.types import ArchivePath, Image
+from flangeye.types import ArchivePath, Image, warnings_of
 from flangeye.units import SI
 from flangeye_emulators.world.board_image import BoardCamera, render_board
 from flangeye_plugins.acquire.images import ImagesParams, SeenBoardParams, acquire_images, lens_of
@@ -145,6 +145,20 @@ def test_a_folder_of_images_needs_no_calibrated_camera(views: Any, tmp_path: Pat
     assert any(note.startswith("camera by 12 views") for note in taken.source.notes)
     with pytest.raises(StageError, match=r"or board: \{kind: charuco, …\} to find it"):
         acquire_images(ArchivePath(None), ImagesParams(path=tmp_path, reader=reader))
+
+
+@pytest.mark.parametrize(("scale", "warned"), [(1.0, False), (1.5, True), (0.5, True)])
+def test_a_calibration_of_another_image_size_is_said(
+    views: Any, tmp_path: Path, scale: float, warned: bool
+) -> None:
+    reader = written_with_poses(tmp_path, views)
+    np.savetxt(tmp_path / "K.txt", MATRIX * [[scale], [scale], [1]])
+    taken = acquire_images(ArchivePath(None), ImagesParams(path=tmp_path, reader=reader))
+    said = [note for note in warnings_of(taken.source.notes) if "principal point" in note]
+    assert bool(said) is warned
+    assert (
+        all(note.fix.endswith(f"scale its matrix by {1 / scale:.2g}") for note in said) or scale > 1
+    )
 
 
 def test_images_of_a_known_camera_without_the_board_that_is_fitted_end_early(

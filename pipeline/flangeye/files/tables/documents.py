@@ -74,8 +74,16 @@ def _yaml(file: Path) -> TableDocument:
     text = read_text(file)
     if len(text) > MAX_BYTES:
         raise StageError(f"{file}: is larger than {MAX_BYTES} bytes; write it as .json")
+    text = re.sub(r"\n---\s*\Z", "\n", _OPENCV.sub("", text))
+    # What `ros2 topic echo` prints: a document for each message
+    parts = [part for part in re.split(r"^---[ \t]*$", text, flags=re.MULTILINE) if part.strip()]
     try:
-        document = parse_yaml(_OPENCV.sub("", text), str(file))
+        if len(parts) > 1:
+            records = [
+                parse_yaml(part, f"{file}, document {i}").data for i, part in enumerate(parts, 1)
+            ]
+            return TableDocument(records, lambda at: f"{file}: document {at + 1}")
+        document = parse_yaml(text, str(file))
     except RecipeError as error:
         raise StageError(str(error)) from None
     return TableDocument(document.data, lambda at: f"{file}:{document.line((at,))}")

@@ -75,6 +75,10 @@ def draft_recipe(
     Raises:
         FlangeyeError: Something is missing that no answer gives; says which line to add.
     """
+    unread = _convertible(survey, 1)
+    read = survey.tables or survey.clouds or survey.of((*IMAGES, ".mcap", ".db3"))
+    if unread and not read and questions.given.get("reader") is None:
+        raise unread
     robot = _robot(survey, out, questions)
     reader = _reader(survey, questions, registry, robot)
     archive = _bound(reader, registry, robot)(survey.folder)
@@ -175,8 +179,6 @@ def _missing(survey: FolderSurvey, reason: StageError) -> str:
             f"was; put poses.csv beside them, its first line: {column},{POSES_LINE}; then a line "
             f"for each, {scans[0].name},412.1,-33.0,501.7,2.91,0.12,-0.03"
         )
-    if other := _convertible(survey, 1):
-        return str(other)
     closed = survey.of(CLOSED)
     if closed:
         return f"{survey.folder}: {closed[0].name} is a table that is not read; save it as .csv"
