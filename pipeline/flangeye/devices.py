@@ -257,7 +257,7 @@ class KnowsSeams(Protocol):
 
 
 class StateSource(Protocol):
-    """Where an arm is, and when: all that a tactile sensor may know of it."""
+    """The arm's pose and its time, for a tactile sensor that needs nothing else of the arm."""
 
     def state(self) -> RobotState:
         """Return the newest sample."""
@@ -342,7 +342,7 @@ class Profiler(Device, Protocol):
 class Arc(Device, Protocol):
     """A welding power source. Opened by its driver in the process that guards the arm.
 
-    Opened, gas and arc are off; closed they are, whatever happened before.
+    Gas and arc are off when it opens, and are switched off when it closes, also after an error.
 
     Attributes:
         name: For people.

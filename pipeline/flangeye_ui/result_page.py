@@ -312,7 +312,7 @@ def _matrix(facts: Facts) -> None:
 
 
 def _in_3d(project: Project, box: ui.expansion, facts: Facts) -> None:
-    """Draw the fitted rims where the calibration puts them, and what is left at each, enlarged."""
+    """Draw the fitted rims in the base by the calibration, with their residuals enlarged."""
     pose = facts.base_T_camera
     box.clear()
     with box:
@@ -348,7 +348,7 @@ def _cell(project: Project, scene: Scene3D, facts: Facts) -> None:
 
 
 def _residuals(scene: Scene3D, facts: Facts) -> float:
-    """Draw what is left at each pose as an arrow; return how many times its length it has."""
+    """Draw each pose's residual as an arrow; return by how much its length is scaled up."""
     left = [(o.tcp_in_base, o.residual_in_base, o.used) for o in facts.measured]
     arrows = [(np.array(p), np.array(r), used) for p, r, used in left if p and r]
     longest = max((float(np.linalg.norm(r)) for _, r, used in arrows if used), default=0.0)

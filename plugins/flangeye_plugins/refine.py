@@ -183,7 +183,7 @@ def refine_arm(
     scanner: ScannerModel | None = None,
     configuration: Configuration | None = None,
 ) -> HandEye:
-    """Say which of the arm's joint zeros and lengths the poses tell, and correct the arm by them.
+    """Estimate the arm's observable joint zeros and link lengths, and correct the arm by them.
 
     The pose for the arm as its controller reports it stays; the pose for the arm so corrected is
     put beside it, if it is expected to help. The notes say which parameters the poses identify

@@ -324,7 +324,7 @@ def test_nothing_but_identities() -> None:
     session = session_of("centres")
     finding = examine(session.with_poses(np.tile(np.eye(4), (20, 1, 1))), CHECKS).findings[0]
     assert finding.name == "identity matrices"
-    assert finding.fix == "record again: too little is left"
+    assert finding.fix == "record again: fewer than half would remain"
 
 
 def test_a_pose_that_is_stale() -> None:

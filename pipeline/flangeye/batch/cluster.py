@@ -270,7 +270,7 @@ class Pace:
         return max(1, int(wanted))
 
     def asks(self, chunks: int, sessions: int, share: float = 1.0) -> bool:
-        """Return whether the scheduler is to know of more than so much, or than a share of it."""
+        """Return whether the scheduler is asked for more than so much, or than a share of it."""
         if chunks < share * AHEAD * self.workers():
             return True
         # Sessions that a scheduler elsewhere is to know of at least: its workers may only be

@@ -65,7 +65,7 @@ def run_sessions(
     software: Software,
     console: Console,
 ) -> Batch:
-    """Do as :func:`run_batch` with sessions that are planned, of whatever recipes.
+    """Do as :func:`run_batch` with sessions that are already planned, of any recipes.
 
     Args:
         request: How to run them.

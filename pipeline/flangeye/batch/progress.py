@@ -64,7 +64,7 @@ class Tally:
         total: How many sessions there are.
         seconds: What all of them took [s].
         recipe: The first one's, for the title.
-        told: Columns in which any of them says anything.
+        told: Columns that hold a value in any row.
         sample: Rows of every so many.
         common: Folder that all archives have in common; None for URLs, or without archives.
     """

@@ -170,7 +170,7 @@ def _findings(run: Path, registry: Registry) -> list[str]:
 
 
 class Expected(Model):
-    """What a run of the recording came to when it was last believed."""
+    """The accepted result of a recording, which later runs are compared with."""
 
     status: Literal["verified", "unverified", "refused"] = "verified"
     closure: Length | None = Field(None, description="Median held-out error.")

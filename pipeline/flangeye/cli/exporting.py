@@ -125,7 +125,7 @@ def _write_tables(run: Path, out: Path | None) -> None:
 
 
 def _format_named(to: str, registry: Registry) -> str:
-    """Return the format of that name, or the only one that speaks of it: ``urscript`` is ``ur``.
+    """Return the format of that name, or the only one that mentions it: ``urscript`` is ``ur``.
 
     Raises:
         StageError: There is none, or there are several.

@@ -208,7 +208,7 @@ class RunProgress:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Take the bar away, and name what was rejected for a reason that was told."""
+        """Remove the progress bar, and list the captures rejected for a reason already printed."""
         self._progress.stop()
         for first, *others in self._rejected.values():
             if others:

@@ -1,4 +1,4 @@
-"""Run every check, believe what explains most, mend it, and look again."""
+"""Run every check, correct the mistake that explains most of the error, and repeat."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What sightings tell of an arm's own parameters: joint zeros, link lengths and twists."""
+"""Estimate an arm's own parameters from sightings: joint zeros, link lengths and twists."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class ArmParameters:
 
 
 def parameters_of(session: Session) -> ArmParameters:
-    """Return what a session tells of the parameters of the arm that moves its flange.
+    """Return the estimated parameters, with covariance, of the arm that moves the flange.
 
     What all likely ways to the poses agree on, where no joint angles were recorded.
 
@@ -135,7 +135,7 @@ def _columns(found: Estimate, arm: str) -> tuple[Indices, Indices]:
 def most_telling_poses(
     session: Session, known: ArmParameters, candidates: Sequence[Observation], count: int
 ) -> tuple[Indices, ArmParameters]:
-    """Return which sightings would tell most of the arm, and what would be known with them.
+    """Return the most informative further sightings, and the covariance with them.
 
     Args:
         session: What was seen.

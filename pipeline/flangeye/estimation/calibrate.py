@@ -209,7 +209,7 @@ def _at_best(session: Session) -> Session:
 
 
 def _weak(session: Session, options: Options) -> Floats:
-    """Return (P, k) moves of the places that the sightings tell nothing of; see ``unobservable``.
+    """Return the null space (P, k) of the information about the places; see ``unobservable``.
 
     With as much noise as the sightings show, and no less than a camera and an arm have; of the arm
     as it is reported.
@@ -287,7 +287,7 @@ def _in_parent(place: Floats, moves: Floats) -> Floats:
 
 
 def _without(problem: Problem, places: Places, weak: Floats) -> Places:
-    """Return the places moved to where the camera has no part along unobservable moves."""
+    """Return the places moved along the null space until the camera's share of it is zero."""
     if not weak.shape[1]:
         return places
     i = problem.unknown.index(problem.ends[0][0])

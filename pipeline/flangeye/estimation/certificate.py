@@ -117,7 +117,7 @@ class _Block(NamedTuple):
     others: Floats
 
     def naught(self, matrix: Floats) -> Floats:
-        """Return the part of a matrix, of the family's features, that is naught for all places."""
+        """Return the part of a matrix over the family's features that vanishes for all places."""
         size = len(matrix) // 10
         pairs = matrix.reshape(10, size, 10, size).swapaxes(1, 2).reshape(100, -1)
         told = self.first @ (self.first.T @ pairs @ self.others) @ self.others.T

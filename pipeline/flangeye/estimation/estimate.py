@@ -48,7 +48,7 @@ SETTLED = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """What the sightings tell.
+    """The estimate from all sightings, with its covariance.
 
     Attributes:
         problem: What was given.
@@ -92,7 +92,7 @@ class Estimate:
         )
 
     def without(self, rows: Indices) -> Estimate:
-        """Return what all sightings but some tell, with sizes and outliers as all tell them."""
+        """Return the estimate without some sightings; variance components and outliers stay."""
         inliers = self.inliers.copy()
         inliers[rows] = False
         return replace(self, posterior=self.posterior.without(rows), inliers=inliers)

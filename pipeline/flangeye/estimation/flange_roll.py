@@ -21,7 +21,7 @@ FEWEST_ROLLS = 3
 def roll_note(
     observations: Sequence[Observation], base_R_camera: Floats, covariance: Floats
 ) -> str:
-    """Say by how much the plate is turned about its axis, or that it cannot be told.
+    """Return a note on the plate's turn about its own axis, or that it is not observable.
 
     Args:
         observations: The poses that agree.

@@ -194,7 +194,7 @@ class Squares:
         return np.asarray(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T)
 
     def alike(self, places: Floats) -> Floats:
-        """Return features (m, n) of places that nothing tells apart from those at a bottom.
+        """Return features (m, n) of places that fit as well as those at a minimum.
 
         A circle may be turned about itself, and what is seen as a point about any axis.
         """

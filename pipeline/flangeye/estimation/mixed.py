@@ -123,7 +123,7 @@ class LinearModel:
         return np.asarray(both * self.shares[:, None, None] / 2)
 
     def telling(self) -> LinearModel:
-        """Return the model of some sightings that take part, evenly over all."""
+        """Return the model of a subset of the sightings, evenly spread over all."""
         kept = np.flatnonzero(self.shares)
         if len(kept) <= TELLING:
             return self
@@ -160,7 +160,7 @@ class Fit:
 
 
 class Told(NamedTuple):
-    """What the sightings tell by themselves, at one set of sizes of the noise.
+    """Normal equations of the sightings alone, at one set of variance components.
 
     Attributes:
         noise: (N, 6, 6) its covariances.
@@ -176,7 +176,7 @@ class Told(NamedTuple):
 
 
 def told(model: LinearModel, sizes: Floats) -> Told:
-    """Return what the sightings tell with the noise of (S,) sizes; the effects' take no part."""
+    """Return the normal equations at (S,) noise deviations, without the effects' prior."""
     h, r = model.design, np.asarray((model.projectors @ model.residuals[..., None])[..., 0])
     noise = model.noise(sizes)
     weights = model.weights(np.asarray(np.linalg.inv(noise), dtype=np.float64))
@@ -228,7 +228,7 @@ def _solved(model: LinearModel, sizes: Floats, known: Told) -> tuple[Floats, Flo
 
 
 def told_of_places(model: LinearModel, sizes: Floats) -> Floats:
-    """Return (P, P) what the sightings tell of the places, the effects marginalised.
+    """Return the information (P, P) about the places, the effects marginalised.
 
     By the Schur complement, which stays exact where nothing is told; an inverse covariance is not.
     """
@@ -309,7 +309,7 @@ class Posterior:
         return np.asarray(within + (apart.T * self.chances) @ apart)
 
     def without(self, rows: Indices) -> Posterior:
-        """Return what all sightings but some tell, in closed form: the sizes stay as they are."""
+        """Return the estimate without some sightings in closed form; variance components stay."""
         shares = self.model.shares.copy()
         shares[rows] = 0.0
         model = self.model.weighted(shares)

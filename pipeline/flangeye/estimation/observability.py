@@ -293,7 +293,7 @@ def require_enough(problem: Problem, needed: int) -> None:
 
 
 def fewest(problem: Problem) -> int:
-    """Return how many sightings of one camera and one target tell what is unknown."""
+    """Return the fewest sightings of one camera and one target that determine the unknowns."""
     ranks, count = problem.seen.ranks, len(problem.unknown)
     if (ranks == 6).all():
         return {1: 3, 2: 3}.get(count, 6)
@@ -305,7 +305,7 @@ def fewest(problem: Problem) -> int:
 
 
 def meaningless(problem: Problem) -> Floats:
-    """Return (P, k) unit moves that no sighting of the kind could tell: turns of round targets.
+    """Return (P, k) unit moves that are unobservable by definition: turns of round targets.
 
     Of a target that was seen as a circle its turn about its own axis; as a centre, every turn.
     """
@@ -331,7 +331,7 @@ def unobservable(
     mark: bool,
     freedoms: Mapping[str, Floats] | None = None,
 ) -> Floats:
-    """Return (P, k) unit moves of the unknowns that the sightings tell nothing of.
+    """Return the null space of the sightings: (P, k) unit moves of the unknowns.
 
     Args:
         problem: The sightings that agree.
@@ -512,7 +512,7 @@ def _asked(problem: Problem, motions: Sequence[Move]) -> list[str]:
 
 
 def _tie(problem: Problem, named: Sequence[str]) -> str:
-    """Return what would tell what no motion does: a sighting that ties two parts."""
+    """Return the sighting that would tie two parts of the cell, where no motion does."""
     seen = [problem.ends[k] for k in dict.fromkeys(problem.seen.pairs.tolist())]
     ends = dict.fromkeys(end for pair in seen for end in pair)
     moved = [end for end in ends if {*chain(problem.frames, end)} & {*named}]
@@ -536,7 +536,7 @@ def _tie(problem: Problem, named: Sequence[str]) -> str:
 def _seen_again(
     problem: Problem, places: Places, freedoms: Mapping[str, Floats] | None
 ) -> dict[Move, Floats]:
-    """Return the (P, P) that all would tell with one thing moved, by its frame and twist."""
+    """Return the information (P, P) of all sightings repeated with one frame moved by a twist."""
     again: dict[Move, Floats] = {}
     every = freedoms or {name: np.eye(6) for name in problem.moving}
     for name, twists in every.items():

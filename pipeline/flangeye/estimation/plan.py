@@ -1,4 +1,4 @@
-"""Which sighting of a cell tells most, and when enough were seen: by the whole graph's covariance.
+"""Choose a cell's most informative next sighting, and when to stop, by its covariance.
 
 A sighting of one target by one camera tells of every frame between them, and by what those share
 of all others. So a candidate counts by how much it is expected to shrink the error at the work of
@@ -43,7 +43,7 @@ REACH = 0.1
 
 
 def so_far(observations: Sequence[Observation], cell: Cell) -> Rough | None:
-    """Return what sightings tell; None as long as something stays unknown."""
+    """Return the estimate from the sightings so far; None while an unknown is unobservable."""
     with suppress(FlangeyeError, np.linalg.LinAlgError):
         return rough(problem_of(observations, cell), cell.freedoms)
     return None

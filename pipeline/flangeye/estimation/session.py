@@ -74,7 +74,7 @@ class Asked:
 
 @dataclass(frozen=True, eq=False)
 class Session:
-    """What was observed, and what it tells.
+    """Observations of a cell with the estimate from them.
 
     Attributes:
         observations: As they are when clocks and sizes that were found are put right.
@@ -100,7 +100,7 @@ class Session:
         return replace(self, notes=(*self.notes, *notes))
 
     def again(self, observations: Sequence[Observation]) -> Session:
-        """Return what changed observations tell, begun at what is known."""
+        """Return the estimate from changed observations, started at the present one."""
         joints = {c.frame: c.joints for c in self.found.problem.carriers}
         problem = problem_of(observations, self.cell, self.asked.normals)
         carriers = [
@@ -112,7 +112,7 @@ class Session:
         return replace(self, observations=observations, found=found)
 
     def without(self, rows: Indices) -> Session:
-        """Return what all observations but some tell, in closed form.
+        """Return the estimate without some observations, in closed form.
 
         Raises:
             StageError: Too few are left.
@@ -128,7 +128,7 @@ def session_of(
     scanner: ScannerModel | None,
     asked: Asked = Asked(),
 ) -> Session:
-    """Return what observations of a cell tell.
+    """Return the estimate from a cell's observations.
 
     Raises:
         StageError: Too few sightings, all the same, those of a mirrored camera, or the pose of
@@ -380,7 +380,7 @@ def _on_one_clock(session: Session) -> Session:
 
 
 def _with_size(session: Session, factor: float) -> Session:
-    """Return the session with markers as large as the arm's motion shows, or refuse others."""
+    """Return the session with the markers scaled to the size that the arm's motion shows."""
     if not session.asked.size_unknown:
         _require_size(session)
         return session

@@ -37,7 +37,7 @@ def problem_of(observations: Sequence[Observation], cell: Cell, normals: bool = 
         StageError: There is none, or one lacks the pose of what moves.
     """
     if not observations:
-        raise StageError("no pose to solve with: every capture was set aside, each for its reason")
+        raise StageError("no pose to solve with: every capture was rejected, see the reasons above")
     ends = list(dict.fromkeys((o.camera, o.target) for o in observations))
     each = [_measured(o.feature, normals) for o in observations]
     rotations, covariances, projectors = (np.array(column) for column in zip(*each, strict=True))

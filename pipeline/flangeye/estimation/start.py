@@ -91,7 +91,7 @@ def _plausible(problem: Problem, squares: Floats) -> bool:
 
 
 def size_of(problem: Problem) -> float:
-    """Return how many times as large as was said the target of whole poses is, about; else 1.
+    """Return about the ratio of the target's true size to the stated one; 1 without poses.
 
     Rotations do not depend on it, and once they are known the loop's translations are linear in the
     places and the size (Andreff et al. 2001). Of small sets of poses that is taken which explains

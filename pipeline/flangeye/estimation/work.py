@@ -1,4 +1,4 @@
-"""Sightings as they would be at new poses of the work: where the error to expect is taken."""
+"""Predicted sightings at poses over the workspace, at which the expected error is evaluated."""
 
 from __future__ import annotations
 

@@ -87,7 +87,7 @@ class Recording:
 
     @property
     def passes_alone(self) -> bool:
-        """Whether where the flange was at other times is all there is to know of the arms."""
+        """Whether only the flange's poses at other times are known of the arms."""
         return self.motion is not None and self.joints is None and set(self.poses) == {FLANGE}
 
 

@@ -33,7 +33,7 @@ def edge_points(flat: Floats, centre: Floats, bins: int, outer: bool = True) -> 
 
 
 def fringe(flat: Floats, centre: Floats, bins: int, depth: float, outer: bool = True) -> Indices:
-    """Return the points at most ``depth`` [m] behind the one at the edge of their sector.
+    """Return the points within ``depth`` [m] of the outermost (or innermost) one of their sector.
 
     Arguments as for :func:`edge_points`.
     """

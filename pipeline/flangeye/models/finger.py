@@ -89,7 +89,7 @@ class FingerGeometry(Model):
 
 
 class Finger(FingerGeometry):
-    """What is known of a finger and its torch, and how well."""
+    """Calibrated geometry of a tactile finger and its torch, with standard deviations."""
 
     torch_sigma: Length = param(
         "0.05 mm", ge=0, description="Standard deviation of the torch across the tool."

@@ -1,4 +1,4 @@
-"""Files for robots and scanners of one's own: written, and read again before they are believed."""
+"""Write the model files of a user's own robots and scanners, and read them back as a check."""
 
 from __future__ import annotations
 

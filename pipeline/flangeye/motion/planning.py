@@ -22,7 +22,7 @@ NEAR_TILT = 0.2
 
 @dataclass(frozen=True, eq=False)
 class Site:
-    """What a plan may know of the place.
+    """Arm, scanner and obstacles that a plan is made for.
 
     Attributes:
         centre: (3,) in ``base``, where to work when the recipe does not say [m].

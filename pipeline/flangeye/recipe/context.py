@@ -212,7 +212,7 @@ def _configuration(header: Header, context: Context) -> Configuration:
     stands = _stands(section.place)
     if body := header.target:
         if section.place != "known":
-            raise RecipeError("place: where a body is drawn is said once, by target: {at: …}")
+            raise RecipeError("place: a body's place is said by target: {at: …}; take place: away")
         if body.at == "unknown":
             stands = None
         elif body.at not in targets:

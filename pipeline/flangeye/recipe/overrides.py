@@ -58,7 +58,7 @@ def _put(data: Any, keys: Keys, value: Any, path: str) -> None:
 
 
 def _step(data: dict[Hashable, Any], path: str) -> tuple[int | None, str]:
-    """Return which step a path speaks of, if any, and what is below the step's name in it."""
+    """Return the index of the step that a path names, if any, and the rest of the path."""
     steps = data.get("steps")
     names = [_name(entry) for entry in steps] if isinstance(steps, list) else []
     if path.startswith("steps."):

@@ -172,7 +172,7 @@ class CheckDrawing:
 
 
 def drawings_of(facts: Facts) -> list[CheckDrawing]:
-    """Return what the verify steps of a run drew; nothing of a log that is damaged."""
+    """Return the drawings of a run's verify steps; none if the log is damaged."""
     found = facts.log.of_kind("verify")
     judged = {e.step: e.value.reason for e in found if e.step in facts.log.noted}
     if not judged:

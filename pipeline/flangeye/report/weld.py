@@ -171,7 +171,7 @@ def _offsets(view: _View) -> Figure:
 
 
 def _deviation(view: _View, truth: Floats | None) -> Figure:
-    """Show the torch as believed, with its 95 % band, and as it truly was, where that is known."""
+    """Plot the estimated torch position with its 95 % band, and the true one where it is known."""
     weld = view.weld
     true_torch = weld.true_torch if len(weld.true_torch) else weld.torch
     traces = []

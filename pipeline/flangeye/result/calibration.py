@@ -84,7 +84,7 @@ def warnings_result(notes: Iterable[t.Note]) -> list[WarningResult]:
 
 
 def standing_warnings(result: Result) -> list[WarningResult]:
-    """Return what a finished result asks for, whatever its steps noted.
+    """Return the warnings that follow from a finished result itself, beside those of its steps.
 
     An estimate that is arbitrary in some direction, a calibration that nothing judged, a session
     most of whose captures were rejected, and an expected error that poses held out contradict.

@@ -171,7 +171,7 @@ class Stopwatch:
 
     @contextmanager
     def timing(self, label: str) -> Iterator[None]:
-        """Charge the time inside to ``label``."""
+        """Add the time spent in the context to ``label``."""
         self._charge()
         self._running.append(label)
         self.calls[label] += 1

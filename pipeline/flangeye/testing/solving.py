@@ -105,7 +105,7 @@ class SolvingConformance(Conformance):
         return {t.HandEye: reference_solution(observations), **self.known(observations, motion)}
 
     def answer(self, observations: Sequence[t.Observation], motion: Floats = HERE) -> Any:
-        """Return what the stage makes of some observations."""
+        """Return the stage's result from some observations."""
         return require_type(self.call(self.given(observations, motion)), self.gives)
 
     def views(self, motion: Floats = HERE) -> t.Views:

@@ -254,7 +254,7 @@ class Progress:
 
 @dataclass(frozen=True, eq=False)
 class Resumed:
-    """What an earlier run left.
+    """State of an earlier run that a source continues from.
 
     Attributes:
         done: Captures that it took, by id; a source leaves them out.

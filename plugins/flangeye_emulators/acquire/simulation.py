@@ -171,7 +171,7 @@ def _checks(plan: Plan, site: Site, count: int, rng: np.random.Generator) -> lis
 
 
 def _unseen(plan: Plan, site: Site, rng: np.random.Generator) -> list[Floats]:
-    """Return joints of poses all over the workspace that take no part."""
+    """Return joints of poses over the workspace that are kept out of the calibration."""
     # Largest roll, pitch and yaw of poses that show what a calibration is worth [rad]
     spread = plan.size / 2, 0.3
     return [pose.joints for pose in poses_near(plan.centre, UNSEEN, site, rng, spread)]
@@ -218,7 +218,7 @@ class _Session:
         return Source(fingerprint, (note,), Box(plan.centre, plan.size), truth, simulated=True)
 
     def _unseen(self) -> tuple[Observation, ...]:
-        """Return what a scanner without noise sees at the poses that take no part."""
+        """Return noise-free measurements at poses that are kept out of the calibration."""
         joints, angles = self.joints[self.count :], self.angles[self.count :]
         reported = [by_frame(Transform(BASE, FLANGE, pose)) for pose in self.arm.reported(joints)]
         seen = invert(self.base_T_camera) @ self.arm.flange(angles)

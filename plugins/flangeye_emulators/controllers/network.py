@@ -82,7 +82,7 @@ class Network:
             connection.abort()
 
     def freeze(self, frozen: bool) -> None:
-        """Let nothing through in either direction, or everything again."""
+        """Block the connection in both directions, or open it again."""
         self.frozen = frozen
         for connection in list(self.connections):
             connection.hold(frozen)

@@ -117,7 +117,7 @@ class SimulatedCell:
         return [plate, wrist, ball, SolidBody(stub_mesh(self.sphere), finish)]
 
     def board(self, base_T_flange: Floats) -> SolidBody:
-        """Return a board held before the flange, so that nothing of it can be seen."""
+        """Return a board that covers the flange completely."""
         half, away = 4 * self.flange.outer, 0.06
         if self.sphere is not None:
             away += self.sphere.centre_in_flange[2] + self.sphere.radius

@@ -96,7 +96,7 @@ class ArmPoses:
 
 @dataclass(frozen=True, eq=False)
 class Cast:
-    """Who takes part.
+    """Arms and limits of a simulated session.
 
     Attributes:
         configuration: Who carries what.

@@ -68,7 +68,7 @@ class SeenBoardParams(Params):
     @model_validator(mode="after")
     def _is_whole(self) -> Self:
         if self.kind == "marker":
-            raise ValueError("four corners do not tell a camera; use a board")
+            raise ValueError("the four corners of a marker do not determine a camera; use a board")
         if self.kind == "charuco" and not 0 < self.marker < self.square:
             raise ValueError("marker: a ChArUco board's markers are smaller than its squares")
         if self.kind == "checkerboard" and min(self.columns, self.rows) < 4:
@@ -120,7 +120,7 @@ class CalibratedLens(NamedTuple):
         )
 
     def note(self) -> str:
-        """Return what to tell of it."""
+        """Return the note about it: parameters, their standard deviations and the fit."""
         (fx, _, cx), (_, fy, cy), _ = self.matrix
         s = self.deviations
         # The views of an arm's calibration determine these coefficients and no others.

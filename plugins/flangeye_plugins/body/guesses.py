@@ -35,7 +35,7 @@ AT_ONCE = 30_000
 
 
 def guesses(view: CoarseImage, looks: Looks, most: int) -> Floats:
-    """Return at most so many (K, 4, 4) ``camera_T_body`` that a scan does not speak against."""
+    """Return at most so many (K, 4, 4) ``camera_T_body`` that are consistent with a scan."""
     rng = np.random.default_rng(2)
     scan = view.edges(looks.size)
     on = scan.take(_some(scan, SCAN_ENDS, looks.size * SCAN_SPACING, rng))

@@ -34,7 +34,7 @@ share of rays against it from which the part stands elsewhere."""
 
 
 class BodyVerdict(NamedTuple):
-    """What speaks for a body's pose and what against it.
+    """Evidence for and against a body's pose: counts of the scanner's rays.
 
     Attributes:
         due: Rays that should meet the body, away from its edges.
@@ -63,7 +63,7 @@ class BodyVerdict(NamedTuple):
 
     @property
     def shown(self) -> float:
-        """Share of the body's view that is seen as it should be."""
+        """Share of the body's visible surface in which the scan agrees with the mesh."""
         return self.agree / max(self.due, 1)
 
     @property
@@ -79,7 +79,7 @@ class BodyVerdict(NamedTuple):
 
 
 def judged(shape: Shape, view: CoarseImage, pose: Floats, tolerance: float) -> BodyVerdict:
-    """Return what speaks for ``camera_T_body`` and what against it.
+    """Return the evidence for and against ``camera_T_body``.
 
     Args:
         shape: The body.
@@ -141,7 +141,7 @@ def _compared(shape: Shape, view: CoarseImage, pose: Floats, tolerance: float) -
 
 
 def opposed(shape: Shape, view: CoarseImage, pose: Floats) -> Mask | None:
-    """Return (T,) the facets of parts that a scan speaks against at a pose; None where of none.
+    """Return (T,) which facets belong to parts that contradict a scan at a pose; None without any.
 
     A part is what hangs together in the mesh; a tenth of what is seen in its place is not it.
 

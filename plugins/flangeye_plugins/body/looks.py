@@ -255,7 +255,7 @@ def _placed(
 
 
 def _seen(shape: Shape, at: OrientedPoints, views: Floats) -> Mask:
-    """Return (V, N) which points nothing of the body hides, and whose faces face the scanner."""
+    """Return (V, N) which points face the scanner and are not occluded by the body itself."""
     out = at.normals @ views.T < -GRAZING
     for view, column in zip(views, out.T, strict=True):
         lifted = at.points - 1e-3 * shape.size * view

@@ -72,7 +72,7 @@ class CoarseImage:
 
     @cached_property
     def normals(self) -> Floats:
-        """(H, W, 3) unit normals towards the scanner; NaN where there is too little to tell."""
+        """(H, W, 3) unit normals towards the scanner; NaN where neighbours are too few."""
         down, across = _slope(self.xyz, 0, self.angle), _slope(self.xyz, 1, self.angle)
         rough = _unit(np.cross(across, down))
         rough = _facing(rough, self.xyz)

@@ -58,7 +58,7 @@ _WAYS: Mapping[str, tuple[Change, str]] = {
 
 
 class Reading(NamedTuple):
-    """Rotations in another convention: whose, as what they were read, and how they fit."""
+    """A session with its rotations read in another convention: whose, before and after."""
 
     session: RecordedSession
     whose: str

@@ -27,7 +27,7 @@ POINT = "point"
 
 
 class WrittenParams(Params):
-    """A convention; nothing of it is guessed."""
+    """How poses are written: rotation, units, columns; all stated by the recipe."""
 
     rotation: str = Field(
         description="How the rotations are written: xyzw or wxyz (quaternions), vector, three axes "

@@ -279,7 +279,7 @@ class Target:
     notes: tuple[str, ...] = ()
 
     def signals(self, arm: Stream) -> tuple[Signal, Signal] | None:
-        """Both turn as fast, in whatever frame."""
+        """Angular speeds of arm and target, which are the same in every frame."""
         enough = len(self.times) > 2 and len(arm[0]) > 2
         return (turning(*arm), turning(self.times, self.poses)) if enough else None
 

@@ -51,7 +51,7 @@ class EasyHandeyeParams(Params):
 
 
 class ZividSamplesParams(CloudUnitParams):
-    """How the poses are written."""
+    """Unit of the poses, which Zivid's samples do not state."""
 
     length: Literal["m", "mm"] = Field(description="Unit of the positions; Zivid's own are mm.")
 

@@ -84,7 +84,7 @@ class SecondParams(OtherParams):
 
 
 class TableParams(FlangePoseParams, JointsParams, CloudUnitParams):
-    """The convention of the poses; nothing of it is guessed."""
+    """File, columns and convention of the poses. Everything is stated by the recipe."""
 
     file: str | tuple[str, ...] = Field(
         "poses.csv",
@@ -171,7 +171,7 @@ def _scan_column(text: Table, params: TableParams) -> int | None:
 
 
 def _columns(text: Table, params: TableParams, scan: int | None) -> list[int]:
-    """Return where the arm's numbers are: where the recipe says, or whatever else is free."""
+    """Return the arm's columns: as the recipe says, or all that nothing else uses."""
     if params.columns:
         return text.indices(params.columns)
     others = [o for o in (params.target, params.second) if o and o.file is None]

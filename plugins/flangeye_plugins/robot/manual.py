@@ -33,7 +33,7 @@ class OperatorConsole:
     """
 
     def __init__(self, heard: TextIO | None = None, said: TextIO | None = None) -> None:
-        """Hear standard input and speak on standard error, where nothing else is said to."""
+        """Use standard input and standard error unless other streams are given."""
         self._heard = (sys.stdin if heard is None else heard).fileno()
         self._said = sys.stderr if said is None else said
         self._buffer = b""

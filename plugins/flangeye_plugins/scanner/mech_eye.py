@@ -74,7 +74,7 @@ class MechEye(OpenScanner):
         self._api, self._camera, self._params = api, camera, params
 
     def prepare(self) -> None:
-        """Ask the camera who it is, and for metres.
+        """Read the camera's identity, and set its unit to metres.
 
         Raises:
             DeviceError: It does not answer, or keeps to another unit.

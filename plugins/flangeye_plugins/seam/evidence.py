@@ -25,7 +25,7 @@ TOP = 0.3
 
 
 class RayEvidence:
-    """What speaks for a pose of a part."""
+    """Evidence for a part's pose: the rays that agree with it and against it."""
 
     def __init__(
         self, part: CadPart, seam: CadSeam, seen: DepthMap, rng: np.random.Generator

@@ -103,7 +103,7 @@ def _lines(path: Path, unit: LengthUnit, angle: float) -> list[Floats]:
     if suffix == ".dxf":
         pieces, said = read_dxf(path)
         if said not in (None, unit):
-            raise StageError(f"{path}: says that its unit is {said} ($INSUNITS), and unit: {unit}")
+            raise StageError(f"{path}: states the unit {said} ($INSUNITS), the recipe says unit: {unit}")
         return chained(pieces / PER_METRE[unit], MEET)
     if suffix in MESHES:
         # STEP comes in metres, whatever the drawing was in

@@ -34,7 +34,7 @@ SAME = 1e-3
 
 @dataclass(frozen=True)
 class RegistrationLimits:
-    """What a registration must reach to be believed.
+    """Limits that a registration must meet to be accepted.
 
     Attributes:
         seen: Least share of the surface towards the scanner that must have been seen.

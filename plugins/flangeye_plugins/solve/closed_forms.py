@@ -33,7 +33,7 @@ def solve_closed(
     given: tuple[Sequence[Observation], Cell, ScannerModel | None],
     params: ClosedFormParams,
 ) -> HandEye:
-    """Return a closed form's calibration; every observation takes part.
+    """Return a closed form's calibration from all observations.
 
     Its covariance and expected error are those of the mixed model, at the closed form's answer.
 

@@ -56,7 +56,7 @@ def solve_svd(observations: Observations, params: SvdParams) -> HandEye:
 
 
 def check_poses(observations: Sequence[Observation]) -> None:
-    """Refuse observations from which no pose can follow, whatever the method.
+    """Refuse observations that determine no pose by any method.
 
     Raises:
         StageError: Says what is wrong with them.
@@ -77,7 +77,7 @@ def _require_observable(tcps: Floats, residuals: Floats, limit: float) -> None:
 def least_squares_estimate(
     rotation: Floats, translation: Floats, tcps: Floats, residuals: Floats
 ) -> TransformEstimate:
-    """Return a least-squares pose with the covariance its own residuals speak for.
+    """Return a least-squares pose with the covariance estimated from its residuals.
 
     Args:
         rotation: (3, 3) base_R_camera.

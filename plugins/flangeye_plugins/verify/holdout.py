@@ -1,4 +1,4 @@
-"""Errors on poses that took no part in the answer."""
+"""Held-out error: poses that were not used for the estimate."""
 
 from __future__ import annotations
 

@@ -196,7 +196,7 @@ def table_reader():
     [
         (
             {"kind": "marker", "columns": 3, "rows": 3},
-            "four corners do not tell a camera; use a board",
+            "the four corners of a marker do not determine a camera",
         ),
         (
             {"kind": "charuco", "columns": 7, "rows": 5},

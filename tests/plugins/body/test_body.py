@@ -303,7 +303,7 @@ def test_a_recipe_says_where_the_body_is_drawn(sections, target, place) -> None:
         ("target: {body: gripper, at: base}\n", "target: {at: …} is one of them or unknown"),
         (
             "configuration: {place: unknown}\ntarget: gripper\n",
-            "where a body is drawn is said once",
+            "a body's place is said by target",
         ),
     ],
 )

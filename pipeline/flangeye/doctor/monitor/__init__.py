@@ -138,7 +138,7 @@ def _checked(
 
 
 def _refuse_own(path: Path, shared: Collection[Any]) -> None:
-    """Refuse scans that the calibration was made from: they agree with it whatever has moved."""
+    """Refuse the scans that the calibration was estimated from: they cannot show a change."""
     if shared:
         raise StageError(
             f"{path}: {len(shared)} of its scans are the calibration's own, which check nothing; "

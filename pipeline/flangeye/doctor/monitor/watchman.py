@@ -130,7 +130,7 @@ def _blamed(
 
 
 def require_secured(url: str, security: str | None) -> None:
-    """Refuse to speak to another machine in the open without being asked to.
+    """Refuse an unencrypted connection to another machine unless the user allowed it.
 
     Raises:
         StageError: The server is on another machine, and no security policy is given.

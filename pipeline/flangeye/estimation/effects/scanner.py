@@ -100,7 +100,7 @@ def _edge_size(s: Sightings) -> float:
 
 @dataclass(frozen=True)
 class DistortionField:
-    """A scanner's distortion, as large as its model says: linear in weights of unit variance."""
+    """A scanner's distortion field, linear in weights of unit variance."""
 
     scanner: ScannerModel
 

@@ -125,7 +125,7 @@ class DriftVerdict:
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """What checks tell of the camera's motion and of the arm, in information form.
+    """Information about the camera's motion and the arm from checks: matrix and vector.
 
     Attributes:
         matrix: (..., 6 + K, 6 + K).
@@ -137,7 +137,7 @@ class Information:
 
     @classmethod
     def of_covariance(cls, covariance: Floats, mean: Floats | float = 0.0) -> Information:
-        """Return what a mean (D,) known with a (D, D) covariance tells."""
+        """Return a mean (D,) and its (D, D) covariance in information form."""
         matrix = np.asarray(np.linalg.inv(covariance))
         return cls(matrix, matrix @ np.broadcast_to(mean, len(matrix)))
 
@@ -148,7 +148,7 @@ class Information:
         return Information.of_covariance(covariance, self.mean)
 
     def summed(self, first: int, last: int | None) -> Information:
-        """Return what the checks from ``first`` up to ``last``, or to the end, tell together."""
+        """Return the summed information of the checks from ``first`` to ``last``, or the end."""
         return Information(self.matrix[first:last].sum(0), self.vector[first:last].sum(0))
 
     def plus(self, other: Information) -> Information:
@@ -185,7 +185,7 @@ class Prior:
 
 
 def information_of(sightings: CheckSightings, daily: float) -> Information:
-    """Return what each check tells, its share of the day's motion marginalised."""
+    """Return each check's information, with the motion common to its day marginalised."""
     told = _unmarginalised(sightings)
     motions = told.matrix[:, :, :6]
     taken = motions @ np.linalg.inv(motions[:, :6] + np.linalg.inv(allowance(daily)))
@@ -205,7 +205,7 @@ def _unmarginalised(sightings: CheckSightings) -> Information:
 
 
 def prior_of(sightings: CheckSightings, variances: Floats) -> Prior:
-    """Return what a calibration's own sightings tell, all of one check.
+    """Return the information of a calibration's own sightings, taken as one check.
 
     Args:
         sightings: With the calibration's scans and the arm's noise in their covariances.
@@ -294,7 +294,7 @@ def _step(checks: Information, start: Prior, first: int, test: DriftTest) -> tup
 
 
 def _change(after: Information, before: Information) -> Information:
-    """Return what is told of a motion (..., 6) between what came before and what came after."""
+    """Return the estimate of a motion (..., 6) between the checks before and after."""
     taken = after.matrix @ np.linalg.inv(after.matrix + before.matrix)
     left = after.vector - after.matrix @ before.mean
     score = left - (taken @ left[..., None])[..., 0]

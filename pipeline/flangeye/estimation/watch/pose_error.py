@@ -1,4 +1,4 @@
-r"""How wrong an arm's poses are over its workspace, as one calibration tells it. Arrays only.
+r"""An arm's pose error over its workspace, estimated from one calibration. Arrays only.
 
 An arm's joint zeros, lengths and encoders make errors that repeat: the same pose is wrong by the
 same, a pose nearby by nearly the same. So the error of a pose is a sum over few smooth functions of

@@ -1,4 +1,4 @@
-"""What every format's header goes through: found, split into words, its counts believed or not."""
+"""Headers of cloud files: find them, split them into words, check their counts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rows of named cells, whatever file they are from."""
+"""A table: rows of named cells, read from any kind of file."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class Table:
         return self.rows[row][0]
 
     def index(self, column: Column) -> int:
-        """Return which column is meant, from 0.
+        """Return the index from 0 of a column, by its name or its number from 1.
 
         Raises:
             StageError: There is none; names the nearest.

@@ -233,7 +233,7 @@ def _target(
     arm: PoseColumns,
     questions: Questions,
 ) -> PoseColumns | None:
-    """Return what the camera saw, by its name, or whatever else there is as much of."""
+    """Return the target's columns: by their name, else others with as many rows."""
     given = questions.given.get("target-columns")
     if given is not None:
         named = [p.table for p in found if p.table is not arm.table and p.role == "target"]

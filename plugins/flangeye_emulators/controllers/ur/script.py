@@ -114,7 +114,7 @@ class ServoOrder:
 
 @dataclass
 class Orders:
-    """The latest orders.
+    """Latest commands for the threads of the script.
 
     Attributes:
         speed: For the speed thread.

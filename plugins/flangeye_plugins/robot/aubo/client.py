@@ -119,7 +119,7 @@ class AuboClient:
             raise DeviceError(f"{self._name}: {what}: not done: {why}")
 
     def close(self) -> None:
-        """Let go of the connection, whatever became of it."""
+        """Close the connection, also a broken one."""
         try:
             self._rpc.logout()
             self._rpc.disconnect()

@@ -87,7 +87,7 @@ class DashboardFacts(NamedTuple):
 
 
 def facts_of(name: str, host: str, to_drive: bool = True) -> DashboardFacts:
-    """Return what there is to know of a controller that answers and, if asked, can be driven.
+    """Return a controller's software version and cycle time, after checking that it can be driven.
 
     Raises:
         DeviceError: Nobody answers; or it cannot be driven: it is not ready, the network is slow.
