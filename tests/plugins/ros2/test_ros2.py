@@ -49,6 +49,10 @@ def drive(robot, goal, speed=0.5, seconds=10.0):
 
 def under_way(robot, turn=1.0, seconds=1.0):
     robot.move_joints(robot.state().joints + turn * np.eye(6)[0], 0.5, 1.0)
+    lead_on(robot, seconds)
+
+
+def lead_on(robot, seconds):
     until = time.monotonic() + seconds
     while time.monotonic() < until:
         robot.wait_cycle()
@@ -64,6 +68,17 @@ def test_a_move_keeps_its_speed_and_whatever_dies_the_arm_rests(env, latency):
         assert np.abs(robot.state().joints - goal).max() < 1e-3
         under_way(robot)
         moment = time.monotonic()
+        robot.stop()
+        time.sleep(1.0)
+        assert 0.0 < arm.rest_after(moment) < 0.5
+        robot.wait_cycle()
+        under_way(robot)
+        moment = time.monotonic()
+        arm.tell(silent=0.5)
+        with pytest.raises(DeviceError, match="/joint_states: silent for 0.1"):
+            while True:
+                robot.wait_cycle()
+                robot.state()
         robot.stop()
         time.sleep(1.0)
         assert 0.0 < arm.rest_after(moment) < 0.5
@@ -87,6 +102,14 @@ def test_what_goes_wrong_with_an_arm_is_one_line(env):
             arm.tell(rejects=True)
             with pytest.raises(DeviceError, match="controller rejects them"):
                 under_way(robot, seconds=2.0)
+            robot.stop()
+            arm.ask(rejects=False, truth=True)
+            time.sleep(0.3)
+            robot.wait_cycle()
+            under_way(robot)
+            arm.tell(rejects=True)  # the last piece that was taken ends by itself
+            with pytest.raises(DeviceError, match="controller rejects them"):
+                lead_on(robot, 2.0)
             robot.stop()
             arm.tell(rejects=False, silent=0.5)
             time.sleep(0.3)

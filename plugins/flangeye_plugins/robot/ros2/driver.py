@@ -25,8 +25,8 @@ RENEWAL = 0.025
 BEGINNING = pieces.BEHIND + 2 * RENEWAL
 """How long before now a piece begins [s]."""
 
-SET_OFF = 0.8
-"""An arm that has not begun to move after this is not being moved by its controller [s]."""
+STUCK = 0.8
+"""An arm that has not moved for so long is not being moved by its controller [s]."""
 
 
 class Ros2RobotParams(ListenParams):
@@ -101,7 +101,7 @@ class Ros2Arm(Listener):
         """
         self._topic, self._names = params.trajectory, list(params.joints)
         self._motion: pieces.DrivenMotion | None = None
-        self._from, self._began, self._renewed = np.zeros(len(params.joints)), 0.0, 0.0
+        self._from, self._moved, self._renewed = np.zeros(len(params.joints)), 0.0, 0.0
         self._ended = 0.0
         super().__init__(asker, model, params, bridge)
         bridge.offer(self._topic, TRAJECTORY)
@@ -167,7 +167,7 @@ class Ros2Arm(Listener):
     def _begin(self, motion: pieces.DrivenMotion) -> None:
         self._require_listener()
         self._motion, self._from = motion, self._samples[-1].joints
-        self._began = self._renewed = time.monotonic()
+        self._moved = self._renewed = time.monotonic()
         self._renew()
 
     def _renew(self) -> None:
@@ -180,18 +180,19 @@ class Ros2Arm(Listener):
         self._renewed = now
         if motion.done:
             self._motion, self._ended = None, now + pieces.LAST
-        elif isinstance(motion, pieces.DrivenPath) and now - self._began > SET_OFF:
-            self._require_motion(joints)
+        elif isinstance(motion, pieces.DrivenPath):
+            self._require_motion(joints, now)
 
-    def _require_motion(self, joints: Floats) -> None:
-        # It has begun when a joint has turned so far [rad]
-        if np.abs(joints - self._from).max() < 1e-3:
+    def _require_motion(self, joints: Floats, now: float) -> None:
+        # It has moved when a joint has turned so far [rad]
+        if np.abs(joints - self._from).max() > 1e-3:
+            self._from, self._moved = joints, now
+        elif now - self._moved > STUCK:
             raise DeviceError(
-                f"{self.name}: {self._topic} was given a trajectory {SET_OFF} s ago and the arm "
-                "has not moved: its controller rejects them (its log says why) or is not active; "
+                f"{self.name}: {self._topic} was given trajectories for {STUCK} s and the arm has "
+                "not moved: its controller rejects them (its log says why) or is not active; "
                 f"are its joints {', '.join(self._names)}?"
             )
-        self._began = np.inf  # it did set off
 
     def _require_listener(self) -> None:
         if not self._bridge.awaited(lambda: self._bridge.listeners(self._topic)):
