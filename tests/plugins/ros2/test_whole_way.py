@@ -63,6 +63,9 @@ def test_two_commands_lead_to_a_verified_matrix_and_a_third_to_the_graph(termina
         terminal.run("run", "recipe.yaml", "--move", "--out", "run", *QUICK, *FEW)
         matrix = found(terminal)
         require_near(matrix, camera.pose())
+        if not own:
+            check = ("monitor", "run", "--live", "--scans", "2", "--move")
+            assert json.loads(terminal.run(*check, *QUICK)[0])["state"] == "OK"
         publishing = terminal.start("publish", "run")
         parent, pose = tree.heard_of("camera_link" if own else "camera")
         assert parent == "base_link"
