@@ -95,7 +95,7 @@ def could_be_welded(condition: Condition, seed: int, length: float, period: floa
     plan = Path(seam)
     controller = controller_of(plan, belief, settings, "vision")
     truth = WeldTruth(arm)
-    response = controller._response  # type: ignore[attr-defined]
+    response = controller.arm  # type: ignore[attr-defined]
     response.dead_time, response.lag = truth.arm.dead_time, truth.arm.lag
     start = start_at(plan, belief, settings, period)
     trial = run_trial(controller, replace(nominal, seam=seam), truth, start, seed)

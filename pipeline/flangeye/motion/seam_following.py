@@ -106,31 +106,57 @@ class FollowingTask:
 
 
 class Controller(Protocol):
-    """What moves the tool along a seam.
+    """What moves the tool along a seam."""
 
-    Attributes:
-        mode: Its name, for people.
-        side: 1 for the left wall, -1 for the right one.
-        phase: What it is doing.
-        reason: Why it stopped.
-        tip: Arc length of the tip's progress on the plan [m].
-        torch: Arc length of the torch's progress [m].
-        wanted: Deflection asked of the tip at present [m].
-        sigma: Standard deviation of the torch's place across the seam [m].
-        bound: What its distance from the seam does not exceed [m].
-        band: The same for 95 % of the seam [m].
-    """
+    @property
+    def mode(self) -> str:
+        """Its name, for people."""
+        ...
 
-    mode: str
-    side: float
-    phase: Phase
-    reason: str
-    tip: float
-    torch: float
-    wanted: float
-    sigma: float
-    bound: float
-    band: float
+    @property
+    def side(self) -> float:
+        """The wall that is pressed, 1 for the left one, -1 for the right."""
+        ...
+
+    @property
+    def phase(self) -> Phase:
+        """What it is doing."""
+        ...
+
+    @property
+    def reason(self) -> str:
+        """Why it stopped."""
+        ...
+
+    @property
+    def tip(self) -> float:
+        """Arc length of the tip's progress on the plan [m]."""
+        ...
+
+    @property
+    def torch(self) -> float:
+        """Arc length of the torch's progress [m]."""
+        ...
+
+    @property
+    def wanted(self) -> float:
+        """Deflection asked of the tip at present [m]."""
+        ...
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of the torch's place across the seam [m]."""
+        ...
+
+    @property
+    def bound(self) -> float:
+        """What its distance from the seam does not exceed [m]."""
+        ...
+
+    @property
+    def band(self) -> float:
+        """The same for 95 % of the seam [m]."""
+        ...
 
     def step(self, pose: ToolPose, touches: Sequence[Touch]) -> Command:
         """Return the command for this cycle; ``touches`` are the measurements not yet given."""

@@ -20,11 +20,13 @@ from flangeye.motion.arc import OFF
 from flangeye.motion.seam_following import STILL, Command, Phase, ToolPose, Touch
 from flangeye.types import Floats
 from flangeye_plugins.weld.belief import BAND, Belief
-from flangeye_plugins.weld.follower import Follower, ResumePoint, within
+from flangeye_plugins.weld.follower import Follower
 from flangeye_plugins.weld.path import PATH_SPACING, Path, Place
+from flangeye_plugins.weld.pressing import within
 from flangeye_plugins.weld.response import Response
 from flangeye_plugins.weld.settings import Following, PassParams
 from flangeye_plugins.weld.striking import Striking
+from flangeye_plugins.weld.task import ResumePoint
 from flangeye_plugins.weld.weave import Sway, Weave
 
 GAIN = 2.0
@@ -60,7 +62,7 @@ class Traced:
     def path(self, chosen: PassParams) -> Path:
         """Return the torch's path of a pass; its height is that of the tool's end point."""
         s = np.arange(max(chosen.along, 0.0), self._plan.length + PATH_SPACING / 2, PATH_SPACING)
-        frames = [self._root.refined.frame(x) for x in s.tolist()]
+        frames = [self._root.seam.refined.frame(x) for x in s.tolist()]
         planar = np.array([point + chosen.across * normal for point, normal in frames])
         self._along, height, self._sigma = np.array(self.rows).T
         return Path(np.column_stack([planar, np.interp(s, self._along, height) + chosen.up]))
@@ -103,8 +105,8 @@ class Passes:
     def _go_on(self, before: ResumePoint) -> None:
         """Begin in a later pass, where the torch is to be lit again."""
         root, settings = self.root, self._settings
-        root.learned, root.lit = before.learned, settings.offset_along
-        root.refined.noise = before.learned.noise
+        root.sensing.learned, root.welding.lit = before.learned, settings.offset_along
+        root.seam.refined.noise = before.learned.noise
         self.number = before.number - 1
         self._learned()
         self._next_pass(0.0)
@@ -112,7 +114,7 @@ class Passes:
 
     def _learned(self) -> None:
         """Take over the arm's delay as the root pass has found it."""
-        learned = self.root.learned
+        learned = self.root.sensing.learned
         self._response.dead_time, self._response.lag = learned.dead_time, learned.lag
 
     def kept(self) -> ResumePoint | None:

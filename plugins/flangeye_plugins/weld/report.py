@@ -71,10 +71,13 @@ def _advice(controller: Controller) -> tuple[Note, ...]:
     """Recommend a look behind the torch where what nothing ahead of it measures is most of it."""
     root = follower_of(controller)
     # Where it is more than half, a look is worth its price.
-    if root is None or root.bias.looked or root.lit is None or root.share_fixed < 0.5:
+    if root is None or root.lit is None:
+        return ()
+    fixed = root.welding.share_fixed
+    if root.welding.bias.looked or fixed < 0.5:
         return ()
     return (
-        f"{root.share_fixed:.0%} of the torch's variance is what the files state of it: "
+        f"{fixed:.0%} of the torch's variance is what the files state of it: "
         "a look behind the torch ('look') would lessen it, nothing ahead of it can",
     )
 
@@ -88,7 +91,7 @@ def _extent(controller: Controller, plan: Path) -> str:
         return "nothing was welded"
     end = min(root.torch, plan.length)
     return (
-        f"{root.share_welded:.0%} of the seam was welded, from {max(root.lit, 0.0) * 1e3:.0f} to "
+        f"{root.welding.share:.0%} of the seam was welded, from {max(root.lit, 0.0) * 1e3:.0f} to "
         f"{end * 1e3:.0f} of {plan.length * 1e3:.0f} mm"
     )
 
@@ -108,7 +111,7 @@ def learned_figures(controller: Controller) -> Mapping[str, float]:
     root = follower_of(controller)
     if root is None:
         return {}
-    found = root.learned
+    found = root.sensing.learned
     return {
         "finger_gain_error": found.gain,
         "finger_play": 2.0 * abs(found.width),
@@ -116,7 +119,7 @@ def learned_figures(controller: Controller) -> Mapping[str, float]:
         "arm_dead_time": found.dead_time,
         "arm_lag": found.lag,
         "lit_from": -1.0 if root.lit is None else root.lit,
-        "share_welded": root.share_welded,
+        "share_welded": root.welding.share,
     }
 
 
@@ -148,11 +151,11 @@ def _tip_displacements(
 def _refined(controller: Controller, plan: Path) -> Floats:
     """Return the seam as it was felt, (M, 3) in the plane."""
     root = follower_of(controller)
-    if root is None or root.refined.empty:
+    if root is None or root.seam.refined.empty:
         return np.zeros((0, 3))
     s = np.arange(0.0, plan.length, 1e-3)
     points, tangents = plan.evaluate(s)
-    offsets = np.array([root.refined.offset(x) for x in s.tolist()])
+    offsets = np.array([root.seam.refined.offset(x) for x in s.tolist()])
     points[:, :2] += offsets[:, None] * np.stack([-tangents[:, 1], tangents[:, 0]], axis=1)
     return points
 

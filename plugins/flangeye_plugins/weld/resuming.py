@@ -22,11 +22,13 @@ from flangeye.plugin.registry import Lookup, load_registry
 from flangeye.plugin.stage import BoundPart
 from flangeye.types import Floats
 from flangeye_plugins.weld.belief import Belief
-from flangeye_plugins.weld.follower import SETTLING, Follower, ResumePoint
+from flangeye_plugins.weld.follower import Follower
 from flangeye_plugins.weld.passes import Passes
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.probing import Learned
 from flangeye_plugins.weld.settings import Following, Mode, WeldTactileParams
+from flangeye_plugins.weld.steering import SETTLING
+from flangeye_plugins.weld.task import ResumePoint
 from flangeye_plugins.weld.weld_log import LoggedLooks
 
 RUN_IN = 2 * SETTLING

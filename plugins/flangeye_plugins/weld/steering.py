@@ -6,7 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flangeye.motion.seam_following import ToolPose
 from flangeye.types import Floats
+from flangeye_plugins.weld.response import Response
+from flangeye_plugins.weld.task import WeldTask
+from flangeye_plugins.weld.weave import Sway, Weave
+
+SETTLING = 8e-3
+"""Way in which an error of the torch is taken back at speed [m]."""
 
 SLOWEST = 0.1
 """Share of its speed that the tip always keeps."""
@@ -75,6 +82,56 @@ class Steering:
         if across:
             pace = min(pace, self.usual * self.rate * self.distance * cosine / across)
         return speed * min(max(pace, SLOWEST), 1.0)
+
+
+class TorchLead:
+    """Leads the torch along the seam, swinging across it where a weave is asked for.
+
+    Attributes:
+        steering: How the tool is turned.
+        weave: The swing.
+        aim: How far to the left of the seam the torch is to be [m].
+    """
+
+    def __init__(self, task: WeldTask) -> None:
+        settings = task.settings
+        gain = max(settings.cross_track_gain, settings.speed / SETTLING)
+        self.steering = Steering(task.belief.distance, gain, settings.turn_rate)
+        self.weave = Weave(settings.weave_width, settings.weave_frequency)
+        self.aim = self._beside = settings.offset_across
+        self._from = max(settings.offset_along, 0.0)
+        self._swings: float | None = None
+
+    def swing(self, now: float, coming: float, arm: Response) -> Sway:
+        """Return the weave to command, ahead by the arm's delay; set ``aim`` to the one due now.
+
+        Args:
+            now: The time [s].
+            coming: Arc length of the torch, where the arm will be [m].
+            arm: How late the arm is.
+        """
+        if self._swings is None and coming >= self._from:
+            self._swings = now + arm.dead_time
+        elapsed = -1.0 if self._swings is None else now - self._swings
+        self.aim = self._beside + self.weave.at(elapsed).aside
+        return self.weave.at(elapsed + arm.dead_time).led(arm.lag)
+
+    def turn(
+        self, velocity: Floats, coming: ToolPose, normal: Floats, off: float, sway: Sway
+    ) -> float:
+        """Return the angular velocity [rad/s] that keeps the torch where it is to be.
+
+        Args:
+            velocity: (2,) of the robot's end point [m/s].
+            coming: The tool, where the arm will be.
+            normal: (2,) unit normal of the refined path at the torch.
+            off: How far to the left of that path the torch is [m].
+            sway: The weave to command.
+        """
+        if not velocity.any():
+            return 0.0
+        error = off - self._beside - sway.aside
+        return self.steering.turn(velocity, coming.direction, normal, error, sway.rate)
 
 
 def _cos_sin(tool: Floats, normal: Floats) -> tuple[float, float]:

@@ -38,7 +38,7 @@ from flangeye_plugins.weld.camera_process import CameraProcess
 from flangeye_plugins.weld.corners import leg_of
 from flangeye_plugins.weld.execution import WeldCell, follow
 from flangeye_plugins.weld.finger_camera import CameraJob, FingerCameraReader, SteppedReader
-from flangeye_plugins.weld.follower import Follower, ResumePoint
+from flangeye_plugins.weld.follower import Follower
 from flangeye_plugins.weld.frame import Tool, WorkPlane
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.prior import keep_posterior, with_prior
@@ -52,6 +52,7 @@ from flangeye_plugins.weld.resuming import (
     set_back,
 )
 from flangeye_plugins.weld.settings import Following, WeldTactileParams
+from flangeye_plugins.weld.task import ResumePoint
 from flangeye_plugins.weld.weld_log import WeldLog
 
 
@@ -184,7 +185,7 @@ def _kept(planned: Planned, follower: Follower | None) -> tuple[Note, ...]:
     if path is None or follower is None:
         return ()
     try:
-        keep_posterior(path, planned.finger.model, follower.learned)
+        keep_posterior(path, planned.finger.model, follower.sensing.learned)
     except StageError as error:
         return (Warn(f"what the weld found is not kept: {error}", "name another file (prior)"),)
     return (

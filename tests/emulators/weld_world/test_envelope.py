@@ -38,8 +38,8 @@ def test_delays_of_arm_and_images_are_measured_and_made_up_for() -> None:
     name = "20 mm/s, latency 100 ms, lag 100 ms, dead time 60 ms"
     found = try_condition(CONDITIONS[name], 0)
     assert isinstance(found.controller, Follower)
-    assert found.controller.learned.dead_time == pytest.approx(0.06, abs=0.021)
-    assert found.controller.learned.lag == pytest.approx(0.1, abs=0.051)
+    assert found.controller.sensing.learned.dead_time == pytest.approx(0.06, abs=0.021)
+    assert found.controller.sensing.learned.lag == pytest.approx(0.1, abs=0.051)
     assert rms(found) < 0.15e-3
     assert found.errors.max() < 0.4e-3
 

@@ -13,11 +13,12 @@ import pytest
 from flangeye.devices import WeldProfile
 from flangeye.motion.seam_following import STILL, Command, ToolPose, Touch
 from flangeye_plugins.weld.belief import Belief
-from flangeye_plugins.weld.follower import Follower, ResumePoint
-from flangeye_plugins.weld.motion import SeamReading
+from flangeye_plugins.weld.follower import Follower
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.probing import Learned
+from flangeye_plugins.weld.sensing import Located, SeamReading
 from flangeye_plugins.weld.settings import Following
+from flangeye_plugins.weld.task import ResumePoint
 from flangeye_plugins.weld.weave import Sway
 from tests.plugins.weld.bench import straight
 
@@ -44,6 +45,22 @@ def make(
     own = belief or Belief(DISTANCE)
     found: Any = Follower(Path(points), own, following(**given), touch, before)
     found.phase = phase
+    if phase not in ("seeking", "probing"):
+        found.welding.begin(0.0)
+    return found
+
+
+HOLDS = {
+    "tip": "progress", "torch": "progress", "coming": "progress", "lit": "welding",
+    "bound": "welding", "seen": "sensing", "heard": "sensing", "_lost": "pressing",
+}  # fmt: skip
+"""What of the follower holds a part of its state."""
+
+
+def put(found: Any, **state: Any) -> Any:
+    """Put a follower into a state."""
+    for name, value in state.items():
+        setattr(getattr(found, HOLDS[name]), name, value)
     return found
 
 
@@ -54,8 +71,8 @@ def pose(x: float, y: float = 0.0, z: float = 0.0, angle: float = 0.0, time: flo
 def felt_along(found: Any, offset: float, until: float = 0.1) -> None:
     """Let the seam be felt so far to the left of the plan [m]."""
     for s in np.arange(0.005, until, 2e-4).tolist():
-        found.refined.add(s, offset, 0.0)
-    found.refined.renew(-DISTANCE, 100_000)
+        found.seam.refined.add(s, offset, 0.0)
+    found.seam.refined.renew(-DISTANCE, 100_000)
 
 
 # --- how well the torch is known ------------------------------------------------------------------
@@ -64,36 +81,44 @@ def felt_along(found: Any, offset: float, until: float = 0.1) -> None:
 def test_all_that_the_torch_s_place_is_uncertain_by_adds_up() -> None:
     found = make()
     asked, belief = following(), Belief(DISTANCE)
-    found.refined = SimpleNamespace(variance=lambda s: 9e-10, angle=lambda s, a: 0.1)
-    found.learned = Learned(gain_sigma=0.03, width=0.02e-3, unexplained=0.03e-3)
-    found._press = asked.deflection
-    found._time = found._began = 5.0
+    found.seam.refined = SimpleNamespace(variance=lambda s: 9e-10, angle=lambda s, a: 0.1)
+    found.sensing.learned = Learned(gain_sigma=0.03, width=0.02e-3, unexplained=0.03e-3)
+    found.pressing.most = asked.deflection
+    found.welding.begin(5.0)
     gain = 0.03 * asked.deflection
     play = (0.02e-3) ** 2 * (1 / 11 + 10 / 33 - 1 / 121)  # of 0.02 in 0.22 mm it stays pressed
     always = belief.fixed_variance(asked) + gain**2 + play + (0.03e-3) ** 2 + 9e-10
-    assert found._variance(0.0, 0.1) == pytest.approx(always)
+    assert found.welding.variance(0.0, pose(0.0, angle=0.1, time=5.0)) == pytest.approx(always)
     # A tool that slants to the path is off across it by what its length is off by.
     slanting = (0.4 * belief.along_sigma) ** 2
-    assert found._variance(0.4, 0.1) == pytest.approx(always + slanting)
+    assert found.welding.variance(0.4, pose(0.0, angle=0.1, time=5.0)) == pytest.approx(
+        always + slanting
+    )
     # What the tip is off by in the flange goes with the torch, but for what the tool has turned.
     moved = (2 * math.sin(0.6 / 2) * belief.tip_sigma) ** 2
-    assert found._variance(0.0, 0.7) == pytest.approx(always + moved)
+    assert found.welding.variance(0.0, pose(0.0, angle=0.7, time=5.0)) == pytest.approx(
+        always + moved
+    )
     # Where the sweep has told how far ahead the tip is, what it is aside by counts a little.
-    found.learned = replace(found.learned, ahead_sigma=0.02e-3)
+    found.sensing.learned = replace(found.sensing.learned, ahead_sigma=0.02e-3)
     told = (0.02e-3 * math.sin(0.6)) ** 2 + (belief.tip_sigma * (1 - math.cos(0.6))) ** 2
-    assert found._variance(0.0, 0.7) == pytest.approx(always + told)
+    assert found.welding.variance(0.0, pose(0.0, angle=0.7, time=5.0)) == pytest.approx(
+        always + told
+    )
     # The gain that the sweep found ages; before it nothing was found.
-    found._time = 5.0 + 120.0
-    aged = (0.03 + 2 * asked.gain_drift) * asked.deflection
-    assert found._variance(0.0, 0.1) == pytest.approx(always - gain**2 + aged**2)
-    found.phase = "seeking"
-    assert found._variance(0.0, 0.1) == pytest.approx(always)
+    aged, later = (0.03 + 2 * asked.gain_drift) * asked.deflection, 5.0 + 120.0
+    told = always - gain**2 + aged**2
+    assert found.welding.variance(0.0, pose(0.0, angle=0.1, time=later)) == pytest.approx(told)
+    found.welding._swept = None
+    assert found.welding.variance(0.0, pose(0.0, angle=0.1, time=5.0)) == pytest.approx(always)
     # A swing is early or late by what the arm's delay is not known to.
     weaving = make(weave_width="3 mm")
-    weaving.refined, weaving.learned = found.refined, found.learned
-    weaving._press = found._press
+    weaving.seam.refined, weaving.sensing.learned = found.seam.refined, found.sensing.learned
+    weaving.pressing.most, weaving.welding._swept = found.pressing.most, None
     late = (math.pi * 3e-3 * 10e-3) ** 2 / 2
-    assert weaving._variance(0.0, 0.1) == pytest.approx(always + late)
+    assert weaving.welding.variance(0.0, pose(0.0, angle=0.1, time=5.0)) == pytest.approx(
+        always + late
+    )
 
 
 @pytest.mark.parametrize("off", [0.3e-3, -0.3e-3])
@@ -102,22 +127,22 @@ def test_what_the_torch_is_stated_to_be_off_by_is_its_error_and_its_sigmas(
 ) -> None:
     found = make(max_error="5 mm", offset_across="0.1 mm")
     felt_along(found, 1e-3)
-    found.torch, tip = 0.05, 0.05 + DISTANCE
+    found.progress.torch, tip = 0.05, 0.05 + DISTANCE
     found._estimate(pose(tip, 1e-3 + 0.1e-3 + off))
     error = 0.3e-3
-    assert found.sigma == pytest.approx(math.sqrt(found._variance(0.0, 0.0)))
-    assert found.band == pytest.approx(error + 2 * found.sigma, abs=1e-6)
-    assert found.bound == pytest.approx(error + 3 * found.sigma, abs=1e-6)
+    assert found.welding.sigma == pytest.approx(math.sqrt(found.welding.variance(0.0, pose(tip))))
+    assert found.welding.band == pytest.approx(error + 2 * found.welding.sigma, abs=1e-6)
+    assert found.welding.bound == pytest.approx(error + 3 * found.welding.sigma, abs=1e-6)
     vision = make(touch=False)
     vision._estimate(pose(tip, off))
-    assert vision.bound == 0.0
+    assert vision.welding.bound == 0.0
 
 
 def doubtful(torch: float, lit: float | None, off: float = 3e-3, **given: Any) -> Any:
     """A follower whose torch is off by so much, after its estimate."""
     found = make(**given)
     felt_along(found, 0.0)
-    found.torch, found.lit = torch, lit
+    found.progress.torch, found.welding.lit = torch, lit
     found._estimate(pose(torch + DISTANCE, off))
     return found
 
@@ -139,7 +164,7 @@ def test_a_weld_that_cannot_begin_within_the_first_hundredth_of_the_seam_is_refu
     long = straight(0.3)
     assert doubtful(0.0029, None, plan=long).phase == "following"
     told = doubtful(0.0031, None, plan=long)
-    assert told.phase == "stopped" and told.lit is None and told.share_welded == 0.0
+    assert told.phase == "stopped" and told.lit is None and told.welding.share == 0.0
     assert told.reason.startswith("not begun: the torch is known to 3.")
     assert doubtful(0.0178, None, plan=long, offset_along="15 mm").phase == "following"
     assert doubtful(0.0179, None, plan=long, offset_along="15 mm").phase == "stopped"
@@ -152,10 +177,10 @@ def test_a_weld_is_not_begun_where_the_seam_ahead_is_not_known() -> None:
                                 (1e-6, 0.0031, "stopped")):  # fmt: skip
         found = make(plan=long)
         felt_along(found, 0.0)
-        found.refined._doubts[found.refined._index(0.03)] = doubt
-        found.torch = torch
+        found.seam.refined._doubts[found.seam.refined._index(0.03)] = doubt
+        found.progress.torch = torch
         found._estimate(pose(torch + DISTANCE, 0.0))
-        assert found.phase == phase and (found.lit is None) == (doubt > 0.0)
+        assert found.phase == phase and (found.welding.lit is None) == (doubt > 0.0)
     assert found.reason.startswith("not begun: the torch is known to 3.")
     assert " mm only at 2" in found.reason and " mm of the seam, max_error" in found.reason
 
@@ -176,15 +201,15 @@ def test_the_tip_is_set_down_where_the_seam_has_surely_begun() -> None:
 
 def test_the_tip_goes_back_slowly_where_it_is_seen_late() -> None:
     found = make(ends="1 mm", speed="20 mm/s")
-    found._latency, found._response.dead_time, found._response.lag = 0.1, 0.05, 0.1
+    found.sensing.latency, found.arm.dead_time, found.arm.lag = 0.1, 0.05, 0.1
     assert found._backwards() == pytest.approx(1.5e-3 / 2 / 0.25)
 
 
 def test_the_share_that_was_welded_is_of_the_planned_seam() -> None:
     found = doubtful(0.02, 0.01, off=0.0, plan=straight(0.21), offset_along="10 mm")
-    assert found.share_welded == pytest.approx(0.05)
-    found.torch = 0.22  # the arc ends where the seam does
-    assert found.share_welded == pytest.approx(1.0)
+    assert found.welding.share == pytest.approx(0.05)
+    found.progress.torch = 0.22  # the arc ends where the seam does
+    assert found.welding.share == pytest.approx(1.0)
 
 
 def test_a_torch_that_goes_on_has_to_be_on_the_seam_where_it_had_stopped() -> None:
@@ -212,44 +237,44 @@ def test_the_wanted_deflection_goes_to_what_the_phase_asks_for_at_its_rate(
     phase: str, first: float, target: float, rate: str
 ) -> None:
     found, asked = make(phase), following()
-    found.wanted = first
-    found._ramp(0.1)
+    found.pressing.wanted = first
+    found.pressing.ramp(found.phase, found._press(), 0.1)
     step = 0.1 * getattr(asked, rate)
-    assert found.wanted == pytest.approx(first + math.copysign(step, target - first))
-    found._ramp(60.0)
-    assert found.wanted == pytest.approx(target)
+    assert found.pressing.wanted == pytest.approx(first + math.copysign(step, target - first))
+    found.pressing.ramp(found.phase, found._press(), 60.0)
+    assert found.pressing.wanted == pytest.approx(target)
 
 
 def test_a_lost_wall_is_felt_for_as_far_aside_as_the_seam_is_unknown_at_the_tip() -> None:
     found = make("bridging", belief=Belief(DISTANCE, two_walls=False))
     probe = following().probe
     for i in range(120):
-        found.refined.add(3e-4 * i, 0.0, 0.0)
-    found.refined.renew(-DISTANCE, 100_000)
+        found.seam.refined.add(3e-4 * i, 0.0, 0.0)
+    found.seam.refined.renew(-DISTANCE, 100_000)
     aside = []
-    for found.tip in (0.03, 0.04, 0.045, 0.12):
-        found._ramp(60.0)
-        aside.append(found.wanted - probe)
-    assert aside[0] == pytest.approx(2 * math.sqrt(found.refined.variance(0.03)))
+    for found.progress.tip in (0.03, 0.04, 0.045, 0.12):
+        found.pressing.ramp(found.phase, found._press(), 60.0)
+        aside.append(found.pressing.wanted - probe)
+    assert aside[0] == pytest.approx(2 * math.sqrt(found.seam.refined.variance(0.03)))
     assert 0.0 < aside[0] < aside[1] < aside[2] < aside[3] == pytest.approx(probe)
 
 
 def test_nothing_is_pressed_before_a_wall_was_found_nor_without_touch() -> None:
     seeking, vision = make("seeking"), make(touch=False)
     for found in (seeking, vision):
-        found._ramp(60.0)
-        assert found.wanted == 0.0
-    seeking._search.found = True
-    seeking._ramp(60.0)
+        found.pressing.ramp(found.phase, found._press(), 60.0)
+        assert found.pressing.wanted == 0.0
+    seeking.sensing.search.found = True
+    seeking.pressing.ramp(seeking.phase, seeking._press(), 60.0)
     assert seeking.wanted == PRESS
 
 
 def test_the_deflection_has_ended_where_the_tip_is_to_stop_pressing() -> None:
     found, asked = make(), following()
-    going, way = 0.0, found._pressing_ends
-    found.phase, found.wanted = "ending", PRESS
-    while found.wanted > 1e-12:
-        found._ramp(1e-3)
+    going, way = 0.0, found.pressing.ends
+    found.phase, found.pressing.wanted = "ending", PRESS
+    while found.pressing.wanted > 1e-12:
+        found.pressing.ramp(found.phase, found._press(), 1e-3)
         going, way = going + 1e-3, way + 1e-3 * asked.speed
     assert way == pytest.approx(LENGTH - asked.ending, abs=1e-5)
 
@@ -260,15 +285,15 @@ def test_the_deflection_has_ended_where_the_tip_is_to_stop_pressing() -> None:
 def test_where_the_seam_curves_the_tip_goes_as_fast_as_it_swerves_by_three_tenths() -> None:
     """Straight on for the time in which it is blind, off a circle by (v t)^2 / 2 R."""
     found = make(plan=circle())
-    found.tip = found.torch = 0.05
+    found.progress.tip = found.progress.torch = 0.05
     assert found._agility() == math.inf  # nothing is late
-    found._latency, found._response.dead_time, found._response.lag = 0.2, 0.15, 0.25
+    found.sensing.latency, found.arm.dead_time, found.arm.lag = 0.2, 0.15, 0.25
     way = found._agility() * 0.6
     assert way**2 / (2 * RADIUS) == pytest.approx(0.3e-3, rel=1e-2)
-    found._latency = 1e3
+    found.sensing.latency = 1e3
     assert found._agility() == pytest.approx(0.1 * following().speed)
     straight_on = make()
-    straight_on._latency = 1.0
+    straight_on.sensing.latency = 1.0
     assert straight_on._agility() == math.inf
 
 
@@ -279,10 +304,10 @@ def test_a_curve_slows_the_tip_ten_millimetres_before_and_until_the_torch_is_thr
         np.linspace(1e-3, 0.1, 100), [math.cos(1.0), math.sin(1.0), 0]
     )
     found = make(plan=np.concatenate([straight(0.1)[:-1], bent, end]))
-    found._latency = 1.0
+    found.sensing.latency = 1.0
 
     def slow(torch: float, tip: float) -> bool:
-        found.torch, found.tip = torch, tip
+        found.progress.torch, found.progress.tip = torch, tip
         return bool(found._agility() < 2 * math.sqrt(2 * 0.3e-3 * RADIUS))
 
     assert not slow(0.04, 0.082) and slow(0.06, 0.1)
@@ -292,40 +317,44 @@ def test_a_curve_slows_the_tip_ten_millimetres_before_and_until_the_torch_is_thr
 
 def test_a_tip_that_is_not_firmly_on_its_wall_waits_for_it_but_never_stands() -> None:
     found, asked = make(), following()
-    found.wanted = asked.deflection
+    found.pressing.wanted = asked.deflection
     for share, kept in ((0.7, 1.0), (0.9, 1.0), (0.35, 0.5), (0.07, 0.2), (-1.0, 0.2)):
-        found.contact.deflection = share * asked.deflection
+        found.seam.contact.deflection = share * asked.deflection
         assert found._firmness() == pytest.approx(kept)
-    found.wanted, found.contact.deflection = 0.0, 0.35 * asked.probe
+    found.pressing.wanted, found.seam.contact.deflection = 0.0, 0.35 * asked.probe
     assert found._firmness() == pytest.approx(0.5)
-    found.contact.deflection = 0.0
+    found.seam.contact.deflection = 0.0
     for other in (make("ending"), make(touch=False)):
         assert other._firmness() == 1.0
     assert make("bridging")._firmness() == 0.2  # it feels for the other wall
-    found.wanted = found.contact.deflection = asked.deflection
-    found.contact.compression = asked.preload
+    found.pressing.wanted = found.seam.contact.deflection = asked.deflection
+    found.seam.contact.compression = asked.preload
     for strained, kept in ((0.5, 1.0), (0.7, 0.5), (0.95, 0.2)):
-        found.contact.steady = asked.deflection / asked.preload / strained
+        found.seam.contact.steady = asked.deflection / asked.preload / strained
         assert found._firmness() == pytest.approx(kept)
 
 
 def test_the_tip_slows_down_while_no_image_comes() -> None:
     found, asked, along = make(), following(), np.array([0.0, 1.0])
-    found.wanted, found.contact.deflection = asked.deflection, asked.deflection
+    found.now = 7.0
+    found.pressing.wanted, found.seam.contact.deflection = asked.deflection, asked.deflection
     for silence, share in ((0.0, 1.0), (0.0999, 1.0), (0.11, 0.8), (0.149, 0.02)):
-        found._heard = 7.0 - silence
+        found.sensing.heard = 7.0 - silence
         assert found._pace(pose(0.05, time=7.0), along) == pytest.approx(
             share * asked.speed, abs=1e-9
         )
-    found._heard, found.contact.deflection = 7.0 - 0.11, 0.35 * asked.deflection  # half as firm
+    found.sensing.heard, found.seam.contact.deflection = (
+        7.0 - 0.11,
+        0.35 * asked.deflection,
+    )  # half as firm
     assert found._pace(pose(0.05, time=7.0), along) == pytest.approx(0.4 * asked.speed, abs=1e-9)
-    found._heard = 7.0 - 0.149
+    found.sensing.heard = 7.0 - 0.149
     found.phase = "seeking"
     assert found._pace(pose(0.05, time=7.0), along) == 0.0
-    assert found._silence(7.0) == pytest.approx(0.149)
+    assert found._silence == pytest.approx(0.149)
     for blind in (make("ending"), make(touch=False)):
-        blind._heard = 3.0
-        assert blind._silence(7.0) == 0.0
+        blind.sensing.heard, blind.now = 3.0, 7.0
+        assert blind._silence == 0.0
 
 
 # --- where to ------------------------------------------------------------------------------------
@@ -334,7 +363,7 @@ def test_the_tip_slows_down_while_no_image_comes() -> None:
 @pytest.mark.parametrize(("side", "sign"), [("left", 1.0), ("right", -1.0)])
 def test_the_servo_brings_deflection_and_preload_to_what_is_wanted(side: str, sign: float) -> None:
     found, asked = make(side=side), following()
-    found.wanted, found._felt = asked.deflection, SeamReading(1e-3, 0.4e-3)
+    found.pressing.wanted, found.sensing.felt = asked.deflection, SeamReading(1e-3, 0.4e-3)
     y, z = 1e-3 + sign * asked.deflection, 0.4e-3 - asked.preload
     there = found._velocity(pose(0.05, y, z), 4e-3)
     assert there == pytest.approx([4e-3, 0.0, 0.0], abs=1e-12)
@@ -349,15 +378,19 @@ def test_the_servo_brings_deflection_and_preload_to_what_is_wanted(side: str, si
 def test_the_tip_climbs_with_the_plan_and_leaves_it_with_the_seam() -> None:
     climbing = straight(LENGTH) * [1.0, 1.0, 0.0] + straight(LENGTH)[:, [1, 1, 0]] * 0.05
     found, asked = make(plan=climbing), following()
-    found.tip, found._felt, found.wanted = 0.05, SeamReading(0.0, 0.0), asked.deflection
-    found._place = found._plan.at(0.05)
+    found.progress.tip, found.sensing.felt, found.pressing.wanted = (
+        0.05,
+        SeamReading(0.0, 0.0),
+        asked.deflection,
+    )
+    found.progress.place = found.task.plan.at(0.05)
     seated = pose(0.05, asked.deflection, 0.05 * 0.05 - asked.preload)
     assert found._velocity(seated, 4e-3) == pytest.approx([4e-3, 0.0, 0.05 * 4e-3], abs=1e-9)
     for s in np.arange(0.005, 0.06, 2e-4).tolist():
-        found.refined.add(s, 0.1 * (s - 0.05), 0.0)
-    found.refined.renew(-DISTANCE, 100_000)
+        found.seam.refined.add(s, 0.1 * (s - 0.05), 0.0)
+    found.seam.refined.renew(-DISTANCE, 100_000)
     assert found._velocity(seated, 4e-3)[1] == pytest.approx(0.1 * 4e-3, rel=0.03)
-    found.phase, found._felt = "ending", SeamReading(0.0, 0.0)
+    found.phase, found.sensing.felt = "ending", SeamReading(0.0, 0.0)
     assert found._drifting() == 0.0
 
 
@@ -368,7 +401,7 @@ def test_a_vision_weld_presses_nothing_down() -> None:
 
 def test_while_the_groove_is_sought_the_search_says_where_to() -> None:
     found, asked = make("seeking"), following()
-    found._search.down = True
+    found.sensing.search.down = True
     sideways = found._velocity(pose(0.005, 0.0, -asked.preload), 0.0)
     assert sideways == pytest.approx([0.0, asked.lateral_speed, 0.0], abs=1e-12)
     near = found._velocity(pose(0.005, asked.reach - 1e-3, -asked.preload), 0.0)
@@ -378,7 +411,7 @@ def test_while_the_groove_is_sought_the_search_says_where_to() -> None:
 def test_while_nothing_is_felt_the_seam_is_where_what_was_felt_leads() -> None:
     found = make()
     assert found._seam_at_tip().offset == 0.0
-    found._felt, found.tip = SeamReading(3e-3, 0.2e-3), 0.05
+    found.sensing.felt, found.progress.tip = SeamReading(3e-3, 0.2e-3), 0.05
     felt_along(found, 1e-3)
     assert found._seam_at_tip().offset == 3e-3
     for phase in ("bridging", "ending"):
@@ -389,13 +422,19 @@ def test_while_nothing_is_felt_the_seam_is_where_what_was_felt_leads() -> None:
 
 def test_tip_and_torch_go_on_by_a_tenth_of_a_second_s_way_at_most() -> None:
     found, asked = make(), following()
-    found.tip, found._coming, found.torch = 0.05, 0.01, 0.009
+    found.progress.tip, found.progress.coming, found.progress.torch = 0.05, 0.01, 0.009
     found._progress(pose(0.0504), pose(0.0506))
-    assert [found.tip, found._coming, found.torch] == pytest.approx([0.0505, 0.0105, 0.0095])
+    assert [found.progress.tip, found.progress.coming, found.progress.torch] == pytest.approx(
+        [0.0505, 0.0105, 0.0095]
+    )
     found._progress(pose(0.0496), pose(0.0503))
-    assert [found.tip, found._coming, found.torch] == pytest.approx([0.0505, 0.0105, 0.0096])
+    assert [found.progress.tip, found.progress.coming, found.progress.torch] == pytest.approx(
+        [0.0505, 0.0105, 0.0096]
+    )
     assert asked.speed * 0.1 == pytest.approx(0.5e-3)
-    assert found._torch_position(pose(0.05, 0.01, angle=np.pi / 2)) == pytest.approx([0.05, -0.03])
+    assert found.progress.torch_at(pose(0.05, 0.01, angle=np.pi / 2)) == pytest.approx(
+        [0.05, -0.03]
+    )
 
 
 # --- what the finger says -------------------------------------------------------------------------
@@ -404,27 +443,29 @@ def test_tip_and_torch_go_on_by_a_tenth_of_a_second_s_way_at_most() -> None:
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_a_displacement_is_freed_of_rest_play_and_gain(side: str) -> None:
     found, rest = make(side=side), np.array([0.1e-3, -0.2e-3, 0.3e-3])
-    found._search.rest, true = rest, np.array([0.4e-3, 1.5e-3, 1.2e-3])
+    found.sensing.search.rest, true = rest, np.array([0.4e-3, 1.5e-3, 1.2e-3])
     sign = 1.0 if side == "left" else -1.0
     for gain, up in ((0.1, 1.1), (-0.1, 1.0)):  # a preload that is shown larger presses harder
-        found.learned = Learned(gain=gain, width=0.05e-3, reversal=1e3)
+        found.sensing.learned = Learned(gain=gain, width=0.05e-3, reversal=1e3)
         shown = rest + true * [1 + gain, 1 + gain, up] + [0.0, sign * 0.05e-3, 0.0]
-        assert found._corrected(shown) == pytest.approx(true)
+        assert found.sensing._corrected(shown, found.phase) == pytest.approx(true)
     # Play that is gone through over less than the deflection wobbles by may be anywhere.
-    found.learned = Learned(width=0.05e-3, reversal=0.2e-3)
-    assert found._corrected(rest)[1] == pytest.approx(-sign * 0.025e-3)
+    found.sensing.learned = Learned(width=0.05e-3, reversal=0.2e-3)
+    assert found.sensing._corrected(rest, found.phase)[1] == pytest.approx(-sign * 0.025e-3)
 
 
 def test_a_finger_that_is_let_go_of_goes_through_its_play_to_the_other_side() -> None:
     found, most = make("ending"), PRESS
-    found.learned = Learned(width=-0.1e-3)
+    found.sensing.learned = Learned(width=-0.1e-3)
     for less, where in ((0.0, 1.0), (0.05e-3, 0.5), (0.1e-3, 0.0), (0.2e-3, -1.0), (1e-3, -1.0)):
-        found.wanted = most - less
-        assert found._pressing() == pytest.approx(where)
+        found.pressing.wanted = most - less
+        assert found.pressing.played(found.phase, found.sensing.learned.width) == pytest.approx(
+            where
+        )
     found.phase = "following"
-    assert found._pressing() == 1.0
-    found.phase, found.learned = "ending", Learned()
-    assert found._pressing() == 1.0
+    assert found.pressing.played(found.phase, found.sensing.learned.width) == 1.0
+    found.phase, found.sensing.learned = "ending", Learned()
+    assert found.pressing.played(found.phase, found.sensing.learned.width) == 1.0
 
 
 @pytest.mark.parametrize(
@@ -434,9 +475,11 @@ def test_the_noisier_a_finger_the_longer_the_mean_that_is_followed(
     noise: float, share: float
 ) -> None:
     found = make()
-    assert found._smoothed(SeamReading(5.0, 6.0)).offset == 5.0
-    found._felt, found.refined.noise = SeamReading(1.0, 2.0), noise
-    mean = found._smoothed(SeamReading(2.0, 4.0))
+    found.sensing.smooth(SeamReading(5.0, 6.0), noise)
+    assert found.sensing.felt.offset == 5.0
+    found.sensing.felt = SeamReading(1.0, 2.0)
+    found.sensing.smooth(SeamReading(2.0, 4.0), noise)
+    mean = found.sensing.felt
     assert [mean.offset, mean.height] == pytest.approx([1 + share, 2 + 2 * share])
 
 
@@ -448,37 +491,30 @@ def test_the_seam_is_where_the_tip_is_beside_its_ball_and_the_deflection_what_it
         DISTANCE, half_angle=math.pi / 4, lean=-sign * math.pi / 4, two_walls=False, radius=2e-3
     )
     found = make(side=side, belief=belief)
-    found.tip, turned_by = 0.05, 0.3
+    found.progress.tip, turned_by = 0.05, 0.3
     c, s = math.cos(turned_by), math.sin(turned_by)
     moved = np.array([0.1e-3, -sign * 1.4e-3, 0.6e-3])  # of the tip, in the plane
     shown = np.array([c * moved[0] + s * moved[1], -s * moved[0] + c * moved[1], moved[2]])
-    at, felt, deflection = found._located(pose(0.05, 3e-3, -1e-3, turned_by), Touch(0.0, shown))
-    assert at == pytest.approx(0.0501)
-    assert felt.offset == pytest.approx(3e-3 - sign * 1.4e-3 + sign * 2e-3)
-    assert felt.height == pytest.approx(-0.4e-3)
-    assert deflection == pytest.approx(1.4e-3)
-    assert found._lateral(pose(0.05, 3e-3)) == pytest.approx(3e-3 + sign * 2e-3)
+    tool = pose(0.05, 3e-3, -1e-3, turned_by)
+    at = found.sensing.locate(tool, Touch(0.0, shown), found.phase)
+    assert at.s == pytest.approx(0.0501) and at.angle == turned_by
+    assert at.seam.offset == pytest.approx(3e-3 - sign * 1.4e-3 + sign * 2e-3)
+    assert at.seam.height == pytest.approx(-0.4e-3)
+    assert (at.deflection, at.compression) == pytest.approx((1.4e-3, 0.6e-3))
+    assert found.progress.lateral(pose(0.05, 3e-3)) == pytest.approx(3e-3 + sign * 2e-3)
 
 
 def test_a_measurement_meets_the_pose_of_its_image_and_its_delay_is_learned() -> None:
     found = make("bridging")
     for i in range(101):
-        found._track.add(pose(0.05 + 1e-3 * i, time=i * 0.01))
-    found._time, found.learned, found._latency = 1.0, Learned(stamp=0.05), 0.1
-    places = list[float]()
-    located = found._located
-
-    def noted(at: Any, touch: Any) -> Any:
-        places.append(float(at.position[0]))
-        return located(at, touch)
-
-    found._located = noted
-    found._feel(Touch(0.9, np.array([0.0, 0.0, 1e-3])))
-    assert places == [pytest.approx(0.05 + 85e-3)]
-    assert found._latency == pytest.approx(0.1 + 0.05 * (0.15 - 0.1))
-    assert (found._seen, found._heard) == (0.9, 1.0)
-    found._feel(Touch(0.0, np.zeros(3)))  # from before the first pose
-    assert len(places) == 1
+        found.sensing._track.add(pose(0.05 + 1e-3 * i, time=i * 0.01))
+    found.now, found.sensing.learned, found.sensing.latency = 1.0, Learned(stamp=0.05), 0.1
+    at, _ = found.sensing.take(Touch(0.9, np.array([0.0, 0.0, 1e-3])), found.now)
+    assert at.position[0] == pytest.approx(0.05 + 85e-3)
+    assert found.sensing.latency == pytest.approx(0.1 + 0.05 * (0.15 - 0.1))
+    assert (found.sensing.seen, found.sensing.heard) == (0.9, 1.0)
+    found.sensing.seen = -1.0
+    assert found.sensing.take(Touch(0.0, np.zeros(3)), found.now) is None  # before the first pose
 
 
 @pytest.mark.parametrize(("moved", "told"), [(0.19e-3, False), (0.21e-3, True), (-0.21e-3, True)])
@@ -486,106 +522,111 @@ def test_a_seam_that_has_moved_by_two_tenths_since_the_stop_is_another_one(
     moved: float, told: bool
 ) -> None:
     samples = np.array([[s, 1e-3, 0.0, 1, 0.0] for s in np.arange(0.005, 0.05, 5e-4).tolist()])
-    found = make(before=ResumePoint(samples, 0.03))
+    found = make(before=ResumePoint(samples, 0.03)).seam
+
+    def compared(at: float, offset: float) -> str:
+        return str(found.moved(Located(at, SeamReading(offset, 0.0), 0.0, 0.0, 0.0)))
+
     for i in range(14):
-        found._compare(0.02 + 1e-4 * i, 1e-3 + moved + (5e-3 if i % 3 == 0 else 0.0))
-    assert found.phase == "following"
-    found._compare(0.06, 9.0)  # nothing was felt there before
-    found._compare(0.04, 1e-3 + moved)
-    assert (found.phase == "stopped") == told
-    if told:
-        assert found.reason.startswith("the seam has moved by 0.2") and "a seam of its own" in (
-            found.reason
-        )
-    else:
-        found._compare(0.04, 9.0)  # fifteen were compared, and that is that
-        assert len(found._moved) == 15
+        assert not compared(0.02 + 1e-4 * i, 1e-3 + moved + (5e-3 if i % 3 == 0 else 0.0))
+    assert not compared(0.06, 9.0)  # nothing was felt there before
+    why = compared(0.04, 1e-3 + moved)
+    assert why.startswith("the seam has moved by 0.2" if told else "")
+    assert ("a seam of its own" in why) == told
+    assert not compared(0.04, 9.0)  # fifteen were compared, and that is that
+    assert len(found._moved) == 15
 
 
 # --- from phase to phase --------------------------------------------------------------------------
 
 
 def judged(found: Any, **state: Any) -> str:
-    for name, value in state.items():
-        setattr(found, name, value)
-    found._judge(pose(0.05))
+    put(found, **state)._judge(pose(0.05))
     return str(found.phase)
 
 
 def test_phases_follow_from_what_was_felt() -> None:
-    ends = make()._pressing_ends
+    ends = make().pressing.ends
     assert judged(make(), tip=ends - 1e-5) == "following"
     assert judged(make(), tip=ends + 1e-5) == "ending"
     assert judged(make("bridging"), tip=ends + 1e-5) == "ending"
     lost = make()
-    lost.contact.likely = np.array([0.0, 0.0, 0.05, 0.95])
-    lost.wanted = PRESS
+    lost.seam.contact.likely = np.array([0.0, 0.0, 0.05, 0.95])
+    lost.pressing.wanted = PRESS
     assert judged(lost, tip=0.06) == "bridging"
-    assert (lost._bridge, lost.side, lost.wanted) == (0.06, -1.0, -PRESS)  # there is another wall
-    lost.contact.likely = np.array([1.0, 0.0, 0.0, 0.0])
+    assert (lost.pressing._lost, lost.side, lost.wanted) == (
+        0.06,
+        -1.0,
+        -PRESS,
+    )  # there is another wall
+    lost.seam.contact.likely = np.array([1.0, 0.0, 0.0, 0.0])
     assert judged(lost) == "bridging"  # a free tip is where the arm leads it, too
-    lost.contact.deflection = 0.6 * PRESS
+    lost.seam.contact.deflection = 0.6 * PRESS
     assert judged(lost) == "following" and lost.side == -1.0
     sought = make("bridging")
-    sought._tried = 0.02
+    sought.pressing._turned = 0.02
     assert judged(sought, tip=0.0299) == "bridging" and sought.side == 1.0
     assert judged(sought, tip=0.0301) == "bridging" and sought.side == -1.0
     alone = make(belief=Belief(DISTANCE, two_walls=False))
-    alone.contact.likely = np.array([0.0, 0.0, 0.0, 1.0])
+    alone.seam.contact.likely = np.array([0.0, 0.0, 0.0, 1.0])
     assert judged(alone, tip=0.06) == "bridging" and alone.side == 1.0
     for seated, probing, phase in ((False, True, "seeking"), (True, True, "probing"),
                                    (True, False, "following")):  # fmt: skip
         found = make("seeking", probing=probing)
-        found._search.seats = lambda wanted, seated=seated: seated
+        found.sensing.search.seats = lambda wanted, seated=seated: seated
         assert judged(found) == phase
 
 
 def felt_at(found: Any, time: float, s: float, offset: float, deflection: float = PRESS) -> None:
-    found._weigh(time, s, SeamReading(offset, 0.0), (deflection, 1.5e-3), 0.1)
+    """What the follower does with a touch at an arc length."""
+    at = Located(s, SeamReading(offset, 0.0), deflection, 1.5e-3, 0.1)
+    found.sensing.take = lambda touch, now: (pose(s), touch)
+    found.sensing.locate = lambda *given: at
+    found._feel(Touch(time, np.zeros(3)))
 
 
 def test_what_was_felt_a_while_ago_by_a_tip_that_no_wall_lost_is_believed() -> None:
     found = make()
     for i in range(40):
         felt_at(found, 0.033 * i, 0.02 + 2e-4 * i, 1e-3)
-    found.refined.renew(-DISTANCE, 100_000)
-    believed = found.refined.samples()
+    found.seam.refined.renew(-DISTANCE, 100_000)
+    believed = found.seam.refined.samples()
     assert believed[:, 3].sum() == 30 and believed[:, 1] == pytest.approx(1e-3)
     bridging = make("bridging")
     for i in range(40):
         felt_at(bridging, 0.033 * i, 0.02 + 2e-4 * i, 1e-3)
-    assert bridging._felt is None and not bridging.refined._sure
+    assert bridging.sensing.felt is None and not bridging.seam.refined._sure
     ending = make("ending", ends="3 mm")
     for s, kept in ((LENGTH - 3.1e-3, True), (LENGTH - 2.9e-3, False)):
         felt_at(ending, 9.0, s, 0.0)
-        ending._keep(math.inf)
-        assert (len(ending.refined._sure) == 1) == kept
-        ending.refined._sure.clear()
+        ending.seam.keep(math.inf)
+        assert (len(ending.seam.refined._sure) == 1) == kept
+        ending.seam.refined._sure.clear()
 
 
 def test_the_tip_goes_back_to_where_the_seam_is_sure_to_have_begun() -> None:
     found = make("probing", ends="1 mm")
-    found._probing = SimpleNamespace(over=True, learned=lambda: Learned(swept=2.4e-3))
+    found.sensing.probing = SimpleNamespace(over=True, learned=lambda: Learned(swept=2.4e-3))
     down = np.array([0.0, -PRESS, 0.0])
-    found._swept = [(pose(0.005, PRESS), Touch(0.1, down))] * 3
-    found._track.add(pose(0.005, PRESS, -1.5e-3, time=0.1))
-    found._time = found._seen = found._heard = 0.1
-    assert judged(found) == "following" and found._press == pytest.approx(0.8e-3)
-    found.contact.deflection, found.contact.compression = PRESS, 1.5e-3
+    found.sensing._swept = [(pose(0.005, PRESS), Touch(0.1, down))] * 3
+    found.sensing._track.add(pose(0.005, PRESS, -1.5e-3, time=0.1))
+    found.now = found.sensing.seen = found.sensing.heard = 0.1
+    assert judged(found) == "following" and found.pressing.most == pytest.approx(0.8e-3)
+    found.seam.contact.deflection, found.seam.contact.compression = PRESS, 1.5e-3
     here, times = 5e-3, 0.1
-    while found._backed is not None:
+    while found.seam._backed is not None:
         times += 0.01
         at = pose(here, PRESS, -1.5e-3, time=times)
         touches = [Touch(times, np.array([0.0, -PRESS, 1.5e-3]))]
         command = found.step(at, touches)
-        assert found._backed is None or (command.turn, command.velocity[0]) < (1e-9, 1e-9)
+        assert found.seam._backed is None or (command.turn, command.velocity[0]) < (1e-9, 1e-9)
         here += command.velocity[0] * 0.01
     assert here == pytest.approx(2.5e-3, abs=0.1e-3)
-    felt = found.refined.samples()
+    felt = found.seam.refined.samples()
     assert felt[0, 0] < 3.1e-3 and felt[-1, 0] > 4.4e-3
-    assert found.begins == -1e-3 and found.ends == LENGTH + 1e-3
+    assert found.task.begins == -1e-3 and found.task.ends == LENGTH + 1e-3
     found.step(pose(here, PRESS, -1.5e-3, time=times + 0.01), [])
-    assert found._lead(at, at).velocity[0] > 0.0
+    assert found._lead(at, at, 0.01).velocity[0] > 0.0
 
 
 def test_a_weld_has_ended_where_the_torch_is_at_the_end_of_the_seam() -> None:
@@ -601,37 +642,34 @@ def test_a_weld_has_ended_where_the_torch_is_at_the_end_of_the_seam() -> None:
 
 
 def refused(found: Any, at: Any = None, **state: Any) -> str:
-    for name, value in state.items():
-        setattr(found, name, value)
-    found._refuse(at or pose(0.05, time=1.0), found._settings)
-    return str(found.reason)
+    return str(put(found, **state)._blind(at or pose(0.05, time=1.0)))
 
 
 def test_an_arm_that_would_go_on_blindly_is_stopped() -> None:
-    assert refused(make(), _seen=0.501, lit=0.0) == refused(make(), _seen=0.5, lit=0.0) == ""
-    assert refused(make(), _seen=0.499, lit=0.0) == "no tag was seen for 500 ms"
-    assert refused(make(), _seen=-0.99) == ""  # no arc burns: the arm stands and waits
-    assert refused(make(), _seen=-1.01) == "no tag was seen for 2000 ms"
-    assert refused(make("ending"), _seen=0.0) == ""
-    assert refused(make(touch=False), _seen=0.0) == ""
-    assert refused(make("bridging"), _seen=1.0, _bridge=0.02, tip=0.0599) == ""
-    assert refused(make("bridging"), _seen=1.0, _bridge=0.0, tip=0.04) == ""
-    told = refused(make("bridging"), _seen=1.0, _bridge=0.02, tip=0.0601)
+    assert refused(make(), seen=0.501, lit=0.0) == refused(make(), seen=0.5, lit=0.0) == ""
+    assert refused(make(), seen=0.499, lit=0.0) == "no tag was seen for 500 ms"
+    assert refused(make(), seen=-0.99) == ""  # no arc burns: the arm stands and waits
+    assert refused(make(), seen=-1.01) == "no tag was seen for 2000 ms"
+    assert refused(make("ending"), seen=0.0) == ""
+    assert refused(make(touch=False), seen=0.0) == ""
+    assert refused(make("bridging"), seen=1.0, _lost=0.02, tip=0.0599) == ""
+    assert refused(make("bridging"), seen=1.0, _lost=0.0, tip=0.04) == ""
+    told = refused(make("bridging"), seen=1.0, _lost=0.02, tip=0.0601)
     assert told == "no contact for 40 mm of the seam"
     bent = make("seeking")
-    bent._search.bent = True
-    assert refused(bent, _seen=1.0) == "the tip is displaced though nothing should touch it"
+    bent.sensing.search.bent = True
+    assert refused(bent, seen=1.0) == "the tip is displaced though nothing should touch it"
     over = make("seeking")
-    over._search.over = True
-    assert refused(over, _seen=1.0) == "no groove within 8 mm of the plan's start"
+    over.sensing.search.over = True
+    assert refused(over, seen=1.0) == "no groove within 8 mm of the plan's start"
     for z, told in (
         (-7.9e-3, ""),
         (-8e-3, ""),
         (-8.1e-3, "no groove within 8 mm of the plan's start"),
     ):
-        assert refused(make("seeking"), pose(0.05, z=z, time=1.0), _seen=1.0) == told
+        assert refused(make("seeking"), pose(0.05, z=z, time=1.0), seen=1.0) == told
     for phase in ("done", "stopped"):
-        assert refused(make(phase), _seen=0.0) == ""
+        assert judged(make(phase), seen=-9.0) == phase
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
@@ -641,13 +679,13 @@ def test_an_arm_is_no_nearer_to_a_curve_s_centre_than_three_tenths_of_its_radius
     """There all places of the curve are equally near."""
     for share, stopped in ((0.68, True), (0.72, False), (-0.72, False)):
         found = make(plan=circle() * [1.0, side, 1.0])
-        found.tip = 0.1
-        found._place = found._plan.at(0.1)
+        found.progress.tip = 0.1
+        found.progress.place = found.task.plan.at(0.1)
         centre = np.array([0.0, side * RADIUS])
         # Towards the centre by 1 - share of the radius; or as far away from it.
-        towards = (centre - found._place.point) * (1.4 - abs(share)) * np.sign(share)
-        x, y = (found._place.point + towards).tolist()
-        told = refused(found, pose(x, y, time=1.0), _seen=1.0)
+        towards = (centre - found.progress.place.point) * (1.4 - abs(share)) * np.sign(share)
+        x, y = (found.progress.place.point + towards).tolist()
+        told = refused(found, pose(x, y, time=1.0), seen=1.0)
         assert bool(told) == stopped
         if told:
             assert told.startswith("the plan curves with a radius of 50.") and "off towards" in told
@@ -655,109 +693,119 @@ def test_an_arm_is_no_nearer_to_a_curve_s_centre_than_three_tenths_of_its_radius
 
 def test_a_sweep_that_says_why_not_ends_the_weld_and_one_that_learned_begins_it() -> None:
     found, asked = make("probing"), following()
-    found._probing = SimpleNamespace(over=True, learned=lambda: "it is broken")
+    found.sensing.probing = SimpleNamespace(over=True, learned=lambda: "it is broken")
     assert judged(found) == "stopped" and found.reason == "it is broken"
     found = make("probing")
     learned = Learned(dead_time=0.06, lag=0.1, noise=20e-6)
-    found._probing = SimpleNamespace(over=True, learned=lambda: learned)
-    found._search.sigma, found._time, found._seen = np.array([0, 35e-6, 0]), 4.0, 3.9
+    found.sensing.probing = SimpleNamespace(over=True, learned=lambda: learned)
+    found.sensing.search.sigma, found.now, found.sensing.seen = np.array([0, 35e-6, 0]), 4.0, 3.9
     down = np.array([0.0, -asked.deflection, 0.0])
-    found._swept = [(pose(0.05, asked.deflection), Touch(3.9, down))] * 3
+    found.sensing._swept = [(pose(0.05, asked.deflection), Touch(3.9, down))] * 3
     assert judged(found) == "following"
-    assert found.learned.noise == found.refined.noise == 35e-6
-    assert (found._response.dead_time, found._response.lag) == (0.06, 0.1)
-    assert found._began == 4.0 and found.wanted == pytest.approx(asked.deflection)
-    assert found.contact.likely[0] == 1.0
+    assert found.sensing.learned.noise == found.seam.refined.noise == 35e-6
+    assert (found.arm.dead_time, found.arm.lag) == (0.06, 0.1)
+    assert found.welding._swept == 4.0 and found.pressing.wanted == pytest.approx(asked.deflection)
+    assert found.seam.contact.likely[0] == 1.0
     quiet = make("probing")
-    quiet._probing, quiet._search.sigma = found._probing, np.array([0, 5e-6, 0])
-    quiet._swept = found._swept
+    quiet.sensing.probing = found.sensing.probing
+    quiet.sensing.search.sigma, quiet.sensing._swept = np.array([0, 5e-6, 0]), found.sensing._swept
     quiet._learn()
-    assert quiet.refined.noise == 20e-6
+    assert quiet.seam.refined.noise == 20e-6
 
 
 # --- cycle by cycle -------------------------------------------------------------------------------
 
 
 def test_a_cycle_takes_what_was_not_given_before() -> None:
-    found, felt = make("bridging"), list[Any]()
-    found._felt = SeamReading(0.0, 0.0)
-    found._level = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    found._feel = lambda touch: felt.append(touch)
-    touch = Touch(3.05, np.array([1e-3, 2e-3, 3e-3]))
-    found.step(pose(0.05, time=3.0), [])
-    found.step(pose(0.05, time=3.1), [Touch(2.9, np.zeros(3)), Touch(3.0, np.zeros(3)), touch])
-    assert [each.time for each in felt] == [3.05]
-    assert felt[0].displacement == pytest.approx([2e-3, 1e-3, 3e-3])  # in level axes
-    found.step(pose(0.05, time=3.4), [])
-    assert found._elapsed == 0.0  # silent: no ramp
-    vision = make(touch=False)
-    vision._feel = found._feel
-    vision.step(pose(0.05, time=3.0), [])
-    vision.step(pose(0.05, time=3.1), [touch])
-    assert len(felt) == 1
+    for found, count in ((make("bridging"), 1), (make(touch=False), 0)):
+        felt = list[Any]()
+        found.sensing.felt = SeamReading(0.0, 0.0)
+        found.sensing._level = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+        found.step(pose(0.05, time=3.0), [])
+        found.sensing.smooth = found.sensing.seek = None
+        at = Located(0.05, SeamReading(0.0, 0.0), 0.0, 0.0, 0.0)
+        found.sensing.locate = lambda _, touch, phase, felt=felt, at=at: felt.append(touch) or at
+        touch = Touch(3.05, np.array([1e-3, 2e-3, 3e-3]))
+        found.step(pose(0.05, time=3.1), [Touch(2.9, np.zeros(3)), Touch(3.0, np.zeros(3)), touch])
+        assert [each.time for each in felt] == [3.05] * count
+        if count:
+            assert felt[0].displacement == pytest.approx([2e-3, 1e-3, 3e-3])  # in level axes
 
 
 def test_an_arm_stands_where_its_camera_has_been_silent_for_too_long() -> None:
     for silence, still in ((0.149, False), (0.151, True)):
         found = make("bridging")
-        found._felt, found._time, found._seen, found._heard = SeamReading(0.0, 0.0), 1.0, 1.0, 1.0
-        found.tip, found._bridge, found.torch, found._coming = 0.05, 0.05, 0.01, 0.01
+        found.sensing.felt, found.now, found.sensing.seen, found.sensing.heard = (
+            SeamReading(0.0, 0.0),
+            1.0,
+            1.0,
+            1.0,
+        )
+        found.progress.tip, found.pressing._lost, found.progress.torch, found.progress.coming = (
+            0.05,
+            0.05,
+            0.01,
+            0.01,
+        )
         command = found.step(pose(0.05, 1e-3, time=1.0 + silence), [])
         assert (command is STILL) == still
-        assert (found.wanted > 0.0) != still  # the ramp waits too
+        assert (found.pressing.wanted > 0.0) != still  # the ramp waits too
     waiting = make("seeking")
-    waiting._felt = SeamReading(0.0, 0.0)
-    assert waiting._search.resting
+    waiting.sensing.felt = SeamReading(0.0, 0.0)
+    assert waiting.sensing.search.resting
     assert waiting.step(pose(0.005, time=1.0), []) is STILL
-    waiting._search.resting = False
+    waiting.sensing.search.resting = False
     assert waiting.step(pose(0.005, z=5e-3, time=1.01), []).velocity[2] < 0.0
 
 
 def test_the_tool_turns_for_a_torch_that_is_off_and_stands_where_the_tip_does() -> None:
     found, asked = make(touch=False), following()
-    found.tip, found.torch, found._coming = 0.05, 0.01, 0.01
-    found._time = 0.0
+    found.progress.tip, found.progress.torch, found.progress.coming = 0.05, 0.01, 0.01
+    found.now = 0.0
     left = pose(0.05, 0.0, angle=-0.01, time=0.01)  # its torch is 0.4 mm to the left of the seam
     command = found.step(left, [])
     gain = max(asked.cross_track_gain, asked.speed / 8e-3)
     error = DISTANCE * math.sin(0.01)
     assert command.turn == pytest.approx(gain * error / DISTANCE, rel=0.02)
     aside = make(touch=False, offset_across="0.4 mm")
-    aside.tip, aside.torch, aside._coming, aside._time = 0.05, 0.01, 0.01, 0.0
+    put(aside, tip=0.05, torch=0.01, coming=0.01).now = 0.0
     assert abs(aside.step(left, []).turn) < 0.02 * command.turn
     standing = make("seeking")
-    standing._felt, standing._search.resting = SeamReading(0.0, -1.5e-3), False
+    standing.sensing.felt, standing.now = SeamReading(0.0, -1.5e-3), 0.01
     standing._velocity = lambda p, pace: np.zeros(3)
-    standing._search.down = True
-    assert standing._lead(left, left).turn == 0.0
+    assert standing._lead(left, left, 0.01).turn == 0.0
+
+
+def swing(found: Any, now: float) -> Any:
+    """What a follower commands of its weave at a time."""
+    return found.lead.swing(now, found.progress.coming, found.arm)
 
 
 def test_a_swing_begins_on_the_seam_and_is_commanded_as_early_as_the_arm_is_late() -> None:
     found = make(weave_width="4 mm", weave_frequency=0.5, offset_across="1 mm")
-    found._response.dead_time, found._response.lag = 0.1, 0.05
-    found._coming = -1e-6
-    assert found._swayed(3.0) == (0.0, 0.0, 0.0) and found.aim == 1e-3
-    found._coming = 0.0
+    found.arm.dead_time, found.arm.lag = 0.1, 0.05
+    found.progress.coming = -1e-6
+    assert swing(found, 3.0) == (0.0, 0.0, 0.0) and found.lead.aim == 1e-3
+    found.progress.coming = 0.0
     turn = math.pi  # a second
-    assert found._swayed(7.0).aside == pytest.approx(2e-3 * turn * 0.05)  # it begins at 7.1 s
-    now = found._swayed(7.6)  # 0.5 s after that
-    assert found.aim == pytest.approx(1e-3 + 2e-3 * math.sin(turn * 0.5))
+    assert swing(found, 7.0).aside == pytest.approx(2e-3 * turn * 0.05)  # it begins at 7.1 s
+    now = swing(found, 7.6)  # 0.5 s after that
+    assert found.lead.aim == pytest.approx(1e-3 + 2e-3 * math.sin(turn * 0.5))
     early = turn * 0.6
     assert now.aside == pytest.approx(2e-3 * (math.sin(early) + 0.05 * turn * math.cos(early)))
     later = make(weave_width="4 mm", offset_along="10 mm")
     for coming, swings in ((9.9e-3, False), (10.1e-3, True)):
-        later._coming = coming
-        later._swayed(1.0)
-        assert (later._swings is not None) == swings
+        swing(put(later, coming=coming), 1.0)
+        assert (later.lead._swings is not None) == swings
 
 
 def test_the_sweep_moves_across_the_seam_and_turns_and_is_told_where_the_arm_is() -> None:
     found, noted = make("probing"), list[Any]()
-    found._place, found._elapsed = found._plan.at(0.05), 8e-3
-    found._probing = SimpleNamespace(
+    found.progress.place = found.task.plan.at(0.05)
+    found.sensing.probing = SimpleNamespace(
         velocity=lambda elapsed: (2e-3, 0.1), note=lambda *given: noted.append(given), rests=False
     )  # fmt: skip
-    command = found._probe(pose(0.05, 1e-3, angle=0.2, time=4.0))
+    command = found._probe(pose(0.05, 1e-3, angle=0.2, time=4.0), 8e-3)
     assert isinstance(command, Command) and command.turn == 0.1
     assert command.velocity == pytest.approx([0.0, 2e-3, 0.0])
     assert noted == [(4.0, 2e-3, pytest.approx(1e-3), pytest.approx(math.sin(0.2)))]
@@ -766,27 +814,38 @@ def test_the_sweep_moves_across_the_seam_and_turns_and_is_told_where_the_arm_is(
 def test_what_is_kept_of_a_weld_is_what_it_felt_and_where_its_torch_is() -> None:
     found = make()
     felt_along(found, 1e-3)
-    found.torch = 0.03
+    found.progress.torch = 0.03
     assert found.kept() is None  # the torch was not on the seam
-    found.lit = 0.0
+    found.welding.lit = 0.0
     kept = found.kept()
     assert kept.torch == 0.03 and kept.number == 0 and kept.traced.shape == (0, 3)
-    assert kept.samples == pytest.approx(found.refined.samples())
+    assert kept.samples == pytest.approx(found.seam.refined.samples())
     again = make(before=kept)
-    assert again.refined.offset(0.05) == pytest.approx(1e-3, abs=10e-6)
+    assert again.seam.refined.offset(0.05) == pytest.approx(1e-3, abs=10e-6)
     assert again.tip == following().inset and again.torch == following().inset - DISTANCE
 
 
 def test_a_follower_that_has_not_begun_states_nothing_and_presses_nothing() -> None:
     found = make("seeking")
-    assert (found.sigma, found.bound, found.band, found.wanted, found.aim) == (0.0,) * 5
-    assert found.lit is None and found.reason == "" and found.kept() is None
-    assert (found._latency, found._elapsed, found._time) == (0.0, 0.0, None)
+    assert (
+        found.welding.sigma,
+        found.welding.bound,
+        found.welding.band,
+        found.pressing.wanted,
+        found.lead.aim,
+    ) == (0.0,) * 5
+    assert found.welding.lit is None and found.reason == "" and found.kept() is None
+    assert (found.sensing.latency, found.now) == (0.0, None)
 
 
 def test_a_fast_torch_takes_an_error_back_within_eight_millimetres_of_its_way() -> None:
     found = make(touch=False, speed="20 mm/s")
-    found.tip, found.torch, found._coming, found._time = 0.05, 0.01, 0.01, 0.0
+    found.progress.tip, found.progress.torch, found.progress.coming, found.now = (
+        0.05,
+        0.01,
+        0.01,
+        0.0,
+    )
     turn = found.step(pose(0.05, 0.0, angle=-0.01, time=0.01), []).turn
     assert turn == pytest.approx(20e-3 / 8e-3 * math.sin(0.01), rel=0.02)
 
@@ -797,10 +856,10 @@ def test_a_tool_s_length_before_the_seam_the_torch_is_led_to_where_the_plan_was_
 ) -> None:
     found = make()
     for s in np.arange(0.005, 0.1, 2e-4).tolist():
-        found.refined.add(s, 1e-3 + turn * s, 0.0)
-    found.refined.renew(-DISTANCE, 100_000)
+        found.seam.refined.add(s, 1e-3 + turn * s, 0.0)
+    found.seam.refined.renew(-DISTANCE, 100_000)
     for s in (-DISTANCE, following().inset - DISTANCE, LENGTH + DISTANCE):
-        assert found.refined.offset(s) == pytest.approx(1e-3 + turn * s, abs=0.02e-3)
+        assert found.seam.refined.offset(s) == pytest.approx(1e-3 + turn * s, abs=0.02e-3)
 
 
 # --- what is seen behind the torch ----------------------------------------------------------------
@@ -812,37 +871,37 @@ def passing_by(**given: Any) -> Any:
     """A follower whose torch has gone 40 mm in four seconds, ever farther to the left."""
     found = make(belief=SEEING, **given)
     for i in range(41):
-        found._trail.pass_by(1.0 + 0.1 * i, 1e-3 * i, 1e-5 * i, 1e-10 * i)
+        found.welding._trail.pass_by(1.0 + 0.1 * i, 1e-3 * i, 1e-5 * i, 1e-10 * i)
     return found
 
 
 def test_a_look_is_held_against_where_the_torch_was_when_it_passed_that_place() -> None:
     found, asked = passing_by(), following()
     prior = SEEING.fixed_variance(asked) - SEEING.arm_variance(asked)
-    assert found._unseen() == pytest.approx(prior + SEEING.arm_variance(asked))
+    assert found.welding._unseen() == pytest.approx(prior + SEEING.arm_variance(asked))
     found.looked(WeldProfile(0.35e-3, 0.05e-3, 4_050_000_000))  # the torch is at 30 mm
     one = (0.05e-3) ** 2 + 20e-10 + SEEING.arm_variance(asked)
     gain = prior / (prior + one)
-    assert found.bias.value == pytest.approx(gain * (0.35e-3 - 0.2e-3))
-    found.torch = 0.03
+    assert found.welding.bias.value == pytest.approx(gain * (0.35e-3 - 0.2e-3))
+    found.progress.torch = 0.03
     grown = asked.distortion**2 / DISTANCE * 9.5e-3
     known = (1 - gain) * prior + grown + (0.05e-3) ** 2
-    assert found.bias.variance(0.03) == pytest.approx(known)
-    assert found._unseen() == pytest.approx(SEEING.arm_variance(asked) + known)
+    assert found.welding.bias.variance(0.03) == pytest.approx(known)
+    assert found.welding._unseen() == pytest.approx(SEEING.arm_variance(asked) + known)
 
 
 def test_a_look_at_what_no_torch_has_passed_says_nothing_nor_does_one_after_the_end() -> None:
     profile = WeldProfile(0.35e-3, 0.05e-3, 4_050_000_000)
     for found in (passing_by(phase="done"), passing_by(phase="stopped"), make(belief=SEEING)):
         found.looked(profile)
-        assert not found.bias.looked
+        assert not found.welding.bias.looked
     early = passing_by()
     early.looked(WeldProfile(0.35e-3, 0.05e-3, 1_950_000_000))  # the torch was 9 mm along
-    assert not early.bias.looked
+    assert not early.welding.bias.looked
     blind = make()
-    blind._trail = passing_by()._trail
+    blind.welding._trail = passing_by().welding._trail
     blind.looked(profile)
-    assert not blind.bias.looked
+    assert not blind.welding.bias.looked
 
 
 def test_looks_that_contradict_all_that_is_stated_stop_the_weld() -> None:
@@ -856,16 +915,16 @@ def test_looks_that_contradict_all_that_is_stated_stop_the_weld() -> None:
 def test_a_torch_is_led_and_judged_by_where_it_is_seen_to_be() -> None:
     found = make(offset_across="0.1 mm")
     felt_along(found, 0.0)
-    found.bias.value, found.torch, found.lit = 0.25e-3, 0.05, 0.0
+    found.welding.bias.value, found.progress.torch, found.welding.lit = 0.25e-3, 0.05, 0.0
     found._estimate(pose(0.05 + DISTANCE, 0.1e-3 - 0.25e-3, time=6.0))
-    assert found.bound == pytest.approx(3 * found.sigma, abs=1e-6)
-    (row,) = found._trail._rows
+    assert found.welding.bound == pytest.approx(3 * found.welding.sigma, abs=1e-6)
+    (row,) = found.welding._trail._rows
     assert row[0] == pytest.approx(-0.15e-3, abs=1e-6)
-    assert row[1] == pytest.approx(found.sigma**2 - found._unseen())
-    assert found._trail.place_at(6.0) == 0.05
+    assert row[1] == pytest.approx(found.welding.sigma**2 - found.welding._unseen())
+    assert found.welding._trail.place_at(6.0) == 0.05
     led = make(touch=False, offset_across="0.1 mm")
-    led.bias.value, led._time = 0.25e-3, 0.0
-    led.tip, led.torch, led._coming = 0.05, 0.01, 0.01
+    led.welding.bias.value = 0.25e-3
+    put(led, tip=0.05, torch=0.01, coming=0.01).now = 0.0
     right = pose(0.05, 0.0, angle=0.15e-3 / DISTANCE, time=0.01)
     assert led.step(right, []).turn == pytest.approx(0.0, abs=1e-4)
 
@@ -874,21 +933,26 @@ def test_where_the_torch_passes_is_remembered_once_it_is_lit() -> None:
     for lit, count in ((None, 0), (0.0, 1)):
         found = make()
         felt_along(found, 0.0)
-        found.torch, found.lit = 0.05, lit
+        found.progress.torch, found.welding.lit = 0.05, lit
         found._estimate(pose(0.05 + DISTANCE, 0.0, time=6.0))
-        assert len(found._trail._rows) == count and found.lit is not None
+        assert len(found.welding._trail._rows) == count and found.welding.lit is not None
 
 
 @pytest.mark.parametrize("aside", [0.3e-3, -0.3e-3])
 def test_a_torch_that_is_where_its_swing_is_stays_there_and_turns_as_it_goes(aside: float) -> None:
     for rate in (0.0, 1e-3):
         found = make(touch=False)
-        found.tip, found.torch, found._coming, found._time = 0.05, 0.01, 0.01, 0.0
-        found._swayed = lambda now, rate=rate: Sway(aside, rate, 0.0)
+        found.progress.tip, found.progress.torch, found.progress.coming, found.now = (
+            0.05,
+            0.01,
+            0.01,
+            0.0,
+        )
+        found.lead.swing = lambda *given, rate=rate: Sway(aside, rate, 0.0)
         turn = found.step(pose(0.05, 0.0, angle=-aside / DISTANCE, time=0.01), []).turn
         on_line = make(touch=False)
-        on_line.tip, on_line.torch, on_line._coming, on_line._time = 0.05, 0.01, 0.01, 0.0
-        on_line._offset = aside
+        put(on_line, tip=0.05, torch=0.01, coming=0.01).now = 0.0
+        on_line.lead._beside = aside
         held = on_line.step(pose(0.05, 0.0, angle=-aside / DISTANCE, time=0.01), []).turn
         # The tip ahead stays on its way, so the torch goes to the left by a turn to the right.
         assert turn - held == pytest.approx(-rate / DISTANCE, rel=0.01, abs=1e-9)

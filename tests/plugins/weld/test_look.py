@@ -197,5 +197,5 @@ def test_a_look_is_not_taken_for_what_no_torch_passed() -> None:
     follower = trial.controller
     assert isinstance(follower, Follower)
     follower.looked(WeldProfile(1e-3, 0.05e-3, 10**9))
-    assert follower.bias.value == 0.0
-    assert not follower.bias.looked
+    assert follower.welding.bias.value == 0.0
+    assert not follower.welding.bias.looked

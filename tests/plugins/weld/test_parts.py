@@ -15,9 +15,9 @@ from flangeye.types import Transform
 from flangeye_emulators.weld_world.groove import Groove, GrooveSection, Tip
 from flangeye_emulators.weld_world.groove import TipContact as Tip3D
 from flangeye_plugins.weld.frame import Tool, WorkPlane
-from flangeye_plugins.weld.motion import Track
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.refined import RefinedPath
+from flangeye_plugins.weld.sensing import Track
 from tests.plugins.weld.bench import curved, misplaced, straight
 
 FINGER = read_model(bundled("data") / "fingers" / "srm.yaml", Finger)

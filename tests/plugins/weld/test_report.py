@@ -135,7 +135,7 @@ def test_the_refined_seam_is_every_millimetre_as_it_was_felt() -> None:
 
 def test_what_the_sweep_found_is_among_the_figures() -> None:
     controller = follower()
-    controller.learned = Learned(0.1, 0.02, -0.03e-3, 0.1e-3, 0.04, 0.05, 0.06)
+    controller.sensing.learned = Learned(0.1, 0.02, -0.03e-3, 0.1e-3, 0.04, 0.05, 0.06)
     assert learned_figures(controller) == {
         "finger_gain_error": 0.1, "finger_play": 0.06e-3, "timestamps_late": 0.04,
         "arm_dead_time": 0.05, "arm_lag": 0.06, "lit_from": -1.0, "share_welded": 0.0,

@@ -12,12 +12,13 @@ from flangeye.plugin.stage import BoundPart
 from flangeye.run.replay import replay_steps
 from flangeye_emulators.finger.sensor import SimulatedFingerParams, sensor_simulated_finger
 from flangeye_plugins.weld.belief import Belief
-from flangeye_plugins.weld.follower import Follower, ResumePoint
+from flangeye_plugins.weld.follower import Follower
 from flangeye_plugins.weld.frame import WorkPlane
 from flangeye_plugins.weld.passes import Passes
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.resuming import RUN_IN, controller_of, resume_point_of, set_back
 from flangeye_plugins.weld.settings import Following, Mode, PassParams, WeldTactileParams
+from flangeye_plugins.weld.task import ResumePoint
 from tests.plugins.weld.bench import DISTANCE, World, curved, straight
 from tests.plugins.weld.cell import planned, run, true_line
 from tests.plugins.weld.test_replay import logged
@@ -125,7 +126,7 @@ def test_far_along_the_seam_the_torch_is_lit_where_the_overlap_begins() -> None:
     follower = Follower(plan, Belief(DISTANCE), params, before=kept)
     World(line, line, follower, params).run()
     assert (follower.phase, follower.reason) == ("done", "")
-    assert follower.lit == pytest.approx(0.14, abs=0.2e-3)
+    assert follower.welding.lit == pytest.approx(0.14, abs=0.2e-3)
 
 
 def kept_at(torch: float, number: int = 0) -> ResumePoint:

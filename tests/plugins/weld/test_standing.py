@@ -18,9 +18,8 @@ from flangeye_emulators.finger.sensor import SimulatedFingerParams, sensor_simul
 from flangeye_plugins.weld.belief import Belief
 from flangeye_plugins.weld.body import body_of
 from flangeye_plugins.weld.corners import corners_of, leg_of
-from flangeye_plugins.weld.follower import Follower, ResumePoint
+from flangeye_plugins.weld.follower import Follower
 from flangeye_plugins.weld.joint import JointKind, WeldJoint, edges_half_angle, joint_of
-from flangeye_plugins.weld.motion import Track
 from flangeye_plugins.weld.passes import Passes
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.resuming import (
@@ -30,7 +29,9 @@ from flangeye_plugins.weld.resuming import (
     set_back,
     task_of,
 )
+from flangeye_plugins.weld.sensing import Track
 from flangeye_plugins.weld.settings import Following, WeldTactileParams
+from flangeye_plugins.weld.task import ResumePoint
 from flangeye_plugins.weld.touch.region_of_interest import RegionOfInterest, cut, shifted
 from tests.plugins.weld.bench import straight
 

@@ -1,0 +1,199 @@
+"""What the finger says of the seam: each touch meets the pose the tool had when it was seen."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections import deque
+from dataclasses import dataclass
+from itertools import islice
+from typing import NamedTuple
+
+import numpy as np
+
+from flangeye.motion.seam_following import Phase, ToolPose, Touch, turned
+from flangeye.types import Floats
+from flangeye_plugins.weld.pressing import Pressing
+from flangeye_plugins.weld.probing import Learned, Probing
+from flangeye_plugins.weld.progress import Progress
+from flangeye_plugins.weld.search import SweepSearch
+from flangeye_plugins.weld.task import WeldTask
+
+STEADY = 0.03e-3
+"""A finger that scatters less is followed from one measurement to the next [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class SeamReading:
+    """The seam at the tip: measured while it touches, predicted while it does not.
+
+    Attributes:
+        offset: To the left of the plan [m].
+        height: Above the planned height [m].
+    """
+
+    offset: float
+    height: float
+
+
+class Located(NamedTuple):
+    """Where the tip was.
+
+    Attributes:
+        s: Arc length of the plan [m].
+        seam: The seam there, if the tip is seated.
+        deflection: Of the tip, towards the pressed wall [m].
+        compression: Of the tip, into the joint [m].
+        angle: Of the tool [rad].
+    """
+
+    s: float
+    seam: SeamReading
+    deflection: float
+    compression: float
+    angle: float
+
+
+class Sensing:
+    """The finger, and the sweep at the start that tells what it really does.
+
+    Attributes:
+        search: Finds the groove.
+        probing: Sweeps the seated tip.
+        learned: What the sweep found of finger, clock and arm.
+        felt: The seam at the tip, smoothed; None before anything was felt.
+        seen: Time of the newest touch [s].
+        heard: When it came [s].
+        latency: Of the touches, a running mean [s].
+    """
+
+    def __init__(self, task: WeldTask, progress: Progress, pressing: Pressing) -> None:
+        self._task, self._progress, self._pressing = task, progress, pressing
+        belief = task.belief
+        self.search = SweepSearch(task.settings, belief)
+        self.probing = Probing(task.settings, belief, task.settings.sign)
+        self.learned = Learned(ahead=belief.ahead, ahead_sigma=belief.ahead_known)
+        self.felt: SeamReading | None = None if task.touch else SeamReading(0.0, 0.0)
+        self.seen = self.heard = self.latency = 0.0
+        self._level = np.array(belief.level_R_tool)
+        self._track = Track()
+        self._swept: list[tuple[ToolPose, Touch]] = []
+
+    def begin(self, now: float) -> None:
+        """Begin at a time [s]."""
+        self.seen = self.heard = now
+
+    def true(self, pose: ToolPose) -> ToolPose:
+        """Return a pose with the tip as far ahead as the sweep has found it."""
+        ahead = self.learned.ahead * np.array([*pose.direction, 0.0])
+        return ToolPose(pose.time, pose.position + ahead, pose.angle)
+
+    def watch(self, pose: ToolPose) -> None:
+        """Remember where the tool is, for the touches to come."""
+        self._track.add(pose)
+
+    def take(self, touch: Touch, now: float) -> tuple[ToolPose, Touch] | None:
+        """Return a new touch in level axes, with the pose the tool had then (13); None: too old.
+
+        Args:
+            touch: As it was measured.
+            now: The time [s].
+        """
+        if not self._task.touch or touch.time <= self.seen:
+            return None
+        pose = self._track.at(touch.time - self.learned.stamp)
+        if pose is None:
+            return None
+        self.seen, self.heard = touch.time, now
+        late = now - touch.time + self.learned.stamp
+        # A running mean over some twenty images.
+        self.latency += 0.05 * (late - self.latency)
+        return pose, Touch(touch.time, self._level @ touch.displacement)
+
+    def locate(self, pose: ToolPose, touch: Touch, phase: Phase) -> Located:
+        """Return where the tip was in a touch."""
+        plan, belief = self._task.plan, self._task.belief
+        corrected = self._corrected(touch.displacement, phase)
+        tip = pose.position + turned(corrected, pose.angle)
+        s = plan.foot(tip[:2], self._progress.tip)
+        place = plan.at(s)
+        beside = float((tip[:2] - place.point) @ place.normal) - belief.beside
+        felt = SeamReading(beside, float(tip[2]) - place.height)
+        deflection = self._pressing.side * float((pose.position - tip)[:2] @ place.normal)
+        return Located(s, felt, deflection, float(corrected[2]), pose.angle)
+
+    def _corrected(self, displacement: Floats, phase: Phase) -> Floats:
+        """Return a displacement (3,) without what the finger's rest, gain and play add to it."""
+        moved = displacement - self.search.rest
+        kept = self.learned.kept * self._pressing.played(phase, self.learned.width)
+        play = np.array([0.0, self._pressing.side * self.learned.width * kept, 0.0])
+        across = 1.0 + self.learned.gain
+        # The sweep measures the gain across. That upwards is its like; where it is not, the
+        # preload errs towards pressing harder, which holds the tip in its groove.
+        gain = np.array([across, across, max(across, 1.0)])
+        return np.asarray((moved - play) / gain)
+
+    def seek(self, touch: Touch, found: Located) -> None:
+        """Take in a touch of the search for the groove."""
+        self.felt = found.seam
+        compression = float(touch.displacement[2] - self.search.rest[2])
+        self.search.feel(touch.displacement, found.deflection, compression)
+
+    def sweep(self, pose: ToolPose, touch: Touch, found: Located, noise: float) -> None:
+        """Take in a touch of the sweep; one scatters by ``noise`` [m]."""
+        moved = turned(touch.displacement - self.search.rest, pose.angle)
+        along = float(moved[:2] @ self._progress.place.tangent)
+        self.smooth(found.seam, noise)
+        across = -self._pressing.side * found.deflection
+        self.probing.feel(touch.time, across, found.seam.height, along)
+        self._swept.append((pose, touch))
+
+    def swept_last(self) -> list[tuple[ToolPose, Touch]]:
+        """Return the last touches of the sweep, with which the path begins."""
+        return self._swept[-20:]
+
+    def silence(self, now: float) -> float:
+        """Return for how long no image of the tag has come [s]."""
+        return now - self.heard
+
+    def smooth(self, felt: SeamReading, noise: float) -> None:
+        """Take in a reading: a mean over as many as their scatter asks for.
+
+        Args:
+            felt: The reading.
+            noise: Standard deviation of one [m].
+        """
+        before = self.felt
+        if before is None:
+            self.felt = felt
+            return
+        share = min(1.0, max((STEADY / noise) ** 2, 0.1))
+        self.felt = SeamReading(
+            before.offset + share * (felt.offset - before.offset),
+            before.height + share * (felt.height - before.height),
+        )
+
+
+class Track:
+    """The recent poses, to find the tool's pose at the time of an image."""
+
+    def __init__(self, seconds: float = 1.0) -> None:
+        self._poses: deque[ToolPose] = deque()
+        self._seconds = seconds
+
+    def add(self, pose: ToolPose) -> None:
+        """Remember a pose, and forget the oldest."""
+        self._poses.append(pose)
+        while pose.time - self._poses[0].time > self._seconds:
+            self._poses.popleft()
+
+    def at(self, time: float) -> ToolPose | None:
+        """Return the pose at ``time``, between two that are known; None before the first."""
+        index = bisect_right(self._poses, time, key=lambda pose: pose.time)
+        if index == 0:
+            return None
+        if index == len(self._poses):
+            return self._poses[-1]
+        before, after = islice(self._poses, index - 1, index + 1)
+        share = (time - before.time) / (after.time - before.time)
+        position = before.position + share * (after.position - before.position)
+        return ToolPose(time, position, before.angle + share * (after.angle - before.angle))

@@ -1,0 +1,83 @@
+"""What a follower is asked to do, and what a weld that was stopped has left of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from flangeye.types import Floats
+from flangeye_plugins.weld.belief import Belief
+from flangeye_plugins.weld.path import Path
+from flangeye_plugins.weld.probing import Learned
+from flangeye_plugins.weld.settings import INSIDE, Following
+
+
+@dataclass(frozen=True, eq=False)
+class ResumePoint:
+    """State of a stopped weld from which it is resumed.
+
+    Attributes:
+        samples: (K, 5) what was felt; see :meth:`RefinedPath.samples`.
+        torch: Arc length of the torch's progress [m].
+        learned: What the sweep found.
+        traced: (K, 3) how high the tool was, where there are later passes; see ``passes.Traced``.
+        number: Which pass was stopped, the root's is 0.
+    """
+
+    samples: Floats
+    torch: float
+    learned: Learned = field(default_factory=Learned)
+    traced: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    number: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class WeldTask:
+    """A seam to follow.
+
+    Attributes:
+        plan: The planned seam.
+        belief: What is known of tool, finger and joint.
+        settings: Gains and limits.
+        touch: Follow by touch; otherwise the plan alone, for comparison.
+        before: What an earlier weld has left that is gone on with.
+    """
+
+    plan: Path
+    belief: Belief
+    settings: Following
+    touch: bool = True
+    before: ResumePoint | None = None
+
+    @property
+    def beyond(self) -> float:
+        """How far beyond the planned ends the seam may be [m]."""
+        return self.settings.ends or 0.0
+
+    @property
+    def begins(self) -> float:
+        """Where the torch is to begin to weld, by arc length [m]."""
+        after = self.settings.offset_along
+        return after if after > 0.0 else -self.beyond
+
+    @property
+    def ends(self) -> float:
+        """Where the torch is to end, by arc length [m]."""
+        return self.plan.length + self.beyond
+
+    @property
+    def inside(self) -> float:
+        """Where the tip is sure to be on the seam, by arc length [m]."""
+        return math.inf if self.settings.ends is None else self.settings.ends + INSIDE
+
+    @property
+    def margin(self) -> float:
+        """How far beyond the plan tip and torch may come [m]."""
+        return self.belief.distance + self.settings.ending + self.beyond
+
+    @property
+    def sweeps_both_walls(self) -> bool:
+        """Whether the sweep tells how much the tip stands between two walls."""
+        return self.settings.probing and self.belief.two_walls

@@ -1,0 +1,209 @@
+"""How well the torch is known, and whether it may weld: one bound, held against ``max_error``."""
+
+from __future__ import annotations
+
+import math
+
+from flangeye.devices import WeldProfile
+from flangeye.motion.seam_following import ToolPose
+from flangeye_plugins.weld.belief import BAND
+from flangeye_plugins.weld.bias import Bias, Trail
+from flangeye_plugins.weld.estimate import SeamEstimate
+from flangeye_plugins.weld.pressing import Pressing
+from flangeye_plugins.weld.progress import Progress
+from flangeye_plugins.weld.sensing import Sensing
+from flangeye_plugins.weld.steering import TorchLead
+from flangeye_plugins.weld.striking import Striking
+from flangeye_plugins.weld.task import WeldTask
+
+SHORT = 0.01
+"""A weld is done where no larger share of the planned seam was left out."""
+
+
+class Welding:
+    """The torch's bound, and the arc that it allows.
+
+    Attributes:
+        sigma: Standard deviation of the torch's place across the seam [m].
+        bound: What the torch's distance from the seam does not exceed [m].
+        band: The same for 95 % of the seam [m].
+        lit: Where the torch first was within ``max_error``, and so may weld, by arc length [m].
+        bias: What a look behind the torch says of errors that nothing else measures.
+        striking: The arc.
+    """
+
+    def __init__(
+        self,
+        task: WeldTask,
+        progress: Progress,
+        pressing: Pressing,
+        sensing: Sensing,
+        seam: SeamEstimate,
+        lead: TorchLead,
+    ) -> None:
+        self._task, self._progress, self._pressing = task, progress, pressing
+        self._sensing, self._seam, self._lead = sensing, seam, lead
+        belief, settings = task.belief, task.settings
+        # What the arm is off by stays so, seen or not.
+        prior = belief.fixed_variance(settings) - belief.arm_variance(settings)
+        self.bias = Bias(prior, settings.distortion, belief.distance)
+        self.striking = Striking(belief.arc)
+        self.sigma = self.bound = self.band = 0.0
+        self.lit: float | None = None
+        self._trail = Trail()
+        self._swept: float | None = None
+
+    def begin(self, now: float) -> None:
+        """The gain that the sweep has found ages from a time on [s]."""
+        self._swept = now
+
+    # --- how well the torch is known --------------------------------------------------------------
+
+    def estimate(self, pose: ToolPose) -> str:
+        """Estimate how far the torch may be off, with the tool at a pose; let it weld or not.
+
+        Returns:
+            Why the weld must not go on, or nothing.
+        """
+        progress, settings = self._progress, self._task.settings
+        point, normal = self._seam.refined.frame(progress.torch)
+        raw = float((progress.torch_at(pose) - point) @ normal)
+        error = abs(raw - (self._lead.aim - self.bias.value))
+        variance = self.variance(float(pose.direction @ normal), pose)
+        self.sigma = math.sqrt(variance)
+        self.band = error + BAND * self.sigma
+        self.bound = error + settings.sigmas * self.sigma
+        return "" if self._swept is None else self._light(pose.time, raw, variance)
+
+    def variance(self, slant: float, pose: ToolPose) -> float:
+        """Return the variance of the torch's place across the seam [m^2].
+
+        Args:
+            slant: Sine of the angle between the tool and the path.
+            pose: Of the tool.
+        """
+        belief, settings, learned = self._task.belief, self._task.settings, self._sensing.learned
+        refined, torch = self._seam.refined, self._progress.torch
+        minutes = 0.0 if self._swept is None else (pose.time - self._swept) / 60.0
+        gain = (learned.gain_sigma + settings.gain_drift * minutes) * self._pressing.most
+        fixed = self._unseen() + (belief.along_sigma * slant) ** 2
+        # What the tip is off by is off for the torch too: all but what the tool has turned between.
+        turned_by = pose.angle - refined.angle(torch, pose.angle)
+        ahead = min(learned.ahead_sigma, belief.tip_sigma) * math.sin(turned_by)
+        tip = ahead**2 + (belief.tip_sigma * (1.0 - math.cos(turned_by))) ** 2
+        felt = refined.variance(torch) + self._lead.weave.variance
+        return fixed + gain**2 + learned.systematic + tip + felt
+
+    def _unseen(self) -> float:
+        """Return the variance of the torch that nothing ahead of it measures [m^2]."""
+        belief, settings = self._task.belief, self._task.settings
+        if not self.bias.looked:
+            return belief.fixed_variance(settings)
+        return belief.arm_variance(settings) + self.bias.variance(self._progress.torch)
+
+    def look(self, profile: WeldProfile) -> str:
+        """Take in how far the bead lies from the joint, seen behind the torch.
+
+        Returns:
+            Why the weld must not go on, or nothing.
+        """
+        belief = self._task.belief
+        torch = self._trail.place_at(profile.time_ns * 1e-9)
+        if belief.behind is None or torch is None:
+            return ""
+        place = torch - belief.behind
+        passed = self._trail.passing(place)
+        if passed is None:
+            return ""
+        raw, felt = passed
+        others = felt + belief.arm_variance(self._task.settings)
+        self.bias.look(place, profile.offset - raw, profile.sigma, others)
+        return self.bias.doubt
+
+    @property
+    def share_fixed(self) -> float:
+        """Share of the torch's variance that a look behind it alone could lessen."""
+        torch = self._progress.torch
+        fixed = self.bias.variance(torch) if self.bias.looked else self.bias.prior
+        return fixed / max(self.sigma**2, fixed)
+
+    # --- whether it may weld ----------------------------------------------------------------------
+
+    @property
+    def share(self) -> float:
+        """Share of the planned seam that was welded with the torch within ``max_error``."""
+        if self.lit is None:
+            return 0.0
+        task = self._task
+        welded = min(self._progress.torch, task.ends) - self.lit
+        return max(welded, 0.0) / (task.ends - task.begins)
+
+    @property
+    def complete(self) -> bool:
+        """Whether as much was welded as was planned."""
+        return self.lit is not None and self.share >= 1.0 - SHORT
+
+    def too_uncertain(self, bound: float, where: str = "") -> str:
+        """Return why a weld is refused, or stopped, whose bound is too wide [m]."""
+        return (
+            f"the torch is known to {bound * 1e3:.2f} mm only{where}, max_error is "
+            f"{self._task.settings.max_error * 1e3:.3g} mm"
+        )
+
+    def _light(self, now: float, raw: float, variance: float) -> str:
+        """Let gas flow, then strike the arc where the bound allows it.
+
+        Args:
+            now: The time [s].
+            raw: How far to the left of the refined path the torch is measured to be [m].
+            variance: Of the torch's place [m^2].
+
+        Returns:
+            Why the weld must not go on, or nothing.
+        """
+        task, torch = self._task, self._progress.torch
+        if task.begins - torch <= task.belief.arc[0] * task.settings.speed:
+            self.striking.gas(now)
+        if not task.begins <= torch <= task.ends:
+            return ""
+        if self.lit is not None:
+            self._trail.pass_by(now, torch, raw, variance - self._unseen())
+        worst, bound = torch, self.bound
+        if self.lit is None and bound <= task.settings.max_error:
+            worst, bound = self._ahead(variance)
+        if bound > task.settings.max_error:
+            return self._too_far(worst, bound)
+        if self.lit is None:
+            self.lit = torch
+            self.striking.strike(now)
+        return ""
+
+    def _ahead(self, variance: float) -> tuple[float, float]:
+        """Return where the seam that was felt is known least, and the torch's bound there [m].
+
+        Args:
+            variance: Of the torch's place where it is now [m^2].
+        """
+        refined, torch = self._seam.refined, self._progress.torch
+        place, felt = refined.worst(torch, self._task.ends)
+        variance += felt - refined.variance(torch)
+        return place, self._task.settings.sigmas * math.sqrt(max(variance, 0.0))
+
+    def _too_far(self, place: float, bound: float) -> str:
+        """Return why a torch that may be too far from the seam must not go on, or nothing.
+
+        Args:
+            place: Where the bound does not hold, by arc length [m].
+            bound: The torch's bound there [m].
+        """
+        task, torch = self._task, self._progress.torch
+        if self.lit is not None:
+            return self.too_uncertain(bound)
+        if task.before is not None:
+            late = torch > task.before.torch
+            again = "the torch was not on the seam again where it had stopped; raise 'overlap'"
+            return again if late else ""
+        if torch - task.begins <= SHORT * (task.ends - task.begins):
+            return ""
+        ahead = f" at {place * 1e3:.0f} mm of the seam" if place > torch else ""
+        return f"not begun: {self.too_uncertain(bound, ahead)}"
