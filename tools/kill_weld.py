@@ -40,14 +40,8 @@ LOOK = 0.002
 """Between two looks at the arm [s]: the weld needs the cores itself."""
 RESTS, ENDS = 0.3, 3.0
 """What is asked for: an arm at rest; a program that has ended, where no arm is left to look at [s]."""
-PATIENT = tuple(
-    word
-    for given in ("blind=5 s", "stale=1 s", "still=2 s")
-    for word in ("--set", f"steps.5.{given}")
-)
+PATIENT = ("--set", "steps.5.blind=5 s")
 """Where the camera is not what is struck: on a busy machine its images are late."""
-PROMPT = ("--set", "steps.5.probing=false")
-"""The sweep at the start takes half a minute, and no stroke falls into it."""
 AFTER = (1.0, 8.0)
 """The stroke falls between these times after the torch has begun to follow [s]."""
 
@@ -256,7 +250,7 @@ class Bench:
         self._count += 1
         out = self._folder / str(self._count)
         driver = f"robot.driver={{ur_rtde: {{host: {self._controller.host}}}}}"
-        words = ("run", RECIPE, "--move", "--out", str(out), "--set", driver, *PROMPT, *given)
+        words = ("run", RECIPE, "--move", "--out", str(out), "--set", driver, *given)
         run = subprocess.Popen(
             python_command("-m", "flangeye.cli", *words), text=True, start_new_session=True,
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,

@@ -107,7 +107,7 @@ class _Draw:
         if not self.happens():
             return ()
         start, length = self.between(0.02, 0.04), self.between(5e-3, 50e-3)
-        return (Gap(start, start + length, int(self.rng.choice([-1, 1]))),)
+        return (Gap(start, start + length, 1 if self.rng.choice([-1, 1]) > 0 else -1),)
 
     def tacks(self) -> tuple[Tack, ...]:
         height = self.between(0.5e-3, 2e-3)

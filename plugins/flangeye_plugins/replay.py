@@ -70,7 +70,7 @@ class WeldReplay(LoggedWeld):
     def see(self, sight: Mapping[str, Any]) -> None:
         """Read an image again."""
         if self._pixels is None:
-            raise StageError("the log of this weld holds no images: it ran with log_images: false")
+            raise StageError("the log of this weld holds no images")
         piece = piece_of(np.asarray(self._pixels, dtype=np.uint8), sight["corner"], self._finger)
         super().see(sight)
         feeling = self._reader.reread(piece, sight["time_ns"]).feeling

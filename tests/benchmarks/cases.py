@@ -285,17 +285,21 @@ def cycle() -> tuple[Work, Work]:
     from flangeye_plugins.weld.belief import Belief
     from flangeye_plugins.weld.follower import Follower
     from flangeye_plugins.weld.path import Path as Plan
+    from flangeye_plugins.weld.probing import Learned
     from flangeye_plugins.weld.settings import Following
+    from flangeye_plugins.weld.task import WeldTask
 
     x = np.linspace(0.0, 2.0, 2000)
     plan = Plan(np.column_stack([x, 0.02 * np.sin(x / 0.1), 0.0 * x]))
-    follower, clock = Follower(plan, Belief(40e-3), Following(probing=False)), itertools.count()
+    follower, clock = Follower(WeldTask(plan, Belief(40e-3), Following())), itertools.count()
 
     def turn() -> None:
         time = next(clock) * 2e-3
         at = plan.at(5e-3 + 5e-3 * max(time - 1.0, 0.0))
         position = np.array([*(at.point + 2e-3 * at.normal), at.height - 1.5e-3])
         angle = float(np.arctan2(at.tangent[1], at.tangent[0]))
+        if follower.phase == "probing":  # a sweep that found nothing wrong
+            follower._follow(Learned())
         assert follower.phase in ("seeking", "following"), follower.reason
         bent = np.array([0, -2e-3, 1.5e-3]) if time > 0.5 else np.zeros(3)  # free at first
         follower.step(ToolPose(time, position, angle), [Touch(time, bent)])

@@ -14,7 +14,7 @@ from pydantic import BeforeValidator, Field
 from flangeye.files.paths import WHOLE, bundled_file
 from flangeye.models.model import Model
 from flangeye.types import Floats
-from flangeye.units import Angle, Length, Stiffness, param
+from flangeye.units import Angle, Force, Length, Stiffness, param
 
 Row = tuple[float, float, float]
 
@@ -101,6 +101,7 @@ class Finger(FingerGeometry):
         "0.1 mm", ge=0, description="Standard deviation of the tip, along each axis of the flange."
     )
     travel: Length = param("6 mm", gt=0, description="How far the tip may be displaced.")
+    largest_force: Force = param("10 N", gt=0, description="With which the tip may press.")
     calibration: Calibration | None = None
 
     def force(self, displacement: Floats) -> float | None:

@@ -20,11 +20,11 @@ from flangeye.types import Floats, Image, Seed, Transform
 from flangeye.units import Duration, Length, param
 from flangeye_emulators.weld_world.groove import GrooveSection, Tip
 from flangeye_emulators.weld_world.truth import (
-    WORLDS,
     ToolFile,
     ToolPath,
     WeldTruth,
-    WorldName,
+    World,
+    WorldPath,
 )
 from flangeye_emulators.weld_world.world import Nominal, Shutter, WeldWorld
 from flangeye_emulators.world import room
@@ -48,7 +48,7 @@ class SimulatedFingerParams(LaidParams):
     """Parameters of ``sensor.simulated_finger``: the world, whatever the controller's files say."""
 
     tool: ToolPath = param(
-        "srm", description="The true finger and torch: one of data/worlds, or a .yaml file."
+        "srm", description="The true finger and torch: one of data/tools, or a .yaml file."
     )
     seam: str = Field("groove", description="Name of the seam in that file.")
     leg: int | None = Field(None, ge=1, description="Leg of a seam with sharp corners.")
@@ -57,9 +57,10 @@ class SimulatedFingerParams(LaidParams):
         gt=0,
         description="Thickness of the upper plate of a lap joint or fillet, in place of a groove.",
     )
-    world: WorldName = Field(
+    world: WorldPath = param(
         "as_filed",
-        description="What is true and differs from the files: arm, tool, finger, workpiece, heat.",
+        description="What is true and differs from the controller's files: arm, tool, finger, "
+        "clock, workpiece, heat. One of data/worlds, or a .yaml file.",
     )
     hidden: tuple[Duration, Duration] | None = param(
         None, description="The tag is out of sight from the first time to the second."
@@ -213,7 +214,7 @@ def sensor_simulated_finger(
         params: The world.
     """
     del finger
-    return SimulatedFinger(robot, seed, params, WORLDS[params.world])
+    return SimulatedFinger(robot, seed, params, read_model(params.world, World).truth)
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from flangeye.types import Floats
+from flangeye.units import Length
 from flangeye_plugins.weld.joint import WeldJoint, edges_half_angle
 from flangeye_plugins.weld.path import Path, Place
 
@@ -26,9 +28,9 @@ class Gap:
         side: 1 for the wall to the left of the seam, -1 for the right one.
     """
 
-    start: float
-    end: float
-    side: int
+    start: Length
+    end: Length
+    side: Literal[-1, 1]
 
 
 @dataclass(frozen=True)

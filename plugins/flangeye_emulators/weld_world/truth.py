@@ -1,22 +1,24 @@
-"""What is true in a simulated weld: its tool's file, and by how much the rest is off.
+"""What is true in a simulated weld: its tool's file, and its world's file.
 
-Lengths [m], angles [rad], times [s]. A recipe names one of :data:`WORLDS`.
+A recipe names one of ``data/worlds``, or a file of its own. Lengths [m], angles [rad], times [s];
+in the files each has its unit.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, TypeVar, dataclass_transform
 
-from pydantic import BeforeValidator
+from pydantic import BeforeValidator, ConfigDict
 
 from flangeye.files.paths import WHOLE, bundled_file
 from flangeye.models.finger import FingerGeometry
-from flangeye.units import Stiffness, param
+from flangeye.models.model import Model
+from flangeye.units import Angle, Duration, Length, Stiffness, param
 from flangeye_emulators.weld_world.groove import Gap
+
+T = TypeVar("T")
 
 
 class ToolFile(FingerGeometry):
@@ -26,11 +28,18 @@ class ToolFile(FingerGeometry):
     axial: Stiffness = param(gt=0, description="Along the finger.")
 
 
-ToolPath = Annotated[Path, BeforeValidator(bundled_file("true tool", "worlds")), WHOLE]
+ToolPath = Annotated[Path, BeforeValidator(bundled_file("true tool", "tools")), WHOLE]
 """A parameter that names a world's tool: a bundled one, or a file beside the recipe."""
 
 
-@dataclass(frozen=True)
+@dataclass_transform(frozen_default=True)
+def checked(cls: type[T]) -> type[T]:
+    """Return a frozen dataclass of which a file must not name what it does not have."""
+    cls.__pydantic_config__ = ConfigDict(extra="forbid")  # type: ignore[attr-defined]
+    return dataclass(frozen=True)(cls)
+
+
+@checked
 class ArmTruth:
     """Errors of the simulated arm: how it follows, and how far its true pose is off.
 
@@ -45,17 +54,17 @@ class ArmTruth:
         sag: How far it is lower after 100 mm of way.
     """
 
-    lag: float = 0.0
-    dead_time: float = 0.0
-    wave: float = 0.0
-    wave_length: float = 80e-3
-    backlash: float = 0.0
-    repeatability: float = 0.0
+    lag: Duration = 0.0
+    dead_time: Duration = 0.0
+    wave: Length = 0.0
+    wave_length: Length = 80e-3
+    backlash: Length = 0.0
+    repeatability: Length = 0.0
     scale: float = 0.0
-    sag: float = 0.0
+    sag: Length = 0.0
 
 
-@dataclass(frozen=True)
+@checked
 class ToolTruth:
     """Where tip and torch really are, beside where the world's file puts them.
 
@@ -66,13 +75,13 @@ class ToolTruth:
         work: Its upper end leans to the right by this about its tip.
     """
 
-    tip: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    torch: tuple[float, float] = (0.0, 0.0)
-    yaw: float = 0.0
-    work: float = 0.0
+    tip: tuple[Length, Length, Length] = (0.0, 0.0, 0.0)
+    torch: tuple[Length, Length] = (0.0, 0.0)
+    yaw: Angle = 0.0
+    work: Angle = 0.0
 
 
-@dataclass(frozen=True)
+@checked
 class FingerTruth:
     """How the finger deforms, and what its tag shows of it.
 
@@ -93,15 +102,15 @@ class FingerTruth:
     axial: float = 1.0
     gain: float = 0.0
     drift: float = 0.0
-    rest: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    play: float = 0.0
+    rest: tuple[Length, Length, Length] = (0.0, 0.0, 0.0)
+    play: Length = 0.0
     hysteresis: float = 0.0
     creep: float = 0.0
     friction: float = 0.1
-    noise: float = 10e-6
+    noise: Length = 10e-6
 
 
-@dataclass(frozen=True)
+@checked
 class ClockTruth:
     """When images are taken, when they arrive, and what their timestamps say.
 
@@ -115,14 +124,14 @@ class ClockTruth:
     """
 
     rate: float = 30.0
-    latency: float = 30e-3
-    jitter: float = 5e-3
-    stamp: float = 0.0
+    latency: Duration = 30e-3
+    jitter: Duration = 5e-3
+    stamp: Duration = 0.0
     dropped: float = 0.02
-    hidden: tuple[float, float] | None = None
+    hidden: tuple[Duration, Duration] | None = None
 
 
-@dataclass(frozen=True)
+@checked
 class Tack:
     """A tack weld of 8 mm: the groove is filled there.
 
@@ -131,11 +140,11 @@ class Tack:
         height: By how much it is filled.
     """
 
-    start: float
-    height: float = 1e-3
+    start: Length
+    height: Length = 1e-3
 
 
-@dataclass(frozen=True)
+@checked
 class WorkpieceTruth:
     """What the workpiece is like, beside its CAD.
 
@@ -152,19 +161,19 @@ class WorkpieceTruth:
         gaps: Pieces of a wall that are missing.
     """
 
-    wave: float = 0.0
-    wave_length: float = 10e-3
-    bow: float = 0.0
-    half_angle: float = 0.0
-    lean: float = 0.0
-    half_angle_wave: float = 0.0
-    root_gap: float = 0.0
+    wave: Length = 0.0
+    wave_length: Length = 10e-3
+    bow: Length = 0.0
+    half_angle: Angle = 0.0
+    lean: Angle = 0.0
+    half_angle_wave: Angle = 0.0
+    root_gap: Length = 0.0
     tacks: tuple[Tack, ...] = ()
-    spatter: float = 0.0
+    spatter: Length = 0.0
     gaps: tuple[Gap, ...] = ()
 
 
-@dataclass(frozen=True)
+@checked
 class HeatTruth:
     """How the seam moves while it is welded.
 
@@ -173,11 +182,11 @@ class HeatTruth:
         local: Around the torch, within some 15 mm.
     """
 
-    shift: float = 0.0
-    local: float = 0.0
+    shift: Length = 0.0
+    local: Length = 0.0
 
 
-@dataclass(frozen=True)
+@checked
 class LookTruth:
     """A profile sensor behind the torch: what it sees, and when.
 
@@ -187,12 +196,12 @@ class LookTruth:
         clock: When it looks, when its measurements arrive, and which it misses.
     """
 
-    behind: float = 30e-3
-    noise: float = 0.05e-3
+    behind: Length = 30e-3
+    noise: Length = 0.05e-3
     clock: ClockTruth = ClockTruth(rate=10.0, latency=50e-3, dropped=0.1)
 
 
-@dataclass(frozen=True)
+@checked
 class WeldTruth:
     """All that is true of a simulated weld."""
 
@@ -204,44 +213,21 @@ class WeldTruth:
     heat: HeatTruth = HeatTruth()
 
 
-RENDERED = ClockTruth(rate=15.0)
-"""Half of the real camera's 30 images a second: the simulated camera renders each of them."""
+class World(Model):
+    """A file of a simulated weld: what differs in it from what the controller's files say."""
 
-CALIBRATED = WeldTruth(
-    ArmTruth(lag=60e-3, dead_time=20e-3, wave=0.03e-3, scale=0.0005),
-    ToolTruth(tip=(0.1e-3, 0.1e-3, 0.1e-3), torch=(0.2e-3, 0.06e-3), yaw=math.radians(0.05)),
-    FingerTruth(gain=0.08, hysteresis=0.02, friction=0.15),
-    RENDERED,
-    WorkpieceTruth(wave=0.15e-3, wave_length=40e-3, half_angle=math.radians(2.0)),
-    HeatTruth(local=0.03e-3),
-)
+    arm: ArmTruth = ArmTruth()
+    tool: ToolTruth = ToolTruth()
+    finger: FingerTruth = FingerTruth()
+    clock: ClockTruth = ClockTruth()
+    workpiece: WorkpieceTruth = WorkpieceTruth()
+    heat: HeatTruth = HeatTruth()
 
-WORLDS: Mapping[str, WeldTruth] = {
-    "as_filed": WeldTruth(clock=RENDERED),
-    "calibrated": CALIBRATED,
-    "wall_missing": replace(
-        CALIBRATED, workpiece=replace(CALIBRATED.workpiece, gaps=(Gap(90e-3, 110e-3, 1),))
-    ),
-    "warming": WeldTruth(
-        tool=ToolTruth(torch=(0.0, 0.05e-3)),
-        finger=FingerTruth(gain=0.1, drift=0.01),
-        clock=RENDERED,
-    ),
-    "torch_aside": WeldTruth(tool=ToolTruth(torch=(0.0, 0.6e-3)), clock=RENDERED),
-    "tip_astray": WeldTruth(tool=ToolTruth(tip=(1.5e-3, 0.8e-3, -1e-3)), clock=RENDERED),
-}
-"""Described conditions, by the names that recipes give.
+    @property
+    def truth(self) -> WeldTruth:
+        """All that is true."""
+        return WeldTruth(self.arm, self.tool, self.finger, self.clock, self.workpiece, self.heat)
 
-* ``as_filed``: as the files say; images are late by 30 ms, and 2 % of them are lost.
-* ``calibrated``: off by what a calibration leaves: an arm that lags, and waves by 0.03 mm; tip and
-  torch 0.06 to 0.2 mm off; a finger that shows 8 % too much; edges that wander by 0.15 mm; heat.
-* ``wall_missing``: the same, and the left wall is missing from 90 mm to 110 mm of the seam.
-* ``warming``: the torch 0.05 mm to the left, and a finger that shows 10 % too much and 1 % more in
-  a minute.
-* ``torch_aside``: the torch 0.6 mm to the left of where the tool's file has it.
-* ``tip_astray``: the tip 1.5 mm ahead, 0.8 mm to the left and 1 mm lower, as before a calibration.
-"""
 
-WorldName = Literal[
-    "as_filed", "calibrated", "wall_missing", "warming", "torch_aside", "tip_astray"
-]
+WorldPath = Annotated[Path, BeforeValidator(bundled_file("world", "worlds")), WHOLE]
+"""A parameter that names a world: a bundled one, or a file beside the recipe."""

@@ -184,7 +184,7 @@ def belief_of(
     if known is not None and known.lateral is not None and known.axial is not None:
         lateral, axial = known.lateral, known.axial
     noise = (10e-6, 60e-6) if known is None else (known.noise[1], known.noise[2])
-    radius = settings.tip_radius or finger.radius
+    radius = finger.radius
     joint = joint_of(settings.joint, half_angle, settings.sign, radius, settings.root_gap)
     other = None if joint is None else joint.right if settings.side == "left" else joint.left
     return Belief(

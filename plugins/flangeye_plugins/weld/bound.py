@@ -71,9 +71,8 @@ def predicted(plan: Path, belief: Belief, settings: Following) -> Predicted:
     minutes = (s + belief.distance) / settings.speed / 60.0
     weave = Weave(settings.weave_width, settings.weave_frequency)
     # Between two walls the sweep at the start tells how far ahead the tip is.
-    softer = settings.probing and belief.two_walls
-    ahead = min(belief.ahead_known, PIVOTED if softer else math.inf)
-    press = settings.deflection / (SOFTER if softer else 1.0)
+    ahead = min(belief.ahead_known, PIVOTED if belief.two_walls else math.inf)
+    press = settings.deflection / (SOFTER if belief.two_walls else 1.0)
     drift = settings.gain_drift * minutes * press
     return Predicted(
         s, np.full(len(s), belief.fixed_variance(settings)), (belief.along_sigma * sine) ** 2,

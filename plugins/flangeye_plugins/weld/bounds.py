@@ -17,8 +17,8 @@ from flangeye_plugins.weld.touch.tip_displacement import TipDisplacement
 class Bounds:
     """Judges each cycle before its command is given."""
 
-    def __init__(self, finger: Finger, plan: Path, settings: Following) -> None:
-        self._finger, self._plan, self._settings = finger, plan, settings
+    def __init__(self, finger: Finger, plan: Path) -> None:
+        self._finger, self._plan = finger, plan
 
     def check(self, pose: ToolPose, progress: float, felt: Iterable[TipDisplacement]) -> None:
         """Stop a tip that is astray, or that is pressed harder than it may be.
@@ -33,10 +33,10 @@ class Bounds:
         """
         place = self._plan.at(progress)
         astray = abs(float((pose.position[:2] - place.point) @ place.normal))
-        if astray > self._settings.astray:
+        if astray > Following.astray:
             raise DeviceError(
                 f"the tip is {astray * 1e3:.0f} mm away from the plan, "
-                f"allowed are {self._settings.astray * 1e3:.0f} mm"
+                f"allowed are {Following.astray * 1e3:.0f} mm"
             )
         for feeling in felt:
             self._check_press(feeling)
@@ -49,7 +49,8 @@ class Bounds:
                 f"{self._finger.travel * 1e3:.3g} mm"
             )
         force = self._finger.force(feeling.displacement)
-        if force is not None and force > self._settings.force:
+        if force is not None and force > self._finger.largest_force:
             raise DeviceError(
-                f"the tip presses with {force:.1f} N, allowed are {self._settings.force:.3g} N"
+                f"the tip presses with {force:.1f} N, "
+                f"allowed are {self._finger.largest_force:.3g} N"
             )

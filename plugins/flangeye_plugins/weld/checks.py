@@ -48,10 +48,10 @@ def check_finger(finger: Finger, settings: Following) -> None:
             f"{finger.model} stands, {finger.travel * 1e3:.3g} mm"
         )
     force = finger.force(np.array([0.0, settings.deflection, settings.preload]))
-    if force is not None and force > settings.force:
+    if force is not None and force > finger.largest_force:
         raise StageError(
             f"weld.tactile: deflection and preload press with {force:.2g} N, allowed are "
-            f"{settings.force:.2g} N; lower them, or raise 'force'"
+            f"{finger.largest_force:.2g} N; lower them, or raise 'largest_force' in its file"
         )
 
 
@@ -119,8 +119,8 @@ def check_body(body: LeaningTool, belief: Belief, settings: Following) -> None:
     if abs(above) > settings.torch_height:
         raise StageError(
             f"weld.tactile: as the tool leans its torch is {above * 1e3:+.1f} mm above the seam, "
-            f"allowed are {settings.torch_height * 1e3:.3g} mm; change 'travel_angle', set "
-            "torch_up in the finger's file to where the torch's end is, or raise 'torch_height'"
+            f"allowed are {settings.torch_height * 1e3:.3g} mm; change 'travel_angle', or "
+            "set torch_up in the finger's file to where the torch's end is"
         )
 
 
@@ -211,6 +211,6 @@ def check_speeds(finger: Finger, settings: Following, limits: MotionLimits) -> N
     fastest = flange_speed(finger, settings)
     if fastest > limits.speed:
         raise StageError(
-            f"weld.tactile: speed, lateral_speed and turn_rate together move the flange at "
+            f"weld.tactile: speed and turn_rate together move the flange at "
             f"{fastest * 1e3:.3g} mm/s, robot.limits.speed allows {limits.speed * 1e3:.3g} mm/s"
         )

@@ -74,14 +74,14 @@ def leg_of(seam: Seam, params: WeldTactileParams) -> Seam:
     """
     plane = WorkPlane(seam.points_in_base, seam.openings_in_base)
     corners = corners_of(plane.points(seam.points_in_base))
-    if params.corners == "round":
-        return _rounded(seam, corners, params)
+    if params.corner_radius is not None:
+        return _rounded(seam, corners, params, params.corner_radius)
     if params.leg is None:
         if corners:
             raise StageError(
                 f"weld.tactile: the seam has sharp corners ({_listed(corners)}), at which the "
                 f"torch has to stop: write a step weld.tactile for each leg, leg: 1 to "
-                f"{len(corners) + 1}; or corners: round leads it round them"
+                f"{len(corners) + 1}; or corner_radius: 5 mm leads it round them"
             )
         return seam
     if params.leg > len(corners) + 1:
@@ -102,24 +102,22 @@ def leg_of(seam: Seam, params: WeldTactileParams) -> Seam:
     )
 
 
-def _rounded(seam: Seam, corners: list[Corner], params: WeldTactileParams) -> Seam:
-    """Return a plan with an arc in the place of each corner."""
+def _rounded(seam: Seam, corners: list[Corner], params: WeldTactileParams, radius: float) -> Seam:
+    """Return a plan with an arc of a radius [m] in the place of each corner."""
     if params.leg is not None:
-        raise StageError(
-            "weld.tactile: corners: round leaves no legs; drop 'leg', or corners: stop"
-        )
+        raise StageError("weld.tactile: corner_radius leaves no legs; leave out one of the two")
     points = seam.points_in_base
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     ends = [0.0, *(along[each.point] for each in corners), along[-1]]
     pieces, kept = [], np.full(len(along), True)
     for corner, before, here, after in zip(corners, ends, ends[1:], ends[2:], strict=False):
-        cut = params.corner_radius * np.tan(abs(corner.turn) / 2.0)
+        cut = radius * np.tan(abs(corner.turn) / 2.0)
         room = min(here - before, after - here) / 2.0
         if cut > room:
-            allowed = params.corner_radius * room / cut
+            allowed = radius * room / cut
             raise StageError(
                 f"weld.tactile: the corner {_listed([corner])} has no room for a corner_radius of "
-                f"{params.corner_radius * 1e3:.3g} mm, at most {allowed * 1e3:.3g} mm"
+                f"{radius * 1e3:.3g} mm, at most {allowed * 1e3:.3g} mm"
             )
         kept &= np.abs(along - here) >= cut
         pieces.append(_arc(points, along, here, cut, corner.turn))
@@ -161,7 +159,7 @@ def _require_room(corner: Corner, seam: Seam, params: WeldTactileParams) -> None
         raise StageError(
             f"weld.tactile: at the corner {_listed([corner])} the finger ahead of the torch would "
             "run into a wall: room is only round the outside of the upright plate of a fillet or "
-            "lap joint; press that plate ('side'), go round it with corners: round, or end the "
+            "lap joint; press that plate ('side'), go round it with corner_radius, or end the "
             "plan before the corner"
         )
 

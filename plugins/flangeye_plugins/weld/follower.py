@@ -12,16 +12,14 @@ from flangeye.devices import WeldProfile
 from flangeye.motion.arc import OFF
 from flangeye.motion.seam_following import STILL, Command, Phase, ToolPose, Touch
 from flangeye.types import Floats
-from flangeye_plugins.weld.belief import Belief
 from flangeye_plugins.weld.contact import STRAINED, STRIDE
 from flangeye_plugins.weld.estimate import SeamEstimate
-from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.pressing import Pressing, within
 from flangeye_plugins.weld.probing import Learned
 from flangeye_plugins.weld.progress import Progress
 from flangeye_plugins.weld.response import Response
 from flangeye_plugins.weld.sensing import SeamReading, Sensing
-from flangeye_plugins.weld.settings import INSIDE, Following
+from flangeye_plugins.weld.settings import INSIDE
 from flangeye_plugins.weld.steering import SLOWEST, TorchLead
 from flangeye_plugins.weld.task import ResumePoint, WeldTask
 from flangeye_plugins.weld.welding import Welding
@@ -50,18 +48,10 @@ class Follower:
         now: The time [s]; None before the first cycle.
     """
 
-    def __init__(
-        self,
-        plan: Path,
-        belief: Belief,
-        settings: Following,
-        touch: bool = True,
-        before: ResumePoint | None = None,
-    ) -> None:
-        """Prepare to follow ``plan``; see :class:`WeldTask` for the arguments."""
-        self.phase: Phase = "seeking" if touch else "following"
-        self.reason = ""
-        self.task = task = WeldTask(plan, belief, settings, touch, before)
+    def __init__(self, task: WeldTask) -> None:
+        """Prepare to follow a seam."""
+        self.phase: Phase = "seeking" if task.touch else "following"
+        self.reason, self.task = "", task
         self.progress, self.pressing = Progress(task), Pressing(task)
         self.sensing = Sensing(task, self.progress, self.pressing)
         self.seam, self.lead, self.arm = SeamEstimate(task), TorchLead(task), Response()
@@ -209,8 +199,6 @@ class Follower:
         elif self.phase == "seeking" and sensing.search.seats(pressing.most):
             sensing.probing.begin(float(sensing.search.sigma[1]))
             self.phase = "probing"
-            if not self.task.settings.probing:
-                self._follow(sensing.learned)
         elif self.phase == "probing" and sensing.probing.over:
             self._learn()
         elif self.phase == "following" and free > LOST:

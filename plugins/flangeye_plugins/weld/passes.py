@@ -19,12 +19,12 @@ import numpy as np
 from flangeye.motion.arc import OFF
 from flangeye.motion.seam_following import STILL, Command, Phase, ToolPose, Touch
 from flangeye.types import Floats
-from flangeye_plugins.weld.belief import BAND, Belief
+from flangeye_plugins.weld.belief import BAND
 from flangeye_plugins.weld.follower import Follower
 from flangeye_plugins.weld.path import PATH_SPACING, Path, Place
 from flangeye_plugins.weld.pressing import within
 from flangeye_plugins.weld.response import Response
-from flangeye_plugins.weld.settings import Following, PassParams
+from flangeye_plugins.weld.settings import PassParams
 from flangeye_plugins.weld.striking import Striking
 from flangeye_plugins.weld.task import ResumePoint
 from flangeye_plugins.weld.weave import Sway, Weave
@@ -61,7 +61,7 @@ class Traced:
 
     def path(self, chosen: PassParams) -> Path:
         """Return the torch's path of a pass; its height is that of the tool's end point."""
-        s = np.arange(max(chosen.along, 0.0), self._plan.length + PATH_SPACING / 2, PATH_SPACING)
+        s = np.arange(0.0, self._plan.length + PATH_SPACING / 2, PATH_SPACING)
         frames = [self._root.seam.refined.frame(x) for x in s.tolist()]
         planar = np.array([point + chosen.across * normal for point, normal in frames])
         self._along, height, self._sigma = np.array(self.rows).T
@@ -84,12 +84,10 @@ class Passes:
     def __init__(
         self,
         root: Follower,
-        plan: Path,
-        belief: Belief,
-        settings: Following,
-        before: ResumePoint | None = None,
     ) -> None:
-        """Follow the root first, then ``settings.passes``; or go on ``before``'s pass."""
+        """Follow the root first, then its task's later passes; or go on in the one resumed."""
+        task, before = root.task, root.task.before
+        plan, belief, settings = task.plan, task.belief, task.settings
         self.root, self.number = root, 0
         self.mode, self.side = root.mode, root.side
         self._belief, self._settings = belief, settings
@@ -104,13 +102,13 @@ class Passes:
 
     def _go_on(self, before: ResumePoint) -> None:
         """Begin in a later pass, where the torch is to be lit again."""
-        root, settings = self.root, self._settings
-        root.sensing.learned, root.welding.lit = before.learned, settings.offset_along
+        root = self.root
+        root.sensing.learned, root.welding.lit = before.learned, root.task.start.torch
         root.seam.refined.noise = before.learned.noise
         self.number = before.number - 1
         self._learned()
         self._next_pass(0.0)
-        self._start = self.torch = max(settings.offset_along - self._pass.along, 0.0)
+        self._start = self.torch = root.task.start.torch
 
     def _learned(self) -> None:
         """Take over the arm's delay as the root pass has found it."""
@@ -125,7 +123,7 @@ class Passes:
         root = replace(root, traced=np.array(self._traced.rows))
         if not self.number:
             return root
-        return replace(root, torch=self.torch + self._pass.along, number=self.number)
+        return replace(root, torch=self.torch, number=self.number)
 
     def _take_over(self) -> None:
         root = self.root
@@ -177,7 +175,7 @@ class Passes:
         self.number += 1
         self._path, self._began = self._traced.path(self._pass), None
         self._striking = Striking(self._belief.arc)
-        self._weave = Weave(self._pass.weave_width, self._pass.weave_frequency)
+        self._weave = Weave(self._pass.weave_width, self._settings.weave_frequency)
         self._over, self._start = max(height, float(self._path.points[:, 2].max())) + OVER, 0.0
         self.phase, self.torch, self.tip = "returning", 0.0, self._belief.distance
         self.wanted = self.sigma = self.bound = self.band = 0.0
@@ -212,7 +210,7 @@ class Passes:
         ahead = np.array([math.cos(pose.angle), math.sin(pose.angle)])
         torch = pose.position[:2] - distance * ahead
         self.torch = self._path.advance(torch, self.torch, settings.speed * 0.1)
-        self.tip = self.torch + self._pass.along + distance
+        self.tip = self.torch + distance
         self._striking.strike(self._now)
         if self.torch >= self._path.length:
             if self._striking.filled(self._now):
@@ -251,7 +249,7 @@ class Passes:
         """State how far the torch may be from where it is to be, and stop where that is too far."""
         settings = self._settings
         again = (2.0 * settings.arm_sigma) ** 2 + settings.distortion**2 + self._weave.variance
-        seam = self._traced.sigma(self.torch + self._pass.along)
+        seam = self._traced.sigma(self.torch)
         self.sigma = math.sqrt(seam**2 + again)
         self.band, self.bound = (abs(error) + k * self.sigma for k in (BAND, settings.sigmas))
         if self.bound > settings.max_error:

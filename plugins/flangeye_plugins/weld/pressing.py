@@ -22,15 +22,16 @@ class Pressing:
     def __init__(self, task: WeldTask) -> None:
         self._task, settings = task, task.settings
         # Before the sweep has told how much the tip stands.
-        self.most = settings.deflection / (SOFTER if task.sweeps_both_walls else 1.0)
+        self.most = settings.deflection / (SOFTER if task.belief.two_walls else 1.0)
         self.wanted, self.side = 0.0, settings.sign
         self._lost = self._turned = 0.0
 
     def learn(self, found: Learned, swept: float) -> None:
         """Press by what the sweep has found that the tip stands, ``swept`` at most [m]."""
-        if self._task.sweeps_both_walls:
-            softly = max(swept / SOFTER, found.least)
-            self.most = min(softly, self._task.settings.deflection)
+        if self._task.belief.two_walls:
+            settings = self._task.settings
+            least = found.least(self._task.belief.sliding(settings) / SOFTER)
+            self.most = min(max(swept / SOFTER, least), settings.deflection)
 
     def ramp(self, phase: Phase, target: float, elapsed: float) -> None:
         """Move the wanted deflection towards a target [m], as far as it may in a time [s]."""

@@ -103,10 +103,13 @@ class Learned:
         """Variance of one measurement of the tip [m^2]."""
         return (self.noise / (1.0 + self.gain)) ** 2 + self.systematic
 
-    @property
-    def least(self) -> float:
-        """Deflection by which a held tip differs from a free one, for all play and noise [m]."""
-        return 3.0 * abs(self.width) + 2.0 * self.noise
+    def least(self, dragged: float) -> float:
+        """Return the deflection by which a held tip differs from a free one, for certain [m].
+
+        Args:
+            dragged: Deflection that friction alone can give a free one [m].
+        """
+        return 3.0 * abs(self.width) + 2.0 * self.noise + dragged
 
 
 class Probing:
@@ -117,7 +120,7 @@ class Probing:
     """
 
     def __init__(self, settings: Following, belief: Belief, side: float) -> None:
-        self._rate, self._turn_rate = min(settings.lateral_speed, 4e-3), settings.turn_rate / 3.0
+        self._rate, self._turn_rate = 4e-3, settings.turn_rate / 3.0
         self._belief = belief
         self._two_walls, self._settings = belief.two_walls, settings
         self._side, self._noise = side, belief.noise
@@ -220,7 +223,8 @@ class Probing:
             return "the tag was seen too seldom while the finger was probed"
         felt, cycles = np.array(self._felt), np.array(self._cycles)
         found, climbs = self._fit(felt, cycles)
-        if not climbs and found.least < self._reach:
+        least = found.least(self._belief.sliding(self._settings) / SOFTER)
+        if not climbs and least < self._reach:
             return found
         half = self._reach / 2.0
         if not climbs:
@@ -229,7 +233,7 @@ class Probing:
                 f"{found.noise * 1e3:.2f} mm of noise: pressed by {self._reach * 1e3:.2f} mm a "
                 "tip that is held cannot be told from one that is not; fasten it, or its tag"
             )
-        if not self._two_walls or half < max(found.least, self._settings.probe):
+        if not self._two_walls or half < max(least, self._settings.probe):
             return f"{climbs}; lower 'deflection' or raise 'preload', or calibrate the finger"
         self._sweep(half)
         return None

@@ -22,7 +22,7 @@ class Progress:
         self._beside = task.belief.beside
         # Nothing goes farther within a cycle than it does in a tenth of a second.
         self._reach = task.settings.speed * 0.1
-        self.tip = task.settings.set_down
+        self.tip = task.start.tip
         self.torch = self.coming = self.tip - self._distance
         self.place = self._plan.at(self.tip)
 

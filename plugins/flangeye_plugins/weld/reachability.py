@@ -19,6 +19,7 @@ from flangeye.types import Floats, Transform
 from flangeye_plugins.weld.frame import Tool
 from flangeye_plugins.weld.path import Path, Place
 from flangeye_plugins.weld.settings import Following, WeldTactileParams
+from flangeye_plugins.weld.task import Start
 
 ROOM = np.radians(2.0)
 """The joints keep this far away from their limits along the seam [rad]."""
@@ -38,6 +39,7 @@ class Task:
         tool: Translates between flange and plane.
         plan: The seam.
         params: Speeds and clearances.
+        start: Where the weld begins.
         aside: How far to the left of the plan the tip is set down [m].
     """
 
@@ -47,6 +49,7 @@ class Task:
     tool: Tool
     plan: Path
     params: WeldTactileParams
+    start: Start
     aside: float = 0.0
 
 
@@ -198,7 +201,8 @@ def flange_speed(finger: Finger, settings: Following) -> float:
     lever = float(np.hypot(*finger.tip[:2]))
     going = np.linalg.norm([settings.speed, settings.lateral_speed, settings.lateral_speed])
     if settings.passes:
-        swing = max(math.pi * one.weave_frequency * one.weave_width for one in settings.passes)
+        widest = max(one.weave_width for one in settings.passes)
+        swing = math.pi * settings.weave_frequency * widest
         back = np.sqrt(2.0) * settings.return_speed
         going = max(going, back, np.hypot(settings.speed, swing))
     return float(going) + settings.turn_rate * lever
@@ -210,11 +214,11 @@ def _stations(task: Task) -> list[Station]:
     The tip goes on beyond the seam's end by the torch's distance.
     """
     plan, params, tool = task.plan, task.params, task.tool
-    start = plan.at(params.set_down)
+    start = plan.at(task.start.tip)
     aside = start.point + task.aside * start.normal
     above = np.array([*aside, start.height + params.clearance])
-    count = 1 + int(np.ceil(abs(params.start_angle) / (JUMP / 2)))
-    angles = _angle(start) + np.linspace(params.start_angle, 0.0, count)
+    count = 1 + int(np.ceil(abs(task.start.angle) / (JUMP / 2)))
+    angles = _angle(start) + np.linspace(task.start.angle, 0.0, count)
     # The way from joint to joint ends 50 mm higher.
     poses = [tool.base_T_flange(above + [0.0, 0.0, 0.05], float(angles[0]))]
     poses += [tool.base_T_flange(above, float(angle)) for angle in angles]

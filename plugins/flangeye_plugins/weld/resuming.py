@@ -28,7 +28,7 @@ from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.probing import Learned
 from flangeye_plugins.weld.settings import Following, Mode, WeldTactileParams
 from flangeye_plugins.weld.steering import SETTLING
-from flangeye_plugins.weld.task import ResumePoint
+from flangeye_plugins.weld.task import ResumePoint, Start, WeldTask
 from flangeye_plugins.weld.weld_log import LoggedLooks
 
 RUN_IN = 2 * SETTLING
@@ -36,15 +36,20 @@ RUN_IN = 2 * SETTLING
 
 
 def controller_of(
-    plan: Path, belief: Belief, settings: Following, mode: Mode, kept: ResumePoint | None = None
+    plan: Path,
+    belief: Belief,
+    settings: Following,
+    mode: Mode,
+    kept: ResumePoint | None = None,
+    start: Start | None = None,
 ) -> Controller:
-    """Return the controller of the mode that was asked for."""
+    """Return the controller of the mode that was asked for; see :class:`WeldTask`."""
     if isinstance(mode, BoundPart):
         controller: Controller = mode(task_of(plan, belief.distance, settings))
         return controller
-    root = Follower(plan, belief, settings, mode == "tactile", kept)
+    root = Follower(WeldTask(plan, belief, settings, mode == "tactile", kept, start))
     if settings.passes and mode == "tactile":
-        return Passes(root, plan, belief, settings, kept)
+        return Passes(root)
     return root
 
 
@@ -52,8 +57,8 @@ def task_of(plan: Path, distance: float, settings: Following) -> FollowingTask:
     """Return what a plugin's controller is asked to do, the torch ``distance`` behind the tip."""
     return FollowingTask(
         plan.points, plan.tangents, plan.step, distance,
-        side=settings.sign, height_gain=settings.height_gain,
-        **settings.model_dump(include=set(FollowingTask.__dataclass_fields__) - {"side"}),
+        settings.sign, settings.speed, settings.deflection, settings.preload, settings.servo_gain,
+        settings.height_gain, settings.lateral_speed, settings.turn_rate,
     )  # fmt: skip
 
 
@@ -89,7 +94,9 @@ def controller_from(start: Mapping[str, Any]) -> Controller:
     settings = Following.model_validate(start["settings"])
     plan, kept = Path(np.array(start["points"])), start.get("kept")
     before = None if kept is None else _kept_from(kept)
-    return controller_of(plan, belief, settings, _mode_of(start["mode"]), before)
+    given = start.get("start")
+    at = None if given is None else Start(**given)
+    return controller_of(plan, belief, settings, _mode_of(start["mode"]), before, at)
 
 
 def kept_value(kept: ResumePoint) -> dict[str, Any]:
@@ -185,10 +192,8 @@ def _require_same(log: FilePath, points: Floats, before: Floats) -> None:
     )
 
 
-def set_back(
-    params: WeldTactileParams, plan: Path, distance: float, kept: ResumePoint
-) -> WeldTactileParams:
-    """Return the parameters with which the tip is set down so that the torch overlaps.
+def set_back(params: WeldTactileParams, plan: Path, distance: float, kept: ResumePoint) -> Start:
+    """Return where a resumed weld begins so that the torch overlaps.
 
     It is lit where the overlap begins, and set down a run-in before that; in a later pass, which
     touches nothing, it comes down right there.
@@ -197,8 +202,8 @@ def set_back(
         StageError: The tip would be beyond where it can press.
     """
     if kept.number:
-        lit = max(kept.torch - params.overlap, params.passes[kept.number - 1].along)
-        return _standing(params, plan, distance, lit, _away(plan, lit, distance))
+        lit = max(kept.torch - params.overlap, 0.0)
+        return _standing(plan, distance, lit, _away(plan, lit, distance))
     release = params.speed * params.deflection / params.release
     # At the latest 5 mm before the tip lets go of the wall.
     last = plan.length - params.ending - release - 5e-3
@@ -206,18 +211,16 @@ def set_back(
     if last < params.set_down:
         raise StageError("weld.tactile: the rest of the seam is too short for the tip to press on")
     tip = min(_away(plan, max(lit - RUN_IN, params.set_down - distance), distance), last)
-    return _standing(params, plan, distance, max(lit, params.offset_along), tip)
+    return _standing(plan, distance, max(lit, 0.0), tip)
 
 
-def _standing(
-    params: WeldTactileParams, plan: Path, distance: float, lit: float, tip: float
-) -> WeldTactileParams:
-    """Return the parameters with which tip and torch stand on the plan, lit there."""
+def _standing(plan: Path, distance: float, lit: float, tip: float) -> Start:
+    """Return where tip and torch stand on the plan, to weld from ``lit`` on."""
     place = plan.at(tip)
     torch = plan.at(_away(plan, tip, -distance)).point
     heading = np.arctan2(*(place.point - torch)[::-1]) - np.arctan2(*place.tangent[::-1])
     angle = float((heading + np.pi) % (2 * np.pi) - np.pi)
-    return params.model_copy(update={"inset": tip, "start_angle": angle, "offset_along": lit})
+    return Start(tip, lit, angle)
 
 
 def _away(plan: Path, s: float, distance: float) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
@@ -10,7 +11,7 @@ from pydantic import Field, model_validator
 from flangeye.files.paths import RecipePath
 from flangeye.models.finger import FingerPath
 from flangeye.plugin.stage import BoundPart, Choose, Params
-from flangeye.units import Angle, AngularSpeed, Duration, Force, Length, Speed, param
+from flangeye.units import Angle, AngularSpeed, Duration, Length, Speed, param
 from flangeye_plugins.weld.joint import JointKind
 
 Mode = Annotated[str | BoundPart, Choose("controller", words=("tactile", "vision"))]
@@ -28,27 +29,38 @@ class PassParams(Params):
         "3 mm", gt=0, le=0.05, description="Higher than the root pass, the finger too; it must "
         "clear what was welded.",
     )  # fmt: skip
-    along: Length = param("0 mm", ge=0, description="It begins so far after the seam does.")
     weave_width: Length = param("0 mm", ge=0, le=0.03, description="As of the weld itself.")
-    weave_frequency: float = Field(1.0, gt=0, le=10)
 
 
 class Following(Params):
     """The controller's parameters; names in brackets are the paper's."""
 
-    # What no cell needs otherwise. Gains of the preload's control, and by which an error of the
-    # torch is taken back [1/s]; the deflection with which lost contact is felt for [m], twice it
-    # where little is known of where the seam leads, and how fast a wanted deflection is changed,
-    # and ended before the seam ends [m/s].
+    # What no cell needs otherwise. Gains: k_p of the deflection servo, of the preload's control,
+    # and by which an error of the torch is taken back [1/s].
+    servo_gain: ClassVar[float] = 3.0
     height_gain: ClassVar[float] = 3.0
     cross_track_gain: ClassVar[float] = 1.0
+    # Deflection with which lost contact is felt for, twice it where little is known of where the
+    # seam leads; the weld is stopped after this way without contact [m].
     probe: ClassVar[float] = 0.5e-3
+    longest_gap: ClassVar[float] = 40e-3
+    # How fast a wanted deflection is changed, and ended before the seam ends [m/s].
     ramp: ClassVar[float] = 2e-3
     release: ClassVar[float] = 0.8e-3
+    # Largest speed across the seam and in height, and speed of the tool between two passes [m/s].
+    lateral_speed: ClassVar[float] = 5e-3
+    return_speed: ClassVar[float] = 20e-3
+    # How far inside the planned start the tip is set down, and before the planned end stops
+    # pressing, where ``ends`` asks for no more [m].
+    inset: ClassVar[float] = 5e-3
+    ending: ClassVar[float] = 8e-3
     # Farther from the plan the tip stops the weld; standard deviation of the seam about the plan's
-    # shape [m].
+    # shape; the torch's end may be higher or lower than the seam by this [m].
     astray: ClassVar[float] = 20e-3
     wander: ClassVar[float] = 0.3e-3
+    torch_height: ClassVar[float] = 8e-3
+    # Standard deviation of the walls' angles [rad].
+    joint_sigma: ClassVar[float] = math.radians(1.0)
 
     speed: Speed = param("5 mm/s", gt=0, le=0.05, description="Speed of the tip along the seam.")
     side: Literal["left", "right"] = Field(
@@ -60,33 +72,12 @@ class Following(Params):
     preload: Length = param(
         "1.5 mm", gt=0, le=0.01, description="Displacement of the tip into the groove."
     )
-    servo_gain: float = Field(3.0, gt=0, le=20, description="k_p of the deflection servo [1/s].")
-    lateral_speed: Speed = param(
-        "5 mm/s", gt=0, le=0.05, description="Largest speed across the seam, and in height."
-    )
     turn_rate: AngularSpeed = param(
         "20 deg/s", gt=0, le=2.0, description="Largest angular velocity of the tool."
-    )
-    inset: Length = param(
-        "5 mm", ge=0, description="How far inside the planned start the tip is set down."
-    )
-    ending: Length = param(
-        "8 mm", ge=0, description="How far before the planned end the tip stops pressing."
     )
     reach: Length = param(
         "8 mm", gt=0, description="How far from the plan the wall is sought at the start."
     )
-    longest_gap: Length = param(
-        "40 mm", gt=0, description="Without contact for longer, the weld is stopped."
-    )
-    force: Force = param("10 N", gt=0, description="Largest force of the tip, by its stiffness.")
-    stale: Duration = param(
-        "100 ms", gt=0, description="Without a new image of the tag for longer the weld slows down."
-    )
-    still: Duration = param(
-        "150 ms", gt=0, description="Without one for longer the arm stands until one comes: at "
-        "rest, since the last image was taken, after this, the images' latency and its braking.",
-    )  # fmt: skip
     friction: float = Field(
         0.3, ge=0, le=1, description="Largest coefficient of the tip on the work to reckon with."
     )
@@ -109,9 +100,6 @@ class Following(Params):
     gain_drift: float = Field(
         0.05, ge=0, le=1, description="Standard deviation of the finger's gain after a minute."
     )
-    probing: bool = Field(
-        True, description="Sweep the seated tip at the start: finger, clock and arm are measured."
-    )
     joint: JointKind = Field(
         "groove",
         description="groove, butt and corner hold the tip between two walls; in a fillet or lap "
@@ -121,13 +109,6 @@ class Following(Params):
     root_gap: Length = param(
         "0 mm", ge=0, description="Between the plates of a butt joint with square edges: the tip "
         "rests on these.",
-    )  # fmt: skip
-    joint_sigma: Angle = param(
-        "1 deg", ge=0, description="Standard deviation of the walls' angles."
-    )
-    tip_radius: Length | None = param(
-        None, gt=0, description="Radius of the tip's ball, where it is not the one of the finger's "
-        "file.",
     )  # fmt: skip
     work_angle: Angle = param(
         "0 deg", ge=-np.pi / 3, le=np.pi / 3,
@@ -146,9 +127,6 @@ class Following(Params):
         "touch does not tell. Where it is given the tip first feels its way back to where the seam "
         "has surely begun, and the torch welds so far beyond both planned ends.",
     )  # fmt: skip
-    offset_along: Length = param(
-        "0 mm", description="How far after the planned start the torch begins to weld."
-    )
     weave_width: Length = param(
         "0 mm", ge=0, le=0.03,
         description="The torch swings across the seam by this from side to side, the tool turning "
@@ -158,19 +136,27 @@ class Following(Params):
     passes: tuple[PassParams, ...] = Field(
         (), max_length=20, description="Passes after the root's, in their order."
     )
-    return_speed: Speed = param(
-        "20 mm/s", gt=0, le=0.1, description="Speed of the tool between two passes."
-    )
-    torch_height: Length = param(
-        "8 mm", gt=0,
-        description="The torch's end may be higher or lower than the seam by at most this.",
-    )  # fmt: skip
     blind: Duration = param(
         "500 ms",
         gt=0,
-        description="Without a tag for longer while the arc burns, or for four times as "
-        "long before, the weld is stopped.",
+        description="Without an image of the tag for longer while the arc burns, or for four times "
+        "as long before, the weld is stopped. After a fifth of this it slows down, after three "
+        "tenths the arm stands until one comes.",
     )
+
+    @property
+    def stale(self) -> float:
+        """Without an image of the tag for longer the weld slows down [s]."""
+        return 0.2 * self.blind
+
+    @property
+    def still(self) -> float:
+        """Without an image of the tag for longer the arm stands until one comes [s].
+
+        It is at rest, since the last image was taken, after this, the images' latency and its
+        braking.
+        """
+        return 0.3 * self.blind
 
     @property
     def set_down(self) -> float:
@@ -185,6 +171,12 @@ class Following(Params):
 
 class WeldTactileParams(Following):
     """Parameters of ``weld.tactile``."""
+
+    # On the way to the seam, as far as the recipe's limits allow them: speed of the flange [m/s]
+    # and of the joints [rad/s]; height of the tip above the planned start before it descends [m].
+    approach_speed: ClassVar[float] = 50e-3
+    approach_joint_speed: ClassVar[float] = math.radians(20.0)
+    clearance: ClassVar[float] = 15e-3
 
     finger: FingerPath = param(
         "srm", description="One of data/fingers, or a .yaml file of one's own."
@@ -208,30 +200,15 @@ class WeldTactileParams(Following):
         description="tactile: follow the seam by touch. For comparison: vision follows the plan "
         "alone and touches nothing; any other name is that of a controller plugin.",
     )
-    log_images: bool = Field(
-        True, description="Log what was read of every image, 17 kB each; replaying needs it."
-    )
     leg: int | None = Field(
         None, ge=1,
-        description="Of a plan with sharp corners, which leg between them this step welds; at a "
-        "corner the torch stops.",
+        description="Of a plan with sharp corners, which leg between them this step welds.",
     )  # fmt: skip
-    corners: Literal["stop", "round"] = Field(
-        "stop",
-        description="stop: the torch stops at a sharp corner, each leg is a step. round: tip and "
-        "torch go round it without a stop.",
-    )
-    corner_radius: Length = param(
-        "5 mm", gt=0, description="Of the arc that a rounded corner of the plan becomes."
-    )
-    clearance: Length = param(
-        "15 mm", gt=0, description="Height of the tip above the planned start, before it descends."
-    )
-    approach_speed: Speed = param(
-        "50 mm/s", gt=0, description="Speed of the flange on its way there."
-    )
-    approach_joint_speed: AngularSpeed = param(
-        "20 deg/s", gt=0, description="Speed of the joints on the way there."
+    corner_radius: Length | None = param(
+        None,
+        gt=0,
+        description="Tip and torch go round the plan's sharp corners without a stop, on arcs of "
+        "this radius. Without it the torch stops there: each leg is a step.",
     )
     resume: RecipePath | None = Field(
         None,
@@ -244,9 +221,6 @@ class WeldTactileParams(Following):
     )
     overlap: Length = param(
         "30 mm", gt=0, description="How far before the stop the torch begins again, to go on."
-    )
-    start_angle: Angle = param(
-        "0 deg", ge=-np.pi, le=np.pi, description="Angle of the tool to the seam at the start."
     )
 
     @model_validator(mode="after")

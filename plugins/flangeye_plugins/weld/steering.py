@@ -99,7 +99,7 @@ class TorchLead:
         self.steering = Steering(task.belief.distance, gain, settings.turn_rate)
         self.weave = Weave(settings.weave_width, settings.weave_frequency)
         self.aim = self._beside = settings.offset_across
-        self._from = max(settings.offset_along, 0.0)
+        self._from = max(task.start.torch, 0.0)
         self._swings: float | None = None
 
     def swing(self, now: float, coming: float, arm: Response) -> Sway:

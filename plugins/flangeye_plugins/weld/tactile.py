@@ -52,7 +52,7 @@ from flangeye_plugins.weld.resuming import (
     set_back,
 )
 from flangeye_plugins.weld.settings import Following, WeldTactileParams
-from flangeye_plugins.weld.task import ResumePoint
+from flangeye_plugins.weld.task import ResumePoint, Start
 from flangeye_plugins.weld.weld_log import WeldLog
 
 
@@ -80,10 +80,10 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
     planned = _planned(seam, driver, allowed, params)
     params, driver, plan = planned.params, planned.driver, planned.plan
     aside = planned.belief.set_down(params)
-    task = Task(model, allowed, planned.finger, planned.tool, plan, params, aside)
+    task = Task(model, allowed, planned.finger, planned.tool, plan, params, planned.start, aside)
     passage = SeamReach(task)
     checks.check_controller(params.mode, driver)
-    controller_of(plan, planned.belief, params, params.mode, planned.kept)
+    controller_of(plan, planned.belief, params, params.mode, planned.kept, planned.start)
     if not (motion.allowed or driver.simulated):
         raise NothingMoved(_plan_text(plan, params))
     with ExitStack() as opened:
@@ -92,12 +92,12 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
         reader: FingerCameraReader = SteppedReader(job) if driver.simulated else CameraProcess(job)
         eyes = opened.enter_context(reader)
         belief = replace(planned.belief, behind=eyes.behind)
-        controller = controller_of(plan, belief, params, params.mode, planned.kept)
-        weld_log = opened.enter_context(WeldLog(stage_log, not driver.simulated, params.log_images))
+        controller = controller_of(plan, belief, params, params.mode, planned.kept, planned.start)
+        weld_log = opened.enter_context(WeldLog(stage_log, not driver.simulated))
         weld_log.note("start", start_of(planned, belief))
         cell = WeldCell(
             Executor(robot, model, allowed, eyes.tell), eyes, planned.tool,
-            Bounds(planned.finger, plan, params),
+            Bounds(planned.finger, plan),
             None if params.look is None else follower_of(controller), planned.gas_after,
         )  # fmt: skip
         approach(cell, passage, weld_log, params.mode)
@@ -127,7 +127,8 @@ class Planned:
         body: How it stands.
         tool: Translates between flange and plane.
         belief: What is known of all that.
-        params: What was asked for, with what follows for a start in mid-seam.
+        params: What was asked for.
+        start: Where it begins.
         driver: The arm's, with the power source.
         gas_after: For how long gas flows after the arc [s]; None without one.
         kept: What a weld that is resumed has left.
@@ -142,6 +143,7 @@ class Planned:
     tool: Tool
     belief: Belief
     params: WeldTactileParams
+    start: Start
     driver: RobotDriver
     gas_after: float | None
     kept: ResumePoint | None
@@ -166,16 +168,17 @@ def _planned(
     checks.check_seam(seam, plan, body.distance, params)
     checks.check_speeds(finger, params, allowed)
     kept = None if params.resume is None else resume_point_of(params.resume, points)
+    start = Start(params.set_down)
     if kept is not None:
-        params = set_back(params, plan, body.distance, kept)
+        start = set_back(params, plan, body.distance, kept)
     driver, times = _with_power_source(driver, params)
     if times is not None:
         belief = replace(belief, arc=(times.gas_before, times.ignition, times.crater))
     checks.check_tool(body, belief, params)
     check_bound(plan, belief, params)
     return Planned(
-        seam, plane, points, plan, finger, body, Tool(finger, plane, body), belief, params, driver,
-        None if times is None else times.gas_after, kept,
+        seam, plane, points, plan, finger, body, Tool(finger, plane, body), belief, params,
+        start, driver,        None if times is None else times.gas_after, kept,
     )  # fmt: skip
 
 
@@ -229,5 +232,6 @@ def start_of(planned: Planned, belief: Belief) -> dict[str, Any]:
         "belief": asdict(belief),
         "mode": params.model_dump(mode="json", include={"mode"})["mode"],
         "kept": None if kept is None else kept_value(kept),
+        "start": asdict(planned.start),
         "settings": params.model_dump(mode="json", include=set(Following.model_fields)),
     }

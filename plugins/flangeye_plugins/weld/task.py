@@ -33,6 +33,21 @@ class ResumePoint:
     number: int = 0
 
 
+@dataclass(frozen=True)
+class Start:
+    """Where a weld begins on its plan.
+
+    Attributes:
+        tip: Where the tip is set down, by arc length [m].
+        torch: Where the torch begins to weld, by arc length; nothing where the seam begins [m].
+        angle: Of the tool to the seam [rad].
+    """
+
+    tip: float
+    torch: float = 0.0
+    angle: float = 0.0
+
+
 @dataclass(frozen=True, eq=False)
 class WeldTask:
     """A seam to follow.
@@ -43,6 +58,7 @@ class WeldTask:
         settings: Gains and limits.
         touch: Follow by touch; otherwise the plan alone, for comparison.
         before: What an earlier weld has left that is gone on with.
+        given: Where it begins, if that is not where the plan does.
     """
 
     plan: Path
@@ -50,6 +66,12 @@ class WeldTask:
     settings: Following
     touch: bool = True
     before: ResumePoint | None = None
+    given: Start | None = None
+
+    @property
+    def start(self) -> Start:
+        """Where it begins."""
+        return Start(self.settings.set_down) if self.given is None else self.given
 
     @property
     def beyond(self) -> float:
@@ -59,7 +81,7 @@ class WeldTask:
     @property
     def begins(self) -> float:
         """Where the torch is to begin to weld, by arc length [m]."""
-        after = self.settings.offset_along
+        after = self.start.torch
         return after if after > 0.0 else -self.beyond
 
     @property
@@ -76,8 +98,3 @@ class WeldTask:
     def margin(self) -> float:
         """How far beyond the plan tip and torch may come [m]."""
         return self.belief.distance + self.settings.ending + self.beyond
-
-    @property
-    def sweeps_both_walls(self) -> bool:
-        """Whether the sweep tells how much the tip stands between two walls."""
-        return self.settings.probing and self.belief.two_walls

@@ -69,9 +69,8 @@ class WeldLog:
         felt: Number of an image -> what was felt in it.
     """
 
-    def __init__(self, stage_log: StageLog, beside: bool, images: bool = True) -> None:
-        """Write into ``stage_log`` at once, or in a thread ``beside`` the loop; images if asked."""
-        self._images = images
+    def __init__(self, stage_log: StageLog, beside: bool) -> None:
+        """Write into ``stage_log`` at once, or in a thread ``beside`` the loop."""
         self.cycles: list[Cycle] = []
         self.sights = 0
         self.felt: dict[int, TipDisplacement] = {}
@@ -115,8 +114,7 @@ class WeldLog:
 
     def _note_observation(self, number: int, sight: TagObservation) -> None:
         piece = sight.piece
-        if self._images:
-            self.note("image", piece.image)
+        self.note("image", piece.image)
         told = {"number": number, "time_ns": sight.time_ns, "corner": piece.corner}
         self.note("sight", {**told, "tag": sight.feeling is not None})
 

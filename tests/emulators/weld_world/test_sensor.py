@@ -84,7 +84,8 @@ def edited() -> list[tuple[str, Finger]]:
         "camera": FINGER.camera.model_copy(update={"focal": (500.0, 510.0), "width": 300}),
         "tip": (3e-3, -3e-3, 185e-3), "direction": 0.1, "torch": 45e-3, "torch_aside": 5e-3,
         "torch_up": 2e-3, "torch_sigma": 1e-3, "along_sigma": 1e-3, "tip_sigma": 1e-3,
-        "radius": 2e-3, "travel": 9e-3, "calibration": known, "source": "guessed",
+        "radius": 2e-3, "travel": 9e-3, "largest_force": 5.0, "calibration": known,
+        "source": "guessed",
     }  # fmt: skip
     assert set(changes) == set(Finger.model_fields)
     return [(name, FINGER.model_copy(update={name: value})) for name, value in changes.items()]

@@ -1,14 +1,14 @@
 """The true world of a weld: each of its parts does what it is told, and the controller sees none."""
 
-from typing import get_args
-
 import numpy as np
 import pytest
 
+from flangeye.errors import RecipeError
+from flangeye.files.paths import bundled
+from flangeye.models.model import read_model
 from flangeye.motion.seam_following import Command, ToolPose
-from flangeye_emulators.weld_world.groove import Groove, Tip, TipContact
+from flangeye_emulators.weld_world.groove import Gap, Groove, Tip, TipContact
 from flangeye_emulators.weld_world.truth import (
-    WORLDS,
     ArmTruth,
     ClockTruth,
     FingerTruth,
@@ -16,7 +16,7 @@ from flangeye_emulators.weld_world.truth import (
     Tack,
     ToolTruth,
     WorkpieceTruth,
-    WorldName,
+    World,
 )
 from flangeye_emulators.weld_world.world import (
     ArmError,
@@ -163,5 +163,22 @@ def test_the_torch_is_scored_where_it_truly_is(name: str, rms: float) -> None:
     assert np.sqrt(np.mean(trial.errors**2)) == pytest.approx(rms, rel=0.1)
 
 
-def test_every_world_that_a_recipe_may_name_is_there() -> None:
-    assert set(get_args(WorldName)) == set(WORLDS)
+def test_a_world_is_a_file_of_its_own(tmp_path) -> None:
+    """As the bundled ones are; with units, and nothing in it that no world has."""
+    known = {path.stem: read_model(path, World).truth for path in bundled("data").glob("worlds/*")}
+    assert len(known) == 6 and all(each.clock.rate == 15.0 for each in known.values())
+    assert known["tip_astray"].tool.tip == (1.5e-3, 0.8e-3, -1e-3)
+    assert known["wall_missing"].workpiece.gaps == (Gap(90e-3, 110e-3, 1),)
+    own = tmp_path / "own.yaml"
+    own.write_text("arm: {lag: 0.1 s}\nworkpiece: {tacks: [{start: 30 mm}], half_angle: 2 deg}\n")
+    truth = read_model(own, World).truth
+    assert truth.arm == ArmTruth(lag=0.1) and truth.finger == FingerTruth()
+    assert truth.workpiece == WorkpieceTruth(half_angle=np.radians(2.0), tacks=(Tack(30e-3),))
+    for wrong, told in (
+        ("arm: {lagg: 1 s}", r"own.yaml:1: arm.lagg"),
+        ("arm: {lag: 60}", "has no unit: a duration needs one"),
+        ("workpiece: {gaps: [{start: 1 mm, end: 2 mm, side: 0}]}", "side"),
+    ):
+        own.write_text(wrong)
+        with pytest.raises(RecipeError, match=told):
+            read_model(own, World)

@@ -10,6 +10,7 @@ from flangeye_plugins.weld.belief import Belief
 from flangeye_plugins.weld.follower import Follower
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following
+from flangeye_plugins.weld.task import WeldTask
 
 DISTANCE = 40e-3
 SECTION = GrooveSection(np.pi / 6, 8e-3)
@@ -69,7 +70,7 @@ class Weld:
 
 
 def make(mode, plan, settings):
-    return Follower(Path(plan), Belief(DISTANCE), settings, mode == "tactile")
+    return Follower(WeldTask(Path(plan), Belief(DISTANCE), settings, mode == "tactile"))
 
 
 def weld(true, plan, mode="tactile", settings=None, **world):
@@ -80,12 +81,12 @@ def weld(true, plan, mode="tactile", settings=None, **world):
 class World:
     def __init__(
         self, true, plan, controller, settings, *, gaps=(), seed=0, latency=0.03, noise=10e-6,
-        angle=0.0, above=12e-3, hidden=None, longest=80.0, period=PERIOD,
+        angle=0.0, above=12e-3, hidden=None, longest=80.0, period=PERIOD, start=None,
     ):  # fmt: skip
         self.root = Path(true)
         self.contact = TipContact(Groove(self.root, SECTION, gaps), Tip())
         self.controller = controller
-        start = Path(plan).at(settings.set_down)
+        start = Path(plan).at(settings.set_down if start is None else start)
         self.position = np.array([*start.point, start.height + above])
         self.angle = np.arctan2(start.tangent[1], start.tangent[0]) + angle
         self.rng = np.random.default_rng(seed)

@@ -44,7 +44,7 @@ def seam_of(points: Points) -> Seam:
 
 
 def told(**given):
-    defaults = {"side": "left", "joint": "lap", "corners": "stop", "corner_radius": 5e-3}
+    defaults = {"side": "left", "joint": "lap", "corner_radius": None}
     return WeldTactileParams.model_construct(**{**defaults, **given})
 
 
@@ -83,7 +83,7 @@ def test_a_leg_is_what_lies_between_its_corners() -> None:
         (
             (-90.0,),
             {"leg": 1},
-            "go round it with corners: round, or end the plan before the corner",
+            "go round it with corner_radius, or end the plan before the corner",
         ),
         ((90.0,), {"leg": 2, "joint": "groove"}, "run into a wall: room is only round the outside"),
         ((60.0, -60.0), {"leg": 2}, "at the corner -60 deg at 120 mm the finger"),
@@ -94,7 +94,7 @@ def test_what_has_no_room_or_is_not_chosen_is_refused(turns, given, message: str
         leg_of(seam_of(polyline(*turns)), told(**{"leg": None, **given}))
 
 
-ROUND = {"leg": None, "corners": "round", "joint": "groove"}
+ROUND = {"leg": None, "corner_radius": 5e-3, "joint": "groove"}
 
 
 @pytest.mark.parametrize("sampled", [polyline, lambda *t: dense(polyline(*t))])
@@ -114,7 +114,7 @@ def test_a_rounded_corner_is_an_arc_that_touches_both_legs(sampled) -> None:
 @pytest.mark.parametrize(
     ("turns", "given", "message"),
     [
-        ((90.0,), {"leg": 1}, "corners: round leaves no legs; drop 'leg'"),
+        ((90.0,), {"leg": 1}, "corner_radius leaves no legs; leave out one"),
         ((90.0, 90.0), {"corner_radius": 0.04}, "no room .* of 40 mm, at most 30 mm"),
     ],
 )

@@ -123,7 +123,7 @@ class Ending:
 
 def followed(cell: Any, controller: Any, longest: float = 60.0) -> Any:
     given: Controller = controller
-    with WeldLog(lambda name, value: None, False, images=False) as log:
+    with WeldLog(lambda name, value: None, False) as log:
         return follow(cell, given, log, longest), log.cycles
 
 

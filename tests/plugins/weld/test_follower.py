@@ -18,7 +18,7 @@ from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.probing import Learned
 from flangeye_plugins.weld.sensing import Located, SeamReading
 from flangeye_plugins.weld.settings import Following
-from flangeye_plugins.weld.task import ResumePoint
+from flangeye_plugins.weld.task import ResumePoint, Start, WeldTask
 from flangeye_plugins.weld.weave import Sway
 from tests.plugins.weld.bench import straight
 
@@ -38,12 +38,12 @@ def circle(turns: float = 0.4) -> Any:
 
 def make(
     phase: str = "following", plan: Any = None, touch: bool = True, belief: Any = None,
-    before: Any = None, **given: Any,
+    before: Any = None, start: Any = None, **given: Any,
 ) -> Any:  # fmt: skip
     """A follower of a straight plan along x, in a phase."""
     points = straight(LENGTH) if plan is None else plan
     own = belief or Belief(DISTANCE)
-    found: Any = Follower(Path(points), own, following(**given), touch, before)
+    found: Any = Follower(WeldTask(Path(points), own, following(**given), touch, before, start))
     found.phase = phase
     if phase not in ("seeking", "probing"):
         found.welding.begin(0.0)
@@ -151,8 +151,8 @@ def test_the_torch_is_lit_where_it_is_known_and_then_has_to_stay_so() -> None:
     assert doubtful(0.01, None, off=0.0).lit == 0.01
     assert doubtful(0.02, 0.01, off=0.0).lit == 0.01
     assert doubtful(-0.01, None, off=0.0).lit is None  # it is not on the seam yet
-    assert doubtful(0.01, None, off=0.0, offset_along="15 mm").lit is None
-    assert doubtful(0.016, None, off=0.0, offset_along="15 mm").lit == 0.016
+    assert doubtful(0.01, None, off=0.0, start=Start(5e-3, 15e-3)).lit is None
+    assert doubtful(0.016, None, off=0.0, start=Start(5e-3, 15e-3)).lit == 0.016
     assert doubtful(0.01, None, off=0.0, phase="probing").lit is None
     stopped = doubtful(0.02, 0.01)
     assert stopped.phase == "stopped" and stopped.lit == 0.01
@@ -166,8 +166,8 @@ def test_a_weld_that_cannot_begin_within_the_first_hundredth_of_the_seam_is_refu
     told = doubtful(0.0031, None, plan=long)
     assert told.phase == "stopped" and told.lit is None and told.welding.share == 0.0
     assert told.reason.startswith("not begun: the torch is known to 3.")
-    assert doubtful(0.0178, None, plan=long, offset_along="15 mm").phase == "following"
-    assert doubtful(0.0179, None, plan=long, offset_along="15 mm").phase == "stopped"
+    assert doubtful(0.0178, None, plan=long, start=Start(5e-3, 15e-3)).phase == "following"
+    assert doubtful(0.0179, None, plan=long, start=Start(5e-3, 15e-3)).phase == "stopped"
 
 
 def test_a_weld_is_not_begun_where_the_seam_ahead_is_not_known() -> None:
@@ -206,7 +206,7 @@ def test_the_tip_goes_back_slowly_where_it_is_seen_late() -> None:
 
 
 def test_the_share_that_was_welded_is_of_the_planned_seam() -> None:
-    found = doubtful(0.02, 0.01, off=0.0, plan=straight(0.21), offset_along="10 mm")
+    found = doubtful(0.02, 0.01, off=0.0, plan=straight(0.21), start=Start(5e-3, 10e-3))
     assert found.welding.share == pytest.approx(0.05)
     found.progress.torch = 0.22  # the arc ends where the seam does
     assert found.welding.share == pytest.approx(1.0)
@@ -570,9 +570,8 @@ def test_phases_follow_from_what_was_felt() -> None:
     alone = make(belief=Belief(DISTANCE, two_walls=False))
     alone.seam.contact.likely = np.array([0.0, 0.0, 0.0, 1.0])
     assert judged(alone, tip=0.06) == "bridging" and alone.side == 1.0
-    for seated, probing, phase in ((False, True, "seeking"), (True, True, "probing"),
-                                   (True, False, "following")):  # fmt: skip
-        found = make("seeking", probing=probing)
+    for seated, phase in ((False, "seeking"), (True, "probing")):
+        found = make("seeking")
         found.sensing.search.seats = lambda wanted, seated=seated: seated
         assert judged(found) == phase
 
@@ -793,7 +792,7 @@ def test_a_swing_begins_on_the_seam_and_is_commanded_as_early_as_the_arm_is_late
     assert found.lead.aim == pytest.approx(1e-3 + 2e-3 * math.sin(turn * 0.5))
     early = turn * 0.6
     assert now.aside == pytest.approx(2e-3 * (math.sin(early) + 0.05 * turn * math.cos(early)))
-    later = make(weave_width="4 mm", offset_along="10 mm")
+    later = make(weave_width="4 mm", start=Start(5e-3, 10e-3))
     for coming, swings in ((9.9e-3, False), (10.1e-3, True)):
         swing(put(later, coming=coming), 1.0)
         assert (later.lead._swings is not None) == swings

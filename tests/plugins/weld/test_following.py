@@ -91,8 +91,7 @@ def test_a_plan_that_starts_away_from_the_groove_is_refused() -> None:
 
 def test_where_one_wall_of_a_groove_ends_the_other_leads() -> None:
     true = straight()
-    settings = Following(longest_gap="15 mm")
-    done = weld(true, true, settings=settings, gaps=(Gap(0.04, 0.08, 1),))
+    done = weld(true, true, gaps=(Gap(0.04, 0.08, 1),))
     assert done.phase[-1] == "done"  # the other wall leads it
     assert np.abs(done.deviation(0.005)).max() < 0.1e-3
 

@@ -15,7 +15,7 @@ from flangeye.plugin.stage import BoundPart
 from flangeye.run.replay import replay_steps
 from flangeye.types import Seed
 from flangeye_emulators.finger.profiler import SimulatedProfilerParams, profiler_simulated
-from flangeye_emulators.weld_world.truth import RENDERED, LookTruth, ToolTruth, WeldTruth
+from flangeye_emulators.weld_world.truth import ClockTruth, LookTruth, ToolTruth, WeldTruth
 from flangeye_plugins.weld.camera_process import CameraProcess
 from flangeye_plugins.weld.finger_camera import CameraJob
 from flangeye_plugins.weld.follower import Follower
@@ -27,7 +27,7 @@ from tests.plugins.weld.test_touch import FINGER
 from tools.weld_bench import try_condition
 from tools.weld_conditions import CONDITIONS, Condition
 
-ASIDE = WeldTruth(tool=ToolTruth(torch=(0.0, 0.3e-3)), clock=RENDERED)
+ASIDE = WeldTruth(tool=ToolTruth(torch=(0.0, 0.3e-3)), clock=ClockTruth(rate=15.0))
 LOOK = BoundPart(profiler_simulated, SimulatedProfilerParams(behind="10 mm"))
 SETTINGS = {"distortion": "0.15 mm", "max_error": "2 mm"}
 SHORT = 0.09

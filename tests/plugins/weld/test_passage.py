@@ -19,26 +19,28 @@ from flangeye_plugins.weld.frame import Tool, WorkPlane
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.reachability import JUMP, ROOM, SeamReach, Task
 from flangeye_plugins.weld.settings import WeldTactileParams
+from flangeye_plugins.weld.task import Start
 from tests.plugins.weld.cell import BOX, planned
 
 FINGER = read_model(bundled("data") / "fingers" / "srm.yaml", Finger)
 SENSOR = BoundPart(sensor_simulated_finger, SimulatedFingerParams())
 
 
-def task_of(name, **params):
+def task_of(name, angle: float = 0.0):
     model = load_model("robots", name)
     seam = planned("v-curved", shift=(-0.1, 0.0, 0.0))
     plane = WorkPlane(seam.points_in_base, seam.openings_in_base)
     limits = limits_of(LimitsSection.model_validate({"box": BOX}), model)
     plan = Path(plane.points(seam.points_in_base))
-    settings = WeldTactileParams(sensor=SENSOR, **params)
-    return Task(model, limits, FINGER, Tool(FINGER, plane), plan, settings)
+    settings = WeldTactileParams(sensor=SENSOR)
+    start = Start(settings.set_down, angle=angle)
+    return Task(model, limits, FINGER, Tool(FINGER, plane), plan, settings, start)
 
 
 @pytest.mark.parametrize("name", ["ur10e", "ur5e", "franka-panda", "aubo-i5"])
-@pytest.mark.parametrize("angle", ["0 deg", "-90 deg"])
-def test_every_chain_of_postures_is_one_smooth_way(name: str, angle: str) -> None:
-    task = task_of(name, start_angle=angle)
+@pytest.mark.parametrize("angle", [0.0, -np.pi / 2])
+def test_every_chain_of_postures_is_one_smooth_way(name: str, angle: float) -> None:
+    task = task_of(name, angle)
     arm, chains = Arm(task.model), SeamReach(task)._chains
     assert chains
     for chain in chains:

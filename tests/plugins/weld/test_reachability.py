@@ -20,6 +20,7 @@ from flangeye_plugins.weld.frame import Tool, WorkPlane
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.reachability import Barrier, SeamReach, Station, _stations, flange_speed
 from flangeye_plugins.weld.settings import Following
+from flangeye_plugins.weld.task import Start
 from tests.plugins.weld.bench import straight
 
 FINGER = read_model(bundled("data") / "fingers" / "srm.yaml", Finger)
@@ -265,8 +266,9 @@ def test_the_seam_is_looked_at_from_above_its_start_to_where_the_torch_comes_to_
     plane = WorkPlane(points, np.tile([0.0, 0, 1.0], (len(points), 1)))
     tool = Tool(FINGER, plane)
     plan = Path(plane.points(points))
-    params: Any = SimpleNamespace(set_down=5e-3, clearance=15e-3, start_angle=angle)
-    task: Any = SimpleNamespace(plan=plan, params=params, tool=tool, aside=2e-3, finger=FINGER)
+    params: Any = SimpleNamespace(clearance=15e-3)
+    task: Any = SimpleNamespace(plan=plan, params=params, tool=tool, aside=2e-3, finger=FINGER,
+                                start=Start(5e-3, angle=angle))  # fmt: skip
     stations = _stations(task)
     poses = [tool.pose(station.pose, 0.0) for station in stations]
     places = np.array([pose.position for pose in poses])
@@ -293,10 +295,7 @@ def test_later_passes_may_swing_and_go_back_faster_than_the_root_pass_goes() -> 
     def going(**given: Any) -> float:
         return flange_speed(FINGER, Following.model_validate(given)) - turning
 
-    slow = {"lateral_speed": "1 mm/s", "return_speed": "2 mm/s"}
-    one = {"weave_width": "4 mm", "weave_frequency": 1.5}
-    swing = math.pi * 1.5 * 4e-3
-    assert going(**slow) == pytest.approx(math.sqrt(25 + 1 + 1) * 1e-3)
-    assert going(**slow, passes=[{}, one]) == pytest.approx(math.hypot(5e-3, swing))
-    assert going(passes=[{}], return_speed="50 mm/s") == pytest.approx(math.sqrt(2) * 50e-3)
-    assert going(**slow, passes=[{}]) == pytest.approx(math.sqrt(25 + 1 + 1) * 1e-3)
+    one, swing = {"weave_width": "9 mm"}, math.pi * 1.5 * 9e-3
+    assert going() == pytest.approx(math.sqrt(25 + 25 + 25) * 1e-3)
+    assert going(weave_frequency=1.5, passes=[{}, one]) == pytest.approx(math.hypot(5e-3, swing))
+    assert going(passes=[{}]) == pytest.approx(math.sqrt(2) * 20e-3)

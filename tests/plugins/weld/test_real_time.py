@@ -27,7 +27,7 @@ from tests.plugins.weld.test_replay import logged
 pytest.importorskip("rtde_control", reason="ur-rtde is not installed")
 
 # A loaded machine renders and reads images late; the finger is real time, but not hard real time.
-PATIENT = {"blind": "5 s", "stale": "1 s", "still": "2 s"}
+PATIENT = {"blind": "5 s"}
 
 
 # Slow: 40 s where tests share two cores; a cycle's median is 1.0 ms of processor time there.

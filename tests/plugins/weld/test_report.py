@@ -19,6 +19,7 @@ from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.probing import Learned
 from flangeye_plugins.weld.report import SAMPLES, _advice, learned_figures, report_of
 from flangeye_plugins.weld.settings import Following
+from flangeye_plugins.weld.task import WeldTask
 from flangeye_plugins.weld.weld_log import WeldLog
 from tests.plugins.weld.bench import straight
 
@@ -65,7 +66,7 @@ def logged(count: int, images: int = 4, **more: Any) -> Any:
 
 def follower(side: str = "left") -> Any:
     _, _, plan = plane_of()
-    found: Any = Follower(plan, Belief(40e-3), Following.model_validate({"side": side}))
+    found: Any = Follower(WeldTask(plan, Belief(40e-3), Following.model_validate({"side": side})))
     return found
 
 

@@ -164,7 +164,7 @@ def test_a_tip_that_strays_from_the_plan_is_stopped(monkeypatch: pytest.MonkeyPa
 
 
 def check(displacement, lateral=0.0):
-    bounds = Bounds(FINGER, Path(straight()), Following())
+    bounds = Bounds(FINGER, Path(straight()))
     felt = TipDisplacement(0, np.array(displacement), np.zeros(3), np.eye(3), 1.0)
     bounds.check(ToolPose(0.0, np.array([0.05, lateral, 0.0]), 0.0), 0.05, [felt])
 

@@ -31,7 +31,7 @@ from flangeye_plugins.weld.resuming import (
 )
 from flangeye_plugins.weld.sensing import Track
 from flangeye_plugins.weld.settings import Following, WeldTactileParams
-from flangeye_plugins.weld.task import ResumePoint
+from flangeye_plugins.weld.task import ResumePoint, Start
 from flangeye_plugins.weld.touch.region_of_interest import RegionOfInterest, cut, shifted
 from tests.plugins.weld.bench import straight
 
@@ -44,7 +44,7 @@ def params(**given: Any) -> WeldTactileParams:
     return WeldTactileParams.model_validate({"sensor": SENSOR, **given})
 
 
-def again(torch: float, plan: Any = None, number: int = 0, **given: Any) -> WeldTactileParams:
+def again(torch: float, plan: Any = None, number: int = 0, **given: Any) -> Start:
     path = Path(straight(0.3) if plan is None else plan)
     return set_back(
         params(**given), path, DISTANCE, ResumePoint(np.zeros((0, 5)), torch, number=number)
@@ -56,34 +56,33 @@ def again(torch: float, plan: Any = None, number: int = 0, **given: Any) -> Weld
 
 @pytest.mark.parametrize("torch", [0.0, 2e-3, 5e-3, 10.9e-3])
 def test_a_weld_that_has_hardly_begun_begins_again_where_it_did(torch: float) -> None:
-    assert again(torch).inset == pytest.approx(params().inset)
+    assert again(torch).tip == pytest.approx(params().inset)
 
 
 def test_the_torch_is_lit_an_overlap_before_the_stop_and_set_down_a_run_in_before_that() -> None:
     """In which it takes back what the sweep led it aside by: twice 8 mm."""
     found = again(0.2, overlap="30 mm")
-    assert found.offset_along == pytest.approx(0.17)
-    assert found.inset == pytest.approx(0.17 - 0.016 + DISTANCE, abs=0.6e-3)
-    assert found.start_angle == pytest.approx(0.0, abs=1e-9)
+    assert found.torch == pytest.approx(0.17)
+    assert found.tip == pytest.approx(0.17 - 0.016 + DISTANCE, abs=0.6e-3)
+    assert found.angle == pytest.approx(0.0, abs=1e-9)
     early = again(0.02, overlap="30 mm")
-    assert early.offset_along == 0.0
-    assert early.inset == pytest.approx(0.02 - 0.03 - 0.016 + DISTANCE, abs=0.6e-3)
+    assert early.torch == 0.0
+    assert early.tip == pytest.approx(0.02 - 0.03 - 0.016 + DISTANCE, abs=0.6e-3)
     bent_slightly = np.linspace(0.0, 0.5, 800)
     circle = 0.5 * np.column_stack(
         [np.sin(bent_slightly), 1 - np.cos(bent_slightly), 0 * bent_slightly]
     )
     earlier = again(0.005, circle, overlap="30 mm")
-    assert earlier.inset == pytest.approx(params().inset, abs=0.6e-3)
-    assert again(0.06, overlap="30 mm", offset_along="50 mm").offset_along == pytest.approx(0.05)
+    assert earlier.tip == pytest.approx(params().inset, abs=0.6e-3)
 
 
 def test_the_tip_is_set_down_where_it_still_presses_for_five_millimetres() -> None:
     asked = params()
     letting_go = asked.ending + asked.speed * asked.deflection / asked.release
     found = again(0.29)
-    assert found.inset == pytest.approx(0.3 - letting_go - 5e-3)
+    assert found.tip == pytest.approx(0.3 - letting_go - 5e-3)
     short = letting_go + 5e-3 + asked.inset
-    assert again(0.05, straight(short + 1e-4)).inset >= asked.inset
+    assert again(0.05, straight(short + 1e-4)).tip >= asked.inset
     with pytest.raises(StageError, match="the rest of the seam is too short for the tip to press"):
         again(0.05, straight(short - 1e-4))
 
@@ -94,18 +93,17 @@ def test_on_a_curve_the_tool_stands_along_the_chord_from_torch_to_tip(side: floa
     circle = radius * np.column_stack([np.sin(turn), side * (1 - np.cos(turn)), 0 * turn])
     found = again(0.13, circle)
     half = math.asin(DISTANCE / (2 * radius))
-    assert found.start_angle == pytest.approx(-side * half, abs=0.02)
+    assert found.angle == pytest.approx(-side * half, abs=0.02)
     arc = 2 * radius * half
-    assert found.inset == pytest.approx(0.13 - 0.03 - 0.016 + arc, abs=1.1e-3)
+    assert found.tip == pytest.approx(0.13 - 0.03 - 0.016 + arc, abs=1.1e-3)
 
 
 def test_a_later_pass_comes_down_right_where_it_is_lit() -> None:
-    passes = [{"along": "10 mm"}, {"along": "50 mm"}]
+    passes = list[Any](({}, {}))
     found = again(0.1, number=1, passes=passes)
-    assert found.offset_along == pytest.approx(0.07)
-    assert found.inset == pytest.approx(0.07 + DISTANCE, abs=0.6e-3)
-    assert again(0.03, number=1, passes=passes).offset_along == pytest.approx(0.01)
-    assert again(0.03, number=2, passes=passes).offset_along == pytest.approx(0.05)
+    assert found.torch == pytest.approx(0.07)
+    assert found.tip == pytest.approx(0.07 + DISTANCE, abs=0.6e-3)
+    assert again(0.02, number=2, passes=passes).torch == 0.0
 
 
 def test_a_plan_is_the_same_within_a_thousandth_of_a_millimetre() -> None:
@@ -272,7 +270,7 @@ def test_a_bend_nearer_to_an_end_than_a_chord_is_none() -> None:
 
 
 def round_of(points: Any, radius: float) -> Seam:
-    given = CONSTRUCT(leg=None, corners="round", corner_radius=radius, side="left", joint="groove")
+    given = CONSTRUCT(leg=None, corner_radius=radius, side="left", joint="groove")
     return leg_of(seam_of(points), given)
 
 
@@ -308,7 +306,7 @@ def test_room_is_round_the_outside_of_an_upright_plate_alone(
     turn: float, side: str, joint: str, half_angle: float | None, room: bool
 ) -> None:
     for leg in (1, 2):
-        given = CONSTRUCT(leg=leg, corners="stop", corner_radius=5e-3, side=side, joint=joint)
+        given = CONSTRUCT(leg=leg, corner_radius=None, side=side, joint=joint)
         seam = seam_of(bent(turn), half_angle=half_angle)
         if room:
             ends = leg_of(seam, given).points_in_base[[0, -1]]

@@ -12,7 +12,7 @@ from flangeye.plugin.registry import Lookup, load_registry
 from flangeye.plugin.stage import BoundPart, part
 from flangeye.types import Seam
 from flangeye_emulators.weld_world.groove import Gap
-from flangeye_emulators.weld_world.truth import RENDERED, ClockTruth, WeldTruth, WorkpieceTruth
+from flangeye_emulators.weld_world.truth import ClockTruth, WeldTruth, WorkpieceTruth
 from flangeye_plugins.weld.settings import WeldTactileParams
 from tests.plugins.weld.cell import planned, planning_error, run, true_line
 
@@ -58,7 +58,7 @@ def test_both_workpieces_with_the_planning_error_of_the_issue(name: str) -> None
 @pytest.mark.slow
 def test_a_gap_is_bridged_with_real_images() -> None:
     missing = WorkpieceTruth(gaps=(Gap(80e-3, 100e-3, 1),))
-    gap = {"world": WeldTruth(workpiece=missing, clock=RENDERED)}
+    gap = {"world": WeldTruth(workpiece=missing, clock=ClockTruth(rate=15.0))}
     report, _ = run(planning_error("v-curved", seed=0), "v-curved", sensor=gap)
     assert "bridging" in report.phases
     assert report.phases.index("bridging") < len(report.phases) - report.phases[::-1].index(
