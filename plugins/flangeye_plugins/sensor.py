@@ -23,7 +23,7 @@ from flangeye.models.finger import Finger
 from flangeye.plugin.stage import Params, part
 from flangeye.types import Image, Seed
 from flangeye.units import Duration, param
-from flangeye_plugins.weld.touch.region_of_interest import ImageRegion, shifted
+from flangeye_plugins.weld.touch.tag_observation import ImageRegion, shifted
 
 
 class OpenCVParams(Params):

@@ -28,7 +28,7 @@ from flangeye_emulators.weld_world.truth import (
     WeldTruth,
     WorkpieceTruth,
 )
-from flangeye_plugins.weld.body import leaning
+from flangeye_plugins.weld.frame import leaning
 from flangeye_plugins.weld.path import Path
 
 GRAIN = 1e-3

@@ -9,18 +9,12 @@ import numpy as np
 
 from flangeye.models.finger import Finger
 from flangeye.types import Floats
-from flangeye_plugins.weld.body import LeaningTool
+from flangeye_plugins.weld.frame import LeaningTool
 from flangeye_plugins.weld.joint import WeldJoint, joint_of
 from flangeye_plugins.weld.settings import Following
 
 BAND = 2.0
 """The torch's 95 % band, in standard deviations."""
-
-UNCALIBRATED = (1000.0, 2000.0)
-"""Stiffness across and along a finger whose file gives none [N/m]: a soft one."""
-
-FLAT = math.radians(60.0)
-"""A wall that leans by more does not hold the tip when the tool is moved against it."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +23,7 @@ class Belief:
 
     Attributes:
         distance: From the torch to the tip, seen from above [m].
-        lateral: Stiffness across the finger [N/m].
+        lateral: Stiffness across the finger [N/m]; of a soft one where its file gives none.
         axial: Stiffness along the finger [N/m].
         half_angle: Of the joint's walls from their bisector [rad]; None where it is not known.
         noise: Standard deviations of one measurement across and up [m].
@@ -39,7 +33,7 @@ class Belief:
         two_walls: Whether there is a wall on the other side too.
         lean: Of the walls' bisector from the plane's normal, to the left [rad].
         radius: Of the tip's ball [m].
-        level_R_tool: Rows of the tool's axes in level ones; see :mod:`flangeye_plugins.weld.body`.
+        level_R_tool: Rows of the tool's axes in level ones; see :mod:`flangeye_plugins.weld.frame`.
         behind: How far behind the torch a second look sees the bead [m]; None where nothing does.
         arc: Gas before the arc; standing while it is struck; standing while the crater fills [s].
         ahead: By how much the tip is ahead of its file, as earlier welds found it [m].
@@ -51,8 +45,8 @@ class Belief:
     """
 
     distance: float
-    lateral: float = UNCALIBRATED[0]
-    axial: float = UNCALIBRATED[1]
+    lateral: float = 1000.0
+    axial: float = 2000.0
     half_angle: float | None = None
     noise: tuple[float, float] = (10e-6, 60e-6)
     torch_sigma: float = 0.05e-3
@@ -180,17 +174,18 @@ def belief_of(
 ) -> Belief:
     """Return what a finger's file, the tool's stand and the plan say."""
     known = finger.calibration
-    lateral, axial = UNCALIBRATED
+    lateral, axial = Belief.lateral, Belief.axial
     if known is not None and known.lateral is not None and known.axial is not None:
         lateral, axial = known.lateral, known.axial
     noise = (10e-6, 60e-6) if known is None else (known.noise[1], known.noise[2])
     radius = finger.radius
     joint = joint_of(settings.joint, half_angle, settings.sign, radius, settings.root_gap)
+    # A wall that leans by more than 60 degrees does not hold a tip that is moved against it.
     other = None if joint is None else joint.right if settings.side == "left" else joint.left
     return Belief(
         body.distance, lateral, axial, None if joint is None else joint.half_angle, noise,
         finger.torch_sigma, finger.along_sigma, finger.tip_sigma,
-        bool(other is None or other < FLAT),
+        bool(other is None or other < math.radians(60.0)),
         0.0 if joint is None else joint.lean, radius,
         tuple(tuple(row) for row in body.level_R_tool.tolist()),
     )  # fmt: skip

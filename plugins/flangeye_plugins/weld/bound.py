@@ -20,7 +20,7 @@ from flangeye_plugins.weld.belief import Belief
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.probing import PIVOTED, SOFTER
 from flangeye_plugins.weld.settings import Following
-from flangeye_plugins.weld.weave import Weave
+from flangeye_plugins.weld.steering import Weave
 
 REMEDIES = {
     "fixed": ("torch_sigma, arm_sigma and distortion", "calibrate the tool, or 'look' behind it"),

@@ -34,9 +34,6 @@ from flangeye_plugins.weld.finger_camera import (
     torch_of,
 )
 
-OPENING = 30.0
-"""Longest time for a camera to open, the start of its process included [s]."""
-
 TORCH = "torch"
 """What the process is asked for where the torch was."""
 
@@ -133,8 +130,8 @@ class CameraProcess:
 
     def _check_opened(self) -> None:
         try:
-            if not self._wire.poll(OPENING):
-                raise DeviceError(f"the finger's camera does not open ({OPENING:.0f} s){busy()}")
+            if not self._wire.poll(30.0):
+                raise DeviceError(f"the finger's camera does not open (30 s){busy()}")
             answer = self._wire.recv()
         except (EOFError, OSError):
             raise DeviceError(

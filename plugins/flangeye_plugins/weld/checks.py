@@ -12,23 +12,12 @@ from flangeye.motion.limits import MotionLimits
 from flangeye.plugin.stage import BoundPart
 from flangeye.types import Floats, Seam
 from flangeye_plugins.weld.belief import Belief
-from flangeye_plugins.weld.body import LeaningTool
+from flangeye_plugins.weld.frame import LeaningTool
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.reachability import flange_speed
 from flangeye_plugins.weld.settings import Following, Mode
-from flangeye_plugins.weld.steering import Steering
+from flangeye_plugins.weld.steering import Steering, Weave
 from flangeye_plugins.weld.touch.tag_observation import TagDetector
-from flangeye_plugins.weld.weave import Weave
-
-LEAN = np.deg2rad(15.0)
-"""The groove's opening may lean from the plane's normal by this much; the tool stays upright."""
-
-SLOPE = np.deg2rad(10.0)
-"""Largest climb of a seam in its plane."""
-
-CROOKED = np.deg2rad(60.0)
-"""Largest angle between the tool and the seam at the torch: beyond, it would be pushed."""
-
 
 SEATING = 1.4
 """The preload holds the tip in the groove by so much more than the deflection pushes it out."""
@@ -160,18 +149,20 @@ def check_seam(seam: Seam, plan: Path, distance: float, settings: Following) -> 
         np.arccos(np.clip(seam.openings_in_base @ mean / np.linalg.norm(mean), -1, 1).min())
     )
     steep = float(np.arctan(np.abs(np.gradient(plan.points[:, 2], plan.step))).max())
-    if lean > LEAN or steep > SLOPE:
+    # The tool stays upright to the plane: beyond this its torch would leave the seam, or its tip
+    # no longer bear on both walls.
+    if lean > np.radians(15.0) or steep > np.radians(10.0):
         raise StageError(
             f"weld.tactile: the seam leaves its plane: it climbs by {np.degrees(steep):.0f} deg "
-            f"(allowed {np.degrees(SLOPE):.0f}), its opening turns by {np.degrees(lean):.0f} deg "
-            f"(allowed {np.degrees(LEAN):.0f}); the tool is not tilted on the way"
+            f"(allowed 10), its opening turns by {np.degrees(lean):.0f} deg "
+            f"(allowed 15); the tool is not tilted on the way"
         )
     crooked = float(np.abs(tool_angles(plan, distance)).max())
-    if crooked > CROOKED:
+    if crooked > np.radians(60.0):  # beyond, the torch would be pushed
         raise StageError(
             f"weld.tactile: the seam is too curved for a torch {distance * 1e3:.0f} mm behind "
             f"the tip: the tool would stand at {np.degrees(crooked):.0f} deg to it, allowed are "
-            f"{np.degrees(CROOKED):.0f}; end the plan before the bend, or take a tool whose torch "
+            "60; end the plan before the bend, or take a tool whose torch "
             "is nearer to its tip"
         )
     fault = float(tube_radii(seam)[0])

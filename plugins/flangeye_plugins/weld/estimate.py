@@ -8,14 +8,11 @@ from typing import NamedTuple
 import numpy as np
 
 from flangeye_plugins.weld.contact import Contact, Felt
-from flangeye_plugins.weld.pressing import Pressing
 from flangeye_plugins.weld.probing import SOFTER, SWEEP_MARGIN, Learned
 from flangeye_plugins.weld.refined import RefinedPath
 from flangeye_plugins.weld.sensing import STEADY, Located
 from flangeye_plugins.weld.task import WeldTask
-
-COMPARED = 15
-"""Measurements that tell whether the seam has moved since the weld was stopped."""
+from flangeye_plugins.weld.tip import Pressing
 
 
 class _Sample(NamedTuple):
@@ -135,12 +132,13 @@ class SeamEstimate:
     def moved(self, found: Located) -> str:
         """Return why the weld must stop: the seam is not where it was felt before; else nothing."""
         before = self._task.before
-        if before is None or len(self._moved) == COMPARED or found.s > before.samples[-1, 0]:
+        enough = 15  # measurements tell whether it has moved
+        if before is None or len(self._moved) == enough or found.s > before.samples[-1, 0]:
             return ""
         self._moved.append(found.seam.offset - self.refined.offset(found.s))
         by = abs(float(np.median(self._moved)))
         # A seam that has moved by more than 0.2 mm is another one.
-        if len(self._moved) < COMPARED or by <= 0.2e-3:
+        if len(self._moved) < enough or by <= 0.2e-3:
             return ""
         return (
             f"the seam has moved by {by * 1e3:.2f} mm since the weld was stopped; weld "

@@ -16,8 +16,12 @@ from flangeye.devices import (
 from flangeye.models.finger import Finger
 from flangeye.plugin.stage import BoundPart
 from flangeye.types import Floats, Seed
-from flangeye_plugins.weld.touch.region_of_interest import ImageRegion, RegionOfInterest
-from flangeye_plugins.weld.touch.tag_observation import TagDetector, TagReading
+from flangeye_plugins.weld.touch.tag_observation import (
+    ImageRegion,
+    RegionOfInterest,
+    TagDetector,
+    TagReading,
+)
 from flangeye_plugins.weld.touch.tip_displacement import Interpreter, TipDisplacement
 
 

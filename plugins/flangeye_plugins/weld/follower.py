@@ -14,14 +14,13 @@ from flangeye.motion.seam_following import STILL, Command, Phase, ToolPose, Touc
 from flangeye.types import Floats
 from flangeye_plugins.weld.contact import STRAINED, STRIDE
 from flangeye_plugins.weld.estimate import SeamEstimate
-from flangeye_plugins.weld.pressing import Pressing, within
 from flangeye_plugins.weld.probing import Learned
-from flangeye_plugins.weld.progress import Progress
 from flangeye_plugins.weld.response import Response
 from flangeye_plugins.weld.sensing import SeamReading, Sensing
 from flangeye_plugins.weld.settings import INSIDE
 from flangeye_plugins.weld.steering import SLOWEST, TorchLead
 from flangeye_plugins.weld.task import ResumePoint, WeldTask
+from flangeye_plugins.weld.tip import Pressing, Progress, within
 from flangeye_plugins.weld.welding import Welding
 
 LOST = 0.9

@@ -22,21 +22,14 @@ from flangeye.types import Floats
 from flangeye_plugins.weld.belief import BAND
 from flangeye_plugins.weld.follower import Follower
 from flangeye_plugins.weld.path import PATH_SPACING, Path, Place
-from flangeye_plugins.weld.pressing import within
 from flangeye_plugins.weld.response import Response
 from flangeye_plugins.weld.settings import PassParams
-from flangeye_plugins.weld.striking import Striking
+from flangeye_plugins.weld.steering import Striking, Sway, Weave
 from flangeye_plugins.weld.task import ResumePoint
-from flangeye_plugins.weld.weave import Sway, Weave
+from flangeye_plugins.weld.tip import within
 
 GAIN = 2.0
 """How fast a pass takes back an error of place or heading [1/s]."""
-
-OVER = 15e-3
-"""Between two passes the tool is lifted by this [m]."""
-
-THERE = 0.1e-3
-"""A place is reached when the tool is as near to it [m]."""
 
 
 class Traced:
@@ -176,7 +169,9 @@ class Passes:
         self._path, self._began = self._traced.path(self._pass), None
         self._striking = Striking(self._belief.arc)
         self._weave = Weave(self._pass.weave_width, self._settings.weave_frequency)
-        self._over, self._start = max(height, float(self._path.points[:, 2].max())) + OVER, 0.0
+        # Between two passes the tool is lifted by 15 mm.
+        self._over = max(height, float(self._path.points[:, 2].max())) + 15e-3
+        self._start = 0.0
         self.phase, self.torch, self.tip = "returning", 0.0, self._belief.distance
         self.wanted = self.sigma = self.bound = self.band = 0.0
         self.aim = self._pass.across
@@ -189,13 +184,14 @@ class Passes:
         # The torch is to be there, the tool along the path.
         aside = start.point + self._belief.distance * start.tangent - pose.position[:2]
         turn = _nearest(_heading(start) - pose.angle)
-        there = float(np.hypot(*aside)) < THERE and abs(turn) < math.radians(0.2)
+        # A place is reached when the tool is within 0.1 mm and 0.2 deg of it.
+        there = float(np.hypot(*aside)) < 0.1e-3 and abs(turn) < math.radians(0.2)
         goal = start.height if there else self._over
         up = goal - float(pose.position[2])
-        if there and abs(up) < THERE:
+        if there and abs(up) < 0.1e-3:
             self.phase = "passing"
             return self._weld(pose)
-        away = 0.0 if up > OVER / 3 else 1.0  # lifted first
+        away = 0.0 if up > 5e-3 else 1.0  # lifted first
         speed = self._settings.return_speed
         return Command(
             np.array([*(away * _towards(aside, speed)), within(GAIN * up, speed)]),

@@ -31,9 +31,6 @@ SOFTER = 3.0
 """The weld presses between two walls by so much less than the tip was seen to stand: friction of
 0.3 holds a tip on a wall of 45 degrees at 3.4 times what lets it slide down again."""
 
-REVERSALS = (0.02e-3, 0.05e-3, 0.1e-3, 0.15e-3, 0.2e-3, 0.25e-3, 0.3e-3, 0.4e-3, 0.6e-3, 1e-3)
-"""Half widths of play or hysteresis among which the finger's is sought [m]."""
-
 PIVOTS = 0.1
 """The tool is turned about the tip to either side by this [rad]."""
 
@@ -242,7 +239,8 @@ class Probing:
         """Return what explains the sweep, and whether the tip climbs."""
         noise = max(_scatter(felt[:, 1]), self._noise[0])
         late = np.arange(-0.06, 0.121, 0.01)  # timestamps, by up to 120 ms, or early by up to 60
-        stamps, widths = (grid.ravel() for grid in np.meshgrid(late, REVERSALS, indexing="ij"))
+        reversals = 1e-3 * np.array([0.02, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.6, 1.0])
+        stamps, widths = (grid.ravel() for grid in np.meshgrid(late, reversals, indexing="ij"))
         at, slant = (
             np.interp(felt[:, 0] - stamps[:, None], cycles[:, 0], cycles[:, i]) for i in (2, 3)
         )

@@ -24,9 +24,6 @@ SLOPE = 1.5e-3
 SIZES, LENGTHS = (1.0, 3.0, 10.0), (4e-3, 12e-3, 36e-3)
 """Of the fields: standard deviations as multiples of ``wander``, and correlation lengths [m]."""
 
-FORGETS = 0.99
-"""Weight of what was likely before the newest measurement: waves may begin."""
-
 PRIOR = np.array([5e-3, 5e-3, 0.05])
 """Standard deviations of the plan's error: shift along x and y [m], rotation [rad]."""
 
@@ -183,9 +180,10 @@ class RefinedPath:
 
     def _weigh(self, off: Floats, spread: Floats) -> None:
         """Weigh the fields by how likely each expected a sample; note by how much it exceeds."""
-        unlikely = off**2 / spread
-        self._excess = np.maximum(FORGETS * self._excess + (1 - FORGETS) * unlikely, 1e-3)
-        self._likely = FORGETS * self._likely - 0.5 * (unlikely + np.log(spread))
+        # What was likely before a measurement weighs a hundredth less: waves may begin.
+        unlikely, kept = off**2 / spread, 0.99
+        self._excess = np.maximum(kept * self._excess + (1 - kept) * unlikely, 1e-3)
+        self._likely = kept * self._likely - 0.5 * (unlikely + np.log(spread))
         self._likely -= np.logaddexp.reduce(self._likely)
 
     def _note(self, s: float, offset: float, angle: float, doubt: float) -> None:

@@ -12,11 +12,10 @@ import numpy as np
 
 from flangeye.motion.seam_following import Phase, ToolPose, Touch, turned
 from flangeye.types import Floats
-from flangeye_plugins.weld.pressing import Pressing
 from flangeye_plugins.weld.probing import Learned, Probing
-from flangeye_plugins.weld.progress import Progress
 from flangeye_plugins.weld.search import SweepSearch
 from flangeye_plugins.weld.task import WeldTask
+from flangeye_plugins.weld.tip import Pressing, Progress
 
 STEADY = 0.03e-3
 """A finger that scatters less is followed from one measurement to the next [m]."""

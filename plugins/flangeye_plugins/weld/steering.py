@@ -1,16 +1,109 @@
-"""How fast the tool must turn so that the torch behind it stays on the seam (README, eq. A)."""
+"""The torch: how fast the tool must turn to keep it on the seam, its weave, its gas and arc."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
+from flangeye.motion.arc import BURN, GAS, OFF
 from flangeye.motion.seam_following import ToolPose
 from flangeye.types import Floats
 from flangeye_plugins.weld.response import Response
 from flangeye_plugins.weld.task import WeldTask
-from flangeye_plugins.weld.weave import Sway, Weave
+
+
+class Sway(NamedTuple):
+    """A swing at one time, to the left of the seam.
+
+    Attributes:
+        aside: [m].
+        rate: [m/s].
+        rush: Its second derivative [m/s^2].
+    """
+
+    aside: float
+    rate: float
+    rush: float
+
+    def led(self, lag: float) -> Sway:
+        """Return the swing that an arm follows with a time constant [s], to be on this one."""
+        return Sway(self.aside + lag * self.rate, self.rate + lag * self.rush, self.rush)
+
+
+STRAIGHT = Sway(0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Weave:
+    """A sine across the seam.
+
+    Attributes:
+        width: From side to side [m].
+        frequency: [Hz].
+    """
+
+    width: float
+    frequency: float
+
+    def at(self, elapsed: float) -> Sway:
+        """Return the swing so long after it began [s]; none before it has."""
+        if elapsed < 0.0 or not self.width:
+            return STRAIGHT
+        turn = 2.0 * math.pi * self.frequency
+        sine, cosine = math.sin(turn * elapsed), math.cos(turn * elapsed)
+        half = self.width / 2.0
+        return Sway(half * sine, half * turn * cosine, -half * turn**2 * sine)
+
+    @property
+    def fastest(self) -> float:
+        """Largest speed across the seam [m/s]."""
+        return math.pi * self.frequency * self.width
+
+    @property
+    def variance(self) -> float:
+        """Of what it is early or late by, across the seam [m^2]."""
+        # The arm's delay is known to 10 ms: a swing is early or late by it.
+        return (self.fastest * 10e-3) ** 2 / 2.0
+
+
+Times = tuple[float, float, float]
+"""Gas before the arc; standing while it is struck; standing while the crater fills [s]."""
+
+
+class Striking:
+    """One arc: gas, burning, out."""
+
+    def __init__(self, times: Times) -> None:
+        """Begin with neither gas nor arc."""
+        self._before, self._struck_for, self._fills_for = times
+        self._gas = self._strikes = self._ended = math.inf
+
+    def gas(self, now: float) -> None:
+        """Let gas flow from a time on [s]."""
+        self._gas = min(self._gas, now)
+
+    def strike(self, now: float) -> None:
+        """Ask for the arc; it is struck once gas has flowed for its time."""
+        self.gas(now)
+        self._strikes = min(self._strikes, max(now, self._gas + self._before))
+
+    def filled(self, now: float) -> bool:
+        """Ask for the end of the arc; return whether its crater is filled."""
+        self._ended = min(self._ended, now)
+        return now >= self._ended + self._fills_for
+
+    def level(self, now: float) -> float:
+        """Return what the arc is to do now: OFF, GAS or BURN."""
+        return BURN if now >= self._strikes else GAS if now >= self._gas else OFF
+
+    def stands(self, now: float) -> bool:
+        """Return whether the torch has to stand still."""
+        asked, burns = self._strikes < math.inf, now >= self._strikes + self._struck_for
+        return (asked and not burns) or self._ended < math.inf
+
 
 SETTLING = 8e-3
 """Way in which an error of the torch is taken back at speed [m]."""

@@ -31,15 +31,13 @@ from flangeye.types import (
 from flangeye_plugins.weld import checks
 from flangeye_plugins.weld.approach import approach
 from flangeye_plugins.weld.belief import Belief, belief_of
-from flangeye_plugins.weld.body import LeaningTool, body_of
 from flangeye_plugins.weld.bound import check_bound
-from flangeye_plugins.weld.bounds import Bounds
 from flangeye_plugins.weld.camera_process import CameraProcess
 from flangeye_plugins.weld.corners import leg_of
-from flangeye_plugins.weld.execution import WeldCell, follow
+from flangeye_plugins.weld.execution import Bounds, WeldCell, follow
 from flangeye_plugins.weld.finger_camera import CameraJob, FingerCameraReader, SteppedReader
 from flangeye_plugins.weld.follower import Follower
-from flangeye_plugins.weld.frame import Tool, WorkPlane
+from flangeye_plugins.weld.frame import LeaningTool, Tool, WorkPlane, body_of
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.prior import keep_posterior, with_prior
 from flangeye_plugins.weld.reachability import SeamReach, Task

@@ -9,12 +9,10 @@ from flangeye.motion.seam_following import ToolPose
 from flangeye_plugins.weld.belief import BAND
 from flangeye_plugins.weld.bias import Bias, Trail
 from flangeye_plugins.weld.estimate import SeamEstimate
-from flangeye_plugins.weld.pressing import Pressing
-from flangeye_plugins.weld.progress import Progress
 from flangeye_plugins.weld.sensing import Sensing
-from flangeye_plugins.weld.steering import TorchLead
-from flangeye_plugins.weld.striking import Striking
+from flangeye_plugins.weld.steering import Striking, TorchLead
 from flangeye_plugins.weld.task import WeldTask
+from flangeye_plugins.weld.tip import Pressing, Progress
 
 SHORT = 0.01
 """A weld is done where no larger share of the planned seam was left out."""

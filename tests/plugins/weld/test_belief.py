@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from flangeye_plugins.weld.belief import Belief
-from flangeye_plugins.weld.body import leaning
+from flangeye_plugins.weld.frame import leaning
 from flangeye_plugins.weld.settings import Following
 
 RIGHT_ANGLE = math.pi / 4

@@ -15,7 +15,6 @@ from flangeye.models.finger import Finger
 from flangeye.plugin.stage import BoundPart
 from flangeye.types import Seam
 from flangeye_plugins.weld.belief import Belief
-from flangeye_plugins.weld.bounds import Bounds
 from flangeye_plugins.weld.checks import (
     check_body,
     check_controller,
@@ -27,6 +26,7 @@ from flangeye_plugins.weld.checks import (
     check_weave,
     tool_angles,
 )
+from flangeye_plugins.weld.execution import Bounds
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.reachability import _nearest, flange_speed
 from flangeye_plugins.weld.report import _at, _figures, _loop, _stated

@@ -18,8 +18,8 @@ from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.probing import Learned
 from flangeye_plugins.weld.sensing import Located, SeamReading
 from flangeye_plugins.weld.settings import Following
+from flangeye_plugins.weld.steering import Sway
 from flangeye_plugins.weld.task import ResumePoint, Start, WeldTask
-from flangeye_plugins.weld.weave import Sway
 from tests.plugins.weld.bench import straight
 
 DISTANCE, LENGTH, RADIUS = 40e-3, 0.12, 0.05

@@ -9,8 +9,7 @@ from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.models.finger import Finger
 from flangeye.motion.seam_following import STILL
 from flangeye.types import BASE, FLANGE, Transform
-from flangeye_plugins.weld.body import body_from
-from flangeye_plugins.weld.frame import Tool, WorkPlane
+from flangeye_plugins.weld.frame import Tool, WorkPlane, body_from
 from tools.weld_bench import FINGER
 
 TURN = rotation_exp(np.array([0.2, -0.1, 0.5]))

@@ -8,7 +8,7 @@ import pytest
 from flangeye.devices import DeviceError, SensorFrame
 from flangeye.types import Image, Seed
 from flangeye_plugins.weld.finger_camera import CameraJob, FingerReader, SteppedReader
-from flangeye_plugins.weld.touch.region_of_interest import (
+from flangeye_plugins.weld.touch.tag_observation import (
     TAG_MARGIN,
     ImageRegion,
     RegionOfInterest,

@@ -10,8 +10,8 @@ from flangeye.maths.geometry import rotation_from_rpy
 from flangeye.models.finger import Finger
 from flangeye_emulators.weld_world.groove import Groove, GrooveSection, Tip, TipContact
 from flangeye_plugins.weld.belief import belief_of
-from flangeye_plugins.weld.body import body_from, body_of, leaning
 from flangeye_plugins.weld.checks import check_body, check_seat
+from flangeye_plugins.weld.frame import body_from, body_of, leaning
 from flangeye_plugins.weld.joint import WeldJoint, edges_half_angle, joint_of
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following

@@ -12,9 +12,8 @@ import pytest
 from flangeye.motion.seam_following import turned
 from flangeye.types import Floats, Seam
 from flangeye_plugins.weld.belief import Belief
-from flangeye_plugins.weld.body import body_from
 from flangeye_plugins.weld.follower import Follower
-from flangeye_plugins.weld.frame import WorkPlane
+from flangeye_plugins.weld.frame import WorkPlane, body_from
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.probing import Learned
 from flangeye_plugins.weld.report import SAMPLES, _advice, learned_figures, report_of

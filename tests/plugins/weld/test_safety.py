@@ -14,7 +14,7 @@ from flangeye.models.model import read_model
 from flangeye.motion.executor import Executor
 from flangeye.motion.seam_following import ToolPose
 from flangeye_emulators.robot import SimulatedRobot, SimulatedRobotParams
-from flangeye_plugins.weld.bounds import Bounds
+from flangeye_plugins.weld.execution import Bounds
 from flangeye_plugins.weld.finger_camera import LatestState
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following

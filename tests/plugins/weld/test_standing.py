@@ -16,9 +16,9 @@ from flangeye.plugin.stage import BoundPart
 from flangeye.types import Image, Seam
 from flangeye_emulators.finger.sensor import SimulatedFingerParams, sensor_simulated_finger
 from flangeye_plugins.weld.belief import Belief
-from flangeye_plugins.weld.body import body_of
 from flangeye_plugins.weld.corners import corners_of, leg_of
 from flangeye_plugins.weld.follower import Follower
+from flangeye_plugins.weld.frame import body_of
 from flangeye_plugins.weld.joint import JointKind, WeldJoint, edges_half_angle, joint_of
 from flangeye_plugins.weld.passes import Passes
 from flangeye_plugins.weld.path import Path
@@ -32,7 +32,7 @@ from flangeye_plugins.weld.resuming import (
 from flangeye_plugins.weld.sensing import Track
 from flangeye_plugins.weld.settings import Following, WeldTactileParams
 from flangeye_plugins.weld.task import ResumePoint, Start
-from flangeye_plugins.weld.touch.region_of_interest import RegionOfInterest, cut, shifted
+from flangeye_plugins.weld.touch.tag_observation import RegionOfInterest, cut, shifted
 from tests.plugins.weld.bench import straight
 
 SENSOR = BoundPart(sensor_simulated_finger, SimulatedFingerParams())

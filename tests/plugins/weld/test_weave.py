@@ -11,7 +11,7 @@ from flangeye_plugins.weld.checks import check_weave
 from flangeye_plugins.weld.passes import Passes
 from flangeye_plugins.weld.resuming import controller_from, follower_of
 from flangeye_plugins.weld.settings import Following
-from flangeye_plugins.weld.weave import STRAIGHT, Weave
+from flangeye_plugins.weld.steering import STRAIGHT, Weave
 from tools.weld_bench import curved, misplanned, try_condition
 from tools.weld_conditions import CONDITIONS, Condition
 

@@ -18,12 +18,6 @@ from flangeye.types import Floats
 from flangeye.units import SI
 from flangeye_plugins.weld.touch.tag_observation import TagReading
 
-FEWEST_READINGS = 10
-"""Readings at rest, and again with the tip held, without which nothing is estimated."""
-
-CLEAR = 0.2e-3
-"""Largest rms of the tip's displacement that the gain leaves unexplained [m]."""
-
 
 @dataclass(frozen=True, eq=False)
 class Held:
@@ -51,10 +45,10 @@ def calibrate(rest: Sequence[TagReading], held: Sequence[Held], source: str) -> 
     Raises:
         StageError: Too few readings, an axis that was not moved along, or a tip that slid.
     """
-    if min(len(rest), len(held)) < FEWEST_READINGS:
+    if min(len(rest), len(held)) < 10:
         raise StageError(
             f"calibration: the tag was seen {len(rest)} times at rest and {len(held)} times held; "
-            f"at least {FEWEST_READINGS} each are needed"
+            f"at least 10 each are needed"
         )
     place = np.mean([r.translation for r in rest], axis=0)
     tag = np.array([h.reading.translation for h in held]) - place
@@ -62,10 +56,10 @@ def calibrate(rest: Sequence[TagReading], held: Sequence[Held], source: str) -> 
     gain = _gain(tag, tip)
     left = tip - tag @ gain.T
     unexplained = float(np.sqrt(np.mean(np.sum(left**2, axis=1))))
-    if unexplained > CLEAR:
+    if unexplained > 0.2e-3:
         raise StageError(
             f"calibration: the tag's motion leaves {unexplained * 1e3:.2f} mm of the tip's "
-            f"unexplained, at most {CLEAR * 1e3:.2f} mm are allowed; did the tip slide in its mark?"
+            f"unexplained, at most 0.20 mm are allowed; did the tip slide in its mark?"
         )
     noise = np.std([gain @ (r.translation - place) for r in rest], axis=0)
     lateral, axial = _stiffness(held)

@@ -15,16 +15,8 @@ import numpy as np
 from flangeye.errors import StageError
 from flangeye.types import Floats
 
-FEWEST_PIVOTED = 5
-"""Poses of a pivot."""
-
 TILTED = np.radians(12.0)
 """So far the tool must have been turned, as a root of the mean of squares, about two axes."""
-
-SLIPPED = 1.0e-3
-"""A pose that is off by more was not at the mark [m]."""
-
-AXES = "xyz"
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,10 +48,9 @@ def pivot(what: str, poses: Sequence[Floats], displaced: Sequence[Floats] | None
     Raises:
         StageError: Too few poses, a motion that is missing, or a point that did not stay.
     """
-    if len(poses) < FEWEST_PIVOTED:
-        raise StageError(
-            f"pivot of the {what}: {len(poses)} poses, at least {FEWEST_PIVOTED} are needed"
-        )
+    # Six unknowns, three equations a pose; as many again tell what does not fit.
+    if len(poses) < 5:
+        raise StageError(f"pivot of the {what}: {len(poses)} poses, at least 5 are needed")
     given = np.array(poses)
     rotations, places = given[:, :3, :3], given[:, :3, 3]
     if displaced is not None:
@@ -88,8 +79,8 @@ def _require_turned(what: str, rows: Floats) -> None:
     turned = np.sqrt(np.maximum(values, 0.0))
     if turned[0] >= TILTED:
         return
-    axis = AXES[int(np.abs(vectors[:, 0]).argmax())]
-    across = " and ".join(each for each in AXES if each != axis)
+    axis = "xyz"[int(np.abs(vectors[:, 0]).argmax())]
+    across = " and ".join(each for each in "xyz" if each != axis)
     if turned[-1] < TILTED:
         raise StageError(
             f"pivot of the {what}: the tool was hardly turned; tilt it about the flange's x and y, "
@@ -105,9 +96,9 @@ def _require_turned(what: str, rows: Floats) -> None:
 def _require_stayed(what: str, left: Floats) -> None:
     off = np.linalg.norm(left, axis=1)
     worst = int(off.argmax())
-    if off[worst] > SLIPPED:
+    if off[worst] > 1e-3:
         raise StageError(
             f"pivot of the {what}: in pose {worst + 1} it was {off[worst] * 1e3:.2f} mm away "
-            f"from where it was in the others, allowed are {SLIPPED * 1e3:.3g} mm; did it leave "
+            f"from where it was in the others, allowed is 1 mm; did it leave "
             "its mark?"
         )
