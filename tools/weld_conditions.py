@@ -149,8 +149,8 @@ CONDITIONS: Mapping[str, Condition] = {
     ),
     "weave 3 mm at 3 Hz": Condition(WeldTruth(), {"weave_width": "3 mm", "weave_frequency": 3.0}),
     "three passes, 2 mm to the left, 2 mm to the right, weave 3 mm": Condition(WeldTruth(), {
-        "passes": [{"across": "2 mm"}, {"across": "-2 mm", "along": "10 mm"},
-                   {"up": "5 mm", "weave_width": "3 mm", "weave_frequency": 0.8}],
+        "weave_frequency": 0.8,
+        "passes": [{"across": "2 mm"}, {"across": "-2 mm"}, {"up": "5 mm", "weave_width": "3 mm"}],
     }),
     "two passes, arm lag 200 ms + dead time 100 ms": Condition(
         WeldTruth(arm=ArmTruth(lag=200e-3, dead_time=100e-3)), {"passes": [{"across": "2 mm"}]}

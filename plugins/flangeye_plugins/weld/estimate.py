@@ -107,7 +107,8 @@ class SeamEstimate:
         """
         s, seam = found.s, found.seam
         aside = seam.offset - self.refined.offset(s)
-        spread = self.refined.variance(s) + learned.variance + STEADY**2
+        # What play does is in the path already, which the touches before this one have told.
+        spread = self.refined.variance(s) + (learned.noise / (1.0 + learned.gain)) ** 2 + STEADY**2
         expected = time, s, seam.offset, found.angle, aside, spread, seam.height
         self.contact.take(Felt(*expected, found.deflection, found.compression), side)
 

@@ -100,13 +100,10 @@ class Learned:
         """Variance of one measurement of the tip [m^2]."""
         return (self.noise / (1.0 + self.gain)) ** 2 + self.systematic
 
-    def least(self, dragged: float) -> float:
-        """Return the deflection by which a held tip differs from a free one, for certain [m].
-
-        Args:
-            dragged: Deflection that friction alone can give a free one [m].
-        """
-        return 3.0 * abs(self.width) + 2.0 * self.noise + dragged
+    @property
+    def least(self) -> float:
+        """Deflection by which a held tip differs from a free one, for all play and noise [m]."""
+        return 3.0 * abs(self.width) + 2.0 * self.noise
 
 
 class Probing:
@@ -220,8 +217,7 @@ class Probing:
             return "the tag was seen too seldom while the finger was probed"
         felt, cycles = np.array(self._felt), np.array(self._cycles)
         found, climbs = self._fit(felt, cycles)
-        least = found.least(self._belief.sliding(self._settings) / SOFTER)
-        if not climbs and least < self._reach:
+        if not climbs and found.least < self._reach:
             return found
         half = self._reach / 2.0
         if not climbs:
@@ -230,7 +226,7 @@ class Probing:
                 f"{found.noise * 1e3:.2f} mm of noise: pressed by {self._reach * 1e3:.2f} mm a "
                 "tip that is held cannot be told from one that is not; fasten it, or its tag"
             )
-        if not self._two_walls or half < max(least, self._settings.probe):
+        if not self._two_walls or half < max(found.least, self._settings.probe):
             return f"{climbs}; lower 'deflection' or raise 'preload', or calibrate the finger"
         self._sweep(half)
         return None

@@ -123,7 +123,7 @@ class Sensing:
     def _corrected(self, displacement: Floats, phase: Phase) -> Floats:
         """Return a displacement (3,) without what the finger's rest, gain and play add to it."""
         moved = displacement - self.search.rest
-        kept = self.learned.kept * self._pressing.played(phase, self.learned.width)
+        kept = self.learned.kept * self._pressing.played(phase, self.learned.reversal)
         play = np.array([0.0, self._pressing.side * self.learned.width * kept, 0.0])
         across = 1.0 + self.learned.gain
         # The sweep measures the gain across. That upwards is its like; where it is not, the

@@ -73,9 +73,8 @@ class Pressing:
     def learn(self, found: Learned, swept: float) -> None:
         """Press by what the sweep has found that the tip stands, ``swept`` at most [m]."""
         if self._task.belief.two_walls:
-            settings = self._task.settings
-            least = found.least(self._task.belief.sliding(settings) / SOFTER)
-            self.most = min(max(swept / SOFTER, least), settings.deflection)
+            softly = max(swept / SOFTER, found.least)
+            self.most = min(softly, self._task.settings.deflection)
 
     def ramp(self, phase: Phase, target: float, elapsed: float) -> None:
         """Move the wanted deflection towards a target [m], as far as it may in a time [s]."""
@@ -92,16 +91,16 @@ class Pressing:
         probe = self.most if self._task.belief.two_walls else self._task.settings.probe
         return probe + min(BAND * math.sqrt(variance), probe)
 
-    def played(self, phase: Phase, width: float) -> float:
+    def played(self, phase: Phase, reversal: float) -> float:
         """Return on which side of its play the finger is: 1 pressed, -1 let go of, and between.
 
         Args:
             phase: What the follower is doing; at the end the tip is let go of.
-            width: Half width of the play [m].
+            reversal: Half the way over which a reversal goes through the play [m].
         """
-        if phase != "ending" or not width:
+        if phase != "ending":
             return 1.0
-        return 1.0 - min((self.most - self.wanted) / abs(width), 2.0)
+        return 1.0 - min((self.most - self.wanted) / reversal, 2.0)
 
     @property
     def ends(self) -> float:

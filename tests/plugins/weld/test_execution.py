@@ -90,7 +90,11 @@ class Desk:
             time_ns=self.cycles * 10**9, displacement=np.full(3, float(self.cycles))
         )
         felt = feeling if self.cycles % 2 else None
-        return [SimpleNamespace(feeling=felt, time_ns=7, piece=SimpleNamespace(corner=(0, 0)))]
+        return [
+            SimpleNamespace(
+                feeling=felt, time_ns=7, piece=SimpleNamespace(corner=(0, 0), image=None)
+            )
+        ]
 
     def pose(self, flange: Any, seconds: float) -> ToolPose:
         assert flange == "here"

@@ -455,17 +455,12 @@ def test_a_displacement_is_freed_of_rest_play_and_gain(side: str) -> None:
 
 
 def test_a_finger_that_is_let_go_of_goes_through_its_play_to_the_other_side() -> None:
-    found, most = make("ending"), PRESS
-    found.sensing.learned = Learned(width=-0.1e-3)
+    """Over the way of a reversal to both sides, as in the sweep that found it."""
+    found, way = make("ending"), 0.1e-3
     for less, where in ((0.0, 1.0), (0.05e-3, 0.5), (0.1e-3, 0.0), (0.2e-3, -1.0), (1e-3, -1.0)):
-        found.pressing.wanted = most - less
-        assert found.pressing.played(found.phase, found.sensing.learned.width) == pytest.approx(
-            where
-        )
-    found.phase = "following"
-    assert found.pressing.played(found.phase, found.sensing.learned.width) == 1.0
-    found.phase, found.sensing.learned = "ending", Learned()
-    assert found.pressing.played(found.phase, found.sensing.learned.width) == 1.0
+        found.pressing.wanted = PRESS - less
+        assert found.pressing.played("ending", way) == pytest.approx(where)
+        assert found.pressing.played("following", way) == 1.0
 
 
 @pytest.mark.parametrize(

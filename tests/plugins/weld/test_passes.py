@@ -195,9 +195,10 @@ def test_the_torch_goes_along_its_pass_and_the_passes_after_it_follow(points: An
         torches = [
             row[0].position[:2] - DISTANCE * row[0].direction for row in rows if row[2] == "passing"
         ]
+        along = 0.0
         for torch in torches[:: len(torches) // 10]:
-            foot = path.at(path.foot(torch, found.torch if found.number == number else 0.05))
-            assert np.linalg.norm(torch - foot.point) < 0.15e-3
+            along = path.foot(torch, along)
+            assert np.linalg.norm(torch - path.at(along).point) < 0.15e-3
         speed = np.linalg.norm(np.diff(np.array(torches), axis=0), axis=1) / 8e-3
         assert np.median(speed) == pytest.approx(5e-3, rel=0.01)
         assert found.number == min(number + 1, 2)

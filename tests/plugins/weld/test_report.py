@@ -124,8 +124,8 @@ def test_the_true_torch_is_stated_at_the_report_s_times() -> None:
 def test_the_refined_seam_is_every_millimetre_as_it_was_felt() -> None:
     controller = follower()
     for s in np.arange(0.005, 0.09, 2e-4).tolist():
-        controller.refined.add(s, 1e-3, 0.0)
-    controller.refined.renew(-0.05, 100_000)
+        controller.seam.refined.add(s, 1e-3, 0.0)
+    controller.seam.refined.renew(-0.05, 100_000)
     found = reported(logged(5), controller).refined
     x = np.arange(100) * 1e-3 - LENGTH / 2
     assert found == pytest.approx(
@@ -140,7 +140,7 @@ def test_what_the_sweep_found_is_among_the_figures() -> None:
         "finger_gain_error": 0.1, "finger_play": 0.06e-3, "timestamps_late": 0.04,
         "arm_dead_time": 0.05, "arm_lag": 0.06, "lit_from": -1.0, "share_welded": 0.0,
     }  # fmt: skip
-    controller.lit = 0.02
+    controller.welding.lit = 0.02
     assert learned_figures(controller)["lit_from"] == 0.02
     other: Any = SimpleNamespace()
     assert learned_figures(other) == {}
@@ -163,10 +163,10 @@ def test_a_look_behind_is_recommended_where_the_files_are_most_of_what_is_unknow
     torch_sigma: float, told: bool
 ) -> None:
     controller = follower()
-    controller.bias.prior = torch_sigma**2
-    controller.sigma = 0.35e-3
+    controller.welding.bias.prior = torch_sigma**2
+    controller.welding.sigma = 0.35e-3
     assert _advice(controller) == ()  # nothing was welded
-    controller.lit = 0.0
+    controller.welding.lit = 0.0
     advice = _advice(controller)
     assert bool(advice) == told
     if told:

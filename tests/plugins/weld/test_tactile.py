@@ -84,15 +84,15 @@ def test_a_deflection_the_finger_does_not_stand() -> None:
 
 
 def test_a_force_beyond_the_limit() -> None:
-    assert refused(force="2 N") == (
-        "weld.tactile: deflection and preload press with 3.6 N, allowed are 2 N; lower them, or "
-        "raise 'force'"
+    assert refused(deflection="4 mm", preload="5 mm") == (
+        "weld.tactile: deflection and preload press with 11 N, allowed are 10 N; lower them, or "
+        "raise 'largest_force' in its file"
     )
 
 
 def test_speeds_beyond_the_limits() -> None:
     assert refused(limits={"speed": "6 mm/s"}) == (
-        "weld.tactile: speed, lateral_speed and turn_rate together move the flange at 8.66 mm/s, "
+        "weld.tactile: speed and turn_rate together move the flange at 8.66 mm/s, "
         "robot.limits.speed allows 6 mm/s"
     )
 
