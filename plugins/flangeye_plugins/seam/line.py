@@ -103,7 +103,9 @@ def _lines(path: Path, unit: LengthUnit, angle: float) -> list[Floats]:
     if suffix == ".dxf":
         pieces, said = read_dxf(path)
         if said not in (None, unit):
-            raise StageError(f"{path}: states the unit {said} ($INSUNITS), the recipe says unit: {unit}")
+            raise StageError(
+                f"{path}: states the unit {said} ($INSUNITS), the recipe says unit: {unit}"
+            )
         return chained(pieces / PER_METRE[unit], MEET)
     if suffix in MESHES:
         # STEP comes in metres, whatever the drawing was in
