@@ -28,14 +28,9 @@ from flangeye.maths.frame_graph import chain, composed
 from flangeye.maths.geometry import hat, invert
 from flangeye.types import ExpectedError, Floats, Mask
 
-NOISE = "scans and poses, one by one"
-"""The share of what is drawn anew at each sighting."""
-DRAWS = 8
-"""Of an error at each pose and each draw of the sizes, for its quantiles."""
-LEVER = 0.02
-"""Turns count like what they do so far from the flange [m]: enough to tell the turn about a line
-where the work is in one, and no more, for the work is a matter of positions."""
-WEIGHT = np.repeat([LEVER, 1.0], 3)[:, None]
+# Turns count like what they do so far from the flange [m]: enough to tell the turn about a line
+# where the work is in one, and no more, for the work is a matter of positions.
+WEIGHT = np.repeat([0.02, 1.0], 3)[:, None]
 """Of each number of a twist in the rigid part."""
 
 
@@ -68,7 +63,8 @@ def functional(found: Estimate, a: Floats) -> Answer:
     apart = each - each.mean(axis=0)
     covariance = within.mean(axis=0) + apart.T @ apart / max(len(a) - 1, 1)
     of_effects, noise = shares(found.posterior, rows.mean(axis=0))
-    named = {NOISE: noise}
+    # What is drawn anew at each sighting
+    named = {"scans and poses, one by one": noise}
     for effect, share in zip(found.effects, of_effects, strict=True):
         named[effect.name] = named.get(effect.name, 0.0) + share
     return Answer(each.mean(axis=0), 0.5 * (covariance + covariance.T), named)
@@ -259,7 +255,8 @@ def expected_error(
         noise = model.noise(each.sizes)[:, 3:, 3:]
         covariance = spread_of(rows, each.covariance) + noise
         root = np.linalg.cholesky(covariance + 1e-18 * np.eye(3))
-        drawn = bias + (root @ rng.standard_normal((DRAWS, len(bias), 3, 1)))[..., 0]
+        # Eight of an error at each pose and each draw of the sizes, for its quantiles
+        drawn = bias + (root @ rng.standard_normal((8, len(bias), 3, 1)))[..., 0]
         exact = float(((bias**2).sum(axis=1) + np.trace(covariance, axis1=1, axis2=2)).mean())
         square = (drawn**2).sum(axis=2).ravel()
         squares.append(square * exact / square.mean())

@@ -17,12 +17,9 @@ from flangeye.estimation.session import Session
 from flangeye.estimation.sightings import branches_of
 from flangeye.types import FLANGE, Floats, Indices, Mask, Observation
 
-KINDS = ("zeros", "lengths", "twists")
-KNOWN, LOOSE = 0.5, 100.0
+KNOWN = 0.5
 """A parameter is identified singly when the poses leave this share of its size, or less, although
-each other one may be off by so many times its own: by the poses then, not by what is expected."""
-ALIKE = 0.01
-"""Ways to the poses that are as probable as this, or more, count as alike."""
+each other one is loose."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,9 +76,9 @@ def parameters_of(session: Session) -> ArmParameters:
     # Of the endless ways of an arm of more joints, those looked at are a few
     endless = len(ways) > 1 and len(best.values) > 6
     spread = np.full_like(apart, np.inf) if endless else np.sqrt(best.deviations**2 + apart)
-    return replace(
-        best, deviations=spread, ways=np.inf if endless else int((chances > ALIKE).sum())
-    )
+    # Ways to the poses that are a hundredth as probable, or more, count as alike.
+    count = np.inf if endless else int((chances > 0.01).sum())
+    return replace(best, deviations=spread, ways=count)
 
 
 def _ways(session: Session, carrier: Carrier) -> list[Estimate]:
@@ -113,15 +110,18 @@ def _of_one_way(found: Estimate, arm: str) -> ArmParameters:
 def _loosely(found: Estimate, of_size: Indices) -> Floats:
     """Return (P + K, P + K) what is known where the arm's parameters may be off by far more."""
     sizes = found.posterior.mode.sizes.copy()
-    sizes[np.unique(of_size)] *= LOOSE
+    # Each other parameter may be off by a hundred times its own size: identified by the poses,
+    # not by what is expected
+    sizes[np.unique(of_size)] *= 100.0
     return fit(found.posterior.model, sizes, with_gradient=False).covariance
 
 
 def _columns(found: Estimate, arm: str) -> tuple[Indices, Indices]:
     """Return (n, 4) at which column of the unknowns each parameter is, and which size it has."""
     first = found.posterior.model.p + np.cumsum([0, *found.counts])
-    at = {e.kind: k for k, e in enumerate(found.effects) if e.cause == arm and e.kind in KINDS}
-    zeros, lengths, twists = (at[kind] for kind in KINDS)
+    kinds = ("zeros", "lengths", "twists")
+    at = {e.kind: k for k, e in enumerate(found.effects) if e.cause == arm and e.kind in kinds}
+    zeros, lengths, twists = (at[kind] for kind in kinds)
     joint = np.arange(found.counts[zeros])
     columns = np.column_stack([
         first[zeros] + joint,

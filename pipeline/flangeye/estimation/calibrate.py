@@ -50,11 +50,6 @@ from flangeye.types import (
     TransformEstimate,
 )
 
-LEFT_OUT = 1e-9
-"""Size of an effect that is left out [rad, m]."""
-BETTER = 0.9
-"""The answer for corrected arms is given where it expects this share of the error or less."""
-
 
 @dataclass(frozen=True)
 class Options:
@@ -117,7 +112,8 @@ def answered(session: Session, options: Options, method: str) -> HandEye:
     corrected = _corrected(session, righted, weak)
     if corrected is not None:
         then = expected_error(found, work, righted.mean, put_right(found))
-        corrected = replace(corrected, expected=then) if then.rms <= BETTER * expected.rms else None
+        # It is given where it expects nine tenths of the error or less
+        corrected = replace(corrected, expected=then) if then.rms <= 0.9 * expected.rms else None
 
     def without(poses: Indices) -> HandEye:
         rest = session.without(poses)
@@ -219,7 +215,8 @@ def _weak(session: Session, options: Options) -> Floats:
     own = slice(len(sizes) - len(model.scatter), len(sizes) - len(model.scatter) + 2)
     sizes[own] = np.maximum(sizes[own], LEAST)
     known = [k for k, effect in enumerate(found.effects) if effect.kind == COMMON]
-    sizes[known] = LEFT_OUT
+    # Size of an effect that is left out [rad, m]
+    sizes[known] = 1e-9
     agreeing = found.problem.where(found.inliers)
     return unobservable(
         agreeing,

@@ -33,14 +33,8 @@ from flangeye.estimation.lifted import Family, LiftedSightings, Squares, squares
 from flangeye.maths.geometry import nearest_rotation, rotation_exp
 from flangeye.types import Floats, Indices
 
-TRIES, TRIES_ELSEWHERE = 150, 50
-"""To find a certificate, most take twenty; and, where there is none, a better place."""
-GAP, ROUNDING = 1e-3, 1e-12
-"""Share of the cost that may be missing; and of the size of ``Q``, where the cost is none."""
-SHARES = np.geomspace(GAP, 1.0, 31)
-"""Of the cost that may be missing, as they are tried."""
-WAYS = 3
-"""Directions in which a better place is looked for."""
+GAP = 1e-3
+"""Share of the cost that may be missing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,11 +61,13 @@ def certify(sightings: LiftedSightings, places: Floats) -> Certificate:
     squares = squares_of(sightings, places)
     found = squares.descend(np.tile(np.eye(4), (len(places), 1, 1)))
     cost = squares.cost(found)
-    size = max(cost, ROUNDING / GAP * float(np.trace(squares.quadratic)))
+    # Rounding, as a share of the size of `Q`, where the cost is none
+    size = max(cost, 1e-12 / GAP * float(np.trace(squares.quadratic)))
     bare = squares.quadratic / size
     bare[0, 0] -= cost / size
     dual = _Dual.of(bare, squares.families)
-    sought = dual.sought(_across(squares.alike(found)), TRIES)
+    # Most certificates take twenty
+    sought = dual.sought(_across(squares.alike(found)), 150)
     share = dual.missing(sought)
     if share <= GAP:
         return Certificate(places @ found, cost, share * size, True)
@@ -91,7 +87,8 @@ def _across(features: Floats) -> Floats:
 def _elsewhere(squares: Squares, lack: Floats, count: int) -> Floats:
     """Return the best places to which what is lacking leads: a sum of squares of features."""
     tried = []
-    for way in np.linalg.eigh(lack)[1][:, -WAYS:].T:
+    # The three directions that lack most
+    for way in np.linalg.eigh(lack)[1][:, -3:].T:
         start = np.tile(np.eye(4), (count, 1, 1))
         features = way * np.copysign(1.0, way[0])
         for family in squares.families:
@@ -198,11 +195,16 @@ class _Dual(NamedTuple):
 
     def missing(self, multipliers: Floats) -> float:
         """Return the least share that they show to be all that is missing: no cost is negative."""
-        return next((float(each) for each in SHARES if self.shows(multipliers, each)), 1.0)
+        # Shares of the cost that may be missing, as they are tried
+        return next(
+            (float(each) for each in np.geomspace(GAP, 1.0, 31) if self.shows(multipliers, each)),
+            1.0,
+        )
 
     def lacks(self, multipliers: Floats) -> Floats:
         """Return what every matrix lacks of being semidefinite (n, n), as near as it comes."""
-        matrix = self.at(self.sought(np.eye(len(self.bare)), TRIES_ELSEWHERE, multipliers))
+        # Where there is no certificate, so many for a better place
+        matrix = self.at(self.sought(np.eye(len(self.bare)), 50, multipliers))
         return np.asarray(_nearest(matrix) - matrix)
 
 

@@ -21,9 +21,6 @@ from flangeye.maths.frame_graph import Frame, chain
 from flangeye.maths.geometry import invert, rotation_exp, rotation_log
 from flangeye.types import Floats, Indices
 
-NEAR, ROUNDING = 5.0, 1e-9
-"""Standard deviations by which what weights that stay as they are change may move an answer, and
-rounding [rad]."""
 OPTIMAL = "globally optimal: nowhere is there an answer that fits the agreeing poses better"
 NOT_CERTIFIED = "not certified as globally optimal"
 
@@ -176,7 +173,9 @@ def _far_away(shown: Certificate, root: str, answer: CertifiedAnswer) -> str | N
     turns = shown.places[:, :3, :3] @ invert(places)[:, :3, :3]
     away = np.linalg.norm(rotation_log(turns), axis=1)
     known = [np.linalg.eigvalsh(each[:3, :3])[-1] for each in answer.covariances.values()]
-    beyond = away > NEAR * np.sqrt(known) + ROUNDING
+    # Five standard deviations, and rounding [rad]: what weights that stay as they are may move
+    # it
+    beyond = away > 5.0 * np.sqrt(known) + 1e-9
     if not beyond.any():
         return None
     far = np.degrees(away[beyond].max())

@@ -28,23 +28,6 @@ from flangeye.estimation.mixed import (
 from flangeye.maths.statistics import chi2_quantile
 from flangeye.types import Floats, Indices, Mask
 
-SCALE = 2.0
-"""By how many times features may be better or worse than their fits state, one sigma: turns and
-shifts, of whole poses along the line of sight and across it apart, for there cameras differ
-most."""
-FURTHER = 0.05e-3, 0.02e-3
-"""Median noise of a sighting beyond its feature's: rotation [rad] and translation [m]: what a
-feature's fit does not state."""
-TIMES = 4.0
-"""By how many times that may be more or less, one sigma."""
-OUTLIER = 0.9999
-"""A good sighting is predicted by the others no worse than with this probability."""
-ROUNDS = 8
-"""Of linearising, sizes and outliers in turn, at most; two or three are usual."""
-SETTLED = 1e-5
-"""Places that move by less [rad, m] are linearised about for good: what is left is of second order,
-1e-10."""
-
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
@@ -108,9 +91,14 @@ def prior_of(
     effects: Sequence[Effect], counts: Sequence[int], scaled: int, scatters: Sequence[Scatter]
 ) -> Sizes:
     """Return the prior of the sizes of effects and noise; those of one cause share its quality."""
-    sized = [*((e.size, e.factor, e.cause) for e in effects), *[(1.0, SCALE, "")] * scaled]
+    # By how many times features may be better or worse than their fits state, one sigma: turns
+    # and shifts, of whole poses along the line of sight and across it apart, for there cameras
+    # differ most.
+    sized = [*((e.size, e.factor, e.cause) for e in effects), *[(1.0, 2.0, "")] * scaled]
     sized += [
-        *((size, TIMES, "") for size in FURTHER),
+        # Median noise of a sighting beyond what its feature's fit states, rotation [rad]
+        # and translation [m]; it may be four times more or less, one sigma
+        *((size, 4.0, "") for size in (0.05e-3, 0.02e-3)),
         *((s.size, s.factor, s.cause) for s in scatters),
     ]
     causes = sorted({cause for _, _, cause in sized if cause})
@@ -192,14 +180,16 @@ def estimate(problem: Problem, start: Places, effects: Sequence[Effect], agree: 
     places, inliers = start, agree
     z: Floats | None = None
     seen: set[bytes] = set()
-    for _ in range(ROUNDS):
+    # Linearising, sizes and outliers in turn: two or three rounds are usual
+    for _ in range(8):
         model = model_at(problem, places, effects, inliers.astype(float))
         z = mode_of(model, z)
         found = fit(model, model.sizes.at(z), with_gradient=False)
         places, step = _moved(problem, places, found)
         squares, good = judged(model, found)
         key = good.tobytes()
-        if step < SETTLED and (key == inliers.tobytes() or key in seen):
+        # Linearised about for good [rad, m]: what is left is of second order, 1e-10
+        if step < 1e-5 and (key == inliers.tobytes() or key in seen):
             break
         seen.add(key)
         inliers = good if good.sum() >= 3 else inliers
@@ -221,5 +211,6 @@ def judged(model: LinearModel, found: Fit) -> tuple[Floats, Mask]:
     covariance = q @ (noise + spread) @ q + (np.eye(6) - q)
     squares = np.einsum("na,nab,nb->n", left, np.linalg.inv(covariance), left)
     ranks = np.trace(q, axis1=1, axis2=2).round()
-    limits = np.array([chi2_quantile(OUTLIER, int(k)) if k else np.inf for k in range(7)])
+    # A good sighting is predicted by the others no worse than with this probability.
+    limits = np.array([chi2_quantile(0.9999, int(k)) if k else np.inf for k in range(7)])
     return squares / np.maximum(ranks, 1), squares < limits[ranks.astype(int)]

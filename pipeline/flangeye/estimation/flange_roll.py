@@ -14,9 +14,6 @@ from flangeye.maths.geometry import basis_of_plane
 from flangeye.maths.statistics import SIGMA_OF_MAD
 from flangeye.types import Floats, Observation
 
-FEWEST_ROLLS = 3
-"""Poses whose holes were seen, for their scatter to mean anything."""
-
 
 def roll_note(
     observations: Sequence[Observation], base_R_camera: Floats, covariance: Floats
@@ -29,7 +26,8 @@ def roll_note(
         covariance: (3, 3) of its rotation [rad^2].
     """
     turns = roll_of(observations, base_R_camera)
-    if len(turns) < FEWEST_ROLLS:
+    # Fewer have no scatter that means anything
+    if len(turns) < 3:
         return (
             "a constant turn of the plate about its own axis (flange roll) does not show, for the "
             f"holes were told apart in {len(turns)} of {len(observations)} poses: the camera's "

@@ -23,14 +23,8 @@ import numpy as np
 from flangeye.maths.geometry import hat, nearest_rotation, rigid, rotation_exp
 from flangeye.types import Floats, Indices, Mask
 
-STEPS, SETTLED = 50, 1e-12
-"""Of the descent to the bottom of a valley; a step as small [rad, m] is the last."""
 TOLD = 1e-7
 """How well a turn is known at least, of the best known one: a circle's about itself is not."""
-DRAWS, ALIKE = 20, 1e-6
-"""Places that may be alike, and the share by which their costs differ at most if they are."""
-STILL = np.append(np.append(np.eye(3), np.zeros(3)), 1.0)
-"""Entries of a place where nothing is unknown."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,20 +196,22 @@ class Squares:
         able = np.flatnonzero(np.abs(moves).max(axis=0))
         _, sizes, ways = np.linalg.svd(self.root @ moves[:, able])
         untold = ways[int((sizes > TOLD * sizes[0]).sum()) :]
-        steps = np.zeros((DRAWS if len(untold) else 0, len(places), 6))
+        # Places that may be alike
+        steps = np.zeros((20 if len(untold) else 0, len(places), 6))
         drawn = np.random.default_rng(0).uniform(-np.pi, np.pi, (len(steps), len(untold)))
         steps.reshape(-1, 6 * len(places))[:, able] = drawn @ untold
         others = [self.descend(_moved(places, step)) for step in steps]
-        most = self.cost(places) * (1 + ALIKE)
+        # The share by which costs of alike places differ at most
+        most = self.cost(places) * (1 + 1e-6)
         return np.array([self.features(p) for p in (places, *others) if self.cost(p) <= most])
 
     def descend(self, places: Floats) -> Floats:
         """Return the places (K, 4, 4) at the bottom of their valley (Gauss-Newton)."""
-        for _ in range(STEPS):
+        for _ in range(50):
             slopes, errors = self.root @ self.moves(places), self.root @ self.features(places)
             step = -np.asarray(np.linalg.lstsq(slopes, errors, rcond=TOLD)[0]).reshape(-1, 6)
             places = _moved(places, step)
-            if np.abs(step).max() < SETTLED:
+            if np.abs(step).max() < 1e-12:
                 break
         return self.with_shifts(places)
 
@@ -263,7 +259,8 @@ def _linear(side: Side, families: Sequence[Family]) -> tuple[Floats, Indices]:
     by_last = _entries(side.a @ side.b, side.c)
     if family is not None:
         return by_last, family.columns(u, v)
-    return (by_last @ STILL)[:, :, None], np.zeros(1, dtype=np.intp)
+    still = np.append(np.append(np.eye(3), np.zeros(3)), 1.0)  # nothing is unknown
+    return (by_last @ still)[:, :, None], np.zeros(1, dtype=np.intp)
 
 
 def _entries(before: Floats, after: Floats) -> Floats:

@@ -30,14 +30,6 @@ from scipy.linalg.lapack import dpotri
 from flangeye.maths.statistics import spread_evenly
 from flangeye.types import Floats, Indices, Mask
 
-FREE = 1e-10
-"""Information of each unknown before anything is seen, as a share of what is most: none, but what
-keeps the factorisation positive where the sightings show nothing."""
-EXACT = 1e-6, 1e-7
-"""Noise of the exactest sightings [rad, m]: a thousandth of what any camera has."""
-SAMPLES = 32
-"""Draws of the sizes about their mode (half of them mirrored). Beside 2,048 draws they state the
-error of 16 poses equally large, give or take 6 % from session to session."""
 TELLING = 150
 """Sightings that sizes are found from: more change them by less than their priors' spread."""
 
@@ -107,7 +99,8 @@ class LinearModel:
         """Return (N, 6, 6) covariances of the noise; the identity across what was not measured."""
         scaled, further = self.parts(sizes)
         q = self.projectors
-        inside = scaled + further.sum(axis=0) + np.diag(np.repeat(np.square(EXACT), 3))
+        # The exactest sightings [rad, m]: a thousandth of the noise any camera has
+        inside = scaled + further.sum(axis=0) + np.diag(np.repeat(np.square((1e-6, 1e-7)), 3))
         return np.asarray(q @ inside @ q + (np.eye(6) - q))
 
     def parts(self, sizes: Floats) -> tuple[Floats, Floats]:
@@ -242,7 +235,9 @@ def _scaled(information: Floats) -> tuple[Floats, Floats]:
     scale = np.sqrt(np.maximum(np.diag(information), 0.0))
     scale = np.where(scale > 1e-7 * scale.max(), scale, scale.max())
     scaled = information / np.outer(scale, scale)
-    scaled[np.diag_indices(len(scaled))] += FREE
+    # Before anything is seen, as a share of what is most: no information, but what keeps the
+    # factorisation positive where the sightings show nothing
+    scaled[np.diag_indices(len(scaled))] += 1e-10
     return scaled, scale
 
 
@@ -360,7 +355,9 @@ def posterior(model: LinearModel, mode: Floats | None = None) -> Posterior:
     z, some = mode_of(model) if mode is None else mode, model.telling()
     spread, prior = _laplace(some, z), model.sizes
     at_mode, fits, logs = fit(model, prior.at(z), with_gradient=False), [], []
-    for draw in _draws(len(z), SAMPLES):
+    # Half of them mirrored: beside 2,048 draws they state the error of 16 poses equally large,
+    # give or take 6 % from session to session
+    for draw in _draws(len(z), 32):
         at = z + spread @ draw
         found = fit(some, prior.at(at), with_gradient=False)
         logs.append(0.5 * float(draw @ draw - found.cost - at @ at))

@@ -21,29 +21,15 @@ from flangeye.types import CAMERA, TARGET, Floats
 
 FINEST_NOISE = 1e-5
 """No scanner and arm together do better than 10 um; keeps exact inputs from seeming observable."""
-MISTAKE = 5e-3
-"""Noise of a centre beyond which something is not as the recipe says [m]."""
 STILL = np.radians(0.5), 1e-3
 """An arm that turns and moves by less than this stands still [rad, m]."""
-PARALLEL = 0.03
-"""Axes of rotation are parallel when they spread by less [rad]."""
 LEAST = 1e-4, 2e-5
 """Noise of the best camera and arm [rad, m]: exact inputs must not seem observable."""
-TELLS, UNKNOWN = 2.0, 1e3
-"""What shows a weak move makes it known so many times better, at least; of one that is known worse
-than so many times its limit nothing is known."""
 
-SURE = 3.0
-"""Motions that are named are to make everything known so many times better than its limit."""
-USUAL, TIED = (0.5e-3, 0.2e-3), 30.0
-"""Noise that further sightings will have [rad, m]; what they leave known to so many times
-its limit is no matter of another tie, but of more of them."""
 IN_LINE = 0.1
 """Points lie on a line when they are no further from it than this share of its length."""
 NAMED = 0.1
 """A frame of which a weak move has this share, or more, is one that it leaves unknown."""
-FURTHER = np.repeat([np.radians(20), 0.1], 3)
-"""By how much what moves is turned [rad] or moved [m] to find out what that would show."""
 
 Motion = TypeVar("Motion")
 Move = tuple[str, tuple[float, ...]]
@@ -96,7 +82,8 @@ def telling(
     while weak:
         left = {m: weak_moves(information + more, limits) for m, more in further.items()}
         best = min(left, key=lambda motion: _weakness(left[motion]), default=None)
-        if best is None or _weakness(left[best]) > _weakness(weak) - np.log(TELLS):
+        # It makes the weak move known twice as well, at least
+        if best is None or _weakness(left[best]) > _weakness(weak) - np.log(2.0):
             break
         chosen.append(best)
         information, weak = information + further[best], left[best]
@@ -104,7 +91,8 @@ def telling(
 
 
 def _weakness(weak: WeakMoves) -> float:
-    return float(np.log(np.minimum(weak.excess, UNKNOWN)).sum())
+    # Known a thousand times worse than its limit is not known at all
+    return float(np.log(np.minimum(weak.excess, 1e3)).sum())
 
 
 @dataclass(frozen=True)
@@ -231,7 +219,8 @@ def require_observable(
     axis = weak.moves[:, 0] / limit
     cure = (
         "spread the poses further, and check that each scan belongs to its robot pose"
-        if noise < MISTAKE
+        # Noise of a centre beyond which something is not as the recipe says [m]
+        if noise < 5e-3
         else "no scanner or arm is so noisy: check that each scan belongs to its robot pose, and "
         "that the target is where the recipe has it (configuration: {place: unknown} finds it)"
     )
@@ -480,8 +469,10 @@ def _untold(
     information, scale = known
     named = _named(problem, weak, scale)
     share = np.abs(weak.moves[:, 0] / scale).reshape(-1, 2, 3).max(axis=(0, 2))
-    motions, left = telling(information, scale / SURE, _seen_again(problem, places, freedoms))
-    untied = left and left.excess[0] > TIED
+    # What is named is to make everything known three times better than its limit
+    motions, left = telling(information, scale / 3.0, _seen_again(problem, places, freedoms))
+    # Known to thirty times its limit is no matter of another tie, but of more of them
+    untied = left and left.excess[0] > 30.0
     cures = _asked(problem, motions)
     cures += [_tie(problem, _named(problem, left, scale))] if untied else []
     return (
@@ -547,7 +538,8 @@ def _seen_again(
 
 
 def _moved_tells(problem: Problem, places: Places, name: str, twist: Floats) -> Floats:
-    turn, shift = np.split(twist * FURTHER, 2)
+    # What moves is turned [rad] or moved [m] so far to find out what that would show
+    turn, shift = np.split(twist * np.repeat([np.radians(20), 0.1], 3), 2)
     place = np.array(problem.frames[name].place)
     place[..., :3, :3] = rotation_exp(turn) @ place[..., :3, :3]
     place[..., :3, 3] += shift
@@ -558,7 +550,8 @@ def _moved_tells(problem: Problem, places: Places, name: str, twist: Floats) -> 
     # What is not measured of a circle turns with it.
     back = np.kron(np.eye(2), before.turns @ np.swapaxes(linear.turns, 1, 2))
     rows = s.projectors @ back @ rows
-    noise = s.covariances + np.diag(np.repeat(np.square(USUAL), 3))
+    # Noise that further sightings will have [rad, m]
+    noise = s.covariances + np.diag(np.repeat(np.square((0.5e-3, 0.2e-3)), 3))
     q = s.projectors
     weights = q @ np.linalg.inv(q @ noise @ q + (np.eye(6) - q)) @ q
     return np.asarray(np.einsum("nai,nab,nbj->ij", rows, weights, rows, optimize=True))
@@ -575,7 +568,8 @@ def _fault_of(poses: Floats) -> str | None:
     if not _turns(poses):
         return "moved without turning; turn it by 20 deg or more about two axes"
     _, sizes, axes = np.linalg.svd(turns, full_matrices=False)
-    if sizes[1] > PARALLEL * sizes[0]:
+    # Axes are parallel when they spread by less [rad]
+    if sizes[1] > 0.03 * sizes[0]:
         return None
     axis = axes[0] * np.sign(axes[0][np.argmax(np.abs(axes[0]))])
     named = in_base(axis, 2)

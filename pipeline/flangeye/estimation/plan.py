@@ -38,9 +38,6 @@ from flangeye.types import (
     Transform,
 )
 
-REACH = 0.1
-"""About the origin of what is no camera, errors count so far off [m]."""
-
 
 def so_far(observations: Sequence[Observation], cell: Cell) -> Rough | None:
     """Return the estimate from the sightings so far; None while an unknown is unobservable."""
@@ -69,7 +66,8 @@ def work_of_frames(found: Rough, cell: Cell, seen: Sequence[Observation]) -> Map
 
     A camera where it saw something; what else there is about its origin.
     """
-    corners = REACH * np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
+    # About the origin of what is no camera, errors count so far off [m]
+    corners = 0.1 * np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
     work = {}
     for name, place in found.places.items():
         points = np.array([o.feature.centre for o in seen if o.camera == name]).reshape(-1, 3)

@@ -17,9 +17,6 @@ from flangeye.estimation.start import agreeing, begin
 from flangeye.estimation.threads import on_one_thread
 from flangeye.types import Floats, Mask
 
-LIMITS = float(np.radians(2)), 20e-3
-"""Largest standard deviations of a rotation [rad] and a translation [m] of what is known."""
-
 
 @dataclass(frozen=True, eq=False)
 class Rough:
@@ -67,5 +64,8 @@ def rough(problem: Problem, freedoms: Mapping[str, Floats] | None = None) -> Rou
         places = problem.moved(places, found.mean[: model.p])
         agree = judged(model, found)[1] & agree
     known = told_of_places(model, found.sizes)
-    unobservable(problem.where(agree), places, known, LIMITS, False, freedoms)
+    # Largest standard deviations [rad, m] of what is known
+    unobservable(
+        problem.where(agree), places, known, (float(np.radians(2)), 20e-3), False, freedoms
+    )
     return Rough(problem, places, effects, model, found, agree)

@@ -34,22 +34,8 @@ from flangeye.models.cell import Cell
 from flangeye.models.scanners import ScannerModel
 from flangeye.types import Floats, Indices, Mask, Note, Observation, PoseFeature
 
-CLOCK_STEPS, EXACT_DELAY = 6, 1e-5
-"""Steps to find the time between two clocks, and how small the last one is [s]."""
-SIZE_STEPS, EXACT_SIZE, LOOSEST_SIZE = 6, 1e-6, 0.05
-"""Steps to find a target's size, the share by which the last one changes it, and the largest
-standard deviation of what is taken for found: half the prior's."""
 MISTAKE_CERTAIN = 1 - 1e-6
 """Probability with which a mistake that is named is not noise's doing."""
-LARGEST_NOISE = 0.02, np.radians(5.0)
-"""Sightings that agree no better than this [m, rad], nor than a share of their extent, belong to
-other poses."""
-LARGEST_SHARE = 0.4
-"""Of their extent: scans that belong to other poses show noise as large as it."""
-MIRROR = 0.1
-"""A mirrored fit with this share of the residuals or less is the right one."""
-LARGEST_TILT = np.radians(10.0)
-"""Normals further than this from the target's axis, at the median, belong to another frame."""
 CONFIGURED = (
     "that the recipe's configuration is the cell's (place: unknown, where nobody has measured "
     "where the target is mounted)"
@@ -188,9 +174,11 @@ def _begun(problem: Problem) -> tuple[Problem, Places, Mask, tuple[Note, ...]]:
         return problem, places, agreeing(problem, squares), ()
     turns = problem.linearised(places).residuals[:, :3]
     tilt = float(np.median(np.linalg.norm(turns[circles & agreeing(bare, squares)], axis=1)))
-    if not tilt > LARGEST_TILT:
+    # Normals further from the target's axis, at the median, belong to another frame
+    far = np.radians(10.0)
+    if not tilt > far:
         return problem, places, agreeing(bare, squares), ()
-    if tilt < np.pi - LARGEST_TILT:  # a flange whose z points inwards is no mistake of its poses
+    if tilt < np.pi - far:  # a flange whose z points inwards is no mistake of its poses
         raise CalibrationRefused(
             f"the measured normals stand {np.degrees(tilt):.0f} deg from the robot's flange axis: "
             "the orientations of the poses are wrong, or belong to another tool frame; 'flangeye "
@@ -236,9 +224,8 @@ def _plausible(problem: Problem, shift: float, turn: float) -> bool:
     extent = float(np.sqrt(s.centres.var(axis=0).sum()))
     axes = s.rotations[s.ranks >= 5, :, 2]
     turned = float(np.sqrt(axes.var(axis=0).sum())) if len(axes) else 0.0
-    return shift < max(LARGEST_NOISE[0], LARGEST_SHARE * extent) and turn < max(
-        LARGEST_NOISE[1], LARGEST_SHARE * turned
-    )
+    # Scans that belong to other poses show noise as large as their extent.
+    return shift < max(0.02, 0.4 * extent) and turn < max(np.radians(5.0), 0.4 * turned)
 
 
 def _require_right_handed(problem: Problem, places: Places) -> None:
@@ -258,7 +245,8 @@ def _require_right_handed(problem: Problem, places: Places) -> None:
         return
     ours = float(np.median(distances(problem, places)))
     theirs = float(np.median(distances(mirrored, there)))
-    if theirs < MIRROR**2 * ours:
+    # A tenth of the residuals: the mirrored fit is the right one
+    if theirs < 0.1**2 * ours:
         raise StageError(
             "what the camera saw fits the poses only when mirrored "
             f"({np.sqrt(theirs) * 1e3:.1f} mm instead of {np.sqrt(ours) * 1e3:.1f} mm): flip one "
@@ -353,12 +341,13 @@ def _on_one_clock(session: Session) -> Session:
     """
     total: dict[str, float] = {}
     moved = session
-    for _ in range(CLOCK_STEPS):
+    for _ in range(6):
         left = {
             e.name.removeprefix("clock of "): float(mean[0])
             for e, mean, _ in moved.found.numbers("clock")
         }
-        if max(map(abs, left.values()), default=0.0) < EXACT_DELAY:
+        # Far less than any exposure [s]
+        if max(map(abs, left.values()), default=0.0) < 1e-5:
             break
         total = {camera: total.get(camera, 0.0) + x for camera, x in left.items()}
         later = delayed(session.observations, session.cell, total)
@@ -384,14 +373,15 @@ def _with_size(session: Session, factor: float) -> Session:
     if not session.asked.size_unknown:
         _require_size(session)
         return session
-    for _ in range(SIZE_STEPS):
+    for _ in range(6):
         shares = [float(mean[0]) for _, mean, _ in session.found.numbers("size")]
-        if max(map(abs, shares), default=0.0) < EXACT_SIZE:
+        if max(map(abs, shares), default=0.0) < 1e-6:
             break
         factor *= 1 + shares[0]
         session = session.again(_resized(session.observations, 1 + shares[0]))
     known = float(np.sqrt(session.found.numbers("size")[0][2][0, 0]))
-    if known > LOOSEST_SIZE:
+    # Taken for found when it is known to half the prior's deviation
+    if known > 0.05:
         raise CalibrationRefused(
             f"the target's size is told to {known:.1%} only: move the arm further between poses, "
             "or say target_size: known"

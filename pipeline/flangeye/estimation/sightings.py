@@ -19,8 +19,6 @@ from flangeye.types import Feature, Floats, Motion, Observation, PoseFeature
 
 REACHED = 5e-3
 """Further from the controller's poses than this [m], the catalogue's arm is another one."""
-STARTS = 48
-"""Of the search for the branches of an arm that has no closed form of them."""
 
 
 def problem_of(observations: Sequence[Observation], cell: Cell, normals: bool = True) -> Problem:
@@ -128,7 +126,8 @@ def branches_of(problem: Problem, carrier: Carrier) -> Iterator[Floats]:
         if np.linalg.norm((reached - poses)[:, :3, 3], axis=1).max() < REACHED:
             yield carrier.joints
         return
-    starts = arm.inverse(poses[0], STARTS)[:, None]
+    # The arm has no closed form of them
+    starts = arm.inverse(poses[0], 48)[:, None]
     each, all_reached = reached_from(
         arm, np.broadcast_to(poses, (len(starts), *poses.shape)), starts
     )

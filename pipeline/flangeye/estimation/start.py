@@ -35,29 +35,16 @@ from flangeye.maths.geometry import (
 )
 from flangeye.types import Floats, Indices, Mask
 
-MOST_SIGHTINGS = 40
-"""Sightings that one closed form takes: beyond, more cost time and change the start little."""
-FIRST, SETS = 10, 80
-"""Small sets drawn where all sightings agree, and where they do not: 40 % of them wrong, four of
-five in a set right once in eight draws."""
-ENOUGH = 1.5
-"""All sightings agree where no small set leaves a median so many times smaller."""
+SETS = 80
+"""Small sets drawn: where 40 % of the sightings are wrong, four of five in a set are right once in
+eight draws."""
 LEVER = 0.3
 """A turn counts like what it does so far away [m]: the distance of a target."""
 NOISE = 0.2e-3, 0.1e-3
 """Noise of an arm's poses beyond the features' own while nothing is known of it: [rad] and [m]."""
-DRAWS, PATIENCE, AGREE = 60, 12, 1e-3
-"""Random starts at most; so many in turn that find nothing lower end the search, and so do two
-whose costs differ by this share: they ended in one valley."""
-STEPS, SETTLED = 40, 1e-6
-"""Steps of a descent at most, and the share by which the last one lowers the cost."""
-WIDTH = 4.0
-"""Sightings beyond so many times the median square of their pair hardly count."""
 GOOD = 25.0
 """Times the median square within which a sighting may agree with the start: all that is plausible,
 for the estimate judges again."""
-SIZE_ROWS, LARGEST_SIZE = 8, 100.0
-"""Poses of a set that a target's size is told from, and the largest factor on it."""
 
 
 def begin(problem: Problem) -> tuple[Places, Floats]:
@@ -102,14 +89,15 @@ def size_of(problem: Problem) -> float:
     if len(names) != 2:
         return size
     seen, carried = known
+    largest = 100.0  # factor on a target's size
     for _ in range(SETS):
-        rows = rng.choice(n, min(SIZE_ROWS, n), replace=False)
+        rows = rng.choice(n, min(8, n), replace=False)
         with suppress(np.linalg.LinAlgError, CalibrationRefused):
             turn = park_martin(motions_of(carried[rows], seen[rows]))[:3, :3]
             left, right = _sized_translations(carried, seen, turn)
             found = _least(stack_rows(left[rows]), right[rows].ravel())
             median = float(np.median(np.linalg.norm(left @ found - right, axis=1)))
-            if median < least and 1 / LARGEST_SIZE < found[-1] < LARGEST_SIZE:
+            if median < least and 1 / largest < found[-1] < largest:
                 least, size = median, float(found[-1])
     return size
 
@@ -208,12 +196,14 @@ def _solved(loop: _Loop, rng: np.random.Generator) -> dict[str, Floats] | None:
     if form is None or len(loop.seen) < form.fewest:
         return None
     n = len(loop.seen)
-    everyone = np.arange(n) if n <= MOST_SIGHTINGS else rng.choice(n, MOST_SIGHTINGS, replace=False)
+    most = 40  # one closed form takes so many: more cost time and change the start little
+    everyone = np.arange(n) if n <= most else rng.choice(n, most, replace=False)
     size = min(form.fewest + (1 if n > form.fewest else 0), n)
     tried: list[tuple[dict[str, Floats], Floats]] = []
     least, of_all = np.inf, np.inf
     for draw in range(-1, SETS):
-        if draw == FIRST and of_all <= ENOUGH * least:
+        # All sightings agree where no small set leaves a median a third smaller
+        if draw == 10 and of_all <= 1.5 * least:
             break
         chosen = everyone if draw < 0 else rng.choice(n, size, replace=False)
         with suppress(np.linalg.LinAlgError, CalibrationRefused):
@@ -417,18 +407,20 @@ def _anywhere(problem: Problem, rng: np.random.Generator) -> tuple[Places, Float
     """Return the lowest of descents from random places: the rotations first, then all."""
     best: tuple[Places, Floats] | None = None
     least, since = np.inf, 0
-    for _ in range(DRAWS):
+    for _ in range(60):
         places: Places = {name: _drawn(rng) for name in problem.unknown}
         with suppress(np.linalg.LinAlgError):
             places, _ = _descended(problem, places, turns_alone=True)
             found = _descended(problem, places)
             cost = _cost(problem, found[1])
-            if best is not None and abs(cost - least) <= AGREE * cost + 1e-12:
+            # Two of one cost ended in one valley
+            if best is not None and abs(cost - least) <= 1e-3 * cost + 1e-12:
                 return best
             since += 1
             if cost < least:
                 best, least, since = found, cost, 0
-        if since >= PATIENCE:
+        # Twelve starts in turn that find nothing lower end the search
+        if since >= 12:
             break
     if best is None:
         raise CalibrationRefused(
@@ -459,16 +451,17 @@ def _descended(
     weights = q @ np.linalg.inv(q @ (s.covariances + further) @ q + (np.eye(6) - q)) @ q
     damping, before = 1e-6, np.inf
     linear = problem.linearised(places)
-    for _ in range(STEPS):
+    for _ in range(40):
         squares = np.einsum("na,nab,nb->n", linear.residuals, weights, linear.residuals)
-        widths = WIDTH * np.maximum(_middles(problem, squares), 1.0)
+        # Sightings beyond so many times the median square of their pair hardly count
+        widths = 4.0 * np.maximum(_middles(problem, squares), 1.0)
         shares = (1 + squares / widths) ** -2.0
         g = np.concatenate([linear.blocks[name] for name in problem.unknown], axis=2)
         weighted = (shares[:, None, None] * weights) @ g
         information = np.einsum("nai,naj->ij", g, weighted)
         right = np.einsum("nai,na->i", weighted, linear.residuals)
         cost = float((squares / (1 + squares / widths)).sum())
-        if abs(before - cost) <= SETTLED * cost:
+        if abs(before - cost) <= 1e-6 * cost:
             break
         before = cost
         for _ in range(8):

@@ -16,9 +16,6 @@ from flangeye.types import Box, Floats, Mask
 
 COUNT = 256
 """New poses: twice as many change the answer by less than a tenth of what is stated."""
-BOXES, WIDEST = 8, 2.5
-"""Boxes that the session's poses may have been drawn from, as likely as each other, and how many
-spacings of poses they reach beyond these at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +59,11 @@ def work_of(problem: Problem, places: Places, box: Box | None = None) -> Work:
     at = np.asarray(problem.frames[carrier.frame].place)[problem.seen.times, :3, 3]
     inner = np.array([at.min(axis=0), at.max(axis=0)])
     outward = (inner[1] - inner[0]) / max(n - 1, 1) * np.array([[-1.0], [1.0]])
-    wide = _foreseen(_in_box(problem, carrier, inner + WIDEST * outward), places)
+    widest = 2.5  # spacings of poses that a box reaches beyond these
+    wide = _foreseen(_in_box(problem, carrier, inner + widest * outward), places)
     # Beyond the outermost of n poses drawn evenly, what is left is exponential.
-    beyond = np.random.default_rng(0).exponential(size=(BOXES, 2, 3)).clip(max=WIDEST)
+    # boxes that the poses may have been drawn from, as likely as each other
+    beyond = np.random.default_rng(0).exponential(size=(8, 2, 3)).clip(max=widest)
     return Work(session, wide, np.array([_inside(wide, inner + b * outward) for b in beyond]))
 
 

@@ -27,13 +27,6 @@ Triple = tuple[Floats, Floats, Floats]
 
 FEWEST_KRONECKER = 12
 """Poses from which the 90 products of the rotations' entries follow."""
-ROUNDS, SETTLED = 3000, 1e-10
-TINY = 1e-9
-"""Share of the equations that keeps turns where poses do not tell them."""
-STARTS, FEW, KEPT, STEPS = 21, 20, 3, 10
-"""Random starts, rounds of each, and how many of them take how many steps of Newton's further."""
-REST = 1e-4
-"""An arm rested between two poses that differ by less [rad, m]."""
 
 
 def kronecker(a: Floats, b: Floats, c: Floats) -> Triple:
@@ -67,24 +60,27 @@ def best_rotations(given: Triple, rng: np.random.Generator) -> Triple:
         given: Rotations of A, B, C, each (N, 3, 3).
         rng: Draws the starts.
     """
-    (x, y, z), errors = alternate(given, random_rotations(rng, (STARTS,)), rounds=FEW)
-    on = np.argsort(errors)[:KEPT]
+    # 21 random starts of 20 rounds each; the best three go on with Newton's steps
+    (x, y, z), errors = alternate(given, random_rotations(rng, (21,)), rounds=20)
+    on = np.argsort(errors)[:3]
     return _settled(given, (x[on], y[on], z[on]))
 
 
 def _settled(given: Triple, near: Triple) -> Triple:
     """Return the best of rotations (K, 3, 3) after a few steps of Gauss and Newton, each (3, 3)."""
     (a, b, c), (x, y, z) = given, near
-    for step in range(STEPS + 1):
+    steps = 10  # of Newton's
+    for step in range(steps + 1):
         second = y[:, None] @ c
         apart = second @ z[:, None] @ np.swapaxes(a @ x[:, None] @ b, -1, -2)
-        if step == STEPS:
+        if step == steps:
             break
         off = 0.5 * (apart - np.swapaxes(apart, -1, -2))
         turns = np.stack([off[..., 2, 1], off[..., 0, 2], off[..., 1, 0]], axis=-1)
         by = np.broadcast_to(np.eye(3), second.shape)
         rows = np.concatenate([np.broadcast_to(-a, second.shape), by, second], axis=-1)
-        normal = np.einsum("knia,knib->kab", rows, rows) + TINY * len(a) * np.eye(9)
+        # Keeps turns where poses do not tell them
+        normal = np.einsum("knia,knib->kab", rows, rows) + 1e-9 * len(a) * np.eye(9)
         right = np.einsum("knia,kni->ka", rows, turns)
         dx, dy, dz = -np.linalg.solve(normal, right[..., None]).reshape(-1, 3, 3).swapaxes(0, 1)
         x, y, z = rotation_exp(dx) @ x, rotation_exp(dy) @ y, rotation_exp(dz) @ z
@@ -92,7 +88,7 @@ def _settled(given: Triple, near: Triple) -> Triple:
     return x[best], y[best], z[best]
 
 
-def alternate(given: Triple, starts: Triple, rounds: int = ROUNDS) -> tuple[Triple, Floats]:
+def alternate(given: Triple, starts: Triple, rounds: int = 3000) -> tuple[Triple, Floats]:
     """Return rotations X, Y, Z (..., 3, 3) from any starts, and their errors (...) [rad rms].
 
     Each in turn is the rotation that fits best given the other two (Procrustes); the sum of
@@ -115,7 +111,7 @@ def alternate(given: Triple, starts: Triple, rounds: int = ROUNDS) -> tuple[Trip
         moved = _third(forms[2], x, y)
         z = nearest_rotation(moved)
         agreement = (moved * z).sum(axis=(-2, -1))
-        if (agreement - before < SETTLED * len(a)).all():
+        if (agreement - before < 1e-10 * len(a)).all():
             break
         before = agreement
     # |R - 1|^2 = 2 * angle^2 for small angles, and 6 - 2 trace(R) in general.
@@ -177,7 +173,8 @@ def two_steps(a: Floats, b: Floats, c: Floats) -> Triple:
 def _resting(poses: Floats) -> NDArray[np.intp]:
     """Return the indices of the largest group of equal poses."""
     apart = np.abs(poses[:, None] - poses[None]).max(axis=(2, 3))
-    together = apart < REST
+    # It rested between two poses that differ by less [rad, m]
+    together = apart < 1e-4
     return np.flatnonzero(together[int(np.argmax(together.sum(axis=1)))])
 
 

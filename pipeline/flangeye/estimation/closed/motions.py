@@ -16,9 +16,6 @@ from flangeye.errors import CalibrationRefused
 from flangeye.maths.geometry import invert, nearest_rotation, rigid, rotation_log, stack_rows
 from flangeye.types import Floats
 
-LARGEST_TURN = np.radians(170.0)
-"""The axis of a rotation by half a turn may point either way: such pairs of poses are left out."""
-
 
 @dataclass(frozen=True, eq=False)
 class Motions:
@@ -52,7 +49,8 @@ def motions_of(carried: Floats, seen: Floats) -> Motions:
     b = seen[j] @ invert(seen[i])
     alpha, beta = rotation_log(a[:, :3, :3]), rotation_log(b[:, :3, :3])
     turns = np.maximum(np.linalg.norm(alpha, axis=1), np.linalg.norm(beta, axis=1))
-    kept = turns < LARGEST_TURN
+    # The axis of a rotation by half a turn may point either way: such pairs are left out
+    kept = turns < np.radians(170.0)
     if not kept.any():
         raise CalibrationRefused(
             f"all {len(a)} motions between poses turn by {np.degrees(turns.min()):.0f} deg or "

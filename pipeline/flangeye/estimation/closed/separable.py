@@ -15,9 +15,6 @@ from flangeye.maths.geometry import (
 )
 from flangeye.types import Floats
 
-HALF_TURNS = np.stack([np.eye(3), *(np.diag(d) for d in np.eye(3) * 2.0 - 1.0)])
-"""No turn, and half a turn about each axis."""
-
 
 def tsai_lenz(motions: Motions) -> Floats:
     """Return X (4, 4): Tsai & Lenz, IEEE Trans. Robotics and Automation 5(3), 1989, eq. (10)-(15).
@@ -27,13 +24,15 @@ def tsai_lenz(motions: Motions) -> Floats:
     best conditioned of the four systems is the one whose X turns least.
     """
     a, b = _half_sines(motions.alpha), _half_sines(motions.beta)
-    turned = np.einsum("kij,nj->kni", HALF_TURNS, b)
+    # No turn, and half a turn about each axis
+    half_turns = np.stack([np.eye(3), *(np.diag(d) for d in np.eye(3) * 2.0 - 1.0)])
+    turned = np.einsum("kij,nj->kni", half_turns, b)
     systems = hat(a + turned).reshape(4, -1, 3)
     best = int(np.argmax(np.linalg.svd(systems, compute_uv=False)[:, -1]))
     tangent = np.linalg.lstsq(systems[best], (turned[best] - a).ravel(), rcond=None)[0]
     length = np.linalg.norm(tangent)
     angle = 2.0 * np.arctan(length) / max(float(length), 1e-300)
-    rotation = rotation_exp(angle * tangent) @ HALF_TURNS[best]
+    rotation = rotation_exp(angle * tangent) @ half_turns[best]
     return rigid(rotation, translation_of(rotation, motions))
 
 

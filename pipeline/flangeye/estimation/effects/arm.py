@@ -32,12 +32,6 @@ KINDS = {
 """Typical size of each kind for zeros of 1 rad: encoders once a turn [rad], a joint's deflection
 for a metre of lever [rad/m], lengths [m], twists [rad]. Ratios seen in published calibrations of
 industrial arms (Nubiola & Bonev 2013; the zeros and lengths of ``refine.arm``), rounded."""
-BACKLASH = 0.1
-"""Likewise of each joint's angle from pose to pose [rad]: an arm that repeats to 0.03 mm by ISO
-9283 at a reach of a metre has 0.03 mrad."""
-FIELD, FIELD_TIMES = 0.1, 4.0
-"""Likewise what no kind explains, smooth over the workspace [m], and by how many times it may be
-more or less, one sigma: of it nothing is known beforehand."""
 PLACES = ("place of the base", True, (1.0, 0.5)), ("place of the flange", False, (1.2, 0.15))
 ANEW = 0.4, 0.1
 """Likewise where the joints are not known, of turn [rad] and shift [m] that all poses have in
@@ -53,10 +47,6 @@ QUALITY = 4.0
 on no data sheet, and arms of one maker differ tenfold."""
 EACH = 1.8
 """By how many times each kind may be larger or smaller beside the arm's quality, one sigma."""
-UP = np.array([0.0, 0.0, 1.0])
-"""Of an arm's base that is level."""
-DELTA = 1e-6
-"""Step of numeric derivatives by a length [m] or a twist [rad]."""
 
 
 def arm_effects(problem: Problem, arm: str) -> list[Effect]:
@@ -78,7 +68,9 @@ def arm_effects(problem: Problem, arm: str) -> list[Effect]:
     block = _by_place(arm, field)
     return [
         *effects,
-        Effect("smooth error", block, FIELD * accuracy, FIELD_TIMES, arm, True, "field"),
+        # What no kind explains, smooth over the workspace [m]; of it nothing is known
+        # beforehand: four times as much or as little, one sigma
+        Effect("smooth error", block, 0.1 * accuracy, 4.0, arm, True, "field"),
     ]
 
 
@@ -108,7 +100,9 @@ def arm_scatters(problem: Problem) -> list[Scatter]:
     out = []
     for arm, accuracy in {c.arm: c.accuracy or ACCURACY for c in problem.carriers}.items():
         if _told(problem, arm):
-            out.append(Scatter(_backlash(arm), BACKLASH * accuracy, EACH, arm))
+            # Of a joint's angle from pose to pose [rad]: an arm that repeats to 0.03
+            # mm by ISO 9283 at a reach of a metre has 0.03 mrad
+            out.append(Scatter(_backlash(arm), 0.1 * accuracy, EACH, arm))
         else:
             turns, shifts = (_anew(arm, rows) for rows in (slice(3), slice(3, 6)))
             out.append(Scatter(turns, ANEW[0] * accuracy, EACH, arm))
@@ -211,11 +205,12 @@ def _by_links(carrier: Carrier, which: Sequence[int]) -> Floats:
     """Return (T, 6, m) what some of the links' (3 n) a, d [m] and alpha [rad] do."""
     arm, joints = known(carrier)
     before, columns = arm.pose(joints, carrier.link), []
-    for step in DELTA * np.eye(3 * arm.n)[which]:
+    delta = 1e-6  # step by a length [m] or a twist [rad]
+    for step in delta * np.eye(3 * arm.n)[which]:
         after = arm.altered(step.reshape(-1, 3)).pose(joints, carrier.link)
         turned = rotation_log(after[:, :3, :3] @ np.swapaxes(before[:, :3, :3], 1, 2))
         shifted = after[:, :3, 3] - before[:, :3, 3]
-        columns.append(np.concatenate([turned, shifted], axis=1) / DELTA)
+        columns.append(np.concatenate([turned, shifted], axis=1) / delta)
     return np.stack(columns, axis=2)
 
 
@@ -226,7 +221,8 @@ def _levers(arm: Arm, joints: Floats) -> Floats:
     """
     origins, (axes, places) = arm.frames(joints)[..., :3, 3], arm.axes(joints)
     beyond = [origins[:, i + 1 :].mean(axis=1) - places[:, i] for i in range(arm.n)]
-    return np.asarray(np.cross(axes, np.stack(beyond, axis=1)) @ UP)
+    # The base is level
+    return np.asarray(np.cross(axes, np.stack(beyond, axis=1)) @ np.array([0.0, 0.0, 1.0]))
 
 
 def known(carrier: Carrier) -> tuple[Arm, Floats]:

@@ -8,13 +8,9 @@ from flangeye.estimation.effects.effect import Block, Effect
 from flangeye.estimation.graph import Linear, Problem
 from flangeye.types import Floats, Mask
 
-VIEWS_TIMES = 1.05
-"""By how many times a stated deviation may be more or less, one sigma: views told it."""
 SIZE = 1e-3
 """Typical share by which a printed marker is larger or smaller than was said: a tenth of a
 millimetre of 100 mm, what a ruler shows."""
-UNKNOWN_SIZE = 0.1
-"""The same where the size is to be found."""
 TIMES = 2.0
 """By how many times that may be more or less, one sigma."""
 
@@ -25,8 +21,10 @@ def camera_effects(problem: Problem, size_unknown: bool = False) -> list[Effect]
     if s.shared.any():
         for camera in dict.fromkeys(camera for camera, _ in problem.ends):
             name = f"intrinsics of {camera}"
-            effects.append(Effect(name, _shared(camera), 1.0, VIEWS_TIMES, kind="shared"))
-    size = UNKNOWN_SIZE if size_unknown else SIZE
+            # Views told the stated deviation: it may be 1.05 times as much, one sigma
+            effects.append(Effect(name, _shared(camera), 1.0, 1.05, kind="shared"))
+    # A tenth where the size is to be found
+    size = 0.1 if size_unknown else SIZE
     whole = {int(k) for k in s.pairs[s.ranks == 6]}
     pairs = [ends for k, ends in enumerate(problem.ends) if k in whole]
     for target in dict.fromkeys(target for _, target in pairs):

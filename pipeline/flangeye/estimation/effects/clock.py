@@ -13,11 +13,6 @@ from flangeye.maths.streams import joints_at, later, pose_at
 from flangeye.models.cell import Cell
 from flangeye.types import FLANGE, Floats, Observation
 
-DELAY = 20e-3
-"""Typical time between two clocks that nobody set [s]: an exposure, a buffer, a network's delay."""
-TIMES = 4.0
-"""By how many times it may be more or less, one sigma."""
-
 
 def clock_effects(problem: Problem) -> list[Effect]:
     """Return the delay of each camera [s]: by how much its sightings are later than their poses."""
@@ -25,7 +20,9 @@ def clock_effects(problem: Problem) -> list[Effect]:
         return []
     cameras = list(dict.fromkeys(camera for camera, _ in problem.ends))
     return [
-        Effect(f"clock of {camera}", _delay(camera), DELAY, TIMES, kind="clock", lasting=False)
+        # Two clocks that nobody set [s]: an exposure, a buffer, a network's delay; four
+        # times as much or as little, one sigma
+        Effect(f"clock of {camera}", _delay(camera), 20e-3, 4.0, kind="clock", lasting=False)
         for camera in cameras
     ]
 

@@ -8,23 +8,19 @@ from flangeye.estimation.effects.effect import Block, Effect
 from flangeye.estimation.graph import Linear, Problem
 from flangeye.types import Floats
 
-EACH, MOST = 5, 12
-"""Sightings between two knots of the drift at least, and knots at most."""
-SHIFT, TURN = 20e-6, 20e-6
-"""Typical drift over a session [m] and [rad]: a stand that warms by a kelvin."""
-TIMES = 4.0
-"""By how many times it may be more or less, one sigma."""
-
 
 def drift_effects(problem: Problem) -> list[Effect]:
     """Return how each camera drifts, in the order of the sightings: shifts, and turns."""
-    knots = min(len(problem.seen) // EACH, MOST)
+    # Five sightings between two knots at least
+    knots = min(len(problem.seen) // 5, 12)
     if knots < 2:
         return []
     cameras = list(dict.fromkeys(camera for camera, _ in problem.ends))
-    kinds = ("shift", SHIFT, slice(3, 6)), ("turn", TURN, slice(0, 3))
+    # Over a session [m] and [rad]: a stand that warms by a kelvin
+    kinds = ("shift", 20e-6, slice(3, 6)), ("turn", 20e-6, slice(0, 3))
     return [
-        Effect(f"drift of {camera}", _drift(camera, knots, rows), size, TIMES,
+        # By how many times it may be more or less, one sigma
+        Effect(f"drift of {camera}", _drift(camera, knots, rows), size, 4.0,
                f"drift of {camera}", kind="drift", lasting=False)
         for camera in cameras for _, size, rows in kinds
     ]  # fmt: skip

@@ -25,18 +25,9 @@ POWERS = tuple(p for p in product(range(4), repeat=3) if sum(p) <= 3)
 """A calibrated scanner bends its volume once or twice, and has no ripples."""
 GRID = np.stack(np.meshgrid(*[np.linspace(-1, 1, 7)] * 3), axis=-1).reshape(-1, 3)
 """The view, evenly."""
-RADIUS = 30e-3
-"""A target is turned by how the field changes over so much to each side [m]: a flange's radius."""
-NEGLIGIBLE = 0.05
-"""Combinations of weights that move a session's targets by less than this share of the largest
-are left out."""
-LEVER = 0.3
-"""A turn counts like what it does so far away [m]."""
 TIMES = 1.1
 """By how many times the file's calibration error may be more or less, one sigma: data sheets state
 it for every device of the type. Were it free, it would take what the arm does wrong."""
-LEAST_TILT = 1e-3
-"""Circles that all face the camera to this [rad] are seen alike."""
 
 
 def scanner_effects(problem: Problem, scanner: ScannerModel | None) -> list[Effect]:
@@ -55,9 +46,11 @@ def scanner_effects(problem: Problem, scanner: ScannerModel | None) -> list[Effe
 def _distortion(scanner: ScannerModel, seen: Sightings) -> Effect:
     field = DistortionField(scanner)
     moves = field.moves(seen) * seen.by_depth[:, None, None]
-    scaled = moves * np.repeat([LEVER, 1.0], 3)[:, None]
+    # A turn counts like what it does so far away [m]
+    scaled = moves * np.repeat([0.3, 1.0], 3)[:, None]
     _, sizes, ways = np.linalg.svd(stack_rows(scaled), full_matrices=False)
-    kept = ways[sizes > NEGLIGIBLE * sizes[0]].T
+    # Combinations of weights that hardly move a session's targets are left out
+    kept = ways[sizes > 0.05 * sizes[0]].T
 
     def block(problem: Problem, linear: Linear) -> Floats:
         s = problem.seen
@@ -91,7 +84,8 @@ def _edge_size(s: Sightings) -> float:
     """Return what the fits state of their centres in the face, as if all of it were this [m]."""
     rows = s.by_depth & (s.ranks == 5)
     tilts = (_along(s)[rows] ** 2).sum()
-    if not rows.any() or tilts <= LEAST_TILT**2 * rows.sum():
+    # All face the camera to a milliradian: seen alike
+    if not rows.any() or tilts <= 1e-3**2 * rows.sum():
         return 0.0
     own, normals = s.covariances[rows, 3:, 3:], s.rotations[rows, :, 2]
     across = np.einsum("na,nab,nb->n", normals, own, normals)
@@ -133,8 +127,9 @@ class DistortionField:
     def moves(self, s: Sightings) -> Floats:
         """Return (N, 6, K): how each weight turns and moves a target, in ``camera``."""
         across, along, normals = (s.rotations[:, :, i] for i in range(3))
-        bent = [(self.at(s.centres + RADIUS * t) - self.at(s.centres - RADIUS * t))
-                / (2 * RADIUS) for t in (across, along)]  # fmt: skip
+        radius = 30e-3  # to each side of a target [m]: a flange's radius
+        bent = [(self.at(s.centres + radius * t) - self.at(s.centres - radius * t))
+                / (2 * radius) for t in (across, along)]  # fmt: skip
         rising = [np.einsum("ni,nik->nk", normals, each)[:, None] for each in bent]
         turning = np.einsum("ni,nik->nk", along, bent[0]) - np.einsum("ni,nik->nk", across, bent[1])
         turned = (

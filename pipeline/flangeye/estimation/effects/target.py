@@ -11,16 +11,8 @@ from flangeye.estimation.effects.effect import Block, Effect
 from flangeye.estimation.graph import Linear, Problem
 from flangeye.types import Floats
 
-TILT = 0.5e-3
-"""Typical tilt of a plate's face against the flange's axis [rad]: flatness of 0.02 mm over the rim
-and what the last joint's bearing adds."""
-OFFSET = 0.03e-3
-"""Typical distance of the seen circle's centre from the controller's flange origin [m]."""
 TIMES = 2.0
 """By how many times both may be larger or smaller, one sigma."""
-
-WRONG, WRONG_TIMES = 2e-3, 3.0
-"""The same of a circle that is mounted elsewhere than was said, or of a tool frame that is set."""
 
 
 def target_effects(problem: Problem) -> list[Effect]:
@@ -33,10 +25,13 @@ def target_effects(problem: Problem) -> list[Effect]:
     ranks = s.ranks[np.isin(s.pairs, circles) & s.by_depth]
     effects = []
     if (ranks == 5).any():
-        effects.append(Effect("tilt of the face", _tilt(circles), TILT, TIMES, kind="tilt"))
+        # Of a plate's face against the flange's axis [rad]: flatness of 0.02 mm over the
+        # rim and what the last joint's bearing adds
+        effects.append(Effect("tilt of the face", _tilt(circles), 0.5e-3, TIMES, kind="tilt"))
     if (ranks > 0).any():
         effects.append(
-            Effect("offset of the circle", _offset(circles), OFFSET, TIMES, kind="offset")
+            # Of the seen circle's centre from the controller's flange origin [m]
+            Effect("offset of the circle", _offset(circles), 0.03e-3, TIMES, kind="offset")
         )
     return effects
 
@@ -46,7 +41,9 @@ def wrong_offset(problem: Problem, effects: Sequence[Effect]) -> list[Effect] | 
     if not any(effect.kind == "offset" for effect in effects):
         return None
     return [
-        replace(e, size=WRONG, factor=WRONG_TIMES) if e.kind == "offset" else e for e in effects
+        # 2 mm, or three times as much or as little, one sigma
+        replace(e, size=2e-3, factor=3.0) if e.kind == "offset" else e
+        for e in effects
     ]
 
 

@@ -17,8 +17,6 @@ from flangeye.types import Floats
 
 LARGEST = 1e-3
 """Standard deviation of what a part may do: [rad] or [m]."""
-FARTHEST = 0.1
-"""The same of what it may do at all."""
 
 
 def blame(
@@ -61,7 +59,8 @@ def explained(
     residuals = (after.residuals + after.effects @ before.mean).ravel()
     noise = _noise(before, after, daily)
     limit = chi2_quantile(1 - MISFIT, len(residuals))
-    totals = (noise + FARTHEST**2 * d @ d.T for d, _ in _designs(after, about, scanner).values())
+    # What it may do at all
+    totals = (noise + 0.1**2 * d @ d.T for d, _ in _designs(after, about, scanner).values())
     return any(residuals @ np.linalg.solve(total, residuals) < limit for total in totals)
 
 

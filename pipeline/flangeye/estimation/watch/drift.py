@@ -39,10 +39,6 @@ NO_NORMAL = 1.0
 """Variance [rad^2] of a tilt that was not measured: it tells nothing."""
 MISFIT = 1e-6
 """How unlikely one sighting is that is a misfit, while nothing moved."""
-SURE = 1.64
-"""Standard deviations: a drift counts when it is larger than its limit with 95 %."""
-LEVER = 0.5
-"""What moves the work by a length turns it by the length over this [m]."""
 
 
 State = Literal["OK", "DEGRADED", "MOVED"]
@@ -168,7 +164,8 @@ class Information:
 
 def allowance(deviation: float) -> Floats:
     """Return the (6, 6) covariance of a motion that moves the work by ``deviation`` [m] an axis."""
-    return np.diag([(deviation / LEVER) ** 2] * 3 + [deviation**2] * 3)
+    # What moves the work by a length turns it by the length over half a metre
+    return np.diag([(deviation / 0.5) ** 2] * 3 + [deviation**2] * 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,7 +230,8 @@ def verdict(checks: Information, prior: Prior, corners: Floats, test: DriftTest)
         return moved_since(checks, prior, corners, test, found[1], found[0])
     motion, covariance = _slow(checks, prior, test)
     shift = largest_shift(motion, corners)
-    surely = shift - SURE * _deviation(motion, covariance, corners)
+    # Larger than its limit with 95 %, one-sided
+    surely = shift - 1.64 * _deviation(motion, covariance, corners)
     drifted: State = "MOVED" if surely > test.limit else "DEGRADED"
     state = drifted if surely > test.limit / 2 else "OK"
     since = None if state == "OK" else _began(checks, corners, prior, test)

@@ -29,12 +29,6 @@ POWERS = tuple(
     for turn in product(range(2), repeat=3)
     if sum(place) + 2 * sum(turn) <= 2
 )
-SHORTEST, NARROWEST = 0.05, 0.3
-"""An arm's error hardly changes over less: [m] and [rad]."""
-SMALLEST, LARGEST = 1e-6, 1e-2
-"""Sizes of errors that are tried: [m] and [rad]."""
-MOST_POSES = 60
-"""Poses from which the sizes are found; more tell them hardly better."""
 FREE = np.ones(6)
 """Variances of a camera's motion that nothing is known of: [rad^2] and [m^2]."""
 
@@ -88,7 +82,8 @@ def pose_error_of(residuals: Floats, effects: Floats, own: Floats, poses: Floats
         own: (N, 5, 5) covariances of the scans alone.
         poses: (N, 4, 4) of the circle in ``base``.
     """
-    chosen = np.unique(np.linspace(0, len(poses) - 1, MOST_POSES).astype(int))
+    # More tell the sizes hardly better
+    chosen = np.unique(np.linspace(0, len(poses) - 1, 60).astype(int))
     bare = _unsized(poses)
     design = np.concatenate([effects, bare.effects(poses)], axis=2)[chosen]
     seen = residuals[chosen], own[chosen]
@@ -98,7 +93,8 @@ def pose_error_of(residuals: Floats, effects: Floats, own: Floats, poses: Floats
 
     from scipy.optimize import minimize
 
-    bounds = [(np.log(SMALLEST), np.log(LARGEST))] * 4
+    # Sizes that are tried: [m] and [rad]
+    bounds = [(np.log(1e-6), np.log(1e-2))] * 4
     start = np.full(4, np.log(1e-4))
     best = minimize(unlikelihood, start, method="L-BFGS-B", bounds=bounds)
     return _sized(bare, best.x)
@@ -110,7 +106,8 @@ def _unsized(poses: Floats) -> ArmPoseErrors:
     middle[:3, :3] = nearest_rotation(poses[:, :3, :3].mean(axis=0))
     radius = np.linalg.norm(poses[:, :3, 3] - middle[:3, 3], axis=1).max()
     angle = np.linalg.norm(rotation_log(poses[:, :3, :3] @ middle[:3, :3].T), axis=1).max()
-    lengths = RADII * np.array([max(radius, SHORTEST), max(angle, NARROWEST)])
+    # An arm's error hardly changes over less: [m] and [rad]
+    lengths = RADII * np.array([max(radius, 0.05), max(angle, 0.3)])
     return ArmPoseErrors(middle, np.repeat(lengths, 3), (0.0, 0.0), (0.0, 0.0))
 
 
