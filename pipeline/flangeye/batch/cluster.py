@@ -44,14 +44,6 @@ AHEAD = 3
 CHUNK_SECONDS, MOST = 5.0, 500
 """How long a worker is to be busy with a chunk [s], and how many sessions it has at most."""
 
-SINGLE_THREADED = {
-    name: 1
-    for name in (
-        "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS",
-        "OPENCV_FOR_THREADS_NUM",
-    )
-}  # fmt: skip
-"""Sessions run side by side, so each keeps to one core."""
 
 _LOGS = {"distributed.admin.low-level-log-length": 8}
 """Dask keeps as many of the last messages on each connection, 1,000 if nothing is said: with them
@@ -59,7 +51,17 @@ every chunk that was sent to a worker, 600 bytes a session."""
 
 _LOCAL = {
     **_LOGS,
-    "distributed.nanny.pre-spawn-environ": SINGLE_THREADED,
+    # Sessions run side by side, so each keeps to one core.
+    "distributed.nanny.pre-spawn-environ": dict.fromkeys(
+        (
+            "OMP_NUM_THREADS",
+            "MKL_NUM_THREADS",
+            "OPENBLAS_NUM_THREADS",
+            "NUMEXPR_NUM_THREADS",
+            "OPENCV_FOR_THREADS_NUM",
+        ),
+        1,
+    ),
     # A session counts its own starts (work.py), which tells the culprit from those that waited.
     "distributed.scheduler.allowed-failures": 1_000_000,
     # A worker that paused for want of memory would never go on; one that is killed is replaced.

@@ -34,8 +34,6 @@ if TYPE_CHECKING:
 
     from flangeye.plugin.registry import Registry
 
-CSV = "sessions.csv"
-
 
 def run_batch(request: Request, registry: Registry, console: Console) -> Batch:
     """Run every session that has not finished yet, and compare them all.
@@ -129,7 +127,8 @@ def _run(client: Client, job: Job, todo: Iterable[tuple[int, BatchSession]], cou
 
 def _tell(job: Job, dataset: Dataset, ledger: Ledger, tally: Tally) -> None:
     """Write ``sessions.csv`` and the page, from the rows that are there."""
-    with job.place.draft(CSV) as path, path.open("w", newline="", encoding="utf-8") as file:
+    name = "sessions.csv"
+    with job.place.draft(name) as path, path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(tally.columns)
         for table in dataset.blocks(ledger):
@@ -139,7 +138,7 @@ def _tell(job: Job, dataset: Dataset, ledger: Ledger, tally: Tally) -> None:
     if tally.total:
         write_page(tally, job.place)
     else:
-        job.place.remove(CSV)
+        job.place.remove(name)
 
 
 def _plain(cell: object) -> object:

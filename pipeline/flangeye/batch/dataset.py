@@ -33,9 +33,6 @@ FOLDER = "sessions.parquet"
 BLOCK = 10_000
 """Sessions in a file at most."""
 
-_INTEGERS = ("seed", "used", "captures")
-_TEXTS = ("session", "recipe", "archive", "status", "reason", "report")
-
 
 def columns_of(varied: Mapping[str, Sequence[str]]) -> dict[str, Kind]:
     """Return the columns of the table: name -> kind.
@@ -52,7 +49,9 @@ def _kind(name: str, varied: Mapping[str, Sequence[str]]) -> Kind:
     if name in varied:
         kinds = {type(parse_value(text, name)) for text in varied[name]}
         return "int64" if kinds == {int} else "double" if kinds <= {int, float} else "string"
-    return "string" if name in _TEXTS else "int64" if name in _INTEGERS else "double"
+    if name in ("session", "recipe", "archive", "status", "reason", "report"):
+        return "string"
+    return "int64" if name in ("seed", "used", "captures") else "double"
 
 
 def row_of(session: BatchSession, outcome: SessionOutcome, columns: Mapping[str, Kind]) -> Row:

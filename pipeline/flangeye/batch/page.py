@@ -22,8 +22,6 @@ from flangeye.report.units import degrees, duration, millimetres
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-_HERE = Path(__file__).parent
-_REPORT = Path(run_report.__file__).parent
 
 _HEADINGS: Mapping[str, str] = {
     "session": "Session",
@@ -49,10 +47,6 @@ COLOURS = (
     "#3a7ebf", "#d9822b", "#3f9b57", "#b8485f", "#7d62b5", "#8a6d3b", "#c06fa8", "#5b6474",
 )  # fmt: skip
 """Told apart on white and on black; a second thing that varies has at most so many values."""
-
-MARKER = {"size": 6, "opacity": 0.6}
-LINE = {"width": 2, "dash": "dot"}
-_QUANTITY = re.compile(r"([-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S*)")
 
 
 @dataclass(frozen=True)
@@ -151,7 +145,7 @@ def _environment() -> Environment:
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     environment = Environment(
-        loader=FileSystemLoader([_HERE, _REPORT]),
+        loader=FileSystemLoader([Path(__file__).parent, Path(run_report.__file__).parent]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -182,14 +176,6 @@ class Figure:
     scale: float
 
 
-FIGURES = (
-    Figure("holdout_rms_m", "Held-out error, rms", "mm", 1e3),
-    Figure("expected_p95_m", "Expected error, 95 %", "mm", 1e3),
-    Figure("true_rms_m", "True error, rms", "mm", 1e3),
-    Figure("seconds", "Time", "s", 1.0),
-)
-
-
 def drawings_of(rows: Sequence[Row], varied: Sequence[str]) -> list[tuple[str, Drawing]]:
     """Return (title, plot) for every figure that some session has.
 
@@ -200,7 +186,12 @@ def drawings_of(rows: Sequence[Row], varied: Sequence[str]) -> list[tuple[str, D
     x, colour = _axes(rows, varied)
     return [
         (figure.title, _drawing(with_it, figure, x, colour))
-        for figure in FIGURES
+        for figure in (
+            Figure("holdout_rms_m", "Held-out error, rms", "mm", 1e3),
+            Figure("expected_p95_m", "Expected error, 95 %", "mm", 1e3),
+            Figure("true_rms_m", "True error, rms", "mm", 1e3),
+            Figure("seconds", "Time", "s", 1.0),
+        )
         if (with_it := [row for row in rows if row[figure.column] is not None])
     ]
 
@@ -225,7 +216,11 @@ def _drawing(rows: Sequence[Row], figure: Figure, x: str, colour: str | None) ->
         at = [places[i] for i in members]
         y = [rows[i][figure.column] * figure.scale for i in members]
         names = [rows[i]["session"] for i in members]
-        look = {"name": group, "marker": MARKER | {"color": shade}, "line": LINE | {"color": shade}}
+        look = {
+            "name": group,
+            "marker": {"size": 6, "opacity": 0.6} | {"color": shade},
+            "line": {"width": 2, "dash": "dot"} | {"color": shade},
+        }
         drawn = [_points(at, y, names, figure.unit), *_medians(at, y)]
         traces += [trace | look for trace in drawn]
     label = _short(x) + (f" [{unit}]" if unit else "")
@@ -276,7 +271,10 @@ def _medians(places: Sequence[Any], values: Sequence[float]) -> list[Drawing]:
 
 def _places(values: Sequence[Any]) -> tuple[list[Any], str | None]:
     """Return where values stand on an axis, and its unit; None for names, "" for bare numbers."""
-    matches = [_QUANTITY.fullmatch(str(value)) for value in values]
+    matches = [
+        re.fullmatch(r"([-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S*)", str(value))
+        for value in values
+    ]
     found = [match.groups() for match in matches if match]
     units = {unit for _, unit in found}
     if len(found) < len(values) or len(units) != 1:

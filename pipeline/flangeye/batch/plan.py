@@ -17,8 +17,6 @@ from flangeye.plugin.registry import Registry
 from flangeye.recipe.find import find_recipe
 from flangeye.recipe.load import Recipe, load_recipe
 
-_OPENING, _CLOSING = "[{", "]}"
-
 
 @dataclass(frozen=True)
 class BatchSession:
@@ -203,7 +201,7 @@ def split_values(text: str) -> list[str]:
             quote = "" if character == quote else quote
         elif character in "'\"":
             quote = character
-        depth += (character in _OPENING) - (character in _CLOSING) if not quote else 0
+        depth += (character in "[{") - (character in "]}") if not quote else 0
         if character == "," and not depth and not quote:
             values.append("")
         else:

@@ -204,10 +204,6 @@ def _median(values: NDArray[np.float64]) -> float | None:
     return float(np.median(known)) if len(known) else None
 
 
-TOLD_AT_MOST = 10
-"""Sessions without a calibration that are named while the batch runs; the tables name all."""
-
-
 class BatchProgress:
     """A progress bar of sessions; those without a calibration are named as they end."""
 
@@ -246,9 +242,10 @@ class BatchProgress:
 
     def _tell(self, session: str, outcome: SessionOutcome) -> None:
         self._told += 1
-        if self._told <= TOLD_AT_MOST:
+        most = 10  # named while the batch runs; the tables name all
+        if self._told <= most:
             self.note(f"{outcome.status} {session}: {outcome.reason}")
-        elif self._told == TOLD_AT_MOST + 1:
+        elif self._told == most + 1:
             self.note("further ones will be in sessions.csv")
 
 

@@ -54,9 +54,6 @@ STARTS = ".starts"
 READY = f"{STARTS}/ready"
 """There while a batch runs: by it a worker knows that it sees the batch's folder."""
 
-LIBRARY = "plotly.js"
-"""What all reports of a batch share, beside their folders."""
-
 
 @dataclass(frozen=True)
 class Job:
@@ -212,7 +209,8 @@ def _started(job: Job, session: BatchSession, recipes: Recipes) -> SessionOutcom
         path = stack.enter_context(results_at(f"{job.out}/{session.id}"))
         archive = stack.enter_context(archive_at(session.archive))
         # A report for elsewhere has its library inside: nothing is beside it while it is made.
-        library = None if is_url(job.out) else Path(job.out) / LIBRARY
+        # What all reports of a batch share, beside their folders
+        library = None if is_url(job.out) else Path(job.out) / "plotly.js"
         folder = RunFolder.create(recipe.name, path)
         start = Start(ArchivePath(archive))
         result = record_run(recipe, registry, folder, start, job.report, library)

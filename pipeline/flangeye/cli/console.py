@@ -22,9 +22,6 @@ if TYPE_CHECKING:
 
     from flangeye.log.read import RunLog
 
-LONGEST = 4000
-"""Of a line of an error, what is shown [characters]: names in it come from files."""
-
 
 def say(text: object, err: bool = False) -> None:
     """Write a line; what others wrote in it reaches the terminal as text, never as commands."""
@@ -133,9 +130,10 @@ def _fail(error: FlangeyeError) -> NoReturn:
 
         traceback.print_exception(error)
     with suppress(OSError):
+        longest = 4000  # of a line of an error [characters]: names in it come from files
         for line in printable(str(error)).splitlines():
-            more = f" ({len(line) - LONGEST} characters more)" if len(line) > LONGEST else ""
-            sys.stderr.write(f"error: {line[:LONGEST]}{more}\n")
+            more = f" ({len(line) - longest} characters more)" if len(line) > longest else ""
+            sys.stderr.write(f"error: {line[:longest]}{more}\n")
     sys.exit(error.exit_code)
 
 

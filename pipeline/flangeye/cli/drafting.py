@@ -17,11 +17,6 @@ if TYPE_CHECKING:
     from flangeye.plugin.registry import Registry
     from flangeye.recipe.draft import Draft, Questions
 
-TARGETS = re.compile(r"^.*?: steps\.\d+\.fit\.", re.MULTILINE)
-"""Where mistakes in a target are, in a recipe that was drafted."""
-NO_FLANGE = (
-    "no scan shows the flange; what is seen instead, 'body: gripper.stl' for a tool by its mesh"
-)
 ANSWERS = {
     "robot": "Robot model, its .urdf or .yaml file, or none.",
     "plate": "Flange plate, for example ISO 9409-1-50-4-M6.",
@@ -107,7 +102,10 @@ def init(
         for path in new:
             path.unlink()
         # Of the recipe that is not kept nobody knows: its target is what was asked for.
-        raise RecipeError(TARGETS.sub("--target ", str(error))) from None
+        # Mistakes in a target, in a recipe that was drafted
+        raise RecipeError(
+            re.sub(r"^.*?: steps\.\d+\.fit\.", "--target ", str(error), flags=re.MULTILINE)
+        ) from None
     for line in (*draft.told, *(f"assumed: {line}" for line in questions.assumed)):
         say(line)
     say(f"{out}: ok, {len(checked.steps)} steps; next: flangeye run {out}")
@@ -123,7 +121,8 @@ def _of_folder(folder: Path, out: Path, questions: Questions, registry: Registry
     if "fit.rim" not in draft.text or _shows_target(draft, folder, out, registry):
         return draft
     questions.given["target"] = None
-    questions.ask("target", NO_FLANGE, "flange")
+    seen = "what is seen instead, 'body: gripper.stl' for a tool by its mesh"
+    questions.ask("target", f"no scan shows the flange; {seen}", "flange")
     return draft_recipe(survey, out, questions, registry)
 
 

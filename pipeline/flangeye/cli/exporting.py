@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from flangeye.types import CalibratedPose, ExportedFile
 
 
-ROS2 = "export.ros2_launch"
 FORMATS = "'flangeye export --list' names the formats"
 Camera = Annotated[str | None, typer.Option(help="Camera to export, for a cell with several.")]
 Anyway = Annotated[
@@ -101,9 +100,10 @@ def publish(
     from flangeye.run.folder import recipe_of_log
 
     registry = load_plugins()
-    log, pose = _calibrated(run, registry.stage(ROS2), anyway, camera)
+    ros2 = "export.ros2_launch"
+    log, pose = _calibrated(run, registry.stage(ros2), anyway, camera)
     steps = recipe_of_log(log, registry).steps
-    named: Any = next((step.params for step in steps if step.stage.name == ROS2), None)
+    named: Any = next((step.params for step in steps if step.stage.name == ros2), None)
     frames = {
         pose.transform.parent: parent or (named and named.parent),
         pose.transform.child: child or (named and named.child),

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-COLOURS = {"verified": "bold green", "unverified": "bold yellow", "refused": "bold red"}
-
 
 def print_summary(
     console: Console, result: Result, run: str, formats: int, said: Collection[str] = ()
@@ -34,7 +32,8 @@ def print_summary(
     used = sum(o.used for o in result.observations)
     write(console, result.title, "bold")
     verdict = status_of(result).replace(result.status, result.status.upper())
-    colour = COLOURS.get(result.status, "bold")
+    shades = {"verified": "bold green", "unverified": "bold yellow", "refused": "bold red"}
+    colour = shades.get(result.status, "bold")
     rows(console, [(verdict, f"{used} of {len(result.observations)} captures used", "")], colour)
     for each in result.warnings:
         if each.text not in said:

@@ -23,10 +23,6 @@ __all__ = [
 ]
 
 
-LISTED = 8
-"""Names of samples that are written out; of more, the rest is counted."""
-
-
 def as_text(diagnosis: Diagnosis) -> str:
     """Return what was found, a few lines for each finding."""
     session = diagnosis.session
@@ -52,8 +48,9 @@ def _idle(diagnosis: Diagnosis) -> list[str]:
 def _details(finding: Finding) -> list[str]:
     lines = []
     if finding.samples:
-        shown = ", ".join(finding.samples[:LISTED])
-        more = len(finding.samples) - LISTED
+        listed = 8  # of more samples, the rest is counted
+        shown = ", ".join(finding.samples[:listed])
+        more = len(finding.samples) - listed
         lines.append(f"   samples: {shown}" + (f" and {more} more" if more > 0 else ""))
     if evidence := evidence_of(finding):
         lines.append(f"   evidence: {evidence}")

@@ -159,7 +159,7 @@ class RecordedSession:
 
     def read_with(self, **correction: Any) -> RecordedSession:
         """Return the session as ``reader.corrected`` with a correction would give it."""
-        stated = {name: value for name, value in correction.items() if (name, value) != _DEFAULT}
+        stated = {k: value for k, value in correction.items() if (k, value) != ("arms", "both")}
         reader = {"corrected": {"reader": self.reader, **stated}}
         return replace(self, reader=reader, again=None)
 
@@ -250,7 +250,11 @@ class Finding:
 
         Empty where a person has something to do that is no line.
         """
-        lines = [choice.removeprefix("- ") for choice in self.choices if _LINE.fullmatch(choice)]
+        lines = [
+            choice.removeprefix("- ")
+            for choice in self.choices
+            if re.fullmatch(r"(- [a-z]+\.\w+|[a-z_]+): \{.*\}(  # .*)?", choice)
+        ]
         return [dict(parse_value(line, "the doctor's line")) for line in lines]
 
 
@@ -259,13 +263,9 @@ ReadAgain = Callable[[Mapping[str, Any], Mapping[str, Any]], RecordedSession]
 Change = Callable[[Floats], Floats]
 """Gives poses (N, 4, 4) as they should be."""
 
-_DEFAULT = ("arms", "both")
 
 OR_ELSE = "  # or, if it is not: "
 """Between two lines of which a person has to choose one."""
-_LINE = re.compile(r"(- [a-z]+\.\w+|[a-z_]+): \{.*\}(  # .*)?")
-_NAME = re.compile(r"[A-Za-z_][\w.-]*(?: [\w.-]+)*")
-_QUANTITY = re.compile(r"-?[\d.]+ [A-Za-z]+")
 
 
 def _flow(value: Any) -> str:
@@ -276,7 +276,11 @@ def _flow(value: Any) -> str:
     if isinstance(value, (list, tuple)):
         return f"[{', '.join(map(_flow, value))}]"
     text = str(value).lower() if isinstance(value, bool) else str(value)
-    plain = not isinstance(value, str) or _NAME.fullmatch(text) or _QUANTITY.fullmatch(text)
+    plain = (
+        not isinstance(value, str)
+        or re.fullmatch(r"[A-Za-z_][\w.-]*(?: [\w.-]+)*", text)
+        or re.fullmatch(r"-?[\d.]+ [A-Za-z]+", text)
+    )
     return text if plain else f"'{text}'"
 
 

@@ -9,9 +9,6 @@ from flangeye.doctor.diagnosis import FEWEST_SAMPLES, Finding, NotApplicable, Re
 from flangeye.errors import StageError
 from flangeye.plugin.stage import BoundPart, Part
 
-FALSE_ALARM = 1e-3
-"""Probability of any finding at all about a session without a mistake."""
-
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
@@ -92,7 +89,8 @@ def _offered(
             continue
         finally:
             checked()
-        found += [f for f in findings if f.probability * len(checks) < FALSE_ALARM]
+        # Probability of any finding at all about a session without a mistake
+        found += [f for f in findings if f.probability * len(checks) < 1e-3]
     return found, idle
 
 

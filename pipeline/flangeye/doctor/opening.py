@@ -112,13 +112,6 @@ def _bare(session: RecordedSession, index: int, states: Mapping[str, State]) -> 
     )
 
 
-_UNITS: Mapping[str, tuple[str, ...]] = {
-    "auto": ("m", "mm", "in"), "m": ("auto", "mm", "in"), "mm": ("auto", "m", "in"),
-    "in": ("auto", "m", "mm"),
-}  # fmt: skip
-"""What else clouds may be in, by what the recipe says."""
-
-
 def open_session(path: Path, registry: Registry, recipe: Recipe | None = None) -> RecordedSession:
     """Return what an archive holds, as checks see it.
 
@@ -439,7 +432,8 @@ def found_in(
     if any(remark.fix for remark in remarks):
         return seen.features, remarks, None
     if len(seen.features) < FEWEST_SAMPLES and first.params is not None and stated is not None:
-        for unit in _UNITS[stated]:
+        # What else clouds may be in, by what the recipe says
+        for unit in (unit for unit in ("auto", "m", "mm", "in") if unit != stated):
             params = first.params.model_copy(update={"unit": unit})
             others = _seen_by(archive, replace(first, params=params), recipe, registry).features
             if len(others) >= FEWEST_SAMPLES:

@@ -21,8 +21,6 @@ Entity = tuple[str, list[Group]]
 
 MOST_PIECES = 200_000
 """Straight pieces of one drawing."""
-UNITS = {"1": "in", "4": "mm", "6": "m"}
-"""``$INSUNITS``, as far as lengths here have such a unit."""
 
 
 def read_dxf(path: Path) -> tuple[Floats, str | None]:
@@ -61,7 +59,8 @@ def _groups(path: Path) -> list[Group]:
 def _unit(groups: list[Group]) -> str | None:
     for (_, name), (_, value) in pairwise(groups):
         if name == "$INSUNITS":
-            return UNITS.get(value)
+            # As far as lengths here have such a unit
+            return {"1": "in", "4": "mm", "6": "m"}.get(value)
     return None
 
 

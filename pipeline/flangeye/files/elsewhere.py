@@ -17,13 +17,6 @@ from typing import Any
 
 from flangeye.errors import FlangeyeError, StageError
 
-PROTOCOLS = ("s3", "gs", "az", "https", "zip")
-"""What a URL may begin with, or a part of one after ``::``; none of them runs anything."""
-
-LATER = (".pcd", ".ply", ".npy", ".xyz", ".csv", ".txt", ".png", ".jpg", ".jpeg", ".bmp", ".tif",
-         ".tiff")  # fmt: skip
-"""Endings of scans and images."""
-
 
 def is_url(place: str) -> bool:
     """Return whether a place is a URL, not a path."""
@@ -161,7 +154,11 @@ class _StandIn:
             path.touch()
             self._names[path] = about["name"]
             # Files up to so many bytes are fetched at once, whatever they are
-            if path.suffix.lower() in LATER and (about.get("size") or 0) > 1_000_000:
+            of_scans = path.suffix.lower() in (
+                ".pcd", ".ply", ".npy", ".xyz", ".csv", ".txt", ".png", ".jpg", ".jpeg", ".bmp",
+                ".tif", ".tiff",
+            )  # fmt: skip
+            if of_scans and (about.get("size") or 0) > 1_000_000:
                 self.later[path] = about
             else:
                 self.fetch(path)
@@ -198,11 +195,12 @@ def system_of(url: str) -> tuple[Any, str]:
     Raises:
         StageError: The URL is of another kind, or what opens it is not installed.
     """
+    protocols = ("s3", "gs", "az", "https", "zip")  # none of them runs anything
     for each in url.split("::"):
         protocol = each.partition("://")[0]
-        if "://" in each and protocol not in PROTOCOLS:
+        if "://" in each and protocol not in protocols:
             raise StageError(
-                f"{url}: {protocol}:// is not known; {', '.join(f'{p}://' for p in PROTOCOLS)} are"
+                f"{url}: {protocol}:// is not known; {', '.join(f'{p}://' for p in protocols)} are"
             )
     try:
         import fsspec

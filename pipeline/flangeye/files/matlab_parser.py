@@ -15,15 +15,12 @@ PREFIX = "of_"
 """In front of each array's name: savez has arguments of its own."""
 SECONDS = 20
 """Longest time for one file."""
-MEMORY = 4 << 30
-"""What the process may ask for [bytes]; libraries reserve much that they never use."""
-LARGEST = 1 << 28
-"""What the arrays of a file may come to [bytes]."""
 
 
 def main() -> None:
     """Parse, and write the arrays of numbers."""
-    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+    memory = 4 << 30  # libraries reserve much that they never use [bytes]
+    resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     import numpy as np
     from scipy.io import loadmat
@@ -31,8 +28,9 @@ def main() -> None:
     values = loadmat(io.BytesIO(sys.stdin.buffer.read())).items()
     numbers = ((n, v) for n, v in values if isinstance(v, np.ndarray) and v.dtype.kind in "iuf")
     arrays: dict[str, Any] = {PREFIX + name: array for name, array in numbers}
-    if sum(array.nbytes for array in arrays.values()) > LARGEST:
-        raise ValueError(f"its arrays come to more than {LARGEST} bytes")
+    largest = 1 << 28  # [bytes]
+    if sum(array.nbytes for array in arrays.values()) > largest:
+        raise ValueError(f"its arrays come to more than {largest} bytes")
     out = io.BytesIO()
     np.savez(out, **arrays)
     sys.stdout.buffer.write(out.getvalue())

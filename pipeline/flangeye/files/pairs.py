@@ -8,8 +8,6 @@ from collections.abc import Sequence
 from flangeye.errors import StageError
 
 Key = str | tuple[int, ...]
-NAMES_SHOWN = 4
-"""Names that a message lists before it says how many more there are."""
 
 
 def natural(text: str) -> list[tuple[int, str]]:
@@ -94,5 +92,6 @@ def _differing(
 
 
 def _list(names: Sequence[str]) -> str:
-    more = f" and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else ""
-    return ", ".join(names[:NAMES_SHOWN]) + more
+    shown = 4
+    more = f" and {len(names) - shown} more" if len(names) > shown else ""
+    return ", ".join(names[:shown]) + more

@@ -15,12 +15,6 @@ MAX_TEXT = 64_000_000
 """Longest table, list of poses or JSON file [bytes]: a million poses."""
 
 
-_FLAGS = os.O_RDONLY | sum(
-    getattr(os, name, 0) for name in ("O_NONBLOCK", "O_NOCTTY", "O_CLOEXEC", "O_BINARY")
-)
-"""Not every system has all of them."""
-
-
 def open_regular(path: Path, error: type[FlangeyeError] = StageError) -> BinaryIO:
     """Open a regular file, or a link to one, for reading; never waits, as a FIFO would make one.
 
@@ -33,7 +27,11 @@ def open_regular(path: Path, error: type[FlangeyeError] = StageError) -> BinaryI
             device, a FIFO or a socket.
     """
     try:
-        number = os.open(path, _FLAGS)
+        # Not every system has all of them
+        flags = os.O_RDONLY | sum(
+            getattr(os, name, 0) for name in ("O_NONBLOCK", "O_NOCTTY", "O_CLOEXEC", "O_BINARY")
+        )
+        number = os.open(path, flags)
     except (OSError, ValueError) as failure:
         raise error(f"{path}: cannot be read: {_reason(failure)}") from None
     mode = os.fstat(number).st_mode

@@ -9,13 +9,6 @@ from flangeye.errors import RecipeError
 
 LONGEST = 160
 """What is quoted of a parser's message [characters]: some quote the file."""
-_CONTROLS = re.compile(
-    "[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]"
-)
-"""All but tab and line feed: escape sequences begin with them, and directions hide what is said."""
-
-_NAME = re.compile(r"\w[\w ./:+()\-]{0,127}")
-"""A link, joint or frame in another program's file: no quote, no line break, no markup."""
 
 
 def require_name(where: str, name: str) -> str:
@@ -24,7 +17,8 @@ def require_name(where: str, name: str) -> str:
     Raises:
         RecipeError: It has other characters than names have, or more than 128.
     """
-    if not _NAME.fullmatch(name):
+    # A link, joint or frame in another program's file: no quote, no line break, no markup.
+    if not re.fullmatch(r"\w[\w ./:+()\-]{0,127}", name):
         raise RecipeError(
             f"{where}: {name[:LONGEST]!a} is no name: letters, digits and _ . / : + - ( ) or a "
             "space are allowed, 128 at most; rename it in the file"
@@ -34,7 +28,13 @@ def require_name(where: str, name: str) -> str:
 
 def printable(text: str) -> str:
     """Return a text with its control characters written out as escapes."""
-    return _CONTROLS.sub(lambda found: ascii(found[0])[1:-1], text)
+    # All but tab and line feed: escape sequences begin with them, and directions hide what is
+    # said.
+    return re.sub(
+        "[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]",
+        lambda found: ascii(found[0])[1:-1],
+        text,
+    )
 
 
 def reason_of(error: BaseException) -> str:

@@ -23,20 +23,9 @@ from flangeye.errors import RecipeError
 from flangeye.files.regular import read_text
 
 MAX_BYTES = 1_000_000
-MAX_DEPTH = 20
-MAX_DIGITS = 18
-"""Of an integer: it fits into 64 bits, and into a float."""
 
 _INTEGER = re.compile(r"[-+]?\d+")
 _SURROGATE = re.compile("[\ud800-\udfff]")
-_FLOAT = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?")  # linear, whatever follows
-_WORDS: Mapping[str, Any] = {
-    "null": None,
-    "~": None,
-    "": None,
-    "true": True,
-    "false": False,
-}
 
 Keys = tuple[Hashable, ...]
 
@@ -118,6 +107,7 @@ def parse_value(text: str, name: str) -> Any:
 def _refuse_dangers(text: str, name: str, loader: type[yaml.SafeLoader]) -> None:
     """Look at the events first: they are flat, so nothing can expand or recurse yet."""
     depth = 0
+    deepest = 20
     for event in yaml.parse(text, Loader=loader):
         where = f"{name}:{event.start_mark.line + 1 if event.start_mark else 1}"
         tag = getattr(event, "tag", None)
@@ -131,8 +121,8 @@ def _refuse_dangers(text: str, name: str, loader: type[yaml.SafeLoader]) -> None
             depth += 1
         elif isinstance(event, yaml.CollectionEndEvent):
             depth -= 1
-        if depth > MAX_DEPTH:
-            raise RecipeError(f"{where}: nested deeper than {MAX_DEPTH} levels")
+        if depth > deepest:
+            raise RecipeError(f"{where}: nested deeper than {deepest} levels")
 
 
 def _build(node: yaml.Node, path: Keys, lines: dict[Keys, int], name: str) -> Any:
@@ -142,9 +132,10 @@ def _build(node: yaml.Node, path: Keys, lines: dict[Keys, int], name: str) -> An
     if isinstance(node, yaml.SequenceNode):
         return [_build(child, (*path, i), lines, name) for i, child in enumerate(node.value)]
     text, plain = _text(node, name), not getattr(node, "style", None)
-    if plain and len(text) > MAX_DIGITS and _INTEGER.fullmatch(text):
+    digits = 18  # an integer of so many fits into 64 bits, and into a float
+    if plain and len(text) > digits and _INTEGER.fullmatch(text):
         raise RecipeError(
-            f"{name}:{lines[path]}: an integer of {len(text)} digits; at most {MAX_DIGITS} are "
+            f"{name}:{lines[path]}: an integer of {len(text)} digits; at most {digits} are "
             "read, and a name of digits is written in quotes"
         )
     return _scalar(text, plain)
@@ -179,11 +170,13 @@ def _scalar(text: str, plain: bool) -> Any:
     """Return the value of a scalar; only plain ones, without quotes, can be other than text."""
     if not plain:
         return text
-    if text.lower() in _WORDS:
-        return _WORDS[text.lower()]
+    words = {"null": None, "~": None, "": None, "true": True, "false": False}
+    if text.lower() in words:
+        return words[text.lower()]
     if _INTEGER.fullmatch(text):
         return int(text)
-    return float(text) if _FLOAT.fullmatch(text) else text
+    # Linear, whatever follows
+    return float(text) if re.fullmatch(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?", text) else text
 
 
 class Edit(NamedTuple):

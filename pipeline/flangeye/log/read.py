@@ -33,19 +33,6 @@ _TYPES: dict[str, type] = {
     )
 }  # fmt: skip
 
-_GIVEN: dict[str, tuple[type, ...]] = {
-    "segment": (t.FlangeCloud,),
-    "fit": (t.CircleFeature, t.PoseFeature),
-    "verify": (t.Verification,),
-}
-"""What the steps of a kind give, where others rely on it."""
-
-_OF_A_RUN = ("calibration.yaml", "result.json", "report.html")
-MAX_JSON = 1 << 24
-"""Longest JSON message that is read [bytes]; decoded, it takes forty times as much."""
-MAX_TOLD = 10
-"""Damaged parts that are named one by one."""
-
 Value = TypeVar("Value")
 
 
@@ -160,8 +147,9 @@ class RunLog:
     def notes(self) -> list[str]:
         """The log's damage in a few lines, for whoever runs on it."""
         kept = f"kept: {len(self.poses)} captures, {len(self.entries)} values of steps"
-        told = [f"{self.path}: damaged: {what}; {kept}" for what in self.damage[:MAX_TOLD]]
-        more = len(self.damage) - MAX_TOLD
+        told_at_most = 10
+        told = [f"{self.path}: damaged: {what}; {kept}" for what in self.damage[:told_at_most]]
+        more = len(self.damage) - told_at_most
         return told + ([f"{self.path}: damaged: and {more} more"] if more > 0 else [])
 
     def require_sound(self) -> None:
@@ -323,7 +311,8 @@ def log_of(path: Path) -> Path:
     if path.is_dir():
         return path / "run.mcap"
     beside = path.parent / "run.mcap"
-    return beside if path.name in _OF_A_RUN and beside.is_file() else path
+    of_a_run = path.name in ("calibration.yaml", "result.json", "report.html")
+    return beside if of_a_run and beside.is_file() else path
 
 
 def is_log(path: Path) -> bool:
@@ -430,7 +419,12 @@ def _take_json(
 
 def _check_kind(entry: Entry) -> None:
     """Refuse what no stage of a kind gives."""
-    expected = _GIVEN.get(entry.kind)
+    # What the steps of a kind give, where others rely on it
+    expected: tuple[type, ...] | None = {
+        "segment": (t.FlangeCloud,),
+        "fit": (t.CircleFeature, t.PoseFeature),
+        "verify": (t.Verification,),
+    }.get(entry.kind)
     if expected and not isinstance(entry.value, expected):
         names = " or ".join(kind.__name__ for kind in expected)
         raise DamageError(f"a step of {entry.kind} gives {names}, not {entry.type}")
@@ -455,8 +449,9 @@ def decode_json(raw: bytes) -> dict[str, Any]:
     Raises:
         ValueError: It is too long, no JSON, or something else.
     """
-    if len(raw) > MAX_JSON:
-        raise DamageError(f"it has {len(raw)} bytes; at most {MAX_JSON} are read")
+    most = 1 << 24  # decoded, a message takes forty times as much [bytes]
+    if len(raw) > most:
+        raise DamageError(f"it has {len(raw)} bytes; at most {most} are read")
     data = json.loads(raw, parse_constant=_no_number)
     if not isinstance(data, dict):
         raise DamageError(f"it is no object but of type {type(data).__name__}")

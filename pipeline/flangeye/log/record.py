@@ -57,8 +57,6 @@ from flangeye.log import foxglove
 from flangeye.log.records import HASHES, pack
 from flangeye.plugin.hookspecs import hookimpl
 
-PREVIEW_POINTS = 40_000
-
 _ADAPTERS: dict[Any, TypeAdapter[Any]] = {}
 
 
@@ -305,7 +303,7 @@ def _plain(value: Any) -> Any:
     return adapter(type(value)).dump_python(value, mode="json", exclude=left_out)
 
 
-def _thinned(cloud: t.PointCloud, most: int = PREVIEW_POINTS) -> NDArray[np.float32]:
+def _thinned(cloud: t.PointCloud, most: int = 40_000) -> NDArray[np.float32]:
     """Return at most so many finite points, spread evenly."""
     flat = cloud.xyz.reshape(-1, 3)
     if cloud.organised:

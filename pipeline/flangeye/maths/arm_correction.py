@@ -68,12 +68,6 @@ def _motions(field: SmoothField, places: Floats) -> Floats:
     return np.concatenate([turned, still], axis=-1)
 
 
-REACHED = 1e-9
-"""Joint angles belong to a pose when they reach it this closely [rad, m]."""
-STEPS, LONGEST_STEP = 200, 0.2
-"""Newton steps at most, and the most that a joint moves in each [rad]."""
-
-
 def corrected_flange(
     base_T_flange: Floats,
     joints: Floats | None,
@@ -212,16 +206,18 @@ def reached_from(arm: Arm, base_T_flange: Floats, near: Floats) -> tuple[Floats,
     wanted = base_T_flange.reshape(-1, 4, 4)
     joints = np.array(np.broadcast_to(near, (*shape, arm.n)), dtype=np.float64).reshape(-1, arm.n)
     far = np.arange(len(wanted))
-    for _ in range(STEPS):
+    # Newton steps, and the most that a joint moves in each [rad]
+    for _ in range(200):
         frames = arm.frames(joints[far])
         twist = _twist(wanted[far], arm.flange_of(frames))
-        left = np.abs(twist).max(axis=1) >= REACHED
+        # Joint angles belong to a pose when they reach it this closely [rad, m]
+        left = np.abs(twist).max(axis=1) >= 1e-9
         far, frames, twist = far[left], frames[left], twist[left]
         if not len(far):
             break
         step = _least_step(arm.jacobian_of(frames), twist)
         longest = np.abs(step).max(axis=1, keepdims=True)
-        joints[far] += step * np.minimum(1.0, LONGEST_STEP / np.maximum(longest, 1e-12))
+        joints[far] += step * np.minimum(1.0, 0.2 / np.maximum(longest, 1e-12))
     reached = np.ones(len(wanted), dtype=bool)
     reached[far] = False
     return joints.reshape(*shape, arm.n), reached.reshape(shape)

@@ -31,10 +31,6 @@ SAME_BRANCH = 1e-3
 """Two solutions are one when every joint agrees to this [rad or m]."""
 
 
-HELD = 8
-"""Angles at which a redundant joint is held, spread over its range."""
-
-
 class JointAxis(Protocol):
     """One joint: what comes before it, its axis, and its limits.
 
@@ -166,7 +162,8 @@ class Arm:
         self._middle = (self.lower + self.upper) / 2
         self._zero = np.array([joint.theta for joint in joints])
         # A link's transform is before @ motion(q) @ after; the conventions differ in the two.
-        fixed = [_FIXED[robot.convention](joint) for joint in joints]
+        by_convention = {"standard": _standard, "modified": _modified, "urdf": _urdf}
+        fixed = [by_convention[robot.convention](joint) for joint in joints]
         self._before = np.array([before for before, _ in fixed])
         self._after = np.array([after for _, after in fixed])
         self._tool = robot.link_T_flange
@@ -326,7 +323,8 @@ class Arm:
         """Return the closed forms of the other six with a joint held at each angle of a row."""
         if joint not in self._forms:
             low, high = max(self.lower[joint], -np.pi), min(self.upper[joint], np.pi)
-            angles = low + (np.arange(HELD) + 0.5) / HELD * (high - low)
+            held = 8  # angles spread over the range of the redundant joint
+            angles = low + (np.arange(held) + 0.5) / held * (high - low)
             forms = [self._form_holding(joint, angle) for angle in angles]
             self._forms[joint] = [form for form in forms if form is not None]
         return self._forms[joint]
@@ -440,10 +438,6 @@ def _urdf(joint: JointAxis) -> tuple[Floats, Floats]:
     origin = rigid(rotation_from_rpy(*joint.rpy), np.asarray(joint.xyz))
     along = rigid(basis_of_plane(np.asarray(joint.axis)).T, np.zeros(3))
     return origin @ along, along.T
-
-
-_FIXED = {"standard": _standard, "modified": _modified, "urdf": _urdf}
-"""By convention: a joint -> the fixed transforms before and after its motion."""
 
 
 def _screw_x(a: float, alpha: float) -> Floats:

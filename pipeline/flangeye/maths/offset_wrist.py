@@ -26,21 +26,12 @@ from flangeye.types import Floats, Indices
 
 Numbers = NDArray[np.complex128]
 
-EXACT = 1e-9
-"""Axes that meet, are parallel or are square do so within this [m, rad]."""
 
 SAMPLES = 128
 """Angles of joint 6 at which the equation is looked at."""
 
 FINER = 16
 """Samples for one, where a root may hide."""
-
-
-# One sample more at each end: each has both its neighbours.
-_PITCH = 2 * np.pi / SAMPLES
-_COARSE = np.arange(-1.0, SAMPLES + 1)
-_FINE = np.arange(-1.0, 2 * FINER + 1)
-_WAYS = np.array([[1j, 1j, -1j, -1j], [1j, -1j, 1j, -1j]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +101,7 @@ class OffsetWrist:
         """
         seen = orbits @ _circle(angles.ravel())
         place, height, axis, upwards = seen.reshape(4, *angles.shape)
-        shoulder, elbow = _WAYS[:, way]
+        shoulder, elbow = np.array([[1j, 1j, -1j, -1j], [1j, -1j, 1j, -1j]])[:, way]
         across = place.real**2 + place.imag**2
         forward = shoulder * np.sqrt(across - self.aside**2)
         turn = place * (forward + self.aside) / across
@@ -133,7 +124,9 @@ class OffsetWrist:
         Returns:
             (5, K) way, two angles and the values there; (2, S) way and angle.
         """
-        ways, starts, pitch, row = np.arange(4), np.array([-np.pi]), _PITCH, _COARSE
+        # One sample more at each end: each has both its neighbours
+        ways, starts = np.arange(4), np.array([-np.pi])
+        pitch, row = 2 * np.pi / SAMPLES, np.arange(-1.0, SAMPLES + 1)
         doubts = np.zeros(0)
         found = []
         # How often the samples are spaced, more closely each time
@@ -151,7 +144,7 @@ class OffsetWrist:
             ways, doubts = ways[i], angles[i, k + 1]
             if not len(ways):
                 break
-            starts, row, pitch = doubts - pitch, _FINE, pitch / FINER
+            starts, row, pitch = doubts - pitch, np.arange(-1.0, 2 * FINER + 1), pitch / FINER
         return np.hstack(found), np.array([ways, doubts])
 
     def _refined(self, orbits: Numbers, brackets: Floats) -> Floats:
@@ -221,9 +214,10 @@ def _prepared(directions: Floats, points: Floats, flange: Floats) -> OffsetWrist
     normal = np.cross(fourth, fifth)
     between = points[4] - points[3]
     sine = np.linalg.norm(normal)
-    if abs(first @ second) > EXACT or np.linalg.norm(np.cross(second, third)) > EXACT:
+    exact = 1e-9  # axes that meet, are parallel or are square do so within this [m, rad]
+    if abs(first @ second) > exact or np.linalg.norm(np.cross(second, third)) > exact:
         return None
-    if sine < 0.1 or abs(normal @ between) > EXACT:
+    if sine < 0.1 or abs(normal @ between) > exact:
         return None
     met = points[3] + fourth * (np.cross(between, fifth) @ normal / sine**2)
     to_axes = np.eye(4)

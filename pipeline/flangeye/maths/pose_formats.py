@@ -41,18 +41,9 @@ EULER_ORDERS = tuple(
 """The twelve orders about fixed axes (``xyz``, extrinsic) and about turned ones (``ZYX``,
 intrinsic), spelt as scipy spells them."""
 
-LOCKED = 1e-7
-"""So near to gimbal lock [rad] only the sum of the first and the last angle is known."""
 
 _LENGTHS = {"m": 1.0, "mm": 1e-3}
 _ANGLES = {"rad": 1.0, "deg": math.pi / 180}
-_TOKEN = re.compile(
-    r"(?:(?P<label>[A-Za-z][A-Za-z0-9]*)\s*[:=]?\s*)?"
-    r"(?<![\d.])(?P<number>[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)"
-    r"(?:\s*(?P<unit>mm|m|deg|rad|°)(?![A-Za-z]))?"
-)
-_NESTED = re.compile(r"\[\s*\[([^\]]*)\]\s*,\s*\[([^\]]*)\]")
-"""Position and rotation of a RAPID robtarget; configuration and further axes come behind."""
 
 
 @dataclass(frozen=True)
@@ -149,9 +140,21 @@ class PoseConvention:
             ValueError: A number is missing, surplus, or has a unit of another kind.
         """
         text = text.replace("\N{MINUS SIGN}", "-")
-        if nested := _NESTED.search(text):
+        # Position and rotation of a RAPID robtarget; configuration and further axes come
+        # behind.
+        if nested := re.search(r"\[\s*\[([^\]]*)\]\s*,\s*\[([^\]]*)\]", text):
             text = f"{nested[1]} {nested[2]}"
-        found = self._in_order([match.groupdict() for match in _TOKEN.finditer(text)])
+        found = self._in_order(
+            [
+                match.groupdict()
+                for match in re.finditer(
+                    r"(?:(?P<label>[A-Za-z][A-Za-z0-9]*)\s*[:=]?\s*)?"
+                    r"(?<![\d.])(?P<number>[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)"
+                    r"(?:\s*(?P<unit>mm|m|deg|rad|°)(?![A-Za-z]))?",
+                    text,
+                )
+            ]
+        )
         return np.array([self._in_own_unit(i, token) for i, token in enumerate(found)])
 
     def text(self, matrix: Floats) -> str:
@@ -245,9 +248,11 @@ def _to_euler(order: str, rotation: Floats) -> Floats:
     angles = np.array([half_sum - half_difference, middle, half_sum + half_difference])
     if not order.islower():
         angles = angles[::-1]
-    if middle < LOCKED:
+    # So near to gimbal lock [rad] only the sum of the first and the last angle is known
+    locked = 1e-7
+    if middle < locked:
         angles[[0, 2]] = 2 * half_sum, 0.0
-    elif middle > np.pi - LOCKED:
+    elif middle > np.pi - locked:
         angles[[0, 2]] = 2 * half_difference * (-1 if order.islower() else 1), 0.0
     if not proper:
         angles[2 if order.islower() else 0] *= sign

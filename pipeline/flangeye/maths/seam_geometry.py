@@ -83,10 +83,6 @@ def tube_rings(seam: Seam, count: int = 25, segments: int = 24) -> Floats:
     return np.asarray(seam.points_in_base[at, None] + tube_radii(seam)[at, None, None] * turned)
 
 
-TURN = float(np.cos(np.radians(40)))
-"""Where pieces turn more sharply than this, one line ends and another begins."""
-
-
 def sharp_edges(vertices: Floats, triangles: NDArray[np.int32], angle: float) -> Floats:
     """Return (E, 2, 3) the edges of a mesh at which its faces bend by more than an angle [rad].
 
@@ -155,4 +151,6 @@ def _next(
     go = pieces[others[0], 1] - pieces[others[0], 0]
     come = come if ends[before, 1] == node else -come
     go = go if ends[others[0], 0] == node else -go
-    return others[0] if come @ go > TURN * np.linalg.norm(come) * np.linalg.norm(go) else None
+    # Where pieces turn by more than 40 deg, one line ends and another begins
+    straight = np.cos(np.radians(40)) * np.linalg.norm(come) * np.linalg.norm(go)
+    return others[0] if come @ go > straight else None

@@ -17,9 +17,6 @@ T = TypeVar("T", bound=np.floating)
 SIGMA_OF_MAD = 1.4826
 """Standard deviation of a normal variable over its median absolute deviation."""
 
-SAMPLES = 4000
-"""Draws of the pose: a 95 % quantile from this many varies by one percent."""
-
 
 def median(values: NDArray[T]) -> NDArray[T]:
     """Return the medians (...) of (..., n) finite values, one at least, as ``np.median`` does.
@@ -101,11 +98,12 @@ def largest_error_quantile(
     """
     variances, axes = np.linalg.eigh(covariance)
     root = axes * np.sqrt(np.clip(variances, 0.0, None))
-    draws = np.random.default_rng(0).standard_normal((SAMPLES, 6)) @ root.T
+    samples = 4000  # a 95 % quantile from this many draws varies by one percent
+    draws = np.random.default_rng(0).standard_normal((samples, 6)) @ root.T
     motions = np.concatenate(
         [-hat(corners - about), np.broadcast_to(np.eye(3), (len(corners), 3, 3))], axis=2
     )
-    errors = (draws @ motions.reshape(-1, 6).T).reshape(SAMPLES, -1, 3)
+    errors = (draws @ motions.reshape(-1, 6).T).reshape(samples, -1, 3)
     squares = np.einsum("sci,sci->sc", errors, errors).max(axis=1)
     return float(np.sqrt(np.quantile(squares, probability)))
 

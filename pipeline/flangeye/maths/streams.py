@@ -17,8 +17,8 @@ STILL_DISTANCE = 0.5e-3
 STILL_ANGLE = np.radians(0.1)
 LARGEST_OFFSET = 2.0
 """Of two clocks [s]: further apart than this, nothing is looked for."""
-PASSED, PASSED_STEP = 10, 0.02
-"""How many poses before and after a moment are kept of a stream, and how far apart [s]."""
+PASSED_STEP = 0.02
+"""How far apart poses before and after a moment are kept of a stream [s]."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def passed(
         at: The moment [s].
         others: Times and poses of what else moves, by frame.
     """
-    steps = PASSED_STEP * np.arange(-PASSED, PASSED + 1, dtype=np.float64)
+    steps = PASSED_STEP * np.arange(-10, 11, dtype=np.float64)
     more = others or {}
     for each in (times, *(stream for stream, _ in more.values())):
         steps = steps[(steps == 0) | ((at + steps >= each[0]) & (at + steps <= each[-1]))]

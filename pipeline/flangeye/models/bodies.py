@@ -24,9 +24,6 @@ from flangeye.types import Floats, Indices
 SMALLEST, LARGEST = 0.02, 3.0
 """Diagonal of a body that an arm carries and a scanner sees [m]; of the robot's base at most."""
 
-IN_METRES = (".glb", *STEP_SUFFIXES)
-"""Formats that come in metres: glTF by definition (2.0, section 3.4), STEP as it is read."""
-
 
 @dataclass(frozen=True, eq=False)
 class TargetBody:
@@ -206,7 +203,10 @@ def _unit_of(path: Path, vertices: Floats, unit: LengthUnit | None) -> tuple[Len
     fitting = [each for each, size in sizes.items() if SMALLEST <= size <= LARGEST]
     in_each = " or ".join(f"{1e3 * sizes[each]:.0f} mm with unit: {each}" for each in fitting)
     limits = f"a body to look for is {SMALLEST * 1e3:g} mm to {LARGEST:g} m across"
-    stated: LengthUnit | None = unit or ("m" if path.suffix.lower() in IN_METRES else None)
+    # glTF by definition (2.0, section 3.4), STEP as it is read
+    stated: LengthUnit | None = unit or (
+        "m" if path.suffix.lower() in (".glb", *STEP_SUFFIXES) else None
+    )
     if stated in fitting:
         return stated, ""
     if stated or not fitting:

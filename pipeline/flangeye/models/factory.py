@@ -21,7 +21,6 @@ from flangeye.files.yaml_lines import MAX_BYTES, read_yaml
 from flangeye.maths.geometry import rotation_from_rpy
 from flangeye.models.robots import Joint, RobotModel, Volume
 
-DELTAS = ("delta_theta", "delta_a", "delta_d", "delta_alpha")
 LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 PLACE = ("x", "y", "z", "roll", "pitch", "yaw")
 
@@ -47,13 +46,14 @@ def as_built(robot: RobotModel, path: Path) -> RobotModel:
 
 def _from_controller(robot: RobotModel, path: Path) -> RobotModel:
     parser = configparser.ConfigParser(inline_comment_prefixes=("#", ";"))
+    deltas = ("delta_theta", "delta_a", "delta_d", "delta_alpha")
     try:
         parser.read_string(read_text(path, MAX_BYTES, RecipeError))
-        rows = [_numbers(parser["mounting"][name]) for name in DELTAS]
+        rows = [_numbers(parser["mounting"][name]) for name in deltas]
     except (configparser.Error, KeyError, ValueError, OSError) as error:
         raise RecipeError(
             f"{path}: not a controller's calibration.conf: {reason_of(error)}; it has a section "
-            f"[mounting] with {', '.join(DELTAS)}, each [six numbers]"
+            f"[mounting] with {', '.join(deltas)}, each [six numbers]"
         ) from None
     if {len(row) for row in rows} != {len(robot.joints)}:
         raise RecipeError(f"{path}: {len(robot.joints)} numbers are needed in each row")

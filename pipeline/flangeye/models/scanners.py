@@ -78,8 +78,6 @@ STATED_LIMIT = 20.0
 no wall or window behind the robot is that far, and a wrong unit is off by 1,000."""
 DETECTED_LIMIT = 5.0
 """A unit is only detected where the median point is closer to the range than this."""
-SAMPLE = 50_000
-"""Points the median is taken of."""
 
 NAMES: Mapping[LengthUnit, str] = {"m": "metres", "mm": "millimetres", "in": "inches"}
 
@@ -87,7 +85,8 @@ NAMES: Mapping[LengthUnit, str] = {"m": "metres", "mm": "millimetres", "in": "in
 def median_distance(cloud: PointCloud) -> float:
     """Return the median distance of the finite points from the scanner [m], NaN without any."""
     flat = cloud.xyz.reshape(-1, 3)
-    flat = flat[:: max(1, len(flat) // SAMPLE)]
+    # So many points tell the median
+    flat = flat[:: max(1, len(flat) // 50_000)]
     distances = np.linalg.norm(flat.astype(np.float64), axis=1)
     finite = distances[np.isfinite(distances)]
     return float(np.median(finite)) if len(finite) else math.nan

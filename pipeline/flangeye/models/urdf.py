@@ -30,13 +30,8 @@ from flangeye.units import SI
 MAX_BYTES = 10_000_000
 TURNS = ("revolute", "continuous")
 MOVES = (*TURNS, "prismatic")
-FLANGES = ("tool0", "flange", "link8", "link_ee", "ee_link", "end_effector", "tool_frame")
-"""Ends of the names that makers give the flange's frame, z outwards; the surest first."""
 NAMED = 8
 """Links that a message names."""
-ARCHIVES = (
-    "recordings with the flange's poses need no kinematics: robot: {flange: ISO 9409-1-50-4-M6}"
-)
 
 
 @dataclass(frozen=True)
@@ -289,7 +284,8 @@ def _joint(urdf: Urdf, joint: ET.Element, pose: Floats) -> Joint:
     if joint.find("mimic") is not None:
         raise RecipeError(
             f"{urdf.path}: joint '{joint.get('name')}' follows another one (mimic), which is not "
-            f"supported between base and flange; {ARCHIVES}"
+            "supported between base and flange; recordings with the flange's poses need no "
+            "kinematics: robot: {flange: ISO 9409-1-50-4-M6}"
         )
     axis, limit = joint.find("axis"), joint.find("limit")
     lower, upper = -2 * np.pi, 2 * np.pi
@@ -368,7 +364,8 @@ def _base(urdf: Urdf, asked: str | None, to_flange: list[ET.Element]) -> str:
 
 def flange_links(urdf: Urdf) -> list[str]:
     """Return the link that is the flange by a name that makers use, or all ends of the arm."""
-    for ending in FLANGES:
+    # Makers' names of the flange's frame, z outwards; the surest first
+    for ending in ("tool0", "flange", "link8", "link_ee", "ee_link", "end_effector", "tool_frame"):
         named = [name for name in urdf.links if name.endswith(ending)]
         if len(named) == 1:
             return named

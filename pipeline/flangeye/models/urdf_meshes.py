@@ -18,11 +18,6 @@ from flangeye.files.words import reason_of
 from flangeye.maths.geometry import basis_of_plane
 from flangeye.types import Floats
 
-MESHES = (".stl", ".obj", ".dae", ".ply")
-
-NAME_SHOWN = 300
-"""Characters of a name that a message shows."""
-
 
 class MissingMesh(RecipeError):
     """A mesh is not where the URDF says."""
@@ -124,7 +119,8 @@ def _is_file(path: Path) -> bool:
 
 
 def _short(name: str) -> str:
-    return name if len(name) <= NAME_SHOWN else f"{name[:NAME_SHOWN]}…"
+    shown = 300  # characters of a name that a message shows
+    return name if len(name) <= shown else f"{name[:shown]}…"
 
 
 def _nearby(urdf: Path, package: str) -> list[Path]:
@@ -146,8 +142,9 @@ def _loaded(path: Path) -> Any:
     import trimesh
 
     kind = path.suffix.lower()
-    if kind not in MESHES:
-        raise RecipeError(f"{path}: '{kind}' is no mesh that is read; known: {', '.join(MESHES)}")
+    meshes = (".stl", ".obj", ".dae", ".ply")
+    if kind not in meshes:
+        raise RecipeError(f"{path}: '{kind}' is no mesh that is read; known: {', '.join(meshes)}")
     raw = read_regular(path, 200_000_000, RecipeError)
     if kind == ".dae" and (b"<!DOCTYPE" in raw or b"<!ENTITY" in raw):
         raise RecipeError(f"{path}: declares a document type or entities, which are not read")

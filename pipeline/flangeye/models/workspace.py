@@ -12,12 +12,8 @@ from flangeye import types as t
 from flangeye.maths.geometry import nearest_rotation, rotation_log
 from flangeye.types import Box, Floats
 
-CELLS = 3
-"""Along each edge of the box: the cells at its corners are where a turn shows most."""
 ENOUGH = np.radians(5.0)
 """A turn by less does not count as one."""
-FAR = np.radians(20.0)
-"""Turns that show the camera's pose well, as the solver asks for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,11 +41,12 @@ class Coverage:
     def lacking(self) -> list[str]:
         """Say which motion would add most: turns that were left out, sides that were not seen."""
         out = []
+        far = np.radians(20.0)  # as the solver asks for
         for name, turns in zip("xyz", self.turns, strict=True):
             if turns.min() < ENOUGH:
                 low, high = np.degrees(turns)
                 out.append(
-                    f"turn the flange both ways about base {name}, by {np.degrees(FAR):.0f} deg or "
+                    f"turn the flange both ways about base {name}, by {np.degrees(far):.0f} deg or "
                     f"more (so far -{low:.0f} +{high:.0f} deg)"
                 )
         for axis, name in enumerate("xyz"):
@@ -62,11 +59,12 @@ class Coverage:
 def coverage_of(box: Box, poses: Iterable[Floats]) -> Coverage:
     """Return what (4, 4) poses of the flange in the base covered of a box."""
     found = np.array(list(poses)).reshape(-1, 4, 4)
-    places = np.zeros((CELLS,) * 3, np.intp)
+    cells = 3  # the cells at the corners of the box are where a turn shows most
+    places = np.zeros((cells,) * 3, np.intp)
     if not len(found):
         return Coverage(places, np.zeros((3, 2)))
     within = (found[:, :3, 3] - box.centre) / np.maximum(box.size, 1e-9) + 0.5
-    np.add.at(places, tuple(np.clip((within * CELLS).astype(np.intp), 0, CELLS - 1).T), 1)
+    np.add.at(places, tuple(np.clip((within * cells).astype(np.intp), 0, cells - 1).T), 1)
     mean = nearest_rotation(found[:, :3, :3].mean(axis=0))
     turns = rotation_log(found[:, :3, :3] @ mean.T)
     return Coverage(places, np.column_stack([-turns.min(axis=0), turns.max(axis=0)]).clip(0.0))

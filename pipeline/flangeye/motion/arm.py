@@ -33,8 +33,6 @@ from flangeye.motion.watchdog import (
 OPENING = 30.0
 """Longest time for a driver to connect, its client library's import included [s]."""
 
-EVERY = 0.03
-"""Between two signs of life [s]: a fifth of the silence that stops the arm."""
 
 GUARD = "guard"
 """Name of the process that watches an arm."""
@@ -258,7 +256,8 @@ def _beating() -> Iterator[None]:
     signal.signal(BEAT, _nothing)  # and stays: a last one may still be on its way at the end
     taker.start()
     masked = signal.pthread_sigmask(signal.SIG_BLOCK, {BEAT})
-    signal.setitimer(signal.ITIMER_REAL, EVERY, EVERY)
+    every = 0.03  # a fifth of the silence that stops the arm [s]
+    signal.setitimer(signal.ITIMER_REAL, every, every)
     try:
         yield
     finally:

@@ -8,9 +8,6 @@ from flangeye.errors import StageError
 from flangeye.models.robots import RobotModel
 from flangeye.types import Floats
 
-APART = 3
-"""Links this far apart in the chain must not touch; nearer ones are joined where they meet."""
-
 
 class ArmVolume:
     """The capsules that stand for an arm."""
@@ -31,7 +28,8 @@ class ArmVolume:
         self.radii = np.array([volume.radius for volume in volumes])
         self._ends = np.array([[v.start, v.end] for v in volumes]).reshape(len(volumes), 2, 3)
         first, second = np.triu_indices(len(volumes))
-        far = np.abs(self.links[first] - self.links[second]) >= APART
+        # Nearer links are joined where they meet
+        far = np.abs(self.links[first] - self.links[second]) >= 3
         self._pairs = first[far], second[far]
 
     def axes(self, frames: Floats) -> Floats:

@@ -18,9 +18,6 @@ from flangeye.types import Floats
 ROLLS = 8
 """How many directions of the flange's x axis are tried for the one the arm likes best."""
 
-TABLE = 0.0
-"""Height of the table the arm stands on, in ``base`` [m]."""
-
 
 class Margins(NamedTuple):
     """How far poses keep away from what an arm must not do.
@@ -215,8 +212,9 @@ class Reach:
         axes = volume.axes(frames)
         target = self.arm.flange(joints)[:3, 3]
         sight = np.stack([self._eyes, np.broadcast_to(target, self._eyes.shape)], axis=1)
+        # The table the arm stands on
         return (
-            volume.above(axes, TABLE)
+            volume.above(axes, 0.0)
             and volume.apart(axes)
             and volume.leaves_free(axes, sight, self._radius)
         )

@@ -20,18 +20,6 @@ STANDING = 1e-3
 ARRIVED = np.radians(0.05)
 """Every joint this near to its goal, the arm is there [rad]."""
 
-START = 1.0
-"""An arm that has not set off after this did not take the command [s]."""
-
-ENDED = 0.3
-"""An arm whose controller has been ready for so long before the goal has ended its move [s]."""
-
-SLACK = 0.003
-"""By how much a sample may leave the box before it counts: numerics and braking [m]."""
-
-FAST = 1.3
-"""A joint faster than its limit, and this much, is a safety fault."""
-
 
 class SafetyFault(Exception):
     """A reason to stop; its text is for people."""
@@ -145,10 +133,12 @@ class Supervisor:
     def _keep_limits(self, state: RobotState) -> None:
         limits = self._limits
         place = state.base_T_flange.translation
-        if why := limits.outside(place, SLACK) or limits.beyond(state.joints, -ARRIVED):
+        # By how much a sample may leave the box before it counts: numerics and braking [m]
+        if why := limits.outside(place, 0.003) or limits.beyond(state.joints, -ARRIVED):
             raise SafetyFault(f"the arm is {why}" if why.startswith("outside") else why)
         fastest = float(np.abs(state.joint_speeds).max())
-        if fastest > FAST * limits.joint_speed:
+        # A joint that is faster by so much is no matter of numerics
+        if fastest > 1.3 * limits.joint_speed:
             raise SafetyFault(
                 f"a joint turns at {np.degrees(fastest):.0f} deg/s, "
                 f"allowed {np.degrees(limits.joint_speed):.0f} deg/s"
@@ -164,8 +154,9 @@ class Supervisor:
             raise SafetyFault(f"the arm is {np.degrees(off):.1f} deg away from its commanded path")
         waited = (state.time_ns - self._since_ns) * 1e-9
         set_off = np.abs(state.joints - self._from).max() > ARRIVED
-        if waited > START and not set_off and np.abs(way).max() > 2 * ARRIVED:
-            raise SafetyFault(f"the arm has not set off {START:.0f} s after it was told to")
+        start = 1.0  # an arm that has not set off after this did not take the command [s]
+        if waited > start and not set_off and np.abs(way).max() > 2 * ARRIVED:
+            raise SafetyFault(f"the arm has not set off {start:.0f} s after it was told to")
         self._keep_going(state, leg, set_off)
         if waited > 2.0 * leg.seconds + 2.0:
             raise SafetyFault(
@@ -179,7 +170,8 @@ class Supervisor:
             self._ready_ns = 0
             return
         self._ready_ns = self._ready_ns or state.time_ns
-        if (state.time_ns - self._ready_ns) * 1e-9 > ENDED:
+        # So long ready before the goal, its controller has ended the move [s]
+        if (state.time_ns - self._ready_ns) * 1e-9 > 0.3:
             raise SafetyFault(
                 f"the arm ended its move {np.degrees(short):.1f} deg before the goal: its "
                 f"controller did, or this machine was too busy to watch it for {SILENT} s"

@@ -20,8 +20,6 @@ from flangeye.types import Floats
 
 SHORT = 0.005
 """It stops this far before the point [m]: a wrong matrix must not drive it into the work."""
-SLOW = 0.02
-"""Largest speed of the flange [m/s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +124,7 @@ class Toucher:
 
     def _slowly(self) -> MotionLimits:
         limits = self.limits
-        # Largest speed of a joint [rad/s]
+        # Largest speeds of the flange [m/s] and of a joint [rad/s]
         return replace(
-            limits, speed=min(limits.speed, SLOW), joint_speed=min(limits.joint_speed, 0.2)
+            limits, speed=min(limits.speed, 0.02), joint_speed=min(limits.joint_speed, 0.2)
         )

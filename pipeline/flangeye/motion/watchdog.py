@@ -52,9 +52,6 @@ def precedence(priority: int) -> Iterator[None]:
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
-TOLD_NS = 200_000_000
-"""Between two states told to the program while the arm is under way [ns]."""
-
 BEAT = signal.SIGALRM
 """What the program writes to the alarm as long as it lives; every other signal stops the arm."""
 
@@ -169,7 +166,8 @@ class Watchdog:
             self._tell_cycle(state)
             if arrived:
                 self._next_leg(state)
-            elif self._legs and state.time_ns - self._told_ns > TOLD_NS:
+            # Five times a second
+            elif self._legs and state.time_ns - self._told_ns > 200_000_000:
                 self._told_ns = state.time_ns
                 self._wire.send(Report("state", state))
         except (SafetyFault, DeviceError) as fault:

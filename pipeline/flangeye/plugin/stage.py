@@ -498,7 +498,11 @@ def _check_call(declared: Part, kind: PartKind) -> None:
     wanted = get_type_hints(contract.__call__)
     gives = _alternatives(wanted.pop("return", type(None)))
     where = f"part '{declared.name}'"
-    asked = [n for n in inspect.signature(declared.function).parameters if n not in _GIVEN]
+    # Arguments that any part may have: its parameters, the other parts of its kind, the model
+    # of the recipe's `robot` (None without one) and, for a robot, whether the arm is opened to
+    # be read and for nothing else
+    given = ("params", "siblings", "kinematics", "reads_only")
+    asked = [n for n in inspect.signature(declared.function).parameters if n not in given]
     if asked != list(wanted):
         raise TypeError(
             f"{where}: a '{declared.kind}' part is called with {', '.join(wanted)}, "
@@ -515,12 +519,6 @@ def _check_call(declared: Part, kind: PartKind) -> None:
             f"{where} returns {_called(foreign[0])}, but a '{declared.kind}' part returns "
             f"{' or '.join(map(_called, gives))}"
         )
-
-
-_GIVEN = ("params", "siblings", "kinematics", "reads_only")
-"""Arguments that any part may have: its parameters, the other parts of its kind, the model of the
-recipe's ``robot`` (None without one) and, for a robot, whether the arm is opened to be read and for
-nothing else."""
 
 
 def _fits(got: Any, wanted: Any) -> bool:

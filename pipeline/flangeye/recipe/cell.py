@@ -24,8 +24,6 @@ from flangeye.recipe.header import (
 from flangeye.types import BASE, Floats
 
 Complain = Callable[[Sequence[Hashable], str], None]
-INSTEAD = ("robot", "second_robot", "configuration")
-"""Sections of a recipe with one camera and one target."""
 
 MoverSection = CellArmSection | RailSection | PositionerSection
 
@@ -63,7 +61,9 @@ Mistake = tuple[tuple[Hashable, ...], str]
 
 
 def _beside(header: Header) -> Iterator[Mistake]:
-    given = [name for name in INSTEAD if name in header.model_fields_set]
+    # Sections of a recipe with one camera and one target
+    instead = ("robot", "second_robot", "configuration")
+    given = [name for name in instead if name in header.model_fields_set]
     if given:
         yield (), f"says itself what stands where; leave out {' and '.join(given)}"
 

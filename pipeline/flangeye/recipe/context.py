@@ -43,8 +43,6 @@ from flangeye.recipe.header import (
 )
 from flangeye.units import SI
 
-LIMITS = "{box: {centre: [500 mm, 0 mm, 400 mm], size: [800 mm, 800 mm, 800 mm]}}"
-
 Context = dict[type, Any]
 Complain = Callable[[Sequence[Hashable], str], None]
 
@@ -276,7 +274,11 @@ def _devices(header: Header, context: Context, complain: Complain) -> None:
     robot, scanner = header.robot, header.scanner
     if robot and robot.driver:
         if robot.limits is None:
-            complain(("robot",), "a robot with a driver needs limits, for example " + LIMITS)
+            complain(
+                ("robot",),
+                "a robot with a driver needs limits, for example "
+                + "{box: {centre: [500 mm, 0 mm, 400 mm], size: [800 mm, 800 mm, 800 mm]}}",
+            )
         context[RobotDriver] = _robot_driver(robot.driver, context.get(RobotModel))
         context[LimitsSection] = robot.limits
         if robot.limits and (model := context.get(RobotModel)):

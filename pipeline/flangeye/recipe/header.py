@@ -220,20 +220,21 @@ class ConfigurationSection(RecipeSection):
 
 
 FrameName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", min_length=1)]
-ON = "What it is mounted on: base, or an arm, a rail or a positioner of the cell by name."
-KNOWN: Any = Field(
-    "known",
-    description="Where its base is on that: known (at its origin), unknown (to be found), or "
-    "position and rpy.",
-)
-TO_FIND: Any = Field("unknown", description="Where it is on that: unknown (to be found), or known.")
 
 
 class MountedSection(RecipeSection):
     """Where something of a cell is mounted, by default at a known place."""
 
-    on: str = Field("base", description=ON)
-    place: Place = KNOWN
+    on: str = Field(
+        "base",
+        description="What it is mounted on: base, or an arm, a rail or a positioner of the cell by "
+        "name.",
+    )
+    place: Place = Field(
+        "known",
+        description="Where its base is on that: known (at its origin), unknown (to be found), or "
+        "position and rpy.",
+    )
 
 
 class CellArmSection(SecondRobotSection, MountedSection):
@@ -273,7 +274,9 @@ class StandingSection(NamedSection, MountedSection):
     link: int | None = Field(
         None, ge=1, description="Which link of that arm it is on, from 1; its flange if not given."
     )
-    place: Place = TO_FIND
+    place: Place = Field(
+        "unknown", description="Where it is on that: unknown (to be found), or known."
+    )
 
 
 class CellSection(RecipeSection):

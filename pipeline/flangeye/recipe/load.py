@@ -37,10 +37,6 @@ PLACEHOLDERS: Mapping[Hashable, Any] = {"title": "untitled", "steps": ["none"]}
 """What stands for sections that a recipe must have, where they are wrong."""
 
 
-FREEDOMS = 6
-"""Joints that reach a pose in any orientation."""
-
-
 @dataclass(frozen=True)
 class Recipe:
     """A recipe that was checked whole and can run.
@@ -365,10 +361,11 @@ def _require_reached(path: Path, robot: RobotModel) -> None:
     from flangeye.maths.kinematics import Arm
 
     arm = Arm(robot)
-    if arm.n < FREEDOMS:
+    freedoms = 6  # joints that reach a pose in any orientation
+    if arm.n < freedoms:
         raise RecipeError(
             f"{path}: robot: {robot.model} has {arm.n} joints, and the poses of a plan need "
-            f"{FREEDOMS}; record poses by hand and read them: robot: {{flange: ISO 9409-1-50-4-M6}}"
+            f"{freedoms}; record poses by hand and read them: robot: {{flange: ISO 9409-1-50-4-M6}}"
         )
     low, high = np.maximum(arm.lower, -np.pi), np.minimum(arm.upper, np.pi)
     # Of each joint's range: poses that are looked for again, away from the middle's singular ones

@@ -20,9 +20,6 @@ from flangeye.models.targets import FlangeStandard
 from flangeye.recipe.context import Context
 from flangeye.recipe.header import Header
 
-CARRIED = re.compile(r"models/\w+\.(yaml|ply)")
-"""Names of such files, beside the log and in it."""
-
 
 def sections(header: Header) -> dict[str, Any]:
     """Return a recipe's sections as data; a cell says itself what stands where."""
@@ -103,6 +100,6 @@ def carried_files(models: Mapping[str, bytes]) -> Iterator[Path]:
     with TemporaryDirectory() as name:
         (Path(name) / "models").mkdir()
         for file, raw in models.items():
-            if CARRIED.fullmatch(file):
+            if re.fullmatch(r"models/\w+\.(yaml|ply)", file):
                 (Path(name) / file).write_bytes(raw)
         yield Path(name)

@@ -91,23 +91,8 @@ SECTIONS: Mapping[Any, Offer] = {
 }
 """What stages may ask for of a recipe's header."""
 
-WHAT_FOR = {
-    "acquire.simulated": "to simulate it",
-    "acquire": "to plan its poses and to watch it move",
-    "weld": "to lead the torch along the seam",
-}
-"""Why a stage needs kinematics, by the longest start of its name."""
 SEVERAL = ("refine", "verify", "seam", "export")
 """Kinds of which a recipe may have more than one step."""
-IN_A_CELL = {
-    "acquire": "use acquire.samples, acquire.centres or acquire.archive with reader: cell, or "
-    "acquire.simulated_cell",
-    "solve": "use solve.cell",
-    "verify": "use verify.holdout",
-    "export": "leave it out: calibration.yaml carries every transform of the cell, and after the "
-    "run flangeye export RUN --to NAME --camera CAMERA writes one",
-}
-"""What to do instead of a step that serves one camera and one target alone."""
 
 
 @dataclass(frozen=True)
@@ -159,7 +144,15 @@ class StepOrder:
         takes = KINDS[kind].takes
         needs = _required(stage.needs.values()) if stage else takes[:1]
         if self._cell and stage and not _serves_cells(stage):
-            self._complain(at, f"{name} serves no cell; {IN_A_CELL.get(kind, 'leave it out')}")
+            in_a_cell = {
+                "acquire": "use acquire.samples, acquire.centres or acquire.archive with reader: "
+                "cell, or acquire.simulated_cell",
+                "solve": "use solve.cell",
+                "verify": "use verify.holdout",
+                "export": "leave it out: calibration.yaml carries every transform of the cell, and "
+                "after the run flangeye export RUN --to NAME --camera CAMERA writes one",
+            }
+            self._complain(at, f"{name} serves no cell; {in_a_cell.get(kind, 'leave it out')}")
             needs = []
         for need in needs:
             self._need(at, need, _what_for(name))
@@ -251,7 +244,11 @@ def _a(noun: str) -> str:
 
 
 def _what_for(name: str) -> str:
-    return next((why for start, why in WHAT_FOR.items() if name.startswith(start)), "")
+    if name.startswith("acquire.simulated"):
+        return "to simulate it"
+    if name.startswith("acquire"):
+        return "to plan its poses and to watch it move"
+    return "to lead the torch along the seam" if name.startswith("weld") else ""
 
 
 def _missing(need: Any, purpose: str) -> str:

@@ -24,9 +24,6 @@ from flangeye.report.units import duration
 from flangeye.units import parse_quantity
 
 INCOMPLETE: Literal["incomplete"] = "incomplete"
-UNSOLVED = "the run ended before the solver"
-NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:[.,]\d+)*(?:e[-+]?\d+)?(?!\w)")
-"""Reasons that differ in these alone are one; the 6 of M6 is none."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +117,8 @@ def _so_far(log: RunLog, recipe: str) -> r.Result:
 
 
 def _unsolved(observations: Sequence[t.Observation]) -> list[t.Pair]:
-    return [t.Pair(o, np.zeros(3), used=False, reason=UNSOLVED) for o in observations]
+    reason = "the run ended before the solver"
+    return [t.Pair(o, np.zeros(3), used=False, reason=reason) for o in observations]
 
 
 def _box(header: dict[str, Any]) -> t.Box | None:
@@ -205,7 +203,11 @@ def set_aside_of(facts: Facts) -> SetAside:
         reason = (each.reason or "no reason was given").removeprefix(f"{stage}: ")
         rows.append(RejectedRow(each.id, stage, reason))
         shared = by_stage.reason if by_stage else reason
-        kinds[stage, NUMBER.sub("…", shared)].append(shared)
+        # Reasons that differ in numbers alone are one; the 6 of M6 is none
+        kinds[
+            stage,
+            re.sub(r"(?<![\w.])[-+]?\d+(?:[.,]\d+)*(?:e[-+]?\d+)?(?!\w)", "…", shared),
+        ].append(shared)
     counts = [(len(alike), stage, _first_of(alike)) for (stage, _), alike in kinds.items()]
     counts.sort(key=lambda each: -each[0])
     ahead = sum(x.id in early for x in rows)

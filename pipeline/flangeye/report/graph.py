@@ -33,9 +33,6 @@ from flangeye.report.plot import (
 from flangeye.report.space import PlotlyFigure, mapped
 from flangeye.types import BASE, Floats, Observation, Transform
 
-AXES = 0.2
-"""Length of the axes of the root and of cameras [m]."""
-
 
 def graph_drawing(facts: Facts) -> PlotlyFigure | None:
     """Return where cameras were, and where they saw targets; None where not all of it was found."""
@@ -46,9 +43,10 @@ def graph_drawing(facts: Facts) -> PlotlyFigure | None:
     ends = cell.ends(found, seen)
     drawn = [*_cameras(cell, seen, ends), *_targets(cell, seen, ends), *_scans(facts, seen, ends)]
     shown = ", ".join(str(trace["name"]) for trace in drawn)
-    traces = [*drawn, *frame(np.eye(4), BASE, AXES)]
+    axes = 0.2  # length of the axes of the root and of cameras [m]
+    traces = [*drawn, *frame(np.eye(4), BASE, axes)]
     for camera in cell.cameras:
-        traces += [t for pose in _of(camera, seen, ends)[:1] for t in frame(pose, camera, AXES / 2)]
+        traces += [t for pose in _of(camera, seen, ends)[:1] for t in frame(pose, camera, axes / 2)]
     words = "the cell's base"
     summary = (
         f"In {words}: {shown}. Axes are x red, y green, z blue, of cameras at their first sighting."

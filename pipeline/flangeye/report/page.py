@@ -44,8 +44,6 @@ if TYPE_CHECKING:
 
 _HERE = Path(__file__).parent
 
-COLOURS = (*AXES, USED, HELD_OUT)
-
 
 def write_report(log: RunLog, path: Path, library: Path | None = None) -> None:
     """Write the report of a run, finished or not, as one HTML file that needs nothing else.
@@ -195,13 +193,14 @@ def _drawn(facts: Facts, judged: dict[str, str]) -> Iterator[CheckDrawing]:
 def _figure(note: JournalEntry) -> Figure:
     """Return points by series over a value, as a step noted them."""
     value: dict[str, Any] = note.value
+    series = value["series"].items()
     traces = [
         {
             "type": "scatter", "mode": "markers", "name": plain(name),
             "x": [x for x, _ in points], "y": [y for _, y in points],
             "marker": {"color": colour, "size": 8},
         }
-        for (name, points), colour in zip(value["series"].items(), COLOURS, strict=False)
+        for (name, points), colour in zip(series, (*AXES, USED, HELD_OUT), strict=False)
     ]  # fmt: skip
     layout = {**layout2d(plain(value["x"]), plain(value["y"])), "showlegend": len(traces) > 1}
     layout["yaxis"]["zeroline"] = True

@@ -26,12 +26,8 @@ AZIMUTH, ELEVATION = np.radians(-62.0), np.radians(20.0)
 """Where the picture is taken from, about the base: it shows an arm that reaches along x."""
 SQUARE = 0.25
 """Edge of a square of the floor [m]."""
-PLATE = 0.032
-"""Radius of the smallest flange plate of ISO 9409-1 that arms of this size carry [m]."""
 PIXELS = 'vector-effect="non-scaling-stroke"'
 """For a line whose width is in pixels, whatever the picture's scale."""
-PICTURE_MARGIN = 0.08
-"""Round the picture [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +104,8 @@ def still(scene: StillScene, label: str) -> str:
     corners = np.vstack([shape.points for shape in shapes] or [np.zeros((1, 3))])
     floor = _floor(corners)
     flat = np.vstack([_flat(shape.points) for shape in [*floor, *shapes]])
-    low, high = flat.min(axis=0) - PICTURE_MARGIN, flat.max(axis=0) + PICTURE_MARGIN
+    margin = 0.08  # [m]
+    low, high = flat.min(axis=0) - margin, flat.max(axis=0) + margin
     size = high - low
     drawn = "".join(shape.drawn() for shape in [*floor, *shapes])
     return (
@@ -170,7 +167,9 @@ def rods(robot: RobotModel, joints: Floats) -> list[tuple[float, Floats]]:
     origins = frames[:, :3, 3]
     # Radius of the links of an arm whose capsules nobody has written down [m]
     found = found or [(0.045, np.stack(pair)) for pair in pairwise(origins)]
-    return [*found, (PLATE, flange[:3, 3] - np.outer([0.03, PLATE], flange[:3, 2]))]
+    # Radius of the smallest flange plate of ISO 9409-1 that arms of this size carry [m]
+    plate = 0.032
+    return [*found, (plate, flange[:3, 3] - np.outer([0.03, plate], flange[:3, 2]))]
 
 
 def _arm(scene: StillScene) -> list[_Line]:

@@ -13,16 +13,6 @@ from flangeye.maths.geometry import quaternion_from_rotation, rpy_from_rotation
 from flangeye.report.facts import INCOMPLETE, Facts
 from flangeye.report.units import degrees, millimetres, rounded_mm
 
-UNKNOWN = "not measured"
-_FRAMES = {
-    t.BASE: "the robot's base",
-    t.FLANGE: "the flange",
-    t.CAMERA: "the camera",
-    t.TARGET: "the target",
-    t.BASE2: "the second robot's base",
-    t.FLANGE2: "the second robot's flange",
-}
-
 
 @dataclass(frozen=True)
 class Banner:
@@ -190,6 +180,7 @@ def transform_text(name: str, estimate: r.TransformResult) -> TransformText:
     """Return an estimated transform for people."""
     parent, _, child = name.partition("_T_")
     matrix = np.array(estimate.matrix)
+    unknown = "not measured"
     return TransformText(
         name=name,
         parent=parent,
@@ -199,14 +190,22 @@ def transform_text(name: str, estimate: r.TransformResult) -> TransformText:
         translation=[f"{x * 1e3:z.3f}" for x in matrix[:3, 3]],
         rotation=[degrees(x) for x in rpy_from_rotation(matrix[:3, :3])],
         quaternion=[f"{x:z.7f}" for x in quaternion_from_rotation(matrix[:3, :3])],
-        translation_std=[UNKNOWN if x is None else millimetres(x) for x in estimate.sigma[3:]],
-        rotation_std=[UNKNOWN if x is None else degrees(x) for x in estimate.sigma[:3]],
+        translation_std=[unknown if x is None else millimetres(x) for x in estimate.sigma[3:]],
+        rotation_std=[unknown if x is None else degrees(x) for x in estimate.sigma[:3]],
         about=[f"{x * 1e3:z.1f}" for x in estimate.about],
     )
 
 
 def _direction(parent: str, child: str) -> str:
-    parent, child = _FRAMES.get(parent, parent), _FRAMES.get(child, child)
+    named = {
+        t.BASE: "the robot's base",
+        t.FLANGE: "the flange",
+        t.CAMERA: "the camera",
+        t.TARGET: "the target",
+        t.BASE2: "the second robot's base",
+        t.FLANGE2: "the second robot's flange",
+    }
+    parent, child = named.get(parent, parent), named.get(child, child)
     return (
         f"maps points given in {child} to points in {parent}; "
         f"equally, it is the pose of {child} in {parent}"

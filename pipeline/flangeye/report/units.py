@@ -33,21 +33,6 @@ def duration(seconds: float) -> str:
     return f"{seconds * 1e3:.3g} ms" if seconds >= 1e-6 else "0 ms"
 
 
-LENGTHS = (
-    "rms",
-    "median",
-    "p95",
-    "max",
-    "worst",
-    "distance",
-    "offset",
-    "sigma",
-    "shift",
-    "error",
-    "limit",
-)
-
-
 def figure(name: str, value: float) -> str:
     """Return a verification's figure with its unit, which follows from its name.
 
@@ -58,7 +43,11 @@ def figure(name: str, value: float) -> str:
         return f"{value:.0f}"
     if any(word in ("tilt", "angle", "rotation", "turn") for word in words):
         return f"{degrees(value)}\N{NO-BREAK SPACE}\N{DEGREE SIGN}"
-    if any(word in LENGTHS for word in words):
+    lengths = (
+        "rms", "median", "p95", "max", "worst", "distance", "offset", "sigma", "shift", "error",
+        "limit",
+    )  # fmt: skip
+    if any(word in lengths for word in words):
         return f"{millimetres(value)}\N{NO-BREAK SPACE}mm"
     return f"{value:.4g}"
 

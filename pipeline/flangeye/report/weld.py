@@ -36,10 +36,6 @@ BANDS = {"seeking": "#8a8f98", "bridging": "#d98a00", "ending": "#3a7ebf", "stop
 """Colours of the controller's phases; following, the rule, has none."""
 
 
-RINGS, WIDE = 60, 0.01
-"""Circles of the tube, and roughly how wide the tube is drawn [m]."""
-
-
 @dataclass(frozen=True)
 class WeldDrawing:
     """The figures of one weld.
@@ -303,7 +299,8 @@ def _cloud(seam: t.Seam) -> list[Trace]:
 def _drawn(seam: t.Seam) -> list[Trace]:
     line, openings = seam.points_in_base, seam.openings_in_base
     at = np.linspace(0, len(line) - 1, 9).round().astype(int)
-    scale = 0.5 * round_up(WIDE / max(float(tube_radii(seam).max()), 1e-9))
+    # Roughly how wide the tube is drawn [m]
+    scale = 0.5 * round_up(0.01 / max(float(tube_radii(seam).max()), 1e-9))
     # Length of the lines that point at the torch [m]
     arrows = [np.stack([line[i], line[i] + 0.03 * openings[i]]) for i in at]
     return [
@@ -319,7 +316,8 @@ def _drawn(seam: t.Seam) -> list[Trace]:
 
 def _widened(seam: t.Seam, scale: float) -> list[Floats]:
     """Return the tube's rings, drawn too wide: it would not be seen beside the part."""
-    rings = tube_rings(seam, RINGS)
+    # Circles of the tube
+    rings = tube_rings(seam, 60)
     middles = rings[:, :-1].mean(axis=1, keepdims=True)
     return list(middles + scale * (rings - middles))
 

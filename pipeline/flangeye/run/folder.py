@@ -29,14 +29,6 @@ RUNS = Path("runs")
 CHECKS = "checks"
 """Where beside a calibration the scans of its checks go."""
 
-HEADER = """\
-# Maps child coordinates to parent coordinates; metres and radians.
-# For the arm as its controller reports it.
-"""
-CORRECTED_HEADER = """\
-# What stands under corrected_arm holds for the arm with that correction alone, never without it.
-"""
-
 
 class FolderError(FlangeyeError):
     """The run's folder cannot be made or written."""
@@ -133,7 +125,16 @@ def calibration_yaml(result: Result) -> str:
             **_corrections(answers.corrected),
         }
     document["recipe_hash"] = result.provenance.recipe_hash
-    header = HEADER + (CORRECTED_HEADER if "corrected_arm" in document else "")
+    header = """\
+# Maps child coordinates to parent coordinates; metres and radians.
+# For the arm as its controller reports it.
+""" + (
+        """\
+# What stands under corrected_arm holds for the arm with that correction alone, never without it.
+"""
+        if "corrected_arm" in document
+        else ""
+    )
     return header + yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=110)
 
 

@@ -22,11 +22,6 @@ from flangeye.recipe.load import Recipe
 from flangeye.recipe.steps import Step
 from flangeye.run.folder import recipe_of_log
 
-_ORDER = list(KINDS)
-LEFT_OUT = "left out by --leave-out"
-MOST_NAMED = 12
-"""Captures that a message names."""
-
 Acquire = Callable[[], Any]
 """Does the recipe's acquire step."""
 
@@ -183,8 +178,10 @@ class FromLog(FromNothing):
 
     def rejections(self) -> list[t.Rejection]:
         """Return the captures that were set aside by the steps that are not done again."""
-        earlier = _ORDER[: _ORDER.index(self.kind)]
-        named = [t.Rejection(each, "acquire", LEFT_OUT) for each in sorted(self.left_out)]
+        order = list(KINDS)
+        earlier = order[: order.index(self.kind)]
+        why = "left out by --leave-out"
+        named = [t.Rejection(each, "acquire", why) for each in sorted(self.left_out)]
         found = [r for r in self.log.rejections if r.stage.partition(".")[0] in earlier]
         return [*self._kept(found), *named]
 
@@ -268,9 +265,10 @@ def _named(option: str, wanted: Collection[str], log: RunLog) -> frozenset[str]:
         StageError: The log has no such capture.
     """
     known = {*log.poses, *(o.id for o in log.observations()), *(r.id for r in log.rejections)}
+    most = 12
     for each in wanted:
         if each not in known:
-            near = ", ".join(sorted(known)[:MOST_NAMED]) + (" …" if len(known) > MOST_NAMED else "")
+            near = ", ".join(sorted(known)[:most]) + (" …" if len(known) > most else "")
             raise StageError(f"{option} {each}: {log.path} has no such capture; it has {near}")
     return frozenset(wanted)
 

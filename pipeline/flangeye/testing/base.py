@@ -24,10 +24,6 @@ from flangeye.models.targets import Flange, plate_of
 from flangeye.plugin.registry import Lookup, load_registry
 from flangeye.plugin.stage import KINDS, PARTS, Params, Plugin
 
-LONGEST_SUMMARY = 110
-"""Of the first line of a docstring: ``flangeye stages`` shows it on one line."""
-
-
 T = TypeVar("T")
 
 
@@ -156,10 +152,11 @@ class Conformance:
             f"{plugin.name} is tested as a {self.kind}, but is a {plugin.kind}",
         )
         summary = plugin.summary
+        longest = 110  # `flangeye stages` shows it on one line
         require(
-            0 < len(summary) <= LONGEST_SUMMARY,
+            0 < len(summary) <= longest,
             f"{plugin.name}: the docstring's first line has {len(summary)} characters, at most "
-            f"{LONGEST_SUMMARY} fit a line",
+            f"{longest} fit a line",
         )
         for name, field in (plugin.params.model_fields if plugin.params else {}).items():
             require(field.description, f"{plugin.name}: parameter '{name}' has no description")

@@ -31,9 +31,6 @@ WALL = 1.1
 """Depth of the wall behind it [m]."""
 
 
-HALF = 160
-"""Rows and columns on either side of the middle."""
-
 FACING = rigid(rotation_exp(np.array([np.pi - 0.25, 0.15, 0.3])), np.array([0.01, -0.02, DEPTH]))
 """``camera_T_flange``: towards the camera, tilted."""
 
@@ -133,7 +130,8 @@ def sphere_scene(sphere: Sphere) -> Scene:
 def _rays() -> Floats:
     """Return (H, W, 3) directions with z = 1."""
     # Distance of neighbouring points on the flange [m]
-    steps = np.arange(-HALF, HALF + 1) * 0.5e-3 / DEPTH
+    half = 160  # rows and columns on either side of the middle
+    steps = np.arange(-half, half + 1) * 0.5e-3 / DEPTH
     x, y = np.meshgrid(steps, steps)
     return np.stack([x, y, np.ones_like(x)], axis=-1)
 

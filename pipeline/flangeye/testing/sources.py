@@ -32,11 +32,6 @@ from flangeye.types import Floats
 REACH = 5.0
 """No arm's flange is farther from its base: a larger number is in millimetres [m]."""
 
-OUT_OF_RANGE = 20.0
-"""A median point so many times nearer or farther than the scanner sees is in another unit."""
-
-LOOKED_AT = 3
-"""Captures that are compared; more would only take longer."""
 
 CAMERA = rigid(rotation_exp(np.array([np.pi, 0.0, 0.0])), np.array([0.5, 0.0, 1.1]))
 """``base_T_camera`` of the kit's cell: it looks down at the work."""
@@ -52,7 +47,7 @@ class AcquireConformance(Conformance):
     kind = "acquire"
     archive: ClassVar[Path | None] = None
 
-    def acquired(self, count: int = LOOKED_AT) -> tuple[Any, list[Any]]:
+    def acquired(self, count: int = 3) -> tuple[Any, list[Any]]:
         """Return the stream, and its first captures or observations."""
         stream = self.call({t.ArchivePath: t.ArchivePath(self.archive)})
         require(
@@ -93,11 +88,12 @@ class AcquireConformance(Conformance):
             require((pose.parent, pose.child) == (t.BASE, t.FLANGE), f"a pose is {pose.name}")
             far = float(np.linalg.norm(pose.translation))
             require(far < REACH, f"a flange is {far:.3g} m from its base: not in metres?")
+        times = 20.0  # so much nearer or farther than the scanner sees is in another unit
         for capture in only(self.acquired()[1], t.Capture):
             require(capture.cloud.frame == t.CAMERA, f"a cloud is in '{capture.cloud.frame}'")
             points = capture.cloud.points()
             depth = float(np.median(np.linalg.norm(points, axis=1))) if len(points) else 0.0
-            near, limit = self.scanner.near / OUT_OF_RANGE, self.scanner.far * OUT_OF_RANGE
+            near, limit = self.scanner.near / times, self.scanner.far * times
             require(near < depth < limit, f"a scan's middle is {depth:.3g} m away: not in metres?")
 
     def test_captures_survive_the_log(self) -> None:

@@ -18,9 +18,6 @@ from flangeye.testing.base import (
 )
 from flangeye.testing.solving import CAMERA, WORK, observed, reference_solution, work_points
 
-PERIOD = 8e-3
-"""Between two cycles of a controller [s]."""
-
 
 def verified() -> t.VerifiedHandEye:
     """Return the kit's calibration, as if it had passed."""
@@ -118,8 +115,9 @@ class ControllerConformance(Conformance):
         """Return what it commands."""
         controller, task = self.call(None, straight_task()), straight_task()
         felt, given = np.array([0.0, -task.deflection, -task.preload]), []
-        for i in range(round(10.0 / PERIOD)):
-            time = i * PERIOD
+        period = 8e-3  # between two cycles of a controller [s]
+        for i in range(round(10.0 / period)):
+            time = i * period
             pose = ToolPose(time, np.array([task.speed * time, 0.0, 0.0]), 0.0)
             given.append(controller.step(pose, [Touch(time, felt)]))
             require(

@@ -61,8 +61,6 @@ class PointCloud:
 
 BASE, FLANGE, CAMERA, TARGET, TOOL = "base", "flange", "camera", "target", "tool"
 
-FRAME_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,63}")
-"""Names of frames are identifiers: they reach recipes, logs and other programs' files."""
 
 BASE2, FLANGE2 = "base2", "flange2"
 
@@ -87,7 +85,9 @@ class Transform:
 
     def __post_init__(self) -> None:
         for frame in (self.parent, self.child):
-            if not FRAME_NAME.fullmatch(frame):
+            # Names of frames are identifiers: they reach recipes, logs and other
+            # programs' files
+            if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]{0,63}", frame):
                 raise ValueError(f"{frame[:80]!a} is no name of a frame: letters, digits and _")
         freeze(self, matrix=(4, 4))
         rotation = self.matrix[:3, :3]

@@ -39,10 +39,6 @@ __all__ = [
 ]
 
 
-READS_RECORDINGS = ("acquire.archive", "acquire.centres")
-"""First steps that read later recordings as they read the calibration's."""
-
-
 def from_archive(
     path: Path, stored: StoredCalibration, registry: Registry, overrides: Sequence[str] = ()
 ) -> MonitorCheck:
@@ -111,9 +107,11 @@ def _from_archive(stored: StoredCalibration) -> str:
     """Return the calibration's recipe, made to read recordings."""
     data = _steps(stored)
     first = data["steps"][0]
-    name = next((name for name in READS_RECORDINGS if name in first), None)
+    # They read later recordings as they read the calibration's
+    reads_recordings = ("acquire.archive", "acquire.centres")
+    name = next((name for name in reads_recordings if name in first), None)
     params = first[name] if name and isinstance(first, dict) else None
-    data["steps"][0] = {name or READS_RECORDINGS[0]: {**(params or {}), "fewest": 1}}
+    data["steps"][0] = {name or reads_recordings[0]: {**(params or {}), "fewest": 1}}
     return str(yaml.safe_dump(data, sort_keys=False, allow_unicode=True))
 
 

@@ -25,8 +25,6 @@ from flangeye.log.record import adapter
 from flangeye.log.records import DamageError, reason_of
 
 FORMAT = "flangeye.monitor.2"
-PATIENCE = 60.0
-"""How long to wait for another program that adds a check [s]; judging takes it about a second."""
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
@@ -174,7 +172,8 @@ def only_user(path: Path) -> Iterator[None]:
     """
     import fcntl  # not on every system, and nothing but this command needs it
 
-    lock, end = path.with_name(f".{path.name}.lock"), time.monotonic() + PATIENCE
+    patience = 60.0  # for another program that adds a check [s]; judging takes it about a second
+    lock, end = path.with_name(f".{path.name}.lock"), time.monotonic() + patience
     try:
         lock.parent.mkdir(parents=True, exist_ok=True)
         with lock.open("ab") as file:
@@ -189,7 +188,7 @@ def only_user(path: Path) -> Iterator[None]:
             yield
     except BlockingIOError:
         raise StageError(
-            f"{path}: another program has kept it for {PATIENCE:.0f} s; end it, and check again"
+            f"{path}: another program has kept it for {patience:.0f} s; end it, and check again"
         ) from None
     except OSError as error:
         raise StageError(f"{lock}: cannot be written: {error.strerror or error}") from None

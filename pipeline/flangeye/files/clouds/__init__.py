@@ -23,13 +23,6 @@ from flangeye.files.clouds.table import Points, PointTable
 from flangeye.files.elsewhere import at_hand
 from flangeye.types import CAMERA, PointCloud
 
-SAMPLE = 4096
-"""Points among which such a number is looked for."""
-SHARE = 0.01
-"""Of the points at least: measured points are not equal to the last bit so often."""
-FARTHER = 3.0
-"""How many times farther than all others points of one depth are, whose x and y differ."""
-
 
 def mark_missing(xyz: Points) -> str:
     """Set the points that stand for none to NaN, in place.
@@ -43,11 +36,12 @@ def mark_missing(xyz: Points) -> str:
     Returns:
         What was taken for missing and how often, for people; empty where nothing was.
     """
-    some = xyz[:: max(1, len(xyz) // SAMPLE)]
+    some = xyz[:: max(1, len(xyz) // 4096)]
     some = some[np.isfinite(some).all(axis=1)]
     depths, counts = np.unique(some[:, 2], return_counts=True)
     # Points at least: fewer do no harm, and small tables may repeat what was measured
-    if not len(depths) or counts.max() < max(SHARE * len(some), 100):
+    # Measured points are not equal to the last bit so often: one in a hundred
+    if not len(depths) or counts.max() < max(0.01 * len(some), 100):
         return ""
     depth = depths[counts.argmax()]
     alike, others = some[some[:, 2] == depth], some[some[:, 2] != depth]
@@ -55,7 +49,7 @@ def mark_missing(xyz: Points) -> str:
     repeated = (alike == point).all(axis=1).mean() > 0.5
     if repeated and (not point.any() or _beyond(np.abs(point).max(), np.abs(others), 1.0)):
         gone, called = (xyz == point).all(axis=1), f"({', '.join(f'{x:g}' for x in point)})"
-    elif _beyond(abs(depth), np.abs(others[:, 2]), FARTHER):
+    elif _beyond(abs(depth), np.abs(others[:, 2]), 3.0):
         gone, called = xyz[:, 2] == depth, f"a depth of {depth:g}"
     else:
         return ""

@@ -11,11 +11,6 @@ from typing import NoReturn
 from flangeye.errors import StageError
 from flangeye.files.regular import open_regular
 
-HEADER_BYTES = 65536
-"""Headers seen in the wild have 200 to 1,000 bytes; nothing longer is read as a header."""
-LFS = b"version https://git-lfs.github.com/spec/"
-"""How the stand-in of a file begins that Git Large File Storage keeps elsewhere."""
-
 
 def refuse(path: Path | str, what: str) -> NoReturn:
     """Raise the StageError of a file: its path, and what is wrong with it."""
@@ -34,10 +29,12 @@ def read_head(path: Path) -> bytes:
     if path.is_dir():
         refuse(path, "is a folder, not a point cloud")
     with open_regular(path) as file:
-        head = file.read(HEADER_BYTES)
+        # Headers seen in the wild have 200 to 1,000 bytes; nothing longer is read as one
+        head = file.read(65536)
     if not head:
         refuse(path, "is empty (0 bytes)")
-    if head.startswith(LFS):
+    # The stand-in of a file that Git Large File Storage keeps elsewhere begins so
+    if head.startswith(b"version https://git-lfs.github.com/spec/"):
         refuse(path, "is a Git LFS pointer, not the file itself; fetch it: git lfs pull")
     return head
 

@@ -23,9 +23,7 @@ from flangeye.files.clouds.table import (
 )
 from flangeye.maths.geometry import rotation_from_quaternion
 
-_KINDS = {"F": ("4", "8"), "I": ("1", "2", "4", "8"), "U": ("1", "2", "4", "8")}
 MAX_RECORD = 65536
-IDENTITY = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
 
 Header = Mapping[str, list[str]]
 
@@ -86,7 +84,7 @@ def open_pcd(path: Path) -> PointTable:
 def _viewpoint(path: Path, header: Header) -> Viewpoint | None:
     """Return the viewpoint; None for the identity, or where there is none."""
     words = header.get("VIEWPOINT")
-    if not words or [float(word) for word in words if _is_number(word)] == IDENTITY:
+    if not words or list(map(float, filter(_is_number, words))) == [0, 0, 0, 1, 0, 0, 0]:
         return None
     numbers = tuple(float(word) for word in words if _is_number(word))
     if len(numbers) != len(words) or len(numbers) != 7 or abs(math.hypot(*numbers[3:]) - 1) > 1e-3:
@@ -134,7 +132,7 @@ def _record(
             f"its header names {len(counts)} fields, but {len(sizes)} SIZE and {len(kinds)} TYPE",
         )
     for kind, size in zip(kinds, sizes, strict=True):
-        if size not in _KINDS.get(kind, ()):
+        if size not in {"F": "48", "I": "1248", "U": "1248"}.get(kind, "") or len(size) != 1:
             refuse(path, f"its header says TYPE {kind} with SIZE {size}, which PCD does not have")
     if any(counts[axis] != 1 for axis in axes):
         refuse(path, "its header gives x, y and z a COUNT other than 1")

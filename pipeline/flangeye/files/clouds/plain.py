@@ -23,9 +23,6 @@ HEADER_ERRORS = (ValueError, TypeError, SyntaxError, TokenError)
 NUMBERS = "fiu"
 """Kinds of NumPy's types that are numbers."""
 
-WIDEST = 16
-"""Numbers a point may have: x, y, z, then normals, colours, intensity."""
-
 
 def open_npy(path: Path) -> PointTable:
     """Return the points of an array.
@@ -40,9 +37,10 @@ def open_npy(path: Path) -> PointTable:
     if fields:
         axes_of(path, fields)
         return NpyTable(path, shape, tuple(fields))
-    if len(shape) in (2, 3) and 3 <= shape[-1] <= WIDEST:
+    widest = 16  # x, y, z, then normals, colours, intensity
+    if len(shape) in (2, 3) and 3 <= shape[-1] <= widest:
         return NpyTable(path, shape[:-1])
-    if len(shape) in (2, 3) and 3 <= shape[0] <= WIDEST < shape[-1]:
+    if len(shape) in (2, 3) and 3 <= shape[0] <= widest < shape[-1]:
         return NpyTable(path, shape[1:], axes_first=True)
     refuse(path, f"has shape {shape}; a point cloud is (N, 3), (H, W, 3), (3, N) or (3, H, W)")
 
@@ -206,12 +204,9 @@ def _cells(line: str) -> tuple[list[str], str | None, bool]:
     return [cell.replace(",", ".") for cell in cells] if comma else cells, delimiter, comma
 
 
-_HEADING = re.compile(r"([A-Za-z]\w*?)[\s_]*[\[(]?(mm|m|in)?[\])]?")
-
-
 def _axis(cell: str) -> tuple[str, str]:
     """Return the name and the unit of a heading's cell: ``x_mm``, ``X [mm]``."""
-    match = _HEADING.fullmatch(cell.strip('"'))
+    match = re.fullmatch(r"([A-Za-z]\w*?)[\s_]*[\[(]?(mm|m|in)?[\])]?", cell.strip('"'))
     return (match[1], match[2] or "") if match else (cell, "")
 
 

@@ -28,7 +28,6 @@ _TYPES = {
     "float32": "f4",
     "float64": "f8",
 }
-_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 
 
 @dataclass
@@ -55,9 +54,10 @@ def open_ply(path: Path) -> PointTable:
         refuse(path, "its header has no element 'vertex'")
     if encoding == "ascii":
         return _text(path, offset, elements, at)
-    if encoding in _ORDERS:
-        return _binary(path, offset, elements[: at + 1], _ORDERS[encoding])
-    refuse(path, f"its header says format {encoding}; known: ascii, {', '.join(_ORDERS)}")
+    orders = {"binary_little_endian": "<", "binary_big_endian": ">"}
+    if encoding in orders:
+        return _binary(path, offset, elements[: at + 1], orders[encoding])
+    refuse(path, f"its header says format {encoding}; known: ascii, {', '.join(orders)}")
 
 
 def _elements(path: Path, lines: list[list[str]]) -> list[_Element]:

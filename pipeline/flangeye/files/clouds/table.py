@@ -60,20 +60,14 @@ def _repeat(out: bytearray, start: int, length: int) -> None:
         out += (out[start:] * (length // period + 1))[:length]
 
 
-REMARKS = ("#", "//", "%")
-"""How lines begin that are remarks: of Python and PCL, of CloudCompare, of MATLAB."""
-
-
 def is_row(line: str) -> bool:
     """Return whether a line of a text is neither blank nor a remark."""
-    return not line.isspace() and not line.lstrip().startswith(REMARKS)
+    # Remarks of Python and PCL, of CloudCompare, of MATLAB
+    return not line.isspace() and not line.lstrip().startswith(("#", "//", "%"))
 
 
 Shape = tuple[int, ...]
 Points = NDArray[np.float32]
-
-PLAIN = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
-"""The record of points and nothing else: its bytes are the array's."""
 
 
 class PointTable(Protocol):
@@ -199,7 +193,8 @@ class BinaryTable:
         records = np.fromfile(self.path, self.record, count=n, offset=self.offset)
         if len(records) != n:
             refuse(self.path, f"changed while it was read: {len(records)} of {n} points are left")
-        if self.record == PLAIN:
+        # The record of points and nothing else: its bytes are the array's
+        if self.record == np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4")]):
             return records.view("<f4").reshape(n, 3)
         return _stack(*(records[axis] for axis in "xyz"))
 

@@ -54,8 +54,6 @@ __all__ = [
 
 _COMMENT = re.compile(r"\s*(?:[#%]|//)[#%/ ]*")
 """What a line of comment begins with."""
-_SHARE = re.compile(r"([1-9]\d?)/([1-9]\d?)")
-"""A part of a file's rows: the first of so many equal ones."""
 
 
 def program_rows(file: Path, text: str) -> Rows | None:
@@ -169,7 +167,8 @@ def _table(name: str, file: Path, rows: Rows, files: Sequence[Path] = ()) -> Tab
 def _part(file: Path, found: Sequence[Rows], part: str) -> Rows:
     if not found:
         return Rows((), [])
-    share = _SHARE.fullmatch(part)
+    # The first of so many equal parts
+    share = re.fullmatch(r"([1-9]\d?)/([1-9]\d?)", part)
     if share is not None and len(found) == 1:
         return _share(file, found[0], int(share[1]), int(share[2]))
     if not part and len(found) == 1:

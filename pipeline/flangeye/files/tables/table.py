@@ -22,8 +22,6 @@ Cell = str | float
 Row = tuple[str, tuple[Cell, ...]]
 """Where a row stands, as messages begin with it, and its cells."""
 
-_DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
-
 
 class Rows(NamedTuple):
     """What one source gives: a block of a text, a program, the lists of one length in a document.
@@ -128,7 +126,7 @@ def number_of(cell: Cell) -> float | None:
     """Return the number in a cell, with a decimal point or comma; None if it is none."""
     if not isinstance(cell, str):
         return cell
-    text = cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell
+    text = cell.replace(",", ".") if re.fullmatch(r"[-+]?\d+,\d+([eE][-+]?\d+)?", cell) else cell
     try:
         return float(text)
     except ValueError:
@@ -141,9 +139,6 @@ FEWEST = 3
 """Lists or names; fewer are no list of poses."""
 SCAN = "name"
 """Column of the names under which records stand."""
-POSES = (6, 7, 12, 16)
-"""Numbers of a list that is a whole pose."""
-_NUMBERED = re.compile(r"\d+(?=\D*$)")
 _ENDING = re.compile(r"\.[A-Za-z]\w{1,4}$")
 
 
@@ -177,7 +172,7 @@ def _numbered(file: Path, data: Mapping[str, Any]) -> list[Rows]:
     """Return records whose keys differ by a number only: pose1, pose2, …; T1_0, T2_0, T1_1."""
     groups: dict[str, dict[int, str]] = {}
     for key, value in data.items():
-        number = _NUMBERED.search(key)
+        number = re.search(r"\d+(?=\D*$)", key)
         if number and _is_record(value):
             stem = key[: number.start()] + "*" + key[number.end() :]
             groups.setdefault(stem, {})[int(number[0])] = key
@@ -203,7 +198,8 @@ def _is_record(value: Any) -> bool:
     if isinstance(value, Mapping):
         return True
     shape = _shape(value)
-    return shape in MATRICES or (len(shape) == 1 and shape[0] in (3, 4, *POSES)) or shape in (
+    # Three or four numbers are a part of a pose, six and more a whole one
+    return shape in MATRICES or (len(shape) == 1 and shape[0] in (3, 4, 6, 7, 12, 16)) or shape in (
         (3, 1), (4, 1), (6, 1), (1, 3), (1, 6)
     )  # fmt: skip
 

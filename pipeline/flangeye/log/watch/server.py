@@ -26,11 +26,6 @@ Send = Callable[[LogMessage], None]
 
 HERE = "127.0.0.1"
 
-PATIENCE = 10.0
-"""How long to wait for it [s]."""
-
-REFUSAL = b"HTTP/1.1 403 Forbidden\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
-
 
 @contextmanager
 def foxglove_server(port: int) -> Iterator[Send]:
@@ -101,11 +96,14 @@ async def _serve(
 ) -> None:
     async def enter(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         with closing(writer), suppress(OSError, TimeoutError, EOFError, asyncio.LimitOverrunError):
-            head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), PATIENCE)
+            # Whoever says nothing for so long [s] is no browser
+            head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), 10.0)
             if may_look(head):
                 await _joined(head, reader, writer, inside)
             else:
-                writer.write(REFUSAL)
+                writer.write(
+                    b"HTTP/1.1 403 Forbidden\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
+                )
 
     ended = asyncio.Event()
     # Longest first request [bytes]: that of a browser has about 500

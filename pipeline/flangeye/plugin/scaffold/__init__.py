@@ -12,8 +12,6 @@ from flangeye.plugin.stage import KINDS, PARTS
 
 TEMPLATES = Path(__file__).parent / "templates"
 
-NAME = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")
-
 
 def kinds() -> dict[str, str]:
     """Return the kinds a plugin can be written for, and what each is."""
@@ -46,7 +44,7 @@ def write_plugin(name: str, kind: str, into: Path) -> Path:
 
 
 def _require_usable(name: str, kind: str) -> None:
-    if not NAME.fullmatch(name):
+    if not re.fullmatch(r"[a-z][a-z0-9]*(_[a-z0-9]+)*", name):
         raise StageError(
             f"'{name}' cannot be a plugin's name: lower-case letters and digits, words joined by "
             "_, for example acme_hull"

@@ -20,11 +20,6 @@ from flangeye.units import in_mm, parse_quantity
 __all__ = ["Draft", "Questions", "draft_live", "draft_recipe", "look"]
 
 
-BOX = 0.6
-"""Side of the box about where the flange is now, unless another is given [m]: poses about one half
-of a metre apart tell a camera's turn to a hundredth of a degree."""
-
-
 def draft_live(cell: RunningCell, questions: Questions, out: Path) -> Draft:
     """Return a recipe for an arm whose flange faces a camera beside it.
 
@@ -60,7 +55,10 @@ def draft_live(cell: RunningCell, questions: Questions, out: Path) -> Draft:
 def _box(flange: Floats, questions: Questions) -> dict[str, Any]:
     """Return the box that the flange's centre stays in."""
     question = "box that the flange may move in, centre and size in the base"
-    default = f"{in_mm(flange[:3, 3])}; {in_mm(np.full(3, BOX))}"
+    # [m]: poses about one half of a metre apart tell a camera's turn to a hundredth of a
+    # degree
+    side = 0.6
+    default = f"{in_mm(flange[:3, 3])}; {in_mm(np.full(3, side))}"
     answer = questions.ask("box", question, default)
     centre, _, size = answer.partition(";")
     return {"centre": _lengths("box", centre), "size": _lengths("box", size)}

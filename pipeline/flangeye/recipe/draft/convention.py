@@ -45,10 +45,6 @@ NAME_THE_ARM = "name the arm: --robot NAME ('flangeye robots' lists them), or it
 WAYS = {"": ("base_T_flange", "flange_T_base"), "target-": ("camera_T_target", "target_T_camera")}
 
 
-_FIRST = ("kuka", "quaternion_xyzw", "xyzw")
-"""Of conventions with equal names, what most files hold: A, B, C; quaternions without names."""
-
-
 def poses_of(table: Table) -> tuple[list[PoseColumns], Headings]:
     """Return the poses and points in a table, and what else it holds."""
     return poses_by_name(table) if table.heading else poses_by_number(table)
@@ -430,7 +426,10 @@ def _rotation(pose: PoseColumns, questions: Questions, prefix: str, maker: str |
     if usual and CONVENTIONS[usual].count - 3 != len(pose.table.indices(pose.columns)) - 3:
         usual = None
     if pose.rotations and usual not in pose.rotations:
-        usual = pose.rotations[0] if pose.rotations[0] in _FIRST else None
+        # Of conventions with equal names, what most files hold: A, B, C; quaternions
+        # without names
+        likely = ("kuka", "quaternion_xyzw", "xyzw")
+        usual = pose.rotations[0] if pose.rotations[0] in likely else None
     shown = ", ".join(map(str, pose.columns[3:] or pose.columns))
     joints = ", or joints, with --robot" if pose.may_be_joints and not prefix else ""
     known = f"{', '.join(CONVENTIONS)}, vector, xyz, ZYX, …{joints}"

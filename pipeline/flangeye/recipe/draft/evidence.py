@@ -32,7 +32,6 @@ ROUNDED = 5e-3
 """By how much a written quaternion's length, or a rotation matrix, may be off."""
 TURN = 2 * math.pi + 0.01
 """Angles [rad] beyond it are degrees."""
-QUATERNIONS = ("quaternion_xyzw", "quaternion_wxyz")
 
 
 def poses_by_number(table: Table) -> tuple[list[PoseColumns], Headings]:
@@ -143,7 +142,9 @@ def _pose(table: Table, part: list[int], numbers: Floats, told: str) -> PoseColu
 def _of_seven(table: Table, part: list[int], numbers: Floats, told: str) -> PoseColumns | None:
     if (first := _quaternion_at(numbers)) is not None:
         columns = part if first == 3 else [*part[4:], *part[:4]]
-        return PoseColumns(table, tuple(columns), QUATERNIONS, guess=told)
+        return PoseColumns(
+            table, tuple(columns), ("quaternion_xyzw", "quaternion_wxyz"), guess=told
+        )
     angles = np.nanmax(np.abs(numbers)) <= 360.0
     return PoseColumns(table, tuple(part), JOINTS, guess=told) if angles else None
 
@@ -178,8 +179,8 @@ MOST_PAIRS = 60
 """Poses whose pairs are looked at: enough to tell frames apart."""
 CLEARER = 3.0
 """By what factor the next best has to be worse, beyond 0.2 deg or 2 mm."""
-LOOSE_ANGLE, LOOSE_PLACE = np.radians(0.2), 2e-3
-"""Differences [rad, m] below which two hypotheses are both good."""
+LOOSE_PLACE = 2e-3
+"""Difference [m] below which two hypotheses are both good."""
 
 
 class Writing(NamedTuple):
@@ -242,7 +243,8 @@ def writing_of(
     if not tried or tried[0][0] > alike_angle:
         return None
     best, a, b = tried[0]
-    alike = [each for each in tried if each[0] < CLEARER * max(best, LOOSE_ANGLE)]
+    # Two hypotheses that differ by less are both good [rad]
+    alike = [each for each in tried if each[0] < CLEARER * max(best, np.radians(0.2))]
     if len(alike) > 1:
         return _by_places(arm, target, [(a, b) for _, a, b in alike])
     beyond = f", the next {np.degrees(tried[1][0]):.1f} deg" if len(tried) > 1 else ""

@@ -39,24 +39,14 @@ _TURNS: Mapping[str, str] = {
     "rvec": "v", "rvecs": "v", "rotvec": "v", "rodrigues": "v", "rpy": "e",
 }  # fmt: skip
 """Names of rotations, and what the names of their columns begin with."""
-_TURN_WORDS = tuple(word for word in _TURNS if len(word) > 1)
-_VECTORS = {
-    ("rotation", "vec"): "rotvec", ("rotation", "vector"): "rotvec", ("rot", "vec"): "rotvec",
-    ("translation", "vec"): "tvec", ("translation", "vector"): "tvec", ("trans", "vec"): "tvec",
-    ("rpy", "angles"): "rpy",
-}  # fmt: skip
 _OPENCV = ("rvec", "rvecs", "tvec", "tvecs")
 """What OpenCV calls the pose of what a camera sees."""
-_SCANS = ("cloud", "scan", "file", "filename", "image", "img", "name", "path")
 _POSES: Mapping[int, str | None] = {6: None, 7: "xyzw", 12: "matrix", 16: "matrix"}
 """Numbers of a list that is a whole pose, and what they are if no name says more."""
 _JOINT = re.compile(
     r"(?:j_?\d|(?:q|a|axis|theta)_?[1-9])(?:_?(?:rad|deg|pos|position))?"
     r"|(?!.*(?:vel|eff|torque|acc|current|temp)).*joint.*"
 )
-_IN_MATRIX = re.compile(r"(?:r|m|t|rot|mat)([0-3])([0-3])")
-"""Entry of a matrix in row and column: ``r11``, ``m03``."""
-_ENTRY = re.compile(r"(.+?)((?:\.\d+)+)")
 
 
 SEEN = re.compile(r"target|mark|cam|board|tag|cent(er|re)|seen|sphere|object|optical|track|detect")
@@ -77,8 +67,6 @@ _FRAMES: Mapping[str, str] = {
     }.items()
     for name in names.split()
 }
-_ARMS = ({"base", "flange"}, {"world", "flange"})
-_SIGHTS = ({"camera", "target"}, {"camera", "world"})
 _TO = re.compile(r"(?<![a-zA-Z])([a-zA-Z]+)(?:2|_to_|To)([a-zA-Z]+)")
 _IN = re.compile(r"(?<![a-zA-Z])([a-z]+)_?[TH]_?([a-z]+)(?![a-zA-Z])")
 _OF = re.compile(r"(?<![a-zA-Z])[TH]_([a-z]+)_([a-z]+)")
@@ -225,7 +213,8 @@ def _grouped(table: Table) -> tuple[dict[str, Group], Headings]:
         joint = joint or _JOINT.fullmatch(name.lower())
         words = _words(f"{listed}.{'xyzw'[nth]}" if size in (3, 4) else listed if size else name)
         if number_of(table.rows[0][1][index]) is None:
-            if (words and words[-1].lower() in _SCANS) or _is_file(table, index):
+            scans = ("cloud", "scan", "file", "filename", "image", "img", "name", "path")
+            if (words and words[-1].lower() in scans) or _is_file(table, index):
                 rest = replace(rest, scan=name)
         elif joint and not _is_quaternion(table, name):
             unit = next((u for u in _ANGLES if u == words[-1].lower()), None)
@@ -262,14 +251,22 @@ def list_sizes(names: Sequence[str]) -> Counter[str]:
 
 def list_name(name: str) -> str:
     """Return the list that a column is an entry of; empty if it is none."""
-    match = _ENTRY.fullmatch(name)
+    match = re.fullmatch(r"(.+?)((?:\.\d+)+)", name)
     return match[1] if match else ""
 
 
 def _words(name: str) -> list[str]:
     """Return the words of a column's name; R of ``R_gripper2base`` is one."""
     words = [w for w in re.split(r"[^0-9a-zA-Z°]+", name.replace("°", "deg")) if w]
-    for pair, one in _VECTORS.items():
+    for pair, one in {
+        ("rotation", "vec"): "rotvec",
+        ("rotation", "vector"): "rotvec",
+        ("rot", "vec"): "rotvec",
+        ("translation", "vec"): "tvec",
+        ("translation", "vector"): "tvec",
+        ("trans", "vec"): "tvec",
+        ("rpy", "angles"): "rpy",
+    }.items():
         for i in range(len(words) - 1):
             if tuple(w.lower() for w in words[i : i + 2]) == pair:
                 words[i : i + 2] = [one]
@@ -292,7 +289,8 @@ def _put(groups: dict[str, Group], name: str, words: list[str], listed: bool) ->
         axis = axis[1]
     plain = axis in ("x", "y", "z", "w")
     # Behind a name of its own (orientation.roll) only a whole word is no part of the pose's name
-    part, before = _without(before, (*_PLACES, *_TURNS) if plain else _TURN_WORDS)
+    whole = [word for word in _TURNS if len(word) > 1]
+    part, before = _without(before, (*_PLACES, *_TURNS) if plain else whole)
     axis = (_TURNS.get(part, "") if plain else "") + axis
     called = "_".join(before) or (part if part in _OPENCV else "")
     group = groups.setdefault("" if called in _OPENCV else called, Group())
@@ -354,8 +352,9 @@ def _pose(table: Table, group: Group) -> PoseColumns | None:
 
 def _matrix_entries(group: Group) -> tuple[Column, ...]:
     """Return the columns that are named as the entries of a matrix, row by row."""
+    # Entry of a matrix in row and column: ``r11``, ``m03``.
     named = {m.groups(): column for name, column in group.columns.items()
-             if (m := _IN_MATRIX.fullmatch(name))}  # fmt: skip
+             if (m := re.fullmatch(r"(?:r|m|t|rot|mat)([0-3])([0-3])", name))}  # fmt: skip
     return tuple(named[at] for at in sorted(named))
 
 
@@ -369,7 +368,9 @@ def frames_in(name: str) -> tuple[str, str] | None:
     if first is None or second is None:
         return None
     pair = (second, first) if to else (first, second)
-    return pair if set(pair) in _ARMS or set(pair) in _SIGHTS else None
+    of_arms = {"base", "flange"}, {"world", "flange"}
+    of_sights = {"camera", "target"}, {"camera", "world"}
+    return pair if set(pair) in (*of_arms, *of_sights) else None
 
 
 def is_inverse(frames: tuple[str, str]) -> bool:

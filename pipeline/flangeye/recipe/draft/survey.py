@@ -101,10 +101,8 @@ class Questions:
                 return answer
 
 
-TABLES = (".csv", ".txt", ".dat", ".tsv", ".tum", ".log", ".mod", ".src", ".ls", ".script", *KINDS)
 FEWEST_ROWS = 3
 """Rows of a table of poses, and files that are named alike under one pattern."""
-_PART = re.compile(r"(?<![a-z])(r|rot|rotations?|rvecs?|t|trans|translations?|tvecs?|pos)(?![a-z])")
 
 
 @dataclass(frozen=True)
@@ -175,9 +173,12 @@ def look(folder: Path) -> FolderSurvey:
 def places(folder: Path, files: Sequence[Path]) -> Iterator[tuple[str, list[Path]]]:
     """Yield files as a recipe names them, those that are named alike under one pattern."""
     groups: dict[str, list[Path]] = defaultdict(list)
+    known = (
+        ".csv", ".txt", ".dat", ".tsv", ".tum", ".log", ".mod", ".src", ".ls", ".script", *KINDS,
+    )  # fmt: skip
     for file in files:
         # A file that is larger [bytes] holds scans, and is not looked into
-        if file.suffix.lower() in TABLES and file.stat().st_size <= 10_000_000:
+        if file.suffix.lower() in known and file.stat().st_size <= 10_000_000:
             alike = re.sub(r"\d+(?=\D*$)", "*", file.stem) + file.suffix
             groups[str(file.relative_to(folder).with_name(alike))].append(file)
     single = [file for files in groups.values() if len(files) < FEWEST_ROWS for file in files]
@@ -236,7 +237,10 @@ def _width(table: Table) -> int:
 
 def _key(name: str) -> tuple[str, str] | None:
     """Return whether a name is of rotations or of positions, and the rest of it."""
-    match = _PART.search(name.lower())
+    match = re.search(
+        r"(?<![a-z])(r|rot|rotations?|rvecs?|t|trans|translations?|tvecs?|pos)(?![a-z])",
+        name.lower(),
+    )
     return match and (match[1], name[: match.start()].lower() + name[match.end() :].lower())
 
 

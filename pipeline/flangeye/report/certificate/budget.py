@@ -64,12 +64,6 @@ def coverage_factor(freedom: float, probability: float = 0.95) -> float:
     return float(ndtri(upper) if np.isinf(freedom) else stdtrit(freedom, upper))
 
 
-SMALL = 0.01
-"""A cause with a smaller share of the variance is counted among the others."""
-EXPANSION = 23e-6
-"""Of aluminium, of which most arms are made, per kelvin: larger than that of steel."""
-
-
 @dataclass(frozen=True)
 class Conditions:
     """What the person says of the place, for it is not measured.
@@ -250,13 +244,14 @@ def shares_of(result: Result) -> list[Share]:
         return [Share("all causes", np.sqrt(max(whole, 0.0)), _evidence(result))]
     used = sum(o.used for o in result.observations)
     told = {cause: max(variance(share), 0.0) for cause, share in estimate.shares.items()}
-    rows = {cause: v for cause, v in told.items() if v >= SMALL * whole}
+    least = 0.01  # a cause with a smaller share of the variance is counted among the others
+    rows = {cause: v for cause, v in told.items() if v >= least * whole}
     small, rest = sum(told.values()) - sum(rows.values()), whole - sum(told.values())
     shares = [
         Share(cause, np.sqrt(v), f"what {used} poses leave open of it") for cause, v in rows.items()
     ]
     if small > 0:
-        each = f"{len(told) - len(rows)} causes of less than {SMALL:.0%} of the variance each"
+        each = f"{len(told) - len(rows)} causes of less than {least:.0%} of the variance each"
         shares.append(Share("others", np.sqrt(small), each))
     if rest > 0:
         few = "few poses do not tell how large each cause is, nor where exactly the work ends"
@@ -331,8 +326,10 @@ def _distortion(scanner: ScannerModel) -> tuple[str, Literal["B"], float, str]:
 
 
 def _expansion(point: Floats, spread: float) -> tuple[str, Literal["B"], float, str]:
-    half = EXPANSION * float(np.linalg.norm(point)) * spread / 2
-    evidence = f"{spread:g} K between extremes, {EXPANSION * 1e6:g} µm/(m K), rectangular"
+    # Of aluminium, of which most arms are made, per kelvin: larger than that of steel
+    expansion = 23e-6
+    half = expansion * float(np.linalg.norm(point)) * spread / 2
+    evidence = f"{spread:g} K between extremes, {expansion * 1e6:g} µm/(m K), rectangular"
     return "Arm's thermal expansion", "B", half / np.sqrt(3) / np.sqrt(3), evidence
 
 

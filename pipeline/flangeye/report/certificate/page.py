@@ -34,7 +34,6 @@ from flangeye.result import expected_error, result_of_camera, status_of
 
 LEAST_LENGTH = 1e-6
 """Smallest uncertainty that is printed as a number [m]; the page shows three decimals of a mm."""
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 
 
 def write_certificate(
@@ -67,7 +66,8 @@ def print_pdf(page: Path) -> Path | None:
     Raises:
         StageError: Chromium is there and does not print.
     """
-    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    names = ("chromium", "chromium-browser", "google-chrome", "chrome")
+    browser = next(filter(None, map(shutil.which, names)), None)
     if browser is None:
         return None
     out = page.with_suffix(".pdf")
