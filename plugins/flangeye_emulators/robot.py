@@ -158,10 +158,6 @@ def robot_simulated(model: RobotModel, params: SimulatedRobotParams) -> Robot:
     return SimulatedRobot(model, params)
 
 
-STARTING = 20.0
-"""Longest time for a controller to start, on a machine that is busy [s]."""
-
-
 class LoopbackRobotParams(Params):
     """Parameters of ``robot.emulator``."""
 
@@ -240,14 +236,15 @@ def _start(model: RobotModel, params: LoopbackRobotParams, host: str) -> subproc
         start_new_session=True,  # Ctrl-C is for the run, which stops the arm first
     )
     started = time.monotonic()
+    patience = 20.0  # on a machine that is busy [s]
     while not _listens(host):
         if controller.poll() is not None:
             said = controller.stderr.read().strip() if controller.stderr else ""
             raise DeviceError(f"robot.emulator: the controller did not start: {said}")
-        if time.monotonic() - started > STARTING:
+        if time.monotonic() - started > patience:
             _end(controller)
             raise DeviceError(
-                f"robot.emulator: the controller did not start within {STARTING:.0f} s{busy()}"
+                f"robot.emulator: the controller did not start within {patience:.0f} s{busy()}"
             )
         time.sleep(0.05)
     return controller

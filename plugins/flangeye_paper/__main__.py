@@ -19,11 +19,6 @@ Archive = Annotated[Path, typer.Option(help="The authors' published folder.")]
 Out = Annotated[Path, typer.Option(help="Folder for CSV files and pictures.")]
 
 
-_BLOCK = re.compile(
-    r"<!-- begin (?P<file>[\w.-]+\.csv)(?P<options>[^>]*) -->\n.*?<!-- end -->", re.DOTALL
-)
-
-
 @app.command("fig9")
 def _fig9(batches: Batches, out: Out = Path()) -> None:
     """Error by noise, simulated."""
@@ -97,7 +92,12 @@ def refreshed(text: str, folder: Path) -> str:
         head = f"<!-- begin {match['file']}{match['options']} -->"
         return f"{head}\n{markdown(rows, wanted or list(rows[0]))}\n<!-- end -->"
 
-    return _BLOCK.sub(table, text)
+    return re.sub(
+        r"<!-- begin (?P<file>[\w.-]+\.csv)(?P<options>[^>]*) -->\n.*?<!-- end -->",
+        table,
+        text,
+        flags=re.DOTALL,
+    )
 
 
 def markdown(rows: list[dict[str, str]], columns: list[str]) -> str:

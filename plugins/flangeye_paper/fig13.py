@@ -19,21 +19,10 @@ BEYOND = 0.2
 """The true seam is extended straight by this much, for what happens before and after it [m]."""
 
 
-STEP_TIME = 0.1
-"""A lateral step is what happens across the seam within this time [s]."""
-
-
 WORKPIECES = ("straight", "curved")
 TOUCH, PLAN, PRINTED = "by touch", "the plan alone", "Algorithm 2 as printed"
 ACROSS = "by touch, started across the seam: from 160 mm on"
 BRIDGED = "by touch, 20 mm of wall missing: there"
-
-PARTS = {ACROSS: (0.16, np.inf), BRIDGED: (0.09, 0.11)}
-"""Which part of the seam is looked at, by arc length [m]: after four tool lengths; in the gap."""
-
-MODE = "steps.5.mode"
-PATHS = (("robot", "#d97706"), ("tip", "#1d4ed8"), ("torch", "#be123c"))
-SHOWN = ((TOUCH, "#be123c"), (PLAN, "#64748b"), (PRINTED, "#d97706"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,10 +75,11 @@ class SeenWeld:
         time = self.report.time[leaving]
         if not len(time):
             return 0.0
-        both = time + STEP_TIME <= time[-1]
+        step_time = 0.1  # within this time [s]
+        both = time + step_time <= time[-1]
         paths = (self.torch, self.report.tip, self.report.robot)
         laterals = [self._seen(path)[1][leaving] for path in paths]
-        steps = [np.abs(np.interp(time + STEP_TIME, time, off) - off)[both] for off in laterals]
+        steps = [np.abs(np.interp(time + step_time, time, off) - off)[both] for off in laterals]
         return float(np.max(steps, initial=0.0))
 
     def _seen(self, points: Floats) -> tuple[Floats, Floats]:
@@ -159,10 +149,11 @@ def fig13(batches: Path, out: Path) -> None:
 def _welds(batches: Path, workpiece: str) -> Welds:
     """Return the welds of a workpiece by how it was followed."""
     others = read_sessions(batches / f"fig13-others_{workpiece}")
+    mode = "steps.5.mode"
     sessions = {
         TOUCH: read_sessions(batches / f"fig13_{workpiece}"),
-        PLAN: [s for s in others if s.row[MODE] == "vision"],
-        PRINTED: [s for s in others if s.row[MODE] == "as_printed"],
+        PLAN: [s for s in others if s.row[mode] == "vision"],
+        PRINTED: [s for s in others if s.row[mode] == "as_printed"],
         ACROSS: read_sessions(batches / f"fig13-across_{workpiece}"),
         BRIDGED: read_sessions(batches / f"fig13-gap_{workpiece}"),
     }
@@ -176,7 +167,8 @@ def _rows(workpiece: str, welds: Welds) -> Iterable[Row]:
 
 def _figures(name: str, welds: Sequence[SeenWeld]) -> Row:
     """Return the figures over all welds that were followed in one way."""
-    part = PARTS.get(name, (0.0, np.inf))
+    # By arc length [m]: after four tool lengths; in the gap
+    part = {ACROSS: (0.16, np.inf), BRIDGED: (0.09, 0.11)}.get(name, (0.0, np.inf))
     # A weld that was stopped before its torch came there has none.
     found = [off for weld in welds if len(off := weld.deviation(part))]
     every = np.concatenate(found)
@@ -218,14 +210,14 @@ def _paths(panel: Any, workpiece: str, weld: SeenWeld) -> None:
     axes = np.stack([x, np.cross(report.opening, x)], axis=1) * 1e3
     panel.plot(*((truth - start) @ axes).T, color="black", linewidth=2.5, label="true seam")
     panel.plot(*((report.planned - start) @ axes).T, color="#64748b", ls=":", label="planned")
-    for name, colour in PATHS:
+    for name, colour in (("robot", "#d97706"), ("tip", "#1d4ed8"), ("torch", "#be123c")):
         at = (getattr(report, name) - start) @ axes
         panel.plot(*at.T, color=colour, linewidth=1.0, label=name)
     dress(panel, f"paths, {workpiece} groove", "along [mm]", "across [mm]")
 
 
 def _distance(panel: Any, welds: Welds) -> None:
-    for name, colour in SHOWN:
+    for name, colour in ((TOUCH, "#be123c"), (PLAN, "#64748b"), (PRINTED, "#d97706")):
         for i, weld in enumerate(welds[name]):
             off = weld.deviation() * 1e3
             length = np.linalg.norm(weld.truth[-1] - weld.truth[0]) * 1e3

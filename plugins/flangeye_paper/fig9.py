@@ -25,8 +25,6 @@ from flangeye_paper.tables import (
     write_csv,
 )
 
-STAGE = "verify.realisations"
-
 
 def fig9(batches: Path, out: Path) -> None:
     """Write fig9.csv, fig9_summary.csv, fig9_pools.csv and fig9.png.
@@ -49,7 +47,7 @@ def fig9(batches: Path, out: Path) -> None:
 
 def realised(session: SessionRow) -> dict[str, Any]:
     """Return a session's figures in millimetres and degrees, as its row of the CSV."""
-    found = session.figures(STAGE)
+    found = session.figures("verify.realisations")
     scale = {axis: 1e3 if len(axis) == 1 else np.degrees(1.0) for axis in AXES}
     noise = session.row.get("steps.0.noise")
     return {

@@ -20,9 +20,6 @@ from flangeye.types import Floats
 
 Normals = Literal["open3d_0_7_normals", "sound"]
 
-NEIGHBOURS = 30
-"""As in the published scripts; their radius is 1 in the file's unit."""
-
 
 @dataclass(frozen=True)
 class IcpStop:
@@ -55,10 +52,11 @@ def _covariances(points: Floats, radius: float) -> Floats:
     """Return (N, 3, 3) as mean of products less product of means: the rounding is part of it."""
     from scipy.spatial import cKDTree
 
-    distance, index = cKDTree(points).query(points, k=NEIGHBOURS, distance_upper_bound=radius)
+    neighbours = 30  # as in the published scripts; their radius is 1 in the file's unit
+    distance, index = cKDTree(points).query(points, k=neighbours, distance_upper_bound=radius)
     near = np.isfinite(distance)
     sums, products = np.zeros_like(points), np.zeros((len(points), 3, 3))
-    for k in range(NEIGHBOURS):  # one after the other, as the library added them up
+    for k in range(neighbours):  # one after the other, as the library added them up
         point = np.where(near[:, k, None], points[np.where(near[:, k], index[:, k], 0)], 0.0)
         sums += point
         products += point[:, :, None] * point[:, None, :]

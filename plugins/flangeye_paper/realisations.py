@@ -35,7 +35,6 @@ from flangeye_paper.paper_cell import (
 )
 from flangeye_paper.points import PointSource, observations_of
 
-AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 WORKSPACE = Box(CENTRE, SIZE).grid()
 
 
@@ -123,9 +122,10 @@ def _figures(outcomes: list[RealisationOutcome], asked: int) -> dict[str, float]
     errors = np.array([o.error for o in outcomes])
     centre = np.array([o.at_centre for o in outcomes])
     bounds = {name: rms([o.bound[name] for o in outcomes]) for name in outcomes[0].bound}
+    axes = ("x", "y", "z", "roll", "pitch", "yaw")
     return {
-        **{f"{axis}_std": float(errors[:, i].std()) for i, axis in enumerate(AXES)},
-        **{f"{axis}_mean": float(errors[:, i].mean()) for i, axis in enumerate(AXES)},
+        **{f"{axis}_std": float(errors[:, i].std()) for i, axis in enumerate(axes)},
+        **{f"{axis}_mean": float(errors[:, i].mean()) for i, axis in enumerate(axes)},
         **{f"centre_{axis}_std": float(centre[:, i].std()) for i, axis in enumerate("xyz")},
         "workspace_rms": rms([o.rms for o in outcomes]),
         "inliers_alone_rms": rms([o.alone for o in outcomes]),

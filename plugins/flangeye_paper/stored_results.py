@@ -19,9 +19,6 @@ from flangeye.files.arrays import read_npz
 from flangeye.maths.geometry import rigid, rotation_from_rpy, rpy_from_rotation
 from flangeye.types import ArchivePath, Floats, HandEye, Verification
 
-PER_METRE = {"aubo": 1.0, "ur5": 1e3, "franka": 1e3}
-"""Unit of the stored matrices; the stored translations are all in millimetres."""
-
 
 class StoredParams(Params):
     """Parameters of ``verify.stored_results_as_in_paper``."""
@@ -64,7 +61,8 @@ def stored_results(root: Path, robot: str) -> tuple[Floats, Floats]:
     # As the authors' scripts have it
     angles = read_npz(file, "arr_2", (None, None, 3))[:, -1] * (3.14 / 180)
     matrices = read_npz(file, "arr_3", (None, 4, 4))
-    matrices[:, :3, 3] /= PER_METRE[robot]
+    # The stored translations are all in millimetres
+    matrices[:, :3, 3] /= {"aubo": 1.0, "ur5": 1e3, "franka": 1e3}[robot]
     motions = [
         rigid(rotation_from_rpy(*angle), shift) for angle, shift in zip(angles, shifts, strict=True)
     ]

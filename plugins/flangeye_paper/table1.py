@@ -25,7 +25,6 @@ from flangeye_paper.tables import (
 ICP, STORED = "verify.icp_as_in_paper", "verify.stored_results_as_in_paper"
 
 NORMALS = {"open3d_0_7_normals": "defective normals", "sound": "sound normals"}
-COLOURS = {"open3d_0_7_normals": "#d97706", "sound": "#1d4ed8"}
 
 
 def table1(batches: Path, out: Path) -> None:
@@ -129,7 +128,8 @@ def _draw(path: Sequence[SessionRow]) -> Any:
                 (r for r in rows if r["normals"] == normals), key=lambda r: r["iterations"]
             )
             steps, values = [r["iterations"] for r in mine], [r[axis] for r in mine]
-            panel.plot(steps, values, ".-", color=COLOURS[normals], label=label)
+            colour = "#1d4ed8" if normals == "sound" else "#d97706"
+            panel.plot(steps, values, ".-", color=colour, label=label)
         panel.axvline(5, color="#94a3b8", linewidth=1, linestyle=":")
         value = TABLE_1["Aubo i5 PhoXi S"]["xyz".index(axis)]
         panel.plot([5], [value], "D", color=PRINTED.colour, label="Table 1, where theirs stopped")

@@ -14,8 +14,6 @@ from flangeye.devices import PATIENCE, Arc, Device, DeviceError
 from flangeye.models.arc import ArcTimes
 from flangeye.plugin.stage import Params, part
 
-BELL = "\a"
-
 
 class ManualArcParams(ArcTimes, Params):
     """Parameters of ``arc.manual``; ``ignition`` is the time that the person has."""
@@ -54,7 +52,8 @@ class ManualArc(Device):
         self.gas(False)
 
     def _tell(self, what: str) -> None:
-        sys.stderr.write(f"{BELL}>>> {what} <<<\n")
+        bell = "\a"
+        sys.stderr.write(f"{bell}>>> {what} <<<\n")
         sys.stderr.flush()
 
 
@@ -62,10 +61,6 @@ class ManualArc(Device):
 def arc_manual(params: ManualArcParams) -> Arc:
     """A person strikes and ends the arc when asked; nothing measures whether it burns."""
     return ManualArc()
-
-
-PORT, VERSION = 30004, 2
-"""Of RTDE, by the guide."""
 
 
 HEADER = struct.Struct(">HB")
@@ -101,7 +96,8 @@ class UrDigitalArc(Device):
         self._params, self._arrived, self._inputs, self._closed = params, b"", 0, False
         self._until = time.monotonic() + PATIENCE
         try:
-            self._line = socket.create_connection((params.host, PORT), PATIENCE)
+            # RTDE's port
+            self._line = socket.create_connection((params.host, 30004), PATIENCE)
         except OSError as error:
             raise DeviceError(f"{self.name}: {error}") from None
         try:
@@ -145,7 +141,8 @@ class UrDigitalArc(Device):
 
     def _negotiate(self) -> None:
         """Agree on what is sent: the inputs' bits one way, the outputs' the other."""
-        self._asked("V", struct.pack(">H", VERSION))
+        # Of RTDE
+        self._asked("V", struct.pack(">H", 2))
         # Packages in a second [Hz]: what every generation of controller can send
         self._asked("O", struct.pack(">d", 125.0) + b"actual_digital_input_bits")
         names = b"standard_digital_output_mask,standard_digital_output"

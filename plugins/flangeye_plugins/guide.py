@@ -37,9 +37,6 @@ STROKE = 2e-3
 """How far the robot moves, to both sides and down [m]."""
 
 
-HOLD = "Set the tip into a punch mark or a cone, so that it cannot slide; then keep clear"
-
-
 ATTITUDES = (
     "as it welds",
     "leaning to the left by 20 deg",
@@ -108,7 +105,7 @@ def _guided(
             ask("Let the finger hang free, so that its tip touches nothing")
             # Readings of the undeformed finger
             rest = readings(robot).take(40)
-            ask(HOLD)
+            ask("Set the tip into a punch mark or a cone, so that it cannot slide; then keep clear")
         with arm.moving() as robot:
             held = list(readings(robot).held())
             found = calibrate(rest, held, f"flangeye tactile calibrate, on {robot.name}")

@@ -34,9 +34,6 @@ LONGEST = 4096
 """A line is no longer [bytes]."""
 
 
-UNITS = {"m": 1.0, "mm": 1e-3, "um": 1e-6}
-
-
 class TcpParams(Params):
     """Parameters of ``profiler.tcp``."""
 
@@ -72,7 +69,7 @@ class TcpProfiler(Device):
         self.name, self.behind = f"profile sensor at {params.host}:{params.port}", params.behind
         self._params = params
         side = 1.0 if params.positive == "left" else -1.0
-        self._scale = side * UNITS[params.unit]
+        self._scale = side * {"m": 1.0, "mm": 1e-3, "um": 1e-6}[params.unit]
         self._newest: WeldProfile | None = None
         self._lost = ""
         self._closing = False

@@ -154,13 +154,7 @@ def _mm(displacement: Floats) -> str:
     return f"{np.linalg.norm(displacement) * 1e3:.3f}"
 
 
-CANDIDATES, SPREAD = 300, 0.6
-"""Poses looked at for the next session, and their joints' largest change from the last [rad]."""
-MARGIN, SQUAREST = 0.05, np.cos(np.radians(50))
-"""A camera is taken to see the target so far about where it did [m], and at this cosine of the
-angle between its axis and the ray, or more."""
 NAMES = ("zero", "a", "d", "alpha")
-UNITS = (("mrad", 1e3), ("mm", 1e3), ("mm", 1e3), ("mrad", 1e3))
 
 
 class ArmParams(Params):
@@ -240,8 +234,8 @@ def _listed(told: ArmParameters) -> list[str]:
     single: list[str] = []
     combined_only: list[str] = []
     for (joint, which), singly in np.ndenumerate(told.identified):
-        name, (unit, scale) = f"joint {joint + 1} {NAMES[which]}", UNITS[which]
-        value, deviation = (x[joint, which] * scale for x in (told.values, told.deviations))
+        name, unit = f"joint {joint + 1} {NAMES[which]}", ("mrad", "mm", "mm", "mrad")[which]
+        value, deviation = (x[joint, which] * 1e3 for x in (told.values, told.deviations))
         (single if singly else combined_only).append(
             f"{name} {value:+.2f} ± {deviation:.2f} {unit}" if singly else name
         )
@@ -284,18 +278,22 @@ def _candidates(session: Session) -> list[Observation]:
     """Return sightings about the session's, as near and as square as the camera saw those."""
     arm, at = known(next(c for c in session.found.problem.carriers if c.frame == FLANGE))
     rng, places = np.random.default_rng(0), session.found.places
-    joints = at[rng.integers(len(at), size=CANDIDATES)]
-    joints = joints + rng.uniform(-SPREAD, SPREAD, joints.shape)
+    joints = at[rng.integers(len(at), size=300)]
+    spread = 0.6  # of the joints from the last session's [rad]
+    joints = joints + rng.uniform(-spread, spread, joints.shape)
     joints = joints[((joints > arm.lower) & (joints < arm.upper)).all(axis=1)]
     like = session.observations[0]
     moments = [_at(like, pose, q) for pose, q in zip(arm.flange(joints), joints, strict=True)]
     seen = foreseen_poses(moments, places, session.cell)
     before = np.array([o.feature.centre for o in session.observations])
-    near = (seen[:, :3, 3] > before.min(axis=0) - MARGIN) & (
-        seen[:, :3, 3] < before.max(axis=0) + MARGIN
+    margin = 0.05  # a camera is taken to see the target so far about where it did [m]
+    near = (seen[:, :3, 3] > before.min(axis=0) - margin) & (
+        seen[:, :3, 3] < before.max(axis=0) + margin
     )
     facing = np.abs((seen[:, :3, 2] * seen[:, :3, 3]).sum(axis=1))
-    kept = near.all(axis=1) & (facing > SQUAREST * np.linalg.norm(seen[:, :3, 3], axis=1))
+    # The largest angle between its axis and the ray is 50 deg
+    squarest = np.cos(np.radians(50))
+    kept = near.all(axis=1) & (facing > squarest * np.linalg.norm(seen[:, :3, 3], axis=1))
     chosen = [moments[i] for i in np.flatnonzero(kept)]
     return foreseen(chosen, places, session.cell) if chosen else []
 

@@ -82,8 +82,6 @@ def scan_live(scanner: ScannerDriver) -> WorkpieceScan:
 
 
 STAGE = "scan.along"
-ROLLS = 24
-"""Turns of the scanner about its view that are tried at each place."""
 
 
 class AlongParams(Params):
@@ -194,7 +192,8 @@ def _looking(place: Floats, params: AlongParams) -> list[Floats]:
     x /= np.linalg.norm(x)
     axes = np.column_stack([x, np.cross(z, x), z])
     eye = place - params.distance * z
-    turns = [rotation_from_rpy(0.0, 0.0, 2 * np.pi * k / ROLLS) for k in range(ROLLS)]
+    rolls = 24  # turns of the scanner about its view
+    turns = [rotation_from_rpy(0.0, 0.0, 2 * np.pi * k / rolls) for k in range(rolls)]
     return [rigid(axes @ turn, eye) for turn in turns]
 
 

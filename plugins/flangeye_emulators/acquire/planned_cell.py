@@ -33,9 +33,6 @@ from flangeye_emulators.acquire.planned_session import (
 from flangeye_emulators.world.arm import ImperfectArm
 from flangeye_emulators.world.session import DRAWS, CameraView, disturbed
 
-GRID = (-1.0, 0.0, 1.0)
-"""Values of each joint on a grid, in shares of the spread."""
-
 
 class CellSessionParams(ArmsParams):
     """What simulated sessions of cells have in common."""
@@ -309,7 +306,8 @@ def _changes(plan: str, joints: int, rng: np.random.Generator) -> Floats:
     anywhere = rng.uniform(-1, 1, (DRAWS, joints))
     if plan == "random":
         return anywhere
-    grid = np.stack(np.meshgrid(*[GRID] * joints, indexing="ij"), axis=-1).reshape(-1, joints)
+    steps = (-1.0, 0.0, 1.0)  # in shares of the spread
+    grid = np.stack(np.meshgrid(*[steps] * joints, indexing="ij"), axis=-1).reshape(-1, joints)
     order = [rng.permutation(len(grid)) for _ in range(-(-DRAWS // len(grid)))]
     regular = np.asarray(grid[np.concatenate(order)[:DRAWS]])
     either = rng.random((DRAWS, 1)) < 0.5

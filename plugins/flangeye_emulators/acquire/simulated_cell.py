@@ -42,9 +42,6 @@ from flangeye_emulators.world.raycast import SolidBody
 from flangeye_emulators.world.scanner import ScannerQuality, before_camera, scanner_of
 from flangeye_emulators.world.session import CameraView
 
-NEAR = 0.3
-"""Nearest that cameras see [m]."""
-
 
 class SimulatedCellParams(OutlierParams, CellSessionParams):
     """Parameters of ``acquire.simulated_cell``."""
@@ -58,11 +55,12 @@ class SimulatedCellParams(OutlierParams, CellSessionParams):
     @property
     def view(self) -> CameraView:
         """What the cameras see."""
+        near = 0.3  # nearest that cameras see [m]
         if self.wide:
             return CameraView(
-                0.0, NEAR, 2.5, (np.radians(60.0), np.radians(50.0)), np.radians(65.0)
+                0.0, near, 2.5, (np.radians(60.0), np.radians(50.0)), np.radians(65.0)
             )
-        return CameraView(0.0, NEAR, 2.0, FIELD, FACING)
+        return CameraView(0.0, near, 2.0, FIELD, FACING)
 
 
 @stage("acquire.simulated_cell")

@@ -61,12 +61,6 @@ def uncovered(cloud: PointCloud, board: Board, camera_T_target: Floats, cover: C
     return PointCloud(cloud.frame, np.where(hidden[..., None], np.nan, cloud.xyz))
 
 
-NEAREST, FARTHEST = 0.2, 2.0
-"""Where a camera without a scanner is in focus [m]."""
-COVERED = (0.05, 0.35)
-"""A cover begins this share of the board's smaller side away from its middle."""
-
-
 BOARDS: Mapping[str, Board] = {
     "charuco": Board("charuco", 7, 5, 30e-3, 22e-3, "4X4_50"),
     "checkerboard": Board("checkerboard", 8, 5, 25e-3, 0.0, "4X4_50"),
@@ -129,7 +123,8 @@ def acquire_simulated_images(
     rng = np.random.default_rng([VERSION, seed])
     eye = _eye(scanner, params, rng)
     camera = camera_at(params.resolution)
-    near, far = NEAREST, FARTHEST
+    # Where a camera without a scanner is in focus [m]
+    near, far = 0.2, 2.0
     if eye is not None:
         camera = camera_of(eye.pixels, camera)
         near, far = eye.scanner.near, eye.scanner.far
@@ -170,8 +165,9 @@ def _covers(params: SimulatedImagesParams, rng: np.random.Generator) -> list[Cov
     """Return what lies over the target in each capture."""
     chosen = rng.permutation(params.poses)[: round(params.covered * params.poses)]
     side = min(BOARDS[params.board].size)
+    # A cover begins this share of the board's smaller side away from its middle
     return [
-        Cover(rng.uniform(0, 2 * np.pi), side * rng.uniform(*COVERED)) if i in chosen else None
+        Cover(rng.uniform(0, 2 * np.pi), side * rng.uniform(0.05, 0.35)) if i in chosen else None
         for i in range(params.poses)
     ]
 

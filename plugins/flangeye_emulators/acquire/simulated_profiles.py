@@ -25,8 +25,6 @@ from flangeye_emulators.world.session import CameraView, seen_from
 
 FAN = float(np.radians(28.0))
 """Full angle of the laser's fan [rad]."""
-PASSES = (0.5, 0.95)
-"""How far beside the sphere's centre the laser passes, in radii."""
 
 
 class ProfilesParams(SessionParams):
@@ -60,7 +58,8 @@ class ProfileView(CameraView):
         """Return in which of (N, 4, 4) camera_T_target the laser cuts a circle well."""
         x, y, z = poses[:, :3, 3].T
         across = np.abs(x) + self.radius < np.tan(self.field[0] / 2) * z
-        beside = (y > PASSES[0] * self.radius) & (y < PASSES[1] * self.radius)
+        # How far beside the sphere's centre the laser passes
+        beside = (y > 0.5 * self.radius) & (y < 0.95 * self.radius)
         return np.asarray(across & beside & (z > self.near + self.radius) & (z < self.far))
 
 

@@ -51,10 +51,6 @@ from flangeye_emulators.world.structured_light import StructuredLight
 from flangeye_emulators.world.time_of_flight import TimeOfFlight
 from flangeye_plugins.acquire.itinerary import as_plan, left_out, row_at
 
-FEWEST_POSES = 3
-"""Poses without which no camera pose can be found."""
-
-
 VERSION = 1
 """Raised whenever the same parameters would give other captures."""
 
@@ -138,10 +134,11 @@ def _stops(
 ) -> _Stops:
     plan: Plan = params.poses(site, _rng(seeds[0]))
     poses = list(plan.poses)
-    if len(poses) < FEWEST_POSES:
+    fewest = 3  # without which no camera pose can be found
+    if len(poses) < fewest:
         raise StageError(
             f"acquire.simulated: {names} at {len(poses)} of {plan.wanted} planned poses, "
-            f"{FEWEST_POSES} are needed ({reach.why_refused()}); "
+            f"{fewest} are needed ({reach.why_refused()}); "
             "move camera.position, or the plan's centre, or make its size or tilt smaller"
         )
     return _Stops(plan, _checks(plan, site, params.verification, _rng(seeds[1])), poses)

@@ -23,10 +23,6 @@ from flangeye_emulators.controllers.poses import (
     twist_between,
 )
 
-MOBILITY = np.array([4e-3, 4e-3, 4e-3, 0.2, 0.2, 0.2])
-"""Speed per missing force [m/s/N] and torque [rad/s/Nm], at gain one. At a gain of one half it is
-stable against anything softer than 250 N/mm and settles against 20 N/mm in 0.1 s."""
-
 
 @dataclass(frozen=True, eq=False)
 class ForceMode:
@@ -57,7 +53,14 @@ class ForceMode:
         """
         task = self.base_R_task
         missing = self.wrench + _turned(task.T, felt)
-        give = np.clip(self.gain * MOBILITY * missing, -self.fastest, self.fastest)
+        # Speed per missing force [m/s/N] and torque [rad/s/Nm], at gain one: at one half
+        # it is stable against anything softer than 250 N/mm and settles against 20 N/mm in
+        # 0.1 s
+        give = np.clip(
+            self.gain * np.array([4e-3, 4e-3, 4e-3, 0.2, 0.2, 0.2]) * missing,
+            -self.fastest,
+            self.fastest,
+        )
         follow = _turned(task.T, twist_between(pose, target))
         step = np.where(self.compliant, give * dt, follow)
         return carried(pose, _turned(task, step), 1.0)
@@ -110,15 +113,6 @@ class SpringSurface:
 BRAKES = 10.0
 """Deceleration of the joints in a stop nobody planned [rad/s^2]. The maker measures 0.16 to 0.53 s
 from 3.2 rad/s (UR5 manual, stop category 0): 6 to 20 rad/s^2."""
-
-
-HOMES = {
-    "Universal Robots": (0.0, -90.0, 90.0, -90.0, -90.0, 0.0),
-    "AUBO": (0.0, 0.0, 90.0, 0.0, 90.0, 0.0),
-    "Franka Emika": (0.0, -45.0, 0.0, -135.0, 0.0, 90.0, 45.0),
-}
-"""Joint angles [deg] at which a maker's arms hold the flange down, half a metre from the base and
-far from singularities."""
 
 
 class MotionFault(Exception):
@@ -303,9 +297,16 @@ def starting_joints(robot: RobotModel, joints: Sequence[float] | Floats | None) 
         StageError: Their count is wrong, one is not finite, or none are known for the arm.
     """
     if joints is None:
-        if robot.maker not in HOMES:
+        # Joint angles [deg] at which a maker's arms hold the flange down, half a metre
+        # from the base and far from singularities
+        homes = {
+            "Universal Robots": (0.0, -90.0, 90.0, -90.0, -90.0, 0.0),
+            "AUBO": (0.0, 0.0, 90.0, 0.0, 90.0, 0.0),
+            "Franka Emika": (0.0, -45.0, 0.0, -135.0, 0.0, 90.0, 45.0),
+        }
+        if robot.maker not in homes:
             raise StageError(f"give the joint angles at which a {robot.model} shall start")
-        joints = np.radians(HOMES[robot.maker])
+        joints = np.radians(homes[robot.maker])
     chosen = np.array(joints, dtype=np.float64)
     count = len(robot.joints)
     if chosen.shape != (count,) or not np.isfinite(chosen).all():

@@ -35,11 +35,8 @@ POSE = CONVENTIONS["rpy"]
 """Poses are (x, y, z, rx, ry, rz) [m, rad], turned about fixed axes."""
 
 
-FASTEST = np.radians([150.0, 150.0, 150.0, 180.0, 180.0, 180.0])
-"""Largest joint speeds [rad/s]: data sheet of the i5."""
-
-OK, BAD_STATE, INVALID = 0, 1, 5
-"""Return values of commands: AUBO_OK, AUBO_BAD_STATE, AUBO_INVL_ARGUMENT."""
+OK = 0
+"""Return value of commands: AUBO_OK."""
 
 
 class AuboController(ControlUnit):
@@ -54,7 +51,8 @@ class AuboController(ControlUnit):
         """Switch on, with the arm standing at ``joints`` (n,) [rad]."""
         # `RobotConfig.getCycletime` of an i5 [s]
         cycle = 0.005
-        limits = np.resize(FASTEST, len(joints))
+        # Data sheet of the i5 [rad/s]
+        limits = np.resize(np.radians([150.0, 150.0, 150.0, 180.0, 180.0, 180.0]), len(joints))
         super().__init__(SimulatedArm(robot, limits, cycle, joints, zeros), cycle, 0.0)
         self.robot_mode, self.safety = "Running", "Normal"
         self._mover = Mover(self.arm)
@@ -123,7 +121,7 @@ class AuboController(ControlUnit):
         return self.robot_mode != "Running" or self.safety != "Normal"
 
     def _refusal(self) -> int:
-        return BAD_STATE if self._refusing else INVALID
+        return 1 if self._refusing else 5  # AUBO_BAD_STATE, AUBO_INVL_ARGUMENT
 
     # Safety and power
 
@@ -137,7 +135,7 @@ class AuboController(ControlUnit):
     def unlock(self) -> int:
         """Release a protective stop; return whether it was done."""
         if self.safety != "ProtectiveStop" or self.since_stop < self.unlock_after:
-            return BAD_STATE
+            return 1  # AUBO_BAD_STATE
         self.safety = "Normal"
         return OK
 
@@ -165,17 +163,13 @@ class AuboController(ControlUnit):
         return {"robot_mode": self.robot_mode, "safety": self.safety}
 
 
-PORT = 30004
 MARK = b"SOF\x01"
 
-UNKNOWN_METHOD, WRONG_PARAMS = -32601, -32602
-"""JSON-RPC 2.0, section 5.1."""
 
 _LENGTH = struct.Struct(">I")
 _HEADER = len(MARK) + _LENGTH.size
 ROBOT = "rob1"
 VERSION = "0.24.1"
-VERSION_CODE = 24001
 
 
 def serve(options: EmulatorOptions) -> None:
@@ -187,8 +181,9 @@ def serve(options: EmulatorOptions) -> None:
     zeros = joint_zeros(options.robot, options.seed)
     box = AuboController(options.robot, starting_joints(options.robot, options.joints), zeros)
     network = Network(options.host)
-    network.offer(PORT, lambda: RpcSession(network, box))
-    run_server(Server(options, box, network, FaultInjector(box, network), {"JSON-RPC": PORT}))
+    port = 30004
+    network.offer(port, lambda: RpcSession(network, box))
+    run_server(Server(options, box, network, FaultInjector(box, network), {"JSON-RPC": port}))
 
 
 class RpcSession(Connection):
@@ -237,11 +232,12 @@ def _outcome(box: AuboController, request: dict[str, Any]) -> dict[str, Any]:
     name = str(request["method"]).removeprefix(f"{ROBOT}.")
     method = METHODS.get(name)
     if method is None:
-        return _error(UNKNOWN_METHOD, f"{name} is not simulated")
+        # JSON-RPC 2.0, section 5.1
+        return _error(-32601, f"{name} is not simulated")
     try:
         return {"result": method(box, request.get("params", {}))}
     except (KeyError, TypeError, ValueError) as error:
-        return _error(WRONG_PARAMS, f"{name}: {type(error).__name__}: {error}")
+        return _error(-32602, f"{name}: {type(error).__name__}: {error}")
 
 
 def _error(code: int, message: str) -> dict[str, Any]:
@@ -291,7 +287,7 @@ def _speed_joint(box: AuboController, params: Mapping[str, Any]) -> int:
 METHODS: dict[str, Method] = {
     "getRobotNames": _tell(lambda box: [ROBOT]),
     "getAxisNames": _tell(lambda box: []),
-    "SystemInfo.getInterfaceVersionCode": _tell(lambda box: VERSION_CODE),
+    "SystemInfo.getInterfaceVersionCode": _tell(lambda box: 24001),
     "SystemInfo.getControlSoftwareFullVersion": _tell(lambda box: f"{VERSION} (loopback)"),
     "RobotConfig.getCycletime": _tell(lambda box: box.cycle),
     "RobotConfig.getDof": _tell(lambda box: len(box.arm.speeds)),

@@ -19,8 +19,6 @@ from flangeye_emulators.controllers.arm import SpringSurface
 PORT = 29998
 """Of the control channel. It is here, for a client needs nothing of what serves it."""
 
-PATIENCE = 5.0
-"""Longest wait for an answer [s]."""
 
 AUTO = "auto"
 """In a recipe: the address of this run alone."""
@@ -56,7 +54,7 @@ class EmulatorControl(Device):
     ``with LoopbackControl("127.0.0.5") as control: control.fault("freeze=3 s")``
     """
 
-    def __init__(self, host: str, port: int = PORT, patience: float = PATIENCE) -> None:
+    def __init__(self, host: str, port: int = PORT, patience: float = 5.0) -> None:
         """Connect.
 
         Args:

@@ -81,9 +81,6 @@ class Relief:
 TICK = 0.2e-3
 """Spacing of a relief [m]."""
 
-EVEN = Relief((0.0,), (0.0,), (0.0,))
-"""Of a groove that is the same everywhere."""
-
 
 @dataclass(frozen=True, eq=False)
 class Groove:
@@ -99,7 +96,7 @@ class Groove:
     root: Path
     section: GrooveSection
     gaps: tuple[Gap, ...] = ()
-    relief: Relief = EVEN
+    relief: Relief = Relief((0.0,), (0.0,), (0.0,))
 
     def missing(self, s: float, radius: float) -> tuple[int, float]:
         """Return the side where no wall is, and how far a ball may go there; (0, 0) for none."""

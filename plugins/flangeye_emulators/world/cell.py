@@ -28,21 +28,15 @@ from flangeye_emulators.world.mesh import (
 )  # fmt: skip
 from flangeye_emulators.world.raycast import SolidBody
 
-SEGMENTS = 360
-"""Of the sphere's circles: at a radius of 20 mm its facets are within 1 um of its surface."""
-
-
-DECOY = 1.15
-"""Radii of the disc on the stand over those of the flange: near, and not to be taken for it."""
-
 
 @lru_cache(maxsize=8)
 def sphere_mesh(sphere: Sphere) -> Mesh:
     """Return the sphere."""
-    latitude = np.linspace(-np.pi / 2, np.pi / 2, SEGMENTS // 2 + 1)
+    segments = 360  # at a radius of 20 mm its facets are within 1 um of its surface
+    latitude = np.linspace(-np.pi / 2, np.pi / 2, segments // 2 + 1)
     radius, height = sphere.radius * np.cos(latitude), sphere.radius * np.sin(latitude)
     profile = list(zip(radius.tolist(), height.tolist(), strict=True))
-    return lathe(profile, SEGMENTS).moved(rigid(np.eye(3), np.array(sphere.centre_in_flange)))
+    return lathe(profile, segments).moved(rigid(np.eye(3), np.array(sphere.centre_in_flange)))
 
 
 @lru_cache(maxsize=8)
@@ -140,8 +134,9 @@ class SimulatedCell:
 
 
 def _ring(flange: Flange) -> Mesh:
-    outer = DECOY * flange.outer
-    inner = DECOY * (flange.bore or flange.outer / 2)
+    larger = 1.15  # near, and not to be taken for it
+    outer = larger * flange.outer
+    inner = larger * (flange.bore or flange.outer / 2)
     face = region(circle(outer, COARSE), [circle(inner, COARSE)], 0.0)
     sides = [(inner, 0.0), (inner, -0.01), (outer, -0.01), (outer, 0.0)]
     return merged([face, lathe(sides, COARSE)])

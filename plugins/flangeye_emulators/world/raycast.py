@@ -22,9 +22,6 @@ from flangeye_emulators.world.mesh import Mesh
 
 Image = NDArray[np.float32]
 
-FLAT = 2e-6
-"""Largest difference of two planes that are one, of their distance [m] and of their normal: what
-single precision leaves of it."""
 
 SQUARES = ((0, 0), (0, 1), (1, 0), (1, 1))
 """Row and column of the pixels that a sample stands for, itself first."""
@@ -276,7 +273,10 @@ def _is_flat(met: _Met, away: Image) -> Mask:
 
     square = np.ones((3, 3), np.uint8)
     out = np.ones(away.shape, dtype=bool)
-    traits = [(met.body, 1), (away, FLAT), (met.normals[0], FLAT), (met.normals[1], FLAT)]
+    # Two planes are one, in their distance [m] and their normal: what single precision leaves
+    # of it
+    flat = 2e-6
+    traits = [(met.body, 1), (away, flat), (met.normals[0], flat), (met.normals[1], flat)]
     for trait, tolerance in traits:
         out &= cv2.dilate(trait, square) - cv2.erode(trait, square) < tolerance
     return out

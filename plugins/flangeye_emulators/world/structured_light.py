@@ -12,14 +12,6 @@ from flangeye_emulators.world import scan_errors
 from flangeye_emulators.world.raycast import Hits, Image, RaycastScene, bands, pixels_of, through
 from flangeye_emulators.world.scan_errors import Distortion, correlated_normal, normal_quantile
 
-FAINTEST = 0.012
-"""Least share of the light that a point must return, of what a white surface at mid range and
-facing both camera and projector returns: black anodising is lost beyond about 65 degrees."""
-
-
-GRAZING = float(np.cos(np.radians(80.0)))
-"""Cosine of the incidence beyond which no scanner decodes its pattern."""
-
 
 @dataclass(frozen=True, eq=False)
 class _View:
@@ -160,8 +152,11 @@ class StructuredLight:
         """Forget, in place, the points that the scanner does not measure after all."""
         # Turned images of the grain are as good as new ones, and cost nothing.
         patchy, ragged = grains
-        measured &= view.cosine > GRAZING
-        measured &= view.strength * (1 + np.float32(0.3) * patchy) > FAINTEST
+        # No scanner decodes its pattern beyond
+        measured &= view.cosine > float(np.cos(np.radians(80.0)))
+        # Of what a white surface at mid range and facing both camera and projector
+        # returns: black anodising is lost beyond about 65 degrees
+        measured &= view.strength * (1 + np.float32(0.3) * patchy) > 0.012
         measured &= ~scan_errors.lost(distance, self.scanner.edge_loss, ragged)
         at = np.flatnonzero(measured & (view.dazzled > 0.01))
         measured.ravel()[at] = patchy.ravel().take(at) > normal_quantile(

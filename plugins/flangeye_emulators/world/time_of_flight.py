@@ -10,14 +10,6 @@ from flangeye_emulators.world import scan_errors
 from flangeye_emulators.world.raycast import Hits, Image, RaycastScene, pixels_of
 from flangeye_emulators.world.scan_errors import Distortion, correlated_normal, normal_quantile
 
-FLOOR = 0.3
-"""Share of the noise that does not depend on the distance; the rest grows with its square."""
-
-
-MIXING = 0.6
-"""Standard deviation of the spot that one pixel sees [px]: what makes pixels fly at edges."""
-
-
 DIGIT = 1e-3
 """Depths are whole millimetres."""
 
@@ -95,7 +87,10 @@ class TimeOfFlight:
     def _sigma(self, scene: RaycastScene, hits: Hits, depth: Image, strength: Image) -> Image:
         """Return the standard deviation along the ray (H, W) [m]."""
         sigma = np.float32(self.noise * self.scanner.temporal_noise)
-        growth = FLOOR + (1 - FLOOR) * (depth * self._length / self._middle) ** 2
+        # Share of the noise that does not depend on the distance; the rest grows with its
+        # square
+        floor = 0.3
+        growth = floor + (1 - floor) * (depth * self._length / self._middle) ** 2
         # Shot noise: the less light, the more of it; the distance is already in the growth.
         light = np.maximum(strength * (depth / self._middle) ** 2, np.float32(0.01))
         return np.asarray(sigma * growth * scene.figure("grain", hits.body) / np.sqrt(light))
@@ -109,7 +104,8 @@ def _mixed(depth: Image, strength: Image) -> Image:
     import cv2
 
     light = strength + np.float32(1e-6)
-    blur = {"ksize": (5, 5), "sigmaX": MIXING, "sigmaY": MIXING}
+    spot = 0.6  # that one pixel sees, standard deviation [px]: what makes pixels fly at edges
+    blur = {"ksize": (5, 5), "sigmaX": spot, "sigmaY": spot}
     return np.asarray(
         cv2.GaussianBlur(depth * light, **blur) / cv2.GaussianBlur(light, **blur)  # type: ignore[call-overload]
     )

@@ -17,9 +17,6 @@ from flangeye.types import Floats, Image, PointCloud
 
 Grey = NDArray[np.uint8]
 
-PINHOLE = 0.3
-"""Root mean square by which a cloud's points may miss their pixels for a pinhole camera [px]."""
-
 
 class CameraParams(Params):
     """The calibration of the camera that took the images."""
@@ -60,7 +57,8 @@ def image_of_cloud(pixels: Grey, cloud: PointCloud) -> Image | None:
     rays = cloud.xyz[known][:, :2] / cloud.xyz[known][:, 2:]
     (fx, cx), miss_u = _line(rays[:, 0], np.nonzero(known)[1])
     (fy, cy), miss_v = _line(rays[:, 1], np.nonzero(known)[0])
-    if not np.hypot(miss_u, miss_v) <= PINHOLE:
+    # Root mean square [px] by which the points may miss their pixels for a pinhole camera
+    if not np.hypot(miss_u, miss_v) <= 0.3:
         return None
     return Image(pixels, pinhole((fx, fy), (cx, cy)))
 

@@ -38,13 +38,6 @@ from flangeye_plugins.acquire.opening import (
     source_of,
 )
 
-FEWEST_VIEWS = 6
-"""Views below which distortion and principal point are not told apart from tilts."""
-LEAST_TILT = 0.02
-"""How much the board's depth, as a share of it, has to change across it otherwise between views:
-the root mean square of it along the direction in which it changes most."""
-LARGEST_ERROR = 0.01
-"""Standard deviation of the focal length, as a share of it, beyond which nothing is believed."""
 TOO_ALIKE = (
     "they are too alike; tilt the board by 20 deg and more to both sides, or write focal_length: "
     "[fx, fy] and principal_point: [cx, cy]"
@@ -227,11 +220,12 @@ def _require_shown(
 
 
 def _require_views(seen: int, looked: Mapping[str, Corners | Rejected]) -> None:
-    if seen < FEWEST_VIEWS:
+    fewest = 6
+    if seen < fewest:
         missed = {n: found.reason for n, found in looked.items() if isinstance(found, Rejected)}
         why = next((f"; {name}: {reason}" for name, reason in missed.items()), "")
         raise StageError(
-            f"{seen} of {len(looked)} images show the board, {FEWEST_VIEWS} are needed to tell the "
+            f"{seen} of {len(looked)} images show the board, {fewest} are needed to tell the "
             f"camera; take more, or write focal_length: [fx, fy] and principal_point: [cx, cy]{why}"
         )
 
@@ -287,10 +281,13 @@ def _require_tilted(seen: Mapping[str, Corners]) -> None:
     """Refuse parallel boards: the lens is not observable, which least squares does not show."""
     changes = np.array([_depth_change(corners) for corners in seen.values()])
     spread = np.linalg.norm(changes - changes.mean(axis=0), ord=2) / np.sqrt(len(changes))
-    if spread < LEAST_TILT:
+    # How much the board's depth, as a share of it, has to change across it otherwise between
+    # views: the root mean square of it along the direction in which it changes most
+    least = 0.02
+    if spread < least:
         raise StageError(
             f"the {len(seen)} views do not tell the focal length: {TOO_ALIKE} (depth changes by "
-            f"{spread:.1%} across the board between them, {LEAST_TILT:.0%} is needed)"
+            f"{spread:.1%} across the board between them, {least:.0%} is needed)"
         )
 
 
@@ -308,10 +305,11 @@ def _depth_change(corners: Corners) -> Floats:
 
 def _require_certain(lens: CalibratedLens) -> None:
     share = float(lens.deviations[0] / lens.matrix[0, 0])
-    if not share <= LARGEST_ERROR:
+    largest = 0.01  # as a share of the focal length; beyond, nothing is believed
+    if not share <= largest:
         raise StageError(
             f"the {lens.views} views tell the focal length to {share:.1%} only (at most "
-            f"{LARGEST_ERROR:.0%} is allowed): {TOO_ALIKE}"
+            f"{largest:.0%} is allowed): {TOO_ALIKE}"
         )
 
 

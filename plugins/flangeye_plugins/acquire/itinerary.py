@@ -21,13 +21,6 @@ from flangeye.plugin.stage import BoundPart
 from flangeye.types import Floats, Observation, Role
 from flangeye.units import in_mm
 
-FEWEST_POSES = 3
-"""Poses without which no camera pose can be found."""
-
-
-LISTED = 12
-"""Places left out of a plan that are listed, at most."""
-
 
 class Stop(NamedTuple):
     """A pose to scan at.
@@ -142,10 +135,11 @@ class Itinerary:
         Raises:
             StageError: Says why the others are impossible.
         """
-        if found < FEWEST_POSES:
+        fewest = 3  # without which no camera pose can be found
+        if found < fewest:
             raise StageError(
                 f"acquire.live: {found} of {self._plan.wanted} planned poses are possible, "
-                f"{FEWEST_POSES} are needed ({self.why_not()}); correct the view, move the plan's "
+                f"{fewest} are needed ({self.why_not()}); correct the view, move the plan's "
                 "centre, or widen robot.limits"
             )
 
@@ -259,11 +253,12 @@ def as_plan(
     head: str, rows: Sequence[PlanRow], without: Sequence[PlanRow]
 ) -> tuple[str, dict[str, Any]]:
     """Return a plan for people, below its first line, and for programs."""
-    more = len(without) - LISTED
+    listed = 12  # of the places left out
+    more = len(without) - listed
     lines = [
         head,
         "stop  for           flange at (mm, base)    tilt  path      time",
-        *(row.line() for row in [*rows, *without[:LISTED]]),
+        *(row.line() for row in [*rows, *without[:listed]]),
         *([f"and {more} more places"] if more > 0 else []),
     ]
     plan = {"seconds": seconds_of(rows), "rows": [asdict(row) for row in [*rows, *without]]}

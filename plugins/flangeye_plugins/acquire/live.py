@@ -57,8 +57,6 @@ from flangeye.types import (
 from flangeye.units import JointPosition, Length, param
 from flangeye_plugins.acquire.itinerary import Itinerary, Stop, itinerary_of
 
-HOW_TO_MOVE = "dry run, nothing moved; add --move to execute"
-
 
 class Idle:
     """The time in which an arm stood while nothing was exposed, since it first set off.
@@ -149,7 +147,9 @@ def acquire_live(  # noqa: PLR0913  what it asks the runner for
     if motion.plan_only or not (motion.allowed or arm.passive):
         start, how = _offline(params, robot, resumed) if motion.offline else _read(arm, allowed)
         text, plan = planned(start).shown(start)
-        raise NothingMoved("\n".join([text, how, HOW_TO_MOVE]), plan)
+        raise NothingMoved(
+            "\n".join([text, how, "dry run, nothing moved; add --move to execute"]), plan
+        )
 
     def told(state: RobotState) -> None:
         stage_log("arm", state)

@@ -46,15 +46,9 @@ from flangeye.units import param
 if TYPE_CHECKING:
     from flangeye.maths.kinematics import Arm
 
-NAMED_AT_MOST = 12
-"""Ids a note lists in full; of more, the rest is counted."""
-
 
 SIMULATED = "SIMULATED.txt"
 """A file of this name in an archive says that its recordings are a simulator's."""
-
-_BASES = {FLANGE2: BASE2}
-"""Frames that are not placed from the first arm's base."""
 
 
 class OpeningParams(Params):
@@ -140,8 +134,9 @@ def skipped_note(archive: Archive, has: Callable[[Recording], bool], what: str) 
 
 
 def _listed(names: Sequence[str]) -> str:
-    more = len(names) - NAMED_AT_MOST
-    return ", ".join(names[:NAMED_AT_MOST]) + (f" and {more} more" if more > 0 else "")
+    most = 12  # of more, the rest is counted
+    more = len(names) - most
+    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
 
 
 def poses_of(recording: Recording, cell: Cell | None = None) -> Poses:
@@ -149,7 +144,8 @@ def poses_of(recording: Recording, cell: Cell | None = None) -> Poses:
     if cell is not None:
         return cell_poses(recording, cell)
     return {
-        frame: Transform(_BASES.get(frame, BASE), frame, m) for frame, m in recording.poses.items()
+        frame: Transform(BASE2 if frame == FLANGE2 else BASE, frame, m)
+        for frame, m in recording.poses.items()
     }
 
 

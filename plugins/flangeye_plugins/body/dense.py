@@ -14,41 +14,22 @@ from flangeye.types import Floats, Indices, Singles
 from flangeye_plugins.body.shape import GRAZING, OrientedPoints, Shape
 from flangeye_plugins.body.view import spacing_of, view_of
 
-MOST, FEWEST, FEWEST_ENDS = 12_000, 60, 9
-"""Points that are used at most, and needed; and of ends, below which none counts."""
+FEWEST = 60
+"""Points that are needed."""
 
-ROUNDS = 12
-"""Times that the body is moved."""
 
-STILL = 1e-5
-"""Steps in turn [rad] and shift, in sizes, below which nothing moves any more."""
+LEAST_REACH = 4.0
+"""How far off points count at last, in deviations."""
 
-REACH, LEAST_REACH = 0.06, 4.0
-"""How far off points count at first, as a share of the size, and at last, in deviations."""
 
-PATCHES = 8
-"""Patches along the body's size: points of one err together."""
-
-SMOOTH = 1 / 4
-"""Length over which a body's surface is off its CAD alike, as a share of its size: about a face."""
-
-STRAIGHT = float(np.cos(np.radians(40.0)))
-"""Cosine of the largest angle between the ends of a face in body and scan."""
-
-LEAST_NOISE = 1e-6
-"""Deviation below which points are exact [m]."""
-
-LOST, ROUNDED = 1.0, 10.0
+LOST = 1.0
 """Mean and standard deviation of the width that a scanner loses along edges, in distances between
-points, and standard deviation of how much it rounds, see ``_rounding``; before any scan. Filters
-of scanners reach over a few points."""
+points, before any scan. Filters of scanners reach over a few points."""
 
 RASTER = 1 / 12**0.5
 """Standard deviation of where an edge lies between two points, in their distance. All points of a
 straight edge along the raster share it."""
 
-CELL = 1 / 200
-"""Width of the cells that the scan's edges are found in, as a share of the size, at least."""
 
 FACINGS = 6
 """Ways that an edge may look, each with a loss of its own."""
@@ -57,8 +38,6 @@ FILTER = 2
 """Distances between points within which a scanner averages most: published scans of planes
 correlate by 0.7 so far apart."""
 
-SIDES = ((1, 0), (-1, 0), (0, 1), (0, -1))
-"""Neighbours of a ray."""
 
 SAME = 5.0
 """Neighbouring rays meet one surface where their depths differ by less than so many of the
@@ -67,9 +46,6 @@ distances between them: seen at less than 79 degrees to its normal."""
 UNKNOWN = 1.0
 """Standard deviation of what the scan does not show at all: of a turn [rad], and of a shift in
 sizes of the body. A turn that may be any has 1.8, and no estimator is linear that far."""
-
-KNOWN = 0.05
-"""A direction whose deviation is a smaller share of that counts as seen."""
 
 
 class _Equations(NamedTuple):
@@ -135,7 +111,8 @@ class BodyFit:
         """Degrees of freedom of the pose, of six, that the scan determines."""
         turn = np.linalg.eigvalsh(self.bread[:3, :3])
         shift = np.linalg.eigvalsh(self.bread[3:6, 3:6])
-        return int((np.r_[turn, shift] < (KNOWN * UNKNOWN) ** 2).sum())
+        # A direction whose deviation is a smaller share of that counts as seen
+        return int((np.r_[turn, shift] < (0.05 * UNKNOWN) ** 2).sum())
 
     def covariance(self, model_error: float, distortion: Callable[[Floats], Floats]) -> Floats:
         """Return (6, 6), order (rotation, translation), left perturbation in ``camera``.
@@ -147,7 +124,8 @@ class BodyFit:
                 variance moves (P, 3) points [m].
         """
         apart = np.linalg.norm(self.patches[:, None] - self.patches, axis=2)
-        alike = np.exp(-0.5 * (apart / (SMOOTH * self.size)) ** 2)
+        # A body's surface is off its CAD alike over a quarter of its size: about a face
+        alike = np.exp(-0.5 * (apart / ((1 / 4) * self.size)) ** 2)
         inner = self.meat + model_error**2 * np.einsum(
             "pai,pq,qbi->ab", self.pulls, alike, self.pulls, optimize=True
         )
@@ -160,7 +138,7 @@ class BodyFit:
         return np.asarray((moved + moved.T) / 2)
 
 
-def fitted(points: Singles, shape: Shape, start: Floats, most: int = MOST) -> BodyFit | None:
+def fitted(points: Singles, shape: Shape, start: Floats, most: int = 12_000) -> BodyFit | None:
     """Return a body laid on (N, 3) points, from a pose nearby; None where too few are on it.
 
     Args:
@@ -215,25 +193,29 @@ class _Laying:
         apart = spacing * float(np.median(some[:, 2]))
         edges, cell = _scan_edges(points, shape.size)
         usual = np.r_[np.full(FACINGS, -cell / 2 - LOST * apart), 0.0]
-        spread = np.diag(np.r_[np.full(FACINGS, (RASTER * apart) ** 2), ROUNDED**2])
+        # How much a scanner rounds, see `_rounding`; before any scan
+        spread = np.diag(np.r_[np.full(FACINGS, (RASTER * apart) ** 2), 10.0**2])
         spread[:FACINGS, :FACINGS] += (LOST * apart) ** 2
         return cls(some, edges, shape, spacing, RASTER * cell, usual, np.linalg.inv(spread))
 
     def settled(self, pose: Floats) -> _Settled | None:
         """Return the body moved until it rests; None where too few points are on it."""
         shape, scanner = self.shape, self.usual
-        reach = beside = REACH * shape.size
+        # As a share of the size, at first
+        reach = beside = 0.06 * shape.size
         rounding = np.zeros(len(self.points))
         prior = np.zeros((6 + len(scanner),) * 2)
         prior[:6, :6] = UNKNOWN**-2.0 * np.eye(6)
         prior[6:, 6:] = self.prior
-        for _ in range(ROUNDS):
+        # The body is moved a dozen times at most
+        for _ in range(12):
             surface = _surface(self.points, shape, pose, reach, rounding, scanner[-1])
             ends = _ends(self.edges, shape, pose, scanner[:-1], beside, self.spacing)
             if len(surface.residual) < FEWEST:
                 return None
             noise = _deviation(surface.residual)
-            few = len(ends.residual) < FEWEST_ENDS
+            # Of so few none counts
+            few = len(ends.residual) < 9
             # By the raster: what ends are off where the body is not there yet is no noise.
             spread = np.inf if few else max(self.raster, noise)
             equations, weights = _weighted(surface, ends, noise, spread)
@@ -243,7 +225,8 @@ class _Laying:
             step = np.asarray(np.linalg.solve(information, gradient), np.float64)
             pose, scanner = _moved(pose, shape, step), scanner + step[6:]
             if reach < 2 * LEAST_REACH * noise:
-                if rounding.any() and np.abs(step[:6]).max() < STILL:
+                # [rad] and sizes: nothing moves any more
+                if rounding.any() and np.abs(step[:6]).max() < 1e-5:
                     break
                 rounding = _rounding(self.points, shape, pose, self.spacing)
             reach = max(0.5 * reach, LEAST_REACH * noise)
@@ -297,13 +280,14 @@ def _rounding(points: Floats, shape: Shape, pose: Floats, spacing: float) -> Flo
     rotation, origin = pose[:3, :3], -pose[:3, 3] @ pose[:3, :3]
     own = shape.meet(origin, points @ rotation).depth
     total = np.zeros(len(points))
-    for side in SIDES:
+    sides = ((1, 0), (-1, 0), (0, 1), (0, -1))  # neighbours of a ray
+    for side in sides:
         beside = points + FILTER * spacing * np.array([*side, 0.0]) * points[:, 2:]
         with np.errstate(invalid="ignore"):
             off = shape.meet(origin, beside @ rotation).depth - own
             total += np.where(np.abs(off) < SAME * FILTER * spacing, off, np.nan)
     few = np.isfinite(total).sum() < FEWEST
-    return np.zeros(len(points)) if few else total / len(SIDES)
+    return np.zeros(len(points)) if few else total / len(sides)
 
 
 def _ends(
@@ -325,7 +309,9 @@ def _ends(
     gap, nearest = cKDTree(edges.points).query(placed, distance_upper_bound=2 * reach)
     at = np.flatnonzero(np.isfinite(gap))
     number = nearest[at]
-    straight = np.einsum("ni,ni->n", edges.directions[number], outwards[at]) > STRAIGHT
+    # The largest angle between the ends of a face in body and scan is 40 deg
+    cosine = np.einsum("ni,ni->n", edges.directions[number], outwards[at])
+    straight = cosine > np.cos(np.radians(40.0))
     at, number = at[straight], number[straight]
     rays = placed[at] / np.linalg.norm(placed[at], axis=1, keepdims=True)
     across = np.linalg.norm(np.cross(outwards[at], rays), axis=1)
@@ -360,7 +346,8 @@ def _visible_ends(shape: Shape, pose: Floats, spacing: float) -> OrientedPoints:
 
 def _scan_edges(points: Singles, size: float) -> tuple[OrientedPoints, float]:
     """Return where the scan's surfaces end, finely, and the width of the cells [m]."""
-    view = view_of(points, CELL * size)
+    # Width of the cells that edges are found in, as a share of the size, at least
+    view = view_of(points, (1 / 200) * size)
     found, directions = view.ends
     found = found & np.isfinite(view.normals[..., 0])
     cell = view.angle * float(np.median(points[:, 2]))
@@ -417,7 +404,8 @@ def _noise(equations: _Equations, weights: Floats, cluster: Indices, surface: in
 
 
 def _patches(equations: _Equations, shape: Shape) -> Indices:
-    place = np.floor(equations.place / (shape.size / PATCHES)).astype(np.int64)
+    # Points of one err together
+    place = np.floor(equations.place / (shape.size / 8)).astype(np.int64)
     keys = np.column_stack([place, _sextants(equations.facing)])
     return np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
 
@@ -449,4 +437,5 @@ def _moved(pose: Floats, shape: Shape, step: Floats) -> Floats:
 
 
 def _deviation(residual: Floats) -> float:
-    return max(float(SIGMA_OF_MAD * np.median(np.abs(residual))), LEAST_NOISE)
+    # Exact, below [m]
+    return max(float(SIGMA_OF_MAD * np.median(np.abs(residual))), 1e-6)

@@ -17,18 +17,8 @@ from flangeye_plugins.body.looks import Looks
 from flangeye_plugins.body.shape import OrientedPoints, thin
 from flangeye_plugins.body.view import CoarseImage
 
-SCAN_ENDS, BODY_ENDS = 800, 400
-"""Points where faces end that are laid on each other, at most."""
-
-SCAN_SPACING, BODY_SPACING = 1 / 22, 1 / 18
-"""How far those are apart, as shares of the body's size."""
-
-FILTERS = ((4, 30_000), (12, 6_000))
-"""Points of the body by which poses are judged, and how many of them pass."""
-
-LAST, ROUGH = 40, 0.06
-"""Points by which the best are chosen, and how far off a surface may be while the turn is known to
-9 degrees, as a share of the size."""
+ROUGH = 0.06
+"""How far off a surface may be while the turn is known to 9 degrees, as a share of the size."""
 
 AT_ONCE = 30_000
 """Poses judged at once: their points stay in a core's cache."""
@@ -38,9 +28,12 @@ def guesses(view: CoarseImage, looks: Looks, most: int) -> Floats:
     """Return at most so many (K, 4, 4) ``camera_T_body`` that are consistent with a scan."""
     rng = np.random.default_rng(2)
     scan = view.edges(looks.size)
-    on = scan.take(_some(scan, SCAN_ENDS, looks.size * SCAN_SPACING, rng))
-    poses = _passed(on, _some(looks.ends, BODY_ENDS, looks.size * BODY_SPACING, rng), view, looks)
-    return poses[_best_of(looks.scores(poses, view, LAST, ROUGH), most)].astype(np.float64)
+    # Points where faces end that are laid on each other, and how far those are apart, as
+    # shares of the body's size
+    on = scan.take(_some(scan, 800, looks.size * (1 / 22), rng))
+    poses = _passed(on, _some(looks.ends, 400, looks.size * (1 / 18), rng), view, looks)
+    # Forty points choose the best
+    return poses[_best_of(looks.scores(poses, view, 40, ROUGH), most)].astype(np.float64)
 
 
 def _best_of(scores: Floats, most: int) -> Indices:
@@ -69,7 +62,8 @@ def _passed(on: OrientedPoints, at: Indices, view: CoarseImage, looks: Looks) ->
         return looks.scores(posed(number), view, count, ROUGH)
 
     number = _chunked(np.arange(len(scan) * len(body)), unhidden)
-    for count, left in FILTERS:
+    # Points of the body by which poses are judged, and how many of them pass
+    for count, left in ((4, 30_000), (12, 6_000)):
         scores = _chunked(number, partial(scored, count=count))
         number = number[_best_of(scores, left)]
     return posed(number)

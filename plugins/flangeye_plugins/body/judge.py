@@ -10,27 +10,8 @@ from flangeye.types import Floats, Indices, Mask
 from flangeye_plugins.body.shape import GRAZING, Shape
 from flangeye_plugins.body.view import CoarseImage
 
-NEARER_SHARE = 0.1
-"""How far in front of the body a surface contradicts it, as a share of the size: what is nearer to
-the scanner hides it."""
-
-JUMP = 6.0
-"""Widths of a cell by which neighbouring rays differ in depth where the body has an edge."""
-
 OUTLINE = 3
 """Cells beside the body in which its surface should have ended."""
-
-ENDED, BEHIND = 0.03, 0.05
-"""Smallest share of the body's outline that is seen to end before something farther, and how far
-behind it that is, as a share of the size: without, any face of a box is a plate."""
-
-PENALTY = 10
-"""Rays in favour that one ray against outweighs: of the true pose there are hardly any."""
-
-
-TOLERANCE, OPPOSED = 0.01, 0.1
-"""Where a part is judged: how far off its surface a ray may be, as a share of the size, and the
-share of rays against it from which the part stands elsewhere."""
 
 
 class BodyVerdict(NamedTuple):
@@ -57,8 +38,11 @@ class BodyVerdict(NamedTuple):
     @property
     def bounded(self) -> bool:
         """Whether the body is seen to end, or nothing at all is seen around it."""
+        # Least share of the body's outline that is seen to end before something farther:
+        # without, any face of a box is a plate
+        ended = 0.03
         return (
-            self.ended >= ENDED * self.outline or self.beside < ENDED * self.outline
+            self.ended >= ended * self.outline or self.beside < ended * self.outline
         ) and self.outline > 0
 
     @property
@@ -75,7 +59,8 @@ class BodyVerdict(NamedTuple):
     def score(self) -> float:
         """What poses are ranked by: rays for it, less those against it."""
         held = self.agree if self.bounded else 0
-        return held - PENALTY * self.against - self.goes_on
+        # Rays in favour that one against outweighs: of the true pose there are hardly any
+        return held - 10 * self.against - self.goes_on
 
 
 def judged(shape: Shape, view: CoarseImage, pose: Floats, tolerance: float) -> BodyVerdict:
@@ -98,7 +83,8 @@ def judged(shape: Shape, view: CoarseImage, pose: Floats, tolerance: float) -> B
     ended = depth[row, column][..., None] * rays[row, column]
     on = np.abs(np.einsum("ijk,ijk->ij", normals[row, column], scan - ended)) < 2 * tolerance
     measured = beside & np.isfinite(scan[..., 2])
-    ended_there = beside & (scan[..., 2] > depth[row, column] + BEHIND * shape.size)
+    # How far behind the outline that is, as a share of the size
+    ended_there = beside & (scan[..., 2] > depth[row, column] + 0.05 * shape.size)
     counts = (due, agree, against, beside & on, measured, ended_there, beside)
     return BodyVerdict(*(int(count.sum()) for count in counts))
 
@@ -134,7 +120,8 @@ def _compared(shape: Shape, view: CoarseImage, pose: Floats, tolerance: float) -
     due = hit & ~_edges(np.where(hit, depth, np.inf), view.angle)
     due &= np.einsum("ijk,ijk->ij", normals, rays) < -GRAZING * np.linalg.norm(rays, axis=-1)
     agree = due & (np.abs(off) < tolerance)
-    before = (off > 2 * tolerance) & (scan[..., 2] > depth - NEARER_SHARE * shape.size)
+    # What is nearer to the scanner hides the body
+    before = (off > 2 * tolerance) & (scan[..., 2] > depth - 0.1 * shape.size)
     # A single ray may be a mixed one, at an edge of the body.
     against = ndimage.binary_opening(due & ((off < -2 * tolerance) | before))
     return _Compared(rays, scan, depth, normals, hit, due, agree, against, facets)
@@ -151,14 +138,16 @@ def opposed(shape: Shape, view: CoarseImage, pose: Floats) -> Mask | None:
         pose: ``camera_T_body``.
     """
     parts, of_facet = shape.parts
-    seen = _compared(shape, view, pose, TOLERANCE * shape.size) if parts > 1 else None
+    # How far off a part's surface a ray may be
+    seen = _compared(shape, view, pose, 0.01 * shape.size) if parts > 1 else None
     if seen is None:
         return None
     agree, against = (
         np.bincount(of_facet[seen.facets[rays]], minlength=parts)
         for rays in (seen.agree, seen.against)
     )
-    gone = against > OPPOSED * (agree + against)
+    # With so many rays against it, the part stands elsewhere
+    gone = against > 0.1 * (agree + against)
     return gone[of_facet] if gone.any() and not gone.all() else None
 
 
@@ -167,8 +156,9 @@ def _edges(depth: Floats, angle: float) -> Mask:
     from scipy import ndimage
 
     far = np.where(np.isfinite(depth), depth, 1e3)
+    # Widths of a cell by which neighbouring rays differ in depth where the body has an edge
     return np.asarray(
-        ndimage.maximum_filter(far, 3) - ndimage.minimum_filter(far, 3) > JUMP * angle * far
+        ndimage.maximum_filter(far, 3) - ndimage.minimum_filter(far, 3) > 6.0 * angle * far
     )
 
 

@@ -14,28 +14,18 @@ from flangeye.types import Floats, Indices, Mask
 from flangeye_plugins.body.shape import GRAZING, OrientedPoints, Shape, spread_directions
 from flangeye_plugins.body.view import CoarseImage
 
-DIRECTIONS = 128
-"""From which a body is looked at to know what hides what."""
-
 BEYOND = 0.05
 """How far beyond the end of a face nothing of it should be seen, as a share of the size."""
 
-STEEPEST = 0.4
-"""Cosine of the incidence beyond which a coarse view often lacks a surface."""
 
 AGAINST = 2.0
 """Points for it that outweigh one that is seen through, or a face that goes on beyond its end."""
 
-TOLERANCE = 0.01
-"""How far the scan's surface may be from a pose's, as a share of the size; three sigma of the
-scanner's noise at least."""
 
 ALIKE, SIMILAR = 0.5, 0.7
 """Cosine of the largest angle between a surface of the body and the scan's there: where a
 candidate is on its way, and where it is judged."""
 
-LEAST_SHARE = 1e-4
-"""Share of the body's points that show a direction: of facets of a cylinder fewer do."""
 
 QUARTERS = np.array([
     m for m in (np.array(signs)[:, None] * np.eye(3)[list(order)]
@@ -46,9 +36,6 @@ QUARTERS = np.array([
 
 LISTED = 160
 """Points of the body that stand for what is seen of it from a direction."""
-
-DAMPING = 1e-3
-"""Share of a point's information that holds a candidate where it is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +71,8 @@ class Looks:
     @cached_property
     def views(self) -> Floats:
         """(V, 3) directions from the scanner to the body."""
-        return spread_directions(DIRECTIONS)
+        # Enough to know what hides what
+        return spread_directions(128)
 
     @cached_property
     def _seen(self) -> tuple[Mask, Mask]:
@@ -106,8 +94,9 @@ class Looks:
     @cached_property
     def _listed(self) -> tuple[Indices, Indices]:
         """(V, LISTED) numbers of surface points and of ends that stand for what is seen."""
+        # Cosine of the incidence beyond which a coarse view often lacks a surface
         on, ends = (
-            _apart(part.points, seen & (self.views @ part.normals.T < -STEEPEST))
+            _apart(part.points, seen & (self.views @ part.normals.T < -0.4))
             for part, seen in zip((self.surface, self.ends), self._seen, strict=True)
         )
         return on, ends
@@ -166,7 +155,9 @@ class Looks:
         along = np.concatenate([self.surface.directions, self.ends.directions])
         jacobian = np.hstack([np.cross(place / self.size, along), along])
         values = np.linalg.eigvalsh(jacobian.T @ jacobian / len(jacobian))
-        return int((values > LEAST_SHARE).sum())
+        # Share of the body's points that show a direction: of facets of a cylinder fewer
+        # do
+        return int((values > 1e-4).sum())
 
     def twins(self, pose: Floats) -> Floats:
         """Return (K, 4, 4) poses at which a body often looks nearly the same: quarter turns."""
@@ -178,7 +169,8 @@ class Looks:
 
     def tolerance(self, view: CoarseImage) -> float:
         """Return how far off the scan may be [m]."""
-        return max(TOLERANCE * self.size, 3 * view.noise)
+        # As a share of the size; three sigma of the scanner's noise at least
+        return max(0.01 * self.size, 3 * view.noise)
 
     def settled(self, poses: Floats, view: CoarseImage, count: int, reach: float) -> Floats:
         """Return poses (K, 4, 4) moved once towards the scan's surfaces and ends within reach."""
@@ -205,7 +197,8 @@ class Looks:
         jacobian = np.concatenate([np.cross(arms, along), along], axis=2)
         normal = jacobian.transpose(0, 2, 1) @ jacobian
         count = (along**2).sum(axis=(1, 2))
-        normal += (DAMPING * (count + 1))[:, None, None] * np.eye(6)
+        # Share of a point's information that holds a candidate where it is
+        normal += (1e-3 * (count + 1))[:, None, None] * np.eye(6)
         step = np.linalg.solve(normal, jacobian.transpose(0, 2, 1) @ misfit[..., None])[..., 0]
         out = poses.copy()
         out[:, :3, :3] = rotation_exp(step[:, :3] / self.size) @ poses[:, :3, :3]

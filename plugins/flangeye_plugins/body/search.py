@@ -16,29 +16,12 @@ from flangeye_plugins.body.looks import Looks
 from flangeye_plugins.body.shape import Shape
 from flangeye_plugins.body.view import CoarseImage, view_of
 
-GUESSES = 1500
-"""Poses that are settled."""
+FINE_ACROSS = 100
+"""Cells across the body in the view that it is judged in: fine ones show thin parts."""
 
-SETTLING = ((40, (0.08, 0.06, 0.05), 0.03, 300), (160, (0.04, 0.03, 0.02), 0.02, 80))
-"""Points of the body that settle them, how far from the body the scan is taken for it, move by
-move, and how far off it may be where it is judged, as shares of the size, and how many are kept."""
-
-ACROSS, FINE_ACROSS = 60, 100
-"""Cells across the body in the views that it is searched for and judged in: coarse ones have less
-noise, fine ones show thin parts."""
-
-FINALISTS, THINNED, FINE = 8, 2000, 0.003
-"""Poses that are laid on the scan's own points, how many of these are used, and how far off a cell
-of the view may be afterwards, as a share of the size."""
-
-AROUND = 0.55
-"""How far from the body's middle points are kept, as a share of its size: half reaches its ends."""
-
-TWIN = 0.4
-"""Share of the rays that a turned pose explains as well, from which it is laid on the scan too."""
-
-SAME_TURN, SAME_PLACE = float(np.radians(12.0)), 0.06
-"""Poses are one where they differ by less: in turn, and in place as a share of the size."""
+FINE = 0.003
+"""How far off a cell of the view may be after the body is laid on the scan, as a share of the
+size."""
 
 
 class FoundPose(NamedTuple):
@@ -74,9 +57,16 @@ class BodySearch:
 
     def everywhere(self) -> list[FoundPose]:
         """Return distinct poses that the body may have, the best first."""
-        view = view_of(self.points, self.shape.size / ACROSS)
-        poses = guesses(view, self.looks, GUESSES)
-        for count, reaches, tolerance, left in SETTLING:
+        # Coarse cells have less noise
+        view = view_of(self.points, self.shape.size / 60)
+        poses = guesses(view, self.looks, 1500)
+        # Points of the body that settle them, how far from the body the scan is taken for
+        # it, move by move, and how far off it may be where it is judged, as shares of the
+        # size, and how many are kept
+        for count, reaches, tolerance, left in (
+            (40, (0.08, 0.06, 0.05), 0.03, 300),
+            (160, (0.04, 0.03, 0.02), 0.02, 80),
+        ):
             for reach in reaches:
                 poses = self.looks.settled(poses, view, count, reach * self.shape.size)
             scores = self.looks.scores(poses, view, count, tolerance)
@@ -89,7 +79,8 @@ class BodySearch:
         if not len(poses):
             return []
         scores = [judged(self.shape, self._fine, pose, self._rough).score for pose in poses]
-        poses = poses[distinct(poses, np.array(scores), self.looks)[:FINALISTS]]
+        # Laid on the scan's own points
+        poses = poses[distinct(poses, np.array(scores), self.looks)[:8]]
         return self._distinct([one for one in map(self._laid, poses) if one])
 
     @cached_property
@@ -101,7 +92,7 @@ class BodySearch:
         return self.looks.tolerance(self._fine)
 
     def _laid(self, pose: Floats) -> FoundPose | None:
-        fit = fitted(around(self.points, self.shape, pose), self.shape, pose, THINNED)
+        fit = fitted(around(self.points, self.shape, pose), self.shape, pose, 2000)
         if fit is None:
             return None
         tolerance = max(FINE * self.shape.size, 3.5 * self._fine.noise)
@@ -110,7 +101,8 @@ class BodySearch:
 
     def _twins(self, best: FoundPose) -> Floats:
         """Return quarter turns of a pose that explain the scan nearly as well."""
-        twins, least = self.looks.twins(best.pose), TWIN * best.verdict.agree
+        # Share of the rays that a turned pose explains as well, to be laid on the scan too
+        twins, least = self.looks.twins(best.pose), 0.4 * best.verdict.agree
         agree = [judged(self.shape, self._fine, pose, self._rough).agree for pose in twins]
         return np.asarray(twins[np.array(agree) > least])
 
@@ -123,16 +115,18 @@ class BodySearch:
 def around(points: Singles, shape: Shape, pose: Floats) -> Singles:
     """Return the points of (N, 3) around a body at a pose."""
     offset = points - (pose[:3, :3] @ shape.centre + pose[:3, 3]).astype(np.float32)
-    return np.asarray(points[np.einsum("ni,ni->n", offset, offset) < (AROUND * shape.size) ** 2])
+    # As a share of the size: half reaches the body's ends
+    return np.asarray(points[np.einsum("ni,ni->n", offset, offset) < (0.55 * shape.size) ** 2])
 
 
 def distinct(poses: Floats, scores: Floats, looks: Looks) -> Indices:
     """Return the indices of poses of which none is nearly another, the best first."""
     order = np.argsort(-scores, kind="stable")
     centres = poses[order, :3, :3] @ looks.centre + poses[order, :3, 3]
-    near = np.linalg.norm(centres[:, None] - centres, axis=2) < SAME_PLACE * looks.size
+    # One pose, where they differ by less in place, as a share of the size, and in turn
+    near = np.linalg.norm(centres[:, None] - centres, axis=2) < 0.06 * looks.size
     trace = np.einsum("aij,bij->ab", poses[order, :3, :3], poses[order, :3, :3])
-    near &= trace > 1 + 2 * np.cos(SAME_TURN)
+    near &= trace > 1 + 2 * np.cos(float(np.radians(12.0)))
     free = np.ones(len(order), bool)
     for k in range(len(order)):
         if free[k]:

@@ -16,14 +16,12 @@ CREASE = float(np.cos(np.radians(35.0)))
 """Cosine of the angle between facets beyond which their edge is an edge of the body, and not the
 tessellation of a smooth surface; CAD systems facet at 30 degrees at most."""
 
-VIEWS, ACROSS = 48, 72
-"""Directions from which the outside is sampled, and rays across the body from each."""
+ACROSS = 72
+"""Rays across the body from each direction."""
 
 GRAZING = 0.25
 """Cosine of the incidence beyond which a surface counts as not seen."""
 
-SLIVER = 1e-4
-"""Root of the area of a facet, as a share of the size, below which it has no direction."""
 
 SPACINGS = 24
 """Spacings of the samples that pairs are made of along the body's size."""
@@ -207,7 +205,8 @@ class Shape:
         grid = np.stack(np.meshgrid(*2 * [np.arange(ACROSS) + 0.5]), axis=-1) / ACROSS * 2 - 1
         flat = grid.reshape(-1, 2) * radius
         found: list[tuple[Floats, Floats]] = []
-        for view in spread_directions(VIEWS):
+        # Directions from which the outside is sampled
+        for view in spread_directions(48):
             origin = self.centre - 1.5 * radius * view + flat @ basis_of_plane(view)[:2]
             met = self.meet(origin, np.broadcast_to(view, origin.shape))
             hit = np.isfinite(met.depth) & (met.normals @ view < -GRAZING)
@@ -224,7 +223,9 @@ class Shape:
         # Of two facets in one plane the mean normal has length one; of an edge less.
         bent = np.linalg.norm(mean, axis=1) / count < np.cos(np.arccos(CREASE) / 2)
         sharp = (bent | (count == 1))[edge]
-        sharp &= mesh.area_faces[facet] > (SLIVER * self.size) ** 2
+        # Root of the area of a facet, as a share of the size, below which it has no
+        # direction
+        sharp &= mesh.area_faces[facet] > (1e-4 * self.size) ** 2
         a, b = (mesh.vertices[mesh.edges[sharp, k]] for k in range(2))
         along, normals = b - a, normals[facet[sharp]]
         length = np.linalg.norm(along, axis=1)

@@ -11,26 +11,6 @@ from flangeye.maths.statistics import SIGMA_OF_MAD
 from flangeye.types import Floats, Indices, Mask, Singles
 from flangeye_plugins.body.shape import OrientedPoints
 
-MOST_POINTS = 500_000
-"""Points that fill the image well."""
-
-SPARSE = 1.6
-"""A cell is at least as many times as wide as points are apart."""
-
-STEEPEST = 3.0
-"""Cells of one surface differ in depth by less than so many widths: steeper ones are not seen."""
-
-COPLANAR = 0.08
-"""How far off a plane its continuation may be seen at the body's size from a place, as a share of
-the size: as far as a normal's error takes it there."""
-
-ALONG, TURNED, FLAT = 3.5, 0.7, 0.9
-"""Cells apart up to which ends lie on one edge, and the cosines between their directions and
-between their normals."""
-
-LAYER = 1.5
-"""Widths behind the nearest point of a cell up to which points belong to its surface."""
-
 
 @dataclass(frozen=True, eq=False)
 class CoarseImage:
@@ -194,7 +174,8 @@ class CoarseImage:
             inside = (y >= 0) & (y < rows) & (x >= 0) & (x < columns)
             there = self.xyz[np.where(inside, y, 0), np.where(inside, x, 0)]
             off = np.abs(np.einsum("ijk,ijk->ij", there - self.xyz, self.normals))
-            count += inside & (off < COPLANAR * size)
+            # As a share of the size: as far as a normal's error takes its plane there
+            count += inside & (off < 0.08 * size)
         return count >= 2
 
 
@@ -205,11 +186,13 @@ def view_of(points: Singles, pitch: float) -> CoarseImage:
         points: (N, 3) before the scanner, one at least [m].
         pitch: Wider where the points are too sparse to fill the cells.
     """
-    points = points[:: 1 + len(points) // MOST_POINTS]
+    # They fill the image well
+    points = points[:: 1 + len(points) // 500_000]
     z = points[:, 2]
     u, v = points[:, 0] / z, points[:, 1] / z
     low = float(u.min()), float(v.min())
-    angle = max(pitch / float(np.median(z)), SPARSE * spacing_of(points))
+    # A cell is at least so many times as wide as points are apart
+    angle = max(pitch / float(np.median(z)), 1.6 * spacing_of(points))
     columns = int((u.max() - low[0]) / angle) + 1
     rows = int((v.max() - low[1]) / angle) + 1
     cell = ((v - low[1]) / angle).astype(np.int64) * columns + ((u - low[0]) / angle).astype(
@@ -217,7 +200,8 @@ def view_of(points: Singles, pitch: float) -> CoarseImage:
     )
     nearest = np.full(rows * columns, np.inf, np.float32)
     np.minimum.at(nearest, cell, z)
-    near = z < nearest[cell] * (1 + LAYER * angle)
+    # Widths of a cell
+    near = z < nearest[cell] * (1 + 1.5 * angle)
     cell, points = cell[near], points[near]
     count = np.bincount(cell, minlength=rows * columns)
     with np.errstate(invalid="ignore"):
@@ -237,11 +221,13 @@ def _along(ends: OrientedPoints, angle: float) -> OrientedPoints:
 
     if not len(ends.points):
         return ends
-    reach = ALONG * angle * float(np.median(ends.points[:, 2]))
+    # Cells apart up to which ends lie on one edge
+    reach = 3.5 * angle * float(np.median(ends.points[:, 2]))
     one, other = cKDTree(ends.points).query_pairs(reach, output_type="ndarray").T
     directions, normals = ends.directions, ends.normals
-    same = np.einsum("ni,ni->n", directions[one], directions[other]) > TURNED
-    same &= np.einsum("ni,ni->n", normals[one], normals[other]) > FLAT
+    # Cosines between their directions and between their normals
+    same = np.einsum("ni,ni->n", directions[one], directions[other]) > 0.7
+    same &= np.einsum("ni,ni->n", normals[one], normals[other]) > 0.9
     one, other = one[same], other[same]
     total = directions.copy()
     np.add.at(total, one, directions[other])
@@ -278,7 +264,8 @@ def _ring(reach: int) -> list[tuple[int, int]]:
 
 
 def _gate(depth: Floats, angle: float, cells: int) -> Floats:
-    return STEEPEST * angle * cells * depth
+    # Steeper surfaces are not seen
+    return 3.0 * angle * cells * depth
 
 
 def _slope(xyz: Floats, axis: int, angle: float) -> Floats:

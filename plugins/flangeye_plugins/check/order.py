@@ -25,11 +25,6 @@ from flangeye_plugins.check.significance import (
     narrowed,
 )
 
-SHIFTS = (1, -1, 2, -2, 3, -3)
-DELAYS = 24
-"""Delays tried on each side of none, up to the time between samples three times over."""
-
-
 Change = Callable[[Floats], tuple[Floats, Mask]]
 """Gives poses (N, 4, 4), and the samples (N,) that have one."""
 Later = Callable[[float], tuple[Floats, Mask]]
@@ -54,7 +49,7 @@ def order(session: RecordedSession) -> Findings:
     """Scans are paired with the pose before or after their own, from the start or some scan."""
     session.require_samples()
     every = np.arange(1, len(session) - 1)
-    tried = [(arms, by, 0) for arms in session.arms for by in SHIFTS]
+    tried = [(arms, by, 0) for arms in session.arms for by in (1, -1, 2, -2, 3, -3)]
     count = len(tried) + 2 * len(every)
     for by in (1, -1):
         near = narrowed(every, lambda some, by=by: _gains(session, by, some))  # type: ignore[misc]
@@ -115,12 +110,13 @@ def clock(session: RecordedSession) -> Findings:
     if not np.isfinite(times).all() or (np.diff(times) <= 0).any():
         raise NotApplicable("the samples have no times, or these do not rise")
     step = float(np.median(np.diff(times)))
-    coarse = step * 3 * np.linspace(-1, 1, 2 * DELAYS)
+    delays = 24  # on each side of none, up to the time between samples three times over
+    coarse = step * 3 * np.linspace(-1, 1, 2 * delays)
     found = _evidence(session, _delays(session, coarse, session.arms), further=1)
     if found is None:
         return
     arms, middle = session.arms[found.which // len(coarse)], coarse[found.which % len(coarse)]
-    near = middle + np.linspace(-1, 1, 17) * step * 3 / DELAYS
+    near = middle + np.linspace(-1, 1, 17) * step * 3 / delays
     others = _delays(session, near, [arms])
     finer = _evidence(session, others, further=1)
     if finer is None or finer.probability == 1:
@@ -192,8 +188,6 @@ def _fits(
 
 SAME = 1e-9
 """Numbers that differ by less were not measured twice."""
-MOVED = 1e-3
-"""A target that has moved further was seen from another pose [m]."""
 
 
 @part("check.identity")
@@ -247,7 +241,8 @@ def _repeats(
     read = np.flatnonzero(np.isfinite(numbers).all(axis=1))
     alike = KDTree(numbers[read]).query_pairs(SAME, p=np.inf, output_type="ndarray")
     before, after = np.sort(read[alike], axis=1).T
-    moved = np.linalg.norm(others[after] - others[before], axis=1) > MOVED
+    # A target that has moved further was seen from another pose [m]
+    moved = np.linalg.norm(others[after] - others[before], axis=1) > 1e-3
     wrong = np.zeros(len(numbers), dtype=bool)
     wrong[after[moved]] = True
     made_up = any((np.abs(p[wrong] - np.eye(4)) < SAME).all() for _, p in _reported(session))
@@ -269,10 +264,6 @@ def _left_out(session: RecordedSession, wrong: NDArray[np.bool_], name: str, wha
     return Finding(
         name, what, corrected_session.step(), tuple(names), corrected_session=corrected_session
     )
-
-
-OFFSET = 1e-3
-"""A seen circle further than this from where the arm has it is a mistake [m]."""
 
 
 @part("check.moved")
@@ -340,7 +331,8 @@ def tool(session: RecordedSession) -> Findings:
     evidence = best_of(null, found, 3)
     freedom = float(null.count[0]) - found.parameters
     ratio = float(found.likelihood[0] - null.likelihood[0])
-    p = exceedance(ratio, float(null.count[0]), 3, freedom, length / OFFSET)
+    # A seen circle further from where the arm has it is a mistake [m]
+    p = exceedance(ratio, float(null.count[0]), 3, freedom, length / 1e-3)
     if p == 1 or not _known(found, offset):
         return
     listed = [f"{value * 1e3:.2f} mm" for value in offset + 0.0]

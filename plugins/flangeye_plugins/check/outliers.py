@@ -116,8 +116,6 @@ SHIFT = 5e-3
 """Likewise of where it sees the work [m]."""
 LITTLE = np.radians(10.0)
 """Poses that differ by less do not turn the target enough [rad]."""
-ERRORS = np.array([3e-3, np.radians(1.0)])
-"""Errors beyond these [m, rad] are a mistake's or an outlier's, and no motion makes up for them."""
 
 
 @part("check.motion")
@@ -177,7 +175,9 @@ def _uncertainty(session: RecordedSession, null: VariantFits) -> tuple[float, fl
     tell.
     """
     scales = null.scales[0]
-    share = min(1.0, float((ERRORS[: len(scales)] / scales).min()))
+    # Larger ones [m, rad] are a mistake's or an outlier's, and no motion makes up for them
+    errors = np.array([3e-3, np.radians(1.0)])
+    share = min(1.0, float((errors[: len(scales)] / scales).min()))
     covariance = share**2 * _covariance(null.information[0])[:6, :6]
     work = null.unknowns.rotation[0] @ np.nanmean(session.centres, axis=0)
     at_work = np.concatenate([-hat(work), np.eye(3)], axis=1)

@@ -26,24 +26,7 @@ from flangeye_plugins.check.fitting import fit, fit_of, named
 from flangeye_plugins.check.significance import Significance, best_of, explained, helps
 
 QUATERNIONS = ("xyzw", "wxyz")
-COMMON = ("vector", "ZYX", "xyz", "XYZ", "zyx", "ZYZ", "zyz", "ZXZ")
-"""What three angles mean on the arms that are sold, and rotation vectors."""
 
-NAMES = {
-    "xyzw": "a quaternion x, y, z, w", "wxyz": "a quaternion w, x, y, z",
-    "vector": "a rotation vector", "ZYX": "KUKA's A, B, C (ZYX about turned axes)",
-    "xyz": "roll, pitch, yaw or Fanuc's W, P, R (xyz about fixed axes)",
-    "XYZ": "angles XYZ about turned axes", "ZYZ": "angles ZYZ about turned axes",
-}  # fmt: skip
-
-_CARRIED = {"target": ("marker", "camera"), "camera": ("camera", "marker")}
-
-
-_MOUNTED_OTHERWISE: Mapping[str, tuple[str, str]] = {
-    "target": ("in the hand", "eye-in-hand"),
-    "camera": ("beside the robot", "eye-on-base"),
-}
-"""By what the recipe says the arm carries: where the camera then is, and how to say so."""
 
 _WAYS: Mapping[str, tuple[Change, str]] = {
     "inverted": (
@@ -176,10 +159,12 @@ def _rereading(read_as: str, written_as: str) -> Change:
 
 def _readings(stated: str | None) -> Iterator[tuple[str, str]]:
     """Give (as read, as written): every pair of conventions with as many numbers."""
-    for read_as in [stated] if stated else [*QUATERNIONS, *COMMON]:
+    # What three angles mean on the arms that are sold, and rotation vectors
+    common = ("vector", "ZYX", "xyz", "XYZ", "zyx", "ZYZ", "zyz", "ZXZ")
+    for read_as in [stated] if stated else [*QUATERNIONS, *common]:
         others = QUATERNIONS if read_as in QUATERNIONS else ("vector", *EULER_ORDERS)
         if not stated and read_as not in QUATERNIONS:
-            others = COMMON
+            others = common
         yield from ((read_as, other) for other in others if other != read_as)
 
 
@@ -196,8 +181,17 @@ def _stated(session: RecordedSession, of: str | None = None) -> str | None:
 
 
 def _name(rotation: str) -> str:
-    if rotation in NAMES:
-        return NAMES[rotation]
+    names = {
+        "xyzw": "a quaternion x, y, z, w",
+        "wxyz": "a quaternion w, x, y, z",
+        "vector": "a rotation vector",
+        "ZYX": "KUKA's A, B, C (ZYX about turned axes)",
+        "xyz": "roll, pitch, yaw or Fanuc's W, P, R (xyz about fixed axes)",
+        "XYZ": "angles XYZ about turned axes",
+        "ZYZ": "angles ZYZ about turned axes",
+    }
+    if rotation in names:
+        return names[rotation]
     about = "turned" if rotation.isupper() else "fixed"
     return f"angles {rotation} about {about} axes"
 
@@ -232,9 +226,10 @@ def exchanged(session: RecordedSession) -> Findings:
     )
     if not looks_exchanged(carried, standing) or not explained(session) or _unseen(other):
         return
+    carried_by = {"target": ("marker", "camera"), "camera": ("camera", "marker")}
     what = (
-        f"as they are read, the arm carries the {_CARRIED[session.carried][0]} "
-        f"{carried:.2f} m from its flange, and the {_CARRIED[session.carried][1]} stands "
+        f"as they are read, the arm carries the {carried_by[session.carried][0]} "
+        f"{carried:.2f} m from its flange, and the {carried_by[session.carried][1]} stands "
         f"{standing:.2f} m from its base: the poses of robot and markers are both the other way "
         "round, which fits as well"
     )
@@ -303,7 +298,11 @@ def _of_exchanged(session: RecordedSession, turned: RecordedSession) -> tuple[st
     The samples fit each of three: with the arm's poses inverted camera and target are as far from
     flange and base as they are from base and flange with another mounting, or inverted markers.
     """
-    held, name = _MOUNTED_OTHERWISE[session.carried]
+    # Where the camera then is, and how to say so
+    held, name = {
+        "target": ("in the hand", "eye-in-hand"),
+        "camera": ("beside the robot", "eye-on-base"),
+    }[session.carried]
     mounted = f"the camera is {held}", f"configuration: {{name: {name}, place: unknown}}"
     choices = [mounted, ("the poses are flange_T_base", turned.step())]
     if looks_exchanged(*_distances(turned)):

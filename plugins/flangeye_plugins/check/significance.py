@@ -20,21 +20,9 @@ from flangeye.types import Floats, Indices, Mask
 from flangeye_plugins.check.equations import Equations, equations_of
 from flangeye_plugins.check.fitting import VariantFits, errors_at, fit
 
-NEGLIGIBLE = 0.5e-3
-"""Error that an arm's kinematics or a scanner may have without anybody's mistake [m]."""
-SAME = 1e-3
-"""Logarithms of likelihoods that differ by less are equal but for rounding."""
-
-AT_ONCE = 16
-"""Starts of a change that are tried at once; each round leaves an eighth of them."""
-FOLDS = 4
-"""Every fourth sample is held out in turn."""
-
 HELPS = 0.7
 """A correction that explains the samples leaves at most this share of the errors held out."""
 
-ORDINARY = np.array([0.02, 0.01])
-"""Errors that sound samples have, too: growing up to these is no loss [of the spread, rad]."""
 
 EXPLAINED = 0.2
 """And at most this share of how far the samples are apart."""
@@ -91,7 +79,8 @@ def best_of(
         against = np.zeros(len(alternatives.likelihood), dtype=int)
     ratios = alternatives.likelihood - null.likelihood[against]
     # Of readings that come to the same, the first: they are listed by how common they are.
-    index = int(np.flatnonzero(ratios >= ratios.max() - SAME)[0])
+    # Equal but for rounding
+    index = int(np.flatnonzero(ratios >= ratios.max() - 1e-3)[0])
     at = int(against[index])
     before, after = null.misfit(at), alternatives.misfit(index)
     freedom = float(null.count[at]) - alternatives.parameters - further
@@ -113,10 +102,11 @@ def narrowed(starts: Indices, ratios: Callable[[Indices], Floats]) -> Indices:
         starts: Samples that a change may begin with, rising.
         ratios: Gives the logarithms of likelihood ratios of some of them.
     """
-    while len(starts) > AT_ONCE:
-        some = starts[np.linspace(0, len(starts) - 1, AT_ONCE).round().astype(int)]
+    at_once = 16  # starts that are tried at once; each round leaves an eighth of them
+    while len(starts) > at_once:
+        some = starts[np.linspace(0, len(starts) - 1, at_once).round().astype(int)]
         best = int(np.argmax(ratios(some)))
-        first, last = some[max(best - 1, 0)], some[min(best + 1, AT_ONCE - 1)]
+        first, last = some[max(best - 1, 0)], some[min(best + 1, at_once - 1)]
         starts = starts[(starts >= first) & (starts <= last)]
     return starts
 
@@ -147,7 +137,8 @@ def exceedance(ratio: float, count: float, further: int, freedom: float, effect:
 def negligible(kinds: int) -> Floats:
     """Return (B,) what is negligible of each kind of error [m, rad]."""
     # What is negligible of a normal's or a marker's rotation: 4 mrad
-    return np.array([NEGLIGIBLE, *[4e-3] * (kinds - 1)])
+    # Error that an arm's kinematics or a scanner may have without anybody's mistake [m]
+    return np.array([0.5e-3, *[4e-3] * (kinds - 1)])
 
 
 def _effect(before: Misfit, after: Misfit) -> float:
@@ -163,7 +154,8 @@ def helps(session: RecordedSession, corrected: RecordedSession) -> bool:
     thousand divides the errors too, and explains nothing.
     """
     before, after = _foretold(session), _foretold(corrected)
-    none_worse = (after <= np.maximum(1.2 * before, ORDINARY[: len(after)])).all()
+    # Errors that sound samples have, too: growing up to these is no loss [of the spread, rad]
+    none_worse = (after <= np.maximum(1.2 * before, np.array([0.02, 0.01])[: len(after)])).all()
     better = (after <= HELPS * before).any() and none_worse
     return bool(better and after[0] <= EXPLAINED)
 
@@ -191,8 +183,9 @@ def held_out_errors(equations: Equations, ignored: Mask) -> Floats:
         ignored: (N,) samples that take no part at all; NaN.
     """
     seen = np.isfinite(equations.centres[0, :, 0]) & ~ignored
-    dealt = np.where(seen, np.cumsum(seen) % FOLDS, -1)
-    folds = dealt[None] == np.arange(FOLDS)[:, None]
+    folds_of = 4  # every fourth sample is held out in turn
+    dealt = np.where(seen, np.cumsum(seen) % folds_of, -1)
+    folds = dealt[None] == np.arange(folds_of)[:, None]
     found = fit(equations.without(folds | ignored))
     errors = errors_at(equations, found.unknowns)
     out = np.full((len(seen), errors.shape[-1]), np.nan)

@@ -32,14 +32,6 @@ ARMS = (0.1, 4.0)
 """Median distance of a flange from its base [m], from the smallest arm to the largest."""
 
 
-CALIBRATE = (
-    "calibrate the camera: add board: {kind: …, columns: …, rows: …, square: …} to acquire.images, "
-    "which finds it by its views of the board"
-)
-SHARE = 0.5
-"""Rounding to a step moves a place by half of it, rms; this share of the limit is too much."""
-
-
 class OtherUnit(NamedTuple):
     """Another unit of some of the lengths.
 
@@ -229,7 +221,11 @@ def size(session: RecordedSession) -> Findings:
             what = (
                 f"the camera's focal length is {factor:.4f} times as long as its calibration says"
             )
-            yield evidence.finding("focal length", what, corrected_session, CALIBRATE)
+            calibrate = (
+                "calibrate the camera: add board: {kind: …, columns: …, rows: …, square: …} to "
+                "acquire.images, which finds it by its views of the board"
+            )
+            yield evidence.finding("focal length", what, corrected_session, calibrate)
             return
         what = f"the marker is {factor:.4f} times as large as the recipe says"
         fix = f"measure it after printing: its lengths in the fit step times {factor:.4f}"
@@ -274,7 +270,8 @@ def rounding(session: RecordedSession) -> Findings:
     seen = session.centres[session.seen]
     for whose, places in (("the arm", session.poses[:, :3, 3]), ("the target", seen)):
         step = _step(places)
-        if step is not None and step / 2 >= SHARE * session.limit:
+        # Rounding to a step moves a place by half of it, rms; half the limit is too much
+        if step is not None and step / 2 >= 0.5 * session.limit:
             what = (
                 f"positions of {whose} are whole multiples of {1e3 * step:g} mm, and the recipe "
                 f"asks for {1e3 * session.limit:g} mm; if they were rounded, that alone is "

@@ -38,19 +38,21 @@ def _declared(
     return stage(f"export.{name}", serves=serves)(export)
 
 
-_WRITERS: tuple[tuple[Callable[..., ExportedFile], type[NamedParams]], ...] = (
-    (documents.ros2_command, FramesParams),
-    (documents.ros2_launch, FramesParams),
-    (urdf, UrdfParams),
-    (documents.moveit, FramesParams),
-    (documents.easy_handeye2, FramesParams),
-    (documents.opencv, LengthParams),
-    (documents.zivid, ZividExportParams),
-    (documents.robodk, NamedParams),
-    (documents.matrix, LengthParams),
-)
 EXPORTS = (
-    *(_declared(write.__name__, write, params, write.__doc__ or "") for write, params in _WRITERS),
+    *(
+        _declared(write.__name__, write, params, write.__doc__ or "")
+        for write, params in (
+            (documents.ros2_command, FramesParams),
+            (documents.ros2_launch, FramesParams),
+            (urdf, UrdfParams),
+            (documents.moveit, FramesParams),
+            (documents.easy_handeye2, FramesParams),
+            (documents.opencv, LengthParams),
+            (documents.zivid, ZividExportParams),
+            (documents.robodk, NamedParams),
+            (documents.matrix, LengthParams),
+        )
+    ),
     *(_declared(name, row.write, row.params, row.meaning) for name, row in CONTROLLERS.items()),
 )
 """The formats of the camera's pose."""

@@ -23,9 +23,6 @@ from flangeye_plugins.export.writing import (
     numbers_of,
 )
 
-FLAGS = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
-"""Of ``static_transform_publisher``, in the order of ``quaternion_xyzw``."""
-
 
 def ros2_command(pose: CalibratedPose, params: FramesParams) -> ExportedFile:
     """Write the command that publishes the pose as a ROS 2 static transform."""
@@ -52,7 +49,9 @@ def moveit(pose: CalibratedPose, params: FramesParams) -> ExportedFile:
 def _arguments(pose: CalibratedPose, params: FramesParams) -> list[str]:
     numbers = numbers_of("quaternion_xyzw", pose.transform.matrix)
     frames = ("--frame-id", params.carrier(pose), "--child-frame-id", params.carried(pose))
-    return [word for pair in zip(FLAGS, numbers, strict=True) for word in pair] + [*frames]
+    # Of `static_transform_publisher`, in the order of `quaternion_xyzw`
+    flags = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
+    return [word for pair in zip(flags, numbers, strict=True) for word in pair] + [*frames]
 
 
 def _launch_file(pose: CalibratedPose, params: FramesParams) -> str:

@@ -17,7 +17,6 @@ NAME = r"^[A-Za-z][A-Za-z0-9_]{0,23}$"
 """An identifier in every controller's language; KUKA's names have 24 characters at most."""
 FRAME = r"^[A-Za-z_][A-Za-z0-9_/]*$"
 """A tf2 frame or a URDF link."""
-PER_METRE = {"m": 1.0, "mm": 1e3}
 
 
 class NamedParams(Params):
@@ -81,7 +80,7 @@ class LengthParams(NamedParams):
     def matrix(self, pose: CalibratedPose) -> list[list[float]]:
         """Return the rows of the pose (4, 4), its translation in that unit, to nine places."""
         scaled = np.array(pose.transform.matrix)
-        scaled[:3, 3] *= PER_METRE[self.length]
+        scaled[:3, 3] *= {"m": 1.0, "mm": 1e3}[self.length]
         return [[rounded(number) for number in row] for row in scaled]
 
 

@@ -23,9 +23,6 @@ from flangeye.types import (
 )
 from flangeye.units import Length, param
 
-PLAUSIBLE = 0.99
-"""Of good scans this share shows edges as its scanner does; others may rest on wrong edges."""
-
 
 class FitBodyParams(Params):
     """Parameters of ``fit.body``."""
@@ -79,7 +76,8 @@ def fit_body(
             f"the scan is {fit.noise * 1e3:.2f} mm off {body.name}'s surface (limit "
             f"{params.max_rms * 1e3:g} mm): does it move against its mesh, as a gripper's jaws do?"
         )
-    if fit.odd > chi2_quantile(PLAUSIBLE, len(fit.lost) + 1):
+    # Of good scans this share shows edges as its scanner does; others may rest on wrong edges
+    if fit.odd > chi2_quantile(0.99, len(fit.lost) + 1):
         low, high = fit.lost.min() * 1e3, fit.lost.max() * 1e3
         return Rejected(
             f"the scan's edges are {low:+.1f} to {high:+.1f} mm off the ends of {body.name}, more "

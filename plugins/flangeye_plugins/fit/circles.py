@@ -104,8 +104,8 @@ def circle_jacobian(circles: Circles, points: Floats, ring: NDArray[np.intp]) ->
     return rows.T
 
 
-ACROSS, FEWEST = 5, 20
-"""Patches across a face, each with this many points at least."""
+ACROSS = 5
+"""Patches across a face."""
 
 
 def disc_face(points: Floats, rough: Plane, ring: tuple[float, float], gate: float) -> Plane | None:
@@ -163,7 +163,8 @@ def _planes_of_patches(points: Floats, patch: Indices, rough: Plane) -> tuple[Fl
     """
     offsets = points - rough.point
     members = (patch == np.arange(ACROSS**2)[:, None]).astype(np.float64)
-    members = members[members.sum(axis=1) >= FEWEST]
+    # Points of a patch
+    members = members[members.sum(axis=1) >= 20]
     counts = members.sum(axis=1)[:, None]
     means = members @ offsets / counts
     products = (offsets[:, :, None] * offsets[:, None]).reshape(-1, 9)

@@ -25,16 +25,9 @@ from flangeye_plugins.fit.uncertainty import STRETCHES, clustered_covariance, pl
 
 FEWEST_POINTS = 100
 
-EDGE = 1e-3
-"""How far from an edge a point is beyond its influence [m]."""
 
 LEAST_NOISE = 3e-5
 """Scanners round edges by this much, however small their noise is [m]."""
-
-
-ROUNDS, NEAR, SETTLED = 12, 1e-4, 1e-7
-"""Rounds of choosing edge points and fitting, at most, and the last one's step [m]: with a few of
-the points, and with all."""
 
 
 def face_and_rings(
@@ -100,7 +93,8 @@ def away_from_edges(points: Floats, face: Plane, rings: Rings, flange: Flange) -
     offsets = face.flatten(points) - rings.circles.centre
     radius = distances(offsets)
     rim, *bore = rings.circles.radii
-    inside = (radius < rim - EDGE) & (radius > (bore[0] if bore else _ring_of(flange)[0]) + EDGE)
+    edge = 1e-3  # how far from an edge a point is beyond its influence [m]
+    inside = (radius < rim - edge) & (radius > (bore[0] if bore else _ring_of(flange)[0]) + edge)
     inner = chosen(points, inside)
     plane, half = face, 3 * max(face.sigma, LEAST_NOISE)
     # The face is near enough already for a few rounds of its own slab to settle it.
@@ -206,11 +200,13 @@ def find_rings(flat: Floats, nominal: Floats, start: Floats, scale: float) -> Ri
     votes = tuple((e, float(r)) for e, r in zip(edges, nominal, strict=True))
     circles = Circles(vote_centre(votes, start, float(nominal[0])), nominal)
     if len(few) < len(flat):
-        circles = _settled(few, circles, nominal, bins, scale, NEAR).circles
+        # A step as small [m] is the last with a few of the points
+        circles = _settled(few, circles, nominal, bins, scale, 1e-4).circles
         bins = _sectors_for(flat, nominal)
         # How deep behind an edge its points are kept while the circles settle [m]
         flat, _ = _edges_near(flat, circles.centre, nominal, bins, 1e-3)
-    return _settled(flat, circles, nominal, bins, scale, SETTLED)
+    # And so small with all
+    return _settled(flat, circles, nominal, bins, scale, 1e-7)
 
 
 def _settled(
@@ -220,7 +216,8 @@ def _settled(
 
     Which points are at the edge depends on the centre, and the centre on them.
     """
-    for _ in range(ROUNDS):
+    # Rounds of choosing edge points and fitting
+    for _ in range(12):
         before = circles.centre
         points, ring = _edges_near(flat, circles.centre, nominal, bins)
         circles = fit_concentric(points, ring, circles, scale, 0.1 * within)

@@ -19,8 +19,6 @@ from flangeye.maths.geometry import (
 from flangeye.models.corners import Corners
 from flangeye.types import Floats, Image, PointCloud
 
-PRIOR_FREEDOM = 8
-"""What is expected of the corners' noise counts as much as so many coordinates."""
 REACH = 3
 """Half the window about a corner whose points give its depth [px]."""
 
@@ -94,7 +92,9 @@ def _least_squares(corners: Corners, image: Image, start: Floats, expected: floa
         pose = rigid(rotation_exp(step[:3]) @ pose[:3, :3], pose[:3, 3] + step[3:])
     errors, jacobian = reprojection(corners, image, pose)
     misfit, freedom = float(errors @ errors), len(errors) - 6
-    variance = (misfit + PRIOR_FREEDOM * expected**2) / (freedom + PRIOR_FREEDOM)
+    # What is expected of the corners' noise counts as much as so many coordinates
+    expected_freedom = 8
+    variance = (misfit + expected_freedom * expected**2) / (freedom + expected_freedom)
     covariance = variance * np.linalg.inv(jacobian.T @ jacobian)
     # What detection moves all corners by alike [px]; measured on rendered boards of known place
     bias = 0.02 * float(pose[2, 3] / image.camera_matrix[0, 0])

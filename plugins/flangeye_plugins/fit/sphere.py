@@ -16,7 +16,6 @@ from flangeye.types import CircleFeature, FlangeCloud, Floats, Indices, Rejected
 from flangeye_plugins.fit.circles import cauchy_curvature, cauchy_weights
 from flangeye_plugins.fit.uncertainty import STRETCHES, ScannerErrorParams, clustered_covariance
 
-FEWEST_POINTS = 50
 RINGS = 3
 """Rings about the line of sight in which, with the sectors, neighbouring points err together."""
 
@@ -88,8 +87,9 @@ def fit_sphere(
     There is no randomness.
     """
     points = cloud.cloud.xyz.astype(np.float64)
-    if len(points) < FEWEST_POINTS:
-        return Rejected(f"{len(points)} points, at least {FEWEST_POINTS} are needed")
+    fewest = 50
+    if len(points) < fewest:
+        return Rejected(f"{len(points)} points, at least {fewest} are needed")
     start = float(np.median(np.linalg.norm(points - cloud.centre, axis=1)))
     size = start if sphere.size is None else sphere.size
     known = fit_cap(points, cloud.centre, size, params.max_incidence, free=False)

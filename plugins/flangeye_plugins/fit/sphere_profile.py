@@ -24,12 +24,6 @@ from flangeye_plugins.fit.ransac import circles_through
 from flangeye_plugins.fit.uncertainty import STRETCHES, clustered_covariance
 
 FEWEST_POINTS = 20
-SAMPLES = 2000
-"""Triples of points that are tried."""
-
-
-SECTORS = 72
-"""Sectors in which the seen share of a circle is counted, 5 degrees each."""
 
 
 class SphereProfileParams(Params):
@@ -92,7 +86,8 @@ def fit_sphere_profile(
     if isinstance(arc, Rejected):
         return arc
     away = np.sqrt(max(sphere.radius**2 - arc.radius**2, 0.0))
-    coverage = len(np.unique(sectors(arc.points - arc.circles.centre, SECTORS))) / SECTORS
+    count = 72  # of 5 degrees each
+    coverage = len(np.unique(sectors(arc.points - arc.circles.centre, count))) / count
     problem = _why_not(away / sphere.radius, coverage, params)
     if problem:
         return Rejected(problem)
@@ -154,9 +149,10 @@ def _candidates(
     rng = np.random.default_rng(seed)
     flat = np.insert(points[np.argsort(points[:, 0])], 1, 0.0, axis=1)
     near = np.searchsorted(flat[:, 0], flat[:, 0] + radius)  # beyond it nothing is on the circle
-    first = rng.integers(len(flat), size=SAMPLES)
+    samples = 2000  # triples of points that are tried
+    first = rng.integers(len(flat), size=samples)
     reach = np.maximum(near[first] - first, 1)[:, None]
-    others = first[:, None] + (rng.random((SAMPLES, 2)) * reach).astype(np.intp)
+    others = first[:, None] + (rng.random((samples, 2)) * reach).astype(np.intp)
     centres, radii = circles_through(flat[np.column_stack([first, others])])
     least = radius * np.sqrt(1 - params.offset[1] ** 2)
     fitting = (radii > 0.5 * least) & (radii < radius + params.tolerance)

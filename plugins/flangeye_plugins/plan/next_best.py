@@ -15,9 +15,6 @@ from flangeye.plugin.stage import part
 from flangeye.types import Box, Floats
 from flangeye_plugins.plan.grid import PlanParams
 
-PRIOR = np.array([0.2, 0.2, 0.2, 0.1, 0.1, 0.1])
-"""What is known before the first pose: standard deviations, rotation [rad], translation [m]."""
-
 
 class NextBestParams(PlanParams):
     """Parameters of ``plan.next_best``."""
@@ -97,7 +94,8 @@ class Chooser:
         lost = self._site.lost()
         counted = [pose for i, pose in enumerate(self._visited) if i not in lost]
         told = self._information(np.array(counted).reshape(-1, 4, 4)).sum(axis=0)
-        return np.asarray(np.diag(PRIOR**-2.0) + told)
+        # Known before the first pose: standard deviations, rotation [rad], translation [m]
+        return np.asarray(np.diag(np.array([0.2, 0.2, 0.2, 0.1, 0.1, 0.1]) ** -2.0) + told)
 
     def _why(self, pose: Floats) -> str:
         """Describe a pose's benefit: the error reduction, and the direction it informs most."""

@@ -33,13 +33,7 @@ from flangeye_plugins.reader.poses import (
 
 MM = 1e-3
 
-_HEADING = "p_robot 6-DoF index:"
 _AUBO_VERIFICATION = "5"
-# Hard-coded in the authors' calibration_ransac_circle_aubo.py: position [m], quaternion xyzw.
-_AUBO_POSITION = (0.27704067625331485, -0.573055166920657, 0.26205388882758757)
-_AUBO_QUATERNION = (
-    -0.08580920098798522, -0.3893105864494028, 0.9148593368686363, 0.06408152657751885,
-)  # fmt: skip
 
 Poses = Mapping[str, Floats]
 
@@ -53,7 +47,13 @@ def read_aubo(folder: Path) -> Archive:
     clouds = _clouds(folder)
     recordings = _with_centres(folder, poses, clouds, unit=1.0)
     if _AUBO_VERIFICATION in clouds and _AUBO_VERIFICATION not in poses:
-        pose = pose_from_quaternion("tool0_5.pcd", _AUBO_POSITION, _AUBO_QUATERNION)
+        # Hard-coded in the authors' calibration_ransac_circle_aubo.py: position [m],
+        # quaternion xyzw
+        pose = pose_from_quaternion(
+            "tool0_5.pcd",
+            (0.27704067625331485, -0.573055166920657, 0.26205388882758757),
+            (-0.08580920098798522, -0.3893105864494028, 0.9148593368686363, 0.06408152657751885),
+        )
         cloud = clouds.pop(_AUBO_VERIFICATION)
         recordings = [
             Recording(_AUBO_VERIFICATION, {FLANGE: pose}, cloud, role="verification"),
@@ -174,16 +174,17 @@ def _aubo_poses(path: Path) -> dict[str, Floats]:
     """Parse the blocks ``p_robot 6-DoF index:<id>`` and the list of seven numbers after each."""
     lines = read_text(path).splitlines()
     poses: dict[str, Floats] = {}
+    heading = "p_robot 6-DoF index:"
     for number, (line, following) in enumerate(zip(lines, [*lines[1:], ""], strict=True), 1):
-        if not line.startswith(_HEADING):
+        if not line.startswith(heading):
             continue
-        name = line.removeprefix(_HEADING).strip()
+        name = line.removeprefix(heading).strip()
         if name in poses:
             raise StageError(f"{path}:{number}: pose '{name}' is given twice")
         values = _seven(f"{path}:{number + 1}", following)
         poses[name] = pose_from_quaternion(f"{path}: pose '{name}'", values[:3], values[3:])
     if not poses:
-        raise StageError(f"{path}: holds no poses (no line '{_HEADING}<id>')")
+        raise StageError(f"{path}: holds no poses (no line '{heading}<id>')")
     return poses
 
 

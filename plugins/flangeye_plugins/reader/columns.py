@@ -76,7 +76,6 @@ class WrittenParams(Params):
 
 
 PER_UNIT = {"m": 1.0, "mm": 1e-3, "rad": 1.0, "deg": float(np.pi / 180)}
-PER_SECOND = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 
 class CloudUnitParams(Params):
@@ -204,7 +203,8 @@ def times_of(text: Table, column: Column | None, unit: str) -> Floats | None:
     """
     if column is None:
         return None
-    times = text.numbers([text.index(column)])[:, 0] * PER_SECOND[unit]
+    seconds = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[unit]
+    times = text.numbers([text.index(column)])[:, 0] * seconds
     back = np.flatnonzero(np.diff(times) <= 0)
     if len(back):
         raise StageError(f"{text.where(int(back[0]) + 1)}: its time is not after the row before it")

@@ -44,12 +44,9 @@ from flangeye.files.yaml_lines import read_yaml
 from flangeye.types import FLANGE, FLANGE2, Floats, Role
 from flangeye_plugins.reader.poses import pose_from_quaternion, pose_from_rotation_vector
 
-POSE_FILES = ("poses.csv", "poses.yaml", "poses.yml", "poses.json")
 UNPAIRED_SUFFIXES = (".pcd", ".ply", ".npy", ".xyz")
 """A file that ends so and that no pose names is a scan somebody forgot."""
 
-
-_ADVICE = "; 'flangeye init FOLDER' writes a recipe for other tables"
 
 _POSITIONS: Mapping[LengthUnit | None, tuple[str, ...]] = {
     "m": ("x_m", "y_m", "z_m"),
@@ -91,13 +88,15 @@ def folder(path: Path, params: FolderParams) -> Archive:
 
 
 def _poses_file(path: Path) -> Path:
-    if path.is_file() and path.name in POSE_FILES:
+    named = ("poses.csv", "poses.yaml", "poses.yml", "poses.json")
+    if path.is_file() and path.name in named:
         return path
-    found = [path / name for name in POSE_FILES if (path / name).is_file()]
+    found = [path / name for name in named if (path / name).is_file()]
     if not found:
         clouds = sum(1 for p in path.glob("*") if p.suffix.lower() in UNPAIRED_SUFFIXES)
         but = f"clouds ({clouds}), but " if clouds else ""
-        raise NotThisLayout(f"{path}: holds {but}none of {', '.join(POSE_FILES)}{_ADVICE}")
+        advice = "; 'flangeye init FOLDER' writes a recipe for other tables"
+        raise NotThisLayout(f"{path}: holds {but}none of {', '.join(named)}{advice}")
     if len(found) > 1:
         raise StageError(f"{path}: holds {' and '.join(f.name for f in found)}; keep one of them")
     return found[0]

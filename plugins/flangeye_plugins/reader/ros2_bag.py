@@ -47,9 +47,6 @@ CLOUD, POSE = "sensor_msgs/msg/PointCloud2", "geometry_msgs/msg/PoseStamped"
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO, JOINTS = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/JointState"
 TF = "tf2_msgs/msg/TFMessage"
-BASES = ("base", "base_link", "world")
-FLANGES = ("flange", "tool0", "tool_flange", "panda_link8", "fr3_link8", "lbr_link_ee", "link_eef")
-"""Names under which ROS's drivers publish the two frames, the better one first."""
 ARM = "robot: NAME ('flangeye robots' lists them) or robot: {urdf: arm.urdf} in the recipe"
 """How a recipe names its arm."""
 
@@ -198,7 +195,12 @@ def _arm(
     if params.robot is not None:
         topic = bag.only("robot", params.robot, POSE)
         return in_order(*bag.poses[str(topic)]), f"the flange's poses from {topic}", joints
-    base, flange = _frame(bag, params.base, BASES), _frame(bag, params.flange, FLANGES)
+    # Names under which ROS's drivers publish the two frames, the better one first
+    base = _frame(bag, params.base, ("base", "base_link", "world"))
+    flange = _frame(
+        bag, params.flange,
+        ("flange", "tool0", "tool_flange", "panda_link8", "fr3_link8", "lbr_link_ee", "link_eef"),
+    )  # fmt: skip
     if base and flange:
         told = f"the flange's poses from tf, {base} to {flange}"
         return bag.frames.between(base, flange), told, joints

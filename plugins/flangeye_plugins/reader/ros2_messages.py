@@ -26,8 +26,6 @@ from flangeye_plugins.ros2.messages import cloud_of, frame_of, pixels_of, stamp_
 
 T = TypeVar("T")
 
-MISSING = "{}: reading ROS 2 bags needs the extra 'ros': pip install 'flangeye[ros]'"
-
 
 @dataclass(frozen=True)
 class Raw:
@@ -119,7 +117,9 @@ def _guarded(file: Path, read: Callable[[Path], Any]) -> Any:
     except StageError:
         raise
     except ModuleNotFoundError:
-        raise StageError(MISSING.format(file)) from None
+        raise StageError(
+            f"{file}: reading ROS 2 bags needs the extra 'ros': pip install 'flangeye[ros]'"
+        ) from None
     except Exception as error:  # damaged bytes can break the libraries in any way
         raise StageError(f"{file}: cannot be read as a ROS 2 bag: {reason_of(error)}") from None
 

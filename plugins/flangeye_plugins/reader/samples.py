@@ -28,18 +28,6 @@ from flangeye.files.tables import Table, document_of, files_at, read_table
 from flangeye_plugins.reader.columns import CloudUnitParams
 from flangeye_plugins.reader.table import TableParams, table
 
-QUATERNION = ("translation.x", "translation.y", "translation.z",
-              "rotation.x", "rotation.y", "rotation.z", "rotation.w")  # fmt: skip
-METRES = {"rotation": "xyzw", "length": "m"}
-MATRIX = {"rotation": "matrix", "length": "m"}
-VECTOR = {"rotation": "vector", "length": "m", "angle": "rad"}
-EASY = (
-    ("robot", "tracking"), ("hand_world_samples", "camera_marker_samples"),
-    ("hand_world_samples.transforms", "camera_marker_samples.transforms"),
-)  # fmt: skip
-"""What the arm's and the marker's transforms stand under."""
-EFFECTOR, OBJECT = "effector_wrt_world", "object_wrt_sensor"
-
 
 class EasyHandeyeParams(Params):
     """Which way round the robot's poses were written."""
@@ -59,15 +47,22 @@ class ZividSamplesParams(CloudUnitParams):
 @part("reader.easy_handeye")
 def easy_handeye(path: Path, params: EasyHandeyeParams) -> Archive:
     """Read the samples that easy_handeye or easy_handeye2 saved."""
+    quaternion = (*(f"translation.{x}" for x in "xyz"), *(f"rotation.{x}" for x in "xyzw"))
+    metres = {"rotation": "xyzw", "length": "m"}
     for file, found in _tables(path):
-        for robot, marker in EASY:
+        # What the arm's and the marker's transforms stand under
+        for robot, marker in (
+            ("robot", "tracking"),
+            ("hand_world_samples", "camera_marker_samples"),
+            ("hand_world_samples.transforms", "camera_marker_samples.transforms"),
+        ):
             if _has(found, f"{robot}.translation"):
                 _refuse_other_type(file, params.calibration)
                 inverse = params.calibration == "eye_on_base"
-                return _read(file, "easy_handeye", METRES | {
-                    "columns": [f"{robot}.{name}" for name in QUATERNION],
+                return _read(file, "easy_handeye", metres | {
+                    "columns": [f"{robot}.{name}" for name in quaternion],
                     "pose": "flange_T_base" if inverse else "base_T_flange",
-                    "target": METRES | {"columns": [f"{marker}.{name}" for name in QUATERNION]},
+                    "target": metres | {"columns": [f"{marker}.{name}" for name in quaternion]},
                 })  # fmt: skip
     raise NotThisLayout(f"{path}: holds no samples of easy_handeye (samples: of robot, tracking)")
 
@@ -75,20 +70,24 @@ def easy_handeye(path: Path, params: EasyHandeyeParams) -> Archive:
 @part("reader.moveit")
 def moveit(path: Path) -> Archive:
     """Read the samples that MoveIt Calibration saved."""
+    matrix = {"rotation": "matrix", "length": "m"}
+    effector = "effector_wrt_world"
+    seen = "object_wrt_sensor"
     for file, found in _tables(path):
-        if _has(found, EFFECTOR):
-            return _read(file, "MoveIt Calibration", MATRIX | {
-                "columns": [EFFECTOR], "pose": "base_T_flange",
-                "target": MATRIX | {"columns": [OBJECT]},
+        if _has(found, effector):
+            return _read(file, "MoveIt Calibration", matrix | {
+                "columns": [effector], "pose": "base_T_flange",
+                "target": matrix | {"columns": [seen]},
             })  # fmt: skip
-    raise NotThisLayout(f"{path}: holds no samples of MoveIt Calibration ({EFFECTOR}, {OBJECT})")
+    raise NotThisLayout(f"{path}: holds no samples of MoveIt Calibration ({effector}, {seen})")
 
 
 @part("reader.visp")
 def visp(path: Path) -> Archive:
     """Read ViSP's pose_rPe_N.yaml and pose_cPo_N.yaml."""
-    return _read(path / "*rPe*.yaml", "ViSP", VECTOR | {
-        "pose": "base_T_flange", "target": VECTOR | {"file": "*cPo*.yaml"},
+    vector = {"rotation": "vector", "length": "m", "angle": "rad"}
+    return _read(path / "*rPe*.yaml", "ViSP", vector | {
+        "pose": "base_T_flange", "target": vector | {"file": "*cPo*.yaml"},
     })  # fmt: skip
 
 

@@ -47,8 +47,6 @@ from flangeye_plugins.reader.columns import (
 )
 from flangeye_plugins.reader.pairing import MatchedPose, PairingParams, pair
 
-SCAN = "scan"
-"""How the column of the scans' file names is called, if the recipe does not say."""
 JOINTS = "joints"
 """In place of a rotation: the poses follow from the joint angles."""
 
@@ -165,8 +163,9 @@ def _scan_column(text: Table, params: TableParams) -> int | None:
     if params.scan is not None:
         return text.index(params.scan)
     first = text.rows[0][1]
-    if SCAN in text.heading and number_of(first[text.index(SCAN)]) is None:
-        return text.index(SCAN)
+    scan = "scan"  # if the recipe does not say
+    if scan in text.heading and number_of(first[text.index(scan)]) is None:
+        return text.index(scan)
     return 0 if number_of(first[0]) is None and not params.columns else None
 
 

@@ -31,9 +31,6 @@ from flangeye_plugins.robot.tool_check import (
     wrench_at_flange,
 )
 
-CONNECTING = 2.5
-"""Longest time until the controller answers [s]; the library itself waits for ever."""
-
 TRIAL = """
 import os, sys, franky
 realtime = franky.RealtimeConfig.Enforce if sys.argv[2] == "True" else franky.RealtimeConfig.Ignore
@@ -46,8 +43,6 @@ os._exit(0)
 """Connects once, in a process that can be killed: where a host is silent, the library never
 returns."""
 
-
-SHOWN = CONVENTIONS["rpy"].in_units("mm", "deg")
 
 MODES: dict[str, tuple[Mode, str]] = {
     "Idle": ("ready", ""),
@@ -73,6 +68,7 @@ def require_answer(name: str, host: str, realtime: bool) -> None:
         DeviceError: It does not work, or takes too long.
     """
     command = python_command("-c", TRIAL, host, str(realtime))
+    patience = 2.5  # the library itself waits for ever [s]
     try:
         tried = subprocess.run(
             command,
@@ -80,11 +76,11 @@ def require_answer(name: str, host: str, realtime: bool) -> None:
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             text=True,
-            timeout=CONNECTING,
+            timeout=patience,
             check=False,
         )
     except subprocess.TimeoutExpired:
-        raise cannot_connect(name, f"nothing within {CONNECTING:g} s") from None
+        raise cannot_connect(name, f"nothing within {patience:g} s") from None
     if tried.stdout:
         raise cannot_connect(name, tried.stdout)
     if tried.returncode:
@@ -140,8 +136,9 @@ def opened(robot: FrankyRobot, model: RobotModel, params: FrankyParams) -> Frank
     Raises:
         DeviceError: Tool or arm are not the recipe's, or it is not ready.
     """
-    expected = params.tool.flange_T_tool(SHOWN)
-    require_tool(robot.name, "franky", robot.offset, expected, SHOWN)
+    shown = CONVENTIONS["rpy"].in_units("mm", "deg")
+    expected = params.tool.flange_T_tool(shown)
+    require_tool(robot.name, "franky", robot.offset, expected, shown)
     state = robot.state()
     require_model(robot.name, state, model)
     if state.message:

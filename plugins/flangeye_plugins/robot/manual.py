@@ -23,8 +23,6 @@ from flangeye.types import BASE, FLANGE, Floats, Transform
 PERIOD = 0.05
 """Between two looks at the input [s]."""
 
-STOPPED = "it was stopped on its way, and nobody has said where it stands"
-
 
 class OperatorConsole:
     """Says things, and hears lines without ever waiting for one.
@@ -151,7 +149,11 @@ class ManualRobot(Device):
             joint_speeds=np.zeros(self._arm.n),
             time_ns=time.monotonic_ns(),
             mode=self._mode(),
-            message=STOPPED if self._stopped else "",
+            message=(
+                "it was stopped on its way, and nobody has said where it stands"
+                if self._stopped
+                else ""
+            ),
         )
 
     def move_joints(self, joints: Floats, speed: float, acceleration: float) -> None:

@@ -27,15 +27,6 @@ from flangeye_plugins.scanner.opened import DepthView, OpenScanner
 NAME = "scanner.azure_kinect"
 DEFAULT_PYTHON = "kinect"
 HOST = Path(__file__).with_name("kinect_host.py")
-INSTALL = (
-    "pyk4a-bundle needs NumPy 1: make it a Python of its own (python -m venv kinect; "
-    "kinect/bin/pip install pyk4a-bundle 'numpy<2') and name it on this machine: kinect = "
-    '"/whole/path/to/kinect/bin/python" under [programs] in '
-)
-
-
-PER_METRE = 1000.0
-"""Depths come in the SDK's format DEPTH16, whose unit is the millimetre."""
 
 
 class AzureKinectParams(Params):
@@ -114,7 +105,12 @@ def _answer(pipe: Pipe, patience: float) -> dict[str, Any]:
         raise FrameDropped(f"{NAME}: {answer['error']}")
     if "error" in answer:
         said = answer["error"].partition("\n")[0].strip()
-        cure = f"; {INSTALL}{machine_settings()}" if "Import" in said or "Module" in said else ""
+        install = (
+            "pyk4a-bundle needs NumPy 1: make it a Python of its own (python -m venv kinect; "
+            "kinect/bin/pip install pyk4a-bundle 'numpy<2') and name it on this machine: kinect = "
+            '"/whole/path/to/kinect/bin/python" under [programs] in '
+        )
+        cure = f"; {install}{machine_settings()}" if "Import" in said or "Module" in said else ""
         raise DeviceError(f"{NAME}: {said}{cure}")
     return answer
 
@@ -148,7 +144,8 @@ class AzureKinect(OpenScanner):
             view = DepthView(**answer["calibration"])
             xyz = view.points(depth)
             image = None if colour is None else view.coloured(xyz, colour)
-            return self._scan(xyz, PER_METRE, times, image)
+            # The SDK's format DEPTH16, whose unit is the millimetre
+            return self._scan(xyz, 1000.0, times, image)
 
         return decode
 

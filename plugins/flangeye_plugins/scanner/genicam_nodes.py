@@ -17,11 +17,6 @@ NAME = "scanner.genicam"
 ORGANISED = "CalibratedABC_Grid"
 """The output mode in which every pixel has its x, y and z."""
 
-PER_METRE = {"Millimeter": 1000.0, "Meter": 1.0, "Inch": 1 / 0.0254}
-"""How many of the units that a device can name are in a metre."""
-
-AXES = ("CoordinateA", "CoordinateB", "CoordinateC")
-
 
 @dataclass(frozen=True, eq=False)
 class RangeLayout:
@@ -109,14 +104,17 @@ def _reported(nodes: Any) -> RangeLayout:
     mode, unit = _read(nodes, "Scan3dOutputMode"), _read(nodes, "Scan3dDistanceUnit")
     if mode != ORGANISED:
         raise DeviceError(f"{NAME}: Scan3dOutputMode is {mode}, {ORGANISED} is needed")
-    if unit not in PER_METRE:
-        known = ", ".join(PER_METRE)
+    # The units that a device can name
+    per_metre = {"Millimeter": 1000.0, "Meter": 1.0, "Inch": 1 / 0.0254}
+    if unit not in per_metre:
+        known = ", ".join(per_metre)
         raise DeviceError(f"{NAME}: Scan3dDistanceUnit is {unit}; known: {known}")
     pixels = str(_read(nodes, "PixelFormat"))
     if not pixels.startswith("Coord3D_ABC32f"):
         raise DeviceError(f"{NAME}: PixelFormat is {pixels}, Coord3D_ABC32f is needed")
     rows, columns = int(nodes.Height.value), int(nodes.Width.value)
-    scale, offset, invalid = zip(*(_axis(nodes, axis) for axis in AXES), strict=True)
+    axes = ("CoordinateA", "CoordinateB", "CoordinateC")
+    scale, offset, invalid = zip(*(_axis(nodes, axis) for axis in axes), strict=True)
     facts = {
         "Scan3dDistanceUnit": unit,
         "Scan3dOutputMode": mode,
@@ -125,7 +123,7 @@ def _reported(nodes: Any) -> RangeLayout:
         "trigger": "software" if has_node(nodes, "TriggerSoftware") else "start of acquisition",
     }
     return RangeLayout(
-        (rows, columns), PER_METRE[unit], _row(scale), _row(offset), _row(invalid), facts
+        (rows, columns), per_metre[unit], _row(scale), _row(offset), _row(invalid), facts
     )
 
 

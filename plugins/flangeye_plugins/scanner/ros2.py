@@ -36,16 +36,6 @@ from flangeye_plugins.scanner.opened import DepthView, OpenScanner
 
 NAME = "scanner.ros2"
 
-TRIGGER_MESSAGE = b"\x00\x01\x00\x00\x00"
-"""An std_msgs/msg/Empty, serialised: ROS gives a message without fields one byte."""
-
-
-PINHOLES = ("", "plumb_bob", "rational_polynomial")
-"""Distortion models of CameraInfo that OpenCV's coefficients mean."""
-
-LENSES = (0, 4, 5, 8, 12, 14)
-"""Numbers of coefficients that OpenCV takes."""
-
 
 class Ros2ScannerParams(Params):
     """Parameters of ``scanner.ros2``: a cloud, or a depth image, or an image of a marker alone."""
@@ -206,13 +196,15 @@ class Ros2Scanner(OpenScanner):
             )
         rectified = "rect" in str(self._params.depth or self._params.image).rpartition("/")[2]
         info = decoded(message.data, INFO)
-        if info.distortion_model not in PINHOLES:
+        pinholes = ("", "plumb_bob", "rational_polynomial")  # whose coefficients are OpenCV's
+        if info.distortion_model not in pinholes:
             raise DeviceError(
                 f"{NAME}: {topic} has the distortion model {info.distortion_model}; known: "
-                f"{', '.join(PINHOLES[1:])}: rectify the images (image_proc) and name those"
+                f"{', '.join(pinholes[1:])}: rectify the images (image_proc) and name those"
             )
         matrix, lens = decoded(message.data, INFO, partial(intrinsics_of, rectified=rectified))
-        if not (matrix[0, 0] > 0 and matrix[1, 1] > 0 and len(lens) in LENSES):
+        # Numbers of coefficients that OpenCV takes
+        if not (matrix[0, 0] > 0 and matrix[1, 1] > 0 and len(lens) in (0, 4, 5, 8, 12, 14)):
             raise DeviceError(
                 f"{NAME}: {topic} has focal lengths of {matrix[0, 0]:g} and {matrix[1, 1]:g} px "
                 f"and {len(lens)} distortion coefficients: calibrate the camera "
@@ -255,7 +247,9 @@ class Ros2Scanner(OpenScanner):
         if self._params.trigger and self._calls:
             self._bridge.trigger(self._params.trigger, self._params.timeout)
         elif self._params.trigger:
-            self._bridge.publish(self._params.trigger, TRIGGER_MESSAGE)
+            # An std_msgs/msg/Empty, serialised: ROS gives a message without fields one
+            # byte
+            self._bridge.publish(self._params.trigger, b"\x00\x01\x00\x00\x00")
 
     def _after(self, topic: str, count: int, started: int, until: float) -> GraphMessage:
         """Return the first message stamped after a moment; those before it are passed over."""

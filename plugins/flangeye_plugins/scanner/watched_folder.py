@@ -22,8 +22,6 @@ from flangeye.types import PointCloud
 from flangeye.units import Duration, param
 from flangeye_plugins.scanner.opened import OpenScanner
 
-NAME = "scanner.watched_folder"
-
 
 class WatchedFolderParams(Params):
     """Parameters of ``scanner.watched_folder``."""
@@ -116,6 +114,7 @@ class WatchedFolder(OpenScanner):
     def _look(self) -> dict[Path, Stamp]:
         """Return the clouds in the folder; whole or not."""
         found = {}
+        name = "scanner.watched_folder"
         try:
             for path in self._params.path.iterdir():
                 if _is_cloud(path) and path.match(self._params.pattern):
@@ -124,10 +123,10 @@ class WatchedFolder(OpenScanner):
         except FileNotFoundError:
             if self._params.path.is_dir():
                 return self._look()  # a temporary name, renamed while we looked
-            raise DeviceError(f"{NAME}: no folder {self._params.path}") from None
+            raise DeviceError(f"{name}: no folder {self._params.path}") from None
         except OSError as error:
             raise DeviceError(
-                f"{NAME}: {self._params.path} cannot be read ({error.strerror})"
+                f"{name}: {self._params.path} cannot be read ({error.strerror})"
             ) from None
         return found
 

@@ -15,11 +15,6 @@ from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import part
 from flangeye_plugins.scanner.opened import OpenScanner, SerialParams
 
-NAME = "scanner.zivid"
-
-PER_METRE = 1000.0
-"""The SDK's points are millimetres; nothing in it says so at run time."""
-
 
 class ZividParams(SerialParams):
     """Parameters of ``scanner.zivid``."""
@@ -41,10 +36,11 @@ def scanner_zivid(model: ScannerModel | None, params: ZividParams) -> Scanner:
     Raises:
         DeviceError: No SDK, no camera, or settings that cannot be read.
     """
-    zivid = load_sdk("zivid", NAME, "install the Zivid SDK, then pip install 'flangeye[zivid]'")
+    name = "scanner.zivid"
+    zivid = load_sdk("zivid", name, "install the Zivid SDK, then pip install 'flangeye[zivid]'")
     for path in (params.settings, params.file_camera):
         if path is not None and not path.is_file():
-            raise DeviceError(f"{NAME}: no file {path}")
+            raise DeviceError(f"{name}: no file {path}")
     try:
         application = zivid.Application()  # must outlive the camera
         settings = _settings(zivid, params.settings)
@@ -53,7 +49,7 @@ def scanner_zivid(model: ScannerModel | None, params: ZividParams) -> Scanner:
         else:
             camera = application.connect_camera(serial_number=params.serial)
     except RuntimeError as error:
-        raise DeviceError(f"{NAME}: {_line(error)}") from None
+        raise DeviceError(f"{name}: {_line(error)}") from None
     return ZividScanner(application, camera, settings, model)
 
 
@@ -96,7 +92,8 @@ class ZividScanner(OpenScanner):
                 raise DeviceError(f"{self.name}: {_line(error)}") from None
             if xyz.ndim != 3:
                 raise DeviceError(f"{self.name}: points of shape {xyz.shape}, not organised")
-            return self._scan(xyz, PER_METRE, times)
+            # The SDK's points are millimetres; nothing in it says so at run time
+            return self._scan(xyz, 1000.0, times)
 
         return transfer
 

@@ -8,9 +8,6 @@ import numpy as np
 
 from flangeye.types import Floats, Singles
 
-COARSE_CELLS = 128
-"""Cells along the longer side, in which the density of the points is taken."""
-
 
 @dataclass(frozen=True, eq=False)
 class DepthMap:
@@ -63,8 +60,9 @@ def depth_map(points: Singles) -> DepthMap:
 
 def _pitch(rays: Singles, low: Singles, high: Singles) -> float:
     """Return a pixel's size such that it holds a few of the points, where there are points."""
-    cell = float((high - low).max()) / COARSE_CELLS
-    cells = ((rays - low) / np.float32(cell)).astype(int) @ [2 * COARSE_CELLS, 1]
+    coarse = 128  # cells along the longer side, in which the density of the points is taken
+    cell = float((high - low).max()) / coarse
+    cells = ((rays - low) / np.float32(cell)).astype(int) @ [2 * coarse, 1]
     counts = np.unique(cells, return_counts=True)[1]
     spacing = cell / np.sqrt(max(float(np.median(counts)), 1.0))
     # Points a pixel of the map should get, so that none is empty by chance

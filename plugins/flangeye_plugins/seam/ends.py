@@ -13,10 +13,6 @@ from flangeye_plugins.seam.template import EDGES, Section
 
 FEWEST_LANES = 5
 """Lanes that an end is known from."""
-TWO = 2.0
-"""Lanes whose middle half is spread over more pixels end at two places."""
-AROUND = 0.06
-"""Directions about a line in which the scanner may look past it: 40 mm at 0.7 m [rad]."""
 SEAM_WITHIN = 8e-3
 """Lanes this near to the seam say where it ends [m]."""
 
@@ -117,7 +113,8 @@ def surface_end(way: Floats, past: Mask, covered: Mask, pitch: float) -> End | N
     seen = past.sum() >= FEWEST_LANES
     way = way[past] if seen else way
     low, middle, high = np.quantile(way, [0.25, 0.5, 0.75])
-    share = 1.25 / np.sqrt(len(way)) if seen and high - low <= TWO * pitch else 1.0
+    # Lanes whose middle half is spread over more pixels end at two places
+    share = 1.25 / np.sqrt(len(way)) if seen and high - low <= 2.0 * pitch else 1.0
     # Of a normal distribution, from its quartiles' distance
     sigma_of_iqr = 0.7413
     deviation = float(share * sigma_of_iqr * (high - low))
@@ -167,10 +164,13 @@ class Rays:
         from scipy.spatial import cKDTree
 
         self._places = []
+        # Directions about a line in which the scanner may look past it: 40 mm at 0.7 m
+        # [rad]
+        around = 0.06
         for eye, cloud in zip(eyes, clouds, strict=True):
             sight, seen = _directions(line - eye)[0], cloud - eye
             rays, far = _directions(seen)
-            low, high = sight.min(axis=0) - AROUND, sight.max(axis=0) + AROUND
+            low, high = sight.min(axis=0) - around, sight.max(axis=0) + around
             about = ((rays > low) & (rays < high)).all(axis=1)
             if about.any():
                 self._places.append((eye, cKDTree(rays[about]), far[about]))

@@ -18,10 +18,6 @@ from flangeye_plugins.seam.search import agreement, model_of, shares
 
 FINE = 200
 """How many times the finest thing looked at goes into the part's diagonal."""
-SLIDES, STEPS = (0.2, 0.03), 101
-"""How far a part is slid, either way, as shares of the diagonal, and in how many steps each."""
-TOP = 0.3
-"""The part of the peak of the agreement that is taken for where its middle is."""
 
 
 class RayEvidence:
@@ -76,8 +72,9 @@ def slid(fit: CadFit, evidence: RayEvidence) -> CadFit:
     """
     units = np.array([2 / evidence.part.diagonal] * 3 + [1.0] * 3)
     values, vectors = np.linalg.eigh(fit.covariance / np.outer(units, units))
-    for k, share in product(np.nonzero(values > evidence.floor**2)[0], SLIDES):
-        ways = np.linspace(-share, share, STEPS) * evidence.part.diagonal
+    # Either way, as shares of the diagonal
+    for k, share in product(np.nonzero(values > evidence.floor**2)[0], (0.2, 0.03)):
+        ways = np.linspace(-share, share, 101) * evidence.part.diagonal
         poses = np.array([moved(fit.pose, w * vectors[:, k] * units, fit.about) for w in ways])
         way, values[k] = _peak(ways, evidence.scores(poses, fit.noise), values[k])
         fit = replace(fit, pose=moved(fit.pose, way * vectors[:, k] * units, fit.about))
@@ -87,7 +84,8 @@ def slid(fit: CadFit, evidence: RayEvidence) -> CadFit:
 
 def _peak(ways: Floats, scores: Floats, variance: float) -> tuple[float, float]:
     """Return where the peak is, and its variance; where there is none, what it was."""
-    top = scores > scores.max() - TOP * (scores.max() - np.median(scores))
+    # The part of the peak that is taken for where its middle is
+    top = scores > scores.max() - 0.3 * (scores.max() - np.median(scores))
     inside = ways[top]
     if top[[0, -1]].any() or np.ptp(inside) > 0.5 * np.ptp(ways):
         return 0.0, variance

@@ -37,16 +37,6 @@ from flangeye_plugins.seam.sweep import WIDE, Spline, Swept, fitted, swept_from
 from flangeye_plugins.seam.template import EDGES, FACES, JOINTS, JointShape
 
 STAGE = "seam.joint"
-FEWEST_FITTED = 300
-UNSEEN = 0.5
-"""Of a pixel, standard deviation of an end for pixels that scanners drop or invent beside a jump of
-depth: the simulated PhoXi M drops 0.7 to 1.2 of one."""
-BEYOND = (1.0, 2.0, 3.0, 4.0)
-"""Pixels beyond a surface's last point at which the scanner may look past its end."""
-CELL = 3e-3
-"""Lengths of the seam that are seen or not [m]."""
-PLANE = 0.95
-"""What explains this share of the points of a joint is as good as the joint."""
 
 
 class JointParams(SeamParams):
@@ -194,8 +184,9 @@ def _found(seen: PlacedScan, rough: Course, params: JointParams) -> Found:
     box = params.reach + WIDE + 10e-3
     points = seen.points
     at, local = rough.local(points, box)
-    if len(at) < FEWEST_FITTED:
-        raise StageError(f"{STAGE}: {len(at)} points are near the line; {FEWEST_FITTED} are needed")
+    fewest = 300
+    if len(at) < fewest:
+        raise StageError(f"{STAGE}: {len(at)} points are near the line; {fewest} are needed")
     # Points that are fitted to; of more, every second, third,
     most_fitted = 400_000
     pitch, points = _solid(points[at[:: -(-len(at) // most_fitted)]])
@@ -279,20 +270,24 @@ def _end(found: Found, sign: int) -> tuple[float, float]:
     q = swept.in_section(local)
     across = np.linalg.norm(q, axis=1) * np.sign(q[:, 0])
     ends = []
+    # Pixels beyond a surface's last point at which the scanner may look past its end
+    beyond = (1.0, 2.0, 3.0, 4.0)
     for on in surfaces(swept, local, 4 * swept.sigma).values():
         last, more = last_in_lanes(across[on], sign * local[on, 0], pitch)
         at = local[on][last, :3]
-        on_beyond = sign * (more + pitch * np.array(BEYOND)[:, None]).ravel()
-        there = np.tile(at, (len(BEYOND), 1)) + np.outer(on_beyond, [1, 0, 0])
+        on_beyond = sign * (more + pitch * np.array(beyond)[:, None]).ravel()
+        there = np.tile(at, (len(beyond), 1)) + np.outer(on_beyond, [1, 0, 0])
         looked = found.rays.past(found.course.points_at(there), pitch, 5 * swept.sigma)
-        past, covered = np.reshape(looked, (2, len(BEYOND), -1)).max(axis=1)
+        past, covered = np.reshape(looked, (2, len(beyond), -1)).max(axis=1)
         end = surface_end(sign * at[:, 0] + more, past, covered, pitch)
         ends += [] if end is None else [end]
     limit = found.course.length if sign > 0 else 0.0
     place, deviation = soonest(ends, sign * limit - 2 * pitch)
     if np.isinf(deviation):
         return limit, deviation
-    return sign * place, float(np.hypot(deviation, UNSEEN * pitch))
+    # Of a pixel, for those that scanners drop or invent beside a jump of depth: the simulated
+    # PhoXi M drops 0.7 to 1.2 of one
+    return sign * place, float(np.hypot(deviation, 0.5 * pitch))
 
 
 def _line(found: Found) -> tuple[Floats, Floats, Floats]:
@@ -386,9 +381,10 @@ def _refuse_plane(found: Found) -> None:
     on = np.abs(section.distances(q)[0]) < tolerance
     level = np.abs(beyond[:, list(FACES)]) < tolerance
     if not section.joint.gap:
-        if level[on].mean(axis=0).max(initial=0.0) > PLANE:
+        plane = 0.95  # as good as the joint
+        if level[on].mean(axis=0).max(initial=0.0) > plane:
             raise CalibrationRefused(
-                f"{STAGE}: no joint is seen: one plane explains {PLANE:.0%} of the points as well"
+                f"{STAGE}: no joint is seen: one plane explains {plane:.0%} of the points as well"
             )
         return
     gap, length = section.shape[6], found.ends[1] - found.ends[0]
@@ -409,7 +405,8 @@ def _shares(found: Found) -> tuple[float, float]:
     inside = (local[:, 0] > found.ends[0]) & (local[:, 0] < found.ends[1])
     near = inside & (np.linalg.norm(q, axis=1) < WIDE / 2 + swept.section.shape[4:].max())
     explained = float((np.abs(away[near]) < 5 * swept.sigma).mean()) if near.any() else 0.0
-    cells = np.arange(found.ends[0], found.ends[1], CELL)
+    # Lengths of the seam that are seen or not [m]
+    cells = np.arange(found.ends[0], found.ends[1], 3e-3)
     groups = surfaces(swept, local, 5 * swept.sigma).values()
     counts = [np.histogram(local[on, 0], cells)[0] for on in groups]
     seen = np.all(np.array(counts) >= 4, axis=0)

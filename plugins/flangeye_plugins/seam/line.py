@@ -27,9 +27,6 @@ from flangeye_plugins.seam.planned import (
 )
 
 STAGE = "seam.line"
-TABLES = (".csv", ".txt", ".yaml", ".yml", ".json")
-MEET = 1e-6
-"""Pieces of a line whose ends are this near to each other meet [m]."""
 
 
 class LineParams(SeamParams, PlaceParams):
@@ -95,24 +92,26 @@ def _line(params: LineParams) -> Floats:
 def _lines(path: Path, unit: LengthUnit, angle: float) -> list[Floats]:
     """Return all lines (N, 3) of a file [m]."""
     suffix = path.suffix.lower()
-    if suffix in TABLES:
+    tables = (".csv", ".txt", ".yaml", ".yml", ".json")
+    if suffix in tables:
         points = _points(path, unit) / PER_METRE[unit]
         moved = np.linalg.norm(np.diff(points, axis=0), axis=1) > 0
         points = points[np.append(True, moved)] if len(points) else points
         return [points] if len(points) > 1 else []
+    meet = 1e-6  # ends this near to each other meet [m]
     if suffix == ".dxf":
         pieces, said = read_dxf(path)
         if said not in (None, unit):
             raise StageError(
                 f"{path}: states the unit {said} ($INSUNITS), the recipe says unit: {unit}"
             )
-        return chained(pieces / PER_METRE[unit], MEET)
+        return chained(pieces / PER_METRE[unit], meet)
     if suffix in MESHES:
         # STEP comes in metres, whatever the drawing was in
         vertices, triangles = read_mesh(path)
         scale = 1.0 if suffix in STEP_SUFFIXES else PER_METRE[unit]
-        return chained(sharp_edges(vertices / scale, triangles, angle), MEET)
-    known = ", ".join((*TABLES, ".dxf", *MESHES))
+        return chained(sharp_edges(vertices / scale, triangles, angle), meet)
+    known = ", ".join((*tables, ".dxf", *MESHES))
     raise StageError(f"{path}: '{path.suffix}' holds no line; known: {known}")
 
 

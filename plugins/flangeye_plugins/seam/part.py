@@ -12,11 +12,6 @@ from flangeye.models.workpiece import Workpiece
 from flangeye.types import Floats
 from flangeye_plugins.seam.points import Oriented
 
-SAMPLES = 20_000
-SHARP = float(np.cos(np.radians(30)))
-"""Cosine of the angle by which a face must bend away at an edge to end there."""
-EDGE_SAMPLES = 4000
-
 
 class CadPart:
     """A workpiece's CAD, its normals outwards.
@@ -38,7 +33,7 @@ class CadPart:
         volume = np.einsum("ti,ti->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
         self._outwards = 1.0 if volume >= 0 else -1.0
 
-    def sample(self, rng: np.random.Generator, count: int = SAMPLES) -> Oriented:
+    def sample(self, rng: np.random.Generator, count: int = 20_000) -> Oriented:
         """Return points spread evenly over the surface, with outward normals."""
         corners = self.workpiece.vertices[self.workpiece.triangles]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -58,8 +53,9 @@ class CadPart:
         lengths = np.linalg.norm(ends - starts, axis=1)
         if not len(lengths):
             return Oriented(np.zeros((0, 3)), np.zeros((0, 3)))
-        chosen = rng.choice(len(lengths), size=EDGE_SAMPLES, p=lengths / lengths.sum())
-        along = rng.random((EDGE_SAMPLES, 1))
+        count = 4000
+        chosen = rng.choice(len(lengths), size=count, p=lengths / lengths.sum())
+        along = rng.random((count, 1))
         points = starts[chosen] + along * (ends - starts)[chosen] + by * outwards[chosen]
         return Oriented(points, normals[chosen])
 
@@ -84,7 +80,8 @@ class CadPart:
         outwards /= np.maximum(np.linalg.norm(outwards, axis=1, keepdims=True), 1e-300)
         bend = np.einsum("ni,ni->n", self._plane_normals[here], self._plane_normals[there])
         convex = np.einsum("ni,ni->n", outwards, self._plane_normals[there]) > 0
-        outer = convex & (bend < SHARP)
+        # A face that bends away by so much at an edge ends there
+        outer = convex & (bend < float(np.cos(np.radians(30))))
         return starts[outer], ends[outer], self._plane_normals[here][outer], outwards[outer]
 
     def nearest(self, points: Floats) -> Oriented:

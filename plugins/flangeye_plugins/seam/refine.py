@@ -12,15 +12,8 @@ from flangeye.types import Floats
 from flangeye_plugins.seam.part import CadPart
 from flangeye_plugins.seam.points import Oriented
 
-STILL = 2e-6
-"""Converged when no point of the part moves further than this in an iteration [m]."""
 TUKEY = 4.685
 """Tukey's constant: 95 % efficient on Gaussian residuals."""
-BLOCKS = 10
-"""Blocks the part's diagonal is cut into. Points of one block may share their error, as those of
-a scanner do; blocks are taken as independent."""
-LEAST = 1e-6
-"""Information on a direction below this share of that on the best is rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +62,8 @@ def refine(scan: Oriented, part: CadPart, pose: Floats, reach: float) -> CadFit 
         way = np.abs(step[:3]).max() * part.diagonal / 2 + np.abs(step[3:]).max()
         settled = scale <= 1.05 * noise
         scale = max(noise, scale / 2) if not settled else scale
-        if settled and way < STILL:
+        # No point of the part moves further [m]
+        if settled and way < 2e-6:
             break
     rows = _equations(scan, part, pose, TUKEY * scale)
     return None if rows is None else _result(rows, pose, scale, part)
@@ -157,7 +151,9 @@ def _sandwich(rows: _Rows, weights: Floats, part: CadPart) -> tuple[Floats, int]
     the sums of each block's gradients, so that errors which neighbours share count as shared,
     however the scanner makes them, and a CAD that is not quite the workpiece counts too.
     """
-    keys = np.floor(rows.in_part / (part.diagonal / BLOCKS)).astype(int) @ [10_000, 100, 1]
+    # Points of one block may share their error, as those of a scanner do; blocks are taken as
+    # independent
+    keys = np.floor(rows.in_part / (part.diagonal / 10)).astype(int) @ [10_000, 100, 1]
     _, block = np.unique(keys, return_inverse=True)
     blocks = int(block.max()) + 1
     gradients = np.zeros((blocks, 6))
@@ -180,8 +176,9 @@ def _with_unknown(rows: _Rows, weights: Floats, meat: Floats, size: float) -> Fl
     points = shares.sum(axis=0) ** 2 / np.maximum((shares**2).sum(axis=0), 1e-300)
     # Points that must share in determining a direction: a square of a thirtieth of the diagonal
     fewest_supporting = 40
-    known = (points >= fewest_supporting) & (values > LEAST * values[-1])
-    inverse = np.where(known, 1 / np.maximum(values, LEAST * values[-1]), 0.0)
+    least = 1e-6  # information on a direction below this share of that on the best is rounding
+    known = (points >= fewest_supporting) & (values > least * values[-1])
+    inverse = np.where(known, 1 / np.maximum(values, least * values[-1]), 0.0)
     turned = vectors.T @ (meat * np.outer(units, units)) @ vectors
     covariance = turned * np.outer(inverse, inverse) + np.diag(np.where(known, 0.0, size**2))
     return np.asarray(vectors @ covariance @ vectors.T * np.outer(units, units))

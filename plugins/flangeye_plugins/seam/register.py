@@ -20,10 +20,6 @@ from flangeye_plugins.seam.refine import CadFit, refine
 from flangeye_plugins.seam.search import find_poses
 
 STAGE = "seam.cad"
-COARSE = 80
-"""Voxels along the part's diagonal to search in."""
-QUICK = 4000
-"""Points that candidates are fitted with before the best is fitted with all."""
 WORTH = 0.4
 """Candidates below this share of the best one's score are not."""
 LARGER, FEWEST = 3.0, 300
@@ -81,7 +77,8 @@ def register(
     """
     check_unit(points, part)
     seen = depth_map(points.astype(np.float32))
-    coarse = facing_camera(thinned(points, part.diagonal / COARSE))
+    # Voxels along the part's diagonal to search in
+    coarse = facing_camera(thinned(points, part.diagonal / 80))
     found = find_poses(coarse, part, seen, rng)
     worth = found.scores > WORTH * max(found.scores.max(initial=0.0), 0.0)
     evidence = RayEvidence(part, seam, seen, rng)
@@ -133,7 +130,8 @@ def _fits(
     fits: list[CadFit] = []
     for pose in poses:
         around = _around(points, part, pose)
-        few = around.take(rng.permutation(len(around))[:QUICK])
+        # Candidates are fitted with so many points before the best is fitted with all
+        few = around.take(rng.permutation(len(around))[:4000])
         # How far off a candidate may be, as a share of the diagonal
         reach = 0.05
         quick = refine(few, part, pose, reach * part.diagonal)

@@ -13,13 +13,6 @@ from flangeye.types import Floats
 from flangeye_plugins.seam.planned import resampled
 from flangeye_plugins.seam.template import EDGES, FACES, OFFSETS, JointShape, Section
 
-SLAB = 10e-3
-"""Along the line [m]: a rough line that is 3 deg askew smears an edge by half a millimetre."""
-LINES, TRIED, MOST = 6, 150, 700
-"""Lines of a slab, hypotheses of each, and points that are looked at."""
-ALIKE_LINE = np.cos(np.radians(25))
-KEPT = 6
-"""Places in a slab that are followed on to the next."""
 BESIDE = 2e-3
 """Standard deviation of a rough line's error from one slab to the next [m]."""
 
@@ -56,19 +49,21 @@ def rough_path(
         tolerance: Largest distance from a surface [m].
         reach: Largest distance of the seam from the rough line [m].
     """
-    slabs = (local[:, 0] // SLAB).astype(int)
+    # Along the line [m]: a rough line that is 3 deg askew smears an edge by half a millimetre
+    slab = 10e-3
+    slabs = (local[:, 0] // slab).astype(int)
     order = np.argsort(slabs, kind="stable")
     bounds = np.searchsorted(slabs[order], np.arange(slabs.max() + 2))
     spots: list[list[JointPlace]] = []
     for k in range(slabs.max() + 1):
         at = order[bounds[k] : bounds[k + 1]]
-        at = at[:: max(1, len(at) // MOST)]
+        at = at[:: max(1, len(at) // 700)]
         q, normal = local[at, 1:3], normals[at]
         lines = list(_lines(q, normal, tolerance))
         found = [
             place
             for joint in joints
-            for place in _places((k + 0.5) * SLAB, q, lines, joint, tolerance, reach)
+            for place in _places((k + 0.5) * slab, q, lines, joint, tolerance, reach)
         ]
         spots.append(_apart(found))
     return _ways(spots)
@@ -79,13 +74,15 @@ def _lines(q: Floats, normals: Floats, tolerance: float) -> Iterator[Line]:
     flat = normals[:, 1:]
     size = np.linalg.norm(flat, axis=1)
     q, flat = q[size > 0.8], flat[size > 0.8] / size[size > 0.8, None]
-    for _ in range(LINES):
+    alike = np.cos(np.radians(25))
+    for _ in range(6):
         if len(q) < 12:
             return
-        tried = slice(None, None, max(1, len(q) // TRIED))
+        # Hypotheses of each line
+        tried = slice(None, None, max(1, len(q) // 150))
         offsets = np.einsum("ni,ni->n", flat[tried], q[tried])
         on = np.abs(flat[tried] @ q.T - offsets[:, None]) < tolerance
-        on &= flat[tried] @ flat.T > ALIKE_LINE
+        on &= flat[tried] @ flat.T > alike
         best = on[on.sum(axis=1).argmax()]
         middle = q[best].mean(axis=0)
         spread, axes = np.linalg.eigh(np.cov((q[best] - middle).T))
@@ -96,7 +93,7 @@ def _lines(q: Floats, normals: Floats, tolerance: float) -> Iterator[Line]:
         normal = axes[:, 0] * np.sign(axes[:, 0] @ flat[best].mean(axis=0))
         away = q @ normal - normal @ middle
         yield Line(float(np.arctan2(*normal)), float(normal @ middle), q[np.abs(away) < tolerance])
-        left = (np.abs(away) > tolerance) | (flat @ normal < ALIKE_LINE)
+        left = (np.abs(away) > tolerance) | (flat @ normal < alike)
         q, flat = q[left], flat[left]
 
 
@@ -209,7 +206,8 @@ def _apart(places: list[JointPlace]) -> list[JointPlace]:
     for place in sorted(places, key=lambda p: -p.score):
         if all(np.linalg.norm(place.q - other.q) > BESIDE for other in kept):
             kept.append(place)
-        if len(kept) == KEPT:
+        # Places that are followed on to the next slab
+        if len(kept) == 6:
             break
     return kept
 

@@ -19,23 +19,8 @@ from flangeye_plugins.seam.points import Oriented, spread_over_normals
 
 Ints = NDArray[np.intp]
 
-POINTS = 700
-"""Oriented points that pairs are made of, on the scan and on the CAD."""
-MATCHES = 16
-"""Pairs of the CAD that are tried for a pair of the scan."""
-DISTANCE_BINS, ANGLE_BIN = 40, float(np.radians(12))
-FIRST_LOOK, SECOND_LOOK = 100, 1000
-"""Samples of the CAD a pose is judged by, at first and for the best."""
 TOLERANCE = 0.02
 """How far the scan may be from a pose of the part, along a ray, as a share of the diagonal."""
-KEPT = 40
-"""Candidates that go on."""
-NEAR_TURN, NEAR_SHIFT = float(np.radians(6)), 0.03
-"""Two poses are one when they differ by less: in angle, and in place as a share of the diagonal."""
-CHUNK = 400_000
-"""Points that are looked at at once."""
-FACING = 0.3
-"""Cosine of the steepest incidence at which a surface is expected to be seen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,11 +69,14 @@ def find_poses(
     """
     size = part.diagonal
     model = model_of(part, rng, 1.5 * TOLERANCE * size)
-    spread = spread_over_normals(scan, POINTS, rng)
-    poses = _hypotheses(spread, spread_over_normals(model.surface, POINTS, rng), size, rng)
-    scores = agreement(poses, model.thinned(FIRST_LOOK, rng), seen, TOLERANCE * size)
+    points = 700  # that pairs are made of, on the scan and on the CAD
+    spread = spread_over_normals(scan, points, rng)
+    poses = _hypotheses(spread, spread_over_normals(model.surface, points, rng), size, rng)
+    # Samples of the CAD a pose is judged by, at first
+    scores = agreement(poses, model.thinned(100, rng), seen, TOLERANCE * size)
     poses = poses[_distinct(Candidates(poses, scores), size)]
-    scores = agreement(poses, model.thinned(SECOND_LOOK, rng), seen, TOLERANCE * size)
+    # And for the best
+    scores = agreement(poses, model.thinned(1000, rng), seen, TOLERANCE * size)
     order = np.argsort(-scores, kind="stable")
     return Candidates(poses[order], scores[order])
 
@@ -113,7 +101,8 @@ def shares(
     """Return (K,) shares of the surface towards the scanner that were seen, and refuted."""
     if not len(surface):
         return np.zeros(len(poses)), np.zeros(len(poses))
-    chunk = max(1, CHUNK // len(surface))
+    # Points that are looked at at once
+    chunk = max(1, 400_000 // len(surface))
     parts = [
         _shares(poses[i : i + chunk].astype(np.float32), surface, seen, tolerance)
         for i in range(0, len(poses), chunk)
@@ -129,7 +118,8 @@ def _shares(
     points = surface.points.astype(np.float32) @ turns + poses[:, None, :3, 3]
     normals = surface.normals.astype(np.float32) @ turns
     lengths = np.linalg.norm(points, axis=2)
-    facing = -np.einsum("kmi,kmi->km", points, normals) > FACING * lengths
+    # The steepest incidence at which a surface is expected to be seen
+    facing = -np.einsum("kmi,kmi->km", points, normals) > 0.3 * lengths
     # What looks away is put where no ray goes.
     points[~facing] = [1e3, 0.0, 1.0]
     near, through = seen.evidence(points, tolerance)
@@ -182,7 +172,7 @@ def _features(surface: Oriented, i: Ints, j: Ints) -> tuple[Floats, Floats]:
 
 def _keys(surface: Oriented, i: Ints, j: Ints, size: float) -> Ints:
     length, angles = _features(surface, i, j)
-    bins = np.column_stack([length / size * DISTANCE_BINS, angles / ANGLE_BIN]).astype(int)
+    bins = np.column_stack([length / size * 40, angles / float(np.radians(12))]).astype(int)
     return np.asarray(bins @ [1_000_000, 10_000, 100, 1])
 
 
@@ -191,7 +181,8 @@ def _alike(scan: Ints, model: Ints, rng: np.random.Generator) -> tuple[Ints, Int
     order = rng.permutation(len(model))
     order = order[np.argsort(model[order], kind="stable")]
     start = np.searchsorted(model[order], scan, "left")
-    count = np.minimum(np.searchsorted(model[order], scan, "right") - start, MATCHES)
+    # Pairs of the CAD that are tried for a pair of the scan
+    count = np.minimum(np.searchsorted(model[order], scan, "right") - start, 16)
     first = np.repeat(np.arange(len(scan)), count)
     within = np.arange(len(first)) - np.repeat(np.cumsum(count) - count, count)
     return first, order[np.repeat(start, count) + within]
@@ -224,7 +215,7 @@ def _distinct(found: Candidates, size: float) -> Ints:
     """Return the indices of the best of each group of poses that are nearly one, best first."""
     order = np.argsort(-found.scores, kind="stable")
     kept: list[int] = []
-    while len(order) and len(kept) < KEPT:
+    while len(order) and len(kept) < 40:
         best = order[0]
         kept.append(int(best))
         order = order[~_near(found.poses[best], found.poses[order], size)]
@@ -234,4 +225,5 @@ def _distinct(found: Candidates, size: float) -> Ints:
 def _near(pose: Floats, others: Floats, size: float) -> NDArray[np.bool_]:
     traces = np.einsum("ij,kij->k", pose[:3, :3], others[:, :3, :3])
     shifts = np.linalg.norm(others[:, :3, 3] - pose[:3, 3], axis=1)
-    return np.asarray((traces > 1 + 2 * np.cos(NEAR_TURN)) & (shifts < NEAR_SHIFT * size))
+    # One pose, where they differ by less in angle, and in place as a share of the diagonal
+    return np.asarray((traces > 1 + 2 * np.cos(float(np.radians(6)))) & (shifts < 0.03 * size))

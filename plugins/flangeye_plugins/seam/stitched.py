@@ -33,11 +33,6 @@ from flangeye.types import (
 from flangeye_plugins.seam.planned import scanner_covariance
 from flangeye_plugins.seam.points import facing_camera, thinned
 
-CELL = 3e-3
-"""Clouds are thinned to this before they are compared with each other [m]."""
-SAME = 10e-3
-"""Points of two clouds so near to each other may show the same face [m]."""
-
 
 class OfPose(Protocol):
     """What calibration and arm do to points that were mapped to the base."""
@@ -122,7 +117,8 @@ def seen_in_base(
     split = np.split(points, ends[:-1])
     seen = [s.apply(cloud) for s, cloud in zip(stands, split, strict=True)]
     middle = stands[len(stands) // 2]
-    shown = [thinned(cloud, CELL) for cloud in seen]
+    # Clouds are thinned before they are compared with each other [m]
+    shown = [thinned(cloud, 3e-3) for cloud in seen]
     of_pose = _AsSeveral(scan.places, answer, robot, shown)
     back = middle.inverse()
     eyes = back.apply(np.array([stand.translation for stand in stands]))
@@ -204,7 +200,8 @@ def _apart(clouds: Sequence[Floats]) -> float | None:
     found = []
     for first, second in pairwise(clouds):
         surface = facing_camera(first)
-        away, at = cKDTree(first).query(second, distance_upper_bound=SAME)
+        # Points so near to each other may show the same face [m]
+        away, at = cKDTree(first).query(second, distance_upper_bound=10e-3)
         both = np.isfinite(away)
         # Points that two clouds share, for their agreement to be known
         fewest_shared = 200

@@ -17,15 +17,8 @@ from flangeye.types import Floats, Indices
 from flangeye_plugins.seam.rough import JointPlace, turn
 from flangeye_plugins.seam.template import OFFSETS, Section
 
-BEND = np.array([1e-3, 1e-3, 0.05])
-"""Standard deviations of second differences of coefficients: across, out [m], and roll [rad]."""
 WIDE = 18e-3
 """From a face's end, what of it takes part [m]: plates are flat so far."""
-GRAZING = 0.14
-"""Sine of the angle to the line of sight below which a surface is not seen: 8 deg. Pixels that see
-both sides of a jump in depth look like one."""
-BLOCK = 5e-3
-"""Points so near along the seam may share their error [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +158,9 @@ def _step(
     tukey = 4.685
     weight = np.maximum(1 - (residual / (tukey * size)) ** 2, 0.0) ** 2
     sight = np.einsum("ni,ni->n", swept.section.normals[which], turn(points[:, 3:], line[:, 2]))
-    usable = _usable(swept.section, q, pitch) & (sight > GRAZING)
+    # Sine of 8 deg to the line of sight: pixels that see both sides of a jump in depth look
+    # like a surface
+    usable = _usable(swept.section, q, pitch) & (sight > 0.14)
     weight[:first][~usable[:first]] = 0.0
     used = weight > 0
     on = np.abs(residual[:first][used[:first]])
@@ -215,9 +210,12 @@ def _prior(swept: Swept) -> tuple[Floats, Floats]:
     m, free = len(values), joint.free
     size = 3 * m + int(free.sum())
     normal, present = np.zeros((size, size)), np.zeros(size)
+    # Standard deviations of second differences of coefficients: across, out [m], and roll
+    # [rad]
+    bend = np.array([1e-3, 1e-3, 0.05])
     for k in range(3):
         at = slice(k * m, (k + 1) * m)
-        normal[at, at] = bends.T @ bends / BEND[k] ** 2 + 1e-6 * np.eye(m)
+        normal[at, at] = bends.T @ bends / bend[k] ** 2 + 1e-6 * np.eye(m)
         present[at] = values[:, k]
     spread = np.concatenate([np.radians(joint.spread), np.ones(3)])[free]
     normal[3 * m :, 3 * m :] = np.diag(spread**-2.0)
@@ -237,6 +235,7 @@ def _moved(swept: Swept, step: Floats) -> Swept:
 
 def _shared(s: Floats, which: Any, scores: Floats) -> float:
     """Return by how much neighbours' errors, which are alike, raise the variance."""
-    blocks = (s / BLOCK).astype(int) * 4 + which
+    # Points so near along the seam may share their error [m]
+    blocks = (s / 5e-3).astype(int) * 4 + which
     sums = np.bincount(blocks, scores)
     return max(float((sums**2).sum() / max((scores**2).sum(), 1e-300)), 1.0)

@@ -35,15 +35,6 @@ FIRM = 0.004
 """Largest standard deviation of what a scan shows least of a body, in its sizes or radians: what
 fits by chance is seldom held in all directions."""
 
-WIDEST = 1.75
-"""Tangent of 60 degrees: no scanner sees farther to the side, stray points do."""
-
-INCH = 25.4
-"""Millimetres of an inch."""
-
-ALL = 6
-"""Freedoms of a pose; a round body shows fewer."""
-
 
 class SegmentBodyParams(Params):
     """Parameters of ``segment.body``."""
@@ -95,7 +86,8 @@ def segment_body(
         return Rejected("no point between near and far")
     looks = prepared(body)
     shape = looks.shape
-    if looks.freedoms < ALL:
+    # A round body shows fewer freedoms
+    if looks.freedoms < 6:
         raise StageError(
             f"{body.name}: it looks the same however it is turned about an axis, so that a scan "
             "does not show its pose; segment.sphere finds a ball"
@@ -118,7 +110,8 @@ def segment_body(
 
 def _between(points: Singles, near: float, far: float) -> Singles:
     z = points[:, 2]
-    inside = (z > near) & (z < far) & (np.abs(points[:, :2]) < WIDEST * z[:, None]).all(axis=1)
+    # Tangent of 60 degrees: no scanner sees farther to the side, stray points do
+    inside = (z > near) & (z < far) & (np.abs(points[:, :2]) < 1.75 * z[:, None]).all(axis=1)
     return points[inside]
 
 
@@ -184,7 +177,7 @@ def _otherwise(body: TargetBody) -> list[tuple[str, str, TargetBody]]:
             replace(body, vertices=body.vertices * [-1.0, 1.0, 1.0]),
         )
     ]
-    for scale, units in ((INCH, "millimetres for inches"), (10.0, "millimetres for centimetres")):
+    for scale, units in ((25.4, "millimetres for inches"), (10.0, "millimetres for centimetres")):
         for times, size in ((scale, "small"), (1 / scale, "large")):
             if SMALLEST <= times * body.size <= LARGEST:
                 what = f"{scale:g} times too {size}, {units} or the reverse"

@@ -15,13 +15,6 @@ from flangeye_plugins.segment.grid import Grid
 from flangeye_plugins.segment.parts import PlanarPiece
 
 SECTORS = 48
-ROUNDS, FEWEST = 8, 6
-"""Fits of a circle to an edge, each to the points near the last; points of the edge at least."""
-
-
-PLATE_SHOWS, PLATE_ENDS = (0.5, 0.65), 0.85
-"""Where a plate's face is sure to be within a wrist circle, and where it is sure to have ended,
-in radii of the circle: of the robots known, wrists are 75 to 90 mm across and plates 63."""
 
 
 class DiscLimits(NamedTuple):
@@ -137,8 +130,12 @@ def _missing_plate(disc: Disc, nearby: Floats, flange: Flange) -> str | None:
     around = nearby[np.abs(disc.plane.heights(nearby)) < 2 * flange.details.thickness]
     radius = np.linalg.norm(disc.plane.flatten(around - disc.centre + disc.plane.point), axis=1)
     radius /= flange.rim
-    circle = around[(radius > PLATE_ENDS) & (radius < 1.05)]
-    plate = around[(radius > PLATE_SHOWS[0]) & (radius < PLATE_SHOWS[1])]
+    # Where the plate is sure to have ended
+    circle = around[(radius > 0.85) & (radius < 1.05)]
+    # Where a plate's face is sure to be within a wrist circle, in radii of it: of the robots
+    # known, wrists are 75 to 90 mm across and plates 63
+    shows = (0.5, 0.65)
+    plate = around[(radius > shows[0]) & (radius < shows[1])]
     if len(circle) < 10 or len(plate) < 10:
         return None
     height = np.median(disc.plane.heights(plate)) - np.median(disc.plane.heights(circle))
@@ -210,8 +207,9 @@ def _circle_of(edge: Floats, tolerance: float) -> tuple[Floats, float] | None:
     """Return centre (2,) and radius [m] of the circle by least squares through most of an edge."""
     kept = np.ones(len(edge), dtype=bool)
     centre, radius = np.zeros(2), 0.0
-    for _ in range(ROUNDS):
-        if kept.sum() < FEWEST:
+    # Fits of a circle, each to the points near the last
+    for _ in range(8):
+        if kept.sum() < 6:
             return None
         rows = np.column_stack([2 * edge[kept], np.ones(kept.sum())])
         x, y, square = np.linalg.lstsq(rows, (edge[kept] ** 2).sum(axis=1), rcond=None)[0]

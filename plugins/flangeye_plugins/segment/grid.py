@@ -13,12 +13,6 @@ from numpy.typing import NDArray
 from flangeye.maths.statistics import median
 from flangeye.types import Floats, Indices, Singles
 
-SAMPLE = 50_000
-"""Points that show how dense a scan is."""
-
-WIDEST = 1.75
-"""Tangent of 60 degrees: no scanner sees farther to the side, stray points do."""
-
 
 class Grid(NamedTuple):
     """Points whose neighbours in the array are neighbours in the scanner's view.
@@ -87,8 +81,9 @@ def range_image(points: Singles, pitch: float) -> Grid | None:
     are too sparse to fill them, and hold the mean of their points. Of a scan much denser than
     that only so many points are looked at as fill the cells well.
     """
-    lot = _lots(points) if len(points) > SAMPLE else np.zeros(len(points), dtype=np.uint32)
-    share = min(1.0, SAMPLE / max(len(points), 1))
+    sample = 50_000  # points that show how dense a scan is
+    lot = _lots(points) if len(points) > sample else np.zeros(len(points), dtype=np.uint32)
+    share = min(1.0, sample / max(len(points), 1))
     few = _before_scanner(_drawn(points, lot, share))
     if len(few) == 0:
         share, few = 1.0, _before_scanner(points)
@@ -180,7 +175,8 @@ def project(points: Singles, angle: float) -> Grid:
     # Column by column: three times as fast as a transposed copy.
     x, y, z = (points[:, k].copy() for k in range(3))
     u, v = x / z, y / z
-    inside = (np.abs(u) < WIDEST) & (np.abs(v) < WIDEST)
+    widest = 1.75  # tangent of 60 degrees: no scanner sees farther to the side, stray points do
+    inside = (np.abs(u) < widest) & (np.abs(v) < widest)
     if not inside.all():
         x, y, z, u, v = (values[inside] for values in (x, y, z, u, v))
     if len(z) == 0:

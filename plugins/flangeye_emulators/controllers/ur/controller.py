@@ -265,13 +265,11 @@ class ControlBox:
         return 1.0 / self.rate
 
 
-E_SERIES = ControlBox((5, 21, 3, 1), 500)
-CB3 = ControlBox((3, 15, 8, 1), 125)
-
-
 def control_box_of(robot: RobotModel) -> ControlBox:
     """Return the control box of an arm: e-Series where the model's name ends in ``e``."""
-    return E_SERIES if robot.model.endswith("e") else CB3
+    if robot.model.endswith("e"):
+        return ControlBox((5, 21, 3, 1), 500)
+    return ControlBox((3, 15, 8, 1), 125)
 
 
 def joint_speeds_of(robot: RobotModel) -> NDArray[np.float64]:

@@ -17,15 +17,12 @@ from flangeye_emulators.controllers.ur.program import Program, Thread
 CONTROL_SCRIPT = "rtde_control"
 """Name of the program that ur_rtde uploads to take its commands."""
 
-_BEGINS = re.compile(r"^def (\w+)\(\):", re.M)
-_ENDS = re.compile(r"\nend[ \t]*(?=\n|$)")
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 
 _MOVE = re.compile(
     rf"\b(move[jlp])\((p?)\[([^\]]+)\]((?:,\s*[avr]={_NUMBER})*)\)",
 )
 _OPTION = re.compile(rf"([avr])=({_NUMBER})")
-_OFFSET = re.compile(r"reg_offset_int = # int register offset\s*(\d+)")
 
 
 class ControlScript(Program):
@@ -165,8 +162,8 @@ class ScriptSource(NamedTuple):
 
 def take_program(text: str) -> tuple[ScriptSource | None, str]:
     """Return the first whole program in ``text``, if there is one, and what comes after it."""
-    begins = _BEGINS.search(text)
-    ends = _ENDS.search(text, begins.end()) if begins else None
+    begins = re.search(r"^def (\w+)\(\):", text, flags=re.M)
+    ends = re.search(r"\nend[ \t]*(?=\n|$)", text, begins.end()) if begins else None
     if begins is None or ends is None:
         return None, text
     return ScriptSource(begins[1], text[begins.start() : ends.end()]), text[ends.end() :]
@@ -174,7 +171,7 @@ def take_program(text: str) -> tuple[ScriptSource | None, str]:
 
 def register_offset(program: str) -> int:
     """Return the first register the control script uses: 0, or 24."""
-    found = _OFFSET.search(program)
+    found = re.search(r"reg_offset_int = # int register offset\s*(\d+)", program)
     return int(found[1]) if found else 0
 
 

@@ -33,7 +33,6 @@ from flangeye_emulators.controllers.ur.script import (
 )
 
 PORT = 29999
-SERIAL_NUMBER = "20245500001"
 PROGRAM_NAME = "loopback.urp"
 
 Answer = Callable[[URController, str], str]
@@ -99,7 +98,7 @@ def _version(box: URController) -> str:
 
 ANSWERS: dict[str, Answer] = {
     "polyscopeversion": _telling(_version),
-    "get serial number": _telling(lambda box: SERIAL_NUMBER),
+    "get serial number": _telling(lambda box: "20245500001"),
     "get robot model": _telling(lambda box: dashboard_name_of(box.robot)),
     "is in remote control": _telling(lambda box: str(box.remote_control).lower()),
     "running": _telling(
@@ -130,9 +129,6 @@ ANSWERS: dict[str, Answer] = {
 
 
 READY, DONE = 1, 2
-SCRIPT_PORT = 30003
-_CALL = re.compile(r"(\w+)\((.*)\)")
-_NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
 
 
 class URFaultInjector(FaultInjector):
@@ -245,9 +241,10 @@ def serve(options: EmulatorOptions) -> None:
     box = URController(options.robot, starting_joints(options.robot, options.joints), zeros)
     network = Network(options.host)
     stream = rtde.RtdePort(network, box)
-    network.offer(SCRIPT_PORT, lambda: ScriptSession(network, box))
+    script = 30003
+    network.offer(script, lambda: ScriptSession(network, box))
     network.offer(server.PORT, lambda: server.DashboardSession(network, box))
-    ports = {"RTDE": rtde.PORT, "script": SCRIPT_PORT, "dashboard": server.PORT}
+    ports = {"RTDE": rtde.PORT, "script": script, "dashboard": server.PORT}
     run_server(Server(options, box, network, URFaultInjector(box, network), ports), stream.publish)
 
 
@@ -268,10 +265,12 @@ class CustomProgram(Program):
             if move is not None:
                 yield from self.complete(lambda move=move: travel(self.arm, [move]))  # type: ignore[misc]
                 continue
-            call = _CALL.fullmatch(line)
+            call = re.fullmatch(r"(\w+)\((.*)\)", line)
             if call is None or call[1] not in CALLS:
                 raise ProgramError(f"'{line}' is not simulated")
-            numbers = [float(number) for number in _NUMBER.findall(call[2])]
+            numbers = [
+                float(number) for number in re.findall(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?", call[2])
+            ]
             thread = CALLS[call[1]](self, numbers)
             if thread is not None:
                 yield from thread

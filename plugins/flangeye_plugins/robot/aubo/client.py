@@ -11,18 +11,6 @@ import numpy as np
 from flangeye.devices import SILENT, DeviceError
 from flangeye.types import Floats
 
-PORT = 30004
-
-CODES = {
-    1: "the controller is not in a state for it",
-    2: "its queue is full",
-    3: "it is busy",
-    4: "it took too long",
-    5: "a number is not acceptable",
-    8: "this account may not do it",
-}
-"""Return values of commands (AuboErrorCodes), those that a move can meet."""
-
 T = TypeVar("T")
 
 
@@ -72,9 +60,10 @@ class AuboClient:
         self._rpc = sdk.RpcClient()
         self._rpc.setLogHandler(_say_nothing)
         self._rpc.setRequestTimeout(round(1e3 * ANSWER))
-        if self.ask("connect", lambda: self._rpc.connect(host, PORT)) != 0:
+        port = 30004
+        if self.ask("connect", lambda: self._rpc.connect(host, port)) != 0:
             raise DeviceError(
-                f"{name}: nothing answers at {host}:{PORT}: is the controller on, is {host} its "
+                f"{name}: nothing answers at {host}:{port}: is the controller on, is {host} its "
                 "address, is this computer in its network?"
             )
         self.ask("login", lambda: self._rpc.login(user, password))
@@ -115,7 +104,15 @@ class AuboClient:
         """
         code = self.ask(what, order)
         if code != 0:
-            why = CODES.get(abs(code), f"return value {code}")
+            # AuboErrorCodes, those that a move can meet
+            why = {
+                1: "the controller is not in a state for it",
+                2: "its queue is full",
+                3: "it is busy",
+                4: "it took too long",
+                5: "a number is not acceptable",
+                8: "this account may not do it",
+            }.get(abs(code), f"return value {code}")
             raise DeviceError(f"{self._name}: {what}: not done: {why}")
 
     def close(self) -> None:

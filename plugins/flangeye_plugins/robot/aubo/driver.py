@@ -28,14 +28,6 @@ from flangeye_plugins.robot.tool_check import (
 POSE = CONVENTIONS["rpy"]
 """The interface's poses: (x, y, z, rx, ry, rz) [m, rad], turned about fixed axes."""
 
-SHOWN = POSE.in_units("mm", "deg")
-
-STALE = 0.1
-"""Reading the arm takes a millisecond; where it takes longer than this, the network is lost [s]."""
-
-
-STOP = 4.0
-"""Deceleration of a stop [m/s^2, rad/s^2]."""
 
 SAFETY: dict[str, tuple[Mode, str]] = {
     "Recovery": ("not ready", "the arm is outside its safety limits: move it back"),
@@ -83,7 +75,9 @@ def robot_aubo(model: RobotModel, params: AuboParams, reads_only: bool = False) 
     client = AuboClient(sdk, name, params.host, params.user, params.password)
     try:
         robot = AuboRobot(name, client, reads_only)
-        require_tool(name, "aubo", robot.offset, params.tool.flange_T_tool(POSE), SHOWN)
+        require_tool(
+            name, "aubo", robot.offset, params.tool.flange_T_tool(POSE), POSE.in_units("mm", "deg")
+        )
         state = robot.state()
         require_model(name, state, model)
         if state.message and not reads_only:
@@ -127,11 +121,14 @@ class AuboRobot(Device):
         It is read once more where this computer was too busy to read it at one time.
         """
         state, took = self._read()
-        if took > STALE:
+        # Reading the arm takes a millisecond; where it takes longer than this [s], the
+        # network is lost
+        stale = 0.1
+        if took > stale:
             state, took = self._read()
-        if took > STALE:
+        if took > stale:
             raise DeviceError(
-                f"{self.name}: reading it took {took:.2f} s, at most {STALE} s are allowed: the "
+                f"{self.name}: reading it took {took:.2f} s, at most {stale} s are allowed: the "
                 "network is slow"
             )
         if self._ride is None:
@@ -227,10 +224,11 @@ class AuboRobot(Device):
 
     def _brake(self) -> None:
         motion = self._client.motion
+        stop = 4.0  # deceleration [m/s^2, rad/s^2]
         if self._in_joints:
-            self._client.command("stop", lambda: motion.stopJoint(STOP))
+            self._client.command("stop", lambda: motion.stopJoint(stop))
         else:
-            self._client.command("stop", lambda: motion.stopLine(STOP, STOP))
+            self._client.command("stop", lambda: motion.stopLine(stop, stop))
 
     def close(self) -> None:
         """Stop the arm and let go of the connection."""

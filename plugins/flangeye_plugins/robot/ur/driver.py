@@ -30,21 +30,10 @@ from flangeye_plugins.robot.ur.worker import ask_dashboard, read_remote
 PATIENCE = 0.5
 """Longest wait for one answer [s]."""
 
-ROUND_TRIP = 0.08
-"""Longest way to the controller and back [s]: connecting takes twenty-five of them, and who is told
-so late cannot stop an arm in time."""
-
-QUESTIONS = ("PolyscopeVersion", "safetymode", "robotmode", "is in remote control")
-
-_VERSION = re.compile(r"(\d+)\.\d+")
 
 RUNNING = 7
-NORMAL, REDUCED = 1, 2
 REMOTE = "it is in local control: choose Remote Control at the top right of the pendant"
 
-PROGRAM = (
-    "its program was stopped, at the pendant or by the watchdog after a silence: open it again"
-)
 POWER = "the arm has no power or its brakes are on: switch it on at the pendant"
 
 SAFETY: dict[int, tuple[Mode, str]] = {
@@ -94,7 +83,8 @@ def facts_of(name: str, host: str, to_drive: bool = True) -> DashboardFacts:
     """
     try:
         with ask_dashboard(host, PATIENCE) as ask:
-            said, trips = zip(*(_timed(ask, question) for question in QUESTIONS), strict=True)
+            asked = ("PolyscopeVersion", "safetymode", "robotmode", "is in remote control")
+            said, trips = zip(*(_timed(ask, question) for question in asked), strict=True)
     except OSError as error:
         raise DeviceError(
             f"{name}: its dashboard server does not answer ({_reason(error)}): is the controller "
@@ -105,7 +95,7 @@ def facts_of(name: str, host: str, to_drive: bool = True) -> DashboardFacts:
     trouble = _trouble(safety.rpartition(" ")[2], power.rpartition(" ")[2], remote, min(trips))
     if trouble and to_drive:
         raise DeviceError(f"{name}: {trouble}")
-    found = _VERSION.search(version)
+    found = re.search(r"(\d+)\.\d+", version)
     # CB3 controllers (version 3) have cycles of 8 ms, all later ones of 2 ms.
     return DashboardFacts(version, 0.008 if found and int(found[1]) < 5 else 0.002)
 
@@ -132,9 +122,12 @@ def _trouble(safety: str, power: str, remote: str, trip: float) -> str:
         return POWER
     if read_remote(remote) == 0:
         return REMOTE
-    if trip > ROUND_TRIP:
+    # Way to the controller and back [s]: connecting takes twenty-five of them, and who is told
+    # so late cannot stop an arm in time
+    longest = 0.08
+    if trip > longest:
         return (
-            f"the network takes {trip * 1e3:.0f} ms to it and back, at most {ROUND_TRIP * 1e3:.0f} "
+            f"the network takes {trip * 1e3:.0f} ms to it and back, at most {longest * 1e3:.0f} "
             "ms are allowed: connect it by cable, to a switch of its own"
         )
     return ""
@@ -165,7 +158,8 @@ def condition_of(sample: CycleSample, commanded: bool) -> Condition:
         sample: The newest one.
         commanded: Whether a command was given that the sample does not know of.
     """
-    if sample.safety_mode not in (NORMAL, REDUCED):
+    # NORMAL and REDUCED (RTDE guide)
+    if sample.safety_mode not in (1, 2):
         unknown: tuple[Mode, str] = ("not ready", f"safety mode {sample.safety_mode}")
         return Condition(*SAFETY.get(sample.safety_mode, unknown))
     if sample.robot_mode != RUNNING:
@@ -173,7 +167,11 @@ def condition_of(sample: CycleSample, commanded: bool) -> Condition:
     if sample.remote == 0:
         return Condition("not ready", REMOTE)
     if sample.runtime != 2:
-        return Condition("not ready", PROGRAM)
+        return Condition(
+            "not ready",
+            "its program was stopped, at the pendant or by the watchdog after a silence: open it "
+            "again",
+        )
     # A joint that is slower than this stands [rad/s]; a standing arm's noise is half of it
     moves = commanded or sample.busy or bool(np.abs(sample.joint_speeds).max() > 2e-3)
     return Condition("moving" if moves else "ready")

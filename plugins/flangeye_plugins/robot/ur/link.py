@@ -22,9 +22,6 @@ from flangeye.files.processes import python_command
 from flangeye.types import Floats
 from flangeye_plugins.robot.ur import worker
 
-VECTORS = worker.SAMPLE.size - 4 * 6 * 8
-"""Where a sample's vectors begin."""
-
 LEAVING = 0.6
 """Longest time until the process has ended by itself [s]."""
 
@@ -189,7 +186,8 @@ def _sample_of(body: bytes) -> CycleSample | None:
     number, time_ns, *modes = worker.SAMPLE.unpack(body)[:7]
     if not number:
         return None
-    joints, speeds, pose, force = np.frombuffer(body, dtype="<f8", offset=VECTORS).reshape(4, 6)
+    at = worker.SAMPLE.size - 4 * 6 * 8  # where a sample's vectors begin
+    joints, speeds, pose, force = np.frombuffer(body, dtype="<f8", offset=at).reshape(4, 6)
     robot_mode, safety_mode, runtime, remote, busy = modes
     return CycleSample(
         number, time_ns, robot_mode, safety_mode, runtime, remote, bool(busy),

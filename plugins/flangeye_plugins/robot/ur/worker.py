@@ -48,10 +48,6 @@ SILENT = 0.15
 """A motion ends when nobody looked for so long [s]; :data:`flangeye.devices.SILENT`."""
 
 
-ASKING = 0.2
-"""Between two questions whether the control is remote [s]."""
-
-
 class WorkerRefused(Exception):
     """The library or the controller did not do what it was asked."""
 
@@ -257,12 +253,13 @@ class RemoteControl(threading.Thread):
 
     def run(self) -> None:
         """Ask for ever, through a new connection when the old one fails."""
+        asking = 0.2  # between two questions whether the control is remote [s]
         while True:
             with contextlib.suppress(OSError), ask_dashboard(self._host) as ask:
                 while True:
                     self._commander.remote = read_remote(ask("is in remote control"))
-                    time.sleep(ASKING)
-            time.sleep(ASKING)
+                    time.sleep(asking)
+            time.sleep(asking)
 
 
 @contextlib.contextmanager

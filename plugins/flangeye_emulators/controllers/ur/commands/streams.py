@@ -18,9 +18,6 @@ if TYPE_CHECKING:
     from flangeye_emulators.controllers.ur.script import ControlScript
 
 
-TOOL_FEATURE, CUSTOM_FEATURE = 1, 2
-
-
 def order_speed(script: ControlScript, in_space: bool) -> None:
     """9 and 10, speedJ and speedL: hand the order to the speed thread.
 
@@ -97,9 +94,11 @@ def start_jog(script: ControlScript) -> None:
     """41, jogStart: a velocity along the axes that the base, the tool or a frame has now."""
     feature = round(script.number(6))
     axes = np.eye(3)
-    if feature == TOOL_FEATURE:
+    # The tool's frame
+    if feature == 1:
         axes = script.arm.stance.base_T_tcp[:3, :3]
-    elif feature == CUSTOM_FEATURE:
+    # A frame of the caller's
+    elif feature == 2:
         axes = rotation_matrix(script.numbers(11, 3))
     elif feature != 0:
         raise ProgramError(f"jog feature {feature} is unknown")

@@ -18,18 +18,12 @@ if TYPE_CHECKING:
     from flangeye_emulators.controllers.ur.script import ControlScript
 
 
-BACK_SPEED, BACK_ACCELERATION = 0.25, 1.2
-
-
-PLAIN_FRAME = 2
-"""Force mode type: the frame is taken as it is given."""
-
-
 def force_mode(script: ControlScript) -> None:
     """6, forceMode: give way along axes of a frame that is fixed in the base."""
     kind = script.integer(1)
-    if kind != PLAIN_FRAME:
-        raise ProgramError(f"force mode type {kind} is not simulated; {PLAIN_FRAME} is")
+    plain = 2  # the frame is taken as it is given
+    if kind != plain:
+        raise ProgramError(f"force mode type {kind} is not simulated; {plain} is")
     script.orders.force = ForceMode(
         base_R_task=rotation_matrix(script.numbers(3, 3)),
         compliant=np.array([script.integer(2 + i) != 0 for i in range(6)]),
@@ -118,7 +112,8 @@ def go_back_to_contact(script: ControlScript, steps: int) -> Thread:
     contact = arm.chain.stance(joints).base_T_tcp
     # Deceleration after a contact [m/s^2], and how the tool goes back to it: the script's numbers
     yield from script.stop_in_space(3.0)
-    yield from script.complete(lambda: to_pose(arm, contact, BACK_SPEED, BACK_ACCELERATION))
+    # [m/s, m/s^2]
+    yield from script.complete(lambda: to_pose(arm, contact, 0.25, 1.2))
 
 
 INTERNAL_CONTACT = 254
