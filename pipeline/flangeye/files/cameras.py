@@ -30,27 +30,10 @@ DISTORTIONS = (
     "dist", "coeffs", "d", "d1",
 )  # fmt: skip
 """Names of the distortion; other names that begin with ``dist`` follow them."""
-PINHOLE = (
-    ("fx", "fy", "cx", "cy"), ("fx", "fy", "ppx", "ppy"), ("fl_x", "fl_y", "cx", "cy"),
-)  # fmt: skip
-"""Names of the matrix's entries one by one, the second of RealSense, the third of nerfstudio."""
 ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """OpenCV's coefficients."""
 LABELLED = (".txt", ".csv", ".ini", ".cfg", ".toml")
 """Endings of texts with a matrix alone, or with numbers behind labels."""
-COLMAP: Mapping[str, tuple[str, ...]] = {
-    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
-    "PINHOLE": ("fx", "fy", "cx", "cy"),
-    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
-    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
-    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
-    "FULL_OPENCV": ("fx", "fy", "cx", "cy", *ORDER),
-}
-"""Parameters of COLMAP's models that are OpenCV's (COLMAP, camera models)."""
-CORNER = 0.5
-"""In COLMAP the centre of the first pixel is at this [px]; in OpenCV at 0."""
-OTHER_LENSES = ("equidistant", "fisheye", "kannala", "fov", "inverse", "omni", "ds", "eucm")
-"""In the name of a model whose coefficients are not OpenCV's."""
 
 
 class CameraFile(NamedTuple):
@@ -178,7 +161,12 @@ def _mappings(data: Any) -> Iterator[dict[str, Any]]:
 
 
 def _matrix(values: Mapping[str, Any]) -> Floats | None:
-    for names in PINHOLE:
+    # One by one, the second as RealSense names them, the third as nerfstudio does
+    for names in (
+        ("fx", "fy", "cx", "cy"),
+        ("fx", "fy", "ppx", "ppy"),
+        ("fl_x", "fl_y", "cx", "cy"),
+    ):
         if all(_is_number(values.get(name)) for name in names):
             return _pinhole(*(float(values[name]) for name in names))
     if (focal := _numbers(values.get("focal_length"))).size == 2:
@@ -220,7 +208,9 @@ def _in_order(values: Mapping[str, Any]) -> list[Any]:
 
 def _require_opencv(path: Path, values: Mapping[str, Any]) -> None:
     named = [str(values.get(name, "")).lower() for name in ("distortion_model", "model")]
-    other = next((name for name in named if any(word in name for word in OTHER_LENSES)), None)
+    # In the name of a model whose coefficients are not OpenCV's
+    words = ("equidistant", "fisheye", "kannala", "fov", "inverse", "omni", "ds", "eucm")
+    other = next((name for name in named if any(word in name for word in words)), None)
     if other and _distortion(values).any():
         raise StageError(
             f"{path}: its lens is of the model {other}, whose coefficients are not OpenCV's; "
@@ -230,17 +220,27 @@ def _require_opencv(path: Path, values: Mapping[str, Any]) -> None:
 
 def _colmap(path: Path, lines: list[str]) -> CameraFile | None:
     """Return the first camera of COLMAP's list: its id, model, width, height, parameters."""
+    # Those of COLMAP's models that are OpenCV's (COLMAP, camera models)
+    known_models = {
+        "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+        "PINHOLE": ("fx", "fy", "cx", "cy"),
+        "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
+        "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+        "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+        "FULL_OPENCV": ("fx", "fy", "cx", "cy", *ORDER),
+    }
+    corner = 0.5  # in COLMAP the centre of the first pixel [px]; in OpenCV it is at 0
     for line in lines:
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
-        names = COLMAP.get(words[1]) if len(words) > 1 else None
+        names = known_models.get(words[1]) if len(words) > 1 else None
         given = words[4:]
         if names is None or len(given) != len(names) or not all(map(_is_number, given)):
             return None
         known = dict(zip(names, map(float, given), strict=True))
         fx, fy = known.get("fx", known.get("f", 0.0)), known.get("fy", known.get("f", 0.0))
-        matrix = _pinhole(fx, fy, known["cx"] - CORNER, known["cy"] - CORNER)
+        matrix = _pinhole(fx, fy, known["cx"] - corner, known["cy"] - corner)
         return _checked(path, matrix, [known[name] for name in ORDER if name in known])
     return None
 

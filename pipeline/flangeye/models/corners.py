@@ -29,9 +29,6 @@ WIDTH = 640
 """Of an image in which other families are looked for [px]: each tries every square in it."""
 
 
-ENDS = 0.12
-"""Share of a side at each end that is left out: there the next side is near."""
-
 ACROSS = 4.0
 """Half the length of the profiles across a side [px]."""
 
@@ -378,7 +375,8 @@ def _edges(grey: NDArray[np.uint8], start: Floats, along: Floats, across: Floats
     """Return where profiles across a side are steepest (N, 2) [px]: the middle of their slope."""
     import cv2
 
-    shares = np.linspace(ENDS, 1 - ENDS, PROFILES)
+    ends = 0.12  # share of a side at each end that is left out: there the next side is near
+    shares = np.linspace(ends, 1 - ends, PROFILES)
     # Grey values along a profile
     steps = np.linspace(-1.0, 1.0, 33)
     places = start + shares[:, None, None] * along + steps[None, :, None] * across

@@ -22,10 +22,8 @@ from flangeye.files.words import reason_of
 from flangeye.files.yaml_lines import MAX_BYTES, parse_yaml
 from flangeye.types import Floats
 
-HDF5 = b"\x89HDF\r\n"
 MATRICES = ((4, 4), (3, 3), (3, 4))
 """Shapes of a pose, of its rotation, and of a pose without its last row."""
-_OPENCV = re.compile(r"\A%YAML[^\n]*\n(?:---[^\n]*\n)?|!!opencv(?:-nd)?-matrix")
 
 
 class TableDocument(NamedTuple):
@@ -74,7 +72,11 @@ def _yaml(file: Path) -> TableDocument:
     text = read_text(file)
     if len(text) > MAX_BYTES:
         raise StageError(f"{file}: is larger than {MAX_BYTES} bytes; write it as .json")
-    text = re.sub(r"\n---\s*\Z", "\n", _OPENCV.sub("", text))
+    text = re.sub(
+        r"\n---\s*\Z",
+        "\n",
+        re.sub(r"\A%YAML[^\n]*\n(?:---[^\n]*\n)?|!!opencv(?:-nd)?-matrix", "", text),
+    )
     # What `ros2 topic echo` prints: a document for each message
     parts = [part for part in re.split(r"^---[ \t]*$", text, flags=re.MULTILINE) if part.strip()]
     try:
@@ -124,7 +126,7 @@ def _matlab(file: Path) -> TableDocument:
     command = python_command(matlab_parser.__file__)
     # Longest .mat file [bytes]
     content = read_regular(file, 1_000_000)
-    if content.startswith(b"MATLAB 7.3") or content.startswith(HDF5):
+    if content.startswith((b"MATLAB 7.3", b"\x89HDF\r\n")):
         raise StageError(
             f"{file}: is a MATLAB 7.3 file (HDF5), which is not read; in MATLAB, write it anew: "
             f"load('{file.name}'); save('{file.name}', '-v7')"

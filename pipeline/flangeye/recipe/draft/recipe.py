@@ -31,11 +31,8 @@ from flangeye.recipe.load import parse_recipe
 
 PLATE = "ISO 9409-1-50-4-M6"
 """What most small arms carry."""
-POSES_LINE = "x_mm,y_mm,z_mm,rx_rad,ry_rad,rz_rad"
 PRINTED = ("charuco", "checkerboard", "circles", "aruco")
 NONE = "none"
-CLOSED = (".parquet", ".feather", ".pkl", ".pickle", ".xlsx", ".xls", ".ods")
-"""Tables that other programs keep; some of them can hold code."""
 
 
 CONVERTED = {
@@ -174,12 +171,14 @@ def _missing(survey: FolderSurvey, reason: StageError) -> str:
     scans = survey.clouds or survey.of(IMAGES)
     if scans:
         column = "cloud" if survey.clouds else "image"
+        line = "x_mm,y_mm,z_mm,rx_rad,ry_rad,rz_rad"
         return (
             f"{survey.folder}: holds {len(scans)} scans, but nothing that says where the flange "
-            f"was; put poses.csv beside them, its first line: {column},{POSES_LINE}; then a line "
+            f"was; put poses.csv beside them, its first line: {column},{line}; then a line "
             f"for each, {scans[0].name},412.1,-33.0,501.7,2.91,0.12,-0.03"
         )
-    closed = survey.of(CLOSED)
+    # Tables that other programs keep; some of them can hold code
+    closed = survey.of((".parquet", ".feather", ".pkl", ".pickle", ".xlsx", ".xls", ".ods"))
     if closed:
         return f"{survey.folder}: {closed[0].name} is a table that is not read; save it as .csv"
     return f"{survey.folder}: holds no scans and no table of poses; {reason}"
