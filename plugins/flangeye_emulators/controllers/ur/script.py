@@ -163,7 +163,8 @@ class ScriptSource(NamedTuple):
 def take_program(text: str) -> tuple[ScriptSource | None, str]:
     """Return the first whole program in ``text``, if there is one, and what comes after it."""
     begins = re.search(r"^def (\w+)\(\):", text, flags=re.M)
-    ends = re.search(r"\nend[ \t]*(?=\n|$)", text, begins.end()) if begins else None
+    end = re.compile(r"\nend[ \t]*(?=\n|$)")
+    ends = end.search(text, begins.end()) if begins else None
     if begins is None or ends is None:
         return None, text
     return ScriptSource(begins[1], text[begins.start() : ends.end()]), text[ends.end() :]
