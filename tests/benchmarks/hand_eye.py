@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from flangeye.estimation.closed import daniilidis, robot_world, separable
+from flangeye.estimation.closed import at_once, separable
 from flangeye.estimation.closed.comanipulation import alternate, random_rotations
 from flangeye.estimation.closed.motions import motions_of
 from flangeye.estimation.sightings import problem_of
@@ -37,9 +37,9 @@ BY_MOTIONS = {
     "park_martin": separable.park_martin,
     "horaud_dornaika": separable.horaud_dornaika,
     "andreff": separable.andreff,
-    "daniilidis": daniilidis.daniilidis,
+    "daniilidis": at_once.daniilidis,
 }
-BY_BOTH = {"shah": robot_world.shah, "li": robot_world.li}
+BY_BOTH = {"shah": at_once.shah, "li": at_once.li}
 
 
 def sessions(case: str, count: int) -> list:

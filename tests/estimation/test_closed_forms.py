@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from flangeye import CalibrationRefused, StageError
+from flangeye.estimation.closed.at_once import _ratios
 from flangeye.estimation.closed.comanipulation import (
     alternate,
     kronecker,
     random_rotations,
     two_steps,
 )
-from flangeye.estimation.closed.daniilidis import _ratios
 from flangeye.estimation.closed.motions import motions_of
 from flangeye.maths.geometry import invert, rigid, rotation_exp, rotation_log
 from flangeye_plugins.solve.closed_forms import ClosedFormParams

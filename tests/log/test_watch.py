@@ -146,7 +146,7 @@ def test_foxglove_is_served_the_same_messages(log: Any) -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    from flangeye.log.watch.server import foxglove_server
+    from flangeye.log.watch import foxglove_server
 
     with foxglove_server(port) as send:
         for message in follow(path, lambda: None):
@@ -177,7 +177,7 @@ def test_no_other_page_than_foxgloves_own_may_look(origin: str | None, lets_in: 
     websockets = pytest.importorskip("websockets.sync.client")
     from websockets.exceptions import InvalidStatus
 
-    from flangeye.log.watch.server import foxglove_server
+    from flangeye.log.watch import foxglove_server
 
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

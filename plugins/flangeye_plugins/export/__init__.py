@@ -15,7 +15,7 @@ from flangeye.plugin.stage import Stage
 from flangeye.types import CalibratedPose, ExportedFile
 from flangeye_plugins.export import documents
 from flangeye_plugins.export.controllers import CONTROLLERS
-from flangeye_plugins.export.urdf import UrdfParams, urdf
+from flangeye_plugins.export.documents import UrdfParams, urdf
 from flangeye_plugins.export.writing import (
     FramesParams,
     LengthParams,

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from flangeye import StageError, stage
+from flangeye.estimation.closed.at_once import daniilidis, li, shah
 from flangeye.estimation.closed.comanipulation import (
     FEWEST_KRONECKER,
     kronecker,
     two_steps,
 )
-from flangeye.estimation.closed.daniilidis import daniilidis
-from flangeye.estimation.closed.robot_world import li, shah
 from flangeye.estimation.closed.separable import (
     andreff,
     horaud_dornaika,

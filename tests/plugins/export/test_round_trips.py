@@ -27,7 +27,7 @@ from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.testing import ExportConformance
 from flangeye.types import BASE, CAMERA, FLANGE, CalibratedPose, Transform
 from flangeye_plugins.export import EXPORTS
-from flangeye_plugins.export.urdf import UrdfParams
+from flangeye_plugins.export.documents import UrdfParams
 
 with warnings.catch_warnings():  # robodk warns of its own __init__
     warnings.simplefilter("ignore", PendingDeprecationWarning)

@@ -12,8 +12,7 @@ from flangeye_emulators.controllers.network import Connection, LineConnection, N
 from flangeye_emulators.controllers.poses import pose_matrix
 from flangeye_emulators.controllers.server import Server, run_server
 from flangeye_emulators.controllers.ur import rtde, server
-from flangeye_emulators.controllers.ur.commands import COMMANDS, STREAMED
-from flangeye_emulators.controllers.ur.commands.moves import travel
+from flangeye_emulators.controllers.ur.commands import COMMANDS, STREAMED, travel
 from flangeye_emulators.controllers.ur.controller import (
     RefusedError,
     Registers,
