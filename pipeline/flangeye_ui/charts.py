@@ -33,7 +33,8 @@ def residual_chart(
         "xAxis": {"type": "category", "data": names, "axisLabel": {"color": FAINT}},
         "yAxis": {
             "type": "value", "name": "mm", "nameTextStyle": {"color": FAINT},
-            "axisLabel": {"color": FAINT}, "splitLine": {"lineStyle": {"opacity": 0.3}},
+            "axisLabel": {"color": FAINT, "showMaxLabel": not limit},
+            "splitLine": {"lineStyle": {"opacity": 0.3}},
             **({"max": float(f"{1.1e3 * max(limit, *sizes.values()):.2g}")} if limit else {}),
         },
         "series": [

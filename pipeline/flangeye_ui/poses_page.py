@@ -100,9 +100,7 @@ class PosePlanner:
         view: Any = given.get("view")
         guessed = self._view() is not None and isinstance(view, dict)
         if not guessed and self._simulated is None:
-            ui.label(
-                "This recipe has no first guess of the scanner's pose, so there is nothing to drag."
-            )
+            ui.label("The scanner is not drawn: the recipe has no first guess of its pose (view).")
             return
         if guessed:
             position = (view.get("guess") or {}).get("position") or ()

@@ -33,9 +33,12 @@ def add(project: Project) -> None:
             for run in [r for r in project.runs() if (r / "monitor.html").exists()]:
                 name = f"runs/{run.name}/monitor.html"
                 ui.link(name, address_of(project.folder, run / "monitor.html"), new_tab=True)
-            bar.say(f"{len(watched)} of {len(stored)} calibrations are watched.")
+            bar.say(f"{len(watched)} of {len(stored)} calibrations have been checked again.")
             if stored:
-                ui.label("A later scan of the flange says whether a calibration still holds:")
+                ui.label(
+                    "To check the newest calibration, scan the flange again at a few poses and "
+                    "compare (NEW is the folder of the new scans):"
+                )
                 newest = f"runs/{stored[0].name}"
                 command_line(project.command("monitor", newest, "--archive", "NEW"))
                 bar.lead("Scan", "Scan again")

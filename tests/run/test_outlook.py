@@ -89,8 +89,8 @@ def test_coverage_counts_cells_and_turns() -> None:
     assert found.places.sum() == 3
     assert found.turns == pytest.approx(np.array([[0.2, 0.2], [0, 0], [0, 0]]), abs=1e-12)
     assert str(found) == (
-        "2 of 27 cells of the work; turned both ways about 1 of 3 axes "
-        "(-11 +11, -0 +0, -0 +0 deg about base x, y, z)"
+        "2 of 27 cells of the workspace; turned both ways about 1 of 3 axes of the base "
+        "(x -11 to +11, y -0 to +0, z -0 to +0 deg)"
     )
     assert found.lacking() == [
         "turn the flange both ways about base y, by 20 deg or more (so far -0 +0 deg)",

@@ -39,9 +39,9 @@ class GroupedCommands(TyperGroup):
         shown = {name: each for name, each in self.commands.items() if not each.hidden}
         grouped = {name for names in GROUPS.values() for name in names}
         sections = {**GROUPS, "More": [name for name in shown if name not in grouped]}
-        space = formatter.width - 6 - max(map(len, shown))
         for title, names in sections.items():
-            rows = [(n, shown[n].get_short_help_str(space)) for n in names if n in shown]
+            # Whole sentences, which the formatter wraps, and does not cut as Click's own help
+            rows = [(n, shown[n].get_short_help_str(200)) for n in names if n in shown]
             if rows:
                 with formatter.section(title):
                     formatter.write_dl(rows)

@@ -32,10 +32,11 @@ class Coverage:
     def __str__(self) -> str:
         """Say it in a line."""
         both = int((self.turns.min(axis=1) >= ENOUGH).sum())
-        angles = ", ".join(f"-{low:.0f} +{high:.0f}" for low, high in np.degrees(self.turns))
+        angles = [f"-{low:.0f} to +{high:.0f}" for low, high in np.degrees(self.turns)]
+        named = ", ".join(f"{axis} {angle}" for axis, angle in zip("xyz", angles, strict=True))
         return (
-            f"{np.count_nonzero(self.places)} of {self.places.size} cells of the work; turned both "
-            f"ways about {both} of 3 axes ({angles} deg about base x, y, z)"
+            f"{np.count_nonzero(self.places)} of {self.places.size} cells of the workspace; turned "
+            f"both ways about {both} of 3 axes of the base ({named} deg)"
         )
 
     def lacking(self) -> list[str]:
