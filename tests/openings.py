@@ -20,7 +20,7 @@ CALLS = {
     "exec", "eval", "compile", "__import__", "import_module", "load_sdk", "entry_points",
     "system", "popen", "fork", "forkpty", "posix_spawn", "startfile", "create_subprocess_exec",
     "create_subprocess_shell", "add_file", "python_command", "require_named", "find_named",
-    "open_regular", "read_regular", "read_text", "read_bytes", "read_image", "fromfile",
+    "open_regular", "read_regular", "read_text", "read_any_text", "read_bytes", "read_image", "fromfile",
     "loadtxt", "genfromtxt", "memmap", "imread", "VideoCapture", "read_triangle_mesh",
     "read_point_cloud", "LocalCluster", "Client", "create_file_camera", "enable_device_from_file",
     "LoadLibrary", "CDLL", "dlopen", "unsafe_load", "full_load",

@@ -481,6 +481,13 @@ def odd_heading(folder):
     table(folder, "u,v,w,alpha,beta,gamma", kuka)
 
 
+def tables_of_other_lengths(folder):
+    for name in ("robot.csv", "marker.csv"):
+        table(folder, "", quaternion, name=name)
+    rows = (folder / "marker.csv").read_text().splitlines()
+    (folder / "marker.csv").write_text("\n".join(rows[:-1]))
+
+
 def meshes(folder):
     table(folder, "X,Y,Z,A,B,C", kuka)
     for k in range(5):
@@ -559,6 +566,8 @@ def two_poses_of_nobody(folder):
         (meshes, [], "rec/scan_0.stl: is a mesh, not a scan; sample it to points as .ply: "),
         (lambda folder: (folder / "scan.e57").write_text("x"), [],
          "rec/scan.e57: is an E57 scan, which is not read; save it as .ply"),
+        (tables_of_other_lengths, [], "rec/marker.csv: has 4 rows, robot.csv has 5; take the "
+         "surplus away, or give each a column time"),
         (two_tables_of_nobody, [], "not known: which poses are the arm's (a.csv, b.csv); add "
          "--table a.csv"),
         (two_poses_of_nobody, [], "not known: which poses are the arm's (log.csv:a, log.csv:b); "
@@ -650,3 +659,13 @@ def test_a_bad_answer_is_asked_again(folder: Path) -> None:
     assert "ur55" in said
     assert "wall: is none of base, flange" in said
     assert recipe(folder).header.robot.model == "ur5"
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "latin-1", "utf-8-sig"])
+def test_a_table_may_be_in_the_encoding_of_a_spreadsheet(folder: Path, encoding: str) -> None:
+    clouds(folder)
+    table(folder, "# Länge in mm\nX,Y,Z,A,B,C", kuka)
+    written = (folder / "log.csv").read_text("utf-8")
+    (folder / "log.csv").write_bytes(written.encode(encoding))
+    init()
+    assert np.allclose(read_poses(folder)[1][:3, 3], POSES[1][0])

@@ -74,6 +74,23 @@ def read_text(path: Path, limit: int = MAX_TEXT, error: type[FlangeyeError] = St
         raise error(f"{path}: is not UTF-8 text") from None
 
 
+def read_any_text(path: Path) -> str:
+    """Return the text of a table in UTF-8, in UTF-16 as Excel writes it, or else in Latin-1.
+
+    Raises:
+        StageError: As :func:`read_regular`, or it is no text.
+    """
+    raw = read_regular(path)
+    if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return raw.decode("utf-16", "replace")
+    if b"\0" in raw:
+        raise StageError(f"{path}: is not text")
+    try:
+        return raw.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return raw.decode("latin-1")
+
+
 def _reason(failure: Exception) -> str:
     return getattr(failure, "strerror", None) or str(failure)
 

@@ -24,7 +24,7 @@ import numpy as np
 
 from flangeye.errors import StageError
 from flangeye.files.pairs import natural
-from flangeye.files.regular import read_text
+from flangeye.files.regular import read_any_text
 from flangeye.files.tables.documents import KINDS, document_of
 from flangeye.files.tables.table import (
     Cell,
@@ -130,7 +130,7 @@ def sources(file: Path) -> list[Rows]:
     document = document_of(file)
     if document is not None:
         return rows_of(file, document)
-    text = read_text(file)
+    text = read_any_text(file)
     program = program_rows(file, text)
     return [program] if program else text_rows(file, text)
 
@@ -153,7 +153,7 @@ def _single(file: Path) -> Rows:
     document = document_of(file)
     if document is not None:
         return record_of(file, document)
-    text = read_text(file)
+    text = read_any_text(file)
     return program_rows(file, text) or row_of(file, text) or Rows((), [])
 
 

@@ -68,6 +68,7 @@ def table_params(
     arm = _arm(tables, found, questions)
     target = None if scans else _target(tables, found, arm, questions)
     if target is None and not scans:
+        _require_as_many(tables, arm)
         arm, target = _halves(arm)
     arm = _seen_together(arm, target, questions, robot)
     if arm.rotations == JOINTS:
@@ -96,6 +97,20 @@ def _of_joints(arm: PoseColumns, questions: Questions, robot: RobotModel | None)
 def _file(table: Table) -> dict[str, Any]:
     parts = table.name.split(", ")
     return {"file": parts if len(parts) > 1 else table.name}
+
+
+def _require_as_many(tables: Sequence[Table], arm: PoseColumns) -> None:
+    """Refuse a second table whose rows cannot be paired with the arm's.
+
+    Raises:
+        RecipeError: There is one with another number of rows.
+    """
+    other = next((t for t in tables if t.files != arm.table.files), None)
+    if other is not None and len(other.rows) != len(arm.table.rows):
+        raise RecipeError(
+            f"{other.file}: has {len(other.rows)} rows, {arm.table.name} has "
+            f"{len(arm.table.rows)}; take the surplus away, or give each a column time"
+        )
 
 
 def _alone(arm: PoseColumns) -> str:
