@@ -171,7 +171,8 @@ class Contact:
             since /= since.sum()
         while self._newest and self._newest[0].felt.time <= until:
             weighed, likely = self._newest.popleft(), off.pop()
-            if likely[Mode.FREE] < 0.5:
+            # A tip that may be free would lead the path after it: a chance of a tenth is too much.
+            if likely[Mode.FREE] < 0.1:
                 climbs = float(likely[Mode.PRESSED] + likely[Mode.OTHER])
                 yield weighed.felt, climbs * (self._flat * weighed.climbed) ** 2
 
