@@ -55,7 +55,7 @@ def test_a_file_and_a_folder_of_clouds_are_read(tmp_path: Path) -> None:
 def test_a_scan_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(StageError, match="none.pcd: does not exist"):
         scan_file(FileScanParams(path=tmp_path / "none.pcd", unit="m"))
-    with pytest.raises(StageError, match="holds no cloud; known: .csv, .npy, .pcd"):
+    with pytest.raises(StageError, match="holds no cloud; known: .asc, .csv, .npy"):
         scan_file(FileScanParams(path=tmp_path, unit="m"))
 
 
