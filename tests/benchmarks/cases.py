@@ -282,10 +282,9 @@ def finger() -> tuple[Work, Work]:
 def cycle() -> tuple[Work, Work]:
     """A cycle of the weld's controller with a new touch in it, the dearest one; 2 ms are allowed."""
     from flangeye.motion.seam_following import ToolPose, Touch
-    from flangeye_plugins.weld.belief import Belief
+    from flangeye_plugins.weld.belief import Belief, Learned
     from flangeye_plugins.weld.follower import Follower
     from flangeye_plugins.weld.path import Path as Plan
-    from flangeye_plugins.weld.probing import Learned
     from flangeye_plugins.weld.settings import Following
     from flangeye_plugins.weld.task import WeldTask
 

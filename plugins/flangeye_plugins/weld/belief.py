@@ -169,6 +169,71 @@ class Belief:
         return max(math.tan(self.half_angle + settings.sign * self.lean), 0.0)
 
 
+@dataclass(frozen=True)
+class Learned:
+    """What the sweep found.
+
+    Attributes:
+        gain: The finger shows displacements larger by this share.
+        gain_sigma: Its standard deviation.
+        width: Half width of play and hysteresis [m].
+        reversal: Half the way over which a reversal goes through them [m].
+        stamp: Timestamps are late by this [s].
+        dead_time: Dead time of the arm [s].
+        lag: Lag of the arm [s].
+        unexplained: rms that the model leaves beyond the noise [m].
+        askew: Tangent of the angle at which the walls stand to the plan.
+        noise: Standard deviation of one measurement across [m].
+        swept: Largest deflection at which the tip stayed in its seat [m].
+        ahead: The tip is ahead of where its file has it by this [m].
+        ahead_sigma: Its standard deviation, as far as the sweep tells it [m].
+        width_sigma: Standard deviation of the width [m].
+        stamp_sigma: Standard deviation of the stamp [s].
+    """
+
+    gain: float = 0.0
+    gain_sigma: float = 0.05
+    width: float = 0.0
+    reversal: float = 0.02e-3
+    stamp: float = 0.0
+    dead_time: float = 0.0
+    lag: float = 0.0
+    unexplained: float = 0.0
+    askew: float = 0.0
+    noise: float = 10e-6
+    swept: float = math.inf
+    ahead: float = 0.0
+    ahead_sigma: float = math.inf
+    width_sigma: float = 0.1e-3
+    stamp_sigma: float = 0.05
+
+    @property
+    def kept(self) -> float:
+        """How likely play stays where the wall presses it; what wobbles by more goes through it."""
+        # Pressed to one side, the deflection still changes by 0.2 mm back and forth.
+        return self.reversal / (self.reversal + 0.2e-3)
+
+    @property
+    def systematic(self) -> float:
+        """Variance of what is alike in measurements that follow each other, of the tip [m^2].
+
+        Play, taken for ``kept`` of its half width, is at the pressed side as often and anywhere in
+        its width otherwise; and what the sweep left unexplained.
+        """
+        spread = self.kept + (1.0 - self.kept) / 3.0 - self.kept**2
+        return (spread * self.width**2 + self.unexplained**2) / (1.0 + self.gain) ** 2
+
+    @property
+    def variance(self) -> float:
+        """Variance of one measurement of the tip [m^2]."""
+        return (self.noise / (1.0 + self.gain)) ** 2 + self.systematic
+
+    @property
+    def least(self) -> float:
+        """Deflection by which a held tip differs from a free one, for all play and noise [m]."""
+        return 3.0 * abs(self.width) + 2.0 * self.noise
+
+
 def belief_of(
     finger: Finger, body: LeaningTool, half_angle: float | None, settings: Following
 ) -> Belief:

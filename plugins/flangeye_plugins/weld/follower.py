@@ -12,11 +12,10 @@ from flangeye.devices import WeldProfile
 from flangeye.motion.arc import OFF
 from flangeye.motion.seam_following import STILL, Command, Phase, ToolPose, Touch
 from flangeye.types import Floats
+from flangeye_plugins.weld.belief import Learned
 from flangeye_plugins.weld.contact import STRAINED, STRIDE
-from flangeye_plugins.weld.estimate import SeamEstimate
-from flangeye_plugins.weld.probing import Learned
 from flangeye_plugins.weld.response import Response
-from flangeye_plugins.weld.sensing import SeamReading, Sensing
+from flangeye_plugins.weld.sensing import SeamEstimate, SeamReading, Sensing
 from flangeye_plugins.weld.settings import INSIDE
 from flangeye_plugins.weld.steering import SLOWEST, TorchLead
 from flangeye_plugins.weld.task import ResumePoint, WeldTask

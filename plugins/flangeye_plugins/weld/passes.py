@@ -17,7 +17,14 @@ from dataclasses import replace
 import numpy as np
 
 from flangeye.motion.arc import OFF
-from flangeye.motion.seam_following import STILL, Command, Phase, ToolPose, Touch
+from flangeye.motion.seam_following import (
+    STILL,
+    Command,
+    Controller,
+    Phase,
+    ToolPose,
+    Touch,
+)
 from flangeye.types import Floats
 from flangeye_plugins.weld.belief import BAND
 from flangeye_plugins.weld.follower import Follower
@@ -254,6 +261,13 @@ class Passes:
                 f"in pass {self.number + 1} the torch is known to {self.bound * 1e3:.2f} mm only, "
                 f"max_error is {settings.max_error * 1e3:.3g} mm"
             )
+
+
+def follower_of(controller: Controller) -> Follower | None:
+    """Return what follows the seam by touch; of several passes the root's."""
+    if isinstance(controller, Passes):
+        return controller.root
+    return controller if isinstance(controller, Follower) else None
 
 
 def _heading(place: Place) -> float:

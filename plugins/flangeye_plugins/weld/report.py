@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from flangeye.motion.seam_following import Controller, turned
 from flangeye.types import Floats, Note, Seam, WeldReport
 from flangeye_plugins.weld.frame import LeaningTool, WorkPlane
+from flangeye_plugins.weld.passes import follower_of
 from flangeye_plugins.weld.path import Path
-from flangeye_plugins.weld.resuming import follower_of
 from flangeye_plugins.weld.weld_log import WeldLog, columns
 
 SAMPLES = 2000

@@ -21,11 +21,10 @@ from flangeye.motion.seam_following import Command, Controller, FollowingTask, T
 from flangeye.plugin.registry import Lookup, load_registry
 from flangeye.plugin.stage import BoundPart
 from flangeye.types import Floats
-from flangeye_plugins.weld.belief import Belief
+from flangeye_plugins.weld.belief import Belief, Learned
 from flangeye_plugins.weld.follower import Follower
-from flangeye_plugins.weld.passes import Passes
+from flangeye_plugins.weld.passes import Passes, follower_of
 from flangeye_plugins.weld.path import Path
-from flangeye_plugins.weld.probing import Learned
 from flangeye_plugins.weld.settings import Following, Mode, WeldTactileParams
 from flangeye_plugins.weld.steering import SETTLING
 from flangeye_plugins.weld.task import ResumePoint, Start, WeldTask
@@ -70,13 +69,6 @@ def _mode_of(logged: str | Mapping[str, Any]) -> Mode:
     lookup = Lookup(load_registry())
     part = lookup.part(f"controller.{name}")
     return part.bind(part.params.model_validate(given, context=lookup) if part.params else None)
-
-
-def follower_of(controller: Controller) -> Follower | None:
-    """Return what follows the seam by touch; of several passes the root's."""
-    if isinstance(controller, Passes):
-        return controller.root
-    return controller if isinstance(controller, Follower) else None
 
 
 def take_looks(controller: Controller, looks: Sequence[WeldProfile]) -> None:

@@ -38,17 +38,12 @@ from flangeye_plugins.weld.execution import Bounds, WeldCell, follow
 from flangeye_plugins.weld.finger_camera import CameraJob, FingerCameraReader, SteppedReader
 from flangeye_plugins.weld.follower import Follower
 from flangeye_plugins.weld.frame import LeaningTool, Tool, WorkPlane, body_of
+from flangeye_plugins.weld.passes import follower_of
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.prior import keep_posterior, with_prior
 from flangeye_plugins.weld.reachability import SeamReach, Task
 from flangeye_plugins.weld.report import report_of
-from flangeye_plugins.weld.resuming import (
-    controller_of,
-    follower_of,
-    kept_value,
-    resume_point_of,
-    set_back,
-)
+from flangeye_plugins.weld.resuming import controller_of, kept_value, resume_point_of, set_back
 from flangeye_plugins.weld.settings import Following, WeldTactileParams
 from flangeye_plugins.weld.task import ResumePoint, Start
 from flangeye_plugins.weld.weld_log import WeldLog

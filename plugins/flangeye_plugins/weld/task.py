@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from flangeye.types import Floats
-from flangeye_plugins.weld.belief import Belief
+from flangeye_plugins.weld.belief import Belief, Learned
 from flangeye_plugins.weld.path import Path
-from flangeye_plugins.weld.probing import Learned
 from flangeye_plugins.weld.settings import INSIDE, Following
 
 

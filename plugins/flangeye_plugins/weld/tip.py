@@ -6,8 +6,8 @@ import math
 
 from flangeye.motion.seam_following import Phase, ToolPose
 from flangeye.types import Floats
-from flangeye_plugins.weld.belief import BAND
-from flangeye_plugins.weld.probing import SOFTER, Learned
+from flangeye_plugins.weld.belief import BAND, Learned
+from flangeye_plugins.weld.probing import SOFTER
 from flangeye_plugins.weld.task import WeldTask
 
 

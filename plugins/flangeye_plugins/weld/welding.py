@@ -8,8 +8,7 @@ from flangeye.devices import WeldProfile
 from flangeye.motion.seam_following import ToolPose
 from flangeye_plugins.weld.belief import BAND
 from flangeye_plugins.weld.bias import Bias, Trail
-from flangeye_plugins.weld.estimate import SeamEstimate
-from flangeye_plugins.weld.sensing import Sensing
+from flangeye_plugins.weld.sensing import SeamEstimate, Sensing
 from flangeye_plugins.weld.steering import Striking, TorchLead
 from flangeye_plugins.weld.task import WeldTask
 from flangeye_plugins.weld.tip import Pressing, Progress

@@ -12,10 +12,9 @@ import pytest
 
 from flangeye.devices import WeldProfile
 from flangeye.motion.seam_following import STILL, Command, ToolPose, Touch
-from flangeye_plugins.weld.belief import Belief
+from flangeye_plugins.weld.belief import Belief, Learned
 from flangeye_plugins.weld.follower import Follower
 from flangeye_plugins.weld.path import Path
-from flangeye_plugins.weld.probing import Learned
 from flangeye_plugins.weld.sensing import Located, SeamReading
 from flangeye_plugins.weld.settings import Following
 from flangeye_plugins.weld.steering import Sway

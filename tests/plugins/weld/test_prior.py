@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from flangeye.errors import RecipeError, StageError
-from flangeye_plugins.weld.belief import Belief
+from flangeye_plugins.weld.belief import Belief, Learned
 from flangeye_plugins.weld.prior import keep_posterior, with_prior
-from flangeye_plugins.weld.probing import Learned
 from tests.plugins.weld.cell import planned, run
 from tests.plugins.weld.test_probing import swept
 

@@ -7,15 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye_plugins.weld.belief import Belief
-from flangeye_plugins.weld.probing import (
-    SWEEP_MARGIN,
-    Learned,
-    Probing,
-    _dragged,
-    _explained,
-    _scatter,
-)
+from flangeye_plugins.weld.belief import Belief, Learned
+from flangeye_plugins.weld.probing import SWEEP_MARGIN, Probing, _dragged, _explained, _scatter
 from flangeye_plugins.weld.settings import Following
 
 SETTINGS = Following()

@@ -11,11 +11,10 @@ import pytest
 
 from flangeye.motion.seam_following import turned
 from flangeye.types import Floats, Seam
-from flangeye_plugins.weld.belief import Belief
+from flangeye_plugins.weld.belief import Belief, Learned
 from flangeye_plugins.weld.follower import Follower
 from flangeye_plugins.weld.frame import WorkPlane, body_from
 from flangeye_plugins.weld.path import Path
-from flangeye_plugins.weld.probing import Learned
 from flangeye_plugins.weld.report import SAMPLES, _advice, learned_figures, report_of
 from flangeye_plugins.weld.settings import Following
 from flangeye_plugins.weld.task import WeldTask

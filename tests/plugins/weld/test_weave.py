@@ -8,8 +8,8 @@ import pytest
 
 from flangeye.errors import StageError
 from flangeye_plugins.weld.checks import check_weave
-from flangeye_plugins.weld.passes import Passes
-from flangeye_plugins.weld.resuming import controller_from, follower_of
+from flangeye_plugins.weld.passes import Passes, follower_of
+from flangeye_plugins.weld.resuming import controller_from
 from flangeye_plugins.weld.settings import Following
 from flangeye_plugins.weld.steering import STRAIGHT, Weave
 from tools.weld_bench import curved, misplanned, try_condition
