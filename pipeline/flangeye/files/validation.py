@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, get_args
+from dataclasses import is_dataclass
+from typing import Any, get_args, get_type_hints
 
 from pydantic import BaseModel
 
@@ -22,7 +23,7 @@ def sentence(details: Any, model: type[BaseModel], given: Any) -> str:
     """
     if details["type"] == EXPLAINED:
         return str(details["msg"])
-    if details["type"] == "extra_forbidden":
+    if details["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
         return _unknown_key(str(details["loc"][-1]), _fields_at(model, details["loc"][:-1]))
     if details["type"] == "missing":
         return "is missing"
@@ -41,18 +42,25 @@ def _unknown_key(key: str, fields: list[str]) -> str:
     return f"unknown key '{key}'{hint} (allowed: {', '.join(fields) or 'none'})"
 
 
-def _fields_at(model: type[BaseModel], loc: tuple[Any, ...]) -> list[str]:
+def _fields_at(model: type[Any], loc: tuple[Any, ...]) -> list[str]:
     """Return the field names of the model nested at ``loc``, if they can be determined."""
     for key in loc:
         if isinstance(key, int):  # one of several of the same model
             continue
-        annotation = model.model_fields[key].annotation if key in model.model_fields else None
+        annotation = _fields(model).get(key)
         nested = [
             a
             for a in (annotation, *get_args(annotation))
-            if isinstance(a, type) and issubclass(a, BaseModel)
+            if isinstance(a, type) and (issubclass(a, BaseModel) or is_dataclass(a))
         ]
         if not nested:
             return []
         model = nested[0]
-    return list(model.model_fields)
+    return list(_fields(model))
+
+
+def _fields(model: type[Any]) -> dict[str, Any]:
+    """Return the fields of a model, or of a dataclass in one, with their types."""
+    if is_dataclass(model):
+        return get_type_hints(model)
+    return {name: field.annotation for name, field in model.model_fields.items()}

@@ -175,9 +175,10 @@ def test_a_world_is_a_file_of_its_own(tmp_path) -> None:
     assert truth.arm == ArmTruth(lag=0.1) and truth.finger == FingerTruth()
     assert truth.workpiece == WorkpieceTruth(half_angle=np.radians(2.0), tacks=(Tack(30e-3),))
     for wrong, told in (
-        ("arm: {lagg: 1 s}", r"own.yaml:1: arm.lagg"),
+        ("arm: {lagg: 1 s}", r"own.yaml:1: arm.lagg: unknown key 'lagg'; did you mean 'lag'?"),
         ("arm: {lag: 60}", "has no unit: a duration needs one"),
         ("workpiece: {gaps: [{start: 1 mm, end: 2 mm, side: 0}]}", "side"),
+        ("workpiece: {tacks: [{begin: 1 mm}]}", r"'begin' \(allowed: start, height\)"),
     ):
         own.write_text(wrong)
         with pytest.raises(RecipeError, match=told):
