@@ -224,20 +224,22 @@ def test_a_camera_info_may_come_with_the_first_scan_and_has_to_fit_it(env):
 
 def test_a_cloud_in_millimetres_or_without_a_stamp_is_refused_in_one_line(env):
     topics = Topics(cloud="/camera/points", trigger="/camera/capture")
-    with peers(Controller(env), Camera(env, "zivid")) as (_, camera):  # noqa: SIM117
-        with scanner_ros2.function(EYE, topics) as eye:
-            camera.ask(scale=1000.0, pose=True)
-            assert re.fullmatch(
-                r"/camera/points: median distance \d+ m, but phoxi-m sees 0.458 to 1.118 m; these "
-                "look like millimetres: let its driver give metres", complaint_of(eye),
-            )  # fmt: skip
-            camera.ask(scale=1.0, stamped=False, pose=True)
-            assert complaint_of(eye) == (
-                "scanner.ros2: /camera/points is stamped 0, so nobody knows when it was measured: "
-                "let its driver fill in header.stamp"
-            )
-            camera.ask(stamped=True, pose=True)
-            assert not complaint_of(eye)
+    with (
+        peers(Controller(env), Camera(env, "zivid")) as (_, camera),
+        scanner_ros2.function(EYE, topics) as eye,
+    ):
+        camera.ask(scale=1000.0, pose=True)
+        assert re.fullmatch(
+            r"/camera/points: median distance \d+ m, but phoxi-m sees 0.458 to 1.118 m; these "
+            "look like millimetres: let its driver give metres", complaint_of(eye),
+        )  # fmt: skip
+        camera.ask(scale=1.0, stamped=False, pose=True)
+        assert complaint_of(eye) == (
+            "scanner.ros2: /camera/points is stamped 0, so nobody knows when it was measured: "
+            "let its driver fill in header.stamp"
+        )
+        camera.ask(stamped=True, pose=True)
+        assert not complaint_of(eye)
 
 
 def complaint_of(eye):
