@@ -16,10 +16,12 @@ from flangeye_emulators.weld_world.world import Nominal, WeldWorld
 from flangeye_plugins.weld.belief import Belief, belief_of
 from flangeye_plugins.weld.bound import check_bound
 from flangeye_plugins.weld.checks import check_tool
+from flangeye_plugins.weld.follower import Follower
 from flangeye_plugins.weld.frame import LeaningTool, body_from
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.resuming import controller_of
 from flangeye_plugins.weld.settings import Following
+from flangeye_plugins.weld.task import WeldTask
 from tools.weld_conditions import Condition
 from tools.weld_trial import Start, Trial, run_trial
 
@@ -93,10 +95,9 @@ def could_be_welded(condition: Condition, seed: int, length: float, period: floa
     seam = WeldWorld(nominal, condition.truth, [seed, 0]).groove.root.points
     arm = replace(condition.truth.arm, wave=0.0, scale=0.0, sag=0.0)
     plan = Path(seam)
-    controller = controller_of(plan, belief, settings, "vision")
+    controller = Follower(WeldTask(plan, belief, settings, touch=False))
     truth = WeldTruth(arm)
-    response = controller.arm  # type: ignore[attr-defined]
-    response.dead_time, response.lag = truth.arm.dead_time, truth.arm.lag
+    controller.arm.dead_time, controller.arm.lag = truth.arm.dead_time, truth.arm.lag
     start = start_at(plan, belief, settings, period)
     trial = run_trial(controller, replace(nominal, seam=seam), truth, start, seed)
     s, off = trial.column("torch_s"), np.abs(trial.column("torch"))
