@@ -147,7 +147,7 @@ class StepOrder:
             in_a_cell = {
                 "acquire": "use acquire.samples, acquire.centres or acquire.archive with reader: "
                 "cell, or acquire.simulated_cell",
-                "solve": "use solve.cell",
+                "solve": "use solve.robust",
                 "verify": "use verify.holdout",
                 "export": "leave it out: calibration.yaml carries every transform of the cell, and "
                 "after the run flangeye export RUN --to NAME --camera CAMERA writes one",
