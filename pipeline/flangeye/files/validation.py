@@ -13,7 +13,7 @@ EXPLAINED = "explained"
 """Type of an error whose message went through :func:`sentence` already."""
 
 
-def sentence(details: Any, model: type[BaseModel], given: Any) -> str:
+def sentence(details: Any, model: type[Any], given: Any) -> str:
     """Return one of pydantic's error details as a sentence about a field of ``model``.
 
     Args:

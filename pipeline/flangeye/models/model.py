@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from flangeye.errors import RecipeError
 from flangeye.files.validation import sentence
@@ -22,18 +22,18 @@ class Model(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True, defer_build=True)
 
 
-M = TypeVar("M", bound=Model)
+M = TypeVar("M")
 
 
 def read_model(path: Path, cls: type[M]) -> M:
-    """Read one YAML file into a model.
+    """Read one YAML file into a model, or into a dataclass of checked fields.
 
     Raises:
         RecipeError: Every mistake, with file and line.
     """
     document = read_yaml(path)
     try:
-        return cls.model_validate(document.data)
+        return TypeAdapter(cls).validate_python(document.data)
     except ValidationError as error:
         problems = [
             ": ".join([f"{path}:{document.line(e['loc'])}", *place, sentence(e, cls, e["input"])])

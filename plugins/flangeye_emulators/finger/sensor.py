@@ -23,7 +23,6 @@ from flangeye_emulators.weld_world.truth import (
     ToolFile,
     ToolPath,
     WeldTruth,
-    World,
     WorldPath,
 )
 from flangeye_emulators.weld_world.world import Nominal, Shutter, WeldWorld
@@ -214,7 +213,7 @@ def sensor_simulated_finger(
         params: The world.
     """
     del finger
-    return SimulatedFinger(robot, seed, params, read_model(params.world, World).truth)
+    return SimulatedFinger(robot, seed, params, read_model(params.world, WeldTruth))
 
 
 @dataclass(frozen=True)

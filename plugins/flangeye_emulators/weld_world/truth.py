@@ -10,11 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, TypeVar, dataclass_transform
 
-from pydantic import BeforeValidator, ConfigDict
+from pydantic import BeforeValidator, ConfigDict, with_config
 
 from flangeye.files.paths import WHOLE, bundled_file
 from flangeye.models.finger import FingerGeometry
-from flangeye.models.model import Model
 from flangeye.units import Angle, Duration, Length, Stiffness, param
 from flangeye_emulators.weld_world.groove import Gap
 
@@ -35,8 +34,7 @@ ToolPath = Annotated[Path, BeforeValidator(bundled_file("true tool", "tools")), 
 @dataclass_transform(frozen_default=True)
 def checked(cls: type[T]) -> type[T]:
     """Return a frozen dataclass of which a file must not name what it does not have."""
-    cls.__pydantic_config__ = ConfigDict(extra="forbid")  # type: ignore[attr-defined]
-    return dataclass(frozen=True)(cls)
+    return with_config(ConfigDict(extra="forbid"))(dataclass(frozen=True)(cls))
 
 
 @checked
@@ -203,7 +201,7 @@ class LookTruth:
 
 @checked
 class WeldTruth:
-    """All that is true of a simulated weld."""
+    """All that is true of a simulated weld: what a world's file holds."""
 
     arm: ArmTruth = ArmTruth()
     tool: ToolTruth = ToolTruth()
@@ -211,22 +209,6 @@ class WeldTruth:
     clock: ClockTruth = ClockTruth()
     workpiece: WorkpieceTruth = WorkpieceTruth()
     heat: HeatTruth = HeatTruth()
-
-
-class World(Model):
-    """A file of a simulated weld: what differs in it from what the controller's files say."""
-
-    arm: ArmTruth = ArmTruth()
-    tool: ToolTruth = ToolTruth()
-    finger: FingerTruth = FingerTruth()
-    clock: ClockTruth = ClockTruth()
-    workpiece: WorkpieceTruth = WorkpieceTruth()
-    heat: HeatTruth = HeatTruth()
-
-    @property
-    def truth(self) -> WeldTruth:
-        """All that is true."""
-        return WeldTruth(self.arm, self.tool, self.finger, self.clock, self.workpiece, self.heat)
 
 
 WorldPath = Annotated[Path, BeforeValidator(bundled_file("world", "worlds")), WHOLE]

@@ -15,8 +15,8 @@ from flangeye_emulators.weld_world.truth import (
     HeatTruth,
     Tack,
     ToolTruth,
+    WeldTruth,
     WorkpieceTruth,
-    World,
 )
 from flangeye_emulators.weld_world.world import (
     ArmError,
@@ -165,13 +165,13 @@ def test_the_torch_is_scored_where_it_truly_is(name: str, rms: float) -> None:
 
 def test_a_world_is_a_file_of_its_own(tmp_path) -> None:
     """As the bundled ones are; with units, and nothing in it that no world has."""
-    known = {path.stem: read_model(path, World).truth for path in bundled("data").glob("worlds/*")}
+    known = {path.stem: read_model(path, WeldTruth) for path in bundled("data").glob("worlds/*")}
     assert len(known) == 6 and all(each.clock.rate == 15.0 for each in known.values())
     assert known["tip_astray"].tool.tip == (1.5e-3, 0.8e-3, -1e-3)
     assert known["wall_missing"].workpiece.gaps == (Gap(90e-3, 110e-3, 1),)
     own = tmp_path / "own.yaml"
     own.write_text("arm: {lag: 0.1 s}\nworkpiece: {tacks: [{start: 30 mm}], half_angle: 2 deg}\n")
-    truth = read_model(own, World).truth
+    truth = read_model(own, WeldTruth)
     assert truth.arm == ArmTruth(lag=0.1) and truth.finger == FingerTruth()
     assert truth.workpiece == WorkpieceTruth(half_angle=np.radians(2.0), tacks=(Tack(30e-3),))
     for wrong, told in (
@@ -182,4 +182,4 @@ def test_a_world_is_a_file_of_its_own(tmp_path) -> None:
     ):
         own.write_text(wrong)
         with pytest.raises(RecipeError, match=told):
-            read_model(own, World)
+            read_model(own, WeldTruth)
