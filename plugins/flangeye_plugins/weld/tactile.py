@@ -170,8 +170,8 @@ def _planned(
     checks.check_tool(body, belief, params)
     check_bound(plan, belief, params)
     return Planned(
-        seam, plane, points, plan, finger, body, Tool(finger, plane, body), belief, params,
-        start, driver,        None if times is None else times.gas_after, kept,
+        seam, plane, points, plan, finger, body, Tool(finger, plane, body), belief, params, start,
+        driver, None if times is None else times.gas_after, kept,
     )  # fmt: skip
 
 
