@@ -125,16 +125,15 @@ def calibration_yaml(result: Result) -> str:
             **_corrections(answers.corrected),
         }
     document["recipe_hash"] = result.provenance.recipe_hash
-    header = """\
-# Maps child coordinates to parent coordinates; metres and radians.
-# For the arm as its controller reports it.
-""" + (
-        """\
-# What stands under corrected_arm holds for the arm with that correction alone, never without it.
-"""
-        if "corrected_arm" in document
-        else ""
+    header = (
+        "# Maps child coordinates to parent coordinates; metres and radians.\n"
+        "# For the arm as its controller reports it.\n"
     )
+    if "corrected_arm" in document:
+        header += (
+            "# What stands under corrected_arm holds for the arm with that correction alone, never "
+            "without it.\n"
+        )
     return header + yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=110)
 
 
