@@ -99,7 +99,11 @@ def test_only_a_calibration_that_was_not_refused_is_there_for_other_programs(
 
 def test_every_form_of_a_pose_is_the_same_pose(result: Result) -> None:
     text = calibration_yaml(result)
-    assert text.startswith("# Maps child coordinates to parent coordinates; metres and radians.\n")
+    of_a_simulation = "# SIMULATED: made by a simulator; no real cell was calibrated.\n"
+    header = "# Maps child coordinates to parent coordinates; metres and radians.\n"
+    assert not result.simulated and text.startswith(header)
+    simulated = calibration_yaml(result.model_copy(update={"simulated": True}))
+    assert simulated == of_a_simulation + text
     pose = yaml.safe_load(text)["base_T_camera"]
     matrix = np.array(result.transforms["base_T_camera"].matrix)
     assert (pose["parent"], pose["child"]) == ("base", "camera")

@@ -299,6 +299,10 @@ def status_of(result: Result) -> str:
     return f"{result.status} (simulated)" if result.simulated else result.status
 
 
+SIMULATED = "SIMULATED: made by a simulator; no real cell was calibrated"
+"""What heads every file of a simulated calibration that others read."""
+
+
 def _remarks(names: Sequence[str], result: Result) -> tuple[str, ...]:
     run = result.provenance
     partly = any(result.transforms[name].unobservable for name in names)
@@ -310,7 +314,7 @@ def _remarks(names: Sequence[str], result: Result) -> tuple[str, ...]:
         f"recipe {run.recipe}, sha256 {run.recipe_hash[:16]}; input sha256 {run.input_hash[:16]}",
     ]
     if result.simulated:
-        said.append("SIMULATED: made by a simulator; no real cell was calibrated")
+        said.append(SIMULATED)
     if result.refused:
         said.append(f"REFUSED, DO NOT USE: {result.refused}")
     elif result.status != "verified":

@@ -19,7 +19,7 @@ from flangeye.log.record import dump_result
 from flangeye.maths.geometry import quaternion_from_rotation, rpy_from_rotation
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import Recipe, parse_recipe
-from flangeye.result import Result, TransformResult
+from flangeye.result import SIMULATED, Result, TransformResult
 from flangeye.result.contract import AnswerResult
 
 EXPORTS = "exports"
@@ -125,7 +125,8 @@ def calibration_yaml(result: Result) -> str:
             **_corrections(answers.corrected),
         }
     document["recipe_hash"] = result.provenance.recipe_hash
-    header = (
+    header = f"# {SIMULATED}.\n" if result.simulated else ""
+    header += (
         "# Maps child coordinates to parent coordinates; metres and radians.\n"
         "# For the arm as its controller reports it.\n"
     )
