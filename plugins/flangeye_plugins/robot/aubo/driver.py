@@ -147,16 +147,17 @@ class AuboRobot(Device):
         """Return the arm's state, and how long it took to read [s]."""
         began = time.monotonic_ns()
         tell = self._client.state
-        joints, speeds, pose, force = (
+        # The mode comes before the pose: an arm that is said to stand stood when it was read.
+        speeds = np.array(self._ask("joint speeds", tell.getJointSpeeds))
+        mode, message = self._condition(speeds)
+        joints, pose, force = (
             np.array(self._ask(what, question))
             for what, question in (
                 ("joints", tell.getJointPositions),
-                ("joint speeds", tell.getJointSpeeds),
                 ("pose", tell.getTcpPose),
                 ("force", tell.getTcpForce),
             )
         )
-        mode, message = self._condition(speeds)
         ended = time.monotonic_ns()
         base_T_tool = POSE.matrix(pose)
         base_T_flange = base_T_tool @ self._tool_T_flange
