@@ -16,9 +16,7 @@ from flangeye.files.clouds import check_cloud_file, read_cloud, write_cloud
 from flangeye.files.clouds.table import LzfError, decompress
 from flangeye.types import CAMERA, PointCloud
 
-QUICK = settings(
-    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+QUICK = settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 POINTS = np.array([[0.1, -0.2, 0.4], [np.nan, np.nan, np.nan], [1e-3, 2.5, 0.7]], np.float32)
 
 

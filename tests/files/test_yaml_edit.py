@@ -91,7 +91,7 @@ VALUES = st.recursive(
 MAPPINGS = st.dictionaries(st.sampled_from("abcd"), VALUES, min_size=1, max_size=4)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(MAPPINGS, MAPPINGS, st.sampled_from([None, True, False]))
 def test_any_change_reads_back(old: Any, new: Any, style: bool | None) -> None:
     text = yaml.safe_dump(old, sort_keys=False, default_flow_style=style)

@@ -46,7 +46,7 @@ def test_sound_seeds_are_read_and_texts_of_old_refused_or_read(name: Any, tmp_pa
 def test_made_input_is_read_or_refused(name: Any, tmp_path: Path) -> None:
     target, path = TARGETS[name], tmp_path / f"made{TARGETS[name].suffix}"
 
-    @settings(deadline=None, suppress_health_check=list(HealthCheck), database=None)
+    @settings(suppress_health_check=list(HealthCheck), database=None)
     @given(STRATEGIES[name])
     def reads(raw):
         path.write_bytes(raw)

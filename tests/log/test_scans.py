@@ -25,7 +25,7 @@ def scan(rows=300, columns=400):
     return xyz
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(arrays.arrays(np.uint32, st.integers(0, 40)), st.sampled_from([0, 1, BLOCK - 1, BLOCK]))
 def test_every_bit_comes_back(bits: Any, more: Any) -> None:
     flat = np.resize(bits, 3 * (len(bits) + more)).astype(np.uint32).view(np.float32)

@@ -70,7 +70,7 @@ def test_aubo_is_the_chain_of_its_urdf() -> None:
 
 
 @given(poised_arms())
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_inverse_leads_back(poised: Any) -> None:
     arm, joints = poised
     pose = arm.flange(joints)
@@ -92,7 +92,7 @@ def test_inverse_finds_all_branches(robot: str, branches: int) -> None:
 
 
 @given(poised_arms())
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_jacobian_is_the_derivative(poised: Any) -> None:
     arm, joints = poised
     step = 1e-6

@@ -22,7 +22,7 @@ def patch(rng, count, noise=1e-4):
     return points, rough, normal
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(0, 2**32), st.lists(st.integers(40, 900), min_size=2, max_size=6))
 def test_groups_of_any_size_do_not_see_each_other(seed: int, sizes: Any) -> None:
     rng = np.random.default_rng(seed)
@@ -37,7 +37,7 @@ def test_groups_of_any_size_do_not_see_each_other(seed: int, sizes: Any) -> None
         assert plane.sigma == pytest.approx(alone.sigma, rel=1e-6)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(0, 2**32))
 def test_single_precision_is_enough(seed: int) -> None:
     points, rough, normal = patch(np.random.default_rng(seed), 600)

@@ -25,7 +25,6 @@ def about(axis, degrees):
     return rotation_exp(np.radians(degrees) * np.eye(3)["xyz".index(axis)])
 
 
-@settings(deadline=None)
 @given(poses(), st.sampled_from(ALL))
 def test_a_pose_survives_being_written_and_read(pose: Any, name: Any) -> None:
     convention = CONVENTIONS[name]
@@ -34,7 +33,7 @@ def test_a_pose_survives_being_written_and_read(pose: Any, name: Any) -> None:
     np.testing.assert_allclose(convention.read(convention.text(pose)), pose, atol=3e-5)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(poses(), st.sampled_from(EULER_ORDERS), st.sampled_from(["deg", "rad"]))
 def test_any_order_of_angles_is_the_product_of_its_turns(pose: Any, order: Any, angle: Any) -> None:
     labels = ("X", "Y", "Z", "1", "2", "3")

@@ -105,7 +105,7 @@ def test_each_link_has_a_capsule_about_its_mesh(kuka: Path) -> None:
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(2, 60))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_a_capsule_holds_its_points_and_is_no_larger_than_a_ball_about_them(
     seed: int, count: int
 ) -> None:

@@ -19,7 +19,7 @@ ROUTER = Router(MODEL, LIMITS, HOME)
 
 @given(st.lists(st.floats(-0.6, 0.6), min_size=6, max_size=6))
 @example([0.0, 0.25, 0.0, 0.5, 0.5, 0.0])
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_flange_and_joints_stay_below_their_speeds(turns: Any) -> None:
     goal = HOME + np.array(turns)
     way = ROUTER.route(HOME, goal)

@@ -40,7 +40,7 @@ def test_a_straight_move_is_straight_at_its_speed(desk: Desk) -> None:
     assert desk.arm.standing
 
 
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=15, suppress_health_check=[HealthCheck.too_slow])
 @given(st.tuples(*[st.floats(-0.15, 0.15)] * 3), st.floats(0.05, 0.5), st.floats(0.2, 3.0))
 def test_limits_hold_whatever_the_move(offset: Any, speed: float, acceleration: float) -> None:
     desk = Desk()

@@ -319,7 +319,7 @@ def test_every_format_has_its_reader() -> None:
 
 
 @pytest.mark.parametrize("name", READERS)
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(pose=poses())
 def test_what_is_written_is_read_back(name: str, pose: Any) -> None:
     require_same(READERS[name](written(name, pose).text), pose)
@@ -335,7 +335,7 @@ def test_the_unit_is_the_one_asked_for(name: str) -> None:
         assert np.allclose(found, [0.1, 0.2, 0.3], atol=1e-9)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(pose=poses())
 def test_a_urdf_hangs_the_camera_by_its_mount(
     tmp_path_factory: pytest.TempPathFactory, pose: Any

@@ -34,7 +34,7 @@ def test_the_floors_of_recesses_do_not_move_the_plane(floor: float) -> None:
     assert plane.sigma == pytest.approx(1e-4, rel=0.05)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 2**32), st.floats(-1.5, 1.5), st.floats(-2.0, 2.0))
 def test_a_rough_start_is_enough(seed: int, height: float, turn: float) -> None:
     points = face(np.random.default_rng(seed), floor=0.3)

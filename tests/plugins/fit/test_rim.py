@@ -76,7 +76,7 @@ def test_the_covariance_is_flat_and_of_the_right_size() -> None:
     assert 0.1 < ratio < 1.6
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.tuples(*[st.floats(-1, 1)] * 3), st.tuples(*[st.floats(-0.1, 0.1)] * 3))
 def test_the_fit_moves_with_the_cloud(turn: Any, shift: Any) -> None:
     cloud = placed(face(UR5, arc=1.7 * np.pi, pitch=0.6e-3))

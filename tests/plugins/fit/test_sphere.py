@@ -70,7 +70,7 @@ def test_the_centre_belongs_where_the_recipe_says() -> None:
     assert observation.tcp_in_base == pytest.approx([0.4, 0.09, 0.24])
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 2**32), st.floats(-0.2, 0.2), st.floats(-0.2, 0.2), st.floats(0.4, 1.2))
 def test_wherever_it_is_noise_averages_out(seed: int, x: float, y: float, z: float) -> None:
     centre = np.array([x, y, z])

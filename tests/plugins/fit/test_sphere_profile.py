@@ -78,7 +78,7 @@ def test_the_other_side_is_the_mirror_image() -> None:
     assert feature.centre == pytest.approx(CENTRE * [1, -1, 1], abs=2e-7)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 2**32), st.floats(-0.02, 0.02), st.floats(0.5, 0.9), st.floats(0.22, 0.27))
 def test_wherever_it_passes_the_centre_is_found(
     seed: int, x: float, beside: float, z: float

@@ -37,7 +37,7 @@ def test_a_guess_is_taken_as_it_is() -> None:
 
 
 @given(about=st.floats(-0.5, 0.5))
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=5)
 def test_poses_that_face_the_scanner_find_it(about: float) -> None:
     places = [[0.45, -0.15, 0.35], [0.6, 0.2, 0.3], [0.4, 0.25, 0.4]]
     pose = shown([facing(np.array(place), about) for place in places])

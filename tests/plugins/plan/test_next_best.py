@@ -30,7 +30,7 @@ def planned(seed=0, place=None, **params):
 
 
 @given(seed=st.integers(0, 1000), count=st.integers(3, 8))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_poses_stay_in_the_region_and_face_the_scanner(seed: int, count: int) -> None:
     params = fixed(NextBestParams, count=count, candidates=50, facing="30 deg")
     poses = planned(seed, count=count, candidates=50, facing="30 deg")

@@ -30,7 +30,7 @@ def rng(seed=0):
     tilt=st.floats(0.0, 0.3),
     seed=st.integers(0, 1000),
 )
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_poses_stay_within_their_limits(counts: Any, tilt: float, seed: int) -> None:
     params = GridParams(counts=counts, tilt=f"{tilt!r} rad", facing="60 deg")
     plan = grid(easy_site(), rng(seed), params=params)

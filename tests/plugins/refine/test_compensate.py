@@ -109,7 +109,7 @@ def test_it_is_a_refining_stage() -> None:
 small = st.tuples(*[st.floats(-0.02, 0.02)] * 3)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(small, small)
 def test_the_direction_is_the_one_that_is_right(turn: Any, shift: Any) -> None:
     found = compensate(answer(off_by(turn, shift))).base_T_camera.transform

@@ -39,7 +39,7 @@ def off(cloud: FlangeCloud, centre=CENTRE) -> float:
     return float(np.linalg.norm(cloud.centre - centre))
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(
     x=st.floats(-0.1, 0.1), y=st.floats(-0.06, 0.06), z=st.floats(0.5, 0.75),
     tilt=st.floats(-0.7, 0.7),

@@ -57,7 +57,7 @@ def cloud(seed: int, n: int = 12) -> np.ndarray:
 
 
 @given(seed=st.integers(0, 10**6), n=st.integers(3, 30))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_exact_centres_give_the_exact_pose(seed: int, n: int) -> None:
     tcps = cloud(seed, n)
     try:
@@ -70,7 +70,7 @@ def test_exact_centres_give_the_exact_pose(seed: int, n: int) -> None:
 
 
 @given(seed=st.integers(0, 10**6))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_moving_the_base_moves_the_answer_and_nothing_else(seed: int) -> None:
     rng = np.random.default_rng(seed)
     tcps = cloud(seed)
@@ -90,7 +90,7 @@ def test_moving_the_base_moves_the_answer_and_nothing_else(seed: int) -> None:
 
 
 @given(seed=st.integers(0, 10**6), thickness=st.sampled_from([0.0, 1e-9, 1e-5]))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_planar_centres_never_give_a_reflection(seed: int, thickness: float) -> None:
     rng = np.random.default_rng(seed)
     tcps = cloud(seed) * [1, 1, 0] + rng.standard_normal((12, 3)) * thickness

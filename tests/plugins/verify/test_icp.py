@@ -108,7 +108,7 @@ def off_by(phi: np.ndarray, tau: np.ndarray) -> Transform:
 
 
 @given(seed=st.integers(0, 10**6))
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 def test_the_error_of_a_calibration_is_found(seed: int) -> None:
     rng = np.random.default_rng(seed)
     axis = (TRUTH.inverse() @ POSE).rotation[:, 2]
