@@ -159,7 +159,7 @@ def test_friction_holds_a_tip_on_a_wall_and_on_the_face() -> None:
 )
 def test_the_torch_is_scored_where_it_truly_is(name: str, rms: float) -> None:
     told = CONDITIONS[name]
-    trial = try_condition(Condition(told.truth, {}, (0.0, 0.0)), seed=0, length=0.06)
+    trial = try_condition(Condition(told.truth, {}, (0.0, 0.0)), seed=0, length=0.06, period=16e-3)
     assert np.sqrt(np.mean(trial.errors**2)) == pytest.approx(rms, rel=0.1)
 
 

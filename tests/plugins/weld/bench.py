@@ -14,7 +14,7 @@ from flangeye_plugins.weld.task import WeldTask
 
 DISTANCE = 40e-3
 SECTION = GrooveSection(np.pi / 6, 8e-3)
-PERIOD = 8e-3
+PERIOD = 16e-3
 FRAME = 1 / 30
 COLUMNS = ("time", "torch_s", "torch", "tip_s", "tip", "robot", "turn", "advance")
 

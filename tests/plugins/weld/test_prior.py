@@ -79,7 +79,7 @@ def test_a_tip_that_was_bent_since_is_no_surprise_that_is_averaged_away() -> Non
 
 def test_a_weld_writes_the_file_and_the_next_one_starts_from_it(tmp_path) -> None:
     path = tmp_path / "prior.yaml"
-    seam = planned("v-straight", end=0.08)
+    seam = planned("v-straight", end=0.04)
     first, _ = run(seam, prior=path)
     assert first.completed
     assert any("is in prior.yaml: the next one starts from it" in note for note in first.notes)
@@ -93,6 +93,6 @@ def test_a_weld_writes_the_file_and_the_next_one_starts_from_it(tmp_path) -> Non
 
 def test_a_file_that_cannot_be_written_costs_no_report(tmp_path) -> None:
     (tmp_path / "file").write_text("")
-    report, _ = run(planned("v-straight", end=0.08), prior=tmp_path / "file" / "prior.yaml")
+    report, _ = run(planned("v-straight", end=0.04), prior=tmp_path / "file" / "prior.yaml")
     assert report.completed
     assert any("what the weld found is not kept" in note for note in report.notes)

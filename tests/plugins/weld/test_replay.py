@@ -18,7 +18,7 @@ from flangeye.plugin.registry import load_registry
 from flangeye.run.replay import replay_steps
 from flangeye_plugins.sensor import McapParams, sensor_mcap
 from flangeye_plugins.weld.touch.tag_observation import TagDetector
-from tests.plugins.weld.cell import planned, run
+from tests.plugins.weld.cell import welded
 
 STEP = "7.weld.tactile"
 FINGER = read_model(bundled("data") / "fingers" / "srm.yaml", Finger)
@@ -26,7 +26,7 @@ FINGER = read_model(bundled("data") / "fingers" / "srm.yaml", Finger)
 
 @pytest.fixture(scope="module")
 def journal() -> Any:
-    return run(planned("v-straight", shift=(1e-3, 1e-3, 0.0), end=0.04), seed=3)[1]
+    return welded()[1]
 
 
 def logged(journal, path):
