@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ Session = tuple[Sequence[Observation], Cell]
 Mistake = Callable[[Sequence[Observation], Cell], Session]
 
 
+@cache
 def session(name: str, seed: int = 0, arm: str = "quality: real") -> Session:
     path = bundled("recipes") / "configurations" / f"{name}_marker_most-likely_simulated.yaml"
     recipe = load_recipe(path, REGISTRY, [f"seed={seed}", f"steps.0.arm={{{arm}}}"])
@@ -119,7 +121,7 @@ def on_the_wrong_link(link: str) -> Session:
     return seen, replace(cell, frames={**cell.frames, "forearm": frame})
 
 
-@pytest.mark.parametrize("link", ["arm", "arm_link2"])
+@pytest.mark.parametrize("link", [pytest.param("arm", marks=pytest.mark.slow), "arm_link2"])
 def test_a_camera_on_another_link_is_named(link: str) -> None:
     (finding,) = examine_cell(*on_the_wrong_link(link)).findings
     assert finding.what == f"forearm stands on arm_link3, not on {link}"
@@ -135,7 +137,7 @@ def test_nothing_is_named_where_no_cure_helps() -> None:
     rng = np.random.default_rng(0)
     anywhere = [
         _seen(o, lambda _: rigid(rotation_exp(rng.normal(size=3)), rng.normal(size=3)))
-        for o in seen
+        for o in seen[::2]
     ]
     assert not examine_cell(anywhere, cell).findings
 

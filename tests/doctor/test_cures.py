@@ -149,14 +149,22 @@ QUICK = (
 )
 
 
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """A session without a fault, and base_T_camera that comes of it."""
+    path = tmp_path_factory.mktemp("sound")
+    session = clean(np.random.default_rng(5), N, "marker", turn=0.4)
+    recipe = recipe_with(path / "recipe.yaml", RECIPE["steps"][0])
+    return session, calibrated(recipe, write(path / "good", session))
+
+
 @pytest.mark.parametrize(
     "fault", [pytest.param(f, marks=() if f in QUICK else pytest.mark.slow) for f in FAULTS]
 )
-def test_the_line_cures(tmp_path: Path, fault: Any) -> None:
+def test_the_line_cures(tmp_path: Path, sound: Any, fault: Any) -> None:
     name, plant = FAULTS[fault]
-    session = clean(np.random.default_rng(5), N, "marker", turn=0.4)
     recipe = recipe_with(tmp_path / "recipe.yaml", RECIPE["steps"][0])
-    truth = calibrated(recipe, write(tmp_path / "good", session))
+    session, truth = sound
     archive = write(tmp_path / "bad", plant(session))
 
     found = examine(open_session(archive, REGISTRY, recipe), CHECKS).findings
@@ -207,7 +215,8 @@ def test_centres_of_an_unknown_place_are_solved_by_what_a_refusal_names(tmp_path
 
 @pytest.mark.parametrize(
     ("fault", "kind"),
-    [("robot's degrees as radians", "marker"), ("both inverted", "hand"),
+    [("both inverted", "hand"),
+     pytest.param("robot's degrees as radians", "marker", marks=pytest.mark.slow),
      pytest.param("marker's y negated", "marker", marks=pytest.mark.slow),
      pytest.param("marker's rpy as vector", "hand", marks=pytest.mark.slow)],
 )  # fmt: skip
@@ -219,6 +228,7 @@ def test_a_fault_in_tables_is_named_and_its_line_cures(fault: str, kind: str) ->
     assert cured.startswith("verified") and float(cured.split()[1]) < 1.0
 
 
+@pytest.mark.slow
 def test_a_set_without_a_fault_gives_no_finding() -> None:
     cells = [cell.strip() for cell in injected.row("none", "hand", 2).split("|")[1:-1]]
     assert (cells[2], cells[5]) == ("verified", "nothing")

@@ -59,10 +59,13 @@ def test_a_clean_session_gives_nothing(kind: Any, carried: Any) -> None:
     assert diagnosis.notes == ()
 
 
-@pytest.mark.parametrize(("kind", "carried"), SOME)
+UNITS = [(1e3, "m", "mm"), (1e-3, "mm", "m"), (1 / 25.4e-3, "m", "inches"), (25.4, "inches", "mm")]
+
+
 @pytest.mark.parametrize(
-    ("factor", "said", "meant"),
-    [(1e3, "m", "mm"), (1e-3, "mm", "m"), (1 / 25.4e-3, "m", "inches"), (25.4, "inches", "mm")],
+    ("kind", "carried", "factor", "said", "meant"),
+    [(*SOME[i % 3], *unit) for i, unit in enumerate(UNITS)]
+    + [(*each, *UNITS[0]) for each in SOME[1:]],
 )
 def test_robot_positions_in_another_unit(
     kind: str, carried: str, factor: float, said: str, meant: str
@@ -76,8 +79,10 @@ def test_robot_positions_in_another_unit(
     assert f"scale: {float(f'{1 / factor:.10g}')}" in finding.fix
 
 
-@pytest.mark.parametrize(("kind", "carried"), SOME)
-@pytest.mark.parametrize(("factor", "meant"), [(1e3, "mm"), (1 / 25.4e-3, "inches")])
+@pytest.mark.parametrize(
+    ("kind", "carried", "factor", "meant"),
+    [(*each, 1e3, "mm") for each in SOME] + [(*SOME[0], 1 / 25.4e-3, "inches")],
+)
 def test_target_positions_in_another_unit(
     kind: str, carried: str, factor: float, meant: str
 ) -> None:

@@ -40,7 +40,7 @@ def test_leaving_one_out_in_closed_form_is_leaving_it_out(found) -> None:
     assert left_out(model, everyone)[0][3] == pytest.approx(expected, rel=1e-5, abs=1e-10)
 
 
-@pytest.mark.parametrize("sightings", [16, 200])
+@pytest.mark.parametrize("sightings", [16, pytest.param(200, marks=pytest.mark.slow)])
 def test_leaving_a_fold_out_is_fitting_the_others_at_the_same_sizes(sightings) -> None:
     fold = np.arange(1, sightings, 5)
     session = foreign.session("marker", foreign.UR5E, 1e-3, sightings, 1)
@@ -80,9 +80,9 @@ def test_a_pose_that_belongs_elsewhere_is_set_aside() -> None:
 @pytest.mark.parametrize("kind", [pytest.param("marker", marks=pytest.mark.slow), "flange"])
 def test_what_is_stated_as_reported_is_as_large_as_the_error(kind) -> None:
     arms = foreign.UR5E, foreign.PANDA
-    scores = [score(kind, arms[seed % 2], 0.3e-3, 16, seed) for seed in range(8)]
+    scores = [score(kind, arms[seed % 2], 0.3e-3, 16, seed) for seed in range(4)]
     nees, stated, true = np.array([s.reported for s in scores]).T
-    assert 0.4 < nees.mean() < 1.7  # 8 sessions of 6 numbers: 99 % of means
+    assert 0.4 < nees.mean() < 1.9  # 4 sessions of 6 numbers: 99 % of means
     assert 0.6 < np.sqrt(stated.mean() / true.mean()) < 1.7
     if kind == "flange":
         assert true.mean() < 1.1**2 * np.mean([s.svd for s in scores])
@@ -91,7 +91,7 @@ def test_what_is_stated_as_reported_is_as_large_as_the_error(kind) -> None:
 @pytest.mark.parametrize("kind", [pytest.param("hand", marks=pytest.mark.slow), "flange"])
 def test_both_answers_hold_where_no_joints_were_recorded(kind) -> None:
     arms = foreign.UR5E, foreign.PANDA
-    scores = [score(kind, arms[seed % 2], 0.3e-3, 16, seed, told=False) for seed in range(8)]
+    scores = [score(kind, arms[seed % 2], 0.3e-3, 16, seed, told=False) for seed in range(4)]
     for answer in ("true", "reported"):
         nees = np.mean([getattr(s, answer).nees for s in scores])
-        assert 0.3 < nees < 1.7  # 16 and 5 before, of what all poses have in common
+        assert 0.3 < nees < 1.9  # 16 and 5 before, of what all poses have in common

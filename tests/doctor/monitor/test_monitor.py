@@ -88,9 +88,9 @@ def test_what_has_moved_stays_moved(cell: Path, tmp_path: Path) -> None:
 
 def test_a_slow_drift_is_degraded(cell: Path, tmp_path: Path) -> None:
     names = []
-    for i in range(60):
+    for i in range(30):
         names.append(f"slow-{i}")
-        check(cell / names[-1], seed=200 + i, shift=(6.5e-6 * i, 0.0, 0.0))
+        check(cell / names[-1], seed=200 + i, shift=(13e-6 * i, 0.0, 0.0))
     options = ("--false-alarms", "1e-9")
     done = monitor(cell, tmp_path / "h.jsonl", *names, options=options)
     states = [json.loads(line)["state"] for line in done.stdout.splitlines()]
@@ -232,11 +232,11 @@ def test_two_checks_at_once_are_both_kept(cell: Path, tmp_path: Path) -> None:
     words = [sys.executable, "-m", "flangeye.cli", "monitor", str(cell / "calibration")]
     at_once = [
         subprocess.Popen([*words, "--archive", str(cell / f"ok-{i:02}"), "--history", str(history)])
-        for i in range(3)
+        for i in range(2)
     ]
-    assert [one.wait(120) for one in at_once] == [0, 0, 0]
+    assert [one.wait(120) for one in at_once] == [0, 0]
     kept = History.read(history, stored_calibration(cell / "calibration").key)
-    assert {check.source[-5:] for check in kept.checks} == {"ok-00", "ok-01", "ok-02"}
+    assert {check.source[-5:] for check in kept.checks} == {"ok-00", "ok-01"}
 
 
 def test_what_cannot_be_written_is_not_said_and_harms_nothing(
