@@ -157,9 +157,7 @@ class RobotConformance(DriverConformance):
         """In the middle of a move, and it stays where it stopped."""
         with self.opened() as robot:
             start = robot.state().joints
-            robot.move_joints(start + np.eye(len(start))[-1] * 4 * TESTED_TURN, SPEED, ACCELERATION)
-            self._watch(robot, 0.3)
-            require(_fastest(robot.state()) > STANDING, "the move has not begun")
+            self._under_way(robot, start)
             robot.stop()
             robot.stop()
             _, state = self._until_still(robot)
@@ -175,10 +173,7 @@ class RobotConformance(DriverConformance):
         """
         with self.opened() as robot:
             start = robot.state().joints
-            robot.move_joints(start + np.eye(len(start))[-1] * 4 * TESTED_TURN, SPEED, ACCELERATION)
-            self._watch(robot, 0.3)
-            before = robot.state()
-            require(_fastest(before) > STANDING, "the move has not begun")
+            before = self._under_way(robot, start)
             time.sleep(RESTS)
             after = robot.state()
             if after.time_ns == before.time_ns:  # an arm whose time passes in its cycles alone
@@ -218,6 +213,18 @@ class RobotConformance(DriverConformance):
             robot.wait_cycle()
             seen.append(robot.state())
         return seen
+
+    def _under_way(self, robot: Robot, start: t.Floats) -> RobotState:
+        """Send it off and look at it for 0.3 s; again where a busy machine's look came too late."""
+        for _ in range(3):
+            away = np.eye(len(start))[-1] * 4 * TESTED_TURN
+            robot.move_joints(start + away, SPEED, ACCELERATION)
+            state = self._watch(robot, 0.3)[-1]
+            if _fastest(state) > STANDING:
+                return state
+            robot.move_joints(start, SPEED, ACCELERATION)
+            self._until_still(robot)
+        raise AssertionError("the move has not begun")
 
     def _until_still(self, robot: Robot) -> tuple[float, RobotState]:
         """Return the highest joint speed on the way, and where it came to rest."""

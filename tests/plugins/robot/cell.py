@@ -48,18 +48,25 @@ def arrived(robot, order=lambda: None, done=lambda state: state.mode != "moving"
     """Give an order and watch the arm until it is done; return the last state.
 
     The order is given again where this computer was too busy to look in time: a motion that nobody
-    looks at ends.
+    looks at ends. Nor is an arm believed to be done that was looked at, or told of itself, late
+    since the order: it is sent once more, and has arrived when nothing held it up on the way.
     """
     looked = time.monotonic()
     end = looked + patience
     order()
+    told, held_up = robot.state().time_ns, False
     while True:
         began = time.monotonic()
         robot.wait_cycle()
         state = robot.state()
-        if time.monotonic() - looked > SILENT and not state.message:
+        unseen = max(time.monotonic() - looked, 1e-9 * (state.time_ns - told))
+        held_up = held_up or unseen > SILENT / 3
+        finished = done(state)
+        if not state.message and (unseen > SILENT or (finished and held_up)):
+            began = time.monotonic()
             order()
-        elif done(state):
+            held_up = False
+        elif finished:
             return state
-        looked = began
+        looked, told = began, state.time_ns
         assert time.monotonic() < end, "the arm does not arrive"

@@ -81,7 +81,29 @@ def reason_of(robot):
     return None if state.mode in ("ready", "moving") else f"{state.mode}: {state.message}"
 
 
+BUSY = "this computer is busy"
+"""What the driver says where it lost the arm to other work of this machine."""
+
+
 def fail(process, fault, number):
+    """Let a moving arm fail; return what was seen.
+
+    It is begun again where this computer was too busy to drive the arm before it failed, or saw its
+    own lateness before it saw the fault: a driver that notices nothing still says something else.
+    """
+    for _ in range(5):
+        try:
+            seen = fail_once(process, fault, number)
+        except DeviceError as error:
+            if BUSY not in str(error):
+                raise
+        else:
+            if BUSY not in seen or fault in LOSSES:
+                return seen
+    raise AssertionError("this computer is too busy for this test")
+
+
+def fail_once(process, fault, number):
     """Open, move, let it fail, watch, stop, close; every call in time. Return what was seen."""
     process.control.reset()
     until(lambda: answers(process.host))
@@ -136,6 +158,7 @@ def fail_often(lanes, fault, times):
     return seen
 
 
+LOSSES = ("die", "drop", "freeze", "latency=400 ms")
 LOST = (
     "is lost: its",
     "its last sample is",
@@ -147,7 +170,7 @@ LOCAL = "it is in local control: choose Remote Control at the top right of the p
 
 
 @TIMES
-@pytest.mark.parametrize("fault", ["die", "drop", "freeze", "latency=400 ms"])
+@pytest.mark.parametrize("fault", LOSSES)
 def test_a_controller_that_is_lost_is_noticed(lanes: Any, fault: str, times: Any) -> None:
     for line in fail_often(lanes, fault, times):
         assert any(words in line for words in LOST), line

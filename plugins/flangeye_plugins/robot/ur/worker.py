@@ -185,8 +185,10 @@ class Commander:
         """Do what is due when no command comes."""
         if self._receive.getRuntimeState() != PLAYING:
             return
-        unwatched = self._looked() + SILENT < time.monotonic() and self.busy()
-        if unwatched or -math.inf < self._velocity_until < time.monotonic():
+        # The time comes first: who is held up after reading must not take a look for an old one.
+        now = time.monotonic()
+        unwatched = self._looked() + SILENT < now and self.busy()
+        if unwatched or -math.inf < self._velocity_until < now:
             self.stop()
         self._control.kickWatchdog()
 
