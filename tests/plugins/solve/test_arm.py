@@ -240,12 +240,12 @@ def test_published_clouds_held_out(aubo: list[Observation]) -> None:
 def test_the_stated_region_allows_for_joint_zeros(ur5: RobotModel, with_joints: bool) -> None:
     """Zeros within the robot file's accuracy move all poses alike: residuals do not show it."""
     inside = []
-    for seed in range(40):
+    for seed in range(20):
         zeros = ur5.joint_accuracy * np.random.default_rng([seed, 1]).standard_normal(6)
         zeros[0] = 0.0
         poses = simulate(ur5, 14, offsets=zeros, with_joints=with_joints, seed=seed)
         inside.append(holds(solver(ur5)(poses)))
-    assert np.mean(inside) >= 0.95 - 0.103  # three standard deviations of 40 runs
+    assert np.mean(inside) >= 0.95 - 0.147  # three standard deviations of 20 runs
 
 
 def _lifted(pose: np.ndarray) -> np.ndarray:

@@ -150,7 +150,7 @@ def holds(calibration: HandEye) -> bool:
 
 
 @given(seed=st.integers(0, 10**6), n=st.integers(4, 25))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_exact_centres_give_the_exact_pose(seed: int, n: int) -> None:
     cell = Cell(seed, sigma=1e-9)
     found = solve([cell.observe(f"{i}", cell.pose()) for i in range(n)]).base_T_camera.transform
@@ -158,7 +158,7 @@ def test_exact_centres_give_the_exact_pose(seed: int, n: int) -> None:
 
 
 @given(seed=st.integers(0, 10**6))
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 def test_moving_the_base_moves_the_answer_and_nothing_else(seed: int) -> None:
     observations = simulate(15, seed, wrong=2, normal=1e-3)
     rng = np.random.default_rng(seed)
@@ -180,7 +180,7 @@ def test_moving_the_base_moves_the_answer_and_nothing_else(seed: int) -> None:
 def test_without_outliers_it_reaches_the_bound() -> None:
     """Issue 3: within 1.05 x the Cramer-Rao bound, over the workspace."""
     errors, bounds = [], []
-    for seed in range(30):
+    for seed in range(12):
         cell = Cell(seed)
         observations = [cell.observe(f"{i}", cell.pose()) for i in range(75)]
         errors.append(rms_at_work(solve(observations)))
@@ -188,14 +188,14 @@ def test_without_outliers_it_reaches_the_bound() -> None:
         covariance = kabsch_covariance(tcps, cell.sigma)
         at_work = covariance_at(covariance, tcps.mean(axis=0), WORK.grid(4))
         bounds.append(np.sqrt(np.trace(at_work, axis1=1, axis2=2).mean()))
-    # 30 runs leave the ratio an error of 5 %; the slow test has 400.
-    assert rms(errors) <= (1.05 + 0.10) * rms(bounds)
+    # 12 runs leave the ratio an error of 8 %; the slow test has 400.
+    assert rms(errors) <= (1.05 + 0.16) * rms(bounds)
 
 
 def test_gross_outliers_cost_nothing() -> None:
     """Issue 3: with 15 % outliers within 1.10 x of what the inliers alone give."""
     found, inliers_alone = [], []
-    for seed in range(40):
+    for seed in range(15):
         observations = simulate(20, seed, wrong=3)
         found.append(rms_at_work(solve(observations)))
         inliers_alone.append(rms_at_work(svd(observations[:17])))
@@ -217,13 +217,13 @@ def test_rejected_pairs_say_how_far_off_they_are() -> None:
 
 def test_each_centre_counts_with_its_own_covariance() -> None:
     """Centres ten times better in depth, seen from many sides: far better than equal weights."""
-    observations = [simulate(20, seed, depth=0.1) for seed in range(25)]
+    observations = [simulate(20, seed, depth=0.1) for seed in range(10)]
     ours = rms([rms_at_work(solve(o)) for o in observations])
     assert ours < 0.7 * rms([rms_at_work(svd(o)) for o in observations])
 
 
 def test_normals_help() -> None:
-    observations = [simulate(10, seed, normal=5e-4) for seed in range(20)]
+    observations = [simulate(10, seed, normal=5e-4) for seed in range(10)]
     with_normals = rms([rms_at_work(solve(o)) for o in observations])
     assert with_normals < 0.9 * rms([rms_at_work(solve(o, normals="off")) for o in observations])
 
@@ -292,7 +292,7 @@ def test_two_poses_are_refused() -> None:
 
 @pytest.mark.parametrize("n", [3, 4, 5])
 def test_few_poses_are_solved_without_rejecting_any(n: int) -> None:
-    for seed in range(5):
+    for seed in range(2):
         calibration = solve(simulate(n, seed))
         assert sum(p.used for p in calibration.pairs) >= n - 1
         assert np.isfinite(calibration.base_T_camera.covariance).all()
@@ -316,8 +316,8 @@ def test_it_stops_pulling_when_the_workspace_is_known_well_enough() -> None:
     {"normal": 1e-3}, *(pytest.param(kind, marks=pytest.mark.slow) for kind in ({}, {"depth": 0.1})),
 ])  # fmt: skip
 def test_the_stated_region_holds_the_truth(kind: dict[str, Any]) -> None:
-    inside = np.mean([holds(solve(simulate(15, seed, wrong=2, **kind))) for seed in range(80)])
-    assert inside >= 0.95 - 0.075  # three standard deviations of 80 runs
+    inside = np.mean([holds(solve(simulate(15, seed, wrong=2, **kind))) for seed in range(30)])
+    assert inside >= 0.95 - 0.12  # three standard deviations of 30 runs
 
 
 @pytest.mark.slow
