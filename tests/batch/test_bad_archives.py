@@ -1,6 +1,5 @@
-"""Archives that cannot be used: one line and exit code 2 in run, a row with the reason in batch."""
+"""Archives that cannot be used: one line and exit code 2."""
 
-import csv
 from collections.abc import Callable
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -124,17 +123,3 @@ def test_run_says_one_line(
     assert fnmatchcase(err, f"error: {folder}{CASES[spoil]}\n")
     assert err.count("\n") == 1
     assert not (tmp_path / "runs").exists()
-
-
-def test_batch_has_a_row_with_the_reason_for_each(
-    bad: Callable[..., Any], flangeye: Callable[..., Any]
-) -> None:
-    folders = [bad(spoil) for spoil in CASES]
-    code, out, _ = flangeye("batch", "bad.yaml", *folders, "--workers", "1", "--out", "out")
-    assert code == 1
-    assert out.startswith(f"{len(CASES)} sessions: {len(CASES)} failed\n")
-    with Path("out/sessions.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert [row["status"] for row in rows] == ["failed"] * len(CASES)
-    for row, folder, line in zip(rows, folders, CASES.values(), strict=True):
-        assert fnmatchcase(row["reason"], f"{folder}{line}")

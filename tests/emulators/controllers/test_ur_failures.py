@@ -194,7 +194,7 @@ def test_a_move_blocks_for_ever_after_the_controllers_death(doomed: Any) -> None
         running.go_on()
         time.sleep(0.5)
         doomed.end(signal.SIGKILL)
-        assert running.hangs(5.0)
+        assert running.hangs(3.0)
 
 
 def test_a_frozen_controller_blocks_a_move(doomed: Any) -> None:
@@ -205,7 +205,7 @@ def test_a_frozen_controller_blocks_a_move(doomed: Any) -> None:
         running.go_on()
         time.sleep(0.5)
         doomed.send(signal.SIGSTOP)
-        assert running.hangs(4.0)
+        assert running.hangs(3.0)
 
 
 def test_an_output_interface_that_is_never_disconnected_aborts_the_process(doomed: Any) -> None:
