@@ -12,7 +12,7 @@ from tests.fuzz.damage import NASTY, damaged, spoilt
 from tests.fuzz.strategies import STRATEGIES
 from tests.fuzz.targets import SEEDS, TARGETS, survives
 
-CASES = 140
+CASES = 50
 """For each of the targets; ``python -m tools.fuzz`` does as many as one likes."""
 
 
