@@ -86,8 +86,14 @@ RAIL = Axis(np.array([0.0, 1.0, 0.0]), turns=False, travel=(-1.0, 1.0))
 POSITIONER = replace(RAIL, turns=True)
 
 
-@pytest.mark.parametrize("axis", [None, RAIL, POSITIONER])
-@pytest.mark.parametrize("delays", [{"left": 0.0, "right": 0.06}, {"left": -0.04, "right": 0.08}])
+@pytest.mark.parametrize(
+    ("delays", "axis"),
+    [
+        ({"left": 0.0, "right": 0.06}, None),
+        ({"left": -0.04, "right": 0.08}, RAIL),
+        ({"left": 0.0, "right": 0.06}, POSITIONER),
+    ],
+)
 def test_each_cameras_delay_is_found_and_every_place_is_right(
     delays: Any, axis: Axis | None
 ) -> None:

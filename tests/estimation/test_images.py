@@ -32,7 +32,9 @@ def reasons(result):
     return [each.reason for each in result.observations if not each.used]
 
 
-@pytest.mark.parametrize("turn", [0, 90, 180, 270])
+@pytest.mark.parametrize(
+    "turn", [90, 180, *(pytest.param(turn, marks=pytest.mark.slow) for turn in (0, 270))]
+)
 def test_a_board_is_never_taken_for_itself_turned(tmp_path: Path, turn: int) -> None:
     seen = run(
         tmp_path,

@@ -53,7 +53,7 @@ def test_delays_of_arm_and_images_are_measured_and_made_up_for() -> None:
     "name",
     [
         "groove half angle 60 deg, planned 40 deg",
-        "finger half as stiff axially",
+        pytest.param("finger half as stiff axially", marks=pytest.mark.slow),
         "finger play 0.3 mm",
     ],
 )
@@ -82,7 +82,13 @@ def test_noise_of_a_tenth_of_a_millimetre_is_no_silent_failure() -> None:
     assert not found.done or (found.errors <= stated).all()
 
 
-@pytest.mark.parametrize("name", ["heat: seam moves 2 mm", "heat: 1 mm around the torch"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("heat: seam moves 2 mm", marks=pytest.mark.slow),
+        "heat: 1 mm around the torch",
+    ],
+)
 def test_heat_stays_within_the_stated_bound(name: str) -> None:
     found = try_condition(CONDITIONS[name], 0, period=16e-3)
     assert found.done
@@ -95,7 +101,7 @@ def test_a_tip_that_only_friction_held_is_pressed_by_what_it_stands_without() ->
     assert not verdict.silent and verdict.largest < 0.2e-3
 
 
-@pytest.mark.parametrize("world", [910211, 910313])
+@pytest.mark.parametrize("world", [910211, pytest.param(910313, marks=pytest.mark.slow)])
 def test_waves_of_the_arm_at_tip_and_torch_are_in_the_stated_bound(world: int) -> None:
     verdict = judged(world, sigmas=4.0)
     assert verdict.largest and not verdict.silent
@@ -213,7 +219,7 @@ def test_no_torch_is_beyond_its_stated_bound_whether_done_or_stopped() -> None:
     assert f"{len(verdicts)} worlds" in summary(verdicts)[0]
 
 
-@pytest.mark.parametrize("seed", [995001, 995109])
+@pytest.mark.parametrize("seed", [995001, pytest.param(995109, marks=pytest.mark.slow)])
 def test_a_weld_that_is_done_is_welded(seed: int) -> None:
     """These were once done with the arc on for the last of their seams alone."""
     verdict = judged(seed)

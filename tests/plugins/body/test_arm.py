@@ -92,7 +92,13 @@ def test_an_arm_is_found_by_its_links_and_its_error_is_as_stated() -> None:
 
 @pytest.mark.parametrize(
     "bodies",
-    [None, [Plate(np.vstack([np.eye(3), -np.eye(3)]), np.array([0.3, 0.4, 1.7, 0.1, 0.3, -1.4]))]],
+    [
+        None,
+        pytest.param(
+            [Plate(np.vstack([np.eye(3), -np.eye(3)]), np.array([0.3, 0.4, 1.7, 0.1, 0.3, -1.4]))],
+            marks=pytest.mark.slow,
+        ),
+    ],
     ids=["with its elbow elsewhere than reported", "that is not there"],
 )
 def test_an_arm_is_refused(bodies) -> None:

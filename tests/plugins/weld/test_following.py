@@ -16,7 +16,7 @@ def rms(values):
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-@pytest.mark.parametrize("seam", [straight, curved])
+@pytest.mark.parametrize("seam", [pytest.param(straight, marks=pytest.mark.slow), curved])
 def test_the_torch_follows_the_true_seam_and_not_the_plan(seam: Any) -> None:
     true = seam()
     done = weld(true, planning_error(true, seed=2))
@@ -47,7 +47,7 @@ def test_a_tool_across_the_seam_turns_back_within_its_limit(degrees: int) -> Non
     assert done.controller.reason.startswith("not begun")  # the bound holds too late for an arc
 
 
-@pytest.mark.parametrize("seam", [straight, curved])
+@pytest.mark.parametrize("seam", [straight, pytest.param(curved, marks=pytest.mark.slow)])
 def test_a_gap_in_the_wall_is_bridged(seam: Any) -> None:
     true = seam()
     done = weld(true, planning_error(true, seed=0), gaps=(Gap(0.055, 0.075, 1),))
