@@ -100,7 +100,7 @@ OTHER = Board("checkerboard", 9, 6, 0.02)
 def test_a_board_that_is_in_no_image_ends_early_and_the_one_that_is_seen_is_named(
     shown: Board | None, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pixels = np.random.default_rng(0).integers(0, 255, (600, 800), dtype=np.uint8)
+    pixels = np.random.default_rng(0).integers(0, 255, (240, 320), dtype=np.uint8)
     seen = images(shown, 12, 0.2) if shown else {str(k): pixels for k in range(12)}
     looked = []
 

@@ -132,7 +132,10 @@ def test_a_doubt_stops_the_arm_on_its_way_to_the_seam(change: Any, told: str) ->
     assert arm.stopped
 
 
-@pytest.mark.parametrize(("change", "told"), DOUBTS)
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [*(pytest.param(*doubt, marks=pytest.mark.slow) for doubt in DOUBTS[:2]), DOUBTS[2]],
+)
 def test_a_doubt_stops_the_weld_and_the_log_is_kept(change: Any, told: str) -> None:
     arm = Arm(change, after=15.0)
     report, journal = run(planned("v-straight", end=SHORT), driver=driver_of(arm))

@@ -68,7 +68,14 @@ def by_pass(found):
     return np.split(error, back + 1)
 
 
-@pytest.mark.parametrize("name", [name for name in CONDITIONS if "passes" in name])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow if "lag" in name else ())
+        for name in CONDITIONS
+        if "passes" in name
+    ],
+)
 def test_every_pass_is_where_it_was_asked_to_be(name: str) -> None:
     found = try_condition(CONDITIONS[name], 0, SHORT, PERIOD)
     assert found.done, found.controller.reason
