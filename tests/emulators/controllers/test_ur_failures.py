@@ -27,6 +27,9 @@ pytestmark = [
     ),
 ]
 
+OF_THE_LIBRARY = pytest.mark.slow
+"""What the library does by itself: a new version of it may change that, no change of ours."""
+
 PROLOGUE = """
 import sys, threading, time
 import dashboard_client, rtde_control, rtde_io, rtde_receive
@@ -144,6 +147,7 @@ def test_nobody_there_is_an_error_at_once() -> None:
         ]
 
 
+@OF_THE_LIBRARY
 def test_after_the_controllers_death_the_last_pose_is_returned_for_ever(doomed: Any) -> None:
     code = """
         receive = rtde_receive.RTDEReceiveInterface(host)
@@ -186,6 +190,7 @@ def test_a_frozen_stream_is_noticed_after_two_and_a_half_seconds(controller: Any
         assert stale == "True"
 
 
+@OF_THE_LIBRARY
 def test_a_move_blocks_for_ever_after_the_controllers_death(doomed: Any) -> None:
     with client(doomed.host, MOVING + "\n    robot.moveL(target, 0.1, 0.5)\n    say('never')") as (
         running
@@ -197,6 +202,7 @@ def test_a_move_blocks_for_ever_after_the_controllers_death(doomed: Any) -> None
         assert running.hangs(3.0)
 
 
+@OF_THE_LIBRARY
 def test_a_frozen_controller_blocks_a_move(doomed: Any) -> None:
     with client(doomed.host, MOVING + "\n    robot.moveL(target, 0.1, 0.5)\n    say('never')") as (
         running
@@ -208,6 +214,7 @@ def test_a_frozen_controller_blocks_a_move(doomed: Any) -> None:
         assert running.hangs(3.0)
 
 
+@OF_THE_LIBRARY
 def test_an_output_interface_that_is_never_disconnected_aborts_the_process(doomed: Any) -> None:
     code = """
         io = rtde_io.RTDEIOInterface(host)
@@ -223,6 +230,7 @@ def test_an_output_interface_that_is_never_disconnected_aborts_the_process(doome
         assert "terminate called" in running.errors
 
 
+@OF_THE_LIBRARY
 def test_constructors_keep_other_threads_from_running(controller: Any) -> None:
     """So a driver must not connect in the process that serves anything else."""
     controller.control.fault("latency=20 ms")
