@@ -59,7 +59,9 @@ def test_shares_are_what_each_cause_does_to_the_answer(found) -> None:
     model, (n, _, count) = known.model, known.model.design.shape
     one = Posterior(model, mode, (mode,), np.ones(1))
     of_effects, noise = shares(one, np.eye(count)[: model.p])
-    gain = (mode.covariance @ (mode.weights @ model.design).reshape(6 * n, count).T)[: model.p]
+    gain = (mode.covariance @ (model.weights(mode.sizes) @ model.design).reshape(6 * n, count).T)[
+        : model.p
+    ]
     # An effect of one size at a time, through the linear estimator
     for k, share in enumerate(of_effects):
         columns = model.p + np.flatnonzero(model.sizes.effect == k)

@@ -194,6 +194,19 @@ def test_a_rail_slides_and_axes_point_anywhere() -> None:
         assert column == pytest.approx(np.concatenate(numeric) / (2 * step), abs=1e-6)
 
 
+@pytest.mark.parametrize("arm", [ARMS["ur5"], ARMS["franka-panda"], rail_and_arm()])
+@pytest.mark.parametrize("link", [None, 2])
+def test_what_a_links_geometry_does_is_what_an_altered_arm_does(arm: Arm, link: int | None) -> None:
+    joints, step = np.linspace(0.3, -0.4, arm.n), 1e-6
+    twists = arm.link_twists(joints, link).reshape(6, -1)
+    for column, change in zip(twists.T, step * np.eye(3 * arm.n), strict=True):
+        before, after = (
+            arm.altered(sign * change.reshape(-1, 3)).pose(joints, link) for sign in (-1, 1)
+        )
+        numeric = [rotation_log(after[:3, :3] @ before[:3, :3].T), after[:3, 3] - before[:3, 3]]
+        assert column == pytest.approx(np.concatenate(numeric) / (2 * step), abs=1e-6)
+
+
 def test_a_pose_of_an_arm_on_a_rail_is_found_within_the_rails_ends() -> None:
     arm = rail_and_arm()
     joints = np.array([1.4, 0.6, -0.4])

@@ -21,12 +21,12 @@ from functools import cached_property
 import numpy as np
 
 from flangeye.estimation.estimate import Estimate, model_at
-from flangeye.estimation.graph import Carrier, Linear, Problem
+from flangeye.estimation.graph import Linear, Problem
 from flangeye.estimation.mixed import shares, spread_of
 from flangeye.estimation.work import Work
 from flangeye.maths.frame_graph import chain, composed
 from flangeye.maths.geometry import hat, invert
-from flangeye.types import ExpectedError, Floats, Mask
+from flangeye.types import ExpectedError, Floats
 
 # Turns count like what they do so far from the flange [m]: enough to tell the turn about a line
 # where the work is in one, and no more, for the work is a matter of positions.
@@ -67,7 +67,13 @@ def functional(found: Estimate, a: Floats) -> Answer:
     named = {"scans and poses, one by one": noise}
     for effect, share in zip(found.effects, of_effects, strict=True):
         named[effect.name] = named.get(effect.name, 0.0) + share
-    return Answer(each.mean(axis=0), 0.5 * (covariance + covariance.T), named)
+    return Answer(moves(found, a), 0.5 * (covariance + covariance.T), named)
+
+
+def moves(found: Estimate, a: Floats) -> Floats:
+    """Return (P,) the mean of that answer."""
+    p, mean = found.posterior.model.p, found.posterior.mean
+    return np.asarray(mean[:p] + a.mean(axis=0) @ mean[p:])
 
 
 def as_true(found: Estimate) -> Answer:
@@ -75,22 +81,19 @@ def as_true(found: Estimate) -> Answer:
     return functional(found, np.zeros((1, found.posterior.model.p, sum(found.counts))))
 
 
-def as_reported(found: Estimate, work: Work, without: frozenset[str] = frozenset()) -> Answer:
+def as_reported(found: Estimate, work: Work) -> Answer:
     """Return the places for the arms as their controllers report them.
 
     Args:
         found: The posterior.
         work: Where commands are sent: each box that may be meant has an answer of its own.
-        without: Kinds of the arms' errors that are corrected, and so are no part of what they
-            report.
     """
-    return functional(found, commanded(found, work, without))
+    return functional(found, commanded(found, work))
 
 
-def commanded(found: Estimate, work: Work, without: frozenset[str] = frozenset()) -> Floats:
+def commanded(found: Estimate, work: Work) -> Floats:
     """Return (B, P, K) what the effects' numbers add to the places, right over each box."""
-    commands = _Commands(found, work.around, without)
-    return np.array([commands.answer(box) for box in work.boxes])
+    return _Commands(found, work.around, work.boxes.astype(float)).answer()
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,20 +103,20 @@ class _Commands:
     Attributes:
         found: The posterior.
         work: Sightings as they would be there.
-        without: Kinds of the arms' errors that are corrected.
+        boxes: (B, W) one for those that are in each box that may be meant.
     """
 
     found: Estimate
     work: Problem
-    without: frozenset[str]
+    boxes: Floats
 
-    def answer(self, box: Mask) -> Floats:
-        """Return (P, K): what the effects' numbers add to the places, right over one box (W,)."""
-        world, out = self._world(box), [np.zeros((0, self._of_arm.shape[2]))]
+    def answer(self) -> Floats:
+        """Return (B, P, K): what the effects' numbers add to the places, right over each box."""
+        world, out = self._world, [np.zeros((len(self.boxes), 0, self._of_arm.shape[2]))]
         for name in self.found.problem.unknown:
             carried = any(c.frame in chain(self.work.frames, name) for c in self.work.carriers)
-            out.append((self._carried if carried else self._fixed)(name, world, box))
-        return np.concatenate(out)
+            out.append((self._carried if carried else self._fixed)(name, world))
+        return np.concatenate(out, axis=1)
 
     @cached_property
     def _linear(self) -> Linear:
@@ -127,31 +130,33 @@ class _Commands:
     def _columns(self, linear: Linear) -> Floats:
         still = np.zeros((len(self.work.seen), 6, 0))
         columns = [
-            effect.block(self.work, linear)
-            if effect.of_arm and effect.kind not in self.without
-            else np.zeros((len(still), 6, count))
+            effect.block(self.work, linear) if effect.of_arm else np.zeros((len(still), 6, count))
             for effect, count in zip(self.found.effects, self.found.counts, strict=True)
         ]
         return np.concatenate([still, *columns], axis=2)
 
     @cached_property
-    def _twists(self) -> dict[str, Floats]:
-        """(W, 6, K) twists of what each carrier moves, by its frame, at the weight of turns."""
+    def _rigid_parts(self) -> dict[str, Floats]:
+        """(B, 6, K) the rigid motion of what each carrier moves, about its arm base's origin."""
         still, out = np.zeros((len(self.work.seen), 6, 6)), {}
         for carrier in self.work.carriers:
             blocks = {c.frame: still + np.eye(6) * (c is carrier) for c in self.work.carriers}
-            out[carrier.frame] = WEIGHT * self._columns(Linear(np.zeros(0), np.zeros(0), blocks))
+            twists = self._columns(Linear(np.zeros(0), np.zeros(0), blocks))
+            places = np.asarray(self.work.frames[carrier.frame].place)[self.work.seen.times, :3, 3]
+            motions = still + np.eye(6)
+            motions[:, 3:, :3] = -hat(places)
+            out[carrier.frame] = self._explained(motions, twists)
         return out
 
-    def _rigid_part(self, carrier: Carrier, box: Mask) -> Floats:
-        """Return (6, K) the rigid motion, about the arm base's origin, of its displacements."""
-        places = np.asarray(self.work.frames[carrier.frame].place)[self.work.seen.times, :3, 3]
-        motions = np.tile(np.eye(6), (int(box.sum()), 1, 1))
-        motions[:, 3:, :3] = -hat(places[box])
-        return _explained(WEIGHT * motions, self._twists[carrier.frame][box])
+    def _explained(self, by: Floats, moved: Floats) -> Floats:
+        """Return (B, 6, K) the least-squares amounts, over each box, of (W, 6, 6) in (W, 6, K)."""
+        across = np.swapaxes(WEIGHT**2 * by, 1, 2)
+        gram, right = (np.tensordot(self.boxes, across @ each, axes=1) for each in (by, moved))
+        return np.asarray(np.linalg.pinv(gram, rcond=1e-12, hermitian=True) @ right)
 
-    def _world(self, box: Mask) -> Floats:
-        """Return (6, K) by how much reported coordinates of the root are turned and shifted."""
+    @property
+    def _world(self) -> Floats:
+        """(B, 6, K) by how much reported coordinates of the root are turned and shifted."""
         parts = []
         for carrier in self.work.carriers:
             path = chain(self.work.frames, carrier.frame)[:-1]
@@ -160,12 +165,14 @@ class _Commands:
                 base = np.eye(4)
                 for place in places:
                     base = base @ place
-                parts.append(adjoint(base) @ self._rigid_part(carrier, box))
+                parts.append(adjoint(base) @ self._rigid_parts[carrier.frame])
         count = self._of_arm.shape[2]
-        return np.asarray(sum(parts) / len(parts)) if parts else np.zeros((6, count))
+        return np.asarray(
+            sum(parts) / len(parts) if parts else np.zeros((len(self.boxes), 6, count))
+        )
 
-    def _fixed(self, name: str, world: Floats, box: Mask) -> Floats:
-        """Return (6, K) of a place that no arm moves: the rigid part, seen from its own origin."""
+    def _fixed(self, name: str, world: Floats) -> Floats:
+        """Return (B, 6, K) of a place that no arm moves: the rigid part, from its own origin."""
         known, work = self.found.places, self.work
         frames = {n: replace(f, place=known.get(n, f.place)) for n, f in work.frames.items()}
         parent = np.eye(4)
@@ -175,18 +182,19 @@ class _Commands:
         gauge, place = -world, parent @ known[name]
         for carrier in work.carriers:
             if work.frames[carrier.frame].parent == name and carrier.link is None:
-                gauge = gauge + adjoint(place) @ self._rigid_part(carrier, box)
+                gauge = gauge + adjoint(place) @ self._rigid_parts[carrier.frame]
         shift = np.eye(6)
         shift[3:, :3] = -hat(known[name][:3, 3])
         return np.asarray(shift @ adjoint(invert(parent)) @ gauge)
 
-    def _carried(self, name: str, world: Floats, box: Mask) -> Floats:
-        """Return (6, K) of a place that an arm moves: what explains its displacements best.
+    def _carried(self, name: str, world: Floats) -> Floats:
+        """Return (B, 6, K) of a place that an arm moves: what explains its displacements best.
 
         A camera in hand is to see everything where reported coordinates have it.
         """
-        moved = self._of_arm[box] + self._seen_of_world(name)[box] @ world
-        return _explained(WEIGHT * self._linear.blocks[name][box], WEIGHT * moved)
+        by = self._linear.blocks[name]
+        of_world = self._explained(by, self._seen_of_world(name))
+        return self._explained(by, self._of_arm) + of_world @ world
 
     def _seen_of_world(self, name: str) -> Floats:
         """Return (W, 6, 6) how a twist of reported root coordinates moves what is seen.
@@ -215,13 +223,6 @@ class _Commands:
         return out
 
 
-def _explained(by: Floats, moved: Floats) -> Floats:
-    """Return (6, K) the least-squares amounts of (W, 6, 6) in (W, 6, K)."""
-    return np.asarray(
-        np.linalg.pinv(by.reshape(-1, 6), rcond=1e-6) @ moved.reshape(-1, moved.shape[2])
-    )
-
-
 def adjoint(pose: Floats) -> Floats:
     """Return (6, 6) that takes a twist about a frame's origin to its parent's, in its axes."""
     out = np.zeros((6, 6))
@@ -230,39 +231,64 @@ def adjoint(pose: Floats) -> Floats:
     return out
 
 
-def expected_error(
-    found: Estimate, work: Work, answer: Floats, put_right: Floats | float = 0.0
-) -> ExpectedError:
-    """Return the predictive spread of an answer at new poses of the work.
+@dataclass(frozen=True, eq=False)
+class Foreseen:
+    """What the posterior says of sightings at new poses of the work, F times over the mixture.
+
+    Attributes:
+        rows: (W, 3, P + K) how places and effects move what is predicted [m].
+        chances: (F,) they sum to one.
+        means: (F, W, 3) what is expected [m].
+        drawn: (F, 8, W, 3) errors about that, drawn [m].
+        squares: (F,) the mean square of those errors, exactly [m^2].
+    """
+
+    rows: Floats
+    chances: Floats
+    means: Floats
+    drawn: Floats
+    squares: Floats
+
+
+def foreseen(found: Estimate, work: Work) -> Foreseen:
+    """Return what is to be expected at new poses of the work.
 
     Of the pose's own error, of what the arm does beyond the rigid part, and of the noise of a
     sighting: what errors of poses held out consist of.
-
-    Args:
-        found: The posterior.
-        work: Where it is taken.
-        answer: (P,) moves of the places.
-        put_right: (K,) what is corrected of the arms' errors, in numbers of the effects.
     """
     known, rng, at = found.posterior, np.random.default_rng(0), work.poses
     model = model_at(at, found.places, found.effects, np.ones(len(at.seen)), of_session=False)
-    of_places, of_effects = model.places[:, 3:], model.effects[:, 3:]
-    expected = of_places @ answer + of_effects @ np.broadcast_to(put_right, of_effects.shape[2])
-    rows = np.concatenate([of_places, of_effects], axis=2)
-    squares, chances = [], []
-    for chance, each in zip(known.chances, known.fits, strict=True):
-        bias = rows @ each.mean - expected
+    rows = model.design[:, 3:]
+    moved = np.flatnonzero(rows.any(axis=(0, 1)))
+    lasting, drawn, squares = rows[:, :, moved], [], []
+    for each in known.fits:
         noise = model.noise(each.sizes)[:, 3:, 3:]
-        covariance = spread_of(rows, each.covariance) + noise
+        covariance = spread_of(lasting, each.covariance[np.ix_(moved, moved)]) + noise
         root = np.linalg.cholesky(covariance + 1e-18 * np.eye(3))
         # Eight of an error at each pose and each draw of the sizes, for its quantiles
-        drawn = bias + (root @ rng.standard_normal((8, len(bias), 3, 1)))[..., 0]
-        exact = float(((bias**2).sum(axis=1) + np.trace(covariance, axis1=1, axis2=2)).mean())
-        square = (drawn**2).sum(axis=2).ravel()
-        squares.append(square * exact / square.mean())
-        chances.append(np.full(square.size, chance))
-    values, weights = np.concatenate(squares), np.concatenate(chances)
-    order = np.argsort(values)
-    share = np.cumsum(weights[order]) / weights.sum()
-    p95 = float(np.sqrt(values[order][np.searchsorted(share, 0.95)]))
-    return ExpectedError(float(np.sqrt(np.average(values, weights=weights))), p95)
+        drawn.append((root @ rng.standard_normal((8, len(rows), 3, 1)))[..., 0])
+        squares.append(np.trace(covariance, axis1=1, axis2=2).mean())
+    means = np.array([rows @ each.mean for each in known.fits])
+    return Foreseen(rows, known.chances, means, np.array(drawn), np.array(squares))
+
+
+def expected_error(
+    there: Foreseen, answer: Floats, put_right: Floats | float = 0.0
+) -> ExpectedError:
+    """Return the predictive spread of an answer at new poses of the work.
+
+    Args:
+        there: What is to be expected.
+        answer: (P,) moves of the places.
+        put_right: (K,) what is corrected of the arms' errors, in numbers of the effects.
+    """
+    numbers = np.broadcast_to(put_right, there.rows.shape[2] - len(answer))
+    bias = there.means - there.rows @ np.concatenate([answer, numbers])
+    exact = (bias**2).sum(axis=2).mean(axis=1) + there.squares
+    values = ((bias[:, None] + there.drawn) ** 2).sum(axis=3).reshape(len(exact), -1)
+    values *= (exact / values.mean(axis=1))[:, None]
+    weights = np.broadcast_to(there.chances[:, None], values.shape)
+    order = np.argsort(values, axis=None)
+    share = np.cumsum(weights.flat[order]) / weights.sum()
+    p95 = float(np.sqrt(values.flat[order[np.searchsorted(share, 0.95)]]))
+    return ExpectedError(float(np.sqrt(there.chances @ exact / there.chances.sum())), p95)

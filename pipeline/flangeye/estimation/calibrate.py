@@ -16,7 +16,9 @@ from flangeye.estimation.answers import (
     as_true,
     commanded,
     expected_error,
+    foreseen,
     functional,
+    moves,
 )
 from flangeye.estimation.certified import answer_of, certificate_notes, moved_note, verdict_of
 from flangeye.estimation.corrections import CORRECTED, corrections_of, put_right
@@ -104,23 +106,27 @@ def answered(session: Session, options: Options, method: str) -> HandEye:
         CalibrationRefused: The motion leaves something unknown.
     """
     found, weak, work = session.found, _weak(session, options), _work(session, options)
-    commands = commanded(found, work), commanded(found, work, CORRECTED)
-    uncorrected = functional(found, commands[0])
-    reported = _reported(session, uncorrected, weak)
-    expected = expected_error(found, work, uncorrected.mean)
-    righted = functional(found, commands[1])
+    left = np.repeat([not (e.of_arm and e.kind in CORRECTED) for e in found.effects], found.counts)
+    every = commanded(found, work)
+    commands = every, every * left
+    uncorrected, righted = (functional(found, each) for each in commands)
+    reported, there = _reported(session, uncorrected, weak), foreseen(found, work)
+    expected = expected_error(there, uncorrected.mean)
     corrected = _corrected(session, righted, weak)
     if corrected is not None:
-        then = expected_error(found, work, righted.mean, put_right(found))
+        then = expected_error(there, righted.mean, put_right(found))
         # It is given where it expects nine tenths of the error or less
         corrected = replace(corrected, expected=then) if then.rms <= 0.9 * expected.rms else None
 
     def without(poses: Indices) -> HandEye:
         rest = session.without(poses)
         weak = _weak(rest, options)
-        uncorrected, righted = (functional(rest.found, each) for each in commands)
-        answer = _reported(rest, uncorrected, weak)
-        return replace(answer, corrected=_corrected(rest, righted, weak))
+        of_arm, anew = (
+            replace(answer, mean=moves(rest.found, each))
+            for answer, each in zip((uncorrected, righted), commands, strict=True)
+        )
+        answer = _reported(rest, of_arm, weak)
+        return replace(answer, corrected=_corrected(rest, anew, weak))
 
     return replace(
         reported,
@@ -162,14 +168,14 @@ def calibrate_at(
     """
     session = session_of(observations, cell, scanner, options.asked)
     found, weak, work = session.found, _weak(session, options), _work(session, options)
-    moves = found.problem.moves(found.places, places)
-    answer = _reported(session, as_reported(found, work).at(moves), weak)
+    there = found.problem.moves(found.places, places)
+    answer = _reported(session, as_reported(found, work).at(there), weak)
     pairs = _pairs(session, answer)
-    true = as_true(found).at(moves)
+    true = as_true(found).at(there)
     return replace(
         answer,
         pairs=tuple(replace(pair, used=True, reason=None) for pair in pairs),
-        expected=expected_error(found, work, moves),
+        expected=expected_error(foreseen(found, work), there),
         method=method,
         true=tuple(_estimates(session, true, weak)),
         notes=session.notes,
@@ -212,7 +218,7 @@ def _weak(session: Session, options: Options) -> Floats:
     """
     found = session.found
     model, sizes = found.posterior.model, found.posterior.mode.sizes.copy()
-    own = slice(len(sizes) - len(model.scatter), len(sizes) - len(model.scatter) + 2)
+    own = model.factors[:2, 0]
     sizes[own] = np.maximum(sizes[own], LEAST)
     known = [k for k, effect in enumerate(found.effects) if effect.kind == COMMON]
     # Size of an effect that is left out [rad, m]
@@ -356,7 +362,9 @@ def _pairs(session: Session, answer: HandEye) -> tuple[Pair, ...]:
 def _noise_beyond(found: Estimate) -> tuple[float, float]:
     """Return the noise per axis beyond what the features' fits state: [rad] and [m]."""
     model, q = found.posterior.model, found.posterior.model.projectors
-    every = model.noise(found.posterior.mode.sizes) - (np.eye(6) - q) - model.covariances
+    every = (
+        model.noise(found.posterior.mode.sizes) - (np.eye(6) - q) - found.problem.seen.covariances
+    )
     squares = np.diagonal(q @ every @ q, axis1=1, axis2=2).reshape(-1, 2, 3).sum(axis=(0, 2))
     freedoms = np.diagonal(q, axis1=1, axis2=2).reshape(-1, 2, 3).sum(axis=(0, 2))
     turn, shift = np.sqrt(np.maximum(squares / np.maximum(freedoms, 1.0), 0.0))

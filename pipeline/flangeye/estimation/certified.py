@@ -114,7 +114,7 @@ def answer_of(found: Estimate) -> CertifiedAnswer:
         frames |= {f"{target}_point": Frame(target, points) for _, target in problem.ends}
         ends = [(camera, f"{target}_point") for camera, target in problem.ends]
     mode = found.posterior.mode
-    left = model.residuals - (model.effects @ mode.mean[model.p :])
+    left = model.residuals - model.design[..., model.p :] @ mode.mean[model.p :]
     return CertifiedAnswer(
         frames,
         [ends[k] for k in s.pairs],
@@ -125,7 +125,7 @@ def answer_of(found: Estimate) -> CertifiedAnswer:
             for i, name in enumerate(problem.unknown)
         },
         left[kept],
-        mode.weights[kept],
+        model.weights(mode.sizes)[kept],
         s.ranks.astype(np.float64),
     )
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations_with_replacement
 
 import numpy as np
 
@@ -128,24 +129,40 @@ def model_at(
         of_session: Whether the sightings are those of the session, and not new ones.
     """
     linear, s = problem.linearised(places), problem.seen
-    blocks = [effect.block(problem, linear) for effect in effects]
+    blocks = [s.projectors @ effect.block(problem, linear) for effect in effects]
     if not of_session:
         blocks = [b if e.lasting else 0 * b for b, e in zip(blocks, effects, strict=True)]
-    still, scatters, scaled = np.zeros((len(s), 6, 0)), arm_scatters(problem), _sighted(s)
+    moved = [np.zeros((len(s), 6, 0)), *(linear.blocks[name] for name in problem.unknown)]
+    scatters, parts = arm_scatters(problem), _parts(s)
+    further = [*_further(len(s)), *(each.covariances(problem, linear) for each in scatters)]
+    between, pairs = _between(s.covariances, parts)
+    alone = len(effects) + len(parts) + np.arange(len(further))
+    # The exactest sightings [rad, m]: a thousandth of the noise any camera has
+    floor = s.projectors @ np.diag(np.repeat(np.square((1e-6, 1e-7)), 3)) @ s.projectors
     return LinearModel(
         (s.projectors @ linear.residuals[..., None])[..., 0],
-        np.concatenate([still, *(linear.blocks[name] for name in problem.unknown)], axis=2),
-        np.concatenate([still, *blocks], axis=2),
-        s.covariances,
-        scaled,
-        np.array([*_further(len(s)), *(each.covariances(problem, linear) for each in scatters)]),
+        np.concatenate([*(s.projectors @ each for each in moved), *blocks], axis=2),
+        6 * len(problem.unknown),
+        s.projectors @ np.array([*further, *between]) @ s.projectors,
+        np.concatenate([np.column_stack([alone, alone]), len(effects) + pairs]),
+        floor + np.eye(6) - s.projectors,
         s.projectors,
-        prior_of(effects, [block.shape[2] for block in blocks], len(scaled), scatters),
+        prior_of(effects, [block.shape[2] for block in blocks], len(parts), scatters),
         shares,
     )
 
 
-def _sighted(seen: Sightings) -> Floats:
+def _between(covariances: Floats, parts: Floats) -> tuple[list[Floats], Indices]:
+    """Return (N, 6, 6) what covariances are the sum of, by each two of (D, N, 6, 6) parts, (., 2).
+
+    With D the parts, each so many times as large, D C D has their products as factors.
+    """
+    pairs = list(combinations_with_replacement(range(len(parts)), 2))
+    each = [parts[j] @ covariances @ parts[k] / (1 + (j == k)) for j, k in pairs]
+    return [one + np.swapaxes(one, 1, 2) for one in each], np.array(pairs)
+
+
+def _parts(seen: Sightings) -> Floats:
     """Return (D, N, 6, 6) projectors onto turns and shifts; of whole poses along and across apart.
 
     What a fit to points in space states knows of the line of sight; what is told from an image has
@@ -182,11 +199,7 @@ def estimate(problem: Problem, start: Places, effects: Sequence[Effect], agree: 
     seen: set[bytes] = set()
     # Linearising, sizes and outliers in turn: two or three rounds are usual
     for _ in range(8):
-        model = model_at(problem, places, effects, inliers.astype(float))
-        z = mode_of(model, z)
-        found = fit(model, model.sizes.at(z), with_gradient=False)
-        places, step = _moved(problem, places, found)
-        squares, good = judged(model, found)
+        z, places, step, good = _improved(problem, places, effects, inliers, z)
         key = good.tobytes()
         # Linearised about for good [rad, m]: what is left is of second order, 1e-10
         if step < 1e-5 and (key == inliers.tobytes() or key in seen):
@@ -199,9 +212,16 @@ def estimate(problem: Problem, start: Places, effects: Sequence[Effect], agree: 
     return Estimate(problem, effects, places, known, inliers, squares)
 
 
-def _moved(problem: Problem, places: Places, found: Fit) -> tuple[Places, float]:
-    step = found.mean[: 6 * len(problem.unknown)]
-    return problem.moved(places, step), float(np.abs(step).max(initial=0.0))
+def _improved(
+    problem: Problem, places: Places, effects: Sequence[Effect], agree: Mask, z: Floats | None
+) -> tuple[Floats, Places, float, Mask]:
+    """Return sizes, places, by how much these moved [rad, m], and what agrees with them."""
+    model = model_at(problem, places, effects, agree.astype(float))
+    z = mode_of(model, z)
+    found = fit(model, model.sizes.at(z), with_gradient=False)
+    step = found.mean[: model.p]
+    moved = float(np.abs(step).max(initial=0.0))
+    return z, problem.moved(places, step), moved, judged(model, found)[1]
 
 
 def judged(model: LinearModel, found: Fit) -> tuple[Floats, Mask]:

@@ -18,17 +18,18 @@ many unknowns as places and effects have: the cost is linear in N. Arrays only.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import cholesky
+from scipy.linalg import cho_solve, cholesky
 from scipy.linalg.lapack import dpotri
 
+from flangeye.maths.geometry import stack_rows
 from flangeye.maths.statistics import spread_evenly
-from flangeye.types import Floats, Indices, Mask
+from flangeye.types import Floats, Indices
 
 TELLING = 150
 """Sightings that sizes are found from: more change them by less than their priors' spread."""
@@ -57,74 +58,56 @@ class Sizes:
 
 @dataclass(frozen=True, eq=False)
 class LinearModel:
-    """What was seen, near one set of places.
+    """What was seen, near one set of places; all across what was measured alone.
 
     Attributes:
         residuals: (N, 6) measured minus predicted, in ``camera`` [rad, m].
-        places: (N, 6, P) how the unknown places move what is predicted.
-        effects: (N, 6, K) how the effects do, an effect of size one.
-        covariances: (N, 6, 6) of the features alone.
-        scaled: (D, N, 6, 6) projectors onto what is scaled apart of those.
-        scatter: (M, N, 6, 6) of each other cause that scatters from sighting to sighting, of size
-            one.
+        design: (N, 6, P + K) how the unknown places move what is predicted, and how the effects do,
+            an effect of size one.
+        p: P, the number of unknowns of the places.
+        causes: (C, N, 6, 6) what the noise is the sum of, each of size one: what scatters from
+            sighting to sighting, turns and shifts of any sighting first; then the features' own
+            covariances between each two of their parts.
+        factors: (C, 2) the two sizes whose product each of those is times.
+        still: (N, 6, 6) the noise that has no size: the identity across what was not measured.
         projectors: (N, 6, 6) onto what was measured.
         sizes: Their prior.
         shares: (N,) weight of each sighting, from 0 (an outlier) to 1.
     """
 
     residuals: Floats
-    places: Floats
-    effects: Floats
-    covariances: Floats
-    scaled: Floats
-    scatter: Floats
+    design: Floats
+    p: int
+    causes: Floats
+    factors: Indices
+    still: Floats
     projectors: Floats
     sizes: Sizes
     shares: Floats
 
-    @cached_property
-    def design(self) -> Floats:
-        """(N, 6, P + K) of places and effects, across what was measured alone."""
-        h, whole = np.concatenate([self.places, self.effects], axis=2), np.eye(6)
-        part = (self.projectors != whole).any(axis=(1, 2))
-        h[part] = self.projectors[part] @ h[part]
-        return h
-
-    @property
-    def p(self) -> int:
-        """Number of unknowns of the places."""
-        return int(self.places.shape[2])
-
     def noise(self, sizes: Floats) -> Floats:
         """Return (N, 6, 6) covariances of the noise; the identity across what was not measured."""
-        scaled, further = self.parts(sizes)
-        q = self.projectors
-        # The exactest sightings [rad, m]: a thousandth of the noise any camera has
-        inside = scaled + further.sum(axis=0) + np.diag(np.repeat(np.square((1e-6, 1e-7)), 3))
-        return np.asarray(q @ inside @ q + (np.eye(6) - q))
+        amounts = sizes[self.factors].prod(axis=1)
+        return np.asarray(self.still + np.tensordot(amounts, self.causes, axes=1))
 
-    def parts(self, sizes: Floats) -> tuple[Floats, Floats]:
-        """Return (N, 6, 6) of the features, scaled, and (M, N, 6, 6) of what else scatters."""
-        own = len(sizes) - len(self.scatter)
-        scale = np.tensordot(sizes[own - len(self.scaled) : own], self.scaled, axes=1)
-        further = sizes[own:, None, None, None] ** 2 * self.scatter
-        return scale @ self.covariances @ scale, further
-
-    def weights(self, bare: Floats) -> Floats:
+    def weights(self, sizes: Floats) -> Floats:
         """Return (N, 6, 6) of the sightings by the inverse of their noise, each by its share."""
+        bare = np.linalg.inv(self.noise(sizes))
         both = self.projectors @ (bare + np.swapaxes(bare, 1, 2)) @ self.projectors
         return np.asarray(both * self.shares[:, None, None] / 2)
+
+    def where(self, rows: Indices) -> LinearModel:
+        """Return the model of some of the sightings."""
+        each = ("residuals", "design", "still", "projectors", "shares")
+        some = {name: getattr(self, name)[rows] for name in each}
+        return replace(self, causes=self.causes[:, rows], **some)
 
     def telling(self) -> LinearModel:
         """Return the model of a subset of the sightings, evenly spread over all."""
         kept = np.flatnonzero(self.shares)
         if len(kept) <= TELLING:
             return self
-        rows = kept[np.linspace(0, len(kept) - 1, TELLING).round().astype(int)]
-        each = ("residuals", "places", "effects", "covariances", "projectors", "shares")
-        some = {name: getattr(self, name)[rows] for name in each}
-        both = {name: getattr(self, name)[:, rows] for name in ("scaled", "scatter")}
-        return replace(self, **some, **both)
+        return self.where(kept[np.linspace(0, len(kept) - 1, TELLING).round().astype(int)])
 
     def weighted(self, shares: Floats) -> LinearModel:
         """Return the model with other weights of its sightings."""
@@ -137,87 +120,92 @@ class Fit:
 
     Attributes:
         sizes: (S,) the sizes.
-        mean: (P + K,) of places and effects.
-        covariance: (P + K, P + K).
-        weights: (N, 6, 6) inverse covariances of the noise, each by its share.
+        information: (P + K, P + K) of the sightings about places and effects.
+        right: (P + K,) of the normal equations.
+        root: (P + K, P + K) lower Cholesky factor of the information with the effects' prior.
         cost: -2 log of the restricted likelihood, but for a constant.
         gradient: (S,) of it by the logarithm of each size.
     """
 
     sizes: Floats
-    mean: Floats
-    covariance: Floats
-    weights: Floats
-    cost: float
-    gradient: Floats
+    information: Floats
+    right: Floats
+    root: Floats
+    cost: float = 0.0
+    gradient: Floats = field(default_factory=lambda: np.zeros(0))
+
+    @cached_property
+    def mean(self) -> Floats:
+        """(P + K,) of places and effects."""
+        return np.asarray(cho_solve((self.root, True), self.right, check_finite=False))
+
+    @cached_property
+    def covariance(self) -> Floats:
+        """(P + K, P + K) of places and effects."""
+        half = dpotri(self.root, lower=1)[0]
+        whole = half + half.T
+        whole[np.diag_indices(len(whole))] /= 2
+        return np.asarray(whole)
 
 
 class Told(NamedTuple):
-    """Normal equations of the sightings alone, at one set of variance components.
+    """What sightings alone tell, at one set of variance components.
 
     Attributes:
-        noise: (N, 6, 6) its covariances.
-        weights: (N, 6, 6) their inverses, each by its share.
-        information: (P + K, P + K) of places and effects.
-        right: (P + K,) of the normal equations.
+        whitening: (N, 6, 6) roots of the inverse covariances of the noise, each by its share.
+        rows: (6 N, P + K) the design in units of the noise.
+        errors: (6 N,) the residuals likewise.
+        log_noise: log det of the noise.
     """
 
-    noise: Floats
-    weights: Floats
-    information: Floats
-    right: Floats
+    whitening: Floats
+    rows: Floats
+    errors: Floats
+    log_noise: float
 
 
 def told(model: LinearModel, sizes: Floats) -> Told:
-    """Return the normal equations at (S,) noise deviations, without the effects' prior."""
-    h, r = model.design, np.asarray((model.projectors @ model.residuals[..., None])[..., 0])
-    noise = model.noise(sizes)
-    weights = model.weights(np.asarray(np.linalg.inv(noise), dtype=np.float64))
-    weighted = (weights @ h).reshape(-1, h.shape[2])
-    return Told(noise, weights, h.reshape(weighted.shape).T @ weighted, weighted.T @ r.ravel())
+    """Return what the sightings tell at (S,) sizes of the noise."""
+    roots = np.linalg.cholesky(model.noise(sizes))
+    whitening = np.sqrt(model.shares)[:, None, None] * np.linalg.inv(roots)
+    errors = (whitening @ model.residuals[..., None]).ravel()
+    logs = np.log(np.diagonal(roots, axis1=1, axis2=2)).sum(axis=1)
+    rows = stack_rows(whitening @ model.design)
+    return Told(whitening, rows, errors, float(2 * model.shares @ logs))
 
 
 def fit(model: LinearModel, sizes: Floats, with_gradient: bool = True) -> Fit:
     """Solve Henderson's mixed-model equations at (S,) sizes, with the restricted likelihood.
 
-    Without the gradient (zeros) it takes half the time.
+    Without the gradient it takes half the time.
 
     Raises:
         numpy.linalg.LinAlgError: The equations are not positive definite.
     """
-    known, h = told(model, sizes), model.design
-    mean, covariance, log_information = _solved(model, sizes, known)
-    left = np.asarray((model.projectors @ model.residuals[..., None])[..., 0] - h @ mean)
-    prior = sizes[model.sizes.effect] ** -2.0
+    known = told(model, sizes)
+    found = _solved(model, sizes, known.rows.T @ known.rows, known.rows.T @ known.errors)
+    left, prior = known.errors - known.rows @ found.mean, sizes[model.sizes.effect] ** -2.0
     cost = float(
-        model.shares @ np.linalg.slogdet(known.noise)[1]
+        known.log_noise
         - np.log(prior).sum()
-        + log_information
-        + np.einsum("na,nab,nb->", left, known.weights, left)
-        + prior @ mean[model.p :] ** 2
+        + 2 * np.log(np.diag(found.root)).sum()
+        + left @ left
+        + prior @ found.mean[model.p :] ** 2
     )
-    found = Fit(sizes, mean, covariance, known.weights, cost, np.zeros(len(sizes)))
-    if not with_gradient:
-        return found
-    bare = np.asarray(np.linalg.inv(known.noise), dtype=np.float64)
-    return replace(found, gradient=_gradient(model, sizes, found, (h, left, bare, prior)))
+    gradient = _gradient(model, found, known, left.reshape(-1, 6)) if with_gradient else np.zeros(0)
+    return replace(found, cost=cost, gradient=gradient)
 
 
-def _solved(model: LinearModel, sizes: Floats, known: Told) -> tuple[Floats, Floats, float]:
-    """Return mean and covariance of places and effects, and log det of their information.
+def _solved(model: LinearModel, sizes: Floats, information: Floats, right: Floats) -> Fit:
+    """Return places and effects by what sightings tell.
 
     Raises:
         numpy.linalg.LinAlgError: The equations are not positive definite.
     """
-    information = known.information.copy()
-    effects = np.arange(model.p, len(information))
-    information[effects, effects] += sizes[model.sizes.effect] ** -2.0
-    scaled, scale = _scaled(information)
-    root = cholesky(scaled, lower=True)
-    inverse = np.tril(dpotri(root, lower=1)[0])
-    covariance = (inverse + np.tril(inverse, -1).T) / np.outer(scale, scale)
-    log_information = float(2 * (np.log(np.diag(root)) + np.log(scale)).sum())
-    return covariance @ known.right, covariance, log_information
+    whole, effects = information.copy(), np.arange(model.p, len(information))
+    whole[effects, effects] += sizes[model.sizes.effect] ** -2.0
+    scaled, scale = _scaled(whole)
+    return Fit(sizes, information, right, scale[:, None] * cholesky(scaled, lower=True))
 
 
 def told_of_places(model: LinearModel, sizes: Floats) -> Floats:
@@ -225,7 +213,8 @@ def told_of_places(model: LinearModel, sizes: Floats) -> Floats:
 
     By the Schur complement, which stays exact where nothing is told; an inverse covariance is not.
     """
-    whole, p = told(model, sizes).information, model.p
+    rows, p = told(model, sizes).rows, model.p
+    whole = rows.T @ rows
     effects = whole[p:, p:] + np.diag(sizes[model.sizes.effect] ** -2.0)
     return np.asarray(whole[:p, :p] - whole[:p, p:] @ np.linalg.solve(effects, whole[p:, :p]))
 
@@ -234,38 +223,29 @@ def _scaled(information: Floats) -> tuple[Floats, Floats]:
     """Return an information with a diagonal of ones, a little more, and what it is divided by."""
     scale = np.sqrt(np.maximum(np.diag(information), 0.0))
     scale = np.where(scale > 1e-7 * scale.max(), scale, scale.max())
-    scaled = information / np.outer(scale, scale)
+    scaled = information / scale / scale[:, None]
     # Before anything is seen, as a share of what is most: no information, but what keeps the
     # factorisation positive where the sightings show nothing
     scaled[np.diag_indices(len(scaled))] += 1e-10
     return scaled, scale
 
 
-def _gradient(
-    model: LinearModel, sizes: Floats, found: Fit, parts: tuple[Floats, Floats, Floats, Floats]
-) -> Floats:
+def _gradient(model: LinearModel, found: Fit, known: Told, left: Floats) -> Floats:
     """Return (S,) derivatives of the cost by the logarithms of the sizes.
 
     Of an effect's: 2 (K_k - (tr V_k + |delta_k|^2) / s_k^2). Of the noise's, with dR by each:
     tr(W dR) - tr(V H'W dR W H) - e'W dR W e.
     """
-    h, left, bare, prior = parts
-    out = np.zeros(len(sizes))
+    sizes, out = found.sizes, np.zeros(len(found.sizes))
     second = np.diag(found.covariance)[model.p :] + found.mean[model.p :] ** 2
-    np.add.at(out, model.sizes.effect, 2 * (1 - second * prior))
-    w = found.weights
-    spread = spread_of(h, found.covariance) + left[:, :, None] * left[:, None, :]
+    np.add.at(out, model.sizes.effect, 2 * (1 - second * sizes[model.sizes.effect] ** -2.0))
+    rows = known.rows.reshape(len(left), 6, -1)
+    spread = spread_of(rows, found.covariance) + left[:, :, None] * left[:, None, :]
     # dcost/dR, (N, 6, 6)
-    slope = model.shares[:, None, None] * (model.projectors @ bare @ model.projectors) - (
-        w @ spread @ w
-    )
-    scaled, further = model.parts(sizes)
-    own = len(sizes) - len(further)
-    # d(D C D) by log D_j is P_j D C D and its transpose
-    out[own - len(model.scaled) : own] = 2 * np.einsum(
-        "nab,dnac,ncb->d", slope, model.scaled, scaled
-    )
-    out[own:] = 2 * (slope * further).sum(axis=(1, 2, 3))
+    slope = np.swapaxes(known.whitening, 1, 2) @ (np.eye(6) - spread) @ known.whitening
+    by_cause = model.causes.reshape(len(model.causes), -1) @ slope.ravel()
+    amounts = sizes[model.factors].prod(axis=1)
+    np.add.at(out, model.factors, (by_cause * amounts)[:, None])
     return out
 
 
@@ -305,11 +285,10 @@ class Posterior:
 
     def without(self, rows: Indices) -> Posterior:
         """Return the estimate without some sightings in closed form; variance components stay."""
-        shares = self.model.shares.copy()
+        shares, taken = self.model.shares.copy(), self.model.where(rows)
         shares[rows] = 0.0
-        model = self.model.weighted(shares)
-        mode, *fits = _anew(model, [self.mode, *self.fits])
-        return Posterior(model, mode, tuple(fits), self.chances)
+        mode, *fits = _told_less(taken, [self.mode, *self.fits])
+        return Posterior(self.model.weighted(shares), mode, tuple(fits), self.chances)
 
 
 def shares(known: Posterior, rows: Floats) -> tuple[Floats, Floats]:
@@ -321,14 +300,13 @@ def shares(known: Posterior, rows: Floats) -> tuple[Floats, Floats]:
     Returns:
         (E, A, A) of each effect, and (A, A) of the noise.
     """
-    sizes = known.model.sizes.effect
-    own = np.eye(int(sizes.max(initial=-1)) + 1)[:, sizes]
-    of_effects, whole = np.zeros((len(own), len(rows), len(rows))), np.zeros((len(rows),) * 2)
-    for chance, each in zip(known.chances, known.fits, strict=True):
-        moved = rows @ each.covariance
-        scaled = moved[:, known.model.p :] / each.sizes[sizes]
-        of_effects += chance * np.einsum("ak,ek,bk->eab", scaled, own, scaled)
-        whole += chance * moved @ rows.T
+    effect, p = known.model.sizes.effect, known.model.p
+    moved = np.array([rows @ each.covariance for each in known.fits])
+    sizes = np.array([each.sizes[effect] for each in known.fits])
+    scaled = moved[:, :, p:] * (np.sqrt(known.chances)[:, None] / sizes)[:, None]
+    parts = (scaled[:, :, effect == k] for k in range(int(effect.max(initial=-1)) + 1))
+    of_effects = np.array([np.tensordot(each, each, axes=((0, 2), (0, 2))) for each in parts])
+    whole = np.tensordot(known.chances, moved, axes=1) @ rows.T
     return of_effects, np.asarray(whole - of_effects.sum(axis=0))
 
 
@@ -364,30 +342,25 @@ def posterior(model: LinearModel, mode: Floats | None = None) -> Posterior:
         fits.append(found)
     if some is not model:
         # So many sightings tell the noise's own sizes to a few percent.
-        noise = _of_noise(model)
-        fits = [replace(f, sizes=np.where(noise, at_mode.sizes, f.sizes)) for f in fits]
-        fits = _anew(model, fits)
+        own = model.factors
+        for k, each in enumerate(fits):
+            sizes = each.sizes.copy()
+            sizes[own] = at_mode.sizes[own]
+            fits[k] = _solved(model, sizes, at_mode.information, at_mode.right)
     chances = np.exp(np.array(logs) - max(logs))
     return Posterior(model, at_mode, tuple(fits), chances / chances.sum())
 
 
-def _of_noise(model: LinearModel) -> Mask:
-    """Return (S,) which sizes are of the noise; the others are of effects."""
-    count = len(model.sizes.centre)
-    return np.arange(count) >= count - len(model.scaled) - len(model.scatter)
-
-
-def _anew(model: LinearModel, fits: Sequence[Fit]) -> list[Fit]:
-    """Return places and effects by another model, each at the sizes of a fit."""
-    noise, known, out = _of_noise(model), {}, []
+def _told_less(taken: LinearModel, fits: Sequence[Fit]) -> Iterator[Fit]:
+    """Give fits without some of their sightings, each at its sizes."""
+    known: dict[bytes, tuple[Floats, Floats]] = {}
     for each in fits:
-        key = each.sizes[noise].tobytes()  # what is told depends on the noise's alone
+        key = each.sizes[taken.factors].tobytes()  # what is told depends on the noise's alone
         if key not in known:
-            known[key] = told(model, each.sizes)
-        mean, covariance, _ = _solved(model, each.sizes, known[key])
-        weights = known[key].weights
-        out.append(replace(each, mean=mean, covariance=covariance, weights=weights))
-    return out
+            rows, errors = told(taken, each.sizes)[1:3]
+            known[key] = rows.T @ rows, rows.T @ errors
+        information, right = known[key]
+        yield _solved(taken, each.sizes, each.information - information, each.right - right)
 
 
 def _laplace(model: LinearModel, z: Floats) -> Floats:
@@ -423,9 +396,7 @@ def left_out(model: LinearModel, found: Fit) -> tuple[Floats, Floats]:
     In closed form (the leave-one-out residual of Cook & Weisberg 1982): a sighting that took part
     has drawn the fit towards itself by H V H'W, which is taken back.
     """
-    h = model.design
-    left = (model.projectors @ model.residuals[..., None])[..., 0] - h @ found.mean
-    leverage = spread_of(h, found.covariance)
-    full = np.linalg.inv(np.eye(6) - leverage @ found.weights)
-    predicted = full @ leverage
-    return (full @ left[..., None])[..., 0], predicted
+    left = model.residuals - model.design @ found.mean
+    leverage = spread_of(model.design, found.covariance)
+    full = np.linalg.inv(np.eye(6) - leverage @ model.weights(found.sizes))
+    return (full @ left[..., None])[..., 0], full @ leverage

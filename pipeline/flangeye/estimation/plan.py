@@ -20,7 +20,6 @@ import numpy as np
 from flangeye.errors import FlangeyeError
 from flangeye.estimation.estimate import Estimate, model_at
 from flangeye.estimation.graph import Places
-from flangeye.estimation.mixed import fit
 from flangeye.estimation.rough import Rough, rough
 from flangeye.estimation.sightings import problem_of
 from flangeye.maths.frame_graph import composed
@@ -162,8 +161,7 @@ def whitened(
     """Return (M, 6, P + K) rows of sightings, and (M, 6) their errors, of unit covariance."""
     problem = problem_of(sightings, cell)
     model = model_at(problem, found.places, found.effects, np.ones(len(sightings)))
-    weights = fit(model, found.fit.sizes).weights
-    values, vectors = np.linalg.eigh(weights)
+    values, vectors = np.linalg.eigh(model.weights(found.fit.sizes))
     roots = (vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]) @ np.swapaxes(vectors, 1, 2)
     return roots @ model.design, (roots @ model.residuals[..., None])[..., 0]
 

@@ -241,7 +241,8 @@ class RunLog:
     def readings(self) -> Iterator[t.Capture | t.Rejection]:
         """Yield the captures; one that cannot be read is given as its rejection."""
         capture, parts = "", dict[str, Any]()
-        for message in _messages(self.path):
+        # Many thousands of poses without a scan are not read once more
+        for message in _messages(self.path) if self.poses else ():
             topic = message.channel.topic
             try:
                 if topic == "/capture":

@@ -220,6 +220,28 @@ class Arm:
         columns[..., link or self.n :] = 0.0
         return columns
 
+    def link_twists(self, joints: Floats, link: int | None = None) -> Floats:
+        """Return what each joint's own geometry does to the flange, (..., n) -> (..., 6, n, 3).
+
+        Its twist in ``base``, taken at its origin, for a unit of the joint's ``a``, ``d`` and
+        ``alpha`` (see :meth:`altered`); or that of a link, which the joints beyond do not move.
+        """
+        frames = self.frames(joints)
+        moved = self.flange_of(frames) if link is None else frames[..., link, :, :]
+        first, last = frames[..., :-1, :, :], frames[..., 1:, :, :]
+        # Along whose x and z it is longer, and about whose x it is twisted
+        x, z, about = {
+            "standard": (last, first, last),
+            "modified": (first, last, first),
+            "urdf": (first, first, first @ self._before @ self._after),
+        }[self._robot.convention]
+        levers = moved[..., None, :3, 3] - about[..., :3, 3]
+        out = np.zeros((*frames.shape[:-3], self.n, 3, 6))
+        out[..., 0, 3:], out[..., 1, 3:] = x[..., :3, 0], z[..., :3, 2]
+        out[..., 2, :3], out[..., 2, 3:] = about[..., :3, 0], np.cross(about[..., :3, 0], levers)
+        out[..., link or self.n :, :, :] = 0.0
+        return np.moveaxis(out, -1, -3)
+
     def manipulability(self, joints: Floats) -> Floats:
         """Return sqrt(det(J J^T)), (..., n) -> (...); zero where the arm is singular.
 

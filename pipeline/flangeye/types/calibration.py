@@ -151,7 +151,8 @@ class HandEye:
         shared: (k,) how much it found of each error that the features share (such as the camera's,
             :class:`PoseFeature`), in standard deviations; none where it looked for none.
         without: Takes indices of pairs and returns the answer that the others give, where the
-            solver knows it without solving again; it raises as the solver does.
+            solver knows it without solving again, with the covariances of all; it raises as the
+            solver does.
     """
 
     camera: TransformEstimate

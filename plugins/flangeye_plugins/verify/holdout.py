@@ -169,16 +169,24 @@ def hold_out(
         mapped, expected = mapped_and_expected(ends, poses)
         held.errors[fold] = mapped - expected
         turns = invert(ends.camera)[:, :3, :3] @ ends.target[:, :3, :3]
-        held.tilts[fold] = [_tilt(o.feature, turn) for o, turn in zip(poses, turns, strict=True)]
+        held.tilts[fold] = _tilts([o.feature for o in poses], turns)
     return held
 
 
-def _tilt(feature: Feature, turn: Floats) -> float:
-    """Return the angle between a feature's orientation and that expected in ``camera`` [rad]."""
-    if isinstance(feature, PoseFeature):
-        off = rotation_log(feature.camera_T_target.rotation @ turn.T)
-        return float(np.linalg.norm(off))
-    return np.nan if feature.normal is None else float(angle_between(feature.normal, turn[:, 2]))
+def _tilts(features: Sequence[Feature], turns: Floats) -> Floats:
+    """Return (N,) angles between features' orientations and (N, 3, 3) expected ones [rad]."""
+    whole = np.array([isinstance(each, PoseFeature) for each in features])
+    out, nothing = np.empty(len(features)), np.full(3, np.nan)
+    seen = [each.camera_T_target.rotation for each in features if isinstance(each, PoseFeature)]
+    off = np.reshape(seen, (-1, 3, 3)) @ np.swapaxes(turns[whole], 1, 2)
+    out[whole] = np.linalg.norm(rotation_log(off), axis=1)
+    axes = [
+        nothing if each.normal is None else each.normal
+        for each in features
+        if not isinstance(each, PoseFeature)
+    ]
+    out[~whole] = angle_between(np.reshape(axes, (-1, 3)), turns[~whole, :, 2])
+    return out
 
 
 def _figures(held: HeldOut, counted: Mask) -> dict[str, float]:

@@ -8,7 +8,7 @@ share its quality, and each is a little better or worse beside it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -18,7 +18,7 @@ from flangeye.estimation.effects.effect import Block, Effect
 from flangeye.estimation.graph import Carrier, Linear, Problem
 from flangeye.maths.arm_correction import effects as field_effects
 from flangeye.maths.arm_correction import field_over
-from flangeye.maths.geometry import hat, rotation_log
+from flangeye.maths.geometry import hat
 from flangeye.maths.kinematics import Arm
 from flangeye.types import Floats, SmoothField
 
@@ -190,28 +190,14 @@ def displacements(carrier: Carrier) -> dict[str, Floats]:
     link = carrier.link
     columns = arm.jacobian(joints, link)
     waves = np.stack([np.sin(joints), np.cos(joints)], axis=1)
-    lengths = [3 * i + k for i in range(arm.n) for k in (0, 1)]
-    twists = [3 * i + 2 for i in range(arm.n)]
+    links = arm.link_twists(joints, link)
     return {
         "zeros": columns,
         "encoders": (columns[:, :, None, :] * waves[:, None]).reshape(len(joints), 6, -1),
         "sag": columns * _levers(arm, joints)[:, None],
-        "lengths": _by_links(carrier, lengths),
-        "twists": _by_links(carrier, twists),
+        "lengths": links[..., :2].reshape(len(joints), 6, -1),
+        "twists": links[..., 2],
     }
-
-
-def _by_links(carrier: Carrier, which: Sequence[int]) -> Floats:
-    """Return (T, 6, m) what some of the links' (3 n) a, d [m] and alpha [rad] do."""
-    arm, joints = known(carrier)
-    before, columns = arm.pose(joints, carrier.link), []
-    delta = 1e-6  # step by a length [m] or a twist [rad]
-    for step in delta * np.eye(3 * arm.n)[which]:
-        after = arm.altered(step.reshape(-1, 3)).pose(joints, carrier.link)
-        turned = rotation_log(after[:, :3, :3] @ np.swapaxes(before[:, :3, :3], 1, 2))
-        shifted = after[:, :3, 3] - before[:, :3, 3]
-        columns.append(np.concatenate([turned, shifted], axis=1) / delta)
-    return np.stack(columns, axis=2)
 
 
 def _levers(arm: Arm, joints: Floats) -> Floats:
