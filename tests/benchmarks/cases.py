@@ -17,14 +17,14 @@ import numpy as np
 from flangeye import types as t
 from flangeye.files.clouds import read_cloud, write_cloud
 from flangeye.maths.geometry import kabsch
-from flangeye.models.cell import cell_of
+from flangeye.models.configuration import ORIGIN, Configuration
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.find import find_recipe
 from flangeye.recipe.load import Recipe, load_recipe
 from flangeye_plugins.fit.ransac import fit_ransac_circle
 from flangeye_plugins.fit.rim import fit_rim
 from flangeye_plugins.segment.flange import segment_flange
-from flangeye_plugins.solve.robust import RobustParams, solve_cell, solve_robust
+from flangeye_plugins.solve.robust import RobustParams, solve_robust
 from flangeye_plugins.solve.svd import solve_svd
 
 
@@ -188,40 +188,60 @@ def solve() -> tuple[Work, Work]:
     )
 
 
-def robust() -> tuple[Work, Work]:
-    """solve.robust beside solve.svd."""
-    observations = _observations()
-    return (
-        Work(lambda: _solver(solve_robust, observations), "75 poses"),
-        Work(lambda: _solver(solve_svd, observations), "solve.svd"),
-    )
-
-
 def _matrix() -> Work:
     """A yardstick that no change of ours moves."""
     square = np.random.default_rng(0).normal(size=(300, 300))
     return Work(lambda: np.linalg.eigh(square @ square.T), "eigenvectors of a 300 x 300 matrix")
 
 
-def robust_circles() -> tuple[Work, Work]:
-    """solve.robust of 50 circles with normals, the arm's error looked for; 50 ms are asked for."""
-    from tests.estimation.cells import CONFIGURATIONS, session
+def _calibrated(kind: str, count: int) -> tuple[Work, Work]:
+    """solve.robust with held-out errors, of poses of an arm by a foreign generator."""
+    from flangeye.models.loading import load_model
+    from flangeye_plugins.verify.holdout import verify_holdout
+    from tests.estimation import foreign
 
-    cell = CONFIGURATIONS["eye-on-base, flange"]
-    made = session(cell, np.random.default_rng(0), n=50, feature="normal")
-    call = partial(solve_cell, made.observations, cell_of(cell, None), RobustParams())
-    return Work(call, "50 circles with normals"), _matrix()
+    rotation, place = (size**2 * np.eye(3) for size in foreign.NOISE[kind])
+    both, joined = np.kron(np.diag([1.0, 0.0]), rotation), np.kron(np.diag([0.0, 1.0]), place)
+    session = foreign.session(kind, foreign.UR5E, 0.3e-3, count, 1)
+    observations = [
+        t.Observation(
+            f"{i}",
+            t.PoseFeature(t.Transform(t.CAMERA, t.TARGET, seen), both + joined)
+            if kind == "marker"
+            else t.CircleFeature(seen[:3, 3], seen[:3, 2], {"rim": 0.03}, place, rotation, 1.0),
+            t.by_frame(t.Transform(t.BASE, t.FLANGE, pose)),
+        )
+        for i, (pose, seen) in enumerate(zip(session.reported, session.seen, strict=True))
+    ]
+    configuration = Configuration(stands=None if kind == "marker" else ORIGIN)
+    asked = {"robot": load_model("robots", "ur5e"), "configuration": configuration}
+
+    def calibrate() -> None:
+        found = solve_robust(t.Observations(observations, t.Source("")), RobustParams(), **asked)
+        verify_holdout(found, lambda _: found, verify_holdout.params(), **asked)
+
+    return Work(calibrate, f"{count} of a {kind}, with held-out errors"), _matrix()
 
 
-def robust_poses() -> tuple[Work, Work]:
-    """solve.robust of 200 whole poses; 1 s is asked for."""
-    from tests.estimation.cells import CONFIGURATIONS, session
+def _session_of_many(command: str, count: int) -> tuple[Work, Work]:
+    """A command on so many marker poses in two tables, a whole process, beside importing numpy."""
+    from tests.estimation import foreign
+    from tools.injected import plain, recipe_of
 
-    cell = CONFIGURATIONS["eye-in-hand, marker"]
-    rng = np.random.default_rng(1)
-    made = session(cell, rng, n=200, tilt=0.4)
-    call = partial(solve_cell, made.observations, cell_of(cell, None), RobustParams())
-    return Work(call, "200 poses"), _matrix()
+    folder = Path(tempfile.mkdtemp())
+    session = foreign.session("marker", foreign.UR5E, 0.1e-3, count, 1)
+    rows = plain(session.reported, session.seen)
+    np.savetxt(folder / "arm.txt", rows.arm)
+    np.savetxt(folder / "marker.txt", rows.marker)
+    (folder / "recipe.yaml").write_text(recipe_of(rows, in_hand=False))
+    out, given = folder / "out", () if command == "doctor" else ("--out", str(folder / "out"))
+    call = _flangeye(command, str(folder / "recipe.yaml"), *given)
+
+    def anew() -> object:
+        shutil.rmtree(out, ignore_errors=True)
+        return call()
+
+    return Work(anew, f"flangeye {command}, {count} poses"), help_text()[1]
 
 
 def read() -> tuple[Work, Work]:
@@ -313,13 +333,23 @@ def cycle() -> tuple[Work, Work]:
 
 
 def _command(*words: str, **variables: str) -> Callable[[], object]:
-    """Return a call of Python in a process of its own, its bytecode cached."""
+    """Return a call of Python in a process of its own, its bytecode cached.
+
+    It returns what the process held at most [MB].
+    """
     environment = os.environ | {"PYTHONPYCACHEPREFIX": tempfile.mkdtemp()} | variables
     environment.pop("PYTHONDONTWRITEBYTECODE", None)
-    return lambda: subprocess.run(
-        [sys.executable, "-P", *words], check=True, env=environment,
-        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-    )  # fmt: skip
+    command, silent = [sys.executable, "-P", *words], subprocess.DEVNULL
+
+    def call() -> float:
+        process = subprocess.Popen(command, env=environment, stdout=silent, stderr=silent)
+        _, status, used = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        if process.returncode:
+            raise subprocess.CalledProcessError(process.returncode, command)
+        return used.ru_maxrss / 1024
+
+    return call
 
 
 def _flangeye(*words: str) -> Callable[[], object]:
@@ -382,9 +412,11 @@ CASES = {
     "fit.rim": fit,
     "fit.ransac_circle": ransac,
     "solve.svd": solve,
-    "solve.robust": robust,
-    "solve.robust, circles": robust_circles,
-    "solve.robust, poses": robust_poses,
+    "calibrate, 50": partial(_calibrated, "flange", 50),
+    "calibrate, 200": partial(_calibrated, "marker", 200),
+    "calibrate, 5000": partial(_calibrated, "marker", 5000),
+    "run, 5000": partial(_session_of_many, "run", 5000),
+    "doctor, 1000": partial(_session_of_many, "doctor", 1000),
     "archive to matrix": archive,
     "report": report,
     "acquire.simulated": acquire,
@@ -400,8 +432,10 @@ GOALS = {
     "segment.flange": "20",
     "segment.flange, loose": "40",
     "fit.rim": "0.06",
-    "solve.robust, circles": "6",
-    "solve.robust, poses": "100",
+    "calibrate, 50": "0.15 s",
+    "calibrate, 200": "0.4 s",
+    "calibrate, 5000": "8 s, 300 MB",
+    "doctor, 1000": "20 s",
     "archive to matrix": "3 s",
     "report": "0.5 s",
     "acquire.simulated": "1.2",

@@ -118,6 +118,7 @@ def answered(session: Session, options: Options, method: str) -> HandEye:
         # It is given where it expects nine tenths of the error or less
         corrected = replace(corrected, expected=then) if then.rms <= 0.9 * expected.rms else None
 
+    @on_one_thread
     def without(poses: Indices) -> HandEye:
         rest = session.without(poses)
         weak = _weak(rest, options)

@@ -202,10 +202,14 @@ def _solved(model: LinearModel, sizes: Floats, information: Floats, right: Float
     Raises:
         numpy.linalg.LinAlgError: The equations are not positive definite.
     """
-    whole, effects = information.copy(), np.arange(model.p, len(information))
-    whole[effects, effects] += sizes[model.sizes.effect] ** -2.0
-    scaled, scale = _scaled(whole)
-    return Fit(sizes, information, right, scale[:, None] * cholesky(scaled, lower=True))
+    diagonal = np.diag(information).copy()
+    diagonal[model.p :] += sizes[model.sizes.effect] ** -2.0
+    most, whole = diagonal.max(), information.copy()
+    # Before anything is seen, as a share of what is known, or of the most where nothing is: no
+    # information, but what keeps the factorisation positive where the sightings show nothing
+    diagonal += 1e-10 * np.where(diagonal > 1e-14 * most, diagonal, most)
+    np.fill_diagonal(whole, diagonal)
+    return Fit(sizes, information, right, cholesky(whole.T, lower=True, overwrite_a=True))
 
 
 def told_of_places(model: LinearModel, sizes: Floats) -> Floats:
@@ -217,17 +221,6 @@ def told_of_places(model: LinearModel, sizes: Floats) -> Floats:
     whole = rows.T @ rows
     effects = whole[p:, p:] + np.diag(sizes[model.sizes.effect] ** -2.0)
     return np.asarray(whole[:p, :p] - whole[:p, p:] @ np.linalg.solve(effects, whole[p:, :p]))
-
-
-def _scaled(information: Floats) -> tuple[Floats, Floats]:
-    """Return an information with a diagonal of ones, a little more, and what it is divided by."""
-    scale = np.sqrt(np.maximum(np.diag(information), 0.0))
-    scale = np.where(scale > 1e-7 * scale.max(), scale, scale.max())
-    scaled = information / scale / scale[:, None]
-    # Before anything is seen, as a share of what is most: no information, but what keeps the
-    # factorisation positive where the sightings show nothing
-    scaled[np.diag_indices(len(scaled))] += 1e-10
-    return scaled, scale
 
 
 def _gradient(model: LinearModel, found: Fit, known: Told, left: Floats) -> Floats:
