@@ -197,7 +197,7 @@ def _matrix() -> Work:
 def _calibrated(kind: str, count: int) -> tuple[Work, Work]:
     """solve.robust with held-out errors, of poses of an arm by a foreign generator."""
     from flangeye.models.loading import load_model
-    from flangeye_plugins.verify.holdout import verify_holdout
+    from flangeye_plugins.verify.holdout import HoldoutParams, verify_holdout
     from tests.estimation import foreign
 
     rotation, place = (size**2 * np.eye(3) for size in foreign.NOISE[kind])
@@ -218,7 +218,7 @@ def _calibrated(kind: str, count: int) -> tuple[Work, Work]:
 
     def calibrate() -> None:
         found = solve_robust(t.Observations(observations, t.Source("")), RobustParams(), **asked)
-        verify_holdout(found, lambda _: found, verify_holdout.params(), **asked)
+        verify_holdout(found, lambda _: found, HoldoutParams(), **asked)
 
     return Work(calibrate, f"{count} of a {kind}, with held-out errors"), _matrix()
 
@@ -406,7 +406,7 @@ def report() -> tuple[Work, Work] | None:
     return Work(_flangeye("report", str(out)), "the run of 30 published clouds"), help_text()[1]
 
 
-CASES = {
+CASES: dict[str, Callable[[], tuple[Work, Work] | None]] = {
     "segment.flange": segment,
     "segment.flange, loose": segment_unorganised,
     "fit.rim": fit,

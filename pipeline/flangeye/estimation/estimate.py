@@ -15,7 +15,7 @@ import numpy as np
 
 from flangeye.estimation.effects.arm import QUALITY, Scatter, arm_scatters
 from flangeye.estimation.effects.effect import Effect
-from flangeye.estimation.graph import Places, Problem, Sightings
+from flangeye.estimation.graph import Linear, Places, Problem, Sightings
 from flangeye.estimation.mixed import (
     Fit,
     LinearModel,
@@ -129,10 +129,7 @@ def model_at(
         of_session: Whether the sightings are those of the session, and not new ones.
     """
     linear, s = problem.linearised(places), problem.seen
-    blocks = [s.projectors @ effect.block(problem, linear) for effect in effects]
-    if not of_session:
-        blocks = [b if e.lasting else 0 * b for b, e in zip(blocks, effects, strict=True)]
-    moved = [np.zeros((len(s), 6, 0)), *(linear.blocks[name] for name in problem.unknown)]
+    design, counts = _design(problem, linear, effects, of_session)
     scatters, parts = arm_scatters(problem), _parts(s)
     further = [*_further(len(s)), *(each.covariances(problem, linear) for each in scatters)]
     between, pairs = _between(s.covariances, parts)
@@ -141,15 +138,27 @@ def model_at(
     floor = s.projectors @ np.diag(np.repeat(np.square((1e-6, 1e-7)), 3)) @ s.projectors
     return LinearModel(
         (s.projectors @ linear.residuals[..., None])[..., 0],
-        np.concatenate([*(s.projectors @ each for each in moved), *blocks], axis=2),
+        design,
         6 * len(problem.unknown),
-        s.projectors @ np.array([*further, *between]) @ s.projectors,
+        np.array([s.projectors @ each @ s.projectors for each in (*further, *between)]),
         np.concatenate([np.column_stack([alone, alone]), len(effects) + pairs]),
         floor + np.eye(6) - s.projectors,
         s.projectors,
-        prior_of(effects, [block.shape[2] for block in blocks], len(parts), scatters),
+        prior_of(effects, counts, len(parts), scatters),
         shares,
     )
+
+
+def _design(
+    problem: Problem, linear: Linear, effects: Sequence[Effect], of_session: bool
+) -> tuple[Floats, list[int]]:
+    """Return (N, 6, P + K) of places and effects, and how many numbers each effect has."""
+    q = problem.seen.projectors
+    places = [np.zeros((len(q), 6, 0)), *(q @ linear.blocks[name] for name in problem.unknown)]
+    blocks = [q @ effect.block(problem, linear) for effect in effects]
+    if not of_session:
+        blocks = [b if e.lasting else 0 * b for b, e in zip(blocks, effects, strict=True)]
+    return np.concatenate([*places, *blocks], axis=2), [block.shape[2] for block in blocks]
 
 
 def _between(covariances: Floats, parts: Floats) -> tuple[list[Floats], Indices]:
