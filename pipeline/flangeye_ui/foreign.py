@@ -21,7 +21,6 @@ OPENED = {
     ".yaml": "text/plain; charset=utf-8", ".txt": "text/plain; charset=utf-8",
 }  # fmt: skip
 """What a browser opens; anything else is saved."""
-ROOMS = ("runs", "batches")
 
 
 def address_of(folder: Path, path: Path) -> str:
@@ -54,6 +53,8 @@ def _found(folder: Path, path: str) -> Path | None:
     """Return the file itself, whatever links lead to it, if it lies in one of the rooms."""
     with suppress(OSError, ValueError, RuntimeError):  # of names that no system has
         found = (folder / path).resolve()
-        inside = any(found.is_relative_to((folder / room).resolve()) for room in ROOMS)
+        inside = any(
+            found.is_relative_to((folder / room).resolve()) for room in ("runs", "batches")
+        )
         return found if inside and found.is_file() else None
     return None

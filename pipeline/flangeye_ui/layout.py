@@ -27,7 +27,6 @@ BESIDE = {
     "Archive": ("/archive", "Compare the sessions of this folder and look into their scans."),
 }
 SIMULATED = "SIMULATED: no real arm or scanner; the figures are the simulation's."
-STYLE = css() + (Path(__file__).parent / "page.css").read_text(encoding="utf-8")
 
 
 class ActionBar:
@@ -70,7 +69,7 @@ def weigh(button: ui.button, second: bool) -> None:
 @contextmanager
 def page(project: Project, title: str) -> Iterator[ActionBar]:
     """Lay out one page around what is made inside; yield the bar with its primary button."""
-    ui.add_css(STYLE)
+    ui.add_css(css() + (Path(__file__).parent / "page.css").read_text(encoding="utf-8"))
     ui.add_head_html("<script>document.documentElement.lang = 'en'</script>")
     ui.colors(
         primary=LIGHT["link"], positive=LIGHT["verified"], negative=LIGHT["refused"],

@@ -35,11 +35,6 @@ steps:
 """
 
 
-DIGITS = 6
-
-LIFE = 120.0
-"""A code is good for so long [s]: time to walk to the terminal and back."""
-
 MOST_WRONG = 5
 """Wrong codes of one server, by mistyping; guessing that often meets 5 of 10^6."""
 
@@ -259,10 +254,13 @@ class MoveCodes:
 
     def ask(self, words: Sequence[str], page: str) -> None:
         """Show a new code in the terminal, with the command that it would start."""
-        code = f"{secrets.randbelow(10**DIGITS):0{DIGITS}d}"
-        self._open = (code, tuple(words), page, time.monotonic() + LIFE)
+        digits = 6
+        code = f"{secrets.randbelow(10**digits):0{digits}d}"
+        # A code is good for so long [s]: time to walk to the terminal and back.
+        life = 120.0
+        self._open = (code, tuple(words), page, time.monotonic() + life)
         line = shlex.join(["flangeye", "run", *words, "--move"])
-        self._show(f"code {code} moves the arm: {line}   (asked for by the page, {LIFE:.0f} s)")
+        self._show(f"code {code} moves the arm: {line}   (asked for by the page, {life:.0f} s)")
 
     def spend(self, given: str, words: Sequence[str], page: str) -> None:
         """Take the code back.

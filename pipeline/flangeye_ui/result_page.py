@@ -41,8 +41,6 @@ ASKED = {
     "rpy": ("Its roll, pitch, yaw", "180 deg, 0 deg, 30 deg"),
 }
 """What a person gives, by the step's own names: what it is called, and an example."""
-OPTIONS = ("seen", "tip")
-"""Those of them that ``flangeye touch`` takes: it reads the arm itself."""
 
 
 class TouchBox:
@@ -77,7 +75,10 @@ class TouchBox:
         """Say what is known by what was given so far."""
         given = self._given()
         examples = {key: example for key, (_, example) in ASKED.items()}
-        points = {key: ", ".join(given[key]) if key in given else examples[key] for key in OPTIONS}
+        # Those of them that ``flangeye touch`` takes: it reads the arm itself.
+        points = {
+            key: ", ".join(given[key]) if key in given else examples[key] for key in ("seen", "tip")
+        }
         options = [f"--{key}={point}" for key, point in points.items()]
         self._line.text = self._project.command("touch", self._run, *options, "--move")
         self._keep.set_enabled(False)

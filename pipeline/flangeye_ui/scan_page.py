@@ -25,17 +25,12 @@ from flangeye_ui.process import RunProcess
 from flangeye_ui.project import Project
 from flangeye_ui.scene import EARLIER, FLANGE, RIM, SCAN, SCANNED, Scene3D, drawing_of, outline_of
 
-EVERY = 0.25
-"""Between two looks at the run [s]."""
-SILENCE = 5.0
-"""A page that is not heard of for so long is taken for dead, and its arm is stopped [s]."""
 BEFORE = {
     True: "The arm moves its flange from pose to pose before the scanner. Keep people out of its "
     "workspace. Starting asks for a code that the terminal shows.",
     False: "No arm moves. Each scan is shown when it arrives, with what became of it.",
 }
 """What is about to happen, by whether an arm moves."""
-BEAT = "setInterval(() => emitEvent('beat'), 500)"
 
 
 def add(project: Project) -> None:
@@ -110,9 +105,12 @@ class RunPanel:
         """Look at the run, and at whether this page still lives."""
         ui.on("beat", self._beat)
         client.on_disconnect(lambda: self._project.page_gone(self._me))
-        ui.timer(0.1, lambda: ui.run_javascript(BEAT), once=True)
+        ui.timer(
+            0.1, lambda: ui.run_javascript("setInterval(() => emitEvent('beat'), 500)"), once=True
+        )
         self._look()
-        ui.timer(EVERY, self._look)
+        # Between two looks at the run [s].
+        ui.timer(0.25, self._look)
 
     def _beat(self, _: Any) -> None:
         self._heard = time.monotonic()
@@ -158,8 +156,10 @@ class RunPanel:
 
     def _look(self) -> None:
         run, running = self._project.run, self._running
-        if running and time.monotonic() - self._heard > SILENCE:
-            self._project.page_gone(self._me, f"the page was silent for {SILENCE:g} s")
+        # A page that is not heard of for so long is taken for dead, and its arm is stopped [s].
+        silence = 5.0
+        if running and time.monotonic() - self._heard > silence:
+            self._project.page_gone(self._me, f"the page was silent for {silence:g} s")
         left, other = self._project.unfinished(), self._project.elsewhere()
         shown = run is not None and not (other and run.code is not None)
         ended = shown and run is not None and run.code in (0, 1)

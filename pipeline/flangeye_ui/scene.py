@@ -51,8 +51,6 @@ TAKEN, LEFT_OUT = "#2e9e5b", "#d64545"
 """Colours of poses and of what is left at them."""
 SHAFT, TIP = 0.002, 0.006
 """Radii of an arrow [m]."""
-DARK = "body.body--dark .scene canvas {filter: invert(0.88) hue-rotate(180deg)}"
-"""At night what is light is dark and colours keep their hue: a scene has one background only."""
 
 
 class Scene3D(ui.scene):
@@ -65,7 +63,9 @@ class Scene3D(ui.scene):
         hovered: Callable[[str], None] | None = None,
     ) -> None:
         """Make one as wide as its column; ``hovered`` hears which named thing is pointed at."""
-        ui.add_css(DARK)
+        # At night what is light is dark and colours keep their hue: a scene has one background
+        # only.
+        ui.add_css("body.body--dark .scene canvas {filter: invert(0.88) hue-rotate(180deg)}")
         self._hovered, self._last, self._of = hovered, "", views
         self._floor = views is not SCANNED
         super().__init__(

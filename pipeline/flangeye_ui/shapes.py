@@ -29,7 +29,6 @@ PUBLISHED = {
     "franka-panda": "panda_description/urdf/panda.urdf",
 }  # fmt: skip
 """URDFs of the package ``example-robot-data`` that have the meshes of an arm, by model."""
-KEPT = {"cache-control": "private, max-age=3600"}
 
 
 def add(project: Project) -> None:
@@ -48,7 +47,11 @@ def add(project: Project) -> None:
     def picture(kind: str, name: str) -> Response:
         if kind not in ("robots", "scanners") or name not in model_names(kind):
             return PlainTextResponse("no such shape\n", 404)
-        return Response(_picture(kind, name), media_type="image/svg+xml", headers=KEPT)
+        return Response(
+            _picture(kind, name),
+            media_type="image/svg+xml",
+            headers={"cache-control": "private, max-age=3600"},
+        )
 
     @app.get("/shapes/arm.stl")
     def mesh(q: str) -> Response:

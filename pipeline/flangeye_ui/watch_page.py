@@ -16,8 +16,6 @@ from flangeye_ui.foreign import address_of
 from flangeye_ui.layout import command_line, mistake, page
 from flangeye_ui.project import Project
 
-TONES = {"OK": "good", "DEGRADED": "fair", "MOVED": "poor"}
-
 
 def add(project: Project) -> None:
     """Add the page."""
@@ -59,7 +57,8 @@ async def _load(project: Project, run: Path, place: ui.column) -> None:
             ui.label("No check was judged yet.")
             return
         last = history.findings[-1]
-        with ui.element("div").classes(TONES[last.state]):
+        tones = {"OK": "good", "DEGRADED": "fair", "MOVED": "poor"}
+        with ui.element("div").classes(tones[last.state]):
             ui.label(last.state).classes("title said").props('role="status"')
         ui.label(f"By the last of {len(history.findings)} checks {sentence(last)}")
         label = f"Shift of the work at each check of {run.name}, mm"

@@ -15,10 +15,6 @@ from flangeye.maths.seam_geometry import torch_deviation
 from flangeye.types import Floats, WeldReport, WorkpieceScan
 from flangeye_paper.tables import Row, SessionRow, dress, legend, read_sessions, sheet, write_csv
 
-BEYOND = 0.2
-"""The true seam is extended straight by this much, for what happens before and after it [m]."""
-
-
 WORKPIECES = ("straight", "curved")
 TOUCH, PLAN, PRINTED = "by touch", "the plan alone", "Algorithm 2 as printed"
 ACROSS = "by touch, started across the seam: from 160 mm on"
@@ -84,10 +80,12 @@ class SeenWeld:
 
     def _seen(self, points: Floats) -> tuple[Floats, Floats]:
         """Return arc lengths (K,) of points (K, 3) and how far they are to the left (K,) [m]."""
+        # The true seam is extended straight by this much, for what happens before and after it [m].
+        beyond = 0.2
         line = np.vstack([
-            self.truth[0] - BEYOND * _unit(self.truth[1] - self.truth[0]),
+            self.truth[0] - beyond * _unit(self.truth[1] - self.truth[0]),
             self.truth,
-            self.truth[-1] + BEYOND * _unit(self.truth[-1] - self.truth[-2]),
+            self.truth[-1] + beyond * _unit(self.truth[-1] - self.truth[-2]),
         ])  # fmt: skip
         start, step = line[:-1], np.diff(line, axis=0)
         lengths = np.linalg.norm(step, axis=1)
@@ -98,7 +96,7 @@ class SeenWeld:
         distance = np.linalg.norm(_flat(away - along[..., None] * ahead, self.report), axis=2)
         nearest = distance.argmin(axis=1)
         rows = np.arange(len(points))
-        arc = np.concatenate([[0.0], np.cumsum(lengths)])[nearest] + along[rows, nearest] - BEYOND
+        arc = np.concatenate([[0.0], np.cumsum(lengths)])[nearest] + along[rows, nearest] - beyond
         return arc, np.einsum("ki,ki->k", away[rows, nearest], left[nearest])
 
 

@@ -135,9 +135,6 @@ def sensor_opencv(
     return OpenCVCamera(finger, params)
 
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp")
-
-
 class ImageFolderParams(Params):
     """Parameters of ``sensor.image_folder``."""
 
@@ -195,10 +192,11 @@ def sensor_image_folder(
     finger: Finger, robot: StateSource, seed: Seed, params: ImageFolderParams
 ) -> TactileSensor:
     """A folder of images, one after the other."""
-    found = (p for p in _listed(params.path) if p.suffix.lower() in SUFFIXES)
+    suffixes = (".png", ".jpg", ".jpeg", ".bmp")
+    found = (p for p in _listed(params.path) if p.suffix.lower() in suffixes)
     files = sorted(found, key=lambda path: natural(path.name))
     if not files:
-        raise StageError(f"{params.path}: holds no image; known: {', '.join(SUFFIXES)}")
+        raise StageError(f"{params.path}: holds no image; known: {', '.join(suffixes)}")
     timed = ((i * params.period, _read(file, finger)) for i, file in enumerate(files))
     return RecordedImages(f"images in {params.path.name}", finger, robot, timed)
 

@@ -15,9 +15,6 @@ from flangeye.plugin.stage import Params, part
 from flangeye.types import Floats
 from flangeye.units import Angle, Length, param
 
-WIDEST = 0.6
-"""Axes of shown flanges are farther apart than this [rad]: they do not look at one scanner."""
-
 
 class GuessParams(Params):
     """Parameters of ``view.guess``."""
@@ -68,10 +65,12 @@ def view_shown(arm: Arm, scanner: ScannerModel, params: ShownParams) -> Floats:
     places, axes = flanges[:, :3, 3], flanges[:, :3, 2]
     mean = axes.mean(axis=0) / np.linalg.norm(axes.mean(axis=0))
     apart = float(np.arccos(np.clip(axes @ mean, -1.0, 1.0)).max())
-    if apart > WIDEST:
+    # Axes of shown flanges are farther apart than this [rad]: they do not look at one scanner.
+    widest = 0.6
+    if apart > widest:
         raise StageError(
             f"view.shown: one of the flanges looks {np.degrees(apart):.0f} deg away from the "
-            f"others' middle, allowed {np.degrees(WIDEST):.0f} deg; show poses that face the "
+            f"others' middle, allowed {np.degrees(widest):.0f} deg; show poses that face the "
             "scanner"
         )
     middle = places.mean(axis=0)

@@ -31,10 +31,6 @@ from flangeye.types import (
     Transform,
 )
 
-ORDINARY = 0.02, np.radians(1.0)
-"""Errors of sound sightings, as a share of how far they are apart, and of their rotations [rad]."""
-NEAREST, FARTHEST = 0.02, 10.0
-"""Sightings and poses in the middle of a cell are so far from camera and base [m]."""
 UNITS = {"mm": 1e-3, "m": 1e3}
 """Factors on lengths, by the unit they are in if the recipe says the other one."""
 
@@ -273,7 +269,10 @@ class Foretold:
     @property
     def size(self) -> float:
         """Of the errors, in units of ordinary ones."""
-        return float(max(self.share / ORDINARY[0], (self.misfit.angle or 0.0) / ORDINARY[1]))
+        # Errors of sound sightings, as a share of how far they are apart, and of their rotations
+        # [rad].
+        ordinary = 0.02, np.radians(1.0)
+        return float(max(self.share / ordinary[0], (self.misfit.angle or 0.0) / ordinary[1]))
 
     @property
     def ordinary(self) -> bool:
@@ -302,7 +301,9 @@ def _possible(suspicion: Suspicion) -> bool:
     seen = np.array([np.linalg.norm(o.feature.centre) for o in suspicion.observations])
     reach = [x.translation for o in suspicion.observations for x in o.poses.values()]
     far = np.linalg.norm(reach, axis=1)
-    return bool(NEAREST < np.median(seen) < FARTHEST and NEAREST < np.median(far) < FARTHEST)
+    # Sightings and poses in the middle of a cell are so far from camera and base [m].
+    nearest, farthest = 0.02, 10.0
+    return bool(nearest < np.median(seen) < farthest and nearest < np.median(far) < farthest)
 
 
 def _by_pair(observations: Sequence[Observation]) -> dict[tuple[str, str], list[int]]:

@@ -20,7 +20,6 @@ os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_PIXELS))
 os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
 
 PNG = b"\x89PNG\r\n\x1a\n"
-TOO_LARGE = f"is an image of more than {MAX_PIXELS} pixels"
 
 
 class ImageError(ValueError):
@@ -39,15 +38,16 @@ def decode_image(raw: bytes, flags: int) -> NDArray[Any]:
     """
     import cv2
 
+    too_large = f"is an image of more than {MAX_PIXELS} pixels"
     if _stated_pixels(raw) > MAX_PIXELS:
-        raise ImageError(TOO_LARGE)
+        raise ImageError(too_large)
     if _is_cut_png(raw):
         raise ImageError("is a damaged image")
     try:
         pixels = cv2.imdecode(np.frombuffer(raw, dtype=np.uint8), flags) if raw else None
     except cv2.error as error:
         large = "MAX_IMAGE" in str(error)
-        raise ImageError(TOO_LARGE if large else "is a damaged image") from None
+        raise ImageError(too_large if large else "is a damaged image") from None
     if pixels is None:
         raise ImageError("is not an image, or is damaged")
     return np.asarray(pixels)

@@ -35,7 +35,6 @@ from flangeye.types import Singles
 if TYPE_CHECKING:
     from mcap.records import Chunk
 
-MAGIC = b"\x89MCAP0\r\n"
 MAX_RECORD = 1 << 30
 """Largest record that is read [bytes]."""
 MAX_CHUNK = 1 << 28
@@ -146,15 +145,16 @@ class LogFile:
 
     def _records(self, file: IO[bytes], size: int) -> Iterator[tuple[int, bytes]]:
         """Yield (opcode, content); a record that is cut off was being written, and is no damage."""
-        begin = file.read(len(MAGIC))
-        if not MAGIC.startswith(begin):
+        magic = b"\x89MCAP0\r\n"
+        begin = file.read(len(magic))
+        if not magic.startswith(begin):
             raise NotMcapError
         self._crc = zlib.crc32(begin)
         while len(head := file.read(9)) == 9:
             opcode, length = struct.unpack("<BQ", head)
-            body = file.read(min(length, size)) if length <= MAX_RECORD else MAGIC
+            body = file.read(min(length, size)) if length <= MAX_RECORD else magic
             if len(body) < length:
-                if body.endswith(MAGIC):  # the end is there, so nothing was being written
+                if body.endswith(magic):  # the end is there, so nothing was being written
                     self._sound = False
                     self.damaged(f"a record says that it has {length} bytes; the rest is not read")
                 return

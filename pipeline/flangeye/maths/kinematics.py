@@ -27,9 +27,6 @@ from flangeye.types import Floats
 SOLVED = 1e-9
 """A pose is reached when it is this close: rotation [rad] and translation [m] together."""
 
-SAME_BRANCH = 1e-3
-"""Two solutions are one when every joint agrees to this [rad or m]."""
-
 
 class JointAxis(Protocol):
     """One joint: what comes before it, its axis, and its limits.
@@ -423,12 +420,14 @@ class Arm:
         # Sorting by what is rounded to the tolerance keeps the order independent of the last
         # bits, which differ between the paths that lead to one solution.
         distance = np.abs(joints - self._middle).max(axis=1, initial=0.0)
-        rounded = np.round(np.vstack([joints.T[::-1], distance]) / SAME_BRANCH)
+        # Two solutions are one when every joint agrees to this [rad or m].
+        same_branch = 1e-3
+        rounded = np.round(np.vstack([joints.T[::-1], distance]) / same_branch)
         joints = joints[np.lexsort(rounded)]
         apart = np.abs(joints[:, None] - joints)
         # An angle has come round again after a turn; a slide has not.
         apart = np.where(self.slides, apart, np.minimum(apart, np.abs(2 * np.pi - apart)))
-        same = apart.max(axis=-1, initial=0.0) <= SAME_BRANCH
+        same = apart.max(axis=-1, initial=0.0) <= same_branch
         if not np.tril(same, -1).any():
             return joints
         kept: list[int] = []

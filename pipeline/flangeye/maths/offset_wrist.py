@@ -27,13 +27,6 @@ from flangeye.types import Floats, Indices
 Numbers = NDArray[np.complex128]
 
 
-SAMPLES = 128
-"""Angles of joint 6 at which the equation is looked at."""
-
-FINER = 16
-"""Samples for one, where a root may hide."""
-
-
 @dataclass(frozen=True, eq=False)
 class OffsetWrist:
     """What a pose is solved with, in a frame whose z is axis 1 and whose y is axis 2 at zero.
@@ -126,10 +119,14 @@ class OffsetWrist:
         """
         # One sample more at each end: each has both its neighbours
         ways, starts = np.arange(4), np.array([-np.pi])
-        pitch, row = 2 * np.pi / SAMPLES, np.arange(-1.0, SAMPLES + 1)
+        # Angles of joint 6 at which the equation is looked at.
+        samples = 128
+        pitch, row = 2 * np.pi / samples, np.arange(-1.0, samples + 1)
         doubts = np.zeros(0)
         found = []
         # How often the samples are spaced, more closely each time
+        # Samples for one, where a root may hide.
+        finer = 16
         for _ in range(3):
             angles = starts[:, None] + pitch * row
             values = self._posture(orbits, angles, ways[:, None])[0]
@@ -144,7 +141,7 @@ class OffsetWrist:
             ways, doubts = ways[i], angles[i, k + 1]
             if not len(ways):
                 break
-            starts, row, pitch = doubts - pitch, np.arange(-1.0, 2 * FINER + 1), pitch / FINER
+            starts, row, pitch = doubts - pitch, np.arange(-1.0, 2 * finer + 1), pitch / finer
         return np.hstack(found), np.array([ways, doubts])
 
     def _refined(self, orbits: Numbers, brackets: Floats) -> Floats:

@@ -15,9 +15,6 @@ from flangeye.motion.clearance import ArmVolume
 from flangeye.motion.limits import MotionLimits
 from flangeye.types import Floats
 
-ROLLS = 8
-"""How many directions of the flange's x axis are tried for the one the arm likes best."""
-
 
 class Margins(NamedTuple):
     """How far poses keep away from what an arm must not do.
@@ -122,8 +119,10 @@ class Reach:
     def _rolls(self, centre: Floats) -> list[Floats]:
         """Return poses (4, 4) at a point that look at the scanner, turned about that view."""
         poses = []
-        for step in range(ROLLS):
-            turn = rotation_from_rpy(np.pi, 0.0, 2 * np.pi * step / ROLLS)
+        # How many directions of the flange's x axis are tried for the one the arm likes best.
+        rolls = 8
+        for step in range(rolls):
+            turn = rotation_from_rpy(np.pi, 0.0, 2 * np.pi * step / rolls)
             poses.append(rigid(self._base_T_camera[:3, :3] @ turn, centre))
         return poses
 

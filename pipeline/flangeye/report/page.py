@@ -42,8 +42,6 @@ from flangeye.types import Floats
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-_HERE = Path(__file__).parent
-
 
 def write_report(log: RunLog, path: Path, library: Path | None = None) -> None:
     """Write the report of a run, finished or not, as one HTML file that needs nothing else.
@@ -138,7 +136,7 @@ def _environment() -> Environment:
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     environment = Environment(
-        loader=FileSystemLoader(_HERE),
+        loader=FileSystemLoader(Path(__file__).parent),
         autoescape=True,
         optimized=False,  # a page is rendered once
         undefined=StrictUndefined,

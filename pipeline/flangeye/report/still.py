@@ -24,8 +24,6 @@ from flangeye.types import Floats
 
 AZIMUTH, ELEVATION = np.radians(-62.0), np.radians(20.0)
 """Where the picture is taken from, about the base: it shows an arm that reaches along x."""
-SQUARE = 0.25
-"""Edge of a square of the floor [m]."""
 PIXELS = 'vector-effect="non-scaling-stroke"'
 """For a line whose width is in pixels, whatever the picture's scale."""
 
@@ -141,17 +139,19 @@ def _flat(points: Floats) -> Floats:
 
 def _floor(corners: Floats) -> Iterable[_Line]:
     """Return the squares of the floor below everything, and the axes of the base."""
-    low = np.floor(np.minimum(corners.min(axis=0), -SQUARE) / SQUARE)[:2].astype(int)
-    high = np.ceil(np.maximum(corners.max(axis=0), SQUARE) / SQUARE)[:2].astype(int)
+    # Edge of a square of the floor [m].
+    square = 0.25
+    low = np.floor(np.minimum(corners.min(axis=0), -square) / square)[:2].astype(int)
+    high = np.ceil(np.maximum(corners.max(axis=0), square) / square)[:2].astype(int)
     lines = []
     for axis in (0, 1):
         for n in range(low[axis], high[axis] + 1):
             ends = np.zeros((2, 3))
             ends[:, axis], ends[:, 1 - axis] = n, (low[1 - axis], high[1 - axis])
-            lines.append(_Line(SQUARE * ends, "var(--grid, #9aa4b4)", 1.0, PIXELS))
+            lines.append(_Line(square * ends, "var(--grid, #9aa4b4)", 1.0, PIXELS))
     for axis, colour in enumerate((SERIES["x"], SERIES["y"], SERIES["z"])):
         tip = np.zeros((2, 3))
-        tip[1, axis] = SQUARE
+        tip[1, axis] = square
         lines.append(_Line(tip, colour, 0.012))
     return lines
 

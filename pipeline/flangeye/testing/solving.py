@@ -41,8 +41,6 @@ POSES = 16
 MOTION = rigid(rotation_exp(np.array([0.3, -0.2, 0.9])), np.array([0.2, 0.1, -0.3]))
 """Another place for the robot's base."""
 
-SHIFT = rigid(np.eye(3), np.array([0.2, 0.1, -0.3]))
-"""The same without a turn: boxes stay boxes."""
 
 HERE = np.eye(4)
 
@@ -268,7 +266,9 @@ class VerifyConformance(SolvingConformance):
         """A robot that stands elsewhere is judged the same."""
         observations = observed(work_points())
         here = self.answer(observations)
-        there = self.answer(elsewhere(observations, SHIFT), SHIFT)
+        # The same without a turn: boxes stay boxes.
+        shift = rigid(np.eye(3), np.array([0.2, 0.1, -0.3]))
+        there = self.answer(elsewhere(observations, shift), shift)
         for name, figure in here.figures.items():
             require(
                 np.isclose(there.figures.get(name, np.nan), figure, rtol=1e-3, atol=2e-6),

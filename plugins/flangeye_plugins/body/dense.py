@@ -18,30 +18,9 @@ FEWEST = 60
 """Points that are needed."""
 
 
-LEAST_REACH = 4.0
-"""How far off points count at last, in deviations."""
-
-
-LOST = 1.0
-"""Mean and standard deviation of the width that a scanner loses along edges, in distances between
-points, before any scan. Filters of scanners reach over a few points."""
-
-RASTER = 1 / 12**0.5
-"""Standard deviation of where an edge lies between two points, in their distance. All points of a
-straight edge along the raster share it."""
-
-
 FACINGS = 6
 """Ways that an edge may look, each with a loss of its own."""
 
-FILTER = 2
-"""Distances between points within which a scanner averages most: published scans of planes
-correlate by 0.7 so far apart."""
-
-
-SAME = 5.0
-"""Neighbouring rays meet one surface where their depths differ by less than so many of the
-distances between them: seen at less than 79 degrees to its normal."""
 
 UNKNOWN = 1.0
 """Standard deviation of what the scan does not show at all: of a turn [rad], and of a shift in
@@ -192,11 +171,17 @@ class _Laying:
         some, spacing = points[:: 1 + len(points) // most].astype(np.float64), spacing_of(points)
         apart = spacing * float(np.median(some[:, 2]))
         edges, cell = _scan_edges(points, shape.size)
-        usual = np.r_[np.full(FACINGS, -cell / 2 - LOST * apart), 0.0]
+        # Mean and standard deviation of the width that a scanner loses along edges, in distances
+        # between points, before any scan. Filters of scanners reach over a few points.
+        lost = 1.0
+        usual = np.r_[np.full(FACINGS, -cell / 2 - lost * apart), 0.0]
         # How much a scanner rounds, see `_rounding`; before any scan
-        spread = np.diag(np.r_[np.full(FACINGS, (RASTER * apart) ** 2), 10.0**2])
-        spread[:FACINGS, :FACINGS] += (LOST * apart) ** 2
-        return cls(some, edges, shape, spacing, RASTER * cell, usual, np.linalg.inv(spread))
+        # Standard deviation of where an edge lies between two points, in their distance. All points
+        # of a straight edge along the raster share it.
+        raster = 1 / 12**0.5
+        spread = np.diag(np.r_[np.full(FACINGS, (raster * apart) ** 2), 10.0**2])
+        spread[:FACINGS, :FACINGS] += (lost * apart) ** 2
+        return cls(some, edges, shape, spacing, raster * cell, usual, np.linalg.inv(spread))
 
     def settled(self, pose: Floats) -> _Settled | None:
         """Return the body moved until it rests; None where too few points are on it."""
@@ -208,6 +193,8 @@ class _Laying:
         prior[:6, :6] = UNKNOWN**-2.0 * np.eye(6)
         prior[6:, 6:] = self.prior
         # The body is moved a dozen times at most
+        # How far off points count at last, in deviations.
+        least_reach = 4.0
         for _ in range(12):
             surface = _surface(self.points, shape, pose, reach, rounding, scanner[-1])
             ends = _ends(self.edges, shape, pose, scanner[:-1], beside, self.spacing)
@@ -224,14 +211,14 @@ class _Laying:
             gradient[6:] += self.prior @ (self.usual - scanner)
             step = np.asarray(np.linalg.solve(information, gradient), np.float64)
             pose, scanner = _moved(pose, shape, step), scanner + step[6:]
-            if reach < 2 * LEAST_REACH * noise:
+            if reach < 2 * least_reach * noise:
                 # [rad] and sizes: nothing moves any more
                 if rounding.any() and np.abs(step[:6]).max() < 1e-5:
                     break
                 rounding = _rounding(self.points, shape, pose, self.spacing)
-            reach = max(0.5 * reach, LEAST_REACH * noise)
+            reach = max(0.5 * reach, least_reach * noise)
             if not few:
-                beside = max(0.5 * beside, LEAST_REACH * spread)
+                beside = max(0.5 * beside, least_reach * spread)
         left = equations._replace(residual=equations.residual - equations.jacobian @ step)
         return _Settled(pose, left, weights, information, len(surface.residual), noise, scanner)
 
@@ -281,11 +268,16 @@ def _rounding(points: Floats, shape: Shape, pose: Floats, spacing: float) -> Flo
     own = shape.meet(origin, points @ rotation).depth
     total = np.zeros(len(points))
     sides = ((1, 0), (-1, 0), (0, 1), (0, -1))  # neighbours of a ray
+    # Distances between points within which a scanner averages most: published scans of planes
+    # correlate by 0.7 so far apart.
+    reach = 2
     for side in sides:
-        beside = points + FILTER * spacing * np.array([*side, 0.0]) * points[:, 2:]
+        beside = points + reach * spacing * np.array([*side, 0.0]) * points[:, 2:]
         with np.errstate(invalid="ignore"):
             off = shape.meet(origin, beside @ rotation).depth - own
-            total += np.where(np.abs(off) < SAME * FILTER * spacing, off, np.nan)
+            # Neighbouring rays meet one surface where their depths differ by less than so many of
+            # the distances between them: seen at less than 79 degrees to its normal.
+            total += np.where(np.abs(off) < 5.0 * reach * spacing, off, np.nan)
     few = np.isfinite(total).sum() < FEWEST
     return np.zeros(len(points)) if few else total / len(sides)
 

@@ -24,9 +24,6 @@ from flangeye_plugins.body.view import CoarseImage, view_of
 ROUGH = 0.06
 """How far off a surface may be while the turn is known to 9 degrees, as a share of the size."""
 
-AT_ONCE = 30_000
-"""Poses judged at once: their points stay in a core's cache."""
-
 
 def guesses(view: CoarseImage, looks: Looks, most: int) -> Floats:
     """Return at most so many (K, 4, 4) ``camera_T_body`` that are consistent with a scan."""
@@ -75,8 +72,10 @@ def _passed(on: OrientedPoints, at: Indices, view: CoarseImage, looks: Looks) ->
 
 def _chunked(number: Indices, work: Callable[[Indices], Any]) -> Any:
     """Return what the work gives for some numbers at once, one after the other."""
-    chunks = range(0, max(len(number), 1), AT_ONCE)
-    return np.concatenate([work(number[k : k + AT_ONCE]) for k in chunks])
+    # Poses judged at once: their points stay in a core's cache.
+    at_once = 30_000
+    chunks = range(0, max(len(number), 1), at_once)
+    return np.concatenate([work(number[k : k + at_once]) for k in chunks])
 
 
 def _some(points: OrientedPoints, count: int, spacing: float, rng: np.random.Generator) -> Indices:

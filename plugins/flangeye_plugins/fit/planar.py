@@ -19,9 +19,6 @@ from flangeye.maths.geometry import (
 from flangeye.models.corners import Corners
 from flangeye.types import Floats, Image, PointCloud
 
-REACH = 3
-"""Half the window about a corner whose points give its depth [px]."""
-
 
 class PlanarPose(NamedTuple):
     """A pose of a flat target.
@@ -183,11 +180,13 @@ def points_of(corners: Corners, cloud: PointCloud) -> Floats:
 def _point_at(xyz: NDArray[np.float32], pixel: Floats) -> Floats:
     column, row = np.round(pixel).astype(int)
     height, width = xyz.shape[:2]
-    if not (REACH <= column < width - REACH and REACH <= row < height - REACH):
+    # Half the window about a corner whose points give its depth [px].
+    reach = 3
+    if not (reach <= column < width - reach and reach <= row < height - reach):
         return np.full(3, np.nan)
-    window = xyz[row - REACH : row + REACH + 1, column - REACH : column + REACH + 1]
+    window = xyz[row - reach : row + reach + 1, column - reach : column + reach + 1]
     points = window.reshape(-1, 3).astype(np.float64)
-    down, across = np.indices(window.shape[:2]).reshape(2, -1) - REACH
+    down, across = np.indices(window.shape[:2]).reshape(2, -1) - reach
     rows = np.stack([np.ones(len(points)), across + column - pixel[0], down + row - pixel[1]], 1)
     known = np.isfinite(points).all(axis=1)
     # Share of that window that must have points

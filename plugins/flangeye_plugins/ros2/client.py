@@ -22,9 +22,6 @@ from flangeye.files.processes import Pipe, PipeEndedError, busy, python_command
 from flangeye.models.graph import Topic
 from flangeye_plugins.ros2.messages import CLOCK, CLOCK_TYPE, stamp_of, types
 
-BRIDGE = Path(__file__).with_name("bridge")
-"""Run by the other Python, and not imported here: this one may have no rclpy."""
-
 PROGRAM = "ros2"
 """The entry of this machine's settings that names the Python which has rclpy."""
 
@@ -83,7 +80,8 @@ class Bridge(Device):
         self._answers: queue.Queue[dict[str, Any]] = queue.Queue()
         self._triggered: queue.Queue[dict[str, Any]] = queue.Queue()
         self._asking = threading.Lock()
-        words = [*ros_python(asker), str(BRIDGE)]
+        # Run by the other Python, and not imported here: this one may have no rclpy.
+        words = [*ros_python(asker), str(Path(__file__).with_name("bridge"))]
         try:
             self._pipe = Pipe(words, _environment())
         except OSError as error:

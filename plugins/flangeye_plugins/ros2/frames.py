@@ -15,10 +15,6 @@ from flangeye_plugins.ros2.messages import decoded
 
 TF, STATIC, TF_TYPE = "/tf", "/tf_static", "tf2_msgs/msg/TFMessage"
 
-STALE = 0.25
-"""A frame that moves and was not told of for so long is lost: robot_state_publisher publishes at
-20 Hz unless it is told otherwise [s]."""
-
 
 class StampedFrame(NamedTuple):
     """A frame: its parent, its pose there (4, 4), and when that came; never for one that stands."""
@@ -91,6 +87,9 @@ class Frames:
     def _from(self, name: str, ancestor: str) -> Floats:
         """Return the pose of a frame in one of its ancestors."""
         pose = np.eye(4)
+        # A frame that moves and was not told of for so long is lost: robot_state_publisher
+        # publishes at 20 Hz unless it is told otherwise [s].
+        stale = 0.25
         while name != ancestor:
             frame = self.frames[name]
             age = (
@@ -98,9 +97,9 @@ class Frames:
                 if frame.received_ns is None
                 else 1e-9 * (time.monotonic_ns() - frame.received_ns)
             )
-            if age > STALE:
+            if age > stale:
                 raise DeviceError(
-                    f"{self._asker}: tf has not told of {name} for {age:.2f} s, at most {STALE} s "
+                    f"{self._asker}: tf has not told of {name} for {age:.2f} s, at most {stale} s "
                     "are allowed"
                 )
             pose, name = frame.pose @ pose, frame.parent

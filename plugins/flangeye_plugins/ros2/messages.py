@@ -32,7 +32,6 @@ PIXELS = {"mono8": ("u1", 1), "8UC1": ("u1", 1), "mono16": ("u2", 1), "16UC1": (
 """Encodings of ``sensor_msgs/Image`` that are read: type and channels."""
 PER_METRE = {"16UC1": 1000.0, "mono16": 1000.0, "32FC1": 1.0}
 """Encodings of depth images: units in a metre (REP 118)."""
-MISSING = "ROS 2 messages need the extra 'ros': pip install 'flangeye[ros]'"
 
 
 def stamp_of(data: bytes) -> int:
@@ -66,7 +65,8 @@ def types() -> Any:
     try:
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise StageError(MISSING) from None
+        missing = "ROS 2 messages need the extra 'ros': pip install 'flangeye[ros]'"
+        raise StageError(missing) from None
     return get_typestore(Stores.ROS2_HUMBLE)
 
 

@@ -19,9 +19,6 @@ from flangeye_plugins.seam.points import Oriented, spread_over_normals
 
 Ints = NDArray[np.intp]
 
-TOLERANCE = 0.02
-"""How far the scan may be from a pose of the part, along a ray, as a share of the diagonal."""
-
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
@@ -68,15 +65,17 @@ def find_poses(
         rng: Draws the points and pairs.
     """
     size = part.diagonal
-    model = model_of(part, rng, 1.5 * TOLERANCE * size)
+    # How far the scan may be from a pose of the part, along a ray, as a share of the diagonal.
+    tolerance = 0.02
+    model = model_of(part, rng, 1.5 * tolerance * size)
     points = 700  # that pairs are made of, on the scan and on the CAD
     spread = spread_over_normals(scan, points, rng)
     poses = _hypotheses(spread, spread_over_normals(model.surface, points, rng), size, rng)
     # Samples of the CAD a pose is judged by, at first
-    scores = agreement(poses, model.thinned(100, rng), seen, TOLERANCE * size)
+    scores = agreement(poses, model.thinned(100, rng), seen, tolerance * size)
     poses = poses[_distinct(Candidates(poses, scores), size)]
     # And for the best
-    scores = agreement(poses, model.thinned(1000, rng), seen, TOLERANCE * size)
+    scores = agreement(poses, model.thinned(1000, rng), seen, tolerance * size)
     order = np.argsort(-scores, kind="stable")
     return Candidates(poses[order], scores[order])
 

@@ -9,12 +9,6 @@ from flangeye import Params, StageError
 from flangeye.maths.statistics import median
 from flangeye.units import Length, param
 
-FARTHEST, NEAREST = 30.0, 0.01
-"""No scanner for such work sees farther than 30 m or nearer than 10 mm."""
-
-SAMPLE = 100_000
-"""Coordinates that settle the median depth."""
-
 
 class RangeParams(Params):
     """How far from the scanner something is looked for."""
@@ -33,13 +27,16 @@ def check_scale(xyz: NDArray[np.float32], where: str) -> None:
     Raises:
         StageError: Says which unit it looks like.
     """
-    depths = np.abs(xyz[..., 2].ravel()[:: 1 + xyz.size // SAMPLE])
+    # Coordinates that settle the median depth.
+    depths = np.abs(xyz[..., 2].ravel()[:: 1 + xyz.size // 100_000])
     depth = float(median(depths[~np.isnan(depths)]))
-    if NEAREST <= depth <= FARTHEST:
+    # No scanner for such work sees farther than 30 m or nearer than 10 mm.
+    farthest, nearest = 30.0, 0.01
+    if nearest <= depth <= farthest:
         return
     looks = (
         "millimetres read as metres: state unit mm where the clouds are read"
-        if depth > FARTHEST
+        if depth > farthest
         else "metres read as millimetres: state unit m where the clouds are read"
     )
     raise StageError(

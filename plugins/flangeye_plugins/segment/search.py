@@ -17,9 +17,6 @@ from flangeye_plugins.segment.parts import PlanarPiece, SurfacePiece, flat_parts
 NOISE_GATE = 5.0
 """Robust standard deviations of the grid's own bending above which a point is not smooth."""
 
-SAMPLE = 40_000
-"""Second differences that settle what is typical, to one percent."""
-
 
 BLANK = 0.2
 """A face without holes scores near 0, the published faces with five holes 0.77 and more, one
@@ -155,7 +152,8 @@ def _step(depth: Singles, at: Indices, axis: int) -> Singles:
 
 def _typical(values: Singles) -> float:
     """Return the robust standard deviation of second differences."""
-    sample = np.abs(values.ravel()[:: 1 + values.size // SAMPLE])
+    # Second differences that settle what is typical, to one percent.
+    sample = np.abs(values.ravel()[:: 1 + values.size // 40_000])
     sample = sample[np.isfinite(sample)]
     return SIGMA_OF_MAD * float(median(sample)) if sample.size else 0.0
 

@@ -13,10 +13,6 @@ from flangeye_plugins.segment.discs import in_box
 from flangeye_plugins.segment.grid import Grid, coarse_view
 from flangeye_plugins.segment.scale import RangeParams, check_scale
 
-ACROSS = 16
-"""Coarse points across the sphere."""
-
-
 CANDIDATES = 6
 """Places with the most votes that are looked at more closely."""
 
@@ -26,9 +22,6 @@ UNKNOWN_SIZES = np.geomspace(75e-3, 8e-3, 14)
 
 SIZE_STEP = 0.1
 """How far a sphere may be from such a radius, as a share of it."""
-
-SEEN_TO = np.sin(np.radians(60.0))
-"""Share of the radius within which, across the view, a scanner sees a sphere well."""
 
 
 class SegmentSphereParams(RangeParams):
@@ -72,7 +65,8 @@ def segment_sphere(
     radii = UNKNOWN_SIZES if sphere.size is None else [sphere.size]
     found: list[Candidate] = []
     for radius in radii:
-        view = coarse_view(capture.cloud.xyz, 2 * radius / ACROSS)
+        # Coarse points across the sphere.
+        view = coarse_view(capture.cloud.xyz, 2 * radius / 16)
         if view is None:
             return Rejected("no finite point")
         check_scale(view.xyz, capture.id)
@@ -204,10 +198,12 @@ def _share_seen(
     offsets = near - centre
     along = offsets @ (centre / np.linalg.norm(centre))
     squared = (offsets**2).sum(axis=1)
-    facing = squared - along**2 < (SEEN_TO * radius) ** 2
+    # Share of the radius within which, across the view, a scanner sees a sphere well.
+    seen_to = np.sin(np.radians(60.0))
+    facing = squared - along**2 < (seen_to * radius) ** 2
     on_face = (np.abs(np.sqrt(squared) - radius) < tolerance) & (along < 0)
     for_it, against = (facing & on_face).sum(), (facing & ~on_face).sum()
-    due = np.pi * (SEEN_TO * radius) ** 2 / (angle * np.linalg.norm(centre)) ** 2
+    due = np.pi * (seen_to * radius) ** 2 / (angle * np.linalg.norm(centre)) ** 2
     return float(max(0.0, (for_it - against) / due))
 
 

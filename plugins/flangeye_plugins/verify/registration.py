@@ -21,8 +21,6 @@ from flangeye.maths.statistics import rms
 from flangeye.models.targets import Flange
 from flangeye.types import Floats
 
-FEWEST_POINTS = 100
-
 
 @dataclass(frozen=True, eq=False)
 class SampledSurface:
@@ -125,8 +123,9 @@ def read_surface(path: Path, unit: LengthUnit, rotation: Floats, offset: Floats)
         StageError: The file is no cloud, or too small.
     """
     xyz = read_cloud(path, unit).points().astype(np.float64)
-    if len(xyz) < FEWEST_POINTS:
-        raise StageError(f"{path}: {len(xyz)} points; a flange needs {FEWEST_POINTS} or more")
+    fewest_points = 100
+    if len(xyz) < fewest_points:
+        raise StageError(f"{path}: {len(xyz)} points; a flange needs {fewest_points} or more")
     points = xyz @ rotation.T + offset
     return SampledSurface(points, _normals(points))
 
@@ -142,7 +141,6 @@ def _normals(points: Floats, neighbours: int = 12) -> Floats:
 
 SIZE = 0.03
 """Radius of a flange [m]: brings rotations and translations to one scale."""
-ITERATIONS = 200
 STILL = 5e-6
 """Converged when no point moves further than this in one iteration [m]; near the end matches may
 go on changing to and fro between neighbours, a micrometre each time. Before the last limit a
@@ -203,7 +201,8 @@ def _converge(
     source: Floats, surface: SampledSurface, motion: Floats, limit: float, still: float
 ) -> tuple[Floats, Floats] | str:
     """Iterate at one limit; return the motion and the directions (k, 6) it says nothing about."""
-    for _ in range(ITERATIONS):
+    iterations = 200
+    for _ in range(iterations):
         jacobian, distances = _equations(source, surface, motion, limit)
         if len(distances) < 6:
             return f"no points came within {limit * 1e3:g} mm of the flange's shape"
@@ -211,7 +210,7 @@ def _converge(
         motion = rigid(rotation_exp(step[:3]), step[3:]) @ motion
         if np.abs(step[:3]).max() * SIZE + np.abs(step[3:]).max() < still:
             return motion, unknown
-    return f"no convergence in {ITERATIONS} iterations"
+    return f"no convergence in {iterations} iterations"
 
 
 def _equations(

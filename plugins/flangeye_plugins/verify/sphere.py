@@ -26,10 +26,6 @@ class BallBar(Params):
     length: Length = Field(gt=0, description="Calibrated distance of the centres.")
 
 
-FEWEST_PAIRS = 10
-"""Pairs of the arm's poses: the 95 % quantile of fewer is their largest."""
-
-
 class SphereCheckParams(Params):
     """Parameters of ``verify.sphere``."""
 
@@ -104,10 +100,12 @@ def _of_poses(
     first, second = np.triu_indices(len(used), 1)
     lengths = np.linalg.norm(driven[first] - driven[second], axis=1)
     apart = lengths >= params.shortest
-    if apart.sum() < FEWEST_PAIRS:
+    # Pairs of the arm's poses: the 95 % quantile of fewer is their largest.
+    fewest_pairs = 10
+    if apart.sum() < fewest_pairs:
         raise StageError(
             f"verify.sphere: {int(apart.sum())} pairs of poses are {params.shortest * 1e3:g} mm or "
-            f"more apart, {FEWEST_PAIRS} are needed: take poses that lie further apart"
+            f"more apart, {fewest_pairs} are needed: take poses that lie further apart"
         )
     return np.linalg.norm(seen[first] - seen[second], axis=1)[apart], lengths[apart]
 

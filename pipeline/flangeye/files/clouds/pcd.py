@@ -23,8 +23,6 @@ from flangeye.files.clouds.table import (
 )
 from flangeye.maths.geometry import rotation_from_quaternion
 
-MAX_RECORD = 65536
-
 Header = Mapping[str, list[str]]
 
 
@@ -136,8 +134,9 @@ def _record(
             refuse(path, f"its header says TYPE {kind} with SIZE {size}, which PCD does not have")
     if any(counts[axis] != 1 for axis in axes):
         refuse(path, "its header gives x, y and z a COUNT other than 1")
-    if sum(int(size) * count for size, count in zip(sizes, counts, strict=True)) > MAX_RECORD:
-        refuse(path, f"its header says that one point has more than {MAX_RECORD} bytes")
+    max_record = 65536
+    if sum(int(size) * count for size, count in zip(sizes, counts, strict=True)) > max_record:
+        refuse(path, f"its header says that one point has more than {max_record} bytes")
     # Fields may share a name ("_" is padding), so only x, y and z keep theirs.
     names = [f"{i}" for i in range(len(counts))]
     for axis, name in zip(axes, "xyz", strict=True):

@@ -22,7 +22,6 @@ _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _MOVE = re.compile(
     rf"\b(move[jlp])\((p?)\[([^\]]+)\]((?:,\s*[avr]={_NUMBER})*)\)",
 )
-_OPTION = re.compile(rf"([avr])=({_NUMBER})")
 
 
 class ControlScript(Program):
@@ -195,7 +194,9 @@ def parse_move(found: re.Match[str]) -> Move:
     """Return the move that was found; URScript's defaults where it does not say."""
     kind, is_pose, target, options = found.groups()
     joint = kind == "movej"
-    given = {name: float(value) for name, value in _OPTION.findall(options)}
+    given = {
+        name: float(value) for name, value in re.compile(rf"([avr])=({_NUMBER})").findall(options)
+    }
     return Move(
         kind=kind,
         is_pose=bool(is_pose),

@@ -25,9 +25,6 @@ RENEWAL = 0.025
 BEGINNING = pieces.BEHIND + 2 * RENEWAL
 """How long before now a piece begins [s]."""
 
-STUCK = 0.8
-"""An arm that has not moved for so long is not being moved by its controller [s]."""
-
 
 class Ros2RobotParams(ListenParams):
     """Parameters of ``robot.ros2``."""
@@ -185,11 +182,13 @@ class Ros2Arm(Listener):
 
     def _require_motion(self, joints: Floats, now: float) -> None:
         # It has moved when a joint has turned so far [rad]
+        # An arm that has not moved for so long is not being moved by its controller [s].
+        stuck = 0.8
         if np.abs(joints - self._from).max() > 1e-3:
             self._from, self._moved = joints, now
-        elif now - self._moved > STUCK:
+        elif now - self._moved > stuck:
             raise DeviceError(
-                f"{self.name}: {self._topic} was given trajectories for {STUCK} s and the arm has "
+                f"{self.name}: {self._topic} was given trajectories for {stuck} s and the arm has "
                 "not moved: its controller rejects them (its log says why) or is not active; "
                 f"are its joints {', '.join(self._names)}?"
             )

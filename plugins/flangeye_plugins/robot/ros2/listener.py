@@ -24,12 +24,6 @@ from flangeye_plugins.ros2.messages import JOINT_STATE, decoded, positions_of
 STALE = 0.1
 """A sample older than this is no news of the arm [s]."""
 
-SLOWEST = 0.05
-"""Longest time between joint states with which an arm can be watched [s]."""
-
-LISTENING = 1.0
-"""For how long joint states are counted when an arm is opened [s]."""
-
 
 NOTHING = "nothing came on it"
 
@@ -144,20 +138,24 @@ class Listener(Device):
 
     def _measured_period(self) -> float:
         """Return the time between two joint states [s]."""
-        until = self._bridge.until_known() + LISTENING
-        while not self._take(LISTENING / 2) and time.monotonic() < until:
+        # For how long joint states are counted when an arm is opened [s].
+        listening = 1.0
+        until = self._bridge.until_known() + listening
+        while not self._take(listening / 2) and time.monotonic() < until:
             pass
         kept, first = self._kept, self._samples[-1].received_ns if self._samples else 0
         while 0 < self._kept < kept + 10 and time.monotonic() < until:
-            self._take(LISTENING / 2)
+            self._take(listening / 2)
         if self._kept == kept:
             topic = self._params.joint_states
             raise DeviceError(f"{self._asker}: {topic}: {self._missing() or NOTHING}")
         period = 1e-9 * (self._samples[-1].received_ns - first) / (self._kept - kept)
-        if period > SLOWEST:
+        # Longest time between joint states with which an arm can be watched [s].
+        slowest = 0.05
+        if period > slowest:
             raise DeviceError(
                 f"{self._asker}: {self._params.joint_states} comes {1 / period:.0f} times a "
-                f"second, at least {1 / SLOWEST:.0f} are needed: raise the rate of its publisher"
+                f"second, at least {1 / slowest:.0f} are needed: raise the rate of its publisher"
             )
         return max(period, 1e-3)
 

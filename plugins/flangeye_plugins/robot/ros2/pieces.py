@@ -42,9 +42,6 @@ LAST = 0.03
 SAMPLE_TIME = 0.01
 """Between the samples of a motion [s]."""
 
-PACE = 0.15
-"""Over which it is seen how fast the arm goes along a motion [s]."""
-
 
 class Point(NamedTuple):
     """A point of a piece: joints (n,) [rad] and their speeds [rad/s], so long after now [s]."""
@@ -132,10 +129,12 @@ class DrivenPath(DrivenMotion):
         One that is held up is waited for and never hurried after.
         """
         self._seen.append((self._elapsed, self._reached(joints)))
-        while self._elapsed - self._seen[0][0] > PACE:
+        # Over which it is seen how fast the arm goes along a motion [s].
+        pace = 0.15
+        while self._elapsed - self._seen[0][0] > pace:
             self._seen.popleft()
         (began, start), (now, here) = self._seen[0], self._seen[-1]
-        if now < 2 * PACE or now == began:
+        if now < 2 * pace or now == began:
             return 1.0
         # A motion goes on at least at this share of its speed: an arm that was held up is to go
         # on
