@@ -30,7 +30,7 @@ os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), str(SITE)])  # of the wor
 
 from rich.console import Console  # noqa: E402
 
-from flangeye.batch import Request, cluster, command, run_batch, work  # noqa: E402
+from flangeye.batch import Request, cluster, run_batch, work  # noqa: E402
 from flangeye.batch.cluster import local_client  # noqa: E402
 from flangeye.batch.outcome import SessionOutcome  # noqa: E402
 from flangeye.plugin.registry import load_registry  # noqa: E402
@@ -72,7 +72,7 @@ class Bench:
         out = self.folder / name
         request = Request(str(recipe), repeat=sessions, out=str(out), report=False)
         begun = time.perf_counter()
-        with patch.object(command, "_client", lambda *_: nullcontext(client)):
+        with patch("flangeye.batch._client", lambda *_: nullcontext(client)):
             done = run_batch(request, self.registry, Console(stderr=True, quiet=True))
         wall = time.perf_counter() - begun
         assert done.accepted and done.tally.total == sessions

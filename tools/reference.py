@@ -14,8 +14,8 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from typer.main import get_command
 
+from flangeye.cli import commands
 from flangeye.cli.app import GROUPS
-from flangeye.cli.commands import app
 from flangeye.plugin.registry import load_registry
 from flangeye.plugin.stage import KINDS, PARTS, Plugin
 from flangeye.report.look import DARK, LIGHT, LOGO, MONO, SANS
@@ -54,7 +54,7 @@ def _look() -> str:
 
 
 def _commands() -> str:
-    group = get_command(app)
+    group = get_command(commands())
     assert isinstance(group, typer.core.TyperGroup)
     lines = ["# Commands", "", "`flangeye COMMAND --help` prints the same.", ""]
     for title, names in GROUPS.items():

@@ -25,13 +25,21 @@ from flangeye.models.configuration import Configuration
 from flangeye.models.loading import load_model
 from flangeye.models.targets import plate_of
 from flangeye.types import CAMERA, Capture, Earlier, PointCloud, PoseFeature, Rejected
-from flangeye_emulators.world import materials
-from flangeye_emulators.world.mesh import Mesh, box, capsule, flange_mesh, wrist_mesh
+from flangeye_emulators.world.mesh import (
+    FINISHES,
+    METAL,
+    PAINTED,
+    TABLE,
+    Mesh,
+    box,
+    capsule,
+    flange_mesh,
+    wrist_mesh,
+)
 from flangeye_emulators.world.raycast import RaycastScene, SolidBody
 from flangeye_emulators.world.scanner import scanner_of
-from flangeye_plugins.body.judge import judged
 from flangeye_plugins.body.looks import prepared
-from flangeye_plugins.body.search import FINE, FINE_ACROSS
+from flangeye_plugins.body.search import FINE, FINE_ACROSS, judged
 from flangeye_plugins.body.shape import Shape
 from flangeye_plugins.body.view import view_of
 from flangeye_plugins.fit.body import FitBodyParams, fit_body
@@ -66,11 +74,11 @@ def as_made(body, rng):
 def wrist():
     plate = plate_of(load_model("robots", "ur5e", Path()))
     arm = [([0, 0, -0.06], [0, 0.12, -0.07], 0.04), ([0, 0.12, -0.07], [-0.35, 0.15, -0.15], 0.045)]
-    links = [SolidBody(capsule(np.array(a), np.array(b), r), materials.PAINTED) for a, b, r in arm]
-    finish = materials.FINISHES[plate.details.finish]
+    links = [SolidBody(capsule(np.array(a), np.array(b), r), PAINTED) for a, b, r in arm]
+    finish = FINISHES[plate.details.finish]
     return [
         SolidBody(flange_mesh(plate), finish),
-        SolidBody(wrist_mesh(plate), materials.PAINTED),
+        SolidBody(wrist_mesh(plate), PAINTED),
         *links,
     ]
 
@@ -87,11 +95,11 @@ def scene(rng, body):
     depth = rng.uniform(0.55, 0.85)
     centre = np.array([rng.uniform(-0.15, 0.15) * depth, rng.uniform(-0.12, 0.12) * depth, depth])
     pose = rigid(rotation, centre - rotation @ body.centre)
-    own = SolidBody(Mesh(body.vertices, body.triangles), materials.METAL)
+    own = SolidBody(Mesh(body.vertices, body.triangles), METAL)
     bodies = [one.moved(pose) for one in [*wrist(), own]]
     tilt = rotation_from_rpy(rng.uniform(-0.3, 0.3), rng.uniform(-0.3, 0.3), 0.0)
     table = box([-1, -1, 0], [1, 1, 0.05]).moved(rigid(tilt, [0, 0, rng.uniform(0.95, 1.1)]))
-    bodies.append(SolidBody(table, materials.TABLE))
+    bodies.append(SolidBody(table, TABLE))
     for k in range(6):
         z = rng.uniform(0.6, 1.0)
         at = np.array([rng.uniform(-0.4, 0.4) * z, rng.uniform(-0.3, 0.3) * z, z])
@@ -106,7 +114,7 @@ def scene(rng, body):
             else capsule(np.zeros(3), np.array([0, 0, length]), radius, 32)
         )
         if np.linalg.norm(at - centre) > 0.6 * body.size:
-            bodies.append(SolidBody(mesh.moved(rigid(turned(rng), at)), materials.PAINTED))
+            bodies.append(SolidBody(mesh.moved(rigid(turned(rng), at)), PAINTED))
     return bodies, pose
 
 

@@ -17,13 +17,11 @@ from flangeye.models.cell import cell_of
 from flangeye.models.configuration import DEFAULT
 from flangeye.models.loading import load_model
 from flangeye.models.scanners import middle_of_view
-from flangeye.motion.planning import Site
-from flangeye.motion.reach import Reach
+from flangeye.motion.reach import Reach, Site
 from flangeye.types import BASE, FLANGE, Box, CircleFeature, Observation, Transform, by_frame
 from flangeye_emulators.world.arm import ImperfectArm
 from flangeye_emulators.world.scanner import CameraPose
-from flangeye_plugins.plan.grid import GridParams, grid
-from flangeye_plugins.plan.next_best import NextBestParams, next_best
+from flangeye_plugins.plan import GridParams, NextBestParams, grid, next_best
 from flangeye_plugins.solve.robust import FEWEST_ONLINE, RobustParams, solve_cell
 
 ROBOT, SCANNER = load_model("robots", "ur5e"), load_model("scanners", "phoxi-m")

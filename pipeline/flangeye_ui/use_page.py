@@ -14,8 +14,8 @@ from flangeye.errors import FlangeyeError
 from flangeye.files.regular import write_whole
 from flangeye.models.configuration import CELL
 from flangeye.plugin.stage import Stage
+from flangeye.report.certificate import render
 from flangeye.report.certificate.budget import Conditions
-from flangeye.report.certificate.page import render
 from flangeye.report.facts import Facts
 from flangeye.types import ExportedFile
 from flangeye_ui.foreign import address_of

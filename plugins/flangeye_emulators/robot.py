@@ -27,7 +27,7 @@ from flangeye_emulators.controllers.arm import (
 from flangeye_emulators.controllers.client import AUTO, EmulatorControl, address_of
 from flangeye_emulators.controllers.motion import joint_move, linear_move
 from flangeye_emulators.controllers.mover import Mover, Plan
-from flangeye_emulators.world import room
+from flangeye_emulators.world import bench
 
 
 class SimulatedRobotParams(Params):
@@ -73,7 +73,7 @@ class SimulatedRobot(Device):
         zeros = joint_zeros(model, params.joint_errors)
         self.arm = SimulatedArm(model, limits, params.period, joints, zeros)
         self.cycles = self._looked = 0
-        room.enter(self)
+        bench.enter(self)
         self._mover = Mover(self.arm)
         self._stopped_by = ""
 

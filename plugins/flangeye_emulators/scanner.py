@@ -21,13 +21,18 @@ from flangeye.models.workpiece import load_workpiece
 from flangeye.plugin.stage import Params, part
 from flangeye.types import BASE, CAMERA, Array, Floats, PointCloud, Transform, Truth
 from flangeye_emulators.controllers.client import AUTO, EmulatorControl, address_of
-from flangeye_emulators.world import room
+from flangeye_emulators.world import bench
 from flangeye_emulators.world.bench import BenchParams, bench_with
 from flangeye_emulators.world.cell import SimulatedCell
 from flangeye_emulators.world.raycast import Image, RaycastScene
-from flangeye_emulators.world.scanner import CameraPose, ScannerQuality, before_camera, scanner_of
-from flangeye_emulators.world.structured_light import StructuredLight
-from flangeye_emulators.world.time_of_flight import TimeOfFlight
+from flangeye_emulators.world.scanner import (
+    CameraPose,
+    ScannerQuality,
+    StructuredLight,
+    TimeOfFlight,
+    before_camera,
+    scanner_of,
+)
 from flangeye_plugins.scanner.opened import OpenScanner
 
 
@@ -53,7 +58,7 @@ def scanner_mounted(model: ScannerModel | None, params: MountedParams) -> Scanne
     """
     if model is None:
         raise DeviceError("scanner.mounted: the recipe must say which scanner to be: scanner.model")
-    if room.newest() is None:
+    if bench.newest() is None:
         raise DeviceError(
             "scanner.mounted: no simulated arm carries it; give the recipe robot.driver: simulated"
         )
@@ -85,7 +90,7 @@ class MountedScanner(OpenScanner):
         Raises:
             DeviceError: The arm is gone.
         """
-        arm = room.newest()
+        arm = bench.newest()
         if arm is None:
             raise DeviceError(f"{self.name}: the arm that carries it is gone")
         scene = before_camera(self._bodies, arm.true_flange() @ self._flange_T_camera)

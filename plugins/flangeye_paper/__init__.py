@@ -13,7 +13,7 @@ STAGES = {
     "verify.realisations": "flangeye_paper.realisations:verify_realisations",
     "verify.icp_as_in_paper": "flangeye_paper.icp_as_in_paper:verify_icp_as_in_paper",
     "verify.algorithm_1_by_iteration": "flangeye_paper.icp_as_in_paper:verify_by_iteration",
-    "verify.stored_results_as_in_paper": "flangeye_paper.stored_results:verify_stored_results",
+    "verify.stored_results_as_in_paper": "flangeye_paper.published:verify_stored_results",
     "scan.as_laid": "flangeye_paper.misplanned:scan_as_laid",
     "seam.misplanned": "flangeye_paper.misplanned:seam_misplanned",
 }

@@ -10,7 +10,7 @@ import numpy as np
 
 from flangeye.files.arrays import read_npz
 from flangeye.types import Floats
-from flangeye_paper.stored_results import stored_file
+from flangeye_paper.published import stored_file
 from flangeye_paper.tables import (
     AXES,
     AXIS_COLOURS,

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flangeye import FlangeyeError
-from flangeye_paper.stored_results import stored_results
+from flangeye_paper.published import stored_results
 from flangeye_paper.tables import (
     METHODS,
     Look,

@@ -24,16 +24,17 @@ from flangeye.types import (
     Verification,
     Views,
 )
-from flangeye_paper.paper_cell import (
+from flangeye_paper.points import (
     BASE_T_CAMERA,
     CENTRE,
     SIZE,
+    PointSource,
     Realisation,
     bound,
     errors_of,
+    observations_of,
     rms_over_workspace,
 )
-from flangeye_paper.points import PointSource, observations_of
 
 WORKSPACE = Box(CENTRE, SIZE).grid()
 

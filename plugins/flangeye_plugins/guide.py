@@ -20,8 +20,8 @@ from flangeye.models.robots import RobotModel
 from flangeye.motion.executor import Executor, led
 from flangeye.motion.limits import MotionLimits, limits_of
 from flangeye.plugin.stage import part
-from flangeye.recipe.guide import Recipe
 from flangeye.recipe.header import LimitsSection
+from flangeye.recipe.load import Recipe
 from flangeye.types import BASE, FLANGE, Floats, Transform
 from flangeye_plugins.weld.finger_camera import LatestState
 from flangeye_plugins.weld.settings import WeldTactileParams

@@ -11,7 +11,7 @@ from flangeye import Params, RecipePath, StageError, stage
 from flangeye.devices import KnowsSeams, MotionAllowed, RobotDriver, ScannerDriver
 from flangeye.errors import NothingMoved
 from flangeye.files.clouds import CLOUD_SUFFIXES, LengthUnit, read_cloud
-from flangeye.files.pairs import natural
+from flangeye.files.scans import natural
 from flangeye.maths.geometry import invert, rigid, rotation_from_rpy
 from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import RobotModel

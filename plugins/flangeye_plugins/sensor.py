@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from flangeye.devices import Device, DeviceError, SensorFrame, StateSource, TactileSensor
 from flangeye.errors import StageError
 from flangeye.files.images import MAX_FILE, ImageError, decode_image
-from flangeye.files.pairs import natural
 from flangeye.files.paths import RecipePath
 from flangeye.files.regular import read_regular
+from flangeye.files.scans import natural
 from flangeye.log.read import read_notes
 from flangeye.models.finger import Finger
 from flangeye.plugin.stage import Params, part

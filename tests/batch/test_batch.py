@@ -18,9 +18,8 @@ import pytest
 
 from flangeye.batch import cluster
 from flangeye.batch.dataset import Dataset, Ledger, columns_of
-from flangeye.batch.keys import Software, software_of
 from flangeye.batch.outcome import BatchError, Request
-from flangeye.batch.plan import plan
+from flangeye.batch.plan import Software, plan, software_of
 from flangeye.batch.work import READY, STARTS, WORKER_DIED, Job
 
 SLURM = Path(__file__).parents[2] / "docs/examples/slurm_cluster.py"

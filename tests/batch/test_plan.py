@@ -11,9 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flangeye.batch import plan as batch_plan
-from flangeye.batch.keys import Software, _code_of, check_software, software_of
 from flangeye.batch.outcome import BatchError, Request
-from flangeye.batch.plan import plan, split_values
+from flangeye.batch.plan import Software, _code_of, check_software, plan, software_of, split_values
 from flangeye.errors import FlangeyeError, StageError
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.load import load_recipe

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from flangeye.batch.dataset import Dataset
 from flangeye.batch.regress import read_manifests
-from flangeye.cli.commands import app
+from flangeye.cli import commands
 from flangeye.files.paths import bundled
 
 DATA = Path(__file__).parents[2] / "data"
@@ -57,7 +57,7 @@ def manifest(folder, name="mine", recording="../rec", recipe="../points.yaml", m
 
 
 def regress():
-    return CliRunner().invoke(app, ["regress", "known", "--workers", "1"])
+    return CliRunner().invoke(commands(), ["regress", "known", "--workers", "1"])
 
 
 def test_each_manifest_is_compared_and_a_second_start_runs_nothing(folder: Path) -> None:
@@ -131,5 +131,5 @@ def test_every_shipped_manifest_names_a_recipe_a_source_and_a_licence() -> None:
 @pytest.mark.slow
 def test_the_shipped_manifests_are_as_expected(ancorasir: Path, tmp_path: Path) -> None:
     shutil.copytree(DATA / "manifests", tmp_path / "data" / "manifests")
-    done = CliRunner().invoke(app, ["regress", "--out", str(tmp_path / "runs")])
+    done = CliRunner().invoke(commands(), ["regress", "--out", str(tmp_path / "runs")])
     assert done.exit_code == 0, done.output

@@ -12,13 +12,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from flangeye.batch.command import _tell
+from flangeye.batch import _tell
 from flangeye.batch.dataset import Dataset, Kind, Ledger, columns_of, row_of
-from flangeye.batch.keys import Software
 from flangeye.batch.outcome import SessionOutcome
 from flangeye.batch.page import drawings_of, write_page
 from flangeye.batch.page import render as rendered
-from flangeye.batch.plan import BatchSession
+from flangeye.batch.plan import BatchSession, Software
 from flangeye.batch.progress import Tally
 from flangeye.batch.work import Job
 from flangeye.files.paths import place_at

@@ -10,9 +10,8 @@ from typing import Any
 import pytest
 
 from flangeye.batch.dataset import columns_of
-from flangeye.batch.keys import software_of
 from flangeye.batch.outcome import MARKER, Request, SessionOutcome, finished_outcome
-from flangeye.batch.plan import plan
+from flangeye.batch.plan import plan, software_of
 from flangeye.batch.work import (
     READY,
     STARTS,

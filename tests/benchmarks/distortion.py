@@ -20,7 +20,7 @@ from flangeye.types import CircleFeature, Floats, HandEye, Observation, Transfor
 from flangeye_emulators.acquire.planned_session import FACING, PlannedSession, plan_session
 from flangeye_emulators.acquire.simulated_session import ScanParams
 from flangeye_emulators.world.raycast import pixels_of
-from flangeye_emulators.world.scan_errors import Distortion
+from flangeye_emulators.world.scanner import Distortion
 from flangeye_emulators.world.session import CameraView, seen_from
 from flangeye_plugins.solve.robust import RobustParams, solve_cell
 

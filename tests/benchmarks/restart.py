@@ -16,11 +16,11 @@ from pathlib import Path
 
 from rich.console import Console
 
-from flangeye.batch import Request, command
+from flangeye import batch
+from flangeye.batch import Request
 from flangeye.batch.dataset import BLOCK, Dataset, columns_of, row_of
-from flangeye.batch.keys import software_of
 from flangeye.batch.outcome import SessionOutcome
-from flangeye.batch.plan import plan
+from flangeye.batch.plan import plan, software_of
 from flangeye.files.paths import place_at
 from flangeye.plugin.registry import Registry, load_registry
 
@@ -54,7 +54,7 @@ def main(count: int) -> None:
         write_rows(request, registry)
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         cpu, clock = time.process_time(), time.perf_counter()
-        done = command.run_batch(request, registry, Console(file=io.StringIO()))
+        done = batch.run_batch(request, registry, Console(file=io.StringIO()))
         assert done.known == count
         print(
             f"{count} finished sessions: {time.process_time() - cpu:.1f} s of the processor, "

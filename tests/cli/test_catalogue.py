@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from flangeye.cli import commands
 from flangeye.cli.app import complete_recipe
-from flangeye.cli.commands import app
 from flangeye.errors import FlangeyeError
 from flangeye.models.loading import load_model, model_names
 from flangeye.plugin.registry import PluginNotFoundError, load_registry
@@ -16,7 +16,7 @@ from tests.conftest import Call
 
 
 def flangeye(*words, typed=""):
-    done = CliRunner().invoke(app, [str(word) for word in words], input=typed)
+    done = CliRunner().invoke(commands(), [str(word) for word in words], input=typed)
     if done.exception and not isinstance(done.exception, SystemExit):
         raise done.exception
     return done.output
@@ -111,7 +111,7 @@ def test_a_wrong_value_is_one_line_and_leaves_no_file(
 def test_a_file_that_is_there_is_told_before_anything_is_asked(kind: str, tmp_path: Path) -> None:
     out = tmp_path / "mine.yaml"
     out.touch()
-    done = CliRunner().invoke(app, [kind, "mine", "--out", str(out)])
+    done = CliRunner().invoke(commands(), [kind, "mine", "--out", str(out)])
     assert str(done.exception) == f"{out}: is there already; take another name with --out"
     assert not done.output
 

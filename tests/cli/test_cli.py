@@ -13,7 +13,7 @@ import yaml
 from typer.testing import CliRunner
 
 from flangeye import __version__
-from flangeye.cli.commands import app
+from flangeye.cli import commands
 from flangeye.errors import NothingMoved
 from flangeye.types import Rejection
 from tests import toy
@@ -183,8 +183,8 @@ def test_what_was_measured_before_is_shown_as_that(tmp_path: Path) -> None:
     acquire = f"acquire.centres: {{path: ., reader: {table}}}"
     (tmp_path / "points.yaml").write_text(f"title: Points\nsteps:\n  - {acquire}\n  - solve.svd\n")
     run, recipe = str(tmp_path / "run"), str(tmp_path / "points.yaml")
-    CliRunner().invoke(app, ["run", recipe, "--out", run], catch_exceptions=False)
-    shown = CliRunner().invoke(app, ["show", run], catch_exceptions=False).output
+    CliRunner().invoke(commands(), ["run", recipe, "--out", run], catch_exceptions=False)
+    shown = CliRunner().invoke(commands(), ["show", run], catch_exceptions=False).output
     assert shown.splitlines()[1] == "5 of 5 measurements went through"
 
 

@@ -9,8 +9,8 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from flangeye import result as r
+from flangeye.cli import commands
 from flangeye.cli.app import GROUPS
-from flangeye.cli.commands import app
 from flangeye.cli.console import wrapped, write
 from flangeye.cli.summary import RunProgress, print_refusal, print_summary
 from flangeye.types import Rejection, Source, Warn
@@ -139,7 +139,7 @@ def test_markup_of_others_is_not_followed() -> None:
 
 
 def test_help_lists_every_command_in_its_group_with_a_whole_sentence() -> None:
-    told = CliRunner().invoke(app, ["--help"], terminal_width=80).output
+    told = CliRunner().invoke(commands(), ["--help"], terminal_width=80).output
     listed = told[told.index("Calibrate:") :]
     assert [title for title in GROUPS if f"{title}:\n" in listed] == list(GROUPS)
     assert "More:" not in listed, "a command without a group"

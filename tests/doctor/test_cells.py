@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from flangeye.cli.commands import app
+from flangeye.cli import commands
 from flangeye.doctor.cells import _moved, _scaled, _seen, examine_cell
 from flangeye.files.paths import bundled
 from flangeye.maths.geometry import invert, rigid, rotation_exp
@@ -145,8 +145,8 @@ def test_nothing_is_named_where_no_cure_helps() -> None:
 def test_the_command_examines_the_log_of_a_cell(tmp_path: Path) -> None:
     out = tmp_path / "run"
     name = "configurations/two-scanners_marker_most-likely_simulated"
-    assert CliRunner().invoke(app, ["run", name, "--out", str(out)]).exit_code == 0
-    told = CliRunner().invoke(app, ["doctor", str(out)])
+    assert CliRunner().invoke(commands(), ["run", name, "--out", str(out)]).exit_code == 0
+    told = CliRunner().invoke(commands(), ["doctor", str(out)])
     assert told.exit_code == 0, told.output
     assert "40 of 40 samples" in told.output
     assert "nothing found" in told.output
@@ -154,9 +154,11 @@ def test_the_command_examines_the_log_of_a_cell(tmp_path: Path) -> None:
 
 def test_what_the_recipe_states_wrongly_is_put_right(tmp_path: Path) -> None:
     name, recorded = "configurations/arm-on-rail_marker_most-likely_simulated", tmp_path / "tables"
-    assert CliRunner().invoke(app, ["run", name, "--out", str(tmp_path / "run")]).exit_code == 0
+    assert (
+        CliRunner().invoke(commands(), ["run", name, "--out", str(tmp_path / "run")]).exit_code == 0
+    )
     told = CliRunner().invoke(
-        app, ["export", str(tmp_path / "run"), "--to", "tables", "--out", str(recorded)]
+        commands(), ["export", str(tmp_path / "run"), "--to", "tables", "--out", str(recorded)]
     )
     assert told.exit_code == 0
     recipe = recorded / "recipe.yaml"
@@ -164,7 +166,7 @@ def test_what_the_recipe_states_wrongly_is_put_right(tmp_path: Path) -> None:
     text = recipe.read_text()
     assert table in text
     recipe.write_text(text.replace(table, f"{table}          pose: target_T_camera\n"))
-    told = CliRunner().invoke(app, ["doctor", str(recipe)])
+    told = CliRunner().invoke(commands(), ["doctor", str(recipe)])
     assert told.exit_code == 1
     fix = "fix: sightings: [{camera: second, target: marker, pose: camera_T_target}]"
     assert fix in told.output

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from flangeye.cli.commands import app
+from flangeye.cli import commands
 from flangeye.errors import StageError
 from flangeye.files.clouds import read_cloud, write_cloud
 from flangeye.files.elsewhere import (
@@ -162,7 +162,7 @@ def test_a_run_from_a_bucket_into_a_bucket_has_the_result_of_one_on_disk(
         (str(sample), str(tmp_path / "run")),
         ("s3://cell/sample", "s3://cell/out"),
     ):
-        done = CliRunner().invoke(app, [*words, archive, "--out", out])
+        done = CliRunner().invoke(commands(), [*words, archive, "--out", out])
         assert done.exit_code == 0, done.output
     assert "flangeye show s3://cell/out" in done.output
     here = json.loads((tmp_path / "run" / "result.json").read_text())

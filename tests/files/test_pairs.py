@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from flangeye.errors import StageError
-from flangeye.files.pairs import in_order, natural, numbers_of, partners
-from flangeye.files.scans import Poses, scans_in, scans_of
+from flangeye.files.scans import Poses, in_order, natural, numbers_of, partners, scans_in, scans_of
 
 
 def test_names_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:

@@ -226,7 +226,7 @@ def _read_rewritten(path):
 
 def _follow(path):
     from flangeye.errors import StageError
-    from flangeye.log.watch.view import RunView, follow
+    from flangeye.log.watch import RunView, follow
 
     def wait():
         raise StageError("no more")

@@ -15,8 +15,7 @@ from flangeye import types as t
 from flangeye.errors import StageError
 from flangeye.log.read import read_run
 from flangeye.log.record import Recorder
-from flangeye.log.watch import watch_run
-from flangeye.log.watch.view import follow
+from flangeye.log.watch import follow, watch_run
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import parse_recipe
 from flangeye.run.runner import Runner

@@ -36,7 +36,7 @@ from flangeye.types import (
     Transform,
     by_frame,
 )
-from flangeye_plugins.solve.svd import solve_svd
+from flangeye_plugins.solve.named import solve_svd
 from tests import toy
 
 

@@ -11,17 +11,19 @@ from hypothesis import strategies as st
 from flangeye import StageError
 from flangeye.maths.geometry import kabsch, rigid, rotation_exp
 from flangeye.types import BASE, CAMERA, Transform, Views
-from flangeye_paper.paper_cell import (
+from flangeye_paper.points import (
     BASE_T_CAMERA,
     CENTRE,
     SIZE,
+    PointsParams,
+    acquire_points,
     bound,
     errors_of,
     grid,
+    observations_of,
     realise,
     rms_over_workspace,
 )
-from flangeye_paper.points import PointsParams, acquire_points, observations_of
 from flangeye_paper.realisations import (
     WORKSPACE,
     RealisationsParams,

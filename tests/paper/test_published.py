@@ -16,13 +16,17 @@ from flangeye_paper.icp_as_in_paper import (
     verify_by_iteration,
 )
 from flangeye_paper.points import PointsParams, acquire_points
-from flangeye_paper.published import PublishedParams, acquire_published_centres
+from flangeye_paper.published import (
+    PublishedParams,
+    StoredParams,
+    acquire_published_centres,
+    verify_stored_results,
+)
 from flangeye_paper.realisations import error_oracle
-from flangeye_paper.stored_results import StoredParams, verify_stored_results
 from flangeye_plugins.cost import TranslationParams, cost_translation
 from flangeye_plugins.reader.ancorasir import AncorasirParams
 from flangeye_plugins.reader.ancorasir import ancorasir as reader
-from flangeye_plugins.solve.svd import SvdParams, solve_svd
+from flangeye_plugins.solve.named import SvdParams, solve_svd
 
 ICP, STORED = "verify.icp_as_in_paper", "verify.stored_results_as_in_paper"
 

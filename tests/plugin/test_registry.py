@@ -189,8 +189,6 @@ def test_exports_are_found_without_the_other_stages() -> None:
 
 
 def test_help_waits_for_no_arrays() -> None:
-    code = (
-        "import sys; import flangeye.cli.commands; print({'numpy', 'pydantic'} & set(sys.modules))"
-    )
+    code = "import sys; from flangeye.cli import commands; commands(); print({'numpy', 'pydantic'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"

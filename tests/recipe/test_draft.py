@@ -14,7 +14,7 @@ from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-from flangeye.cli.commands import app
+from flangeye.cli import commands
 from flangeye.errors import RecipeError, StageError
 from flangeye.maths.geometry import rigid
 from flangeye.models.boards import Board, print_of
@@ -54,7 +54,7 @@ def init(*words, typed=None):
     line = ["init", "rec", *map(str, words)]
     if typed is None:
         line.append("--yes")
-    done = CliRunner().invoke(app, line, input=typed)
+    done = CliRunner().invoke(commands(), line, input=typed)
     if done.exception and not isinstance(done.exception, SystemExit):
         raise done.exception
     return done.output
@@ -594,7 +594,7 @@ def test_what_is_missing_is_one_line_with_what_to_add(
     folder: Path, made: Any, words: list[Any], line: str
 ) -> None:
     made(folder)
-    done = CliRunner().invoke(app, ["init", "rec", "--yes", *words])
+    done = CliRunner().invoke(commands(), ["init", "rec", "--yes", *words])
     assert str(done.exception).startswith(line)
     assert getattr(done.exception, "exit_code", None) == 2
     assert not (folder.parent / "recipe.yaml").exists()
@@ -634,7 +634,7 @@ def test_a_bag_of_joint_angles_is_read_by_the_arm_that_is_named(folder: Path) ->
 def test_a_recipe_is_not_written_over(folder: Path) -> None:
     sample(folder)
     init("--robot", "ur5")
-    done = CliRunner().invoke(app, ["init", "rec", "--yes"])
+    done = CliRunner().invoke(commands(), ["init", "rec", "--yes"])
     assert str(done.exception) == "recipe.yaml: is there already; take another name with --out"
 
 
@@ -646,7 +646,7 @@ def test_a_folder_of_one_bag_is_refused_before_a_question(folder: Path) -> None:
 
 def test_a_question_without_an_answer_names_the_option(folder: Path) -> None:
     sample(folder)
-    done = CliRunner().invoke(app, ["init", "rec"], input="")
+    done = CliRunner().invoke(commands(), ["init", "rec"], input="")
     assert str(done.exception) == (
         "which arm ('flangeye robots', or a .urdf) (--robot): was not answered; give the option, "
         "or --yes for the defaults"

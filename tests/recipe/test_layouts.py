@@ -13,7 +13,7 @@ from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-from flangeye.cli.commands import app
+from flangeye.cli import commands
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
@@ -279,9 +279,9 @@ def test_a_layout_is_verified_without_an_edit(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "rec").mkdir()
     LAYOUTS[name](tmp_path / "rec", *session(SEED))
-    told = CliRunner().invoke(app, ["init", "rec", "--yes"])
+    told = CliRunner().invoke(commands(), ["init", "rec", "--yes"])
     assert told.exit_code == 0, f"{told.output}{told.exception}"
-    done = CliRunner().invoke(app, ["run", "recipe.yaml", "--out", "out"])
+    done = CliRunner().invoke(commands(), ["run", "recipe.yaml", "--out", "out"])
     assert done.exit_code == 0, f"{told.output}{done.output}{done.exception}"
     assert "\nVERIFIED " in done.output
 
@@ -299,7 +299,7 @@ def test_joint_angles_are_no_poses_and_ask_for_their_arm(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "rec").mkdir()
     joints_alone(tmp_path / "rec", *session(SEED))
-    told = CliRunner().invoke(app, ["init", "rec", "--yes", "--robot", "none"])
+    told = CliRunner().invoke(commands(), ["init", "rec", "--yes", "--robot", "none"])
     assert str(told.exception) == (
         "rec/robot.txt: 6 numbers a row, which as poses in any usual convention do not turn as the "
         "target does; joint angles? name the arm: --robot NAME ('flangeye robots' lists them), or "

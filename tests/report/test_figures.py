@@ -18,8 +18,7 @@ from flangeye.log.read import RunLog
 from flangeye.maths.geometry import rigid
 from flangeye.models.bodies import load_body
 from flangeye.report import write_report
-from flangeye.report.cell import cell_drawing, found_body
-from flangeye.report.clouds import cloud_panels
+from flangeye.report.cell import cell_drawing, cloud_panels, found_body
 from flangeye.report.facts import facts_of
 from flangeye.report.page import render
 from flangeye.report.plot import box_edges, figure3d, joined, packed, plain, round_up, scatter3d

@@ -12,8 +12,8 @@ from flangeye.log.read import read_run
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.load import load_recipe
 from flangeye.report.facts import Facts, facts_of
-from flangeye.report.graph import graph_drawing
 from flangeye.report.page import render
+from flangeye.report.space import graph_drawing
 from flangeye.run.folder import RunFolder
 from flangeye.run.session import Start, record_run
 

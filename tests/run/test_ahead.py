@@ -17,7 +17,7 @@ from flangeye.run import runner
 from flangeye.run.ahead import Done, cores, worked_ahead
 from flangeye.run.runner import Runner
 from flangeye_emulators.acquire import simulation
-from flangeye_emulators.world.structured_light import StructuredLight
+from flangeye_emulators.world.scanner import StructuredLight
 from tests import toy
 from tests.conftest import TOY_RECIPE, replaced
 

@@ -28,16 +28,15 @@ from flangeye.models.finger import Finger
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
 from flangeye.models.targets import Flange
-from flangeye.motion.planning import Plan, Site
+from flangeye.motion.reach import Plan, Site
 from flangeye.motion.seam_following import Command, Controller, FollowingTask
 from flangeye.run.replay import ReplayedStep
 from flangeye.testing.solving import reference_solution
 from flangeye.types import FLANGE
 from flangeye_emulators.arc import SimulatedArc, SimulatedArcParams
 from flangeye_emulators.robot import SimulatedRobot, SimulatedRobotParams
-from flangeye_plugins.fit.rim import fit_rim
-from flangeye_plugins.fit.rim_params import RimParams
-from flangeye_plugins.plan.grid import GridParams, grid
+from flangeye_plugins.fit.rim import RimParams, fit_rim
+from flangeye_plugins.plan import GridParams, grid
 from flangeye_plugins.segment.flange import SegmentParams, segment_flange
 
 noise = np.random.default_rng()

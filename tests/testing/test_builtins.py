@@ -40,16 +40,16 @@ from flangeye.types import (
 )
 from flangeye.units import SI
 from flangeye_emulators.acquire.simulated import acquire_simulated
-from flangeye_emulators.acquire.simulated_params import SimulatedParams
+from flangeye_emulators.acquire.simulation import SimulatedParams
 from flangeye_emulators.robot import robot_simulated
-from flangeye_emulators.world.structured_light import StructuredLight
+from flangeye_emulators.world.scanner import StructuredLight
 from flangeye_plugins.acquire.archive import ArchiveParams, acquire_archive
 from flangeye_plugins.cost import cost_axes, cost_translation, cost_work_radius
 from flangeye_plugins.error import error_holdout
 from flangeye_plugins.fit.ransac import fit_ransac_circle
 from flangeye_plugins.fit.rim import fit_rim
 from flangeye_plugins.fit.sphere import fit_sphere
-from flangeye_plugins.plan.grid import GridParams, grid
+from flangeye_plugins.plan import GridParams, grid
 from flangeye_plugins.reader.folder import FolderParams, folder
 from flangeye_plugins.refine import refine_compensate
 from flangeye_plugins.scanner.watched_folder import (
@@ -59,8 +59,8 @@ from flangeye_plugins.scanner.watched_folder import (
 from flangeye_plugins.segment.flange import SegmentParams, segment_flange
 from flangeye_plugins.segment.sphere import segment_sphere
 from flangeye_plugins.solve.iterative import solve_iterative
+from flangeye_plugins.solve.named import solve_svd
 from flangeye_plugins.solve.robust import solve_robust
-from flangeye_plugins.solve.svd import solve_svd
 from flangeye_plugins.verify.holdout import verify_holdout
 from flangeye_plugins.verify.icp import verify_icp
 from flangeye_plugins.view import GuessParams, view_guess

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from flangeye.cli.commands import app
+from flangeye.cli import commands
 from flangeye.errors import StageError
 from flangeye.plugin.scaffold import kinds, write_plugin
 from flangeye.plugin.stage import KINDS, PARTS
@@ -53,7 +53,7 @@ def test_there_is_a_template_and_a_kit_for_every_kind() -> None:
 
 def test_a_new_scanner_passes_its_tests(python: Any, tmp_path: Path) -> None:
     told = CliRunner().invoke(
-        app, ["new-plugin", "quick_eye", "--kind", "scanner", "--into", str(tmp_path)]
+        commands(), ["new-plugin", "quick_eye", "--kind", "scanner", "--into", str(tmp_path)]
     )
     folder = tmp_path / "flangeye-quick-eye"
     assert told.exit_code == 0

@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
-from flangeye.batch.command import run_sessions
+from flangeye.batch import run_sessions
 from flangeye.batch.dataset import Dataset, Ledger, columns_of
-from flangeye.batch.keys import software_of
 from flangeye.batch.outcome import Request, SessionOutcome
-from flangeye.batch.plan import BatchSession, plan
+from flangeye.batch.plan import BatchSession, plan, software_of
 from flangeye.doctor import examine, open_session
 from flangeye.errors import FlangeyeError, RecipeError
 from flangeye.files.paths import place_at

@@ -13,14 +13,6 @@ from functools import cache, cached_property
 from pathlib import Path
 
 from flangeye.batch.dataset import Dataset, Kind, row_of
-from flangeye.batch.keys import (
-    Fingerprints,
-    Software,
-    check_software,
-    common_key,
-    session_key,
-    software_of,
-)
 from flangeye.batch.outcome import (
     ACCEPTED,
     FINISHED,
@@ -30,7 +22,15 @@ from flangeye.batch.outcome import (
     mark_finished,
     outcome_of,
 )
-from flangeye.batch.plan import BatchSession
+from flangeye.batch.plan import (
+    BatchSession,
+    Fingerprints,
+    Software,
+    check_software,
+    common_key,
+    session_key,
+    software_of,
+)
 from flangeye.errors import FlangeyeError, StageError
 from flangeye.files.elsewhere import archive_at, is_url, results_at
 from flangeye.files.paths import Storage, place_at

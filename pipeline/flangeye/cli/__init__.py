@@ -3,9 +3,16 @@
 Modules are imported inside the commands, so that ``--help`` answers at once.
 """
 
+from __future__ import annotations
+
 import os
+from importlib import import_module
+from typing import TYPE_CHECKING
 
 from flangeye.cli.console import end_in_words
+
+if TYPE_CHECKING:
+    from typer import Typer
 
 
 def main() -> None:
@@ -18,6 +25,13 @@ def main() -> None:
 
 
 def _command() -> None:
-    from flangeye.cli.commands import app
+    commands()()
 
-    app()
+
+def commands() -> Typer:
+    """Return every command: importing their modules declares them."""
+    from flangeye.cli.app import app
+
+    for name in ["catalogue", "drafting", "exporting", "hardware", "logs", "running", "watching"]:
+        import_module(f"flangeye.cli.{name}")
+    return app

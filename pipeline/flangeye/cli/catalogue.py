@@ -76,7 +76,7 @@ def new_robot(  # noqa: PLR0913  one for each option
     out: Out = None,
 ) -> None:
     """Create a robot model from a URDF or from its joints."""
-    from flangeye.models.new_model import require_new, robot_of_joints, write_robot
+    from flangeye.models.loading import require_new, robot_of_joints, write_robot
     from flangeye.models.urdf import robot_from_urdf
 
     path = out or Path(f"{name}.yaml")
@@ -130,7 +130,7 @@ def new_scanner(  # noqa: PLR0913  one for each option
 
     Archives need only the range, simulation needs all options.
     """
-    from flangeye.models.new_model import require_new, write_scanner
+    from flangeye.models.loading import require_new, write_scanner
 
     path = out or Path(f"{name}.yaml")
     require_new(path)

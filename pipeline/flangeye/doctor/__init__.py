@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from flangeye.doctor.cells import examine_cell
-from flangeye.doctor.diagnosis import Finding, Misfit
-from flangeye.doctor.examine import Diagnosis, examine
+from flangeye.doctor.diagnosis import Diagnosis, Finding, Misfit, examine
 from flangeye.doctor.opening import open_cell, open_session
 
 __all__ = [

@@ -14,8 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from flangeye.doctor.diagnosis import Change, Finding, Misfit, RecordedSession
-from flangeye.doctor.examine import Diagnosis, require_enough
+from flangeye.doctor.diagnosis import (
+    Change,
+    Diagnosis,
+    Finding,
+    Misfit,
+    RecordedSession,
+    require_enough,
+)
 from flangeye.errors import FlangeyeError
 from flangeye.estimation.rough import rough
 from flangeye.estimation.sightings import problem_of

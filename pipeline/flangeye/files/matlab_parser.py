@@ -11,11 +11,6 @@ import resource
 import sys
 from typing import Any
 
-PREFIX = "of_"
-"""In front of each array's name: savez has arguments of its own."""
-SECONDS = 20
-"""Longest time for one file."""
-
 
 def main() -> None:
     """Parse, and write the arrays of numbers."""
@@ -27,7 +22,8 @@ def main() -> None:
 
     values = loadmat(io.BytesIO(sys.stdin.buffer.read())).items()
     numbers = ((n, v) for n, v in values if isinstance(v, np.ndarray) and v.dtype.kind in "iuf")
-    arrays: dict[str, Any] = {PREFIX + name: array for name, array in numbers}
+    # The prefix keeps arrays apart from arguments of savez
+    arrays: dict[str, Any] = {"of_" + name: array for name, array in numbers}
     largest = 1 << 28  # [bytes]
     if sum(array.nbytes for array in arrays.values()) > largest:
         raise ValueError(f"its arrays come to more than {largest} bytes")

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
+
+import numpy as np
+import yaml
 
 from flangeye.errors import RecipeError
 from flangeye.files.paths import bundled
 from flangeye.files.words import nearest
-from flangeye.files.yaml_lines import read_yaml
+from flangeye.files.yaml_lines import parse_value, read_yaml
+from flangeye.maths.kinematics import Arm
 from flangeye.models.model import read_model
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerData, ScannerModel
+from flangeye.models.targets import load_standard
 
 
 def load_model(kind: Literal["robots", "scanners"], name: str, near: Path | None = None) -> Any:
@@ -49,3 +55,83 @@ def _path(kind: str, name: str, near: Path | None) -> Path:
         close = nearest(name, known, n=2) or known
         raise RecipeError(f"no {kind[:-1]} '{name}'; known: {', '.join(close)}, or a .yaml file")
     return bundled("data") / kind / f"{name}.yaml"
+
+
+def write_robot(path: Path, robot: RobotModel) -> str:
+    """Write an arm's file and return what to compare with the pendant: the flange at zero.
+
+    Raises:
+        RecipeError: The file exists, or the arm's plate is not known.
+    """
+    if robot.flange.standard:
+        load_standard(robot.flange.standard)
+    data = robot.filled().model_dump(mode="json", exclude_unset=True)
+    _write(path, data)
+    written: RobotModel = load_model("robots", str(path))
+    x, y, z = 1e3 * Arm(written).flange(np.zeros(len(written.joints)))[:3, 3]
+    return (
+        f"{path}: {len(written.joints)} joints; with all at zero the flange is at "
+        f"({x:.1f}, {y:.1f}, {z:.1f}) mm in the base: compare with the pendant\n"
+        f"in a recipe: robot: {path}"
+    )
+
+
+def robot_of_joints(
+    name: str, maker: str, convention: str, joints: Sequence[str], standard: str | None
+) -> RobotModel:
+    """Return an arm of joints as text, ``d: 89.159 mm, alpha: 90 deg``, base to flange.
+
+    Raises:
+        RecipeError: A joint is not of that form; says which.
+    """
+    from pydantic import ValidationError
+
+    from flangeye.files.validation import sentence
+
+    parsed = [parse_value("{" + text + "}", f"joint {i + 1}") for i, text in enumerate(joints)]
+    given: dict[str, Any] = {
+        "model": name, "maker": maker, "convention": convention, "joints": parsed,
+        "source": "stated when the file was made",
+        "volumes_missing": "the file has none; give the arm by its URDF, or add volumes to it",
+    }  # fmt: skip
+    try:
+        return RobotModel.model_validate({**given, "flange": {"standard": standard}})
+    except ValidationError as error:
+        told = [
+            f"{'.'.join(map(str, e['loc']))}: {sentence(e, RobotModel, e['input'])}"
+            for e in error.errors()
+        ]
+        raise RecipeError("\n".join(told)) from None
+
+
+def write_scanner(path: Path, values: Mapping[str, Any]) -> str:
+    """Write a scanner's file from what is known of it; nothing that is None.
+
+    Raises:
+        RecipeError: The file exists, or a value is wrong: names the line.
+    """
+    _write(path, {name: value for name, value in values.items() if value is not None})
+    try:
+        scanner = load_model("scanners", str(path))
+    except RecipeError:
+        path.unlink()
+        raise
+    near, far = scanner.range
+    return f"{path}: sees {near:.3f} to {far:.3f} m\nin a recipe: scanner: {path}"
+
+
+def _write(path: Path, data: Mapping[str, Any]) -> None:
+    require_new(path)
+    path.write_text(yaml.safe_dump(dict(data), sort_keys=False, allow_unicode=True), "utf-8")
+
+
+def require_new(path: Path) -> None:
+    """Refuse to write a model's file there, before anything is asked for it.
+
+    Raises:
+        RecipeError: The file exists, or does not end as a model's file does.
+    """
+    if path.suffix not in (".yaml", ".yml"):
+        raise RecipeError(f"{path}: a model's file ends in .yaml")
+    if path.exists():
+        raise RecipeError(f"{path}: is there already; take another name with --out")

@@ -14,7 +14,7 @@ from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import RobotModel
 from flangeye.motion.arm import watched
 from flangeye.motion.limits import MotionLimits
-from flangeye.motion.planning import read_state
+from flangeye.motion.reach import read_state
 from flangeye.motion.route import Barred, Route, Router
 from flangeye.types import Floats
 

@@ -141,7 +141,7 @@ PARTS: Mapping[str, PartKind] = {
     "reader": PartKind(
         "an archive layout that acquire.archive can read", "flangeye.files.recording:Reader"
     ),
-    "plan": PartKind("the robot poses an acquisition visits", "flangeye.motion.planning:Planner"),
+    "plan": PartKind("the robot poses an acquisition visits", "flangeye.motion.reach:Planner"),
     "cost": PartKind(
         "what solve.iterative minimises of a pose error", "flangeye.models.contracts:Cost"
     ),
@@ -160,7 +160,7 @@ PARTS: Mapping[str, PartKind] = {
         "repeats from its log what a step decided, and compares", "flangeye.run.replay:Repeat"
     ),
     "guide": PartKind(
-        "a guided procedure with the devices of a recipe", "flangeye.recipe.guide:Guide"
+        "a guided procedure with the devices of a recipe", "flangeye.recipe.load:Guide"
     ),
     "controller": PartKind(
         "what leads tool and torch along a seam in weld.tactile",

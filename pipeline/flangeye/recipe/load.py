@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any, Protocol, get_args
 
 import yaml
 from pydantic import BaseModel, ValidationError
@@ -376,3 +376,13 @@ def _require_reached(path: Path, robot: RobotModel) -> None:
             "its own, so that it cannot be sent to a plan's; record poses by hand and read them: "
             "robot: {flange: ISO 9409-1-50-4-M6}"
         )
+
+
+class Guide(Protocol):
+    """How a ``guide`` part is called."""
+
+    def __call__(
+        self, recipe: Recipe, motion: MotionAllowed, ask: Callable[[str], None], out: Path
+    ) -> str:
+        """Lead the person, write the outcome to ``out`` and return a line about it."""
+        ...

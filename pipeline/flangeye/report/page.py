@@ -18,14 +18,12 @@ from flangeye.files.paths import VERSION
 from flangeye.files.regular import write_whole
 from flangeye.log.read import JournalEntry, RunLog, read_notes
 from flangeye.maths.statistics import rms
-from flangeye.report.cell import cell_drawing
-from flangeye.report.clouds import cloud_panels
+from flangeye.report.cell import cell_drawing, cloud_panels
 from flangeye.report.facts import Facts, facts_of, idle_of, provenance_of, set_aside_of, timings_of
-from flangeye.report.graph import graph_drawing
 from flangeye.report.look import LOGO, css
 from flangeye.report.plot import AXES, HELD_OUT, USED, Figure, layout2d, plain, round_up
 from flangeye.report.residuals import errors_of, residual_figure
-from flangeye.report.space import workspace_drawing
+from flangeye.report.space import graph_drawing, workspace_drawing
 from flangeye.report.still import scene_of, still
 from flangeye.report.summary import (
     TransformText,

@@ -21,7 +21,7 @@ from flangeye.testing.base import (
     require_round_trip,
     require_type,
 )
-from flangeye.testing.scenes import FACING, flange_scene
+from flangeye.testing.percapture import FACING, flange_scene
 from flangeye.types import Floats
 
 CAMERA = rigid(rotation_exp(np.array([3.0, 0.2, -0.4])), np.array([0.6, -0.1, 1.2]))

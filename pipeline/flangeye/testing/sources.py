@@ -16,7 +16,7 @@ from flangeye.log.read import read_run
 from flangeye.log.record import Recorder
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.maths.kinematics import Arm
-from flangeye.motion.planning import Site
+from flangeye.motion.reach import Site
 from flangeye.testing.base import (
     Conformance,
     only,

@@ -9,7 +9,7 @@ from flangeye.models.scanners import ScannerModel
 from flangeye.models.targets import Flange, Sphere
 from flangeye.plugin.stage import stage
 from flangeye.types import Captures, Seed, StageLog
-from flangeye_emulators.acquire.simulated_params import SimulatedParams
+from flangeye_emulators.acquire.simulation import SimulatedParams
 
 
 @stage("acquire.simulated")

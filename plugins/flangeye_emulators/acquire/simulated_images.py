@@ -25,14 +25,11 @@ from flangeye_emulators.acquire.planned_session import (
     plan_session,
     source_of,
 )
-from flangeye_emulators.world import materials
 from flangeye_emulators.world.board_image import PAPER_MARGIN, BoardCamera, Cover, render_board
-from flangeye_emulators.world.mesh import box
+from flangeye_emulators.world.mesh import MATT, box
 from flangeye_emulators.world.raycast import Pixels, RaycastScene, SolidBody
-from flangeye_emulators.world.scanner import scanner_of
+from flangeye_emulators.world.scanner import StructuredLight, TimeOfFlight, scanner_of
 from flangeye_emulators.world.session import CameraView, seen_from
-from flangeye_emulators.world.structured_light import StructuredLight
-from flangeye_emulators.world.time_of_flight import TimeOfFlight
 
 
 def camera_of(pixels: Pixels, camera: BoardCamera) -> BoardCamera:
@@ -49,7 +46,7 @@ def sheet_of(board: Board) -> SolidBody:
     half = np.array(board.size) / 2 + PAPER_MARGIN * board.square
     # Of the sheet that carries the print [m]
     low, high = [*-half, -4e-3], [*half, 0.0]
-    return SolidBody(box(low, high), materials.MATT)
+    return SolidBody(box(low, high), MATT)
 
 
 def uncovered(cloud: PointCloud, board: Board, camera_T_target: Floats, cover: Cover) -> PointCloud:

@@ -8,10 +8,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 
 from flangeye.devices import MotionAllowed
 from flangeye.errors import NothingMoved, StageError
@@ -20,8 +20,8 @@ from flangeye.models.bodies import TargetBody
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel, middle_of_view
 from flangeye.models.targets import Flange, Sphere, plate_of
-from flangeye.motion.planning import Plan, PlannedPose, Site, poses_near
-from flangeye.motion.reach import Reach
+from flangeye.motion.reach import Plan, PlannedPose, Reach, Site, poses_near
+from flangeye.plugin.stage import BoundPart, Choose
 from flangeye.run.ahead import cores, worked_ahead
 from flangeye.types import (
     BASE,
@@ -40,16 +40,40 @@ from flangeye.types import (
     Truth,
     by_frame,
 )  # fmt: skip
-from flangeye.units import in_mm
+from flangeye.units import in_mm, param
 from flangeye_emulators.acquire.planned_session import UNSEEN, noise_free
-from flangeye_emulators.acquire.simulated_params import SimulatedParams
-from flangeye_emulators.world.arm import ImperfectArm
+from flangeye_emulators.world.arm import ArmErrors, ImperfectArm
 from flangeye_emulators.world.cell import SimulatedCell
 from flangeye_emulators.world.raycast import Image, SolidBody
-from flangeye_emulators.world.scanner import before_camera, scanner_of
-from flangeye_emulators.world.structured_light import StructuredLight
-from flangeye_emulators.world.time_of_flight import TimeOfFlight
+from flangeye_emulators.world.scanner import (
+    CameraPose,
+    ScannerQuality,
+    StructuredLight,
+    TimeOfFlight,
+    before_camera,
+    scanner_of,
+)
 from flangeye_plugins.acquire.itinerary import as_plan, left_out, row_at
+
+
+class SimulatedParams(ScannerQuality):
+    """Parameters of ``acquire.simulated``."""
+
+    poses: Annotated[BoundPart, Choose("plan")] = param(
+        {"grid": {}}, description="Poses the robot visits."
+    )
+    camera: CameraPose = Field(default_factory=CameraPose, description="The scanner's true pose.")
+    verification: int = Field(
+        1, ge=0, description="Captures that are kept from solving, near the workspace's middle."
+    )
+    arm: ArmErrors = Field(
+        default_factory=ArmErrors,
+        description="Errors of the arm that its controller does not know of.",
+    )
+    outliers: float = Field(
+        0.0, ge=0, le=1, description="Share of the captures in which the flange is covered."
+    )
+
 
 VERSION = 1
 """Raised whenever the same parameters would give other captures."""

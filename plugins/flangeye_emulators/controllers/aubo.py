@@ -25,10 +25,9 @@ from flangeye_emulators.controllers.arm import (
     joint_zeros,
     starting_joints,
 )
-from flangeye_emulators.controllers.fault_injection import FaultInjector
 from flangeye_emulators.controllers.motion import joint_move, linear_move
 from flangeye_emulators.controllers.mover import Mover
-from flangeye_emulators.controllers.network import Connection, Network
+from flangeye_emulators.controllers.network import Connection, FaultInjector, Network
 from flangeye_emulators.controllers.server import Server, run_server
 
 POSE = CONVENTIONS["rpy"]

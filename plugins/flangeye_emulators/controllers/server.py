@@ -27,8 +27,13 @@ from flangeye.files.elsewhere import is_this_machine
 from flangeye.models.graph import EmulatorOptions
 from flangeye_emulators.controllers.arm import ControlUnit, SpringSurface, starting_joints
 from flangeye_emulators.controllers.client import PORT
-from flangeye_emulators.controllers.fault_injection import FaultInjector, Schedule, parse_fault
-from flangeye_emulators.controllers.network import LineConnection, Network
+from flangeye_emulators.controllers.network import (
+    FaultInjector,
+    LineConnection,
+    Network,
+    Schedule,
+    parse_fault,
+)
 
 KEPT = 60_000
 """Lateness is kept for so many cycles: two minutes at 500 Hz."""

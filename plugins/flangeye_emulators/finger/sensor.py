@@ -26,7 +26,7 @@ from flangeye_emulators.weld_world.truth import (
     WorldPath,
 )
 from flangeye_emulators.weld_world.world import Nominal, Shutter, WeldWorld
-from flangeye_emulators.world import room
+from flangeye_emulators.world import bench
 from flangeye_emulators.world.bench import LaidParams
 from flangeye_plugins.weld.corners import corners_of
 from flangeye_plugins.weld.frame import Tool, WorkPlane
@@ -114,8 +114,8 @@ class SimulatedFinger(Device):
         age = (state.time_ns - self._started) * 1e-9
         if self._params.fails is not None and age >= self._params.fails:
             raise DeviceError(f"{self.name}: the camera is lost")
-        pose = self.tool.pose(room.true_flange(state), now)
-        shown = self._shown(pose, room.true_flange(state))
+        pose = self.tool.pose(bench.true_flange(state), now)
+        shown = self._shown(pose, bench.true_flange(state))
         self._torch.append((now, self._beside_plan()))
         if self._shutter.due(age):
             # A tag that something covers: it is as if it were far out of the image.

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+from weakref import WeakSet, ref
+
 import numpy as np
 from pydantic import Field
 
+from flangeye.devices import RobotState
 from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.maths.seam_geometry import distances_to_line
 from flangeye.models.workpiece import Workpiece, WorkpiecePath
 from flangeye.plugin.stage import Params
-from flangeye.types import Floats
+from flangeye.types import BASE, FLANGE, Floats, Transform
 from flangeye.units import Angle, Length, param
-from flangeye_emulators.world import materials
-from flangeye_emulators.world.mesh import Mesh, box, capsule
+from flangeye_emulators.world.mesh import METAL, PAINTED, RUBBER, TABLE, WALL, Mesh, box, capsule
 from flangeye_emulators.world.raycast import SolidBody
 
 BENCH_MARGIN = 0.25
@@ -77,7 +80,7 @@ def bench_with(
     low, high = part.vertices.min(axis=0), part.vertices.max(axis=0)
     top = float(low[2])
     bench = box([*(low[:2] - BENCH_MARGIN), top - 0.04], [*(high[:2] + BENCH_MARGIN), top])
-    bodies = [SolidBody(bench, materials.TABLE), SolidBody(part, materials.METAL)]
+    bodies = [SolidBody(bench, TABLE), SolidBody(part, METAL)]
     seams = [
         s.points @ base_T_part[:3, :3].T + base_T_part[:3, 3] for s in workpiece.seams.values()
     ]
@@ -105,10 +108,10 @@ def _thing(place: Floats, floor: float, rng: np.random.Generator) -> SolidBody:
     pose = rigid(rotation_from_rpy(0.0, 0.0, rng.uniform(0, np.pi)), np.array([*place, floor]))
     if rng.random() < 0.6:
         block = box([-size[0], -size[1], 0.0], [size[0], size[1], 2 * size[2]])
-        return SolidBody(block.moved(pose), materials.PAINTED)
+        return SolidBody(block.moved(pose), PAINTED)
     radius = float(size[0]) / 2
     ends = np.array([[-size[1] - 0.02, 0, radius], [size[1] + 0.02, 0, radius]])
-    return SolidBody(capsule(ends[0], ends[1], radius).moved(pose), materials.RUBBER)
+    return SolidBody(capsule(ends[0], ends[1], radius).moved(pose), RUBBER)
 
 
 def _sheet(workpiece: Workpiece, base_T_part: Floats, covered: float) -> SolidBody:
@@ -117,4 +120,44 @@ def _sheet(workpiece: Workpiece, base_T_part: Floats, covered: float) -> SolidBo
     edge = high[0] - covered * (high[0] - low[0])
     above = high[2] + 0.03
     sheet = box([edge, low[1] - 0.02, above], [high[0] + 0.02, high[1] + 0.02, above + 0.002])
-    return SolidBody(sheet.moved(base_T_part), materials.WALL)
+    return SolidBody(sheet.moved(base_T_part), WALL)
+
+
+class StandingArm(Protocol):
+    """An arm in the room."""
+
+    def state(self) -> RobotState:
+        """Return what it says of itself."""
+        ...
+
+    def true_flange(self) -> Floats:
+        """Return where its flange really is (4, 4), in base."""
+        ...
+
+
+_ARMS: WeakSet[StandingArm] = WeakSet()
+_NEWEST: list[ref[StandingArm]] = []
+
+
+def enter(arm: StandingArm) -> None:
+    """Let an arm stand in the room, for as long as it lives."""
+    _ARMS.add(arm)
+    _NEWEST[:] = [ref(arm)]
+
+
+def newest() -> StandingArm | None:
+    """Return the arm that came into the room last, which carries what is mounted on an arm."""
+    return _NEWEST[0]() if _NEWEST else None
+
+
+def true_flange(reported: RobotState) -> Transform:
+    """Return where the flange of the arm that reports this really is.
+
+    An arm that is not simulated here is where it says.
+    """
+    for arm in _ARMS:
+        state = arm.state()
+        same = len(state.joints) == len(reported.joints) and state.time_ns == reported.time_ns
+        if same and np.array_equal(state.joints, reported.joints):
+            return Transform(BASE, FLANGE, arm.true_flange())
+    return reported.base_T_flange

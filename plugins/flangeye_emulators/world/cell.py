@@ -13,9 +13,16 @@ from flangeye.models.robots import RobotModel
 from flangeye.models.targets import Flange, Sphere
 from flangeye.motion.clearance import ArmVolume
 from flangeye.types import Floats
-from flangeye_emulators.world import materials
 from flangeye_emulators.world.mesh import (
     COARSE,
+    FINISHES,
+    MATT,
+    METAL,
+    PAINTED,
+    POLISHED,
+    RUBBER,
+    TABLE,
+    WALL,
     Mesh,
     box,
     capsule,
@@ -72,8 +79,8 @@ class SimulatedCell:
         x, y = self.centre[:2]
         far = x + self.size[0] / 2 + 0.13
         return [
-            SolidBody(box([-0.4, y - 0.9, -0.04], [far + 0.3, y + 0.9, 0.0]), materials.TABLE),
-            SolidBody(box([far, y - 0.9, 0.0], [far + 0.02, y + 0.9, 0.7]), materials.WALL),
+            SolidBody(box([-0.4, y - 0.9, -0.04], [far + 0.3, y + 0.9, 0.0]), TABLE),
+            SolidBody(box([far, y - 0.9, 0.0], [far + 0.02, y + 0.9, 0.7]), WALL),
             *self._stand(),
         ]
 
@@ -93,21 +100,21 @@ class SimulatedCell:
             own = self.body.by_link.items()
             links = [Mesh(one.vertices, one.triangles).moved(frames[k]) for k, one in own]
         return [
-            *([SolidBody(merged(links), materials.PAINTED)] if links else []),
+            *([SolidBody(merged(links), PAINTED)] if links else []),
             *(body.moved(base_T_flange) for body in self._at_flange()),
         ]
 
     def _at_flange(self) -> list[SolidBody]:
         """Return what moves with the flange, in ``flange``."""
-        finish = materials.FINISHES[self.flange.details.finish]
+        finish = FINISHES[self.flange.details.finish]
         plate = SolidBody(flange_mesh(self.flange), finish)
-        wrist = SolidBody(wrist_mesh(self.flange), materials.PAINTED)
+        wrist = SolidBody(wrist_mesh(self.flange), PAINTED)
         if self.body is not None and not isinstance(self.body, ArmBody):
             tool = Mesh(self.body.vertices, self.body.triangles)
-            return [plate, wrist, SolidBody(tool, materials.METAL)]
+            return [plate, wrist, SolidBody(tool, METAL)]
         if self.sphere is None:
             return [plate, wrist]
-        ball = SolidBody(sphere_mesh(self.sphere), materials.MATT)
+        ball = SolidBody(sphere_mesh(self.sphere), MATT)
         return [plate, wrist, ball, SolidBody(stub_mesh(self.sphere), finish)]
 
     def board(self, base_T_flange: Floats) -> SolidBody:
@@ -117,7 +124,7 @@ class SimulatedCell:
             away += self.sphere.centre_in_flange[2] + self.sphere.radius
         if self.body is not None and not isinstance(self.body, ArmBody):
             away += float(self.body.vertices[:, 2].max())
-        sheet = SolidBody(box([-half, -half, away], [half, half, away + 0.003]), materials.WALL)
+        sheet = SolidBody(box([-half, -half, away], [half, half, away + 0.003]), WALL)
         return sheet.moved(base_T_flange)
 
     def _stand(self) -> list[SolidBody]:
@@ -127,10 +134,10 @@ class SimulatedCell:
         pose = np.eye(4)
         pose[:3, :3] = rotation_from_rpy(0.12, -0.1, 0.0)
         pose[:3, 3] = [foot[0], foot[1], top]
-        ring = SolidBody(_ring(self.flange), materials.POLISHED).moved(pose)
+        ring = SolidBody(_ring(self.flange), POLISHED).moved(pose)
         low = np.array([foot[0], foot[1], 0.0])
         post = capsule(low, np.array([foot[0], foot[1], top - 0.03]), 0.015)
-        return [ring, SolidBody(post, materials.RUBBER)]
+        return [ring, SolidBody(post, RUBBER)]
 
 
 def _ring(flange: Flange) -> Mesh:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from flangeye.errors import StageError
 from flangeye.maths.geometry import basis_of_plane
-from flangeye.models.robots import Recess
+from flangeye.models.robots import Finish, Recess
 from flangeye.models.targets import Flange
 from flangeye.types import Floats
 
@@ -230,3 +230,34 @@ def _hole(centre: tuple[float, float], edge: float, flange: Flange) -> Mesh:
     sink, depth = flange.details.countersink, flange.details.hole_depth
     profile = [(edge, 0.0), (edge - sink, -sink), (edge - sink, -depth), (0.0, -depth)]
     return lathe(profile, HOLE_SEGMENTS, centre)
+
+
+@dataclass(frozen=True)
+class Material:
+    """How one surface answers the projector.
+
+    Attributes:
+        albedo: Share of the light it returns in all directions.
+        gloss: Share of the points that are lost in the middle of a highlight.
+        grain: Standard deviation of depth, over that on a white diffuse surface.
+    """
+
+    albedo: float
+    gloss: float = 0.0
+    grain: float = 1.0
+
+
+PAINTED = Material(albedo=0.6)
+METAL = Material(albedo=0.35, gloss=0.6, grain=1.2)
+ANODISED = Material(albedo=0.08, gloss=0.3, grain=1.5)
+POLISHED = Material(albedo=0.25, gloss=0.9, grain=1.3)
+MATT = Material(albedo=0.8)
+RUBBER = Material(albedo=0.03, grain=1.5)
+WALL = Material(albedo=0.8)
+TABLE = Material(albedo=0.3)
+
+FINISHES: Mapping[Finish, Material] = {
+    "painted": PAINTED,
+    "metal": METAL,
+    "anodised": ANODISED,
+}

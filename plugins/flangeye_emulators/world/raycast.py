@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from flangeye.models.scanners import ScannerModel
 from flangeye.types import Floats, Indices, Mask
-from flangeye_emulators.world.materials import Material
-from flangeye_emulators.world.mesh import Mesh
+from flangeye_emulators.world.mesh import Material, Mesh
 
 Image = NDArray[np.float32]
 

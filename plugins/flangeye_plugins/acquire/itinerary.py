@@ -14,8 +14,7 @@ from flangeye.maths.geometry import angle_between
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel, middle_of_view
 from flangeye.models.targets import Flange
-from flangeye.motion.planning import Plan, PlannedPose, Site, poses_near
-from flangeye.motion.reach import Margins, Reach, Refusal
+from flangeye.motion.reach import Margins, Plan, PlannedPose, Reach, Refusal, Site, poses_near
 from flangeye.motion.route import Barred, Route, Router
 from flangeye.plugin.stage import BoundPart
 from flangeye.types import Floats, Observation, Role

@@ -33,8 +33,7 @@ from flangeye.models.scanners import ScannerModel
 from flangeye.models.targets import Flange
 from flangeye.motion.arm import WatchedArm, watched
 from flangeye.motion.limits import MotionLimits, limits_of
-from flangeye.motion.planning import read_state
-from flangeye.motion.reach import Margins
+from flangeye.motion.reach import Margins, read_state
 from flangeye.motion.route import Barred, Leg, Route
 from flangeye.motion.supervision import RememberedState
 from flangeye.plugin.stage import BoundPart, Choose, Params, stage

@@ -18,8 +18,7 @@ import numpy as np
 from flangeye.doctor.diagnosis import Arms, Misfit, RecordedSession
 from flangeye.maths.geometry import hat, rotation_exp
 from flangeye.types import Floats
-from flangeye_plugins.check.equations import Equations, equations_of
-from flangeye_plugins.check.starts import VariantUnknowns, start_of
+from flangeye_plugins.check.equations import Equations, VariantUnknowns, equations_of, start_of
 
 TAILS = 4.0
 """Degrees of freedom of the errors' distribution."""

@@ -2,10 +2,290 @@
 
 from __future__ import annotations
 
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+
 from flangeye import stage
-from flangeye.models.targets import Flange
-from flangeye.types import CircleFeature, FlangeCloud, Rejected
-from flangeye_plugins.fit.rim_params import RimParams
+from flangeye.maths.circles import distances, edge_points, fringe, sectors, vote_centre
+from flangeye.maths.geometry import basis_of_plane
+from flangeye.maths.planes import Plane, chosen, fit_plane, thinned
+from flangeye.models.targets import Flange, roll_angle
+from flangeye.types import CircleFeature, FlangeCloud, Floats, Indices, Mask, Rejected
+from flangeye.units import Length, param
+from flangeye_plugins.fit.circles import (
+    Circles,
+    cauchy_curvature,
+    cauchy_weights,
+    circle_jacobian,
+    circle_residuals,
+    disc_face,
+    fit_concentric,
+)
+from flangeye_plugins.fit.uncertainty import (
+    STRETCHES,
+    ScannerErrorParams,
+    clustered_covariance,
+    plane_covariance,
+)
+
+FEWEST_POINTS = 100
+
+
+LEAST_NOISE = 3e-5
+"""Scanners round edges by this much, however small their noise is [m]."""
+
+
+def face_and_rings(
+    cloud: FlangeCloud, flange: Flange, params: RimParams
+) -> CircleFeature | Rejected:
+    """Return the circle of a flange's rim, or why there is none; see ``fit.rim``."""
+    points = cloud.cloud.xyz.astype(np.float64, order="F")
+    rough = Plane(cloud.centre, cloud.normal)
+    # The face is sought within 3 mm of the rough plane.
+    face = disc_face(points, rough, _ring_of(flange), 3e-3)
+    if face is None:
+        return Rejected(f"fewer than 3 of {len(points)} points lie on a common plane")
+    flat = face.flatten(chosen(points, _on_face(face, points)))
+    if len(flat) < FEWEST_POINTS:
+        return Rejected(f"{len(flat)} points on the face, at least {FEWEST_POINTS} are needed")
+    start = face.flatten(cloud.centre[None])[0]
+    nominal = np.array(list(flange.radii.values()))
+    rings = find_rings(flat, nominal, start, params.inlier / 2)
+    problem = _why_not(rings, flange, params)
+    if problem:
+        return Rejected(problem)
+    plane = away_from_edges(points, face, rings, flange)
+    return _feature(points, plane, face, rings, flange, params)
+
+
+def _ring_of(flange: Flange) -> tuple[float, float]:
+    # Before a wrist circle's plane stands the plate; only what is outside it is in the plane.
+    # Where the plate has ended, in radii of a wrist circle: of the robots known, wrists are 75 to
+    # 90 mm across and plates 63
+    return (0.85 * flange.rim if flange.bore is None else 0.0, 1.5 * flange.outer)
+
+
+def _on_face(face: Plane, points: Floats) -> Mask:
+    heights, sigma = face.heights(points), max(face.sigma, LEAST_NOISE)
+    # Chamfers and mixed pixels lie behind the face; before it there is nothing but noise.
+    return np.asarray((heights > -2.5 * sigma) & (heights < 6.0 * sigma))
+
+
+def _why_not(rings: Rings, flange: Flange, params: RimParams) -> str | None:
+    """Return why the circles are not the flange's, or None."""
+    coverage = rings.coverage(params.inlier)
+    for k, (name, expected) in enumerate(flange.radii.items()):
+        if coverage[k] < params.min_coverage:
+            return (
+                f"{coverage[k]:.0%} of the {name} lies within {params.inlier * 1e3:g} mm of a "
+                f"circle, at least {params.min_coverage:.0%} is needed"
+            )
+        got = rings.circles.radii[k]
+        if abs(got - expected) > params.radius_tolerance:
+            return (
+                f"{name} radius {got * 1e3:.2f} mm, expected {expected * 1e3:.2f} mm "
+                f"within {params.radius_tolerance * 1e3:g} mm"
+            )
+    return None
+
+
+def away_from_edges(points: Floats, face: Plane, rings: Rings, flange: Flange) -> Plane:
+    """Return the face's plane from points a millimetre inside rim and bore.
+
+    Near an edge chamfers, mixed pixels and reflections pull points off the plane, and most of
+    them backwards: with 0.2 mm of noise they hide in it and move the plane by 0.015 mm.
+    """
+    offsets = face.flatten(points) - rings.circles.centre
+    radius = distances(offsets)
+    rim, *bore = rings.circles.radii
+    edge = 1e-3  # how far from an edge a point is beyond its influence [m]
+    inside = (radius < rim - edge) & (radius > (bore[0] if bore else _ring_of(flange)[0]) + edge)
+    inner = chosen(points, inside)
+    plane, half = face, 3 * max(face.sigma, LEAST_NOISE)
+    # The face is near enough already for a few rounds of its own slab to settle it.
+    for some in (thinned(inner), thinned(inner), inner):
+        near = chosen(some, np.abs(plane.heights(some)) < half)
+        if len(near) < FEWEST_POINTS:
+            return face
+        plane = fit_plane(near, face.normal)
+    return plane
+
+
+def _feature(
+    points: Floats, plane: Plane, face: Plane, rings: Rings, flange: Flange, params: RimParams
+) -> CircleFeature:
+    """Return the circle, found in ``face``, in ``plane``, with all that is known of it."""
+    centre = face.lift(rings.circles.centre)
+    centre = centre - plane.heights(centre) * plane.normal
+    axes = basis_of_plane(plane.normal)
+    heights = plane.heights(points)
+    near = np.abs(heights) < 3 * max(plane.sigma, LEAST_NOISE)
+    about_centre = Plane(centre, plane.normal).flatten(chosen(points, near))
+    of_plane = plane_covariance(about_centre, heights[near]) + _unevenness(flange, params)
+    to_flange = flange.details.thickness if flange.bore is None else 0.0
+    return CircleFeature(
+        centre=centre + to_flange * plane.normal,
+        normal=plane.normal,
+        radii=dict(zip(flange.radii, rings.circles.radii.tolist(), strict=True)),
+        covariance=axes.T @ _centre_covariance(rings, of_plane, params) @ axes,
+        normal_covariance=axes[:2].T @ of_plane[:2, :2] @ axes[:2],
+        arc_coverage=float(rings.coverage(params.inlier)[0]),
+        roll=roll_angle(about_centre, flange),
+    )
+
+
+def _unevenness(flange: Flange, params: RimParams) -> Floats:
+    """Return the (3, 3) covariance of slopes and height that the face's tolerance allows.
+
+    A surface anywhere within a band has the band's width over root 12 as standard deviation; a
+    slope is that over the standard deviation of a disc's points along an axis, half its radius.
+    """
+    height = params.flatness**2 / 12
+    slope = height / (flange.rim / 2) ** 2
+    return np.diag([slope, slope, height])
+
+
+def _centre_covariance(rings: Rings, of_plane: Floats, params: RimParams) -> Floats:
+    """Return the (3, 3) covariance of the centre in the face's axes, the normal last [m^2]."""
+    covariance = params.scanner_error**2 * np.eye(3)
+    covariance[:2, :2] += params.edge_bias**2 * np.eye(2)
+    covariance[:2, :2] += rings.covariance()[:2, :2]
+    covariance[2, 2] += of_plane[2, 2]
+    return covariance
+
+
+class Rings(NamedTuple):
+    """Rim, and bore if there is one, with the edge points they were fitted to.
+
+    Attributes:
+        circles: In the face's coordinates; radii in the order rim, bore.
+        points: (N, 2) edge points [m].
+        ring: (N,) 0 for rim, 1 for bore.
+        bins: (k,) number of sectors each ring was searched in.
+        scale: Distance at which an edge point's weight is a half [m].
+    """
+
+    circles: Circles
+    points: Floats
+    ring: Indices
+    bins: Indices
+    scale: float
+
+    @property
+    def residuals(self) -> Floats:
+        """(N,) how far outside its circle each edge point lies [m]."""
+        return circle_residuals(self.circles, self.points, self.ring)
+
+    def coverage(self, inlier: float) -> Floats:
+        """Return (k,) the share of each circle with an edge point within ``inlier`` of it."""
+        on_circle = np.abs(self.residuals) <= inlier
+        return np.bincount(self.ring[on_circle], minlength=len(self.bins)) / self.bins
+
+    def covariance(self) -> Floats:
+        """Return the (2 + k, 2 + k) covariance of centre and radii [m^2]."""
+        jacobian = circle_jacobian(self.circles, self.points, self.ring)
+        stretch = sectors(self.points - self.circles.centre, STRETCHES) + STRETCHES * self.ring
+        residuals, scale = self.residuals, self.scale
+        weights, curvature = cauchy_weights(residuals, scale), cauchy_curvature(residuals, scale)
+        return clustered_covariance(jacobian, residuals, weights, stretch, curvature)
+
+
+def find_rings(flat: Floats, nominal: Floats, start: Floats, scale: float) -> Rings:
+    """Return the concentric circles along the outer and inner edge of flat points.
+
+    Args:
+        flat: (N, 2) points of the face [m].
+        nominal: (k,) radii to look for: rim, and bore if any [m].
+        start: (2,) a point inside the bore, or near the centre [m].
+        scale: Distance at which an edge point's weight is a half [m].
+    """
+    few = thinned(flat)
+    bins = _sectors_for(few, nominal)
+    edges = [few[edge_points(few, start, int(n), k == 0)] for k, n in enumerate(bins)]
+    votes = tuple((e, float(r)) for e, r in zip(edges, nominal, strict=True))
+    circles = Circles(vote_centre(votes, start, float(nominal[0])), nominal)
+    if len(few) < len(flat):
+        # A step as small [m] is the last with a few of the points
+        circles = _settled(few, circles, nominal, bins, scale, 1e-4).circles
+        bins = _sectors_for(flat, nominal)
+        # How deep behind an edge its points are kept while the circles settle [m]
+        flat, _ = _edges_near(flat, circles.centre, nominal, bins, 1e-3)
+    # And so small with all
+    return _settled(flat, circles, nominal, bins, scale, 1e-7)
+
+
+def _settled(
+    flat: Floats, circles: Circles, nominal: Floats, bins: Indices, scale: float, within: float
+) -> Rings:
+    """Return the circles through the points at the edges, once their centre has come to rest.
+
+    Which points are at the edge depends on the centre, and the centre on them.
+    """
+    # Rounds of choosing edge points and fitting
+    for _ in range(12):
+        before = circles.centre
+        points, ring = _edges_near(flat, circles.centre, nominal, bins)
+        circles = fit_concentric(points, ring, circles, scale, 0.1 * within)
+        if np.abs(circles.centre - before).max() < within:
+            break
+    return Rings(circles, points, ring, bins, scale)
+
+
+def _sectors_for(flat: Floats, nominal: Floats) -> Indices:
+    """Return (k,) numbers of sectors, each about two points wide at its ring.
+
+    Narrower ones often hold no point at the edge itself, wider ones lose detail.
+    """
+    rim, *bore = nominal**2
+    spacing = np.sqrt(np.pi * (rim - sum(bore)) / len(flat))
+    bins: Indices = np.clip(np.rint(np.pi * nominal / spacing), 24, 360).astype(np.intp)
+    return bins
+
+
+def _edges_near(
+    flat: Floats, centre: Floats, nominal: Floats, bins: Indices, depth: float = 0.0
+) -> tuple[Floats, Indices]:
+    """Return the edge points near each nominal circle, and which circle each belongs to.
+
+    With a depth, all points that are at most so far [m] behind them.
+    """
+    offsets = flat - centre
+    reach = distances(offsets)
+    found = []
+    # Where the edges of rim and bore are sought, in nominal radii
+    for k, (low, high) in enumerate(((0.8, 1.1), (0.75, 1.3))[: len(nominal)]):
+        inside = (reach > low * nominal[k]) & (reach < high * nominal[k])
+        near, outer, count = flat.T.compress(inside, axis=1).T, k == 0, int(bins[k])
+        found.append(
+            near[fringe(near, centre, count, depth, outer)]
+            if depth
+            else near[edge_points(near, centre, count, outer)]
+        )
+    ring = np.repeat(np.arange(len(found)), [len(f) for f in found])
+    return np.concatenate(found), ring
+
+
+class RimParams(ScannerErrorParams):
+    """Parameters of ``fit.rim``."""
+
+    inlier: Length = param(
+        "0.3 mm", gt=0, description="Largest distance of a rim point from the circle."
+    )
+    # Smallest share of the rim's circumference, and of the bore's, to be seen
+    min_coverage: ClassVar[float] = 0.3
+    radius_tolerance: Length = param(
+        "1.5 mm",
+        gt=0,
+        description="Largest difference of a fitted radius from the flange's: room for chamfers "
+        "and for what the scanner wears off an edge.",
+    )
+    # Standard deviation of what shifts a whole edge unseen (chamfer, shadow); added to the
+    # centre's covariance in the face [m]
+    edge_bias: ClassVar[float] = 0.05e-3
+    # Width of the band the face lies in (ISO 9409-1: 0.04 mm), which no number of points averages
+    # out; added to the covariance across the face [m]
+    flatness: ClassVar[float] = 0.04e-3
 
 
 @stage("fit.rim")
@@ -18,6 +298,4 @@ def fit_rim(cloud: FlangeCloud, flange: Flange, params: RimParams) -> CircleFeat
     is no randomness. For a wrist circle the centre is moved along the normal by the plate's
     thickness, to where the robot's flange frame has its origin.
     """
-    from flangeye_plugins.fit.face_and_rings import face_and_rings
-
     return face_and_rings(cloud, flange, params)

@@ -14,9 +14,9 @@ from typing import Any, TypeVar
 import numpy as np
 
 from flangeye import StageError
-from flangeye.files.pairs import natural
 from flangeye.files.recording import NotThisLayout
 from flangeye.files.regular import open_regular
+from flangeye.files.scans import natural
 from flangeye.files.words import reason_of
 from flangeye.log.records import Channel, LogFile
 from flangeye.maths.streams import interpolated

@@ -22,8 +22,8 @@ from typing import Any, Literal
 from pydantic import Field
 
 from flangeye import Params, StageError, part
-from flangeye.files.pairs import natural
 from flangeye.files.recording import Archive, NotThisLayout
+from flangeye.files.scans import natural
 from flangeye.files.tables import Table, document_of, files_at, read_table
 from flangeye_plugins.reader.columns import CloudUnitParams
 from flangeye_plugins.reader.table import TableParams, table

@@ -23,9 +23,8 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from flangeye import StageError, part
-from flangeye.files.pairs import partners
 from flangeye.files.recording import Archive, NotThisLayout, Recording
-from flangeye.files.scans import Poses, recording_of, scans_of
+from flangeye.files.scans import Poses, partners, recording_of, scans_of
 from flangeye.files.tables import Column, Table, files_at, number_of
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.pose_corrections import inverted

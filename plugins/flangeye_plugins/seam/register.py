@@ -17,9 +17,8 @@ from flangeye.maths.geometry import rigid, rotation_exp, rotation_log
 from flangeye.maths.seam_geometry import distances_to_line
 from flangeye.models.workpiece import CadSeam
 from flangeye.types import Floats
-from flangeye_plugins.seam.depthmap import DepthMap, depth_map
 from flangeye_plugins.seam.part import CadPart
-from flangeye_plugins.seam.points import Oriented, facing_camera, thinned
+from flangeye_plugins.seam.points import DepthMap, Oriented, depth_map, facing_camera, thinned
 from flangeye_plugins.seam.refine import CadFit, moved, refine
 from flangeye_plugins.seam.search import agreement, find_poses, model_of, shares
 

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flangeye.types import Floats
-from flangeye_plugins.seam.depthmap import DepthMap
 from flangeye_plugins.seam.part import CadPart
-from flangeye_plugins.seam.points import Oriented, spread_over_normals
+from flangeye_plugins.seam.points import DepthMap, Oriented, spread_over_normals
 
 Ints = NDArray[np.intp]
 

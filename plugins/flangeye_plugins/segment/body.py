@@ -134,9 +134,8 @@ def _misdrawn(
     points: Singles, body: TargetBody, every: list[FoundPose], passes: Callable[[FoundPose], bool]
 ) -> Rejected | None:
     """Return how a mesh is drawn wrongly, where it would be found otherwise; None where not."""
-    from flangeye_plugins.body.judge import opposed
     from flangeye_plugins.body.looks import Looks, prepared
-    from flangeye_plugins.body.search import FINE_ACROSS, BodySearch
+    from flangeye_plugins.body.search import FINE_ACROSS, BodySearch, opposed
     from flangeye_plugins.body.shape import Shape
     from flangeye_plugins.body.view import view_of
 

@@ -2,34 +2,174 @@
 
 from __future__ import annotations
 
-from flangeye import StageError, stage
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from flangeye import CalibrationRefused, StageError, stage
+from flangeye.estimation.calibrate import Options, calibrate_at
 from flangeye.estimation.closed.at_once import daniilidis, li, shah
 from flangeye.estimation.closed.comanipulation import (
     FEWEST_KRONECKER,
     kronecker,
     two_steps,
 )
+from flangeye.estimation.closed.motions import Motions, motions_of, place_of
 from flangeye.estimation.closed.separable import (
     andreff,
     horaud_dornaika,
     park_martin,
     tsai_lenz,
 )
-from flangeye.models.cell import cell_of
+from flangeye.estimation.graph import Places, Problem
+from flangeye.estimation.observability import (
+    FINEST_NOISE,
+    fewest,
+    information_of_centres,
+    require_enough,
+    require_observable,
+    require_poses,
+    require_right_handed,
+    require_same_units,
+    require_several_places,
+    require_turns,
+    robust_sigma,
+)
+from flangeye.estimation.sightings import problem_of
+from flangeye.estimation.start import circle_of, start_of_circles
+from flangeye.maths.geometry import invert, kabsch, kabsch_covariance
+from flangeye.maths.statistics import covariance_inflation
+from flangeye.models.cell import Cell, cell_of
 from flangeye.models.configuration import DEFAULT, EVERY, Configuration
 from flangeye.models.robots import RobotModel, SecondRobot
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import Stage
-from flangeye.types import HandEye, Observations
-from flangeye_plugins.solve.closed_forms import (
-    ClosedForm,
-    ClosedFormParams,
-    by_both,
-    by_motions,
-    by_three,
-    linear,
-    solve_closed,
+from flangeye.types import Floats, HandEye, Observation, Observations, TransformEstimate
+from flangeye_plugins.solve.observations import (
+    LimitsParams,
+    centres_of,
+    estimate_of,
+    hand_eye,
+    residuals_of,
+    tcps_of,
 )
+
+ClosedForm = Callable[[Problem], Places]
+"""Gives (4, 4) of each unknown."""
+
+
+class ClosedFormParams(LimitsParams):
+    """Parameters of the closed forms."""
+
+
+def solve_closed(
+    method: str,
+    solver: ClosedForm,
+    given: tuple[Sequence[Observation], Cell, ScannerModel | None],
+    params: ClosedFormParams,
+) -> HandEye:
+    """Return a closed form's calibration from all observations.
+
+    Its covariance and expected error are those of the mixed model, at the closed form's answer.
+
+    Args:
+        method: Name of the stage.
+        solver: The closed form.
+        given: What was observed, where, and by which scanner.
+        params: Limits of what counts as observable.
+
+    Raises:
+        StageError: Too few poses, or all the same.
+        CalibrationRefused: The motion leaves something unknown: it says which motion is missing.
+    """
+    observations, cell, scanner = given
+    problem = problem_of(observations, cell)
+    require_enough(problem, fewest(problem))
+    require_turns(problem)
+    try:
+        places = solver(problem)
+    except np.linalg.LinAlgError:
+        raise CalibrationRefused(f"{method}: its equations have no solution here") from None
+    options = Options(params.limits)
+    return calibrate_at(places, observations, cell, scanner, options, method)
+
+
+def by_motions(method: Callable[[Motions], Floats]) -> ClosedForm:
+    """Return AX = XB as a closed form: the other unknown is the mean over the poses."""
+
+    def closed(problem: Problem) -> Places:
+        carried, seen = _one_arm(problem)
+        x = method(motions_of(carried, seen))
+        return _placed(problem, x, place_of(carried, x, seen))
+
+    return closed
+
+
+def by_both(method: Callable[[Floats, Floats], tuple[Floats, Floats]]) -> ClosedForm:
+    """Return AX = ZB as a closed form."""
+
+    def closed(problem: Problem) -> Places:
+        return _placed(problem, *method(*_one_arm(problem)))
+
+    return closed
+
+
+def by_three(
+    method: Callable[[Floats, Floats, Floats], tuple[Floats, Floats, Floats]], needed: int
+) -> ClosedForm:
+    """Return AXB = YCZ as a closed form that needs so many poses."""
+
+    def closed(problem: Problem) -> Places:
+        if len(problem.unknown) != 3 or not (problem.seen.ranks == 6).all():
+            raise StageError(
+                "AXB = YCZ has three unknowns: it needs two arms, a marker, and place: unknown"
+            )
+        if len(problem.seen) < needed:
+            raise StageError(f"{needed} poses needed, {len(problem.seen)} given")
+        _, known = circle_of(problem)
+        x, y, z = method(known[2], known[0], invert(known[1]))
+        return _as_named(problem, [x, invert(z), invert(y)])
+
+    return closed
+
+
+def linear(problem: Problem) -> Places:
+    """Return the unknowns of circles by linear least squares."""
+    if (problem.seen.ranks == 6).all():
+        raise StageError("takes circles, and there are whole poses: use solve.park_martin")
+    return start_of_circles(problem)
+
+
+def _one_arm(problem: Problem) -> tuple[Floats, Floats]:
+    """Return ``G`` and ``M`` of ``G X M`` that is the same at every pose, both (N, 4, 4).
+
+    Raises:
+        StageError: The measurements are no whole poses, or the unknowns are others.
+    """
+    if not (problem.seen.ranks == 6).all():
+        raise StageError(
+            "needs whole poses of a marker, and there are circles: use solve.linear or solve.robust"
+        )
+    if len(problem.unknown) != 2:
+        count = {1: "one", 3: "three"}.get(len(problem.unknown), str(len(problem.unknown)))
+        raise StageError(
+            f"has two unknowns, and the configuration leaves {count}: write place: unknown for a "
+            "marker on or before one arm, or use solve.robust"
+        )
+    _, known = circle_of(problem)
+    return known[1], known[0]
+
+
+def _placed(problem: Problem, x: Floats, other: Floats) -> Places:
+    return _as_named(problem, [x, invert(other)])
+
+
+def _as_named(problem: Problem, found: Sequence[Floats]) -> Places:
+    names, _ = circle_of(problem)
+    return {
+        name: invert(place) if back else place
+        for (name, back), place in zip(names, found, strict=True)
+    }
 
 
 def _named(name: str, solver: ClosedForm, documentation: str) -> Stage:
@@ -105,3 +245,64 @@ CLOSED_FORMS = (
     ),
 )
 """The stages."""
+
+
+class SvdParams(LimitsParams):
+    """Parameters of ``solve.svd``."""
+
+
+@stage("solve.svd")
+def solve_svd(observations: Observations, params: SvdParams) -> HandEye:
+    """Fit the camera's pose to all centres by equally weighted least squares.
+
+    Equations (8) to (10) of the paper with scale one. The noise is taken as equal in every
+    coordinate of every centre and estimated from the residuals; the covariance is widened for
+    few poses so that its 95 % region holds its share (see ``covariance_inflation``).
+
+    Raises:
+        StageError: Fewer than three poses, all at one place, or not in one unit.
+        CalibrationRefused: The centres lie on a line, or leave a rotation unknown.
+    """
+    pulled = list(observations)
+    check_poses(pulled)
+    rotation, translation = kabsch(centres_of(pulled), tcps_of(pulled))
+    residuals = residuals_of(pulled, rotation, translation)
+    _require_observable(tcps_of(pulled), residuals, params.rotation_limit)
+    estimate = least_squares_estimate(rotation, translation, tcps_of(pulled), residuals)
+    return hand_eye(pulled, estimate, "solve.svd")
+
+
+def check_poses(observations: Sequence[Observation]) -> None:
+    """Refuse observations that determine no pose by any method.
+
+    Raises:
+        StageError: Says what is wrong with them.
+    """
+    require_poses(len(observations))
+    centres, tcps = centres_of(observations), tcps_of(observations)
+    require_several_places(tcps)
+    require_same_units(centres, tcps)
+    require_right_handed(centres, tcps)
+
+
+def _require_observable(tcps: Floats, residuals: Floats, limit: float) -> None:
+    noise = max(robust_sigma(residuals), FINEST_NOISE)
+    no_axes = np.zeros((0, 3))
+    require_observable(tcps, no_axes, information_of_centres(tcps, noise), noise, limit)
+
+
+def least_squares_estimate(
+    rotation: Floats, translation: Floats, tcps: Floats, residuals: Floats
+) -> TransformEstimate:
+    """Return a least-squares pose with the covariance estimated from its residuals.
+
+    Args:
+        rotation: (3, 3) base_R_camera.
+        translation: (3,) [m].
+        tcps: (N, 3) in base [m].
+        residuals: (N, 3) [m], of N >= 3 pairs.
+    """
+    freedom = 3 * len(tcps) - 6
+    sigma = float(np.sqrt((residuals**2).sum() / freedom * covariance_inflation(freedom)))
+    covariance = kabsch_covariance(tcps, sigma)
+    return estimate_of(rotation, translation, covariance, tcps.mean(axis=0))

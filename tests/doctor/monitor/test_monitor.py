@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from flangeye.cli.commands import app
+from flangeye.cli import commands
 from flangeye.doctor.monitor import History, from_arm, judge, stored_calibration
 from flangeye.doctor.monitor.chart import figure
 from flangeye.doctor.monitor.history import CheckFinding
@@ -47,7 +47,7 @@ def monitor(cell: Path, history: Path, *archives: str, options: tuple[str, ...] 
     given = [x for name in archives for x in ("--archive", str(cell / name))]
     calibration = str(cell / "calibration")
     return CliRunner().invoke(
-        app, ["monitor", calibration, *given, "--history", str(history), *options]
+        commands(), ["monitor", calibration, *given, "--history", str(history), *options]
     )
 
 
@@ -371,7 +371,7 @@ def calibrated_from_six(scans: Path, out: Path, *more: str) -> None:
     if not scans.exists():
         part_of_sample(scans, range(6))
     words = ["run", "ur5_phoxi-m_sample", "--archive", str(scans), "--out", str(out), *more]
-    done = CliRunner().invoke(app, words)
+    done = CliRunner().invoke(commands(), words)
     assert done.exit_code == 0, done.output
 
 
@@ -394,7 +394,7 @@ def test_recordings_may_be_laid_out_otherwise_than_the_calibrations(tmp_path: Pa
     np.save(later / "arm.npy", poses)
     words = ["monitor", str(tmp_path / "run" / "calibration.yaml"), "--archive", str(later)]
     reader = "acquire.archive.reader={table: {file: arm.npy, rotation: matrix, length: m}}"
-    found = CliRunner().invoke(app, [*words, "--set", reader])
+    found = CliRunner().invoke(commands(), [*words, "--set", reader])
     assert found.exit_code == 0, found.output
     assert json.loads(found.stdout)["state"] == "OK"
 
@@ -430,7 +430,7 @@ def test_a_calibration_from_a_table_is_checked_with_tables_of_a_single_row(tmp_p
     row = table_of(tmp_path / "calibrated", 21)
     (tmp_path / "recipe.yaml").write_text(TABLE)
     words = ["run", str(tmp_path / "recipe.yaml"), "--out", str(tmp_path / "calibration")]
-    assert CliRunner().invoke(app, words).exit_code == 0
+    assert CliRunner().invoke(commands(), words).exit_code == 0
     for name, aside in (("fine", 0.0), ("moved", 0.02)):
         (tmp_path / name).mkdir()
         *pose, x, y, z = map(float, row.split(","))

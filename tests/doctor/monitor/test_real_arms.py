@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from flangeye.cli.commands import app
+from flangeye.cli import commands
 from flangeye.doctor.monitor import (
     History,
     MonitorCheck,
@@ -63,5 +63,5 @@ def _aside(seen: Observation, shift: float) -> Observation:
 
 
 def _run(*words: str) -> None:
-    done = CliRunner().invoke(app, ["run", *words])
+    done = CliRunner().invoke(commands(), ["run", *words])
     assert done.exit_code == 0, done.output

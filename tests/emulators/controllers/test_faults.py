@@ -3,7 +3,7 @@ from typing import Any
 import pytest
 
 from flangeye.errors import StageError
-from flangeye_emulators.controllers.fault_injection import Fault, Kind, Schedule, parse_fault
+from flangeye_emulators.controllers.network import Fault, Kind, Schedule, parse_fault
 
 KINDS = {
     "freeze": Kind(lambda seconds: None, takes_seconds=True),

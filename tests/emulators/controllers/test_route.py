@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from flangeye_emulators.controllers.motion import JOINTS, POSES, TURN_LENGTH, Waypoint, route
 from flangeye_emulators.controllers.poses import pose_matrix
-from flangeye_emulators.controllers.route import JOINTS, POSES, TURN_LENGTH, Waypoint, route
 
 
 def at(x, y, turn=0.0):

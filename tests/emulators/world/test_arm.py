@@ -14,12 +14,12 @@ from flangeye.models.targets import flange_of, load_standard
 from flangeye.types import BASE, FLANGE, TARGET, Source, Transform, Truth
 from flangeye_emulators.acquire.planned_session import plan_session
 from flangeye_emulators.acquire.simulated import acquire_simulated
-from flangeye_emulators.acquire.simulated_params import SimulatedParams
 from flangeye_emulators.acquire.simulated_session import SimulatedMarkerParams
+from flangeye_emulators.acquire.simulation import SimulatedParams
 from flangeye_emulators.world.arm import REAL, ArmErrors, ErrorSizes, ImperfectArm
 from flangeye_emulators.world.scanner import CameraPose
 from flangeye_emulators.world.session import CameraView
-from flangeye_plugins.plan.grid import GridParams, grid
+from flangeye_plugins.plan import GridParams, grid
 
 HOME = np.radians([0, -90, 90, -90, -90, 0])
 VIEW = CameraView(0.65, 0.3, 2.0, (0.9, 0.7), 0.9)

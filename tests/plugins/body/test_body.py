@@ -30,8 +30,7 @@ from flangeye.types import (
     Rejected,
     Transform,
 )
-from flangeye_emulators.world import materials
-from flangeye_emulators.world.mesh import Mesh, box
+from flangeye_emulators.world.mesh import MATT, PAINTED, TABLE, Mesh, box
 from flangeye_emulators.world.raycast import RaycastScene, SolidBody
 from flangeye_emulators.world.scanner import scanner_of
 from flangeye_plugins.body.looks import prepared
@@ -53,9 +52,9 @@ def scan(body: TargetBody, pose=POSE, seed: int = 0) -> Capture:
     """A simulated scan of a body before a table, with a box beside it."""
     mesh = Mesh(body.vertices, body.triangles)
     bodies = [
-        SolidBody(mesh.moved(pose), materials.MATT),
-        SolidBody(box([-1, -1, 1.0], [1, 1, 1.02]), materials.TABLE),
-        SolidBody(box([-0.3, -0.2, 0.8], [-0.2, -0.05, 0.9]), materials.PAINTED),
+        SolidBody(mesh.moved(pose), MATT),
+        SolidBody(box([-1, -1, 1.0], [1, 1, 1.02]), TABLE),
+        SolidBody(box([-0.3, -0.2, 0.8], [-0.2, -0.05, 0.9]), PAINTED),
     ]
     xyz = eye().scan(RaycastScene(bodies), np.random.default_rng(seed))
     return Capture("0000", PointCloud(CAMERA, xyz), {FLANGE: Transform(BASE, FLANGE, pose)})
@@ -111,9 +110,7 @@ def test_what_is_stated_covers_what_scanner_and_make_do() -> None:
         q = np.linalg.qr(rng.standard_normal((3, 3)))[0]
         pose = rigid((q := q * np.sign(np.linalg.det(q))), POSE[:3, 3] - q @ made.centre)
         xyz = scanner_of(SCANNER, 0.3, 1.0, rng).scan(
-            RaycastScene(
-                [SolidBody(Mesh(made.vertices, made.triangles).moved(pose), materials.MATT)]
-            ),
+            RaycastScene([SolidBody(Mesh(made.vertices, made.triangles).moved(pose), MATT)]),
             rng,
         )
         capture = Capture("0000", PointCloud(CAMERA, xyz), {})

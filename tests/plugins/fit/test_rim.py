@@ -10,8 +10,7 @@ from flangeye.models.loading import load_model
 from flangeye.models.targets import wrist_circle_of
 from flangeye.types import CAMERA, CircleFeature, FlangeCloud, PointCloud, Rejected
 from flangeye.units import SI
-from flangeye_plugins.fit.rim import fit_rim
-from flangeye_plugins.fit.rim_params import RimParams
+from flangeye_plugins.fit.rim import RimParams, fit_rim
 from tests.plugins.bounds import check_bound
 from tests.plugins.fit.scenes import CENTRE, NORMAL, face, flange, placed
 from tests.plugins.fixed import fixed

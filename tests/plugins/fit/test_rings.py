@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flangeye_plugins.fit.face_and_rings import _sectors_for, find_rings
+from flangeye_plugins.fit.rim import _sectors_for, find_rings
 
 CENTRE = np.array([0.003, -0.002])
 NOMINAL = np.array([0.03, 0.016])

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flangeye.maths.geometry import angle_between
-from flangeye.motion.planning import Site
-from flangeye_plugins.plan.next_best import NextBestParams, next_best
+from flangeye.motion.reach import Site
+from flangeye_plugins.plan import NextBestParams, next_best
 from tests.plugins.fixed import fixed
 from tools.study_next_best import compare
 

@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 
 from flangeye.maths.geometry import rpy_from_rotation
 from flangeye.models.loading import load_model
-from flangeye.motion.planning import Site
-from flangeye.motion.reach import Reach
-from flangeye_plugins.plan.grid import GridParams, grid
+from flangeye.motion.reach import Reach, Site
+from flangeye_plugins.plan import GridParams, grid
 
 UP = np.diag([1.0, -1.0, -1.0])
 

@@ -13,7 +13,7 @@ from flangeye.errors import NothingMoved
 from flangeye.maths.kinematics import Arm
 from flangeye.types import Transform
 from flangeye_emulators.scanner import MountedParams, scanner_mounted
-from flangeye_emulators.world import room
+from flangeye_emulators.world import bench
 from tests.plugins.scan.flange_cell import (
     BOX,
     MOUNTED,
@@ -69,7 +69,7 @@ def test_a_place_outside_the_box_is_named() -> None:
 def test_a_mounted_scanner_needs_a_model_and_an_arm(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(DeviceError, match="must say which scanner to be: scanner.model"):
         scanner_mounted(None, MountedParams())
-    monkeypatch.setattr(room, "newest", lambda: None)
+    monkeypatch.setattr(bench, "newest", lambda: None)
     with pytest.raises(DeviceError, match="no simulated arm carries it; give the recipe robot.dr"):
         scanner_mounted(PHOXI, MountedParams())
 

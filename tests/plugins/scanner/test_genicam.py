@@ -11,8 +11,7 @@ from pydantic import ValidationError
 
 from flangeye.devices import DeviceError, FrameDropped, Scanner
 from flangeye.models.loading import load_model
-from flangeye_plugins.scanner.genicam import GenicamParams, scanner_genicam
-from flangeye_plugins.scanner.genicam_nodes import configure
+from flangeye_plugins.scanner.genicam import GenicamParams, configure, scanner_genicam
 from tests.plugins.fixed import fixed
 from tests.plugins.scanner.genapi import Description, node_map
 

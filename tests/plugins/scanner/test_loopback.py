@@ -19,8 +19,7 @@ from flangeye.types import BASE, FLANGE, Capture, Transform, by_frame
 from flangeye.units import SI
 from flangeye_emulators.scanner import LoopbackScannerParams, scanner_loopback
 from flangeye_emulators.world.scanner import CameraPose
-from flangeye_plugins.fit.rim import fit_rim
-from flangeye_plugins.fit.rim_params import RimParams
+from flangeye_plugins.fit.rim import RimParams, fit_rim
 from flangeye_plugins.segment.flange import SegmentParams, segment_flange
 from tests.emulators.controllers.process import Process
 from tests.plugins.fixed import fixed

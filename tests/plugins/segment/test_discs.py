@@ -11,10 +11,11 @@ from flangeye.maths.geometry import basis_of_plane
 from flangeye.maths.planes import Plane
 from flangeye.models.loading import load_model
 from flangeye.models.targets import wrist_circle_of
-from flangeye_plugins.segment import search as choice
+from flangeye_plugins.segment import flange as choice
 from flangeye_plugins.segment.discs import (
     Disc,
     DiscLimits,
+    PlanarPiece,
     compare,
     incidence,
     of_size,
@@ -22,11 +23,9 @@ from flangeye_plugins.segment.discs import (
     ring_shares,
     width,
 )
-from flangeye_plugins.segment.flange import SegmentParams
+from flangeye_plugins.segment.flange import SegmentParams, _piece, _scatter, choose
 from flangeye_plugins.segment.grid import Grid
-from flangeye_plugins.segment.parts import PlanarPiece
 from flangeye_plugins.segment.scale import check_scale
-from flangeye_plugins.segment.search import _piece, _scatter, choose
 from tests.plugins.bounds import check_bound
 from tests.plugins.segment.test_choice import BORE, UR5
 

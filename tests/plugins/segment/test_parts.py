@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from flangeye.maths.planes import Plane
-from flangeye_plugins.segment import parts as room
-from flangeye_plugins.segment.parts import Patch, SurfacePiece, _flattest, _principal, flat_parts
+from flangeye_plugins.segment import discs as room
+from flangeye_plugins.segment.discs import Patch, SurfacePiece, _flattest, _principal, flat_parts
 
 PITCH = 2e-3
 SCATTER = 3e-4

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from flangeye.maths.planes import Plane
-from flangeye_plugins.segment.discs import Disc, DiscLimits
+from flangeye_plugins.segment.discs import Disc, DiscLimits, PlanarPiece
+from flangeye_plugins.segment.flange import _compared, _disc, _piece
 from flangeye_plugins.segment.grid import Grid
-from flangeye_plugins.segment.parts import PlanarPiece
-from flangeye_plugins.segment.search import _compared, _disc, _piece
 from tests.plugins.segment.test_choice import BORE, UR5
 
 ANGLE, DEPTH = 2e-3, 0.5

@@ -5,14 +5,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye_plugins.segment import search as surfaces
-from flangeye_plugins.segment.grid import Grid
-from flangeye_plugins.segment.search import (
+from flangeye_plugins.segment import flange as surfaces
+from flangeye_plugins.segment.flange import (
     NOISE_GATE,
     _averaged,
     connected_pieces,
     smooth_surface,
 )
+from flangeye_plugins.segment.grid import Grid
 
 ANGLE = 4e-3
 BEND = 0.8e-3

@@ -21,7 +21,7 @@ from flangeye.types import (
     Transform,
     by_frame,
 )
-from flangeye_plugins.solve.svd import SvdParams, solve_svd
+from flangeye_plugins.solve.named import SvdParams, solve_svd
 
 TRUTH = rotation_exp(np.array([2.9, 0.4, -0.3])), np.array([0.4, -0.7, 0.9])
 MM = 1e-3

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 import flangeye_plugins.weld
-from flangeye.cli.commands import app
+from flangeye.cli import commands
 from flangeye.devices import MotionAllowed, RobotDriver
 from flangeye.errors import NothingMoved, StageError
 from flangeye.models.finger import Finger
@@ -31,7 +31,7 @@ PAGE = Path(flangeye_plugins.weld.__file__).parent / "README.md"
 
 
 def calibrated(out, *more):
-    return CliRunner().invoke(app, ["tactile", "calibrate", WELD, "--out", str(out), *more])
+    return CliRunner().invoke(commands(), ["tactile", "calibrate", WELD, "--out", str(out), *more])
 
 
 def test_what_the_page_shows_is_what_the_command_prints(
@@ -60,7 +60,7 @@ def test_the_file_it_writes_says_how_the_finger_moves(tmp_path: Path) -> None:
 
 def test_it_waits_for_the_person(tmp_path: Path) -> None:
     arguments = ["tactile", "calibrate", WELD, "--set", HELD, "--out", str(tmp_path / "f.yaml")]
-    told = CliRunner().invoke(app, arguments, input="\n\n")
+    told = CliRunner().invoke(commands(), arguments, input="\n\n")
     assert told.exit_code == 0
     assert told.output.count("then press Enter") == 2
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from flangeye.cli.commands import app
+from flangeye.cli import commands
 from flangeye.errors import StageError
 from flangeye.log.read import read_run
 from flangeye.maths.geometry import covariance_at
@@ -21,11 +21,13 @@ from flangeye.report.certificate import (
     Conditions,
     budget_of,
     print_pdf,
+    render,
+    sandbox,
+    standard_text,
     use_budget_of,
     write_certificate,
 )
 from flangeye.report.certificate.budget import Share, shares_of
-from flangeye.report.certificate.page import render, sandbox, standard_text
 from flangeye.report.facts import facts_of
 from flangeye.report.units import millimetres
 from flangeye.result import Result
@@ -146,7 +148,7 @@ def test_correlated_quantities_are_named(result: Result) -> None:
 
 def test_the_command_writes_the_page_and_prints_it(run: Path, tmp_path: Path) -> None:
     page = tmp_path / "c.html"
-    done = CliRunner().invoke(app, ["certificate", str(run), "--out", str(page), "--no-pdf"])
+    done = CliRunner().invoke(commands(), ["certificate", str(run), "--out", str(page), "--no-pdf"])
     assert done.exit_code == 0 and page.exists()
     printed = print_pdf(page)
     if printed is None:

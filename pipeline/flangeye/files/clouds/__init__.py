@@ -15,11 +15,10 @@ from typing import Literal
 
 import numpy as np
 
-from flangeye.files.clouds.header import refuse
 from flangeye.files.clouds.pcd import Viewpoint, open_pcd
 from flangeye.files.clouds.plain import array_of, holds_numbers, load_npy, open_npy, open_text
 from flangeye.files.clouds.ply import open_ply
-from flangeye.files.clouds.table import Points, PointTable
+from flangeye.files.clouds.table import Points, PointTable, refuse
 from flangeye.files.elsewhere import at_hand
 from flangeye.types import CAMERA, PointCloud
 

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 
-from flangeye.files.clouds.header import axes_of, count_of, refuse, split_header
 from flangeye.files.clouds.table import (
     BinaryTable,
     CompressedTable,
@@ -20,6 +19,10 @@ from flangeye.files.clouds.table import (
     PointTable,
     Shape,
     TextTable,
+    axes_of,
+    count_of,
+    refuse,
+    split_header,
 )
 from flangeye.maths.geometry import rotation_from_quaternion
 

@@ -14,8 +14,17 @@ import numpy as np
 from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
-from flangeye.files.clouds.header import axes_of, count_of, read_head, refuse
-from flangeye.files.clouds.table import Points, PointTable, Shape, TextTable, is_row
+from flangeye.files.clouds.table import (
+    Points,
+    PointTable,
+    Shape,
+    TextTable,
+    axes_of,
+    count_of,
+    is_row,
+    read_head,
+    refuse,
+)
 
 HEADER_ERRORS = (ValueError, TypeError, SyntaxError, TokenError)
 """What NumPy raises at a header that is none: it parses a Python literal."""

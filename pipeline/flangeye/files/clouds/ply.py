@@ -7,8 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from flangeye.files.clouds.header import axes_of, count_of, refuse, split_header
-from flangeye.files.clouds.table import BinaryTable, PointTable, TextTable
+from flangeye.files.clouds.table import (
+    BinaryTable,
+    PointTable,
+    TextTable,
+    axes_of,
+    count_of,
+    refuse,
+    split_header,
+)
 
 _TYPES = {
     "char": "i1",

@@ -23,8 +23,8 @@ from pathlib import Path
 import numpy as np
 
 from flangeye.errors import StageError
-from flangeye.files.pairs import natural
 from flangeye.files.regular import read_any_text
+from flangeye.files.scans import natural
 from flangeye.files.tables.documents import KINDS, document_of
 from flangeye.files.tables.table import (
     Cell,

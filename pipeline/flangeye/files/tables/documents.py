@@ -14,7 +14,6 @@ from xml.etree import ElementTree
 import numpy as np
 
 from flangeye.errors import RecipeError, StageError
-from flangeye.files import matlab_parser
 from flangeye.files.arrays import read_arrays
 from flangeye.files.processes import python_command
 from flangeye.files.regular import read_regular, read_text
@@ -123,7 +122,7 @@ def _numpy(file: Path) -> TableDocument:
 
 def _matlab(file: Path) -> TableDocument:
     """Return the arrays of a .mat file: its parser, which damage can crash, has its own process."""
-    command = python_command(matlab_parser.__file__)
+    command = python_command(str(Path(__file__).parents[1] / "matlab_parser.py"))
     # Longest .mat file [bytes]
     content = read_regular(file, 1_000_000)
     if content.startswith((b"MATLAB 7.3", b"\x89HDF\r\n")):
@@ -131,20 +130,19 @@ def _matlab(file: Path) -> TableDocument:
             f"{file}: is a MATLAB 7.3 file (HDF5), which is not read; in MATLAB, write it anew: "
             f"load('{file.name}'); save('{file.name}', '-v7')"
         )
+    longest = 20  # for one file [s]
     try:
         done = subprocess.run(
-            command, input=content, capture_output=True, timeout=matlab_parser.SECONDS, check=False
+            command, input=content, capture_output=True, timeout=longest, check=False
         )
     except subprocess.TimeoutExpired:
-        raise StageError(
-            f"{file}: cannot be read: its parser took more than {matlab_parser.SECONDS} s"
-        ) from None
+        raise StageError(f"{file}: cannot be read: its parser took more than {longest} s") from None
     if done.returncode < 0:
         raise StageError(f"{file}: cannot be read: it is damaged, its parser crashed")
     if done.returncode:
         raise ValueError(done.stderr.decode("utf-8", "replace"))
     found = np.load(io.BytesIO(done.stdout), allow_pickle=False)
-    arrays = {n.removeprefix(matlab_parser.PREFIX): array for n, array in found.items()}
+    arrays = {n.removeprefix("of_"): array for n, array in found.items()}
     return TableDocument(arrays, lambda at: f"{file}: row {at + 1}")
 
 

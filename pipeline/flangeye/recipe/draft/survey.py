@@ -12,8 +12,7 @@ from pathlib import Path
 from flangeye.errors import FlangeyeError, RecipeError, StageError
 from flangeye.files.cameras import cameras_in
 from flangeye.files.clouds import CONVERSIONS
-from flangeye.files.pairs import natural
-from flangeye.files.scans import CLOUDS, IMAGES, VENDOR, texts_of_points
+from flangeye.files.scans import CLOUDS, IMAGES, VENDOR, natural, texts_of_points
 from flangeye.files.tables import KINDS, Table, number_of, read_table, tables_in
 from flangeye.recipe.draft.headings import list_name, list_sizes
 

@@ -2,8 +2,175 @@
 
 from __future__ import annotations
 
-from flangeye.report.certificate.budget import Budget, Conditions, budget_of, use_budget_of
-from flangeye.report.certificate.page import print_pdf, write_certificate
+import os
+import shutil
+import subprocess
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from flangeye.errors import FlangeyeError, StageError
+from flangeye.files.paths import VERSION
+from flangeye.files.regular import write_whole
+from flangeye.files.yaml_lines import parse_yaml
+from flangeye.log.read import read_run
+from flangeye.models.loading import load_model
+from flangeye.models.scanners import ScannerModel
+from flangeye.recipe.own_models import carried_files
+from flangeye.report.certificate.budget import (
+    Budget,
+    Conditions,
+    Contribution,
+    Share,
+    budget_of,
+    shares_of,
+    use_budget_of,
+)
+from flangeye.report.facts import Facts, facts_of, provenance_of
+from flangeye.report.look import css
+from flangeye.report.summary import transform_text
+from flangeye.report.units import degrees, millimetres
+from flangeye.result import expected_error, result_of_camera, status_of
+
+LEAST_LENGTH = 1e-6
+"""Smallest uncertainty that is printed as a number [m]; the page shows three decimals of a mm."""
+
+
+def write_certificate(
+    run: Path, path: Path | None, conditions: Conditions, camera: str | None = None
+) -> Path:
+    """Write the certificate of a run and return its path.
+
+    Args:
+        run: The run's folder or its ``run.mcap``.
+        path: The file; by default ``certificate.html`` beside the log.
+        conditions: What the person says of the place.
+        camera: Of a cell, the camera that is certified.
+
+    Raises:
+        StageError: There is no log, no calibration in it, it is of a cell and no camera was
+            chosen, or the file cannot be written.
+    """
+    log = run / "run.mcap" if run.is_dir() else run
+    facts = facts_of(read_run(log))
+    facts = replace(facts, result=result_of_camera(facts.result, camera))
+    page = render(facts, conditions)
+    path = path or log.parent / f"certificate{f'-{camera}' if camera else ''}.html"
+    write_whole(path, page)
+    return path
+
+
+def print_pdf(page: Path) -> Path | None:
+    """Print a page to a PDF beside it, with Chromium; None where there is none.
+
+    Raises:
+        StageError: Chromium is there and does not print.
+    """
+    names = ("chromium", "chromium-browser", "google-chrome", "chrome")
+    browser = next(filter(None, map(shutil.which, names)), None)
+    if browser is None:
+        return None
+    out = page.with_suffix(".pdf")
+    options = ["--headless", *sandbox(), "--disable-gpu", "--no-pdf-header-footer"]
+    command = [browser, *options, f"--print-to-pdf={out.resolve()}", page.resolve().as_uri()]
+    try:
+        subprocess.run(command, check=True, capture_output=True, timeout=120)
+    except (subprocess.SubprocessError, OSError) as error:
+        raise StageError(f"{out}: {browser} does not print: {error}") from None
+    return out
+
+
+def sandbox() -> list[str]:
+    """Return what lets Chromium start: for root it refuses its sandbox, for others it keeps it."""
+    return ["--no-sandbox"] if getattr(os, "geteuid", lambda: 1)() == 0 else []
+
+
+def render(facts: Facts, conditions: Conditions) -> str:
+    """Return the page as text."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.globals["look"] = css
+    environment.filters |= {"mm": millimetres, "standard": standard_text, "part": part_text}
+    return environment.get_template("certificate.html.j2").render(_content(facts, conditions))
+
+
+def standard_text(row: Contribution | Share) -> str:
+    """Return a standard uncertainty with its unit; one that is only bounded says so."""
+    angle = isinstance(row, Contribution) and row.unit == "rad"
+    # Smallest uncertainty that is printed as a number [rad]: 0.0001 degrees
+    shown, least = (degrees, 1.75e-6) if angle else (millimetres, LEAST_LENGTH)
+    bound = row.standard < least or (isinstance(row, Contribution) and row.bound)
+    return f"{'below ' if bound else ''}{shown(max(row.standard, least))}{'°' if angle else ' mm'}"
+
+
+def part_text(metres: float) -> str:
+    """Return how far one contribution moves the point along an axis [mm]."""
+    if metres == 0:
+        return "–"
+    return millimetres(metres) if abs(metres) >= LEAST_LENGTH / 2 else "< 0.001"
+
+
+def _content(facts: Facts, conditions: Conditions) -> dict[str, Any]:
+    result = facts.result
+    header = parse_yaml(facts.recipe, "recipe").data if facts.recipe else {}
+    scanner = _scanner(header, facts.log.models)
+    return {
+        "result": result,
+        "status": status_of(result),
+        "budget": budget_of(result),
+        "shares": shares_of(result),
+        "use": use_budget_of(result, scanner, conditions),
+        "transform": transform_text(*next(iter(result.transforms.items()))),
+        "objects": _objects(header, scanner),
+        "conditions": conditions,
+        "expected": expected_error(result),
+        "used": sum(o.used for o in result.observations),
+        "provenance": provenance_of(facts),
+        "version": VERSION,
+    }
+
+
+def _objects(header: dict[str, Any], scanner: ScannerModel | None) -> list[tuple[str, str]]:
+    """Return what was calibrated with what: name and value."""
+    robot, feature = header.get("robot") or {}, header.get("feature") or {}
+    rows = {
+        "Robot": str(robot.get("model", "")),
+        "Scanner": f"{scanner.maker} {scanner.model}" if scanner else "",
+        "Target": str(feature.get("standard") or feature.get("sphere") or "the robot's flange"),
+        "Configuration": _configured(header),
+        "Serial": str(_serial(header.get("scanner") or {})),
+    }
+    return [(name, value) for name, value in rows.items() if value]
+
+
+def _configured(header: dict[str, Any]) -> str:
+    if "cell" in header:
+        return "a cell of several cameras, arms or targets, all calibrated at once"
+    return str((header.get("configuration") or {}).get("name", "eye-on-base"))
+
+
+def _serial(section: dict[str, Any]) -> str:
+    driver = section.get("driver")
+    settings = next(iter(driver.values()), None) if isinstance(driver, dict) else None
+    return str(settings.get("serial", "")) if isinstance(settings, dict) else ""
+
+
+def _scanner(header: dict[str, Any], models: Mapping[str, bytes]) -> ScannerModel | None:
+    model = (header.get("scanner") or {}).get("model")
+    try:
+        with carried_files(models) as folder:
+            return load_model("scanners", model, folder) if model else None
+    except FlangeyeError:  # the file of the run's machine need not be on this one
+        return None
+
 
 __all__ = [
     "Budget",

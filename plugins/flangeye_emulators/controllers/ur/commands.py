@@ -20,10 +20,13 @@ import numpy as np
 from flangeye.types import Floats
 from flangeye_emulators.controllers.arm import BRAKES, ForceMode, SimulatedArm
 from flangeye_emulators.controllers.motion import (
+    JOINTS,
+    POSES,
     ControllerMotion,
     Servo,
     Speed,
     Travel,
+    Waypoint,
     joint_move,
     linear_move,
 )
@@ -33,7 +36,6 @@ from flangeye_emulators.controllers.poses import (
     pose_vector,
     rotation_matrix,
 )
-from flangeye_emulators.controllers.route import JOINTS, POSES, Waypoint
 from flangeye_emulators.controllers.ur.program import ProgramError, Thread
 from flangeye_emulators.controllers.ur.script import ControlScript, Move, ServoOrder, SpeedOrder
 

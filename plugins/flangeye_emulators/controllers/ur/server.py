@@ -7,8 +7,13 @@ from collections.abc import Callable
 
 from flangeye.models.graph import EmulatorOptions
 from flangeye_emulators.controllers.arm import joint_zeros, starting_joints
-from flangeye_emulators.controllers.fault_injection import FaultInjector, Kind
-from flangeye_emulators.controllers.network import Connection, LineConnection, Network
+from flangeye_emulators.controllers.network import (
+    Connection,
+    FaultInjector,
+    Kind,
+    LineConnection,
+    Network,
+)
 from flangeye_emulators.controllers.poses import pose_matrix
 from flangeye_emulators.controllers.server import Server, run_server
 from flangeye_emulators.controllers.ur import rtde, server

@@ -18,7 +18,7 @@ from flangeye.plugin.stage import Params
 from flangeye.types import BASE, FLANGE, Floats, Transform
 from flangeye_plugins.robot.tool_check import require_model
 from flangeye_plugins.ros2.client import Bridge, GraphMessage
-from flangeye_plugins.ros2.frames import Frames
+from flangeye_plugins.ros2.graph import Frames
 from flangeye_plugins.ros2.messages import JOINT_STATE, decoded, positions_of
 
 STALE = 0.1
