@@ -39,7 +39,7 @@ from flangeye_emulators.world.mesh import (
 from flangeye_emulators.world.raycast import RaycastScene, SolidBody
 from flangeye_emulators.world.scanner import scanner_of
 from flangeye_plugins.body.looks import prepared
-from flangeye_plugins.body.search import FINE, FINE_ACROSS, judged
+from flangeye_plugins.body.search import FINE_ACROSS, judged
 from flangeye_plugins.body.shape import Shape
 from flangeye_plugins.body.view import view_of
 from flangeye_plugins.fit.body import FitBodyParams, fit_body
@@ -158,7 +158,7 @@ def trial(name, seed):
         body = wrong(body, seed // 10 * 2 + seed % 10 - 1)
     points, shape = capture.cloud.points(), prepared(body).shape
     view = view_of(points, body.size / FINE_ACROSS)
-    tolerance = max(FINE * body.size, 3.5 * view.noise)
+    tolerance = max(0.003 * body.size, 3.5 * view.noise)
     visible = there and judged(shape, view, pose, tolerance).shown > VISIBLE
     start = time.process_time()
     found = segment_body(capture, body, Configuration(), Earlier([]), SegmentBodyParams())

@@ -22,7 +22,7 @@ from flangeye.types import BASE, FLANGE, Box, CircleFeature, Observation, Transf
 from flangeye_emulators.world.arm import ImperfectArm
 from flangeye_emulators.world.scanner import CameraPose
 from flangeye_plugins.plan import GridParams, NextBestParams, grid, next_best
-from flangeye_plugins.solve.robust import FEWEST_ONLINE, RobustParams, solve_cell
+from flangeye_plugins.solve.robust import RobustParams, solve_cell
 
 ROBOT, SCANNER = load_model("robots", "ur5e"), load_model("scanners", "phoxi-m")
 BASE_T_CAMERA = CameraPose().matrix
@@ -64,7 +64,7 @@ def levels(plan, params, seed, poses):
     seen = []
     for pose, _ in zip(planned.poses, range(poses), strict=False):
         seen.append(observe(pose.joints, pose.base_T_flange, arm, rng))
-        if len(seen) >= FEWEST_ONLINE:
+        if len(seen) >= 6:
             yield level(seen, planned.centre)
 
 

@@ -26,9 +26,6 @@ from flangeye.run.folder import recipe_of_log
 from flangeye.run.outlook import Outlook, outlook
 from flangeye.types import Floats
 
-POINTS = 20_000
-"""Of a scan that are sent to the page."""
-
 
 class RunProcess:
     """``flangeye run``, started, followed and stopped.
@@ -170,9 +167,11 @@ def thinned(data: bytes) -> Floats:
 
     xyz = foxglove.points_of(PointCloud.FromString(data)).reshape(-1, 3)
     # Much of a whole scan is holes: enough of it to have POINTS left, and not all to look through.
-    some = xyz[:: max(1, len(xyz) // (20 * POINTS))]
+    # Of a scan that are sent to the page.
+    points = 20_000
+    some = xyz[:: max(1, len(xyz) // (20 * points))]
     cloud = t.PointCloud(t.CAMERA, some).points()
-    return cloud[:: max(1, len(cloud) // POINTS)].astype(np.float64)
+    return cloud[:: max(1, len(cloud) // points)].astype(np.float64)
 
 
 def picture_of(cloud: Floats, flange: Floats) -> str:

@@ -35,10 +35,6 @@ steps:
 """
 
 
-MOST_WRONG = 5
-"""Wrong codes of one server, by mistyping; guessing that often meets 5 of 10^6."""
-
-
 @dataclass(frozen=True)
 class Mistake:
     """One thing that is wrong with the recipe.
@@ -268,7 +264,8 @@ class MoveCodes:
         Raises:
             StageError: It is not the one that was shown for this, or is used up.
         """
-        if self._wrong >= MOST_WRONG:
+        # Wrong codes of one server, by mistyping; guessing that often meets 5 of 10^6.
+        if self._wrong >= 5:
             raise StageError("too many wrong codes: nothing moves until 'flangeye ui' is restarted")
         shown, self._open = self._open, None
         if shown is None or shown[1:3] != (tuple(words), page) or time.monotonic() > shown[3]:

@@ -26,7 +26,6 @@ from flangeye_paper.tables import (
 )
 
 ORACLE = "algorithm-1-oracle"
-SHOWN = (5, 10, 20, 40, 75)
 
 
 def fig10(batches: Path, out: Path) -> None:
@@ -43,7 +42,7 @@ def fig10(batches: Path, out: Path) -> None:
         if session.accepted
     ]
     write_csv(out / "fig10.csv", rows)
-    write_csv(out / "fig10_summary.csv", [_summary(rows, poses) for poses in SHOWN])
+    write_csv(out / "fig10_summary.csv", [_summary(rows, poses) for poses in (5, 10, 20, 40, 75)])
     _draw(rows).save(out / "fig10.png")
 
 

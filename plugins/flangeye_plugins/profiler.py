@@ -30,9 +30,6 @@ from flangeye.plugin.stage import Params, part
 from flangeye.types import Seed
 from flangeye.units import Duration, Length, param
 
-LONGEST = 4096
-"""A line is no longer [bytes]."""
-
 
 class TcpParams(Params):
     """Parameters of ``profiler.tcp``."""
@@ -106,9 +103,11 @@ class TcpProfiler(Device):
 
     def _read(self) -> None:
         begun = b""
+        # A line is no longer [bytes].
+        longest = 4096
         while not self._closing:
             try:
-                data = self._socket.recv(LONGEST)
+                data = self._socket.recv(longest)
             except TimeoutError:
                 continue
             except OSError as error:
@@ -120,8 +119,8 @@ class TcpProfiler(Device):
             *lines, begun = (begun + data).split(b"\n")
             for line in lines:
                 self._take(line)
-            if len(begun) > LONGEST:
-                self._lose(f"sends no lines: {LONGEST} bytes without an end of line")
+            if len(begun) > longest:
+                self._lose(f"sends no lines: {longest} bytes without an end of line")
                 return
 
     def _lose(self, why: str) -> None:

@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from flangeye import types as t
-from flangeye.log.foxglove import APPLICATION, CLOUDS, foxglove_layout, points_of
+from flangeye.log.foxglove import CLOUDS, foxglove_layout, points_of
 from flangeye.log.record import Recorder
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import parse_recipe
@@ -105,7 +105,7 @@ def test_a_rerun_blueprint_is_written(flangeye: Any, tmp_path: Path) -> None:
 
 def test_a_rerun_blueprint_is_that_of_the_logs_name(tmp_path: Path) -> None:
     """Rerun takes a log's file name for its application, and a layout of another is not used."""
-    assert RunFolder(tmp_path).log.stem == APPLICATION
+    assert RunFolder(tmp_path).log.stem == "run"
 
 
 def test_another_viewer_is_not_known(flangeye: Any) -> None:

@@ -19,7 +19,7 @@ pytest.importorskip("nicegui", reason="nicegui is not installed")
 
 from flangeye.errors import StageError
 from flangeye.recipe.find import find_recipe
-from flangeye_ui.project import MOST_WRONG, MoveCodes
+from flangeye_ui.project import MoveCodes
 from tests.ui.conftest import Served, ended, serve
 
 HOSTILE = """<!doctype html><title>loading</title><script>
@@ -248,7 +248,7 @@ def test_a_script_in_the_page_itself_cannot_move_the_arm(browser: Any, hostile: 
     before = sorted(hostile.folder.glob("runs/*"))
     page.get_by_role("link", name="Scan", exact=True).click()
     page.get_by_role("button", name="Start: the arm moves").click()
-    for _ in range(MOST_WRONG + 1):
+    for _ in range(6):
         page.get_by_label("Code from the terminal").fill("000000")
         page.get_by_role("button", name="Move the arm").click()
         page.get_by_role("button", name="Move the arm").wait_for(state="hidden")
@@ -294,7 +294,7 @@ def test_a_code_is_for_one_command_of_one_page_and_once() -> None:
     codes.spend(code, ["cell.yaml"], "page")
     with pytest.raises(StageError, match="expired"):
         codes.spend(code, ["cell.yaml"], "page")
-    for _ in range(MOST_WRONG):
+    for _ in range(5):
         right = asked()
         with pytest.raises(StageError, match="not the code"):
             codes.spend("x" + right, ["cell.yaml"], "page")

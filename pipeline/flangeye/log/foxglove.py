@@ -160,8 +160,6 @@ def _set_pose(position: Any, orientation: Any, transform: Transform) -> None:
 
 
 CLOUDS = ("/capture/cloud", "/circle", "/base/flanges")
-APPLICATION = "run"
-"""Rerun keeps one layout for each application; that of a log is its file's name, ``run.mcap``."""
 
 
 def foxglove_layout() -> str:
@@ -211,4 +209,6 @@ def write_rerun_blueprint(path: Path) -> None:
     image = rrb.Spatial2DView(name="Camera", origin="/capture/image")
     log = rrb.TextLogView(name="Log", origin="/log")
     columns = rrb.Horizontal(cell, rrb.Vertical(image, log), column_shares=[2, 1])
-    rrb.Blueprint(columns, collapse_panels=True).save(APPLICATION, str(path))
+    # Rerun keeps one layout for each application; that of a log is its file's name,
+    # ``run.mcap``.
+    rrb.Blueprint(columns, collapse_panels=True).save("run", str(path))

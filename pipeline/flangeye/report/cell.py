@@ -20,14 +20,10 @@ from flangeye.recipe.context import body_of
 from flangeye.recipe.header import TargetSection
 from flangeye.recipe.own_models import carried_files
 from flangeye.report.facts import Facts
+from flangeye.report.look import SERIES
+from flangeye.report.plot import AXES as COLOURS
 from flangeye.report.plot import (
-    AXES as COLOURS,
-)
-from flangeye.report.plot import (
-    CIRCLE,
     DIVERGING,
-    NEUTRAL,
-    USED,
     Trace,
     box_edges,
     figure3d,
@@ -77,7 +73,7 @@ def cell_drawing(facts: Facts) -> PlotlyFigure | None:
         return None
     if box := facts.result.workspace:
         edges = box_edges(np.array(box.centre), np.array(box.size))
-        traces.append(lines(edges, NEUTRAL, 2, name="workspace"))
+        traces.append(lines(edges, SERIES["held_out"], 2, name="workspace"))
     traces += frame(np.eye(4), carrier, AXES)
     if pose is not None:
         traces += frame(pose, t.CAMERA, AXES)
@@ -101,8 +97,10 @@ def _from_moving_camera(facts: Facts) -> PlotlyFigure | None:
     ]
     at = np.array([m[:3, 3] for m in cameras.values()])
     drawn = [
-        points(at, USED, 3, name="the camera at every capture"),
-        points(centres, CIRCLE, 3, name="the target's centre as the camera saw it from each"),
+        points(at, SERIES["used"], 3, name="the camera at every capture"),
+        points(
+            centres, SERIES["circle"], 3, name="the target's centre as the camera saw it from each"
+        ),
         *_targets([cameras[k] @ m for k, m in markers.items() if k in cameras]),
         *_scan(facts, cameras[shown], shown),
         *(_body(body, cameras[shown]) if body else ()),
@@ -140,7 +138,7 @@ def _targets(poses: list[Floats]) -> list[Trace]:
 
 def _body(body: FoundBody, camera: Floats) -> list[Trace]:
     name = f"{plain(body.name, 40)} where it was found"
-    return [lines(list(mapped(camera, body.edges)), CIRCLE, 2, name=name)]
+    return [lines(list(mapped(camera, body.edges)), SERIES["circle"], 2, name=name)]
 
 
 class FoundBody(NamedTuple):
@@ -179,7 +177,7 @@ def found_body(facts: Facts) -> FoundBody | None:
 def _circles(facts: Facts, pose: Floats) -> list[Trace]:
     fitted = [e.value for e in facts.log.of_kind("fit") if isinstance(e.value, t.CircleFeature)]
     rings = [mapped(pose, line) for circle in fitted for line in circle_lines(circle, 36)]
-    return [lines(rings, CIRCLE, 2, name="fitted circles")] if rings else []
+    return [lines(rings, SERIES["circle"], 2, name="fitted circles")] if rings else []
 
 
 def _flanges(facts: Facts, pose: Floats) -> list[Trace]:
@@ -189,7 +187,7 @@ def _flanges(facts: Facts, pose: Floats) -> list[Trace]:
     each = max(1, 3_000 // len(entries))
     xyz = np.concatenate([thinned(flange.cloud.xyz, each) for flange in entries])
     name = "flange clouds" if entries[0].camera_T_target is None else "the body's clouds"
-    return [points(mapped(pose, xyz), USED, 1.5, name=name)]
+    return [points(mapped(pose, xyz), SERIES["used"], 1.5, name=name)]
 
 
 def _scan(facts: Facts, pose: Floats, capture: str | None) -> list[Trace]:
@@ -200,7 +198,7 @@ def _scan(facts: Facts, pose: Floats, capture: str | None) -> list[Trace]:
         return []
     xyz = thinned(first.cloud.points(), 3_000)
     name = f"scan {plain(first.id, 40)}"
-    return [points(mapped(pose, xyz), NEUTRAL, 1.2, name=name)] if len(xyz) else []
+    return [points(mapped(pose, xyz), SERIES["held_out"], 1.2, name=name)] if len(xyz) else []
 
 
 @dataclass(frozen=True)
@@ -313,7 +311,7 @@ def _cloud(xyz: Floats, limit: float) -> Trace:
 
 def _fitted(fit: FittedFeature) -> list[Trace]:
     drawn = [(line - fit.circle.centre) @ fit.axes.T for line in circle_lines(fit.circle)]
-    return [lines(drawn, CIRCLE, 5, name="fitted circles and normal")]
+    return [lines(drawn, SERIES["circle"], 5, name="fitted circles and normal")]
 
 
 def _caption(fit: FittedFeature, shown: int, facts: Facts) -> list[tuple[str, str]]:

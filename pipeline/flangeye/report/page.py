@@ -20,8 +20,8 @@ from flangeye.log.read import JournalEntry, RunLog, read_notes
 from flangeye.maths.statistics import rms
 from flangeye.report.cell import cell_drawing, cloud_panels
 from flangeye.report.facts import Facts, facts_of, idle_of, provenance_of, set_aside_of, timings_of
-from flangeye.report.look import LOGO, css
-from flangeye.report.plot import AXES, HELD_OUT, USED, Figure, layout2d, plain, round_up
+from flangeye.report.look import LOGO, SERIES, css
+from flangeye.report.plot import Figure, layout2d, plain, round_up
 from flangeye.report.residuals import errors_of, residual_figure
 from flangeye.report.space import graph_drawing, workspace_drawing
 from flangeye.report.still import scene_of, still
@@ -190,13 +190,14 @@ def _figure(note: JournalEntry) -> Figure:
     """Return points by series over a value, as a step noted them."""
     value: dict[str, Any] = note.value
     series = value["series"].items()
+    colours = [SERIES[name] for name in ("x", "y", "z", "used", "held_out")]
     traces = [
         {
             "type": "scatter", "mode": "markers", "name": plain(name),
             "x": [x for x, _ in points], "y": [y for _, y in points],
             "marker": {"color": colour, "size": 8},
         }
-        for (name, points), colour in zip(series, (*AXES, USED, HELD_OUT), strict=False)
+        for (name, points), colour in zip(series, colours, strict=False)
     ]  # fmt: skip
     layout = {**layout2d(plain(value["x"]), plain(value["y"])), "showlegend": len(traces) > 1}
     layout["yaxis"]["zeroline"] = True

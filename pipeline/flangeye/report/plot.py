@@ -19,8 +19,6 @@ from flangeye.types import Floats
 Trace = dict[str, Any]
 Figure = dict[str, Any]
 
-USED, UNUSED, HELD_OUT = SERIES["used"], SERIES["unused"], SERIES["held_out"]
-TRUTH, CIRCLE, NEUTRAL = SERIES["truth"], SERIES["circle"], SERIES["held_out"]
 AXES = (SERIES["x"], SERIES["y"], SERIES["z"])
 
 DIVERGING = [

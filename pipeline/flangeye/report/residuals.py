@@ -13,7 +13,8 @@ import numpy as np
 from flangeye import result as r
 from flangeye.maths.statistics import rms
 from flangeye.report.facts import Facts
-from flangeye.report.plot import HELD_OUT, UNUSED, USED, Figure, Trace, plain
+from flangeye.report.look import SERIES
+from flangeye.report.plot import Figure, Trace, plain
 from flangeye.report.units import millimetres
 
 
@@ -84,8 +85,8 @@ def residual_figure(errors: Errors) -> Figure | None:
         return None
     names = _labels(errors.ids)
     traces = [
-        _bars("residual, used", errors.group(used=True), USED),
-        _bars("residual, not used", errors.group(used=False), UNUSED),
+        _bars("residual, used", errors.group(used=True), SERIES["used"]),
+        _bars("residual, not used", errors.group(used=False), SERIES["unused"]),
         *(_diamonds(step, held) for step, held in errors.held_out.items()),
     ]
     measured = {o.id: o for o in errors.poses}
@@ -95,7 +96,7 @@ def residual_figure(errors: Errors) -> Figure | None:
 
 
 def _bars(name: str, group: Mapping[str, float], colour: str) -> Trace:
-    pattern = {"shape": "/", "size": 5, "solidity": 0.5} if colour == UNUSED else {}
+    pattern = {"shape": "/", "size": 5, "solidity": 0.5} if colour == SERIES["unused"] else {}
     return {
         "type": "bar",
         "name": f"{name} ({len(group)})",
@@ -109,7 +110,7 @@ def _diamonds(step: str, held: Mapping[str, float]) -> Trace:
         "type": "scatter",
         "mode": "markers",
         "name": f"{plain(step, 40)}, pose left out",
-        "marker": {"color": HELD_OUT, "symbol": "diamond", "size": 7},
+        "marker": {"color": SERIES["held_out"], "symbol": "diamond", "size": 7},
         "errors": held,
     }
 

@@ -22,12 +22,8 @@ from flangeye.recipe.cell import cell_of
 from flangeye.recipe.header import CellSection, Header
 from flangeye.recipe.own_models import carried_files
 from flangeye.report.facts import Facts
+from flangeye.report.look import SERIES
 from flangeye.report.plot import (
-    CIRCLE,
-    NEUTRAL,
-    TRUTH,
-    UNUSED,
-    USED,
     Trace,
     box_edges,
     figure3d,
@@ -66,7 +62,12 @@ def workspace_drawing(facts: Facts) -> PlotlyFigure | None:
     sigma = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
     traces = [
         _predicted(grid, sigma),
-        lines(box_edges(np.array(box.centre), np.array(box.size)), NEUTRAL, 2, name="workspace"),
+        lines(
+            box_edges(np.array(box.centre), np.array(box.size)),
+            SERIES["held_out"],
+            2,
+            name="workspace",
+        ),
         *target_centres(facts, frame, np.array(estimate.matrix), size=4),
     ]
     low, high = millimetres(float(sigma.min())), millimetres(float(sigma.max()))
@@ -116,7 +117,10 @@ def target_centres(facts: Facts, frame: str, pose: Floats | None, size: float) -
     what = "flange" if frame == t.BASE else "target"
     groups = []
     unused = f"{what}, not used" if facts.estimate else what
-    for used, colour, name in ((True, CIRCLE, f"{what}, used"), (False, UNUSED, unused)):
+    for used, colour, name in (
+        (True, SERIES["circle"], f"{what}, used"),
+        (False, SERIES["unused"], unused),
+    ):
         group = [o for o in facts.measured if o.used is used and o.tcp_in_base]
         if not group:
             continue
@@ -151,7 +155,7 @@ def _true_errors(facts: Facts, grid: Floats, extent: float) -> tuple[Trace, floa
     # The longest comes to about a fifth of the distance between neighbours and box edge.
     scale = 0.5 * round_up(0.2 * max(extent, 0.05) / max(largest, 1e-9))
     segments = [np.stack([p, p + scale * d]) for p, d in zip(grid, shift, strict=True)]
-    trace = lines(segments, TRUTH, 4, name=f"true error × {scale:g}")
+    trace = lines(segments, SERIES["truth"], 4, name=f"true error × {scale:g}")
     return trace, scale, millimetres(largest)
 
 
@@ -196,7 +200,7 @@ def _of(camera: str, seen: Sequence[Observation], ends: Ends) -> Floats:
 def _cameras(cell: Cell, seen: Sequence[Observation], ends: Ends) -> list[Trace]:
     at = {camera: _of(camera, seen, ends)[:, :3, 3] for camera in cell.cameras}
     return [
-        points(places, USED, 3, name=f"{plain(camera, 40)} at every sighting")
+        points(places, SERIES["used"], 3, name=f"{plain(camera, 40)} at every sighting")
         for camera, places in at.items()
         if len(places) and np.ptp(places, axis=0).max() > 0
     ]
@@ -206,7 +210,7 @@ def _targets(cell: Cell, seen: Sequence[Observation], ends: Ends) -> list[Trace]
     centres = each_applied(ends.camera, np.array([o.feature.centre for o in seen]))
     at = {target: centres[[o.target == target for o in seen]] for target in cell.targets}
     return [
-        points(places, CIRCLE, 3, name=f"{plain(target, 40)} where it was seen")
+        points(places, SERIES["circle"], 3, name=f"{plain(target, 40)} where it was seen")
         for target, places in at.items()
         if len(places)
     ]
@@ -221,5 +225,5 @@ def _scans(facts: Facts, seen: Sequence[Observation], ends: Ends) -> list[Trace]
             # Of a scan that is drawn
             xyz = mapped(at[capture.id], thinned(capture.cloud.points(), 3_000))
             name = f"scan {plain(capture.id, 40)}"
-            first[capture.camera] = points(xyz, NEUTRAL, 1.2, name=name)
+            first[capture.camera] = points(xyz, SERIES["held_out"], 1.2, name=name)
     return [*first.values()]

@@ -11,13 +11,8 @@ from numpy.typing import NDArray
 from flangeye import types as t
 from flangeye.maths.seam_geometry import distances_to_line, tube_radii, tube_rings
 from flangeye.report.facts import Facts
+from flangeye.report.look import SERIES
 from flangeye.report.plot import (
-    CIRCLE,
-    HELD_OUT,
-    NEUTRAL,
-    TRUTH,
-    UNUSED,
-    USED,
     Figure,
     Trace,
     curve,
@@ -136,11 +131,11 @@ def _summary(facts: Facts, weld: WeldReport) -> str:
 def _paths(view: _View) -> Figure:
     weld = view.weld
     named: tuple[tuple[str, Floats, str, dict[str, Any]], ...] = (
-        ("planned", weld.planned, HELD_OUT, {"dash": "dot"}),
-        ("felt (refined)", weld.refined, TRUTH, {}),
-        ("robot", weld.robot, UNUSED, {}),
-        ("tip", weld.tip, USED, {}),
-        ("torch", weld.torch, CIRCLE, {}),
+        ("planned", weld.planned, SERIES["held_out"], {"dash": "dot"}),
+        ("felt (refined)", weld.refined, SERIES["truth"], {}),
+        ("robot", weld.robot, SERIES["unused"], {}),
+        ("tip", weld.tip, SERIES["used"], {}),
+        ("torch", weld.torch, SERIES["circle"], {}),
     )
     traces = []
     for name, places, colour, rest in named:
@@ -155,10 +150,10 @@ def _offsets(view: _View) -> Figure:
     weld = view.weld
     traces = []
     for name, places, colour in (
-        ("felt (refined)", weld.refined, TRUTH),
-        ("tip", weld.tip, USED),
-        ("torch", weld.torch, CIRCLE),
-        ("robot", weld.robot, UNUSED),
+        ("felt (refined)", weld.refined, SERIES["truth"]),
+        ("tip", weld.tip, SERIES["used"]),
+        ("torch", weld.torch, SERIES["circle"]),
+        ("robot", weld.robot, SERIES["unused"]),
     ):
         along, across = view.off_plan(places) if len(places) else (np.zeros(0), np.zeros(0))
         traces.append(curve(along * 1e3, across * 1e3, name, colour))
@@ -172,8 +167,8 @@ def _deviation(view: _View, truth: Floats | None) -> Figure:
     true_torch = weld.true_torch if len(weld.true_torch) else weld.torch
     traces = []
     for name, line, torch, colour in (
-        ("believed, from the seam as felt", weld.refined, weld.torch, CIRCLE),
-        ("true, from the true seam", truth, true_torch, TRUTH),
+        ("believed, from the seam as felt", weld.refined, weld.torch, SERIES["circle"]),
+        ("true, from the true seam", truth, true_torch, SERIES["truth"]),
     ):
         if line is not None and len(line) > 1:
             along, across, _ = _beside(view, line, torch)
@@ -183,7 +178,7 @@ def _deviation(view: _View, truth: Floats | None) -> Figure:
         for sign, name in ((1.0, "95 % band"), (-1.0, "95 % band, right")):
             # A band that is wider is drawn so wide: it says that nothing is known [m]
             edge = sign * np.minimum(weld.band[beside], 5e-3) * 1e3
-            traces.append(curve(along * 1e3, edge, name, UNUSED, dash="dot"))
+            traces.append(curve(along * 1e3, edge, name, SERIES["unused"], dash="dot"))
     return {"data": traces, "layout": layout2d("along the seam [mm]", "torch to the left [mm]")}
 
 
@@ -198,8 +193,8 @@ def _beside(view: _View, line: Floats, torch: Floats) -> tuple[Floats, Floats, N
 
 def _contact(weld: WeldReport) -> Figure:
     traces = [
-        curve(weld.time, weld.deflection * 1e3, "deflection", USED),
-        curve(weld.time, weld.wanted * 1e3, "wanted", CIRCLE, dash="dot"),
+        curve(weld.time, weld.deflection * 1e3, "deflection", SERIES["used"]),
+        curve(weld.time, weld.wanted * 1e3, "wanted", SERIES["circle"], dash="dot"),
     ]
     layout = layout2d("time [s]", "deflection [mm]")
     layout["shapes"] = [_band(*span) for span in _spans(weld) if span[2] in BANDS]
@@ -209,8 +204,8 @@ def _contact(weld: WeldReport) -> Figure:
 
 def _speeds(weld: WeldReport) -> Figure:
     traces = [
-        curve(weld.time, weld.speed * 1e3, "robot [mm/s]", USED),
-        curve(weld.time, np.degrees(weld.turn), "turning [deg/s]", CIRCLE),
+        curve(weld.time, weld.speed * 1e3, "robot [mm/s]", SERIES["used"]),
+        curve(weld.time, np.degrees(weld.turn), "turning [deg/s]", SERIES["circle"]),
     ]
     return {"data": traces, "layout": layout2d("time [s]", "mm/s, deg/s")}
 
@@ -285,7 +280,7 @@ def seam_view(facts: Facts) -> SeamView | None:
         f"the true seam passes within {millimetres(widest)} mm of every point of the plan: the "
         "registration and the hand-eye pose together."
     )
-    true_seams = [lines(truth, TRUTH, 3, name="true seam")] if truth else []
+    true_seams = [lines(truth, SERIES["truth"], 3, name="true seam")] if truth else []
     space = figure3d([*_cloud(seam), *_drawn(seam), *true_seams], eye=(0.9, -1.0, 1.1))
     return SeamView(space, _profile(seam, truth), summary, _facts(seam, facts))
 
@@ -293,7 +288,7 @@ def seam_view(facts: Facts) -> SeamView | None:
 def _cloud(seam: t.Seam) -> list[Trace]:
     if seam.cloud is None or not len(seam.cloud.points()):
         return []
-    return [points(thinned(seam.cloud.points(), 8_000), NEUTRAL, 1.4, name="scan")]
+    return [points(thinned(seam.cloud.points(), 8_000), SERIES["held_out"], 1.4, name="scan")]
 
 
 def _drawn(seam: t.Seam) -> list[Trace]:
@@ -304,11 +299,11 @@ def _drawn(seam: t.Seam) -> list[Trace]:
     # Length of the lines that point at the torch [m]
     arrows = [np.stack([line[i], line[i] + 0.03 * openings[i]]) for i in at]
     return [
-        lines(_widened(seam, scale), USED, 2, name=f"tube, 95 % × {scale:g}"),
-        lines([line], CIRCLE, 5, name="planned seam"),
-        lines(arrows, CIRCLE, 2, name="towards the torch"),
+        lines(_widened(seam, scale), SERIES["used"], 2, name=f"tube, 95 % × {scale:g}"),
+        lines([line], SERIES["circle"], 5, name="planned seam"),
+        lines(arrows, SERIES["circle"], 2, name="towards the torch"),
         scatter3d(
-            line[:1], "markers", marker={"size": 5, "color": CIRCLE, "symbol": "diamond"},
+            line[:1], "markers", marker={"size": 5, "color": SERIES["circle"], "symbol": "diamond"},
             name="start",
         ),
     ]  # fmt: skip
@@ -325,11 +320,11 @@ def _widened(seam: t.Seam, scale: float) -> list[Floats]:
 def _profile(seam: t.Seam, truth: list[Floats]) -> dict[str, Any]:
     """Return the tube's radius along the seam, and the true error where it is known."""
     along = seam.arc_length * 1e3
-    traces = [curve(along, tube_radii(seam) * 1e3, "tube, 95 %", USED, width=2)]
+    traces = [curve(along, tube_radii(seam) * 1e3, "tube, 95 %", SERIES["used"], width=2)]
     if truth:
         errors = [distances_to_line(seam.points_in_base, line) for line in truth]
         nearest = min(errors, key=lambda each: float(each.max()))
-        traces.append(curve(along, nearest * 1e3, "true error", TRUTH, width=2))
+        traces.append(curve(along, nearest * 1e3, "true error", SERIES["truth"], width=2))
     layout = {
         "xaxis": {"title": {"text": "along the seam [mm]"}},
         "yaxis": {"title": {"text": "across it [mm]"}, "rangemode": "tozero"},

@@ -22,10 +22,6 @@ from flangeye_emulators.controllers.poses import (
     rotation_vector,
 )
 
-TURN_LENGTH = 0.25
-"""A turn of one radian counts as this many metres [m/rad]: a wrist turns about as fast as a tool
-moves at such a distance. Where a move is mostly a turn, its speed limits the turn."""
-
 
 class Space(Protocol):
     """Where straight lines are drawn: joint angles (n,), or poses (4, 4)."""
@@ -55,7 +51,9 @@ class PoseSpace:
     def distance(self, start: Floats, end: Floats) -> float:
         """Return the way of the tool's point, or its turn where that counts more [m]."""
         turn = np.linalg.norm(rotation_vector(start[:3, :3].T @ end[:3, :3]))
-        return float(max(np.linalg.norm(end[:3, 3] - start[:3, 3]), TURN_LENGTH * turn))
+        # A turn of one radian counts as this many metres [m/rad]: a wrist turns about as fast as a
+        # tool moves at such a distance. Where a move is mostly a turn, its speed limits the turn.
+        return float(max(np.linalg.norm(end[:3, 3] - start[:3, 3]), 0.25 * turn))
 
     def between(self, start: Floats, end: Floats, share: float) -> Floats:
         """Return the pose (4, 4) at ``share`` of the way."""

@@ -454,10 +454,6 @@ def _highlight(cosines: Image, between: Image) -> Image:
     return np.asarray(np.exp(-((np.arccos(halfway) / float(np.radians(6.0))) ** 2)))
 
 
-DIGIT = 1e-3
-"""Depths are whole millimetres."""
-
-
 class TimeOfFlight:
     """One camera, with the distortion it happens to have. Interface as ``StructuredLight``."""
 
@@ -554,7 +550,9 @@ def _mixed(depth: Image, strength: Image) -> Image:
 
 
 def _digits(depth: Image) -> Image:
-    return np.asarray(np.rint(depth / np.float32(DIGIT)) * np.float32(DIGIT))
+    # Depths are whole millimetres.
+    digit = 1e-3
+    return np.asarray(np.rint(depth / np.float32(digit)) * np.float32(digit))
 
 
 class CameraPose(PlaceParams):

@@ -257,10 +257,6 @@ def _frames(ends: OrientedPoints) -> Floats:
 FINE_ACROSS = 100
 """Cells across the body in the view that it is judged in: fine ones show thin parts."""
 
-FINE = 0.003
-"""How far off a cell of the view may be after the body is laid on the scan, as a share of the
-size."""
-
 
 class FoundPose(NamedTuple):
     """A pose that a body may have.
@@ -333,7 +329,9 @@ class BodySearch:
         fit = fitted(around(self.points, self.shape, pose), self.shape, pose, 2000)
         if fit is None:
             return None
-        tolerance = max(FINE * self.shape.size, 3.5 * self._fine.noise)
+        # How far off a cell of the view may be after the body is laid on the scan, as a share of
+        # the size.
+        tolerance = max(0.003 * self.shape.size, 3.5 * self._fine.noise)
         verdict = judged(self.shape, self._fine, fit.pose, tolerance)
         return FoundPose(fit.pose, verdict, fit.weakest(self.looks.freedoms))
 

@@ -25,8 +25,6 @@ from flangeye_plugins.fit.planar import (
 )
 from flangeye_plugins.fit.uncertainty import ScannerErrorParams
 
-LIKELIER = float(np.log(1000))
-"""Logarithm of how many times likelier than the other the better of two poses must be."""
 NO_IMAGE = "there is no image; printed targets are found in the scanner's image"
 
 
@@ -262,7 +260,8 @@ def _ambiguity(poses: list[PlanarPose]) -> Rejected | None:
         return None
     best, other = poses
     ratio = (other.misfit - best.misfit) / (2 * best.noise**2)
-    if ratio > LIKELIER:
+    # Logarithm of how many times likelier than the other the better of two poses must be.
+    if ratio > float(np.log(1000)):
         return None
     apart = np.degrees(_apart(best, other))
     if apart < 0.1:  # both came to the same pose

@@ -27,12 +27,10 @@ from flangeye.maths.pose_corrections import (
     transposed,
     without_tool,
 )
-from flangeye.maths.pose_formats import EULER_ORDERS
+from flangeye.maths.pose_formats import PLAIN
 from flangeye.maths.streams import later, pose_at
 from flangeye.types import FLANGE, FLANGE2, Floats, Mask
 from flangeye.units import Duration, Length, param
-
-ROTATIONS = ("xyzw", "wxyz", "vector", *EULER_ORDERS)
 
 
 class PoseMistake(Params):
@@ -40,7 +38,7 @@ class PoseMistake(Params):
 
     rotation: tuple[str, str] | None = Field(
         None, description="Conventions of the rotations: the one in which that reader read them, "
-        f"then the one in which they were written; {', '.join(ROTATIONS[:3])}, or axes.",
+        f"then the one in which they were written; {', '.join(PLAIN[:3])}, or axes.",
     )  # fmt: skip
     transposed: bool = Field(False, description="The rotations' matrices were transposed.")
     inverted: bool = Field(
@@ -55,8 +53,8 @@ class PoseMistake(Params):
     @classmethod
     def _known(cls, value: tuple[str, str] | None) -> tuple[str, str] | None:
         for each in value or ():
-            if each not in ROTATIONS:
-                raise ValueError(f"no rotation '{each}'; known: {', '.join(ROTATIONS)}")
+            if each not in PLAIN:
+                raise ValueError(f"no rotation '{each}'; known: {', '.join(PLAIN)}")
         return value
 
     @property

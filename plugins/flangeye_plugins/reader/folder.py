@@ -39,14 +39,10 @@ from flangeye import Params, RecipeError, StageError, part
 from flangeye.files.clouds import PER_METRE, LengthUnit
 from flangeye.files.recording import Archive, NotThisLayout, Recording
 from flangeye.files.regular import read_text
-from flangeye.files.scans import IMAGES, with_companion
+from flangeye.files.scans import CLOUDS, IMAGES, with_companion
 from flangeye.files.yaml_lines import read_yaml
 from flangeye.types import FLANGE, FLANGE2, Floats, Role
 from flangeye_plugins.reader.poses import pose_from_quaternion, pose_from_rotation_vector
-
-UNPAIRED_SUFFIXES = (".pcd", ".ply", ".npy", ".xyz")
-"""A file that ends so and that no pose names is a scan somebody forgot."""
-
 
 _POSITIONS: Mapping[LengthUnit | None, tuple[str, ...]] = {
     "m": ("x_m", "y_m", "z_m"),
@@ -93,7 +89,7 @@ def _poses_file(path: Path) -> Path:
         return path
     found = [path / name for name in named if (path / name).is_file()]
     if not found:
-        clouds = sum(1 for p in path.glob("*") if p.suffix.lower() in UNPAIRED_SUFFIXES)
+        clouds = sum(1 for p in path.glob("*") if p.suffix.lower() in CLOUDS)
         but = f"clouds ({clouds}), but " if clouds else ""
         advice = "; 'flangeye init FOLDER' writes a recipe for other tables"
         raise NotThisLayout(f"{path}: holds {but}none of {', '.join(named)}{advice}")
@@ -139,7 +135,7 @@ def _pose(where: str, row: ArmPose, unit: LengthUnit) -> Floats:
 def _refuse_unpaired(file: Path, recordings: Iterable[Recording]) -> None:
     known = {with_companion(recording).cloud for recording in recordings}
     for path in sorted(file.parent.iterdir()):
-        if path.suffix.lower() in UNPAIRED_SUFFIXES and path not in known:
+        if path.suffix.lower() in CLOUDS and path not in known:
             raise StageError(
                 f"{path}: {file.name} has no pose for it; add it, or move the cloud away"
             )

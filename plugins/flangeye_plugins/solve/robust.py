@@ -19,9 +19,6 @@ from flangeye_plugins.solve.observations import LimitsParams
 if TYPE_CHECKING:
     from flangeye.estimation.calibrate import Options
 
-FEWEST_ONLINE = 6
-"""Poses before an online run may stop: fewer tell too little of the noise."""
-
 
 class RobustParams(LimitsParams):
     """Parameters of ``solve.robust``."""
@@ -136,7 +133,8 @@ def pull(
     pulled: list[Observation] = []
     for observation in observations:
         pulled.append(observation)
-        if len(pulled) < FEWEST_ONLINE:
+        # Poses before an online run may stop: fewer tell too little of the noise.
+        if len(pulled) < 6:
             continue
         error = _expected(pulled, solve)
         if stage_log:

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from flangeye_emulators.controllers.motion import JOINTS, POSES, TURN_LENGTH, Waypoint, route
+from flangeye_emulators.controllers.motion import JOINTS, POSES, Waypoint, route
 from flangeye_emulators.controllers.poses import pose_matrix
 
 
@@ -24,7 +24,7 @@ def test_a_straight_line_is_straight_and_turns_evenly() -> None:
 
 def test_a_mere_turn_has_a_length() -> None:
     (piece,) = route(POSES, at(0, 0), [Waypoint(at(0, 0, 0.8), 0.1)], 1.0)
-    assert piece.length == pytest.approx(0.8 * TURN_LENGTH)
+    assert piece.length == pytest.approx(0.8 * 0.25)
 
 
 def test_a_corner_is_rounded_within_its_radius_and_without_a_jump() -> None:

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from flangeye.models.loading import load_model
-from flangeye_emulators.world import scanner
 from flangeye_emulators.world.mesh import ANODISED, METAL, WALL, box
 from flangeye_emulators.world.raycast import RaycastScene, SolidBody, pixels_of
 from flangeye_emulators.world.scanner import TimeOfFlight
@@ -40,7 +39,7 @@ def test_noise_has_a_floor_and_grows_with_the_square_of_the_distance(depth: floa
     half_range = (KINECT.near + KINECT.far) / 2
     wanted = KINECT.temporal_noise * (0.3 + 0.7 * (depth / half_range) ** 2)
     wanted /= np.sqrt(WALL.albedo)
-    digits = scanner.DIGIT / np.sqrt(12)
+    digits = 1e-3 / np.sqrt(12)
     assert np.nanstd(points[..., 2]) == pytest.approx(np.hypot(wanted, digits), rel=0.15)
 
 

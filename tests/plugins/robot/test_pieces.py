@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from flangeye.devices import SILENT
-from flangeye_plugins.robot.aubo import client as pieces
-from flangeye_plugins.robot.aubo.client import GOAL_WITHIN, Ride
+from flangeye_plugins.robot.aubo.client import Ride
 
 SPEED, ACCELERATION, TICK = 0.2, 1.0, 0.01
 
@@ -57,18 +56,18 @@ def test_it_speeds_up_rides_slows_down_stops_and_arrives(driven: Driven) -> None
     assert max(speeds) == SPEED
     assert [speeds[0], speeds[1]] == pytest.approx([ACCELERATION * TICK, 2 * ACCELERATION * TICK])
     assert driven.done[-2:] == ["stop", "arrive"] and driven.done.count("arrive") == 1
-    assert abs(0.1 - driven.at) < GOAL_WITHIN
+    assert abs(0.1 - driven.at) < 2e-3
     ways = 0.1 - np.cumsum(speeds) * TICK
-    braking = np.sqrt(2 * pieces.SHARE * ACCELERATION * np.clip(ways, 0.0, None))
+    braking = np.sqrt(2 * 0.5 * ACCELERATION * np.clip(ways, 0.0, None))
     assert (np.array(speeds)[:-1] <= braking[:-1] + SPEED * 0.1).all()
 
 
 def test_it_never_asks_for_more_than_it_can_brake_from(driven: Driven) -> None:
     driven.look()
-    driven.at = 0.1 - 4 * GOAL_WITHIN
+    driven.at = 0.1 - 4 * 2e-3
     driven.look(0.0)
     driven.look(0.1)
-    assert driven.velocity <= np.sqrt(2 * 0.5 * ACCELERATION * 4 * GOAL_WITHIN) + 1e-12
+    assert driven.velocity <= np.sqrt(2 * 0.5 * ACCELERATION * 4 * 2e-3) + 1e-12
 
 
 def test_a_ride_that_nobody_looked_at_is_over_and_stays_so(driven: Driven) -> None:
@@ -93,7 +92,7 @@ def test_it_waits_until_the_arm_stands(driven: Driven) -> None:
 
 
 def test_the_controllers_own_end_of_a_move_is_no_longer_than_a_piece() -> None:
-    assert 2.0 * np.sqrt(GOAL_WITHIN / 0.5) < SILENT
+    assert 2.0 * np.sqrt(2e-3 / 0.5) < SILENT
 
 
 def test_it_heads_straight_for_the_goal(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,14 +14,6 @@ from flangeye.types import Floats
 T = TypeVar("T")
 
 
-SHARE = 0.5
-"""Of the deceleration allowed, the share that is planned with: a velocity is followed a little
-late, and what it lags behind is made up for with the rest."""
-
-GOAL_WITHIN = 2e-3
-"""From here on the controller moves to the goal itself [rad, m]: an arm at 0.5 rad/s^2 needs
-0.13 s for it, so that this end, too, is a piece."""
-
 STANDING = 2e-3
 """A joint that is slower than this stands [rad/s]."""
 
@@ -174,13 +166,17 @@ class Ride:
         passed, self._renewed = now - self._renewed, now
         if self._velocity == 0.0 and fastest > STANDING:
             return  # it comes to rest first
-        if left < GOAL_WITHIN:
+        # From here on the controller moves to the goal itself [rad, m]: an arm at 0.5 rad/s^2 needs
+        # 0.13 s for it, so that this end, too, is a piece.
+        if left < 2e-3:
             self._finish()
         else:
+            # Of the deceleration allowed, the share that is planned with: a velocity is followed a
+            # little late, and what it lags behind is made up for with the rest.
             self._velocity = min(
                 self._speed,
                 self._velocity + self._acceleration * passed,
-                float(np.sqrt(2.0 * SHARE * self._acceleration * left)),
+                float(np.sqrt(2.0 * 0.5 * self._acceleration * left)),
             )
             self._go(self._velocity / left * rest)
 
