@@ -34,14 +34,14 @@ from flangeye_ui import (
     poses_page,
     result_page,
     scan_page,
-    shapes,
+    scene,
     use_page,
     watch_page,
 )
 from flangeye_ui.project import MoveCodes, Project
 
 PAGES = (
-    cell_page, poses_page, scan_page, result_page, use_page, watch_page, archive_page, shapes,
+    cell_page, poses_page, scan_page, result_page, use_page, watch_page, archive_page, scene,
 )  # fmt: skip
 OPENS = "<!doctype html><meta http-equiv=refresh content='0;url={}'><title>flangeye</title>"
 DENIED = "wrong, used or missing token: open the address that 'flangeye ui' printed last"

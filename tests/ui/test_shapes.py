@@ -16,7 +16,7 @@ from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
 from flangeye.models.robots import RobotModel
 from flangeye.report.still import ready, rods
-from flangeye_ui import shapes
+from flangeye_ui import scene
 
 
 def arm(name: str) -> RobotModel:
@@ -26,12 +26,12 @@ def arm(name: str) -> RobotModel:
 
 
 def drawn(robot: RobotModel, joints: np.ndarray) -> trimesh.Trimesh:
-    mesh = trimesh.load(io.BytesIO(shapes._mesh(robot, joints)), file_type="stl")
+    mesh = trimesh.load(io.BytesIO(scene._mesh(robot, joints)), file_type="stl")
     assert isinstance(mesh, trimesh.Trimesh)
     return mesh
 
 
-@pytest.mark.parametrize("name", sorted(shapes.PUBLISHED))
+@pytest.mark.parametrize("name", sorted(scene.PUBLISHED))
 def test_published_meshes_stand_where_the_arm_does(name: str) -> None:
     """The published arm's flange is this one's at any joints, and its meshes end at the flange."""
     try:
@@ -41,7 +41,7 @@ def test_published_meshes_stand_where_the_arm_does(name: str) -> None:
     robot = arm(name)
     draws = np.random.default_rng(1).uniform(-1, 1, (20, len(robot.joints)))
     for joints in draws:
-        published = shapes._published(robot, joints)
+        published = scene._published(robot, joints)
         assert published is not None
         apart = Arm(published).flange(joints)[:3, 3] - Arm(robot).flange(joints)[:3, 3]
         assert np.linalg.norm(apart) < 1e-9
@@ -61,5 +61,5 @@ def test_an_arm_that_stands_otherwise_keeps_its_capsules() -> None:
     longer = robot.joints[1].model_copy(update={"a": robot.joints[1].a - 0.02})
     other = robot.model_copy(update={"joints": (robot.joints[0], longer, *robot.joints[2:])})
     joints = ready(other)
-    assert shapes._published(other, joints) is None
+    assert scene._published(other, joints) is None
     assert len(drawn(other, joints).split()) == len(rods(other, joints))

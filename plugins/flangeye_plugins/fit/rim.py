@@ -36,10 +36,38 @@ LEAST_NOISE = 3e-5
 """Scanners round edges by this much, however small their noise is [m]."""
 
 
-def face_and_rings(
-    cloud: FlangeCloud, flange: Flange, params: RimParams
-) -> CircleFeature | Rejected:
-    """Return the circle of a flange's rim, or why there is none; see ``fit.rim``."""
+class RimParams(ScannerErrorParams):
+    """Parameters of ``fit.rim``."""
+
+    inlier: Length = param(
+        "0.3 mm", gt=0, description="Largest distance of a rim point from the circle."
+    )
+    # Smallest share of the rim's circumference, and of the bore's, to be seen
+    min_coverage: ClassVar[float] = 0.3
+    radius_tolerance: Length = param(
+        "1.5 mm",
+        gt=0,
+        description="Largest difference of a fitted radius from the flange's: room for chamfers "
+        "and for what the scanner wears off an edge.",
+    )
+    # Standard deviation of what shifts a whole edge unseen (chamfer, shadow); added to the
+    # centre's covariance in the face [m]
+    edge_bias: ClassVar[float] = 0.05e-3
+    # Width of the band the face lies in (ISO 9409-1: 0.04 mm), which no number of points averages
+    # out; added to the covariance across the face [m]
+    flatness: ClassVar[float] = 0.04e-3
+
+
+@stage("fit.rim")
+def fit_rim(cloud: FlangeCloud, flange: Flange, params: RimParams) -> CircleFeature | Rejected:
+    """Fit the flange's rim and bore as concentric circles in its face.
+
+    A robust plane gives depth and normal; the outermost and innermost points of the face, sector
+    by sector, give two circles with one centre and free radii. The covariance has the edges'
+    scatter in the face, where neighbouring points err together, and the plane's across it. There
+    is no randomness. For a wrist circle the centre is moved along the normal by the plate's
+    thickness, to where the robot's flange frame has its origin.
+    """
     points = cloud.cloud.xyz.astype(np.float64, order="F")
     rough = Plane(cloud.centre, cloud.normal)
     # The face is sought within 3 mm of the rough plane.
@@ -264,38 +292,3 @@ def _edges_near(
         )
     ring = np.repeat(np.arange(len(found)), [len(f) for f in found])
     return np.concatenate(found), ring
-
-
-class RimParams(ScannerErrorParams):
-    """Parameters of ``fit.rim``."""
-
-    inlier: Length = param(
-        "0.3 mm", gt=0, description="Largest distance of a rim point from the circle."
-    )
-    # Smallest share of the rim's circumference, and of the bore's, to be seen
-    min_coverage: ClassVar[float] = 0.3
-    radius_tolerance: Length = param(
-        "1.5 mm",
-        gt=0,
-        description="Largest difference of a fitted radius from the flange's: room for chamfers "
-        "and for what the scanner wears off an edge.",
-    )
-    # Standard deviation of what shifts a whole edge unseen (chamfer, shadow); added to the
-    # centre's covariance in the face [m]
-    edge_bias: ClassVar[float] = 0.05e-3
-    # Width of the band the face lies in (ISO 9409-1: 0.04 mm), which no number of points averages
-    # out; added to the covariance across the face [m]
-    flatness: ClassVar[float] = 0.04e-3
-
-
-@stage("fit.rim")
-def fit_rim(cloud: FlangeCloud, flange: Flange, params: RimParams) -> CircleFeature | Rejected:
-    """Fit the flange's rim and bore as concentric circles in its face.
-
-    A robust plane gives depth and normal; the outermost and innermost points of the face, sector
-    by sector, give two circles with one centre and free radii. The covariance has the edges'
-    scatter in the face, where neighbouring points err together, and the plane's across it. There
-    is no randomness. For a wrist circle the centre is moved along the normal by the plate's
-    thickness, to where the robot's flange frame has its origin.
-    """
-    return face_and_rings(cloud, flange, params)
