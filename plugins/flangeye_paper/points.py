@@ -1,4 +1,11 @@
-"""``acquire.points_as_in_paper``: circle centres simulated point by point, without any scan."""
+"""``acquire.points_as_in_paper``: circle centres simulated point by point, without any scan.
+
+The cell of the paper's section 3.1, point by point: truth (17), grid, noise (18). Arrays only.
+
+The paper gives the workspace's size but not its distance. 0.7 m below the camera is the distance
+at which plain least squares shows the slope of the published figure 9, 0.62 mm of x per
+millimetre of noise.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""Which sessions a batch has: the recipe's variants times the archives, checked before any runs."""
+"""Which sessions a batch has: the recipe's variants times the archives, checked before any runs.
+
+Whether a session is still the one that was run: a hash of everything that decides its result.
+
+It is made at every start for every session, so large files are not read.
+"""
 
 from __future__ import annotations
 

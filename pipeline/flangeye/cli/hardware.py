@@ -1,4 +1,4 @@
-"""Devices: calibrate a finger, be a controller."""
+"""Devices: calibrate a finger, touch points of a calibration, be a controller."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The scans beside poses: clouds, and images."""
+"""The scans beside poses: clouds, and images; and which of two lists of names belong together."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Find a robot's or a scanner's model by name."""
+"""Find a robot's or a scanner's model by name; write one of a user's own."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which flange poses a cell allows: in view, in reach, and with the arm out of the way."""
+"""Which flange poses a cell allows: in view, in reach, with the arm out of the way; planning them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The cell as the calibration has it: arm, camera, and what the camera saw, in one frame."""
+"""The cell as the calibration has it: arm, camera, what it saw and the circles fitted to that."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The error over the workspace, in the frame that carries the camera."""
+"""The error over the workspace, and cells of many cameras and targets, each in its root frame."""
 
 from __future__ import annotations
 

@@ -1,4 +1,10 @@
-"""A workpiece on a bench, among things that lie about."""
+"""A workpiece on a bench, among things that lie about.
+
+The arms that are simulated in this process: what else is simulated meets them where they are.
+
+A controller reads where an arm says it is; a finger on that arm touches the work where the arm
+really is. The two meet here, as they do in a real room, and not through the controller.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,11 @@
-"""Triangle meshes of the shapes a cell is made of. Lengths in [m]."""
+"""Triangle meshes of the shapes a cell is made of. Lengths in [m].
+
+What surfaces do to light, as far as a scanner is disturbed by it.
+
+The figures are judgements, set so that simulated scans resemble published ones: noise on a bare
+metal flange 1.2 times and on a black anodised one 1.5 times what the makers state for a white
+diffuse target, hardly any hole in the face at moderate incidence, and none of it at a highlight.
+"""
 
 from __future__ import annotations
 

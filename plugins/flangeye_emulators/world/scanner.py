@@ -1,4 +1,8 @@
-"""Where a simulated scanner stands, and what it is by its principle."""
+"""Where a simulated scanner stands, and what it is by its principle, with its errors.
+
+Structured light: a camera and a projector beside it. Time of flight: one eye, its lamp beside it,
+and the errors of measuring phases. Both round, lose and invent points where the depth steps.
+"""
 
 from __future__ import annotations
 

@@ -10,6 +10,13 @@ With the camera beside the robot the mount is the flange; in the hand it is the 
 ``carrier_T_mount`` the inverse of the pose. With a second arm the mount is that arm's flange, and
 where its base stands is unknown too: ``carrier_T_mount = carrier_T_base @ base_T_base2 @
 base2_T_mount``.
+
+Closed-form calibrations of every variant, to start from.
+
+Where two arms' calibrations start: the second one's base is unknown too.
+
+``X @ camera_T_target = carrier_T_base @ Y @ base2_T_mount @ Z``, with ``X = carrier_T_camera``,
+``Y = base_T_base2`` and ``Z = mount_T_target``; of every variant at once.
 """
 
 from __future__ import annotations

@@ -15,11 +15,13 @@ from flangeye.maths.pose_corrections import delaying, shifted, without_tool
 from flangeye.maths.streams import later, pose_at
 from flangeye.types import Floats, Indices, Mask
 from flangeye_plugins.check.equations import equations_of
-from flangeye_plugins.check.fitting import VariantFits, fit, fit_of
-from flangeye_plugins.check.significance import (
+from flangeye_plugins.check.fitting import (
     Significance,
+    VariantFits,
     best_of,
     exceedance,
+    fit,
+    fit_of,
     helps,
     moved_helps,
     narrowed,

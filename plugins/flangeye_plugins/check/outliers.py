@@ -11,8 +11,16 @@ from flangeye.doctor.diagnosis import Finding, Findings, NotApplicable, Recorded
 from flangeye.maths.geometry import hat, rotation_exp
 from flangeye.types import Floats
 from flangeye_plugins.check.equations import equations_of
-from flangeye_plugins.check.fitting import VariantFits, fit, fit_of, log_of
-from flangeye_plugins.check.significance import Significance, best_of, exceedance, negligible
+from flangeye_plugins.check.fitting import (
+    Significance,
+    VariantFits,
+    best_of,
+    exceedance,
+    fit,
+    fit_of,
+    log_of,
+    negligible,
+)
 
 FLIPS: dict[str, Floats] = {
     "half a turn about its x": rotation_exp(np.array([np.pi, 0, 0])),

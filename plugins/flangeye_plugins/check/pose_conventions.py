@@ -22,8 +22,15 @@ from flangeye.maths.pose_corrections import inverted, reread, transposed
 from flangeye.maths.pose_formats import CONVENTIONS, EULER_ORDERS, PLAIN, written
 from flangeye.models.configuration import looks_exchanged
 from flangeye_plugins.check.equations import equations_of
-from flangeye_plugins.check.fitting import fit, fit_of, named
-from flangeye_plugins.check.significance import Significance, best_of, explained, helps
+from flangeye_plugins.check.fitting import (
+    Significance,
+    best_of,
+    explained,
+    fit,
+    fit_of,
+    helps,
+    named,
+)
 
 QUATERNIONS = ("xyzw", "wxyz")
 

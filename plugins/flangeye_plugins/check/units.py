@@ -20,8 +20,17 @@ from flangeye.doctor.diagnosis import (
 from flangeye.maths.pose_corrections import scaled
 from flangeye.types import Floats
 from flangeye_plugins.check.equations import equations_of
-from flangeye_plugins.check.fitting import VariantFits, fit, fit_of, named
-from flangeye_plugins.check.significance import Significance, best_of, exceedance, explained, helps
+from flangeye_plugins.check.fitting import (
+    Significance,
+    VariantFits,
+    best_of,
+    exceedance,
+    explained,
+    fit,
+    fit_of,
+    helps,
+    named,
+)
 
 UNITS: Mapping[str, float] = {
     "mm": 1e-3, "cm": 1e-2, "inches": 25.4e-3, "feet": 0.3048, "um": 1e-6,

@@ -1,4 +1,8 @@
-"""``plan.*``: where the arm is sent to be scanned. Add a plan: a new module here."""
+"""``plan.*``: where the arm is sent to be scanned. Add a plan: a new module here.
+
+``plan.grid`` takes the corners of a box, in random orientations that face the scanner;
+``plan.next_best`` the pose that reduces the expected error at the work most.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Points with normals: of a scan, and of a CAD's surface."""
+"""What a scan shows: points with normals, as a CAD has them too, and how far each ray went."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether a flat part of the scene is the flange, and if not, why not. Arrays only."""
+"""Flat parts of the scene: whether one is the flange, and if not, why not. Arrays only."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One stage for each closed form of the literature."""
+"""One stage for each closed form of the literature: for comparison, and where speed is all."""
 
 from __future__ import annotations
 
