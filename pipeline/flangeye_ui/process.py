@@ -19,7 +19,8 @@ from flangeye import types as t
 from flangeye.errors import FlangeyeError
 from flangeye.log import foxglove
 from flangeye.log.read import RunLog, read_run, take
-from flangeye.log.watch import LogMessage, RunView, follow
+from flangeye.log.records import LogMessage
+from flangeye.log.watch import RunView, follow
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import Recipe
 from flangeye.run.folder import recipe_of_log

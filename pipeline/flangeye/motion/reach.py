@@ -1,4 +1,4 @@
-"""Which flange poses a cell allows: in view, in reach, with the arm out of the way; planning them."""
+"""Which flange poses a cell allows: in view, in reach, the arm out of the way; plans of them."""
 
 from __future__ import annotations
 
