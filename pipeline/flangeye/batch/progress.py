@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,8 +34,6 @@ if TYPE_CHECKING:
 FIGURES = ("holdout_rms_m", "expected_p95_m", "true_rms_m")
 """Of which medians are told."""
 
-MOST_LISTED = 1000
-"""Sessions, and variants, in the page's tables, and about as many dots in its plots."""
 
 Names = tuple[Any, ...]
 
@@ -69,13 +67,16 @@ class Tally:
         common: Folder that all archives have in common; None for URLs, or without archives.
     """
 
+    # Sessions, and variants, in the page's tables, and about as many dots in its plots.
+    most_listed: ClassVar[int] = 1000
+
     def __init__(self, columns: Mapping[str, Kind], varied: Sequence[str], about: int) -> None:
         self.columns, self.varied = tuple(columns), tuple(varied)
         self.total, self.seconds, self.recipe = 0, 0.0, "nothing"
         self.told: set[str] = set()
         self.sample: list[Row] = []
         self.common: Path | None = None
-        self._step = 1 + about // MOST_LISTED
+        self._step = 1 + about // self.most_listed
         self._archive: str | None = None
         self._archives = self._urls = False
         self._worst: pa.Table | None = None
@@ -126,7 +127,7 @@ class Tally:
 
     def variants(self) -> list[VariantTold]:
         """Return what each variant came to; none where nothing was repeated, or they are many."""
-        if len(self._variants) > MOST_LISTED or len(self._variants) == self.total:
+        if len(self._variants) > self.most_listed or len(self._variants) == self.total:
             return []
         members, statuses = np.concatenate(self._members), np.concatenate(self._statuses)
         figures = np.concatenate(self._figures, axis=1)
@@ -156,7 +157,7 @@ class Tally:
         self._figures.append(np.where(statuses < len(ACCEPTED), figures, np.nan))
 
     def _add_variants(self, table: pa.Table) -> None:
-        if len(self._variants) > MOST_LISTED:
+        if len(self._variants) > self.most_listed:
             return
         values = [table[name].to_pylist() for name in ("archive", *self.varied)]
         known = self._variants
@@ -167,10 +168,10 @@ class Tally:
         import pyarrow as pa
 
         worst = table if self._worst is None else pa.concat_tables([self._worst, table])
-        if len(worst) > MOST_LISTED:
+        if len(worst) > self.most_listed:
             accepted = np.isin(worst["status"].to_pylist(), ACCEPTED)
             error = np.nan_to_num(worst["holdout_rms_m"].to_numpy().astype(float))
-            worst = worst.take(np.lexsort((-error, accepted))[:MOST_LISTED])
+            worst = worst.take(np.lexsort((-error, accepted))[: self.most_listed])
         self._worst = worst
 
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal, Protocol
+from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
 
@@ -23,9 +23,6 @@ from flangeye.maths.offset_wrist import (
     offset_wrist,
 )
 from flangeye.types import Floats
-
-SOLVED = 1e-9
-"""A pose is reached when it is this close: rotation [rad] and translation [m] together."""
 
 
 class JointAxis(Protocol):
@@ -146,6 +143,9 @@ class Arm:
         upper: (n,) joint limits [rad or m].
         slides: (n,) whether a joint slides.
     """
+
+    # A pose is reached when it is this close: rotation [rad] and translation [m] together.
+    solved: ClassVar[float] = 1e-9
 
     def __init__(self, robot: SerialChain) -> None:
         """Take a chain from the catalogue or from a URDF."""
@@ -282,7 +282,7 @@ class Arm:
     def _polished(self, base_T_flange: Floats, joints: Floats, each: bool = False) -> Floats:
         """Return joints near a pose (M, n) as solutions; iterate if none, or not each, is one."""
         error = np.abs(self.flange(joints) - base_T_flange).max(axis=(1, 2), initial=0.0)
-        solved = error < SOLVED
+        solved = error < self.solved
         if solved.all() or (solved.any() and not each):
             return self._distinct(self._within_limits(joints[solved]))
         # Iterations from a closed form; a calibrated arm takes about five
@@ -300,7 +300,7 @@ class Arm:
             frames = self.frames(joints)
             reached = self.flange_of(frames)
             error = _pose_error(base_T_flange, reached)
-            done = np.linalg.norm(error, axis=-1) < SOLVED
+            done = np.linalg.norm(error, axis=-1) < self.solved
             solved = np.concatenate([solved, joints[done]])
             if done.all():
                 break
@@ -360,7 +360,7 @@ class Arm:
             if joints is None:
                 continue
             error = np.abs(self.flange(joints) - pose).max(axis=(1, 2), initial=0.0)
-            solved += len(self._within_limits(joints[error < SOLVED]))
+            solved += len(self._within_limits(joints[error < self.solved]))
         return solved
 
     def _form_holding(self, joint: int, angle: float) -> ClosedForm | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -16,9 +16,6 @@ from flangeye.types import Floats
 
 STANDING = 1e-3
 """No joint turns faster on an arm that stands [rad/s]."""
-
-ARRIVED = np.radians(0.05)
-"""Every joint this near to its goal, the arm is there [rad]."""
 
 
 class SafetyFault(Exception):
@@ -40,6 +37,9 @@ class Supervisor:
         samples: The last seconds, newest last.
         leg: The leg it is on, or None while it should stand.
     """
+
+    # Every joint this near to its goal, the arm is there [rad].
+    arrived: ClassVar[float] = float(np.radians(0.05))
 
     def __init__(self, robot: RobotModel, limits: MotionLimits, by_hand: bool = False) -> None:
         """Begin; an arm that a person moves is where they say, when they say so."""
@@ -134,7 +134,7 @@ class Supervisor:
         limits = self._limits
         place = state.base_T_flange.translation
         # By how much a sample may leave the box before it counts: numerics and braking [m]
-        if why := limits.outside(place, 0.003) or limits.beyond(state.joints, -ARRIVED):
+        if why := limits.outside(place, 0.003) or limits.beyond(state.joints, -self.arrived):
             raise SafetyFault(f"the arm is {why}" if why.startswith("outside") else why)
         fastest = float(np.abs(state.joint_speeds).max())
         # A joint that is faster by so much is no matter of numerics
@@ -153,9 +153,9 @@ class Supervisor:
         if off > np.radians(3.0):
             raise SafetyFault(f"the arm is {np.degrees(off):.1f} deg away from its commanded path")
         waited = (state.time_ns - self._since_ns) * 1e-9
-        set_off = np.abs(state.joints - self._from).max() > ARRIVED
+        set_off = np.abs(state.joints - self._from).max() > self.arrived
         start = 1.0  # an arm that has not set off after this did not take the command [s]
-        if waited > start and not set_off and np.abs(way).max() > 2 * ARRIVED:
+        if waited > start and not set_off and np.abs(way).max() > 2 * self.arrived:
             raise SafetyFault(f"the arm has not set off {start:.0f} s after it was told to")
         self._keep_going(state, leg, set_off)
         if waited > 2.0 * leg.seconds + 2.0:
@@ -166,7 +166,7 @@ class Supervisor:
     def _keep_going(self, state: RobotState, leg: Leg, set_off: bool) -> None:
         """Doubt an arm that has ended its move: a driver does when nobody looks at it."""
         short = float(np.abs(state.joints - leg.joints).max())
-        if not set_off or state.mode != "ready" or short < ARRIVED:
+        if not set_off or state.mode != "ready" or short < self.arrived:
             self._ready_ns = 0
             return
         self._ready_ns = self._ready_ns or state.time_ns
@@ -178,7 +178,7 @@ class Supervisor:
             )
 
     def _settled(self, state: RobotState, leg: Leg) -> bool:
-        near = np.abs(state.joints - leg.joints).max() < ARRIVED
+        near = np.abs(state.joints - leg.joints).max() < self.arrived
         if not near or np.abs(state.joint_speeds).max() > STANDING:
             self._stood_ns = 0
             return False

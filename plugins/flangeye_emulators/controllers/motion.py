@@ -10,7 +10,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import NamedTuple, Protocol
+from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
@@ -185,9 +185,6 @@ def _grip_speed(chord: float, leg: float, grip: float) -> float:
 SLOWEST = 1e-4
 """Speeds and accelerations below this are taken as this: a move must end."""
 
-SERVO_GAIN = 300.0
-"""Gain at which a servo's delay is its lookahead time."""
-
 
 class ControllerMotion(Protocol):
     """What moves the arm.
@@ -305,16 +302,19 @@ class Servo:
         done: Never.
     """
 
+    # Gain at which a servo's delay is its lookahead time.
+    servo_gain: ClassVar[float] = 300.0
+
     def __init__(self, start: Floats, velocity: Floats, fastest: Floats) -> None:
         """Begin at joint angles (n,) that move; ``fastest`` are the joints' speed limits."""
         self.target = start
-        self.lookahead, self.gain = 0.1, SERVO_GAIN
+        self.lookahead, self.gain = 0.1, self.servo_gain
         self.done = False
         self._joints, self._speeds, self._fastest = start, velocity, fastest
 
     def step(self, dt: float, here: JointStance) -> Floats:
         """Return the next joint angles (n,)."""
-        rate = 2.0 / self.lookahead * np.sqrt(self.gain / SERVO_GAIN)
+        rate = 2.0 / self.lookahead * np.sqrt(self.gain / self.servo_gain)
         # The filter's exact solution over one cycle: stable however long the cycle.
         behind = self._joints - self.target
         drift = self._speeds + rate * behind

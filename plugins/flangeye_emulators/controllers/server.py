@@ -18,7 +18,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -34,9 +34,6 @@ from flangeye_emulators.controllers.network import (
     Schedule,
     parse_fault,
 )
-
-KEPT = 60_000
-"""Lateness is kept for so many cycles: two minutes at 500 Hz."""
 
 
 def run_server(server: Server, publish: Callable[[int], None] = lambda cycle: None) -> None:
@@ -226,10 +223,13 @@ class ControllerClock:
         gaps: Times the clock had to start again.
     """
 
+    # Lateness is kept for so many cycles: two minutes at 500 Hz.
+    kept: ClassVar[int] = 60_000
+
     def __init__(self, cycle: float, step: Callable[[], None]) -> None:
         self._cycle, self._step = cycle, step
         self.ticks = self.made_up = self.gaps = 0
-        self._lateness = np.zeros(KEPT, dtype=np.float32)
+        self._lateness = np.zeros(self.kept, dtype=np.float32)
         self._due = 0.0
 
     def start(self) -> None:
@@ -248,7 +248,7 @@ class ControllerClock:
 
     def _advance(self, now: float) -> None:
         late = now - self._due
-        self._lateness[self.ticks % KEPT] = late
+        self._lateness[self.ticks % self.kept] = late
         # Cycles missed for less than this [s] are made up for at once; after a longer gap (the
         # process was stopped) the clock starts again from now, and the gap is counted
         if late > 0.05:
@@ -260,7 +260,7 @@ class ControllerClock:
 
     def figures(self) -> dict[str, float]:
         """Return how punctual the steps were; times in [s]."""
-        late = self._lateness[: min(self.ticks, KEPT)]
+        late = self._lateness[: min(self.ticks, self.kept)]
         if not len(late):
             return {"ticks": 0}
         median, high = np.percentile(late, [50, 99])

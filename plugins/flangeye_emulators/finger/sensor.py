@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,15 +33,6 @@ from flangeye_plugins.weld.corners import corners_of
 from flangeye_plugins.weld.frame import Tool, WorkPlane
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.touch.tag_observation import dictionary_of
-
-MODULES = 8
-"""Of the printed tag with its white margin: six of a 4x4 tag, and one on each side."""
-
-TEXELS = 40
-"""To a module of the texture."""
-
-BACKGROUND = 90.0
-"""What is behind the tag [grey levels]."""
 
 
 class SimulatedFingerParams(LaidParams):
@@ -278,16 +270,31 @@ def typical_compliance() -> Compliance:
 class FingerCamera:
     """Renders the tag of one finger."""
 
+    # What is behind the tag [grey levels].
+    background: ClassVar[float] = 90.0
+
+    # To a module of the texture.
+    texels: ClassVar[int] = 40
+
+    # Of the printed tag with its white margin: six of a 4x4 tag, and one on each side.
+    modules: ClassVar[int] = 8
+
     def __init__(self, finger: FingerGeometry, optics: Optics, rng: np.random.Generator) -> None:
         """Print the tag; every image draws its noise from ``rng``."""
         import cv2
 
         self._lens, self._optics, self._rng = finger.camera, optics, rng
-        marker = cv2.aruco.generateImageMarker(dictionary_of(finger), finger.tag.id, 6 * TEXELS)
-        paper = np.full((MODULES * TEXELS, MODULES * TEXELS), 230, dtype=np.uint8)
-        paper[TEXELS:-TEXELS, TEXELS:-TEXELS] = np.where(marker > 0, 230, 25)
+        marker = cv2.aruco.generateImageMarker(
+            dictionary_of(finger), finger.tag.id, 6 * self.texels
+        )
+        paper = np.full(
+            (self.modules * self.texels, self.modules * self.texels), 230, dtype=np.uint8
+        )
+        paper[self.texels : -self.texels, self.texels : -self.texels] = np.where(
+            marker > 0, 230, 25
+        )
         self._paper = paper
-        self._texel = finger.tag.side / (6 * TEXELS)
+        self._texel = finger.tag.side / (6 * self.texels)
         self._grain = rng.standard_normal(
             (2 * finger.camera.height, 2 * finger.camera.width), np.float32
         )
@@ -297,9 +304,9 @@ class FingerCamera:
         """Return what is seen of a tag at a pose in the camera: (3, 3), and (3,) [m]."""
         lens = self._lens
         onto = lens.matrix @ np.column_stack([rotation[:, 0], rotation[:, 1], translation])
-        seen = np.full((lens.height, lens.width), BACKGROUND, dtype=np.uint8)
+        seen = np.full((lens.height, lens.width), self.background, dtype=np.uint8)
         sheet = onto @ self._sheet()
-        x, y = self._extent(sheet, MODULES * TEXELS)
+        x, y = self._extent(sheet, self.modules * self.texels)
         if x.stop > x.start and y.stop > y.start:
             seen[y, x] = self._warped(sheet, x, y)
         return Image(self._spoilt(seen), lens.matrix, np.array(lens.distortion))
@@ -328,14 +335,14 @@ class FingerCamera:
         width, height = x.stop - x.start, y.stop - y.start
         seen = cv2.warpPerspective(
             self._paper, fine, (width * k, height * k), flags=cv2.INTER_LINEAR,
-            borderValue=BACKGROUND,
+            borderValue=self.background,
         )  # fmt: skip
         small = cv2.resize(seen, (width, height), interpolation=cv2.INTER_AREA)
         return np.asarray(small, dtype=np.uint8)
 
     def _sheet(self) -> Floats:
         """Return (3, 3): from the texture's pixels to the tag's plane; its y points up."""
-        middle = MODULES * TEXELS / 2 - 0.5
+        middle = self.modules * self.texels / 2 - 0.5
         u = self._texel
         return np.array([[u, 0.0, -u * middle], [0.0, -u, u * middle], [0.0, 0.0, 1.0]])
 

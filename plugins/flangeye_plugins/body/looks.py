@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import permutations, product
+from typing import ClassVar
 
 import numpy as np
 
@@ -13,14 +14,6 @@ from flangeye.models.bodies import TargetBody
 from flangeye.types import Floats, Indices, Mask
 from flangeye_plugins.body.shape import GRAZING, OrientedPoints, Shape, spread_directions
 from flangeye_plugins.body.view import CoarseImage
-
-BEYOND = 0.05
-"""How far beyond the end of a face nothing of it should be seen, as a share of the size."""
-
-
-AGAINST = 2.0
-"""Points for it that outweigh one that is seen through, or a face that goes on beyond its end."""
-
 
 ALIKE, SIMILAR = 0.5, 0.7
 """Cosine of the largest angle between a surface of the body and the scan's there: where a
@@ -45,6 +38,13 @@ class Looks:
     Attributes:
         shape: The body.
     """
+
+    # Points for it that outweigh one that is seen through, or a face that goes on beyond its
+    # end.
+    against: ClassVar[float] = 2.0
+
+    # How far beyond the end of a face nothing of it should be seen, as a share of the size.
+    beyond: ClassVar[float] = 0.05
 
     shape: Shape
 
@@ -80,7 +80,7 @@ class Looks:
 
         Of these, which end before something that is far behind.
         """
-        ends, away = self.ends, BEYOND * self.size
+        ends, away = self.ends, self.beyond * self.size
         beyond = ends._replace(points=ends.points + away * ends.directions)
         free = ~_before(self.shape, beyond.points, self.views, away)
         on, off = (_seen(self.shape, part, self.views) for part in (self.surface, beyond))
@@ -123,18 +123,18 @@ class Looks:
         there = (np.abs(off) < reach) & (cosine > SIMILAR) & (np.abs(behind) < 3 * reach)
         through, wrong = behind > 2 * reach, (np.abs(behind) < 2 * reach) & ~there
         return np.asarray(
-            there.mean(axis=1) - AGAINST * through.mean(axis=1) - 0.5 * wrong.mean(axis=1)
+            there.mean(axis=1) - self.against * through.mean(axis=1) - 0.5 * wrong.mean(axis=1)
         )
 
     def _ends_score(self, poses: Floats, view: CoarseImage, at: Indices, reach: float) -> Floats:
         placed, outwards = _placed(poses, *self._singles[1], at)
         offset, cosine = view.to_end(placed, outwards)
         there = (np.einsum("kni,kni->kn", offset, offset) < reach**2) & (cosine > SIMILAR)
-        placed = placed + BEYOND * self.size * outwards
+        placed = placed + self.beyond * self.size * outwards
         facing = self._end_normals[at] @ poses[:, :3, :3].transpose(0, 2, 1)
         off, behind, cosine = view.compared(placed, facing)
         on = (np.abs(off) < reach / 2) & (cosine > SIMILAR) & (np.abs(behind) < reach)
-        return np.asarray(there.mean(axis=1) - AGAINST * on.mean(axis=1))
+        return np.asarray(there.mean(axis=1) - self.against * on.mean(axis=1))
 
     @cached_property
     def _end_normals(self) -> Floats:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,19 +12,8 @@ from numpy.typing import NDArray
 from flangeye.maths.geometry import basis_of_plane
 from flangeye.types import Floats, Indices, Mask
 
-CREASE = float(np.cos(np.radians(35.0)))
-"""Cosine of the angle between facets beyond which their edge is an edge of the body, and not the
-tessellation of a smooth surface; CAD systems facet at 30 degrees at most."""
-
-ACROSS = 72
-"""Rays across the body from each direction."""
-
 GRAZING = 0.25
 """Cosine of the incidence beyond which a surface counts as not seen."""
-
-
-SPACINGS = 24
-"""Spacings of the samples that pairs are made of along the body's size."""
 
 
 class OrientedPoints(NamedTuple):
@@ -84,6 +73,16 @@ class Shape:
         vertices: (V, 3) [m].
         triangles: (T, 3) indices of vertices.
     """
+
+    # Spacings of the samples that pairs are made of along the body's size.
+    spacings: ClassVar[int] = 24
+
+    # Rays across the body from each direction.
+    across: ClassVar[int] = 72
+
+    # Cosine of the angle between facets beyond which their edge is an edge of the body, and not
+    # the tessellation of a smooth surface; CAD systems facet at 30 degrees at most.
+    crease: ClassVar[float] = float(np.cos(np.radians(35.0)))
 
     vertices: Floats
     triangles: NDArray[np.int32]
@@ -154,7 +153,7 @@ class Shape:
         """
         import trimesh
 
-        mesh = trimesh.graph.smooth_shade(self._mesh, np.arccos(CREASE), facet_minarea=None)
+        mesh = trimesh.graph.smooth_shade(self._mesh, np.arccos(self.crease), facet_minarea=None)
         normals = np.zeros(mesh.vertices.shape)
         np.add.at(normals, mesh.faces, (mesh.face_normals * mesh.area_faces[:, None])[:, None])
         return mesh, normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
@@ -175,14 +174,14 @@ class Shape:
     def surface(self) -> OrientedPoints:
         """Points on the outside, some spacings apart for each direction of the surface."""
         points, normals = self.outside
-        keep = thin(points, normals, self.size / SPACINGS)
+        keep = thin(points, normals, self.size / self.spacings)
         return OrientedPoints(points[keep], normals[keep], normals[keep])
 
     @cached_property
     def ends(self) -> OrientedPoints:
         """Some of the points where faces end, some spacings apart for each direction."""
         ends = self.outline
-        return ends.take(thin(ends.points, ends.directions, self.size / SPACINGS))
+        return ends.take(thin(ends.points, ends.directions, self.size / self.spacings))
 
     @cached_property
     def outline(self) -> OrientedPoints:
@@ -191,18 +190,21 @@ class Shape:
 
         # A file's facets may be wound either way: the face's side is the one that was looked at.
         ends, (seen, outwards) = self._edges(), self.outside
-        within = ends.points - ends.directions * self.size / ACROSS
-        gap, nearest = cKDTree(seen).query(within, distance_upper_bound=2 * self.size / ACROSS)
+        within = ends.points - ends.directions * self.size / self.across
+        gap, nearest = cKDTree(seen).query(within, distance_upper_bound=2 * self.size / self.across)
         ends, nearest = ends.take(np.isfinite(gap)), nearest[np.isfinite(gap)]
         side = np.einsum("ni,ni->n", ends.normals, outwards[nearest])
         ends = ends._replace(normals=ends.normals * np.sign(side)[:, None])
-        return ends.take(np.abs(side) > CREASE)
+        return ends.take(np.abs(side) > self.crease)
 
     @cached_property
     def outside(self) -> tuple[Floats, Floats]:
         """(N, 3) points that rays from all around meet, and normals towards them."""
         radius = self.size / 2
-        grid = np.stack(np.meshgrid(*2 * [np.arange(ACROSS) + 0.5]), axis=-1) / ACROSS * 2 - 1
+        grid = (
+            np.stack(np.meshgrid(*2 * [np.arange(self.across) + 0.5]), axis=-1) / self.across * 2
+            - 1
+        )
         flat = grid.reshape(-1, 2) * radius
         found: list[tuple[Floats, Floats]] = []
         # Directions from which the outside is sampled
@@ -221,7 +223,7 @@ class Shape:
         np.add.at(mean, edge, normals[facet])
         count = np.bincount(edge)
         # Of two facets in one plane the mean normal has length one; of an edge less.
-        bent = np.linalg.norm(mean, axis=1) / count < np.cos(np.arccos(CREASE) / 2)
+        bent = np.linalg.norm(mean, axis=1) / count < np.cos(np.arccos(self.crease) / 2)
         sharp = (bent | (count == 1))[edge]
         # Root of the area of a facet, as a share of the size, below which it has no
         # direction
@@ -230,7 +232,7 @@ class Shape:
         along, normals = b - a, normals[facet[sharp]]
         length = np.linalg.norm(along, axis=1)
         outwards = np.cross(along, normals) / length[:, None]
-        many = np.ceil(length / (self.size / ACROSS)).astype(int)
+        many = np.ceil(length / (self.size / self.across)).astype(int)
         which = np.repeat(np.arange(len(a)), many)
         at = np.arange(len(which)) - np.repeat(np.cumsum(many) - many, many)
         share = ((at + 0.5) / many[which])[:, None]

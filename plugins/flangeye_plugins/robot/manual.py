@@ -20,9 +20,6 @@ from flangeye.models.robots import RobotModel
 from flangeye.plugin.stage import Params, part
 from flangeye.types import BASE, FLANGE, Floats, Transform
 
-PERIOD = 0.05
-"""Between two looks at the input [s]."""
-
 
 class OperatorConsole:
     """Says things, and hears lines without ever waiting for one.
@@ -113,6 +110,9 @@ class ManualRobot(Device):
     said where it is.
     """
 
+    # Between two looks at the input [s].
+    _period: ClassVar[float] = 0.05
+
     by_hand = True
     """See :class:`flangeye.devices.MovedByHand`."""
 
@@ -123,7 +123,7 @@ class ManualRobot(Device):
             DeviceError: Nobody will.
         """
         self.name = f"{model.model} moved by hand"
-        self.period = PERIOD
+        self.period = self._period
         self.flange_T_tool: Transform | None = None
         self._desk, self._arm = desk, Arm(model)
         convention = CONVENTIONS[params.convention]
@@ -138,7 +138,7 @@ class ManualRobot(Device):
         labels = " ".join(convention.labels)
         desk.say(f"Type or paste the pose of the flange as the pendant shows it, no tool: {labels}")
         while self._waiting:
-            self._listen(patience=PERIOD)
+            self._listen(patience=self._period)
 
     def state(self) -> RobotState:
         """Return where the arm stands, as the person last said."""
@@ -172,7 +172,7 @@ class ManualRobot(Device):
 
     def wait_cycle(self) -> None:
         """Wait a little."""
-        time.sleep(PERIOD)
+        time.sleep(self._period)
 
     def stop(self) -> None:
         """Tell the person to leave the arm where it is."""

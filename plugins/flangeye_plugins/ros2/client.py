@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 from flangeye.devices import Device, DeviceError
 from flangeye.errors import StageError
@@ -24,10 +24,6 @@ from flangeye_plugins.ros2.messages import CLOCK, CLOCK_TYPE, stamp_of, types
 
 PROGRAM = "ros2"
 """The entry of this machine's settings that names the Python which has rclpy."""
-
-
-DISCOVERY = 2.0
-"""After its start a node knows what runs; on an idle machine it does after half a second [s]."""
 
 
 MATCHING = 0.5
@@ -61,6 +57,10 @@ class Bridge(Device):
         asker: Who is told of in errors: the driver.
         middleware: The RMW implementation that the node uses.
     """
+
+    # After its start a node knows what runs; on an idle machine it does after half a second
+    # [s].
+    discovery: ClassVar[float] = 2.0
 
     def __init__(self, asker: str, sim_time: bool = False) -> None:
         """Start it.
@@ -121,7 +121,7 @@ class Bridge(Device):
 
     def until_known(self) -> float:
         """Return when discovery has ended, by ``time.monotonic`` [s]: nothing new comes then."""
-        return max(self._began + DISCOVERY, time.monotonic() + MATCHING)
+        return max(self._began + self.discovery, time.monotonic() + MATCHING)
 
     def awaited(self, look: Callable[[], Found]) -> Found:
         """Return what there is, as soon as there is something and as long as it may appear."""
@@ -132,7 +132,7 @@ class Bridge(Device):
 
     def wait_until_known(self) -> None:
         """Return when all that runs is known."""
-        time.sleep(max(self._began + DISCOVERY - time.monotonic(), 0.0))
+        time.sleep(max(self._began + self.discovery - time.monotonic(), 0.0))
 
     # --- what comes
 

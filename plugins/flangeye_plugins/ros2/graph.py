@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -153,10 +153,6 @@ class Frames:
             self.frames[child] = StampedFrame(parent, pose, received_ns)
 
 
-COUNTED = 1.5
-"""For how long messages are counted [s]; a camera that runs by itself gives one in that time."""
-
-
 NONE = "none"
 """The answer that there is no controller, or no trigger."""
 
@@ -166,6 +162,10 @@ TRIGGERS = re.compile(r"capture|trigger|acquire|scan|grab|snap|frame", re.IGNORE
 
 class Ros2Graph(Device):
     """What runs; see :class:`flangeye.models.graph.Graph`."""
+
+    # For how long messages are counted [s]; a camera that runs by itself gives one in that
+    # time.
+    counted: ClassVar[float] = 1.5
 
     def __init__(self) -> None:
         """Join it.
@@ -287,9 +287,11 @@ class Ros2Graph(Device):
         if chosen not in known:
             return read_text(Path(chosen), MAX_BYTES, DeviceError)
         self._bridge.follow(chosen, TEXT)
-        latched = self._bridge.wait(chosen, 0, COUNTED)
+        latched = self._bridge.wait(chosen, 0, self.counted)
         if latched is None:
-            raise DeviceError(f"{chosen}: nothing came within {COUNTED:g} s; --robot takes a file")
+            raise DeviceError(
+                f"{chosen}: nothing came within {self.counted:g} s; --robot takes a file"
+            )
         return str(decoded(latched.data, TEXT).data)
 
     def _listen(self, topics: Sequence[Topic]) -> list[Heard]:
@@ -307,11 +309,11 @@ class Ros2Graph(Device):
             self._bridge.want(topic.name)
         time.sleep(MATCHING)
         before = {topic.name: self._bridge.heard(topic.name) for topic in some}
-        time.sleep(COUNTED)
+        time.sleep(self.counted)
         return [
             Heard(
                 topic,
-                (self._bridge.heard(topic.name) - before[topic.name]) / COUNTED,
+                (self._bridge.heard(topic.name) - before[topic.name]) / self.counted,
                 self._bridge.newest(topic.name),
                 dict(joints[topic.name]),
             )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
@@ -16,9 +16,6 @@ T = TypeVar("T")
 
 STANDING = 2e-3
 """A joint that is slower than this stands [rad/s]."""
-
-ANSWER = 0.5
-"""Longest wait for one answer [s]; the library then raises, it never hangs."""
 
 
 class AuboClient:
@@ -33,6 +30,9 @@ class AuboClient:
         motion: Its ``MotionControl``.
         config: Its ``RobotConfig``.
     """
+
+    # Longest wait for one answer [s]; the library then raises, it never hangs.
+    answer: ClassVar[float] = 0.5
 
     def __init__(self, sdk: Any, name: str, host: str, user: str, password: str) -> None:
         """Connect and log in.
@@ -51,7 +51,7 @@ class AuboClient:
         self._failure = sdk.AuboException
         self._rpc = sdk.RpcClient()
         self._rpc.setLogHandler(_say_nothing)
-        self._rpc.setRequestTimeout(round(1e3 * ANSWER))
+        self._rpc.setRequestTimeout(round(1e3 * self.answer))
         port = 30004
         if self.ask("connect", lambda: self._rpc.connect(host, port)) != 0:
             raise DeviceError(
@@ -79,7 +79,7 @@ class AuboClient:
         try:
             return question()
         except self._failure as error:
-            self._lost = time.monotonic() - began >= ANSWER
+            self._lost = time.monotonic() - began >= self.answer
             raise self._error(what, " ".join(str(error).split())) from None
 
     def _error(self, what: str, said: str) -> DeviceError:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -20,12 +20,6 @@ from flangeye_plugins.robot.tool_check import require_model
 from flangeye_plugins.ros2.client import Bridge, GraphMessage
 from flangeye_plugins.ros2.graph import Frames
 from flangeye_plugins.ros2.messages import JOINT_STATE, decoded, positions_of
-
-STALE = 0.1
-"""A sample older than this is no news of the arm [s]."""
-
-
-NOTHING = "nothing came on it"
 
 
 class TfParams(Params):
@@ -68,6 +62,11 @@ class Listener(Device):
         period: Between two joint states [s].
         flange_T_tool: None: joint states know no tool.
     """
+
+    nothing: ClassVar[str] = "nothing came on it"
+
+    # A sample older than this is no news of the arm [s].
+    stale: ClassVar[float] = 0.1
 
     flange_T_tool: Transform | None = None
 
@@ -115,7 +114,7 @@ class Listener(Device):
 
     def wait_cycle(self) -> None:
         """Return when the next joint state has come."""
-        if not self._take(STALE):
+        if not self._take(self.stale):
             self._fresh()
 
     def close(self) -> None:
@@ -148,7 +147,7 @@ class Listener(Device):
             self._take(listening / 2)
         if self._kept == kept:
             topic = self._params.joint_states
-            raise DeviceError(f"{self._asker}: {topic}: {self._missing() or NOTHING}")
+            raise DeviceError(f"{self._asker}: {topic}: {self._missing() or self.nothing}")
         period = 1e-9 * (self._samples[-1].received_ns - first) / (self._kept - kept)
         # Longest time between joint states with which an arm can be watched [s].
         slowest = 0.05
@@ -185,7 +184,7 @@ class Listener(Device):
             raise DeviceError(f"{self.name}: {error}") from None
         self._heard.update(told)
         mine = {joint: told[joint] for joint in self._params.joints if joint in told}
-        if not self._angles or message.received_ns - self._begun_ns > 1e9 * STALE:
+        if not self._angles or message.received_ns - self._begun_ns > 1e9 * self.stale:
             self._angles, self._begun_ns = {}, message.received_ns
         self._angles.update(mine)
         if len(self._angles) < self.arm.n:
@@ -208,7 +207,7 @@ class Listener(Device):
 
     def _require_forwards(self, sample: JointSample) -> None:
         back = 1e-9 * (self._samples[-1].time_ns - sample.time_ns) if self._samples else 0.0
-        if back > STALE:
+        if back > self.stale:
             self._samples.clear()
             raise DeviceError(
                 f"{self.name}: its stamps jumped back by {back:.2f} s: a clock was set, or the "
@@ -218,18 +217,18 @@ class Listener(Device):
     def _fresh(self) -> JointSample:
         """Return the newest sample; raise DeviceError for one that is too old."""
         if not self._samples:
-            raise DeviceError(f"{self.name}: {self._missing() or NOTHING}")
+            raise DeviceError(f"{self.name}: {self._missing() or self.nothing}")
         newest = self._samples[-1]
         age = 1e-9 * (time.monotonic_ns() - newest.received_ns)
-        if age > STALE:
+        if age > self.stale:
             raise DeviceError(
-                f"{self.name}: silent for {age:.2f} s, at most {STALE} s are allowed{busy()}"
+                f"{self.name}: silent for {age:.2f} s, at most {self.stale} s are allowed{busy()}"
             )
         off = 1e-9 * (newest.received_ns - newest.time_ns)
-        if abs(off) > STALE:
+        if abs(off) > self.stale:
             when = "before" if off > 0 else "after"
             raise DeviceError(
-                f"{self.name}: stamped {abs(off):.2f} s {when} it came, at most {STALE} s are "
+                f"{self.name}: stamped {abs(off):.2f} s {when} it came, at most {self.stale} s are "
                 "allowed: set the clocks of both computers (NTP), or sim_time: true where stamps "
                 "are of /clock"
             )

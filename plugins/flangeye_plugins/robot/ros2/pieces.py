@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import deque
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -30,8 +30,6 @@ second for the controller, an arm that nobody leads any more stands within half 
 BEHIND = 0.2
 """How far back the points of a piece begin [s]: longer than clocks may differ and messages take."""
 
-KNOT = 0.05
-"""Between the points of a piece [s]; the controller's cubics between them keep to the motion."""
 
 BRISK = 3.0
 """Deceleration of a stop, where it takes less time [rad/s^2]."""
@@ -103,6 +101,10 @@ class DrivenMotion(ABC):
 class DrivenPath(DrivenMotion):
     """A motion that is known from its beginning to its end."""
 
+    # Between the points of a piece [s]; the controller's cubics between them keep to the
+    # motion.
+    knot: ClassVar[float] = 0.05
+
     def __init__(self, joints: Floats, acceleration: float) -> None:
         """Follow (N, n) joint angles :data:`SAMPLE_TIME` apart, braking at a rate [rad/s^2].
 
@@ -160,7 +162,9 @@ class DrivenPath(DrivenMotion):
 
     def _ahead(self) -> list[Point]:
         left = max(self._end - self._phase, LAST)
-        knots = [KNOT * i for i in range(1, round(AHEAD / KNOT) + 1) if KNOT * i < left]
+        knots = [
+            self.knot * i for i in range(1, round(AHEAD / self.knot) + 1) if self.knot * i < left
+        ]
         if left <= AHEAD:
             knots = [*(knot for knot in knots if left - knot > SAMPLE_TIME), left]
         return [self._point(after) for after in knots]

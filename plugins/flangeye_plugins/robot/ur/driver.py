@@ -6,7 +6,7 @@ import contextlib
 import re
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -181,10 +181,6 @@ SHOWN = CONVENTIONS["ur"]
 POSE = SHOWN.in_units("m", "rad")
 
 
-STALE = 0.1
-"""A sample older than this is no news of the arm [s]."""
-
-
 @part("robot.ur_rtde")
 def robot_ur_rtde(model: RobotModel, params: ControllerParams, reads_only: bool = False) -> Robot:
     """An arm of Universal Robots, e-Series or CB3, through the library ur_rtde.
@@ -230,6 +226,9 @@ class UrRobot(Device):
     Attributes:
         offset: (4, 4) ``flange_T_tool`` as the controller has it.
     """
+
+    # A sample older than this is no news of the arm [s].
+    stale: ClassVar[float] = 0.1
 
     def __init__(
         self, name: str, host: str, period: float, link: ControllerLink, offset: Floats
@@ -280,7 +279,7 @@ class UrRobot(Device):
 
     def wait_cycle(self) -> None:
         """Return when a sample has come that no earlier call waited for."""
-        until = time.monotonic() + STALE
+        until = time.monotonic() + self.stale
         late = False
         while (sample := self._link.sample()) is None or sample.number <= self._seen:
             if late:
@@ -314,17 +313,17 @@ class UrRobot(Device):
 
     def _fresh(self) -> CycleSample:
         """Return the newest sample; wait for one where this computer was too busy to take it."""
-        until = time.monotonic() + STALE
+        until = time.monotonic() + self.stale
         while True:
             # The time comes first: who is not let run for a while after reading has read it fresh.
             late, now = time.monotonic() > until, time.monotonic_ns()
             sample = self._link.sample()
             age = np.inf if sample is None else 1e-9 * (now - sample.time_ns)
-            if sample is not None and age < STALE:
+            if sample is not None and age < self.stale:
                 return sample
             if late:
                 raise DeviceError(
-                    f"{self.name}: its last sample is {age:.2f} s old, at most {STALE} s are "
+                    f"{self.name}: its last sample is {age:.2f} s old, at most {self.stale} s are "
                     f"allowed: the controller or the network has stopped{busy()}"
                 )
             time.sleep(self.period)

@@ -23,7 +23,7 @@ import threading
 import time
 import zlib
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 SAMPLE = struct.Struct("<2q5i24d")
 """count, time [ns] by the monotonic clock, robot mode, safety mode, runtime state, control (1
@@ -36,7 +36,6 @@ LOOK = struct.Struct("<d")
 behind the sample."""
 
 MEMORY = SIZE + LOOK.size
-PLAYING = 2
 LOST = 17
 """Exit code: the connection to the controller has ended."""
 
@@ -133,6 +132,8 @@ class Commander:
         remote: Whether programs may come through the network: 1, 0, or -1 where it cannot be asked.
     """
 
+    playing: ClassVar[int] = 2
+
     def __init__(self, control: Any, receive: Any, period: float, memory: mmap.mmap) -> None:
         self.remote = -1
         self._memory, self._answered = memory, time.monotonic()
@@ -183,7 +184,7 @@ class Commander:
 
     def idle(self) -> None:
         """Do what is due when no command comes."""
-        if self._receive.getRuntimeState() != PLAYING:
+        if self._receive.getRuntimeState() != self.playing:
             return
         # The time comes first: who is held up after reading must not take a look for an old one.
         now = time.monotonic()
@@ -203,7 +204,7 @@ class Commander:
 
     def end(self) -> None:
         """Stop the arm and the program on the controller."""
-        if self._receive.getRuntimeState() == PLAYING:
+        if self._receive.getRuntimeState() == self.playing:
             self.stop()
             self._control.stopScript()
 
