@@ -184,7 +184,7 @@ def weld(calibration: VerifiedHandEye, seam: Seam) -> WeldReport:
     none = np.zeros(0)
     return WeldReport(
         mode="toy", completed=True, reason="", planned=seam.points_in_base, refined=none,
-        opening=np.array([0.0, 0.0, 1.0]), time=none, tip=none, torch=none, robot=none,
+        openings=seam.openings_in_base, time=none, tip=none, torch=none, robot=none,
         deflection=none, wanted=none, speed=none, turn=none, along=none, phases=(),
     )  # fmt: skip
 

@@ -19,7 +19,7 @@ class AsLaidParams(LaidParams):
         (seam,) = load_workpiece(self.workpiece).seams.values()
         pose = self.base_T_part
         points = _dense(seam.points) @ pose[:3, :3].T + pose[:3, 3]
-        return points, pose[:3, :3] @ seam.opening, seam.half_angle
+        return points, pose[:3, :3] @ seam.openings[0], seam.half_angle
 
 
 @stage("scan.as_laid")

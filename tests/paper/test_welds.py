@@ -35,7 +35,7 @@ def weld(torch_off=0.0, robot_off=0.0, phases=("following",), mode="tactile"):
 
     names = np.repeat(phases, -(-len(TIME) // len(phases)))[: len(TIME)]
     return WeldReport(
-        mode=mode, completed=True, reason="", planned=TRUTH, refined=TRUTH, opening=UP,
+        mode=mode, completed=True, reason="", planned=TRUTH, refined=TRUTH, openings=np.tile(UP, (len(TRUTH), 1)),
         time=TIME, tip=path(TIP, 0.0), torch=path(TIP - 0.04, torch_off),
         robot=path(TIP, robot_off), deflection=zero, wanted=zero, speed=zero + 5e-3,
         turn=zero + 0.1, along=TIP - 0.04, phases=tuple(names),

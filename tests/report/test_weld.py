@@ -30,7 +30,7 @@ def path(start, off):
 
 WELD = t.WeldReport(
     mode="tactile", completed=True, reason="", planned=LINE, refined=LINE + [0.0, 1e-3, 0.0],
-    opening=np.array([0.0, 0.0, 1.0]), time=TIME, tip=path(0.5, 1e-3), torch=path(0.46, 1.2e-3),
+    openings=np.tile([0.0, 0.0, 1.0], (201, 1)), time=TIME, tip=path(0.5, 1e-3), torch=path(0.46, 1.2e-3),
     robot=path(0.5, 3e-3), deflection=np.full(401, 2e-3), wanted=np.full(401, 2e-3),
     speed=np.full(401, 5e-3), turn=np.full(401, 0.1), along=5e-3 * TIME - 0.04, phases=PHASES,
     figures={"images": 600.0, "images_with_tag": 590.0},

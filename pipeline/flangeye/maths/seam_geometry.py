@@ -42,17 +42,19 @@ def distances_to_line(points: Floats, line: Floats) -> Floats:
     return np.asarray(np.linalg.norm(nearest, axis=2).min(axis=1))
 
 
-def torch_deviation(points: Floats, line: Floats, opening: Floats) -> Floats:
-    """Return how far points (N, 3) are from a polyline (M, 3) across its opening (3,) [m].
+def torch_deviation(points: Floats, line: Floats, openings: Floats) -> Floats:
+    """Return how far points (N, 3) are from a polyline (M, 3) across its openings (M, 3) [m].
 
-    Only of the points that are beside the line: those before its start and beyond its end, where
-    nothing is welded, are left out.
+    One opening (3,) stands for all. Only of the points that are beside the line: those before its
+    start and beyond its end, where nothing is welded, are left out.
     """
-    flat = np.eye(3) - np.outer(opening, opening)
-    start, step = line[:-1] @ flat, np.diff(line @ flat, axis=0)
+    up = np.broadcast_to(openings, line.shape)[:-1]
+    start, step = line[:-1], np.diff(line, axis=0)
+    step = step - _along(step, up)
     lengths = np.einsum("mi,mi->m", step, step)
-    start, step, lengths = start[lengths > 0], step[lengths > 0], lengths[lengths > 0]
-    away = (points @ flat)[:, None] - start
+    start, step, up, lengths = (x[lengths > 0] for x in (start, step, up, lengths))
+    away = points[:, None] - start
+    away = away - np.einsum("nmi,mi->nm", away, up)[:, :, None] * up
     share = np.einsum("nmi,mi->nm", away, step) / lengths
     distance = np.linalg.norm(away - np.clip(share, 0.0, 1.0)[:, :, None] * step, axis=2)
     nearest = distance.argmin(axis=1)

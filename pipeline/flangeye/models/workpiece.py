@@ -47,7 +47,9 @@ class SeamLine(Model):
 
     name: str
     points: tuple[Vector, ...] = Field(min_length=2, description="Along the root, in order.")
-    opening: Vector = Field(description="Out of the groove, towards the torch; of any length.")
+    opening: Vector | tuple[Vector, ...] = Field(
+        description="Out of the groove, towards the torch; of any length. One, or one a point."
+    )
     half_angle: Angle | None = Field(None, description="Between a wall and the opening.")
     half_width: Length | None = Field(None, description="From the root to a shoulder, sideways.")
 
@@ -68,13 +70,13 @@ class CadSeam:
 
     Attributes:
         points: (N, 3) along the root [m].
-        opening: (3,) unit vector towards the torch.
+        openings: (N, 3) unit vectors towards the torch.
         half_angle: Between a wall and the opening [rad], if known.
         half_width: From the root to a shoulder [m], if known.
     """
 
     points: Floats
-    opening: Floats
+    openings: Floats
     half_angle: float | None
     half_width: float | None
 
@@ -169,13 +171,19 @@ def _decoded(path: Path, raw: bytes) -> tuple[Floats, NDArray[np.int64]]:
 
 def _seam(path: Path, line: SeamLine, scale: float) -> CadSeam:
     points = np.array(line.points) * scale
-    opening = np.array(line.opening)
+    openings = np.array(line.opening, dtype=np.float64)
     if not (np.linalg.norm(np.diff(points, axis=0), axis=1) > 0).all():
         raise StageError(f"{path}: seam '{line.name}' has the same point twice in a row")
-    if not np.linalg.norm(opening) > 0:
+    if openings.ndim == 2 and len(openings) != len(points):
+        raise StageError(
+            f"{path}: seam '{line.name}' has {len(points)} points and {len(openings)} openings; "
+            "write one for all, or one for each"
+        )
+    lengths = np.linalg.norm(openings, axis=-1, keepdims=True)
+    if not (lengths > 0).all():
         raise StageError(f"{path}: seam '{line.name}' has an opening without a direction")
-    opening = opening / np.linalg.norm(opening)
-    return CadSeam(points, opening, line.half_angle, line.half_width)
+    openings = np.broadcast_to(openings / lengths, points.shape)
+    return CadSeam(points, openings, line.half_angle, line.half_width)
 
 
 def _check_on_part(path: Path, name: str, seam: CadSeam, vertices: Floats) -> None:

@@ -170,7 +170,7 @@ def weld_result(weld: t.WeldReport | None, scan: t.WorkpieceScan | None) -> Weld
         return None
     ticks = np.diff(weld.time, append=weld.time[-1:])
     names = np.array(weld.phases)
-    correction = torch_deviation(weld.refined, weld.planned, weld.opening)
+    correction = torch_deviation(weld.refined, weld.planned, weld.openings)
     return WeldResult(
         mode=weld.mode,
         completed=weld.completed,
@@ -193,7 +193,8 @@ def _weld_truth(weld: t.WeldReport, true_seams: list[t.Array]) -> WeldTruthResul
     torch = weld.true_torch if len(weld.true_torch) else weld.torch
     welds = ~np.isin(weld.phases, ("seeking", "probing", "returning", "passing"))
     torch = torch[welds & (weld.along >= weld.figures.get("lit_from", 0.0) - 1e-9)]
-    found = [torch_deviation(torch, truth, weld.opening) for truth in true_seams]
+    lines = [np.asarray(seam) for seam in true_seams]
+    found = [torch_deviation(torch, line, weld.openings_beside(line)) for line in lines]
     errors = min((e for e in found if len(e)), key=lambda e: float(e.max()), default=None)
     return None if errors is None else WeldTruthResult(rms=rms(errors), max=float(errors.max()))
 

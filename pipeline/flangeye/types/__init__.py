@@ -327,7 +327,7 @@ class WeldReport:
         reason: Why it did not; empty when it did.
         planned: (N, 3) the plan [m].
         refined: (M, 3) the seam as the tip felt it; M may be zero [m].
-        opening: (3,) unit vector out of the work: deviations are taken across it.
+        openings: (N, 3) unit vectors out of the work there: deviations are taken across them.
         time: (K,) since the weld began [s].
         tip: (K, 3) where the finger's tip was [m].
         torch: (K, 3) [m].
@@ -352,7 +352,7 @@ class WeldReport:
     reason: str
     planned: Array
     refined: Array
-    opening: Array
+    openings: Array
     time: Array
     tip: Array
     torch: Array
@@ -376,10 +376,22 @@ class WeldReport:
         for name in ("refined", "tip", "torch", "robot", "true_torch"):
             if not len(getattr(self, name)):  # JSON does not tell (0, 3) from (0,)
                 object.__setattr__(self, name, np.zeros((0, 3)))
-        freeze(self, planned=(len(self.planned), 3), refined=(len(self.refined), 3), opening=(3,))
+        n = len(self.planned)
+        freeze(self, planned=(n, 3), refined=(len(self.refined), 3), openings=(n, 3))
         freeze(self, tip=(k, 3), torch=(k, 3), robot=(k, 3))
         freeze(self, true_torch=(len(self.true_torch) and k, 3))
         for name in ("sigma", "bound", "band"):
             freeze(self, **{name: (len(getattr(self, name)) and k,)})
         for name in ("time", "deflection", "wanted", "speed", "turn", "along"):
             freeze(self, **{name: (k,)})
+
+    @property
+    def opening(self) -> Array:
+        """(3,) the openings' mean: to look at it from."""
+        mean = self.openings.mean(axis=0)
+        return np.asarray(mean / np.linalg.norm(mean))
+
+    def openings_beside(self, line: Array) -> Array:
+        """Return the openings (M, 3) beside a line (M, 3) that is near the plan."""
+        away = np.linalg.norm(line[:, None] - self.planned, axis=2)
+        return np.asarray(self.openings[away.argmin(axis=1)])

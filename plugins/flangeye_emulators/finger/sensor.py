@@ -30,8 +30,7 @@ from flangeye_emulators.weld_world.world import Nominal, Shutter, WeldWorld
 from flangeye_emulators.world import bench
 from flangeye_emulators.world.bench import LaidParams
 from flangeye_plugins.weld.corners import corners_of
-from flangeye_plugins.weld.frame import Tool, WorkPlane
-from flangeye_plugins.weld.path import Path
+from flangeye_plugins.weld.frame import Tool, WorkSurface
 from flangeye_plugins.weld.touch.tag_observation import dictionary_of
 
 
@@ -80,9 +79,10 @@ class SimulatedFinger(Device):
         finger = read_model(params.tool, ToolFile)
         self.name = f"simulated finger {finger.model}"
         self.camera_matrix, self.distortion = finger.camera.matrix, np.array([])
-        self._plane, nominal = _as_planned(finger, params)
-        self.world, self._planned = WeldWorld(nominal, truth, [seed, 12]), Path(nominal.seam)
-        self.tool = Tool(finger, self._plane)
+        self._surface, nominal = _as_planned(finger, params)
+        self._planned = self._surface.path
+        self.world = WeldWorld(nominal, truth, [seed, 12], self._rolled_out)
+        self.tool = Tool(finger, self._surface)
         self._robot, self._params = robot, params
         self._rng = np.random.default_rng([seed, 11])
         self._camera = FingerCamera(finger, Optics(), self._rng)
@@ -127,7 +127,7 @@ class SimulatedFinger(Device):
         known = list(self._torch)  # in one go: a thread that reads images may add to it
         times = np.array([time for time, _ in known])
         torch = np.array([place for _, place in known]).reshape(-1, 3)
-        return times, self._plane.base_T_plane.apply(torch)
+        return times, self._surface.unrolled(torch)
 
     def _beside_plan(self) -> Floats:
         """Return the torch (3,) less what the true seam is off the planned one beside it [m]."""
@@ -152,15 +152,24 @@ class SimulatedFinger(Device):
 
     def _stands(self, pose: ToolPose, base_T_flange: Transform) -> Floats:
         """Return how the tool stands (3, 3): its axes, turned back by its heading."""
-        axes = self._plane.base_T_plane.rotation.T @ self.tool.base_R_tool(base_T_flange)
+        axes = self.tool.in_plane(base_T_flange)
         return np.asarray(rotation_from_rpy(0.0, 0.0, -pose.angle) @ axes)
+
+    def _rolled_out(self, tip: Floats, torch: Floats) -> Floats:
+        """Return the torch (3,) rolled out, from where it is in the plane tangential at the tip."""
+        surface = self._surface
+        in_base = surface.unrolled(tip[None])[0]
+        beside = surface.at(surface.foot(in_base))
+        near = surface.foot(in_base) + float((torch - tip)[:2] @ beside.place.tangent)
+        in_base = in_base + beside.unrolled(torch - tip)
+        return surface.rolled(in_base, surface.foot(in_base, near))
 
     def _image(self, displacement: Floats) -> Image:
         return self._camera.image(*self._compliance.tag(displacement))
 
 
-def _as_planned(finger: ToolFile, params: SimulatedFingerParams) -> tuple[WorkPlane, Nominal]:
-    """Return the plane of the work, and the seam as its CAD has it."""
+def _as_planned(finger: ToolFile, params: SimulatedFingerParams) -> tuple[WorkSurface, Nominal]:
+    """Return the surface of the work, and the seam as its CAD has it, rolled out."""
     workpiece = load_workpiece(params.workpiece)
     if params.seam not in workpiece.seams:
         known = ", ".join(workpiece.seams)
@@ -168,18 +177,16 @@ def _as_planned(finger: ToolFile, params: SimulatedFingerParams) -> tuple[WorkPl
     seam = workpiece.seams[params.seam]
     pose = params.base_T_part
     points = seam.points @ pose[:3, :3].T + pose[:3, 3]
-    openings = np.tile(pose[:3, :3] @ seam.opening, (len(points), 1))
-    plane = WorkPlane(points, openings)
+    openings = seam.openings @ pose[:3, :3].T
+    surface = WorkSurface(points, openings)
     if params.leg is not None:
-        corners = [corner.point for corner in corners_of(plane.points(points))]
+        corners = [corner.point for corner in corners_of(surface.points)]
         bounds = [0, *corners, len(points) - 1]
         kept = slice(bounds[params.leg - 1], bounds[params.leg] + 1)
-        points = points[kept]
-        plane = WorkPlane(points, openings[kept])
+        surface = WorkSurface(points[kept], openings[kept])
     tip = Tip(finger.radius, finger.lateral, finger.axial)
-    return plane, Nominal(
-        plane.points(points), _section(seam, params), tip, finger.torch_from_tip, np.eye(3)
-    )
+    section = _section(seam, params)
+    return surface, Nominal(surface.points, section, tip, finger.torch_from_tip, np.eye(3))
 
 
 def _section(seam: CadSeam, params: SimulatedFingerParams) -> GrooveSection:

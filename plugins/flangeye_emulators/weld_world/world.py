@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Generic, NamedTuple, TypeVar
 
@@ -65,7 +66,23 @@ class WeldWorld:
         off: How far the torch is to the left of the seam, where the seam is now [m].
     """
 
-    def __init__(self, nominal: Nominal, truth: WeldTruth, seed: int | list[int]) -> None:
+    def __init__(
+        self,
+        nominal: Nominal,
+        truth: WeldTruth,
+        seed: int | list[int],
+        rolled_out: Callable[[Floats, Floats], Floats] = lambda tip, torch: torch,
+    ) -> None:
+        """Prepare a world.
+
+        Args:
+            nominal: What the files say.
+            truth: What is true.
+            seed: Of its chance.
+            rolled_out: Returns where a torch (3,) is when the work's surface is rolled out, from
+                where it is in the plane that touches the surface at the tip (3,): its arguments
+                are tip and torch. The surface is flat where it is not given.
+        """
         rng = np.random.default_rng(seed)
         self.groove: Groove = true_groove(nominal.seam, nominal.section, truth.workpiece, rng)
         self.contact = TipContact(self.groove, _true_tip(nominal.tip, truth))
@@ -73,6 +90,7 @@ class WeldWorld:
         self._tool, self._stands = TrueTool(truth.tool, nominal.torch), nominal.level_R_tool
         self._finger = TrueFinger(truth.finger)
         self._heat = SeamDistortion(truth.heat, self.groove.root.length)
+        self._rolled_out = rolled_out
         self.tip, self.torch = np.zeros(3), np.zeros(3)
         self.torch_s, self.off = float(nominal.torch[0]), 0.0
 
@@ -89,7 +107,7 @@ class WeldWorld:
         """
         stands = self._stands if level_R_tool is None else level_R_tool
         pose = self._arm.true_pose(reported)
-        self.torch = self._tool.torch(pose, stands)
+        self.torch = self._rolled_out(pose.position, self._tool.torch(pose, stands))
         root = self.groove.root
         self.torch_s = root.foot(self.torch[:2], self.torch_s)
         place = root.at(self.torch_s)

@@ -75,16 +75,17 @@ def seam_cad(  # noqa: PLR0913  what it asks the runner for
     rng = np.random.default_rng([11, seed])
     found = register(seen.points, CadPart(workpiece), seam, _limits(params), rng)
     turn, shift = found.fit.pose[:3, :3], found.fit.pose[:3, 3]
-    line = resampled(seam.points, SPACING) @ turn.T + shift
+    dense = resampled(np.hstack([seam.points, seam.openings]), SPACING)
+    line = dense[:, :3] @ turn.T + shift
     of_fit = found.fit.covariance + scanner_covariance(scanner, float(np.linalg.norm(shift)))
     covariances = covariance_at(of_fit, found.fit.about, line)
     deviation = _deviation(covariances, params.max_deviation)
     mapped, covariance = seen.in_base(line, covariances)
     refuse_outside(STAGE, mapped, workspace)
-    opening = seen.base_T_camera.rotation @ turn @ seam.opening
+    openings = dense[:, 3:] @ (seen.base_T_camera.rotation @ turn).T
     planned = Seam(
         mapped,
-        np.tile(opening, (len(mapped), 1)),
+        openings / np.linalg.norm(openings, axis=1, keepdims=True),
         covariance,
         half_angle=seam.half_angle,
         half_width=seam.half_width,

@@ -118,10 +118,14 @@ def _above(points: Floats, openings: Floats, x: Floats, tool: float) -> Floats:
 
 
 def resampled(line: Floats, spacing: float) -> Floats:
-    """Return a polyline (M, 3) at even steps of about ``spacing``, both ends included."""
-    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    """Return a polyline (M, 3) at even steps of about ``spacing``, both ends included.
+
+    Further columns of it go along: (N, K) gives (M, K).
+    """
+    steps = np.linalg.norm(np.diff(line[:, :3], axis=0), axis=1)
+    arc = np.concatenate([[0.0], np.cumsum(steps)])
     at = np.linspace(0.0, arc[-1], max(2, round(arc[-1] / spacing) + 1))
-    return np.stack([np.interp(at, arc, line[:, k]) for k in range(3)], axis=1)
+    return np.stack([np.interp(at, arc, column) for column in line.T], axis=1)
 
 
 def refuse_outside(stage: str, points_in_base: Floats, workspace: Box | None) -> None:

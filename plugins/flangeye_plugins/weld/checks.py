@@ -12,7 +12,7 @@ from flangeye.motion.limits import MotionLimits
 from flangeye.plugin.stage import BoundPart
 from flangeye.types import Floats, Seam
 from flangeye_plugins.weld.belief import Belief
-from flangeye_plugins.weld.frame import LeaningTool
+from flangeye_plugins.weld.frame import LeaningTool, WorkSurface
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.reachability import flange_speed
 from flangeye_plugins.weld.settings import Following, Mode
@@ -131,12 +131,13 @@ def check_weave(distance: float, settings: Following) -> None:
         )
 
 
-def check_seam(seam: Seam, plan: Path, distance: float, settings: Following) -> None:
+def check_seam(seam: Seam, surface: WorkSurface, distance: float, settings: Following) -> None:
     """Refuse a seam that this tool cannot follow.
 
     Raises:
-        StageError: Too short, steep, curved, or uncertain.
+        StageError: Too short, bent, curved, or uncertain.
     """
+    plan = surface.path
     used = settings.set_down + settings.ending
     used += settings.speed * settings.deflection / settings.release
     if plan.length <= used:
@@ -144,18 +145,14 @@ def check_seam(seam: Seam, plan: Path, distance: float, settings: Following) -> 
             f"weld.tactile: the seam is {plan.length * 1e3:.0f} mm long; inset, ending and release "
             f"alone take {used * 1e3:.0f} mm"
         )
-    mean = seam.openings_in_base.mean(axis=0)
-    lean = float(
-        np.arccos(np.clip(seam.openings_in_base @ mean / np.linalg.norm(mean), -1, 1).min())
-    )
-    steep = float(np.arctan(np.abs(np.gradient(plan.points[:, 2], plan.step))).max())
-    # The tool stays upright to the plane: beyond this its torch would leave the seam, or its tip
-    # no longer bear on both walls.
-    if lean > np.radians(15.0) or steep > np.radians(10.0):
+    bent = surface.bending(distance)
+    # Where the tool leans by more its tip no longer bears on both walls alike.
+    if bent > np.radians(30.0):
         raise StageError(
-            f"weld.tactile: the seam leaves its plane: it climbs by {np.degrees(steep):.0f} deg "
-            f"(allowed 10), its opening turns by {np.degrees(lean):.0f} deg "
-            f"(allowed 15); the tool is not tilted on the way"
+            f"weld.tactile: the seam bends out of its surface so much that over the "
+            f"{distance * 1e3:.0f} mm from the torch to the tip the tool would lean by "
+            f"{np.degrees(bent):.0f} deg, allowed are 30; end the plan before the bend, or take a "
+            "tool whose torch is nearer to its tip"
         )
     crooked = float(np.abs(tool_angles(plan, distance)).max())
     if crooked > np.radians(60.0):  # beyond, the torch would be pushed

@@ -1,16 +1,24 @@
-"""The plane of the work: two dimensions and a height; how the tool stands and leans in it."""
+"""The surface of the work along a seam, and how the tool stands and leans on it.
+
+A seam may climb, bend and twist. It is followed as if its surface were rolled out flat: as long as
+it is, with its curvature in the surface (the geodesic one), its openings all upwards. What happens
+beside it is the same in both, to the first order of its distance.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.models.finger import Finger, FingerGeometry
 from flangeye.motion.seam_following import Command, ToolPose
 from flangeye.types import BASE, FLANGE, Floats, Transform
+from flangeye_plugins.weld.path import CHORD, Path, Place
 from flangeye_plugins.weld.settings import Following
 
 
@@ -56,100 +64,297 @@ def body_from(torch: Floats, work: float, travel: float) -> LeaningTool:
     return LeaningTool(np.asarray(turn @ leans), np.asarray(turn @ leans @ torch))
 
 
-class WorkPlane:
-    """A frame on the work: x along the seam as a whole, z out of the work.
+class Stand(NamedTuple):
+    """Where something is on the surface.
 
     Attributes:
-        base_T_plane: Its pose.
+        point: (3,) of the seam beside it, in base [m].
+        axes: (3, 3) columns there, in base: along the seam, to its left, out of the work.
+        place: The same place rolled out.
+    """
+
+    point: Floats
+    axes: Floats
+    place: Place
+
+    def rolled(self, vectors: Floats) -> Floats:
+        """Return vectors (3,) in base as they are in the plane."""
+        along, left, up = (vectors @ self.axes).tolist()
+        tx, ty = self.place.tangent.tolist()
+        return np.array([along * tx - left * ty, along * ty + left * tx, up])
+
+    def unrolled(self, vector: Floats) -> Floats:
+        """Return a vector (3,) in the plane as it is in base."""
+        x, y, z = vector.tolist()
+        tx, ty = self.place.tangent.tolist()
+        return np.asarray(self.axes @ np.array([x * tx + y * ty, y * tx - x * ty, z]))
+
+
+class WorkSurface:
+    """The surface along a seam, and the plane into which it is rolled out.
+
+    The plane's x leads along the seam as a whole, its z out of the work.
+
+    Attributes:
+        points: (N, 3) of the seam in the plane, all of height zero [m].
+        path: The seam in the plane.
     """
 
     def __init__(self, points: Floats, openings: Floats) -> None:
-        """Lay the plane through (N, 3) points of a seam and across its openings (N, 3)."""
-        z = openings.mean(axis=0)
-        z /= np.linalg.norm(z)
-        along = points[-1] - points[0]
-        # Ends nearer than 1 mm to each other: the seam goes once around.
-        if np.linalg.norm(along) < 1e-3:
-            along = points[1] - points[0]
-        x = along - (along @ z) * z
-        x /= np.linalg.norm(x)
-        rotation = np.column_stack([x, np.cross(z, x), z])
-        self.base_T_plane = Transform(BASE, "plane", rigid(rotation, points.mean(axis=0)))
-        self._inverse = self.base_T_plane.inverse()
+        """Take the surface through (N, 3) points of a seam and across its openings (N, 3)."""
+        self.points = _rolled_out(points, openings)
+        self.path = Path(self.points)
+        chords = np.linalg.norm(np.diff(self.points, axis=0), axis=1)
+        along = np.concatenate([[0.0], np.cumsum(chords)])
+        ticks = self.path.step * np.arange(len(self.path.points), dtype=np.float64)
+        line = _interpolated(ticks, along, points)
+        ahead = np.gradient(line, self.path.step, axis=0)
+        # A scanned opening scatters from place to place: the mean over a chord counts.
+        width = max(1, round(CHORD / self.path.step))
+        up = uniform_filter1d(_interpolated(ticks, along, openings), width, 0, mode="nearest")
+        self._rows: Floats = np.hstack([line, ahead, up])
+        self._plain = self._rows.tolist()
 
-    def points(self, in_base: Floats) -> Floats:
-        """Return points (N, 3) in the plane's frame."""
-        return self._inverse.apply(in_base)
+    def line(self, s: Floats) -> tuple[Floats, Floats]:
+        """Return points (K, 3) at arc lengths (K,), and axes (K, 3, 3) there, as columns.
+
+        The seam goes on straight beyond both ends.
+        """
+        inside = np.clip(s, 0.0, self.path.length) / self.path.step
+        index = np.minimum(inside.astype(int), len(self._rows) - 2)
+        share = (inside - index)[:, None]
+        row = (1.0 - share) * self._rows[index] + share * self._rows[index + 1]
+        ahead = row[:, 3:6] / np.linalg.norm(row[:, 3:6], axis=1)[:, None]
+        left = np.cross(row[:, 6:], ahead)
+        left /= np.linalg.norm(left, axis=1)[:, None]
+        beyond = (s - inside * self.path.step)[:, None]
+        axes = np.stack([ahead, left, np.cross(ahead, left)], axis=2)
+        return row[:, :3] + beyond * ahead, axes
+
+    def at(self, s: float) -> Stand:
+        """Return the place at an arc length [m]."""
+        x, y, z, tx, ty, tz, ux, uy, uz = self._at(s)
+        nx, ny, nz = uy * tz - uz * ty, uz * tx - ux * tz, ux * ty - uy * tx
+        norm = math.hypot(nx, ny, nz)
+        nx, ny, nz = nx / norm, ny / norm, nz / norm
+        ux, uy, uz = ty * nz - tz * ny, tz * nx - tx * nz, tx * ny - ty * nx
+        axes = np.array([[tx, nx, ux], [ty, ny, uy], [tz, nz, uz]])
+        return Stand(np.array([x, y, z]), axes, self.path.at(s))
+
+    def _at(self, s: float) -> list[float]:
+        """Return point, direction and opening (9,) at an arc length."""
+        # Called several times a cycle: plain floats are ten times faster than arrays of one.
+        path = self.path
+        inside = 0.0 if s < 0.0 else path.length if s > path.length else s
+        share = inside / path.step
+        index = min(int(share), len(self._plain) - 2)
+        share -= index
+        here, there = self._plain[index], self._plain[index + 1]
+        row = [a + share * (b - a) for a, b in zip(here, there, strict=True)]
+        x, y, z, ahead_x, ahead_y, ahead_z, *up = row
+        norm, beyond = math.hypot(ahead_x, ahead_y, ahead_z), s - inside
+        tx, ty, tz = ahead_x / norm, ahead_y / norm, ahead_z / norm
+        return [x + beyond * tx, y + beyond * ty, z + beyond * tz, tx, ty, tz, *up]
+
+    def foot(self, point: Floats, near: float | None = None) -> float:
+        """Return the arc length beside a point (3,) in base, near another if one is known [m]."""
+        px, py, pz = point.tolist()
+        # Beyond a curve's centre a foot runs away.
+        far = 30e-3
+        if near is None or math.dist((px, py, pz), self._at(near)[:3]) > far:
+            away = np.linalg.norm(point - self._rows[:, :3], axis=1)
+            # Of a seam that goes once around its start.
+            near = float(np.argmax(away < away.min() + 1e-3)) * self.path.step
+        for _ in range(3):
+            x, y, z, tx, ty, tz, *_ = self._at(near)
+            ahead = (px - x) * tx + (py - y) * ty + (pz - z) * tz
+            near += ahead
+            if abs(ahead) < 1e-9:
+                break
+        return near
+
+    def rolled(self, point: Floats, s: float) -> Floats:
+        """Return a point (3,) in base, beside an arc length, as it is in the plane (3,)."""
+        stand = self.at(s)
+        off = stand.rolled(point - stand.point)
+        off[:2] += stand.place.point
+        return off
+
+    def height(self, point: Floats) -> float:
+        """Return how high a point (3,) in base is above the seam beside it [m].
+
+        Along the opening there or along all of them, whichever is more: one that leans says
+        nothing of what is far from it.
+        """
+        stand = self.at(self.foot(point))
+        off = point - stand.point
+        whole = self._rows[:, 6:].mean(axis=0)
+        return max(float(off @ stand.axes[:, 2]), float(off @ whole / math.sqrt(whole @ whole)))
+
+    def unrolled(self, points: Floats) -> Floats:
+        """Return points (K, 3) of the plane, in base."""
+        away = np.linalg.norm(points[:, None, :2] - self.path.points[None, :, :2], axis=2)
+        s = away.argmin(axis=1) * self.path.step
+        there, tangents = self.path.evaluate(s)
+        s = s + np.einsum("ki,ki->k", points[:, :2] - there[:, :2], tangents)
+        there, tangents = self.path.evaluate(s)
+        off = points[:, :2] - there[:, :2]
+        along = np.einsum("ki,ki->k", off, tangents)
+        left = tangents[:, 0] * off[:, 1] - tangents[:, 1] * off[:, 0]
+        here, axes = self.line(s)
+        off = np.stack([along, left, points[:, 2]], axis=1)
+        return here + np.asarray(np.einsum("kij,kj->ki", axes, off))
+
+    def bending(self, distance: float) -> float:
+        """Return how far a tool leans from the openings at its tip or torch, at most [rad].
+
+        Args:
+            distance: From the torch to the tip, both on the seam [m].
+        """
+        s = np.arange(distance, self.path.length, 1e-3)
+        ups, behind = self.standing(s, distance)
+        cosines = [np.einsum("ki,ki->k", ups, self.line(at)[1][:, :, 2]) for at in (s, behind)]
+        return float(np.arccos(np.clip(np.concatenate(cosines), -1.0, 1.0)).max(initial=0.0))
+
+    def standing(self, s: Floats, distance: float) -> tuple[Floats, Floats]:
+        """Return how the tool stands with its tip at arc lengths (K,): (K, 3) upwards, in base.
+
+        Its torch is on the seam ``distance`` behind the tip, at the arc lengths (K,) that come
+        second; about that line it stands as the opening does at the tip.
+        """
+        tip, axes = self.line(s)
+        behind = s - distance
+        for _ in range(20):
+            chord = tip - self.line(behind)[0]
+            behind = behind + np.linalg.norm(chord, axis=1) - distance
+        chord /= np.linalg.norm(chord, axis=1)[:, None]
+        up = axes[:, :, 2] - np.einsum("ki,ki->k", axes[:, :, 2], chord)[:, None] * chord
+        return np.asarray(up / np.linalg.norm(up, axis=1)[:, None]), behind
+
+
+def _interpolated(at: Floats, along: Floats, rows: Floats) -> Floats:
+    return np.stack([np.interp(at, along, axis) for axis in rows.T], axis=1)
+
+
+def _rolled_out(points: Floats, openings: Floats) -> Floats:
+    """Return the points (N, 3) of a seam in the plane: as far apart, turning as in the surface."""
+    steps = np.diff(points, axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    moves = np.flatnonzero(lengths > 0.0)
+    before, after = steps[moves[:-1]], steps[moves[1:]]
+    up = openings[moves[1:]] / np.linalg.norm(openings[moves[1:]], axis=1)[:, None]
+    before, after = (v - np.einsum("ki,ki->k", v, up)[:, None] * up for v in (before, after))
+    left = np.einsum("ki,ki->k", np.cross(before, after), up)
+    turns = np.arctan2(left, np.einsum("ki,ki->k", before, after))
+    headings = np.zeros(len(lengths))
+    headings[moves[1:]] = np.cumsum(turns)
+    way = lengths[:, None] * np.stack([np.cos(headings), np.sin(headings)], axis=1)
+    planar = np.vstack([np.zeros(2), np.cumsum(way, axis=0)])
+    whole = planar[-1]
+    # Ends nearer than 1 mm to each other: the seam goes once around.
+    if np.linalg.norm(points[-1] - points[0]) < 1e-3:
+        whole = planar[moves[0] + 1]
+    x, y = whole / np.linalg.norm(whole)
+    planar = planar @ np.array([[x, -y], [y, x]])
+    return np.column_stack([planar - planar.mean(axis=0), np.zeros(len(planar))])
 
 
 class Tool:
     """Translates between the flange in the base and the tool in the plane."""
 
     def __init__(
-        self, finger: FingerGeometry, plane: WorkPlane, body: LeaningTool | None = None
+        self, finger: FingerGeometry, surface: WorkSurface, body: LeaningTool | None = None
     ) -> None:
         """Take a tool that stands upright, or as its ``body`` does."""
         body = body or body_from(finger.torch_from_tip, 0.0, 0.0)
-        self._plane = plane.base_T_plane
+        self._surface, self._distance = surface, body.distance
         self._tip = np.array(finger.tip)
         self._flange_R_tool = finger.flange_R_tool
         self._flange_R_level = finger.flange_R_tool @ body.level_R_tool.T
         self._torch = self._tip + self._flange_R_level @ body.torch
         self._angle: float | None = None
+        self._s: float | None = None
+        # The tip goes on beyond the seam's end.
+        self._ticks = np.arange(-CHORD, surface.path.length + body.distance + CHORD, CHORD / 4)
+        self._ups, _ = surface.standing(self._ticks, body.distance)
+        self._tilts = np.gradient(self._ups, CHORD / 4, axis=0)
 
     def pose(self, base_T_flange: Transform, time: float) -> ToolPose:
         """Return the tool in the plane, its angle continuous with the last one."""
-        plane = self._plane
-        plane_R_base, rotation = plane.rotation.T, base_T_flange.rotation
-        tip_in_base = rotation @ self._tip + base_T_flange.translation
-        tip = plane_R_base @ (tip_in_base - plane.translation)
-        ahead = plane_R_base @ (rotation @ self._flange_R_level[:, 0])
-        angle = math.atan2(ahead[1], ahead[0])
+        rotation, surface = base_T_flange.rotation, self._surface
+        tip = rotation @ self._tip + base_T_flange.translation
+        self._s = surface.foot(tip, self._s)
+        position = surface.rolled(tip, self._s)
+        torch = rotation @ self._torch + base_T_flange.translation
+        behind = surface.rolled(torch, surface.foot(torch, self._s - self._distance))
+        ahead_x, ahead_y, _ = (position - behind).tolist()
+        angle = math.atan2(ahead_y, ahead_x)
         if self._angle is not None:
             angle += math.tau * round((self._angle - angle) / math.tau)
         self._angle = angle
-        return ToolPose(time, tip, angle)
+        return ToolPose(time, position, angle)
+
+    def up(self, base_R_flange: Floats) -> Floats:
+        """Return the tool's level z (3,) in base, for an attitude of the flange (3, 3)."""
+        return np.asarray(base_R_flange @ self._flange_R_level[:, 2])
 
     @property
-    def normal(self) -> Floats:
-        """(3,) the plane's normal, out of the work, in base."""
-        return self._plane.rotation[:, 2]
+    def tilting(self) -> float:
+        """By how much it tilts on the way, at most [rad/m]."""
+        return float(np.linalg.norm(self._tilts, axis=1).max())
 
     def lowest(self, base_T_flange: Floats) -> float:
-        """Return how high the lower one of tip and torch is above the plane [m].
+        """Return how high the lower one of tip and torch is above the seam beside it [m].
 
         Args:
             base_T_flange: (4, 4) pose of the flange.
         """
         in_flange = np.stack([self._tip, self._torch])
         in_base = in_flange @ base_T_flange[:3, :3].T + base_T_flange[:3, 3]
-        return float(((in_base - self._plane.translation) @ self.normal).min())
-
-    def tilt(self, base_T_flange: Transform) -> float:
-        """Return the angle between the tool's level z and the plane's [rad]."""
-        up = base_T_flange.rotation @ self._flange_R_level[:, 2]
-        return float(np.arccos(np.clip(up @ self._plane.rotation[:, 2], -1.0, 1.0)))
+        return min(self._surface.height(point) for point in in_base)
 
     def twist(self, command: Command, base_T_flange: Transform) -> Floats:
         """Return the flange's twist (6,), along the base's axes, that carries out a command."""
-        plane, rotation = self._plane.rotation, base_T_flange.rotation
-        normal, up = plane[:, 2], rotation @ self._flange_R_level[:, 2]
-        # The tool is brought back to the plane's normal within a second.
-        angular = command.turn * normal + _cross(up, normal)
-        linear = plane @ command.velocity - _cross(angular, rotation @ self._tip)
-        return np.concatenate([linear, angular])
+        rotation, surface = base_T_flange.rotation, self._surface
+        tip = rotation @ self._tip
+        s = surface.foot(tip + base_T_flange.translation, self._s)
+        stand = surface.at(s)
+        velocity = stand.unrolled(command.velocity)
+        up, tilt = self._standing(s)
+        going = float(velocity @ stand.axes[:, 0])
+        # It is brought to where it is to stand within a second, and kept there on the way.
+        angular = command.turn * up + _cross(self.up(rotation), up) + going * _cross(up, tilt)
+        return np.concatenate([velocity - _cross(angular, tip), angular])
 
     def base_T_flange(self, position: Floats, angle: float) -> Transform:
-        """Return where the flange is with the tip at (3,) in the plane, the tool as it stands."""
-        c, s = np.cos(angle), np.sin(angle)
-        plane_R_level = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        rotation = self._plane.rotation @ plane_R_level @ self._flange_R_level.T
-        tip = self._plane.apply(position)
+        """Return where the flange is with the tip at (3,) in the plane, the tool at an angle."""
+        surface = self._surface
+        tip = surface.unrolled(position[None])[0]
+        s = surface.foot(tip)
+        stand, (up, _) = surface.at(s), self._standing(s)
+        c, sine = math.cos(angle), math.sin(angle)
+        x = stand.unrolled(np.array([c, sine, 0.0]))
+        x = x - (x @ up) * up
+        x /= np.linalg.norm(x)
+        base_R_level = np.column_stack([x, np.cross(up, x), up])
+        rotation = base_R_level @ self._flange_R_level.T
         return Transform(BASE, FLANGE, rigid(rotation, tip - rotation @ self._tip))
 
-    def base_R_tool(self, base_T_flange: Transform) -> Floats:
-        """Return the tool's axes (3, 3) in the base's."""
-        return np.asarray(base_T_flange.rotation @ self._flange_R_tool)
+    def in_plane(self, base_T_flange: Transform) -> Floats:
+        """Return the tool's axes (3, 3) as they are in the plane."""
+        rotation = base_T_flange.rotation
+        tip = rotation @ self._tip + base_T_flange.translation
+        stand = self._surface.at(self._surface.foot(tip, self._s))
+        return np.stack([stand.rolled(axis) for axis in (rotation @ self._flange_R_tool).T], axis=1)
+
+    def _standing(self, s: float) -> tuple[Floats, Floats]:
+        """Return how the tool is to stand with its tip at an arc length: upwards, and its slope."""
+        share = (s - self._ticks[0]) / (self._ticks[1] - self._ticks[0])
+        share = min(max(share, 0.0), len(self._ticks) - 1.001)
+        index = int(share)
+        share -= index
+        up = (1.0 - share) * self._ups[index] + share * self._ups[index + 1]
+        return up / math.sqrt(up @ up), self._tilts[index]
 
 
 def _cross(first: Floats, second: Floats) -> Floats:

@@ -191,7 +191,9 @@ class SeamReach:
         """Return what a joint turns at most while the seam is followed [rad/s]."""
         task = self._task
         inverse = np.linalg.pinv(self._arm.jacobian(joints))
-        turning = np.abs(inverse[:, :3] @ task.tool.normal) * task.params.turn_rate
+        up = task.tool.up(self._arm.flange(joints)[:3, :3])
+        turning = np.abs(inverse[:, :3] @ up) * task.params.turn_rate
+        turning += np.linalg.norm(inverse[:, :3], axis=1) * task.tool.tilting * task.params.speed
         going = np.linalg.norm(inverse[:, 3:], axis=1) * flange_speed(task.finger, task.params)
         return float((turning + going).max())
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from flangeye.motion.seam_following import Controller, turned
 from flangeye.types import Floats, Note, Seam, WeldReport
-from flangeye_plugins.weld.frame import LeaningTool, WorkPlane
+from flangeye_plugins.weld.frame import LeaningTool, WorkSurface
 from flangeye_plugins.weld.passes import follower_of
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.weld_log import WeldLog, columns
@@ -20,8 +20,7 @@ SAMPLES = 2000
 
 def report_of(  # noqa: PLR0913  all that a weld had
     seam: Seam,
-    plane: WorkPlane,
-    plan: Path,
+    surface: WorkSurface,
     body: LeaningTool,
     controller: Controller,
     weld_log: WeldLog,
@@ -29,6 +28,7 @@ def report_of(  # noqa: PLR0913  all that a weld had
     truth: tuple[Floats, Floats] | None = None,
 ) -> WeldReport:
     """Return the report of a weld; ``truth`` is of a simulation: times, and the true torch."""
+    plan, to_base = surface.path, surface.unrolled
     reason = reason and f"{reason}; {_extent(controller, plan)}"
     every = columns(weld_log.cycles)
     kept = np.unique(np.linspace(0, len(weld_log.cycles) - 1, SAMPLES).round().astype(int))
@@ -37,7 +37,6 @@ def report_of(  # noqa: PLR0913  all that a weld had
     robot = np.array(every["position"]).reshape(-1, 3)[kept]
     tip, deflection = _tip_displacements(weld_log, plan, body, kept)
     torch = robot + np.array([turned(body.torch, angle) for angle in cycle["angle"]]).reshape(-1, 3)
-    to_base = plane.base_T_plane.apply
     velocity = cycle["velocity"].reshape(-1, 3)
     return WeldReport(
         mode=controller.mode,
@@ -45,7 +44,7 @@ def report_of(  # noqa: PLR0913  all that a weld had
         reason=reason,
         planned=seam.points_in_base,
         refined=to_base(_refined(controller, plan)),
-        opening=plane.base_T_plane.rotation[:, 2],
+        openings=seam.openings_in_base,
         time=cycle["time"] - cycle["time"][0] if len(kept) else np.zeros(0),
         tip=to_base(tip),
         torch=to_base(torch),

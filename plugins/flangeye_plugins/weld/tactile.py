@@ -19,7 +19,6 @@ from flangeye.motion.watchdog import LEADING, precedence
 from flangeye.plugin.stage import stage
 from flangeye.recipe.header import LimitsSection
 from flangeye.types import (
-    Floats,
     Note,
     Seam,
     Seed,
@@ -37,7 +36,7 @@ from flangeye_plugins.weld.corners import leg_of
 from flangeye_plugins.weld.execution import Bounds, WeldCell, follow
 from flangeye_plugins.weld.finger_camera import CameraJob, FingerCameraReader, SteppedReader
 from flangeye_plugins.weld.follower import Follower
-from flangeye_plugins.weld.frame import LeaningTool, Tool, WorkPlane, body_of
+from flangeye_plugins.weld.frame import LeaningTool, Tool, WorkSurface, body_of
 from flangeye_plugins.weld.passes import follower_of
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.prior import keep_posterior, with_prior
@@ -101,7 +100,7 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
         )
         truth = eyes.true_torch()
     report = report_of(
-        planned.seam, planned.plane, plan, planned.body, controller, weld_log, reason, truth
+        planned.seam, planned.surface, planned.body, controller, weld_log, reason, truth
     )
     kept = () if reason else _kept(planned, follower_of(controller))
     return replace(report, notes=(*report.notes, *kept))
@@ -113,9 +112,8 @@ class Planned:
 
     Attributes:
         seam: The leg that is welded.
-        plane: Of the work.
-        points: (N, 3) of the seam, in the plane [m].
-        plan: The seam, in the plane.
+        surface: Of the work.
+        plan: The seam, rolled out.
         finger: What the arm carries.
         body: How it stands.
         tool: Translates between flange and plane.
@@ -128,8 +126,7 @@ class Planned:
     """
 
     seam: Seam
-    plane: WorkPlane
-    points: Floats
+    surface: WorkSurface
     plan: Path
     finger: Finger
     body: LeaningTool
@@ -152,15 +149,14 @@ def _planned(
     """
     finger = read_model(params.finger, Finger)
     seam = leg_of(seam, params)
-    plane = WorkPlane(seam.points_in_base, seam.openings_in_base)
-    points = plane.points(seam.points_in_base)
-    plan, body = Path(points), body_of(finger, params)
+    surface = WorkSurface(seam.points_in_base, seam.openings_in_base)
+    plan, body = surface.path, body_of(finger, params)
     checks.check_finger(finger, params)
     belief = belief_of(finger, body, seam.half_angle, params)
     belief = with_prior(belief, params.prior, finger.model)
-    checks.check_seam(seam, plan, body.distance, params)
+    checks.check_seam(seam, surface, body.distance, params)
     checks.check_speeds(finger, params, allowed)
-    kept = None if params.resume is None else resume_point_of(params.resume, points)
+    kept = None if params.resume is None else resume_point_of(params.resume, surface.points)
     start = Start(params.set_down)
     if kept is not None:
         start = set_back(params, plan, body.distance, kept)
@@ -170,7 +166,7 @@ def _planned(
     checks.check_tool(body, belief, params)
     check_bound(plan, belief, params)
     return Planned(
-        seam, plane, points, plan, finger, body, Tool(finger, plane, body), belief, params, start,
+        seam, surface, plan, finger, body, Tool(finger, surface, body), belief, params, start,
         driver, None if times is None else times.gas_after, kept,
     )  # fmt: skip
 
@@ -219,8 +215,7 @@ def start_of(planned: Planned, belief: Belief) -> dict[str, Any]:
     """Return all that the decisions of a weld follow from, besides what was measured."""
     params, kept = planned.params, planned.kept
     return {
-        "points": planned.points.tolist(),
-        "base_T_plane": planned.plane.base_T_plane.matrix.tolist(),
+        "points": planned.surface.points.tolist(),
         "finger": planned.finger.model_dump(mode="json"),
         "belief": asdict(belief),
         "mode": params.model_dump(mode="json", include={"mode"})["mode"],

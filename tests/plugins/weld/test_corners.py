@@ -14,6 +14,7 @@ from flangeye_emulators.weld_world.truth import WeldTruth
 from flangeye_emulators.weld_world.world import Nominal
 from flangeye_plugins.weld.checks import check_seam
 from flangeye_plugins.weld.corners import corners_of, leg_of
+from flangeye_plugins.weld.frame import WorkSurface
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.resuming import controller_of
 from flangeye_plugins.weld.settings import Following, WeldTactileParams
@@ -151,10 +152,12 @@ def round_a_corner(turn, joint, shift, plan_turn=0.01, **given):
     asked = Following.model_validate({"joint": joint, "max_error": "1.5 mm", **given})
     true = dense(polyline(turn, leg=0.06))
     misplanned = seam_of(bench.misplaced(true, shift, plan_turn))
-    plan = Path(leg_of(misplanned, told(**{**ROUND, "joint": joint})).points_in_base)
+    leg = leg_of(misplanned, told(**{**ROUND, "joint": joint}))
+    surface = WorkSurface(leg.points_in_base, leg.openings_in_base)
+    plan = Path(leg.points_in_base)
     body = built_for(asked)
     section, belief = known(Condition(section=JOINTS[joint]), body, asked)
-    check_seam(misplanned, plan, belief.distance, asked)
+    check_seam(misplanned, surface, belief.distance, asked)
     seam = Nominal(true, section, Tip(), body.level_R_tool.T @ body.torch, body.level_R_tool)
     controller = controller_of(plan, belief, asked, "tactile")
     return run_trial(controller, seam, WeldTruth(), start_at(plan, belief, asked, 16e-3), 0)

@@ -15,8 +15,7 @@ from flangeye_emulators.finger.sensor import (
     SimulatedFingerParams,
     sensor_simulated_finger,
 )
-from flangeye_plugins.weld.frame import Tool, WorkPlane
-from flangeye_plugins.weld.path import Path
+from flangeye_plugins.weld.frame import Tool, WorkSurface
 from flangeye_plugins.weld.reachability import JUMP, ROOM, SeamReach, Task
 from flangeye_plugins.weld.settings import WeldTactileParams
 from flangeye_plugins.weld.task import Start
@@ -29,12 +28,11 @@ SENSOR = BoundPart(sensor_simulated_finger, SimulatedFingerParams())
 def task_of(name, angle: float = 0.0):
     model = load_model("robots", name)
     seam = planned("v-curved", shift=(-0.1, 0.0, 0.0))
-    plane = WorkPlane(seam.points_in_base, seam.openings_in_base)
+    surface = WorkSurface(seam.points_in_base, seam.openings_in_base)
     limits = limits_of(LimitsSection.model_validate({"box": BOX}), model)
-    plan = Path(plane.points(seam.points_in_base))
     settings = WeldTactileParams(sensor=SENSOR)
     start = Start(settings.set_down, angle=angle)
-    return Task(model, limits, FINGER, Tool(FINGER, plane), plan, settings, start)
+    return Task(model, limits, FINGER, Tool(FINGER, surface), surface.path, settings, start)
 
 
 @pytest.mark.parametrize("name", ["ur10e", "ur5e", "franka-panda", "aubo-i5"])

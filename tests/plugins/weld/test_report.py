@@ -13,8 +13,7 @@ from flangeye.motion.seam_following import turned
 from flangeye.types import Floats, Seam
 from flangeye_plugins.weld.belief import Belief, Learned
 from flangeye_plugins.weld.follower import Follower
-from flangeye_plugins.weld.frame import WorkPlane, body_from
-from flangeye_plugins.weld.path import Path
+from flangeye_plugins.weld.frame import WorkSurface, body_from
 from flangeye_plugins.weld.report import SAMPLES, _advice, learned_figures, report_of
 from flangeye_plugins.weld.settings import Following
 from flangeye_plugins.weld.task import WeldTask
@@ -26,13 +25,12 @@ BODY = body_from(np.array([-40e-3, 0.0, 4e-3]), 0.0, 0.2)
 ORIGIN = np.array([0.5, -0.2, 0.3])
 
 
-def plane_of() -> tuple[Seam, WorkPlane, Path]:
+def surface_of() -> tuple[Seam, WorkSurface]:
     """A seam along the base's y, so the plane's x is that and its y the base's -x."""
     points = straight(LENGTH)[:, [1, 0, 2]] + ORIGIN
     openings = np.tile([0.0, 0.0, 1.0], (len(points), 1))
     seam = Seam(points, openings, np.tile(np.eye(3) * 1e-8, (len(points), 1, 1)))
-    plane = WorkPlane(points, openings)
-    return seam, plane, Path(plane.points(points))
+    return seam, WorkSurface(points, openings)
 
 
 def in_base(plane_points: Floats) -> Floats:
@@ -63,15 +61,17 @@ def logged(count: int, images: int = 4, **more: Any) -> Any:
 
 
 def follower(side: str = "left") -> Any:
-    _, _, plan = plane_of()
-    found: Any = Follower(WeldTask(plan, Belief(40e-3), Following.model_validate({"side": side})))
+    _, surface = surface_of()
+    found: Any = Follower(
+        WeldTask(surface.path, Belief(40e-3), Following.model_validate({"side": side}))
+    )
     return found
 
 
 def reported(log: Any, controller: Any = None, reason: str = "", truth: Any = None) -> Any:
-    seam, plane, plan = plane_of()
+    seam, surface = surface_of()
     given: WeldLog = log
-    return report_of(seam, plane, plan, BODY, controller or follower(), given, reason, truth)
+    return report_of(seam, surface, BODY, controller or follower(), given, reason, truth)
 
 
 @pytest.mark.parametrize(("side", "sign"), [("left", 1.0), ("right", -1.0)])

@@ -13,7 +13,7 @@ from flangeye.run.replay import replay_steps
 from flangeye_emulators.finger.sensor import SimulatedFingerParams, sensor_simulated_finger
 from flangeye_plugins.weld.belief import Belief
 from flangeye_plugins.weld.follower import Follower
-from flangeye_plugins.weld.frame import WorkPlane
+from flangeye_plugins.weld.frame import WorkSurface
 from flangeye_plugins.weld.passes import Passes
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.resuming import RUN_IN, controller_of, resume_point_of, set_back
@@ -25,7 +25,7 @@ from tests.plugins.weld.test_replay import logged
 
 END = 0.13
 SEAM = planned("v-straight", shift=(1e-3, 1e-3, 0.0), end=END)
-PLAN = WorkPlane(SEAM.points_in_base, SEAM.openings_in_base).points(SEAM.points_in_base)
+PLAN = WorkSurface(SEAM.points_in_base, SEAM.openings_in_base).points
 
 
 @pytest.fixture(scope="module")
