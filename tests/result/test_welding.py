@@ -18,7 +18,7 @@ def report(lit_from: float) -> WeldReport:
     torch = np.column_stack([along, np.where(along < 0.03, 1e-3, 0.0), 0 * along])
     none = np.zeros(len(along))
     return WeldReport(
-        "tactile", True, "", SEAM, SEAM, np.array([0.0, 0.0, 1.0]), along, torch, torch, torch,
+        "tactile", True, "", SEAM, SEAM, np.tile([0.0, 0.0, 1.0], (2, 1)), along, torch, torch, torch,
         none, none, none, none, along, ("following",) * len(along),
         figures={"lit_from": lit_from}, true_torch=torch,
     )  # fmt: skip

@@ -18,8 +18,8 @@ import numpy as np
 from flangeye.types import Floats
 
 Phase = Literal[
-    "seeking", "probing", "following", "bridging", "ending", "returning", "passing", "done",
-    "stopped",
+    "seeking", "probing", "entering", "following", "bridging", "ending", "returning", "passing",
+    "done", "stopped",
 ]  # fmt: skip
 
 

@@ -191,7 +191,7 @@ def _weld_truth(weld: t.WeldReport, true_seams: list[t.Array]) -> WeldTruthResul
     after the root's are beside the seam, as they were asked to be.
     """
     torch = weld.true_torch if len(weld.true_torch) else weld.torch
-    welds = ~np.isin(weld.phases, ("seeking", "probing", "returning", "passing"))
+    welds = ~np.isin(weld.phases, ("seeking", "probing", "entering", "returning", "passing"))
     torch = torch[welds & (weld.along >= weld.figures.get("lit_from", 0.0) - 1e-9)]
     lines = [np.asarray(seam) for seam in true_seams]
     found = [torch_deviation(torch, line, weld.openings_beside(line)) for line in lines]

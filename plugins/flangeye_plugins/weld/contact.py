@@ -31,6 +31,9 @@ class Mode(IntEnum):
     SEATED, PRESSED, OTHER, FREE = range(4)
 
 
+LOST = 0.9
+"""A wall is lost where the tip is as likely free, and held again where it is as likely not."""
+
 RISE = 0.5e-3
 """Scale of how far a tip that climbs has risen [m]."""
 
@@ -100,6 +103,7 @@ class Contact:
         compression: Filtered [m].
         at: Arc length of the newest measurement [m].
         steady: Largest deflection for its compression that the tip stands, as far as was seen.
+        play: What a finger that was pressed shows when its tip is free [m].
     """
 
     def __init__(self, flat: float, slides: float, noise: tuple[float, float]) -> None:
@@ -112,7 +116,7 @@ class Contact:
         """
         self.likely = np.array([1.0, 0.0, 0.0, 0.0])
         self.deflection = self.compression = 0.0
-        self.steady = math.inf
+        self.steady, self.play = math.inf, 0.0
         self.noise = noise
         self._flat, self._slides = flat, slides
         self._time, self.at = -math.inf, math.inf
@@ -124,6 +128,10 @@ class Contact:
         self.likely = np.array([1.0, 0.0, 0.0, 0.0])
         self.deflection, self.compression, self._time = deflection, compression, time
         self._spread = math.inf
+
+    def lose(self) -> None:
+        """Take it for certain that no wall holds the tip."""
+        self.likely, self.deflection = np.array([0.0, 0.0, 0.0, 1.0]), 0.0
 
     @property
     def free(self) -> float:
@@ -194,12 +202,20 @@ class Contact:
         walls = [
             _up_a_wall(s * side * felt.aside, up, felt.spread, tall, self._flat) for s in (1, -1)
         ]
-        drags = [_normal(felt.deflection, self.noise[0] ** 2 + d**2) for d in (0.0, self._slides)]
-        free = 0.5 * sum(drags) * _normal(up, tall + LIFTS**2)
+        free = self._let_go(felt.deflection) * _normal(up, tall + LIFTS**2)
         climbed = walls[0][1] if felt.deflection > 0.0 else walls[1][1]
         chances = np.array([seated, walls[0][0], walls[1][0], free]) + 1e-12
         # Neighbours see the same error of what is expected: one measurement in two is new.
         return chances**0.5, max(climbed, RISE)
+
+    def _let_go(self, deflection: float) -> float:
+        """Return the density of a free tip's deflection [m]: friction drags it, play holds it.
+
+        A finger that was pressed and let go of shows its play, which it does not go through.
+        """
+        noise, play = self.noise[0] ** 2, self.play
+        held = _normal(deflection, noise) + _normal(deflection - play, noise + (0.3 * play) ** 2)
+        return 0.25 * held + 0.5 * _normal(deflection, noise + self._slides**2)
 
 
 def _mostly(off: float, variance: float, seldom: float) -> float:

@@ -13,17 +13,17 @@ from flangeye.motion.arc import OFF
 from flangeye.motion.seam_following import STILL, Command, Phase, ToolPose, Touch
 from flangeye.types import Floats
 from flangeye_plugins.weld.belief import Learned
-from flangeye_plugins.weld.contact import STRAINED, STRIDE
+from flangeye_plugins.weld.contact import LOST, STRAINED, STRIDE
 from flangeye_plugins.weld.response import Response
-from flangeye_plugins.weld.sensing import SeamEstimate, SeamReading, Sensing
+from flangeye_plugins.weld.sensing import SURE, SeamEstimate, SeamReading, Sensing
 from flangeye_plugins.weld.settings import INSIDE
 from flangeye_plugins.weld.steering import SLOWEST, TorchLead
 from flangeye_plugins.weld.task import ResumePoint, WeldTask
 from flangeye_plugins.weld.tip import Pressing, Progress, within
 from flangeye_plugins.weld.welding import Welding
 
-LOST = 0.9
-"""A wall is lost where the tip is as likely free, and held again where it is as likely not."""
+OVER = 1e-3
+"""So far above where it rests in the seam the tip goes back into it [m]."""
 
 WAITING = 0.2
 """Share of its speed that it keeps all the same: a wall that has ended is found out by going on."""
@@ -173,13 +173,12 @@ class Follower:
             sensing.sweep(*taken, found, self.seam.refined.noise)
         else:
             self.seam.weigh(touch.time, found, sensing.learned, self.side)
-            if self.phase == "bridging":
+            if self.phase in ("bridging", "entering"):
                 self.seam.contact.forget()
             elif self.seam.contact.free < 0.5:
                 sensing.smooth(found.seam, self.seam.refined.noise)
                 self._stop(self.seam.moved(found))
-            # A sample is believed when contact has not been doubted for 0.3 s after it.
-            self.seam.keep(touch.time - 0.3)
+            self.seam.keep(touch.time - SURE)
 
     @property
     def _silence(self) -> float:
@@ -191,7 +190,7 @@ class Follower:
 
     def _judge(self, pose: ToolPose) -> None:
         """Change the phase where what was felt asks for it."""
-        sensing, pressing, free = self.sensing, self.pressing, self.seam.contact.free
+        sensing, pressing = self.sensing, self.pressing
         if self.phase in ("following", "bridging") and self.tip >= pressing.ends:
             self.phase = "ending"
         elif self.phase == "seeking" and sensing.search.seats(pressing.most):
@@ -199,17 +198,46 @@ class Follower:
             self.phase = "probing"
         elif self.phase == "probing" and sensing.probing.over:
             self._learn()
-        elif self.phase == "following" and free > LOST:
+        elif self.phase == "entering":
+            self._enter(pose)
+        elif self.phase == "following" and self._lost():
             self.phase = "bridging"
             pressing.lose(self.tip)
-        elif self.phase == "bridging" and self.seam.regained(pressing, LOST):
+        elif self.phase == "bridging" and self.seam.regained(pressing):
             self.phase = "following"
         elif self.phase == "bridging" and pressing.since_turned(self.tip) > STRIDE:
             pressing.turn_over(self.tip)
-        if self.torch >= self.task.ends and self.phase != "stopped":
+        self.seam.leave(self.phase, self.now or 0.0)
+        if self.torch >= self.welding.ends and self.phase != "stopped":
             self._finish()
         if self.phase not in ("done", "stopped"):
             self._stop(self._blind(pose))
+
+    def _enter(self, pose: ToolPose) -> None:
+        """Begin to follow where the tip rests in the seam again; farther in where it does not."""
+        if not self._inside:
+            return
+        seam, pressing, preload = self.seam, self.pressing, self.task.settings.preload
+        if seam.bears and seam.contact.deflection > 0.9 * pressing.most:
+            seam.contact.seat(self.sensing.seen, self.wanted, preload)
+            self.phase = "following"
+            return
+        fell = seam.lost is not None and not seam.bears and self._over(pose) < -0.9 * preload
+        room = pressing.most + pressing.feeler(seam.refined.variance(self.tip))
+        aside = self.side * (self.progress.lateral(pose) - seam.refined.offset(self.tip))
+        if fell or aside > room:
+            seam.start = (seam.start or 0.0) + INSIDE
+            if seam.start > self.task.start.tip:
+                self._stop("the tip fell off the seam's start and found no way back into it")
+
+    def _lost(self) -> bool:
+        """Return whether no wall holds the tip while it follows."""
+        contact = self.seam.contact
+        if self.seam.backs or not self.task.touch:
+            return False
+        if self.pressing.slack_for(self.tip, contact.deflection, contact.play) > STRIDE:
+            contact.lose()
+        return contact.free > LOST
 
     def _learn(self) -> None:
         """Take over what the sweep found of finger, clock and arm."""
@@ -236,7 +264,7 @@ class Follower:
             sensing.felt, self.pressing.wanted = swept[-1].seam, swept[-1].deflection
         seam.contact.seat(sensing.seen, self.wanted, task.settings.preload)
         self.phase = "following"
-        if task.before is None and self.tip > task.inside:
+        if task.before is None and task.settings.ends is not None:
             seam.back()
 
     def _finish(self) -> None:
@@ -307,7 +335,10 @@ class Follower:
         point, normal = self.seam.refined.frame(self.progress.coming)
         pace = self._pace(coming, normal)
         if self.seam.backs:
-            return Command(self._velocity(coming, -min(pace, self._backwards())), 0.0)
+            if self.seam.lost is not None:
+                return STILL
+            back = 0.0 if self.seam.contact.free > 0.5 else min(pace, self._backwards())
+            return Command(self._velocity(coming, -back), 0.0)
         velocity = self._velocity(coming, pace)
         sway = self.lead.swing(coming.time, self.progress.coming, self.arm)
         off = float((self.progress.torch_at(coming) - point) @ normal) + self.welding.bias.value
@@ -327,6 +358,8 @@ class Follower:
         seeking = self.phase == "seeking" and not self.sensing.search.found
         if self.phase == "ending" or seeking or not self.task.touch:
             return 0.0
+        if self.phase == "entering" and not self._inside:
+            return 0.0
         if self.phase == "bridging":
             return self.pressing.feeler(self.seam.refined.variance(self.tip))
         return self.pressing.most
@@ -337,16 +370,19 @@ class Follower:
             self.progress.advance(pose, coming)
             return
         self.progress.back(pose, coming)
-        # Friction holds the tip back: where it was felt counts. The arm stays on the seam as
-        # well: a tip that slips comes to where it is.
-        inside, contact = self.task.inside, self.seam.contact
-        gone = self.tip <= inside - 2.0 * INSIDE / 3.0
-        if contact.at <= inside or gone or contact.free > 1.0 - LOST:
-            self.seam.arrive(self.sensing.learned, self.torch)
+        contact, lost = self.seam.contact, self.seam.lost_for(self.now or 0.0) > SURE
+        # Where the joint is felt farther back than the seam may begin, it goes on there.
+        on = contact.at < -self.task.beyond - INSIDE and self.seam.bears
+        if lost or on:
+            self.seam.arrive(self.sensing.learned, self.torch, lost)
+            if self.seam.start is not None:
+                self.phase, self.pressing.wanted = "entering", 0.0
 
     def _pace(self, pose: ToolPose, normal: Floats) -> float:
         """Return the tip's speed along the seam: less where blind or crooked."""
         if self.phase == "seeking" or self.welding.striking.stands(pose.time):
+            return 0.0
+        if self.phase == "entering" and (self._inside or self._over(pose) < 0.5 * OVER):
             return 0.0
         settings, silence = self.task.settings, self._silence
         sight = 1.0
@@ -376,8 +412,8 @@ class Follower:
         return max(swerving, SLOWEST * self.task.settings.speed)
 
     def _backwards(self) -> float:
-        """Return the speed at which the tip goes back: it ends before it can leave the seam."""
-        return INSIDE / (2.0 * self._delay) if self._delay > 0.0 else math.inf
+        """Return the speed at which the tip goes back, so as not to go far beyond the start."""
+        return INSIDE / max(2.0 * self._delay, SURE)
 
     def _firmness(self) -> float:
         """Return the share of its speed that the tip may keep by how firmly it is on the wall.
@@ -400,6 +436,8 @@ class Follower:
         settings, place, felt = self.task.settings, self.progress.place, self._seam_at_tip()
         lateral = self.progress.lateral(pose)
         deflection = self.side * (lateral - felt.offset)
+        if self.phase == "entering" and self._inside and self.seam.bears:
+            deflection = self.seam.contact.deflection
         most = settings.lateral_speed
         across = -self.side * settings.servo_gain * (deflection - self.wanted)
         search = self.sensing.search
@@ -413,9 +451,19 @@ class Follower:
     def _rising(self, pose: ToolPose) -> float:
         """Return how fast to go up for the preload to be right [m/s]."""
         settings = self.task.settings
-        height = float(pose.position[2]) - self.progress.place.height - self._seam_at_tip().height
         preload = settings.preload if self.task.touch else 0.0
-        return within(-settings.height_gain * (height + preload), settings.lateral_speed)
+        if self.phase == "entering" and not self._inside:
+            preload = -OVER
+        return within(-settings.height_gain * (self._over(pose) + preload), settings.lateral_speed)
+
+    def _over(self, pose: ToolPose) -> float:
+        """Return how far above a seated tip the end point is [m]."""
+        return float(pose.position[2]) - self.progress.place.height - self._seam_at_tip().height
+
+    @property
+    def _inside(self) -> bool:
+        """Whether the tip is back in the seam beyond the start that it has felt."""
+        return self.tip >= (self.seam.start or 0.0) + INSIDE
 
     def _drifting(self) -> float:
         """Return how fast the seam leaves the plan to the left, per length of it, at the tip."""
@@ -429,6 +477,9 @@ class Follower:
         felt = self.sensing.felt
         if felt is None:
             return SeamReading(0.0, 0.0)
-        if self.phase in ("bridging", "ending") and not self.seam.refined.empty:
-            return SeamReading(self.seam.refined.offset(self.tip), felt.height)
+        seam = self.seam
+        if self.phase in ("entering", "bridging", "ending") and not seam.refined.empty:
+            # What was smoothed while the tip fell off the start is too low.
+            height = seam.height if self.phase == "entering" else felt.height
+            return SeamReading(seam.refined.offset(self.tip), height)
         return felt

@@ -203,7 +203,7 @@ class WorkSurface:
         left = tangents[:, 0] * off[:, 1] - tangents[:, 1] * off[:, 0]
         here, axes = self.line(s)
         off = np.stack([along, left, points[:, 2]], axis=1)
-        return here + np.asarray(np.einsum("kij,kj->ki", axes, off))
+        return np.asarray(here + np.einsum("kij,kj->ki", axes, off))
 
     def bending(self, distance: float) -> float:
         """Return how far a tool leans from the openings at its tip or torch, at most [rad].

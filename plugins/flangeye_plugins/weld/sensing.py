@@ -14,12 +14,16 @@ import numpy as np
 from flangeye.motion.seam_following import Phase, ToolPose, Touch, turned
 from flangeye.types import Floats
 from flangeye_plugins.weld.belief import Learned
-from flangeye_plugins.weld.contact import Contact, Felt
+from flangeye_plugins.weld.contact import LOST, Contact, Felt
 from flangeye_plugins.weld.probing import SOFTER, SWEEP_MARGIN, Probing
 from flangeye_plugins.weld.refined import RefinedPath
 from flangeye_plugins.weld.search import SweepSearch
+from flangeye_plugins.weld.settings import INSIDE
 from flangeye_plugins.weld.task import WeldTask
 from flangeye_plugins.weld.tip import Pressing, Progress
+
+SURE = 0.3
+"""A sample is believed when contact has not been doubted for so long after it [s]."""
 
 STEADY = 0.03e-3
 """A finger that scatters less is followed from one measurement to the next [m]."""
@@ -217,14 +221,22 @@ class SeamEstimate:
     Attributes:
         refined: The seam as felt so far.
         contact: The state of the tip's contact.
+        start: Where the seam begins, as the tip felt, by arc length; None where it did not [m].
+        end: Where it ends, likewise.
+        lost: When no wall held the tip any more, and where it was then [s, m]; None while one does.
     """
 
     def __init__(self, task: WeldTask) -> None:
+        self.start: float | None = None
+        self.end: float | None = None
+        self.lost: tuple[float, float] | None = None
         self._task, belief, settings = task, task.belief, task.settings
         self.contact = Contact(
             belief.flat(settings.sign), belief.sliding(settings) / SOFTER, belief.noise
         )
         self.refined = self._path()
+        self._heights: deque[float] = deque(maxlen=20)
+        self._pressed: deque[float] = deque(maxlen=10)
         self._backed: list[_Sample] | None = None
         self._sat: list[_Sample] = []
         self._moved: list[float] = []
@@ -240,7 +252,7 @@ class SeamEstimate:
 
     @property
     def backs(self) -> bool:
-        """Whether the tip goes back to where the seam is sure to have begun."""
+        """Whether the tip goes back to where the seam begins."""
         return self._backed is not None
 
     def renew(self, torch: float) -> None:
@@ -266,15 +278,27 @@ class SeamEstimate:
         if self._task.belief.two_walls:
             self.contact.steady = self.stands(found) / self._task.settings.preload
         self.contact.noise = found.noise, height_noise
+        self.contact.play = abs(found.width) * (1.0 + found.kept) / (1.0 + found.gain)
         self._backed = [_Sample(each.s, each.seam.offset, each.angle, 0.0) for each in swept]
         self.arrive(found, torch)
 
     def back(self) -> None:
-        """Go back to where the seam is sure to have begun: what is felt on the way is kept."""
+        """Go back to where the seam begins: what is felt on the way is kept."""
         self._backed = []
 
-    def arrive(self, found: Learned, torch: float) -> None:
-        """Begin the path with what was felt at the sweep, and on the way back to the start."""
+    def lost_for(self, now: float) -> float:
+        """Return for how long no wall holds the tip [s]; 0 while one does."""
+        return 0.0 if self.lost is None else now - self.lost[0]
+
+    def arrive(self, found: Learned, torch: float, lost: bool = False) -> None:
+        """Begin the path with what was felt at the sweep, and on the way back to the start.
+
+        Args:
+            found: What the sweep found.
+            torch: Arc length of the torch [m].
+            lost: Whether no wall holds the tip any more.
+        """
+        self.start = self._fell_at() if lost else None
         self.keep(math.inf)
         self.refined = self._path(math.sqrt(found.variance))
         self._sat = sorted([*self._sat, *(self._backed or [])])
@@ -282,6 +306,34 @@ class SeamEstimate:
             self.refined.add(*sample)
         self.refined.renew(torch, 10 * len(self._sat))
         self._backed = None
+
+    def leave(self, phase: Phase, now: float) -> None:
+        """Take it that the seam ends where the tip fell off it, if it may end there."""
+        if self.end is not None or phase != "ending" or self.lost_for(now) <= SURE:
+            return
+        task, at = self._task, self._fell_at()
+        if at is None or task.settings.ends is None or not task.belief.two_walls:
+            return
+        if abs(at - task.plan.length) <= task.beyond + INSIDE:
+            self.end = at
+
+    def _fell_at(self) -> float | None:
+        """Return where a tip that was lost fell off the seam [m]; None where it did not.
+
+        Where a wall alone is missing the joint's bottom still bears it.
+        """
+        return None if self.lost is None or self.bears else self.lost[1]
+
+    @property
+    def height(self) -> float:
+        """Height above the plan's of a tip that is sure to have been seated [m]."""
+        return float(np.mean(self._heights or [0.0]))
+
+    @property
+    def bears(self) -> bool:
+        """Whether the joint holds up the tip, by the mean of the last touches."""
+        pressed = float(np.mean(self._pressed or [0.0]))
+        return pressed > self._task.settings.preload / 2.0
 
     def weigh(self, time: float, found: Located, learned: Learned, side: float) -> None:
         """Weigh how the tip touches the wall of a side, 1 for the left.
@@ -298,24 +350,33 @@ class SeamEstimate:
         spread = self.refined.variance(s) + (learned.noise / (1.0 + learned.gain)) ** 2 + STEADY**2
         expected = time, s, seam.offset, found.angle, aside, spread, seam.height
         self.contact.take(Felt(*expected, found.deflection, found.compression), side)
+        self._pressed.append(found.compression)
+        if self.contact.free <= LOST:
+            self.lost = None
+        elif self.lost is None:
+            self.lost = time, s
 
     def keep(self, until: float) -> None:
         """Believe what was felt up to a time [s], short of where the seam may end."""
         task = self._task
         end = task.plan.length - max(task.settings.ending / 4.0, task.beyond)
+        # Between two walls a tip that has fallen off the seam's end is told from one that has not.
+        if task.settings.ends is not None and task.belief.two_walls:
+            end = task.plan.length + task.beyond
         for felt, doubt in self.contact.settled(until):
             sample = _Sample(felt.s, felt.offset, felt.angle, doubt)
+            self._heights.append(felt.height)
             if self._backed is not None:
                 self._backed.append(sample)
             elif felt.s < end:
                 self.refined.add(*sample)
 
-    def regained(self, pressing: Pressing, lost: float) -> bool:
-        """Return whether a wall holds the tip again that is as likely not free as ``lost``.
+    def regained(self, pressing: Pressing) -> bool:
+        """Return whether a wall holds the tip again.
 
         A tip that is free seems to be held where the arm leads it there.
         """
-        return self.contact.free < 1.0 - lost and self.contact.deflection > pressing.most / 2.0
+        return self.contact.free < 1.0 - LOST and self.contact.deflection > pressing.most / 2.0
 
     def moved(self, found: Located) -> str:
         """Return why the weld must stop: the seam is not where it was felt before; else nothing."""

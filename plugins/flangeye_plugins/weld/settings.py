@@ -123,9 +123,10 @@ class Following(Params):
         description="How far to the left of the seam the torch is led.",
     )  # fmt: skip
     ends: Length | None = param(
-        None, ge=0, le=0.03, description="How far the seam's ends may be off along the plan, which "
-        "touch does not tell. Where it is given the tip first feels its way back to where the seam "
-        "has surely begun, and the torch welds so far beyond both planned ends.",
+        None, ge=0, le=0.03, description="How far the seam's ends may be off along the plan. Where "
+        "it is given the tip feels for both: it goes back until it falls off the start, and, "
+        "between two walls, on until it falls off the end. Where it does not, the torch welds so "
+        "far beyond.",
     )  # fmt: skip
     weave_width: Length = param(
         "0 mm", ge=0, le=0.03,

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from flangeye.types import Floats
-from flangeye_plugins.weld.belief import Belief, Learned
+from flangeye_plugins.weld.belief import BAND, Belief, Learned
 from flangeye_plugins.weld.path import Path
-from flangeye_plugins.weld.settings import INSIDE, Following
+from flangeye_plugins.weld.settings import Following
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,21 +78,21 @@ class WeldTask:
 
     @property
     def begins(self) -> float:
-        """Where the torch is to begin to weld, by arc length [m]."""
+        """Where the torch is to begin to weld, by arc length, if no start is felt [m]."""
         after = self.start.torch
-        return after if after > 0.0 else -self.beyond
+        return after if after > 0.0 else -self.beyond - self.lengthwise
 
     @property
     def ends(self) -> float:
         """Where the torch is to end, by arc length [m]."""
-        return self.plan.length + self.beyond
+        return self.plan.length + self.beyond + self.lengthwise
 
     @property
-    def inside(self) -> float:
-        """Where the tip is sure to be on the seam, by arc length [m]."""
-        return math.inf if self.settings.ends is None else self.settings.ends + INSIDE
+    def lengthwise(self) -> float:
+        """How far along the seam the torch may be off, where its ends matter [m]."""
+        return 0.0 if self.settings.ends is None else BAND * self.belief.along_sigma
 
     @property
     def margin(self) -> float:
         """How far beyond the plan tip and torch may come [m]."""
-        return self.belief.distance + self.settings.ending + self.beyond
+        return self.belief.distance + self.settings.ending + self.beyond + self.lengthwise

@@ -68,7 +68,7 @@ class Pressing:
         # Before the sweep has told how much the tip stands.
         self.most = settings.deflection / (SOFTER if task.belief.two_walls else 1.0)
         self.wanted, self.side = 0.0, settings.sign
-        self._lost = self._turned = 0.0
+        self._lost = self._turned = self._firm = 0.0
 
     def learn(self, found: Learned, swept: float) -> None:
         """Press by what the sweep has found that the tip stands, ``swept`` at most [m]."""
@@ -112,6 +112,22 @@ class Pressing:
         release = task.settings.speed * self.most / task.settings.release
         return task.plan.length - max(task.settings.ending, task.beyond) - release
 
+    def slack_for(self, tip: float, deflection: float, play: float) -> float:
+        """Return how far the tip has gone as if no wall held it [m].
+
+        The servo presses it again within a few millimetres where there is a wall. Where there is
+        none the finger shows its play, whatever is asked of it.
+
+        Args:
+            tip: Its arc length [m].
+            deflection: As it is shown [m].
+            play: What a free tip shows [m].
+        """
+        # A quarter of the way from there to what is wanted: in a curve a late arm presses less.
+        if deflection > play + (self.wanted - play) / 4.0:
+            self._firm = tip
+        return tip - self._firm
+
     # --- where a wall has ended -------------------------------------------------------------------
 
     def lose(self, tip: float) -> None:
@@ -121,7 +137,7 @@ class Pressing:
 
     def turn_over(self, tip: float) -> None:
         """Press the other wall, where there is one."""
-        self._turned = tip
+        self._turned = self._firm = tip
         if self._task.belief.two_walls:
             self.side, self.wanted = -self.side, -self.wanted
 

@@ -131,9 +131,20 @@ class Welding:
         """Share of the planned seam that was welded with the torch within ``max_error``."""
         if self.lit is None:
             return 0.0
-        task = self._task
-        welded = min(self._progress.torch, task.ends) - self.lit
-        return max(welded, 0.0) / (task.ends - task.begins)
+        welded = min(self._progress.torch, self.ends) - self.lit
+        return max(welded, 0.0) / (self.ends - self.begins)
+
+    @property
+    def ends(self) -> float:
+        """Where the torch is to end, by arc length [m]: where an end was felt, there."""
+        felt = self._seam.end
+        return self._task.ends if felt is None else felt + self._task.lengthwise
+
+    @property
+    def begins(self) -> float:
+        """Where the torch is to begin to weld, by arc length [m]: where a start was felt, there."""
+        felt = self._seam.start
+        return self._task.begins if felt is None else felt - self._task.lengthwise
 
     @property
     def complete(self) -> bool:
@@ -159,9 +170,9 @@ class Welding:
             Why the weld must not go on, or nothing.
         """
         task, torch = self._task, self._progress.torch
-        if task.begins - torch <= task.belief.arc[0] * task.settings.speed:
+        if self.begins - torch <= task.belief.arc[0] * task.settings.speed:
             self.striking.gas(now)
-        if not task.begins <= torch <= task.ends:
+        if not self.begins <= torch <= self.ends:
             return ""
         if self.lit is not None:
             self._trail.pass_by(now, torch, raw, variance - self._unseen())
@@ -182,7 +193,7 @@ class Welding:
             variance: Of the torch's place where it is now [m^2].
         """
         refined, torch = self._seam.refined, self._progress.torch
-        place, felt = refined.worst(torch, self._task.ends)
+        place, felt = refined.worst(torch, self.ends)
         variance += felt - refined.variance(torch)
         return place, self._task.settings.sigmas * math.sqrt(max(variance, 0.0))
 
@@ -200,7 +211,7 @@ class Welding:
             late = torch > task.before.torch
             again = "the torch was not on the seam again where it had stopped; raise 'overlap'"
             return again if late else ""
-        if torch - task.begins <= SHORT * (task.ends - task.begins):
+        if torch - self.begins <= SHORT * (self.ends - self.begins):
             return ""
         ahead = f" at {place * 1e3:.0f} mm of the seam" if place > torch else ""
         return f"not begun: {self.too_uncertain(bound, ahead)}"

@@ -541,7 +541,16 @@ def judged(found: Any, **state: Any) -> str:
 
 def test_phases_follow_from_what_was_felt() -> None:
     ends = make().pressing.ends
-    assert judged(make(), tip=ends - 1e-5) == "following"
+    firm = make()
+    firm.seam.contact.deflection = PRESS
+    assert judged(firm, tip=ends - 1e-5) == "following"
+    # A finger that shows its play, not what is wanted, for 10 mm is on no wall.
+    for shown, phase in ((0.38e-3, "bridging"), (0.41e-3, "following")):
+        slack = make()
+        slack.pressing.wanted, slack.seam.contact.play = PRESS, 0.3e-3
+        slack.seam.contact.deflection = shown
+        assert judged(slack, tip=9.9e-3) == "following" and judged(slack, tip=10.1e-3) == phase
+    assert judged(make(touch=False), tip=0.05) == "following"
     assert judged(make(), tip=ends + 1e-5) == "ending"
     assert judged(make("bridging"), tip=ends + 1e-5) == "ending"
     lost = make()
@@ -589,16 +598,22 @@ def test_what_was_felt_a_while_ago_by_a_tip_that_no_wall_lost_is_believed() -> N
     for i in range(40):
         felt_at(bridging, 0.033 * i, 0.02 + 2e-4 * i, 1e-3)
     assert bridging.sensing.felt is None and not bridging.seam.refined._sure
-    ending = make("ending", ends="3 mm")
-    for s, kept in ((LENGTH - 3.1e-3, True), (LENGTH - 2.9e-3, False)):
-        felt_at(ending, 9.0, s, 0.0)
-        ending.seam.keep(math.inf)
-        assert (len(ending.seam.refined._sure) == 1) == kept
-        ending.seam.refined._sure.clear()
+    one_wall = Belief(DISTANCE, two_walls=False)
+    for ending, last in (
+        (make("ending", ends="3 mm"), LENGTH + 3e-3),
+        (make("ending", ends="3 mm", belief=one_wall), LENGTH - 3e-3),
+        (make("ending"), LENGTH - 2e-3),
+    ):
+        for s, kept in ((last - 0.1e-3, True), (last + 0.1e-3, False)):
+            felt_at(ending, 9.0, s, 0.0)
+            ending.seam.keep(math.inf)
+            assert (len(ending.seam.refined._sure) == 1) == kept
+            ending.seam.refined._sure.clear()
 
 
-def test_the_tip_goes_back_to_where_the_seam_is_sure_to_have_begun() -> None:
-    found = make("probing", ends="1 mm")
+def swept(**given: Any) -> Any:
+    """A follower whose sweep has just ended, pressed, with the tip at 5 mm."""
+    found = make("probing", **given)
     found.sensing.probing = SimpleNamespace(over=True, learned=lambda: Learned(swept=2.4e-3))
     down = np.array([0.0, -PRESS, 0.0])
     found.sensing._swept = [(pose(0.005, PRESS), Touch(0.1, down))] * 3
@@ -606,20 +621,75 @@ def test_the_tip_goes_back_to_where_the_seam_is_sure_to_have_begun() -> None:
     found.now = found.sensing.seen = found.sensing.heard = 0.1
     assert judged(found) == "following" and found.pressing.most == pytest.approx(0.8e-3)
     found.seam.contact.deflection, found.seam.contact.compression = PRESS, 1.5e-3
-    here, times = 5e-3, 0.1
-    while found.seam._backed is not None:
-        times += 0.01
-        at = pose(here, PRESS, -1.5e-3, time=times)
-        touches = [Touch(times, np.array([0.0, -PRESS, 1.5e-3]))]
-        command = found.step(at, touches)
-        assert found.seam._backed is None or (command.turn, command.velocity[0]) < (1e-9, 1e-9)
-        here += command.velocity[0] * 0.01
-    assert here == pytest.approx(2.5e-3, abs=0.1e-3)
+    return found
+
+
+def driven(found: Any, begins: float, until: Any, again: bool = True) -> list[tuple[str, Any]]:
+    """Step an arm that does as it is told along a groove that begins at an arc length [m].
+
+    Once a tip has fallen off its start there is no groove to be found ``again``.
+    """
+    at, told = np.array([5e-3, PRESS, -1.5e-3]), []
+    for i in range(6000):
+        time = 0.11 + 0.01 * i
+        seated = at[0] >= begins and at[2] < 0.0 and (again or found.phase != "entering")
+        shown = np.array([0.0, -at[1], -at[2]]) if seated else np.zeros(3)
+        command = found.step(ToolPose(time, at, 0.0), [Touch(time, shown)])
+        told.append((found.phase, at.copy()))
+        if until():
+            return told
+        at = at + 0.01 * command.velocity
+    raise AssertionError("it did not happen")
+
+
+def test_the_tip_goes_back_no_farther_than_the_seam_may_begin() -> None:
+    found = swept(ends="1 mm")
+    told = driven(found, -0.05, lambda: not found.seam.backs)
+    assert told[-1][1][0] == pytest.approx(-2.5e-3, abs=0.1e-3)
+    assert found.phase == "following" and found.seam.start is None
     felt = found.seam.refined.samples()
-    assert felt[0, 0] < 3.1e-3 and felt[-1, 0] > 4.4e-3
-    assert found.task.begins == -1e-3 and found.task.ends == LENGTH + 1e-3
-    found.step(pose(here, PRESS, -1.5e-3, time=times + 0.01), [])
+    assert felt[0, 0] < -2e-3 and felt[-1, 0] > 4.4e-3
+    past = 1e-3 + 2.0 * found.task.belief.along_sigma
+    assert found.welding.begins == pytest.approx(-past)
+    assert found.welding.ends == pytest.approx(LENGTH + past)
+    last = told[-1][1]
+    at = ToolPose(9.0, last, 0.0)
     assert found._lead(at, at, 0.01).velocity[0] > 0.0
+
+
+def test_a_tip_that_falls_off_the_start_is_lifted_back_into_the_seam() -> None:
+    """The seam then begins there, and the torch with it."""
+    found = swept(ends="3 mm")
+    told = driven(found, 1e-3, lambda: found.phase == "following" and found.seam.start)
+    assert found.seam.start == pytest.approx(1e-3, abs=0.2e-3)
+    back = 2.0 * found.task.belief.along_sigma
+    assert found.welding.begins == pytest.approx(found.seam.start - back)
+    places = np.array([at for phase, at in told if phase == "entering"])
+    outside = places[:, 0] < 1e-3
+    assert (places[outside, 2].max() > 0.45e-3) and (np.diff(places[:, 0]) >= -1e-12).all()
+    over = places[(places[:, 0] > 0.9e-3) & (places[:, 0] < 2.4e-3), 2]
+    assert len(over) and over.min() > 0.4e-3
+    assert places[-1][2] < -0.7e-3 and places[-1][0] == pytest.approx(2.5e-3, abs=0.2e-3)
+    assert found.seam.refined.samples()[:, 0].min() < 1.3e-3
+
+
+def test_a_tip_that_finds_no_way_back_into_the_seam_stops_the_weld() -> None:
+    found = swept(ends="3 mm")
+    driven(found, 1e-3, lambda: found.phase == "stopped", again=False)
+    assert found.reason == "the tip fell off the seam's start and found no way back into it"
+
+
+@pytest.mark.parametrize(("compressed", "at", "ends"), [
+    (0.0, LENGTH + 2e-3, True), (1.5e-3, LENGTH + 2e-3, False), (0.0, LENGTH - 5e-3, False),
+])  # fmt: skip
+def test_the_seam_ends_where_the_tip_falls_off_it(compressed: float, at: float, ends: bool) -> None:
+    """Not where a wall alone is missing, nor where the plan cannot end."""
+    found = make("ending", ends="3 mm", belief=Belief(DISTANCE, along_sigma=0.4e-3))
+    found.now, found.seam.lost = 1.0, (0.6, at)
+    found.seam._pressed.extend([compressed] * 10)
+    judged(found)
+    assert found.seam.end == (at if ends else None)
+    assert found.welding.ends == pytest.approx((at if ends else LENGTH + 3e-3) + 0.8e-3)
 
 
 def test_a_weld_has_ended_where_the_torch_is_at_the_end_of_the_seam() -> None:

@@ -39,6 +39,25 @@ def test_a_plan_too_high_and_tilted_is_followed_too() -> None:
     assert abs(done.deviation()).max() < 0.4e-3
 
 
+@pytest.mark.parametrize("side", ["left", "right"])
+@pytest.mark.parametrize("shift", [5e-3, -5e-3])
+def test_both_ends_of_the_seam_are_felt_and_it_is_welded_between_them(
+    shift: float, side: str
+) -> None:
+    """The plan is 5 mm off along the seam: the tip falls off where the groove really ends."""
+    true = straight()
+    asked = Following.model_validate({"ends": "6 mm", "side": side})
+    done = weld(true, misplaced(true, (shift, 1e-3, 0.0)), settings=asked)
+    seam, task = done.controller.seam, done.controller.task
+    assert seam.start == pytest.approx(-shift, abs=0.7e-3)
+    assert seam.end == pytest.approx(task.plan.length - shift, abs=1.5e-3)
+    phases = list(dict.fromkeys(done.phase))
+    assert phases == ["seeking", "probing", "following", "entering", "ending", "done"]
+    assert abs(done.deviation()).max() < 0.3e-3
+    assert done.torch_s.max() == pytest.approx(0.12, abs=2.5e-3)
+    assert done.controller.lit + shift == pytest.approx(0.0, abs=1.5e-3)
+
+
 @pytest.mark.parametrize("degrees", [90, -90])
 def test_a_tool_across_the_seam_turns_back_within_its_limit(degrees: int) -> None:
     true = curved()

@@ -19,7 +19,7 @@ from flangeye.motion.seam_following import Command
 from flangeye.types import BASE, FLANGE, Seam, Transform
 from flangeye_emulators.finger.sensor import SimulatedFinger
 from flangeye_emulators.weld_world.truth import ToolFile
-from flangeye_emulators.world import room
+from flangeye_emulators.world import bench
 from flangeye_plugins.weld.frame import Tool, WorkSurface, body_from
 from tests.plugins.weld import cell
 from tools.weld_bench import FINGER
@@ -63,10 +63,10 @@ def over_a_hill(end: float = 0.15) -> tuple[Floats, Floats]:
     return points, np.tile([0.0, 0.0, 1.0], (len(x), 1))
 
 
-SEAMS: Any = pytest.mark.parametrize("seam", [pipe_on_plate, pipe_on_pipe, over_a_hill])
+SEAMS = (pipe_on_plate, pipe_on_pipe, over_a_hill)
 
 
-@SEAMS
+@pytest.mark.parametrize("seam", SEAMS)
 def test_what_is_rolled_out_is_as_long_and_comes_back_to_where_it_was(seam: Any) -> None:
     points, openings = seam()
     surface = WorkSurface(points, openings)
@@ -86,7 +86,7 @@ def test_a_circle_turns_in_the_surface_by_its_part_of_the_curvature() -> None:
     assert bends == pytest.approx([np.cos(np.pi / 4) / 0.06] * 9, rel=5e-3)
 
 
-@SEAMS
+@pytest.mark.parametrize("seam", SEAMS)
 def test_the_tool_stands_on_the_surface_with_tip_and_torch_on_the_seam(seam: Any) -> None:
     points, openings = seam()
     surface, body = WorkSurface(points, openings), body_from(TOLD.torch_from_tip, 0.0, 0.0)
@@ -111,7 +111,7 @@ def test_the_tool_stands_on_the_surface_with_tip_and_torch_on_the_seam(seam: Any
         assert up @ tool.up(flange.rotation) > np.cos(np.radians(30.0))
 
 
-@SEAMS
+@pytest.mark.parametrize("seam", SEAMS)
 def test_the_tip_goes_as_it_is_told_and_the_tool_stays_as_it_is_to_stand(seam: Any) -> None:
     surface = WorkSurface(*seam())
     tool, path = Tool(TOLD, surface), surface.path
@@ -163,7 +163,7 @@ def test_the_torch_keeps_to_a_seam_that_bends_out_of_every_plane(
     frame = SimulatedFinger.frame
 
     def watched(self: SimulatedFinger) -> Any:
-        where.append(room.true_flange(self._robot.state()).apply(torch))
+        where.append(bench.true_flange(self._robot.state()).apply(torch))
         return frame(self)
 
     monkeypatch.setattr(SimulatedFinger, "frame", watched)

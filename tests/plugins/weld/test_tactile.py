@@ -134,14 +134,14 @@ def test_a_seam_too_curved_for_the_tool() -> None:
     assert "deg to it, allowed are 60; end the plan before the bend, or take a tool" in told
 
 
-def test_a_seam_that_leaves_its_plane() -> None:
+def test_a_seam_that_bends_out_of_its_surface() -> None:
     seam = planned("v-straight", end=SHORT)
-    steep = np.array(seam.points_in_base)
-    steep[:, 2] += np.linspace(0, 0.02, len(steep))
-    up = np.tile([0.0, 0.0, 1.0], (len(steep), 1))
-    assert "the seam leaves its plane: it climbs by 19 deg" in refused(
-        Seam(steep, up, seam.covariance)
-    )
+    hump = np.array(seam.points_in_base)
+    turn = np.linspace(-1.0, 1.0, len(hump))
+    hump[:, 2] += 0.03 * (np.cos(turn) - 1.0)
+    hump[:, :2] = hump[:, :2].mean(axis=0) + 0.03 * np.outer(np.sin(turn), [1.0, 0.0])
+    told = refused(Seam(hump, seam.openings_in_base, seam.covariance))
+    assert "the seam bends out of its surface so much" in told and "allowed are 30" in told
 
 
 def test_a_plan_too_uncertain_to_search() -> None:
