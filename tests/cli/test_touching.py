@@ -11,8 +11,8 @@ import pytest
 import yaml
 
 from flangeye import types as t
-from flangeye.cli import hardware
-from flangeye.cli.hardware import touch_points
+from flangeye.cli import touching
+from flangeye.cli.touching import touch_points
 from flangeye.log.read import read_run
 from flangeye_plugins.verify.touch import TouchParams, verify_touch
 from tests.motion.test_touching import Cell, points
@@ -31,7 +31,7 @@ def test_the_step_it_writes_says_what_it_said(
     truth = points(Cell([]))
     wrong = np.array([0.8e-3, 0.0, 0.0])
     cell = Cell(list(truth))
-    monkeypatch.setattr(hardware, "_toucher", lambda recipe, tip, ask: cell.toucher())
+    monkeypatch.setattr(touching, "_toucher", lambda recipe, tip, ask: cell.toucher())
     inverse = calibration.base_T_camera.transform.inverse()
     seen = [", ".join(f"{x!r} m" for x in inverse.apply(p).tolist()) for p in truth + wrong]
     given = (seen, "0 mm, 0 mm, 150 mm")

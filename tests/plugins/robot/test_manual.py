@@ -240,7 +240,7 @@ def test_a_pose_without_an_explanation_is_only_described() -> None:
 
 def test_piped_standard_input_works() -> None:
     code = (
-        "from flangeye.models.model import load_model\n"
+        "from flangeye.models.loading import load_model\n"
         "from flangeye_plugins.robot.manual import ManualParams, robot_manual\n"
         "model = load_model('robots', 'aubo-i5')\n"
         "with robot_manual(model, ManualParams(convention='abb')) as robot:\n"
