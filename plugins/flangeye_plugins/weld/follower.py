@@ -15,15 +15,12 @@ from flangeye.types import Floats
 from flangeye_plugins.weld.belief import Learned
 from flangeye_plugins.weld.contact import LOST, STRAINED, STRIDE
 from flangeye_plugins.weld.response import Response
-from flangeye_plugins.weld.sensing import SURE, SeamEstimate, SeamReading, Sensing
+from flangeye_plugins.weld.sensing import SeamEstimate, SeamReading, Sensing
 from flangeye_plugins.weld.settings import INSIDE
 from flangeye_plugins.weld.steering import SLOWEST, TorchLead
 from flangeye_plugins.weld.task import ResumePoint, WeldTask
 from flangeye_plugins.weld.tip import Pressing, Progress, within
 from flangeye_plugins.weld.welding import Welding
-
-OVER = 1e-3
-"""So far above where it rests in the seam the tip goes back into it [m]."""
 
 WAITING = 0.2
 """Share of its speed that it keeps all the same: a wall that has ended is found out by going on."""
@@ -178,7 +175,7 @@ class Follower:
             elif self.seam.contact.free < 0.5:
                 sensing.smooth(found.seam, self.seam.refined.noise)
                 self._stop(self.seam.moved(found))
-            self.seam.keep(touch.time - SURE)
+            self.seam.keep(touch.time - self.task.settings.sure)
 
     @property
     def _silence(self) -> float:
@@ -370,7 +367,10 @@ class Follower:
             self.progress.advance(pose, coming)
             return
         self.progress.back(pose, coming)
-        contact, lost = self.seam.contact, self.seam.lost_for(self.now or 0.0) > SURE
+        contact, lost = (
+            self.seam.contact,
+            self.seam.lost_for(self.now or 0.0) > self.task.settings.sure,
+        )
         # Where the joint is felt farther back than the seam may begin, it goes on there.
         on = contact.at < -self.task.beyond - INSIDE and self.seam.bears
         if lost or on:
@@ -382,7 +382,9 @@ class Follower:
         """Return the tip's speed along the seam: less where blind or crooked."""
         if self.phase == "seeking" or self.welding.striking.stands(pose.time):
             return 0.0
-        if self.phase == "entering" and (self._inside or self._over(pose) < 0.5 * OVER):
+        if self.phase == "entering" and (
+            self._inside or self._over(pose) < 0.5 * self.task.settings.over
+        ):
             return 0.0
         settings, silence = self.task.settings, self._silence
         sight = 1.0
@@ -413,7 +415,7 @@ class Follower:
 
     def _backwards(self) -> float:
         """Return the speed at which the tip goes back, so as not to go far beyond the start."""
-        return INSIDE / max(2.0 * self._delay, SURE)
+        return INSIDE / max(2.0 * self._delay, self.task.settings.sure)
 
     def _firmness(self) -> float:
         """Return the share of its speed that the tip may keep by how firmly it is on the wall.
@@ -453,7 +455,7 @@ class Follower:
         settings = self.task.settings
         preload = settings.preload if self.task.touch else 0.0
         if self.phase == "entering" and not self._inside:
-            preload = -OVER
+            preload = -settings.over
         return within(-settings.height_gain * (self._over(pose) + preload), settings.lateral_speed)
 
     def _over(self, pose: ToolPose) -> float:

@@ -22,9 +22,6 @@ from flangeye_plugins.weld.settings import INSIDE
 from flangeye_plugins.weld.task import WeldTask
 from flangeye_plugins.weld.tip import Pressing, Progress
 
-SURE = 0.3
-"""A sample is believed when contact has not been doubted for so long after it [s]."""
-
 STEADY = 0.03e-3
 """A finger that scatters less is followed from one measurement to the next [m]."""
 
@@ -309,7 +306,11 @@ class SeamEstimate:
 
     def leave(self, phase: Phase, now: float) -> None:
         """Take it that the seam ends where the tip fell off it, if it may end there."""
-        if self.end is not None or phase != "ending" or self.lost_for(now) <= SURE:
+        if (
+            self.end is not None
+            or phase != "ending"
+            or self.lost_for(now) <= self._task.settings.sure
+        ):
             return
         task, at = self._task, self._fell_at()
         if at is None or task.settings.ends is None or not task.belief.two_walls:

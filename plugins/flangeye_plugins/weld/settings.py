@@ -59,6 +59,10 @@ class Following(Params):
     astray: ClassVar[float] = 20e-3
     wander: ClassVar[float] = 0.3e-3
     torch_height: ClassVar[float] = 8e-3
+    # A sample is believed when contact has not been doubted for so long after it [s]. A tip that
+    # fell off the start goes back into the seam so far above where it rested [m].
+    sure: ClassVar[float] = 0.3
+    over: ClassVar[float] = 1e-3
     # Standard deviation of the walls' angles [rad].
     joint_sigma: ClassVar[float] = math.radians(1.0)
 
