@@ -219,7 +219,9 @@ class Follower:
             seam.contact.seat(self.sensing.seen, self.wanted, preload)
             self.phase = "following"
             return
-        fell = seam.lost is not None and not seam.bears and self._over(pose) < -0.9 * preload
+        # Images are late: it may rest there already.
+        hangs = not seam.bears and seam.contact.compression < preload / 3.0
+        fell = seam.lost is not None and hangs and self._over(pose) < -0.9 * preload
         room = pressing.most + pressing.feeler(seam.refined.variance(self.tip))
         aside = self.side * (self.progress.lateral(pose) - seam.refined.offset(self.tip))
         if fell or aside > room:
