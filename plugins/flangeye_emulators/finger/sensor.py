@@ -159,8 +159,9 @@ class SimulatedFinger(Device):
         """Return the torch (3,) rolled out, from where it is in the plane tangential at the tip."""
         surface = self._surface
         in_base = surface.unrolled(tip[None])[0]
-        beside = surface.at(surface.foot(in_base))
-        near = surface.foot(in_base) + float((torch - tip)[:2] @ beside.place.tangent)
+        s = surface.foot(in_base)
+        beside = surface.at(s)
+        near = s + float((torch - tip)[:2] @ beside.place.tangent)
         in_base = in_base + beside.unrolled(torch - tip)
         return surface.rolled(in_base, surface.foot(in_base, near))
 

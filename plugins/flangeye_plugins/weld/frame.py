@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
+from scipy.spatial import KDTree
 
 from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.models.finger import Finger, FingerGeometry
@@ -113,7 +114,7 @@ class WorkSurface:
         width = max(1, round(CHORD / self.path.step))
         up = uniform_filter1d(_interpolated(ticks, along, openings), width, 0, mode="nearest")
         self._rows: Floats = np.hstack([line, ahead, up])
-        self._plain = self._rows.tolist()
+        self._plain, self._nearest = self._rows.tolist(), KDTree(self.path.points[:, :2])
 
     def line(self, s: Floats) -> tuple[Floats, Floats]:
         """Return points (K, 3) at arc lengths (K,), and axes (K, 3, 3) there, as columns.
@@ -193,8 +194,7 @@ class WorkSurface:
 
     def unrolled(self, points: Floats) -> Floats:
         """Return points (K, 3) of the plane, in base."""
-        away = np.linalg.norm(points[:, None, :2] - self.path.points[None, :, :2], axis=2)
-        s = away.argmin(axis=1) * self.path.step
+        s = self._nearest.query(points[:, :2])[1] * self.path.step
         there, tangents = self.path.evaluate(s)
         s = s + np.einsum("ki,ki->k", points[:, :2] - there[:, :2], tangents)
         there, tangents = self.path.evaluate(s)
