@@ -75,7 +75,9 @@ def try_condition(
     passes = 1 + len(settings.passes)
     controller = controller_of(plan, belief, settings, "tactile")
     watch(controller)
-    nominal = Nominal(true, section, Tip(), body.level_R_tool.T @ body.torch, body.level_R_tool)
+    nominal = Nominal(
+        Path(true), section, Tip(), body.level_R_tool.T @ body.torch, body.level_R_tool
+    )
     start = start_at(plan, belief, settings, period)
     start = replace(start, longest=120.0 * passes, look=condition.look)
     return run_trial(controller, nominal, condition.truth, start, seed)
@@ -91,15 +93,14 @@ def could_be_welded(condition: Condition, seed: int, length: float, period: floa
     body = built_for(settings)
     section, belief = known(condition, body, settings)
     torch = body.level_R_tool.T @ body.torch
-    nominal = Nominal(curved(length), section, Tip(), torch, body.level_R_tool)
-    seam = WeldWorld(nominal, condition.truth, [seed, 0]).groove.root.points
+    nominal = Nominal(Path(curved(length)), section, Tip(), torch, body.level_R_tool)
+    plan = WeldWorld(nominal, condition.truth, [seed, 0]).groove.root
     arm = replace(condition.truth.arm, wave=0.0, scale=0.0, sag=0.0)
-    plan = Path(seam)
     controller = Follower(WeldTask(plan, belief, settings, touch=False))
     truth = WeldTruth(arm)
     controller.arm.dead_time, controller.arm.lag = truth.arm.dead_time, truth.arm.lag
     start = start_at(plan, belief, settings, period)
-    trial = run_trial(controller, replace(nominal, seam=seam), truth, start, seed)
+    trial = run_trial(controller, replace(nominal, seam=plan), truth, start, seed)
     s, off = trial.column("torch_s"), np.abs(trial.column("torch"))
     beside = (s > 0.0) & (s < trial.length)
     return trial.done and bool((off[beside] <= settings.max_error).mean() >= 0.99)

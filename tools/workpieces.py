@@ -1,4 +1,4 @@
-"""The sample workpieces: plates with a V-groove, straight and curved, and the files they ship as.
+"""The sample workpieces: V-grooves, straight, curved and round, a T-joint, and their files.
 
 ``python -m tools.workpieces data/workpieces`` makes the files again.
 """
@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 import yaml
 from numpy.typing import NDArray
 
@@ -157,7 +158,7 @@ def write_files(folder: Path) -> None:
 def samples() -> Mapping[str, tuple[Mesh, str]]:
     """Return each sample's surface and YAML file, by name."""
     plates = {plate.name: (plate.mesh(), _description(plate)) for plate in PLATES}
-    return {**plates, "fillet": (t_joint(), _fillet())}
+    return {**plates, "fillet": (t_joint(), _fillet()), "v-ring": (round_cover(), _ring())}
 
 
 def t_joint() -> Mesh:
@@ -181,6 +182,30 @@ def _fillet() -> str:
     return _yaml("T-joint of two plates of 10 mm", "fillet", seam)
 
 
+RING, COVER = 0.06, 0.11
+"""Radius of a round V-groove, and of the cover that it is in, about the origin [m]."""
+AROUND = 120
+"""Points about it: chords miss the circle by 0.02 mm."""
+
+
+def round_cover() -> Mesh:
+    """Return a round cover that is to be welded into its ring."""
+    half = DEPTH * np.tan(HALF_ANGLE)
+    profile = [
+        [0.0, 0.0], [COVER, 0.0], [COVER, HEIGHT], [RING + half, HEIGHT],
+        [RING, HEIGHT - DEPTH], [RING - half, HEIGHT], [0.0, HEIGHT],
+    ]  # fmt: skip
+    cover = trimesh.creation.revolve(profile, sections=AROUND)
+    return Mesh(np.asarray(cover.vertices), np.asarray(cover.faces, dtype=np.int32))
+
+
+def _ring() -> str:
+    angle = np.linspace(0.0, 2 * np.pi, AROUND + 1)
+    flat = np.zeros(len(angle))
+    points = np.column_stack([RING * np.cos(angle), RING * np.sin(angle), flat + HEIGHT - DEPTH])
+    return _yaml("Cover with a round V-groove", "v-ring", _groove(points))
+
+
 def write_stl(path: Path, mesh: Mesh) -> None:
     """Write triangles as binary STL, in millimetres."""
     corners = mesh.vertices[mesh.triangles] * 1000.0
@@ -194,14 +219,17 @@ def write_stl(path: Path, mesh: Mesh) -> None:
 
 
 def _description(plate: Plate) -> str:
-    seam = {
+    return _yaml(plate.title, plate.name, _groove(plate.seam()))
+
+
+def _groove(points: Floats) -> dict[str, Any]:
+    return {
         "name": "groove",
-        "points": [[round(float(1e3 * v), 6) for v in point] for point in plate.seam()],
+        "points": [[round(float(1e3 * v), 6) for v in point] for point in points],
         "opening": [0, 0, 1],
         "half_angle": f"{np.degrees(HALF_ANGLE):.6g} deg",
         "half_width": f"{1e3 * DEPTH * np.tan(HALF_ANGLE):.6g} mm",
     }
-    return _yaml(plate.title, plate.name, seam)
 
 
 def _yaml(title: str, name: str, seam: Mapping[str, Any]) -> str:

@@ -138,7 +138,7 @@ def run(  # noqa: PLR0913  one for each option
         with _plan_as_json() if json_ else nullcontext():
             result = _record(checked, recipe or checked.name, registry, folder, start)
         if result.status == "refused":
-            _explain_refusal(folder.log, registry, result, checked)
+            _explain_refusal(folder.log, registry, result, checked, recipe or checked.name)
     if result.status == "refused" or (result.weld and not result.weld.completed):
         raise typer.Exit(1)
 
@@ -159,8 +159,10 @@ def _refuse(options: object, why: str) -> None:
         raise StageError(why)
 
 
-def _explain_refusal(log: Path, registry: Registry, result: Result, recipe: Recipe) -> None:
-    """Print a refusal in three parts; the doctor looks for the mistake behind it."""
+def _explain_refusal(
+    log: Path, registry: Registry, result: Result, recipe: Recipe, called: str
+) -> None:
+    """Print a refusal in three parts; the doctor looks for a calibration's mistake behind it."""
     from rich.console import Console
 
     from flangeye.cli.summary import print_refusal
@@ -168,6 +170,12 @@ def _explain_refusal(log: Path, registry: Registry, result: Result, recipe: Reci
     from flangeye.files.elsewhere import with_urls
 
     wrong = str(result.refused)
+    after = _after_verification(recipe)
+    if wrong.split(":")[0] in after:
+        again = f"flangeye run {quote(called)} --from {quote(str(log))} --at {after[0]}"
+        known = "by what the step measured; the calibration before it was accepted"
+        print_refusal(Console(), wrong, known, [with_urls(again)])
+        return
     doctor = with_urls(f"flangeye doctor {log}")
     finding = _first_finding(log, registry, recipe)
     if finding:
@@ -180,6 +188,13 @@ def _explain_refusal(log: Path, registry: Registry, result: Result, recipe: Reci
         known = "poses that took no part disagree with it; " + known
     more = "add poses turned by 20 deg or more; the arm itself may be off"
     print_refusal(Console(), wrong, known, [doctor, more] if result.holdout else [doctor])
+
+
+def _after_verification(recipe: Recipe) -> list[str]:
+    """Return the names of the steps that use a calibration: those after its last verification."""
+    names = [step.stage.name for step in recipe.steps]
+    verified = [i for i, name in enumerate(names) if name.startswith("verify.")]
+    return names[verified[-1] + 1 :] if verified else []
 
 
 def _first_finding(log: Path, registry: Registry, recipe: Recipe) -> Finding | None:

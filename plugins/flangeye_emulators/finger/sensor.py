@@ -30,7 +30,7 @@ from flangeye_emulators.weld_world.world import Nominal, Shutter, WeldWorld
 from flangeye_emulators.world import bench
 from flangeye_emulators.world.bench import LaidParams
 from flangeye_plugins.weld.corners import corners_of
-from flangeye_plugins.weld.frame import Tool, WorkSurface
+from flangeye_plugins.weld.frame import Tool, WorkSurface, rolled_out
 from flangeye_plugins.weld.touch.tag_observation import dictionary_of
 
 
@@ -92,7 +92,7 @@ class SimulatedFinger(Device):
         )
         self._started: int | None = None
         self._mark: Floats | None = None
-        self._torch: list[tuple[float, Floats]] = []
+        self._torch: list[tuple[float, Floats, float]] = []
 
     def frame(self) -> SensorFrame | None:
         """Let the tip settle where the arm now is, and return an image that has arrived, if any.
@@ -108,7 +108,7 @@ class SimulatedFinger(Device):
             raise DeviceError(f"{self.name}: the camera is lost")
         pose = self.tool.pose(bench.true_flange(state), now)
         shown = self._shown(pose, bench.true_flange(state))
-        self._torch.append((now, self._beside_plan()))
+        self._torch.append((now, *self._beside_plan()))
         if self._shutter.due(age):
             # A tag that something covers: it is as if it were far out of the image.
             hidden = self._shutter.hidden(age)
@@ -125,19 +125,23 @@ class SimulatedFinger(Device):
         moves: what scores it knows the planned one.
         """
         known = list(self._torch)  # in one go: a thread that reads images may add to it
-        times = np.array([time for time, _ in known])
-        torch = np.array([place for _, place in known]).reshape(-1, 3)
-        return times, self._surface.unrolled(torch)
+        times, near = (np.array([each[i] for each in known]) for i in (0, 2))
+        torch = np.array([place for _, place, _ in known]).reshape(-1, 3)
+        return times, self._surface.unrolled(torch, near)
 
-    def _beside_plan(self) -> Floats:
-        """Return the torch (3,) less what the true seam is off the planned one beside it [m]."""
+    def _beside_plan(self) -> tuple[Floats, float]:
+        """Return the torch (3,) less what the true seam is off the planned one beside it [m].
+
+        And where on the planned one that is, by arc length [m].
+        """
         world = self.world
         true = world.groove.root.at(world.torch_s)
         across = float((world.torch[:2] - true.point) @ true.normal)
         seam = true.point + (across - world.off) * true.normal  # heat has moved it there
-        planned = self._planned.at(self._planned.foot(seam, world.torch_s))
+        s = self._planned.foot(seam, world.torch_s)
+        planned = self._planned.at(s)
         off = np.array([*(seam - planned.point), true.height - planned.height])
-        return np.asarray(world.torch - off)
+        return np.asarray(world.torch - off), s
 
     def close(self) -> None:
         """Nothing to let go of."""
@@ -158,8 +162,9 @@ class SimulatedFinger(Device):
     def _rolled_out(self, tip: Floats, torch: Floats) -> Floats:
         """Return the torch (3,) rolled out, from where it is in the plane tangential at the tip."""
         surface = self._surface
-        in_base = surface.unrolled(tip[None])[0]
-        s = surface.foot(in_base)
+        before = self.world.contact.s
+        in_base = surface.unrolled(tip[None], np.array([before]))[0]
+        s = surface.foot(in_base, before)
         beside = surface.at(s)
         near = s + float((torch - tip)[:2] @ beside.place.tangent)
         in_base = in_base + beside.unrolled(torch - tip)
@@ -179,15 +184,15 @@ def _as_planned(finger: ToolFile, params: SimulatedFingerParams) -> tuple[WorkSu
     pose = params.base_T_part
     points = seam.points @ pose[:3, :3].T + pose[:3, 3]
     openings = seam.openings @ pose[:3, :3].T
-    surface = WorkSurface(points, openings)
     if params.leg is not None:
-        corners = [corner.point for corner in corners_of(surface.points)]
+        corners = [corner.point for corner in corners_of(rolled_out(points, openings))]
         bounds = [0, *corners, len(points) - 1]
         kept = slice(bounds[params.leg - 1], bounds[params.leg] + 1)
-        surface = WorkSurface(points[kept], openings[kept])
+        points, openings = points[kept], openings[kept]
+    surface = WorkSurface(points, openings)
     tip = Tip(finger.radius, finger.lateral, finger.axial)
     section = _section(seam, params)
-    return surface, Nominal(surface.points, section, tip, finger.torch_from_tip, np.eye(3))
+    return surface, Nominal(surface.path, section, tip, finger.torch_from_tip, np.eye(3))
 
 
 def _section(seam: CadSeam, params: SimulatedFingerParams) -> GrooveSection:

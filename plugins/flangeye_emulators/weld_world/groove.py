@@ -162,7 +162,7 @@ class TipContact:
         """
         root = self._groove.root
         self._s = root.foot(rest[:2], self._s)
-        if not 0.0 <= self._s <= root.length:
+        if not root.first <= self._s <= root.last:
             return self._free(rest)
         place = root.at(self._s)
         fill, aside, wider = self._groove.relief.at(self._s)

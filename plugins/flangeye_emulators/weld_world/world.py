@@ -41,14 +41,14 @@ class Nominal:
     """What the files say, which the world differs from.
 
     Attributes:
-        seam: (N, 3) the CAD's, in the plane of the work [m].
+        seam: The CAD's, in the plane of the work.
         section: The CAD's.
         tip: The finger's.
         torch: (3,) from the tip to the torch, in the tool's axes [m].
         level_R_tool: (3, 3) how the tool stands: its axes in level ones.
     """
 
-    seam: Floats
+    seam: Path
     section: GrooveSection
     tip: Tip
     torch: Floats
@@ -198,17 +198,17 @@ def _follow(behind: Floats, ahead: Floats, half: float) -> Floats:
 
 
 def true_groove(
-    points: Floats, section: GrooveSection, truth: WorkpieceTruth, rng: np.random.Generator
+    seam: Path, section: GrooveSection, truth: WorkpieceTruth, rng: np.random.Generator
 ) -> Groove:
     """Return the groove that is really there.
 
     Args:
-        points: (N, 3) of the CAD's seam in the plane of the work, with its height [m].
+        seam: The CAD's in the plane of the work, with its height.
         section: The CAD's.
         truth: What differs.
         rng: Draws spatter, and where waves begin.
     """
-    root = _wandered(Path(points), truth, rng.uniform(0.0, 2 * np.pi))
+    root = _wandered(seam, truth, rng.uniform(0.0, 2 * np.pi))
     real = GrooveSection(
         section.half_angle + truth.half_angle, section.depth, section.lean + truth.lean
     )
@@ -218,12 +218,14 @@ def true_groove(
 def _wandered(path: Path, truth: WorkpieceTruth, phase: float) -> Path:
     if not (truth.wave or truth.bow):
         return path
-    s = np.linspace(0.0, path.length, len(path.points))
-    aside = truth.wave * np.sin(2 * np.pi * s / truth.wave_length + phase)
-    aside += truth.bow * np.sin(np.pi * s / path.length)
+    s = np.linspace(path.first, path.last, len(path.points))
+    waves = path.length / truth.wave_length
+    waves = max(round(waves), 1) if path.closed else waves  # around, it comes back to itself
+    aside = truth.wave * np.sin(2 * np.pi * waves * s / path.length + phase)
+    aside += truth.bow * np.sin(np.pi * np.mod(s, path.length) / path.length)
     points = path.points.copy()
     points[:, :2] += aside[:, None] * np.stack([-path.tangents[:, 1], path.tangents[:, 0]], axis=1)
-    return Path(points)
+    return Path(points, -path.first)
 
 
 def _relief(

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from flangeye import CalibrationRefused, StageError, stage
@@ -31,9 +32,9 @@ from flangeye_plugins.seam.planned import (
     refuse_outside,
 )
 from flangeye_plugins.seam.points import facing_camera
-from flangeye_plugins.seam.rough import Course, JointPlace, course, rough_path
+from flangeye_plugins.seam.rough import Course, JointPlace, Spline, course, rough_path
 from flangeye_plugins.seam.stitched import PlacedScan, seen_in_base
-from flangeye_plugins.seam.sweep import WIDE, Spline, Swept, fitted, swept_from
+from flangeye_plugins.seam.sweep import WIDE, Swept, fitted, swept_from
 from flangeye_plugins.seam.template import EDGES, FACES, JOINTS, JointShape
 
 STAGE = "seam.joint"
@@ -191,11 +192,11 @@ def _found(seen: PlacedScan, rough: Course, params: JointParams) -> Found:
     most_fitted = 400_000
     pitch, points = _solid(points[at[:: -(-len(at) // most_fitted)]])
     at, local = rough.local(points, box)
-    points = points[at]
-    places = _placed(rough, local, points, params)
-    swept = swept_from(places, rough.length, rough.closed)
-    line = rough
-    rays = Rays(seen.eyes, seen.clouds, rough.points)
+    # What is near to a rough line's corners lies askew to it; the second line has none.
+    line = rough.through(_placed(rough, local, points[at], params))
+    at, local = line.local(points, box)
+    swept = swept_from(_placed(line, local, points[at], params), line.length, line.closed)
+    rays = Rays(seen.eyes, seen.clouds, line.points)
     found = Found(line, swept, local, pitch, rays, (0.0, line.length))
     # The second and third time along the line that the first has found
     refits = 3
@@ -327,7 +328,7 @@ def _judged(found: Found, params: JointParams) -> dict[str, float]:
     Raises:
         CalibrationRefused: Says which figure, and its limit.
     """
-    explained, coverage = _shares(found)
+    explained, coverage, astray = _shares(found)
     start, stop = found.ends
     s = np.linspace(start, stop, 50)
     deviation = float(np.sqrt(np.linalg.eigvalsh(found.swept.line_covariance(s)).max()))
@@ -343,7 +344,7 @@ def _judged(found: Found, params: JointParams) -> dict[str, float]:
     ]
     for value, limit, what, name in limits:
         if not value <= limit:
-            told = what.format(f"{value * 1e3:.2g} mm")
+            told = what.format(f"{value * 1e3:.3g} mm")
             raise CalibrationRefused(f"{STAGE}: {told}, limit {limit * 1e3:g} mm{name}")
     _refuse_plane(found)
     leaning = np.abs(found.swept.section.shape[:4]) - 3 * np.radians(JOINTS[params.joint].spread)
@@ -363,6 +364,12 @@ def _judged(found: Found, params: JointParams) -> dict[str, float]:
                 f"{STAGE}: this is no {params.joint} joint: {value:.0%} {what}, at least 60% are "
                 "needed"
             )
+    if astray is not None:
+        raise CalibrationRefused(
+            f"{STAGE}: from {astray[0] * 1e3:.0f} to {astray[1] * 1e3:.0f} mm along it most points "
+            f"are not on the {params.joint} joint that was found; give more rough points there, or "
+            "end the line before"
+        )
     return {
         "residual": found.swept.sigma,
         "registration": deviation,
@@ -397,20 +404,40 @@ def _refuse_plane(found: Found) -> None:
         )
 
 
-def _shares(found: Found) -> tuple[float, float]:
-    """Return the share of points about the seam that are on it, and of its length that is seen."""
+def _shares(found: Found) -> tuple[float, float, tuple[float, float] | None]:
+    """Return the share of points about the seam that are on it, and of its length that is seen.
+
+    And from where to where most points are on something else [m]; None for nowhere.
+    """
     swept, local = found.swept, found.local
     q = swept.in_section(local)
     away, _ = swept.section.distances(q)
     inside = (local[:, 0] > found.ends[0]) & (local[:, 0] < found.ends[1])
     near = inside & (np.linalg.norm(q, axis=1) < WIDE / 2 + swept.section.shape[4:].max())
-    explained = float((np.abs(away[near]) < 5 * swept.sigma).mean()) if near.any() else 0.0
+    on_joint = near & (np.abs(away) < 5 * swept.sigma)
+    explained = float(on_joint.sum() / max(near.sum(), 1))
     # Lengths of the seam that are seen or not [m]
     cells = np.arange(found.ends[0], found.ends[1], 3e-3)
     groups = surfaces(swept, local, 5 * swept.sigma).values()
     counts = [np.histogram(local[on, 0], cells)[0] for on in groups]
     seen = np.all(np.array(counts) >= 4, axis=0)
-    return explained, float(np.mean(seen)) if len(cells) > 1 else 0.0
+    every, good = (np.histogram(local[which, 0], cells)[0] for which in (near, on_joint))
+    off = _longest_run((every >= 20) & (good < every / 2))
+    # A crossing seam, or a clamp, is shorter [m]
+    short = 20e-3
+    astray = cells[off.start] - cells[0], cells[off.stop] - cells[0]
+    coverage = float(np.mean(seen)) if len(cells) > 1 else 0.0
+    return explained, coverage, astray if astray[1] - astray[0] > short else None
+
+
+def _longest_run(flags: NDArray[np.bool_]) -> slice:
+    """Return where the longest run of true ones among (N,) is."""
+    steps = np.diff(np.concatenate([[0], flags.astype(int), [0]]))
+    starts, stops = np.flatnonzero(steps > 0), np.flatnonzero(steps < 0)
+    if not len(starts):
+        return slice(0, 0)
+    k = int(np.argmax(stops - starts))
+    return slice(int(starts[k]), int(stops[k]))
 
 
 def _notes(found: Found, params: JointParams) -> tuple[str, ...]:

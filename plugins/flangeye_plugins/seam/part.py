@@ -47,7 +47,8 @@ class CadPart:
     def beyond_edges(self, rng: np.random.Generator, by: float) -> Oriented:
         """Return points ``by`` [m] beyond the outer edges of faces, in the plane of each face.
 
-        There the surface has ended: a scan that goes on was taken of something larger.
+        There the surface has ended: a scan that goes on was taken of something larger. Where one
+        body stands on another it goes on, and nothing is returned.
         """
         starts, ends, normals, outwards = self._outer_edges
         lengths = np.linalg.norm(ends - starts, axis=1)
@@ -57,7 +58,8 @@ class CadPart:
         chosen = rng.choice(len(lengths), size=count, p=lengths / lengths.sum())
         along = rng.random((count, 1))
         points = starts[chosen] + along * (ends - starts)[chosen] + by * outwards[chosen]
-        return Oriented(points, normals[chosen])
+        away = np.linalg.norm(points - self.nearest(points).points, axis=1)
+        return Oriented(points, normals[chosen]).take(away > by / 2)
 
     @cached_property
     def _outer_edges(self) -> tuple[Floats, Floats, Floats, Floats]:

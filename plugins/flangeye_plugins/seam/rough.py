@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -251,6 +251,62 @@ def _jump(first: JointPlace, second: JointPlace, slabs: int) -> float:
 
 
 @dataclass(frozen=True, eq=False)
+class Spline:
+    """Cubic B-splines of several numbers over a line.
+
+    Attributes:
+        length: Of the line [m].
+        closed: Whether it comes back to its start.
+        values: (m, k) coefficients.
+    """
+
+    length: float
+    closed: bool
+    values: Floats
+
+    @classmethod
+    def through(cls, length: float, closed: bool, s: Floats, values: Floats) -> Spline:
+        """Return the smooth line nearest to values (N, k) at s [m]."""
+        # Between the knots of the line [m]
+        knots = 30e-3
+        count = max(round(length / knots), 8 if closed else 1) + (0 if closed else 3)
+        empty = cls(length, closed, np.zeros((count, 3)))
+        design = empty.basis(s).toarray()
+        bends = empty.bends()
+        normal = design.T @ design + 0.01 * bends.T @ bends + 1e-9 * np.eye(count)
+        return replace(empty, values=np.linalg.solve(normal, design.T @ values))
+
+    def basis(self, s: Floats) -> Any:
+        """Return the sparse (N, m) basis at s [m]."""
+        from scipy import sparse
+        from scipy.interpolate import BSpline
+
+        count = len(self.values)
+        pieces = count if self.closed else count - 3
+        knots = np.arange(-3, pieces + 4) * (self.length / pieces)
+        inside = np.clip(s, 0.0, self.length * (1 - 1e-12))
+        design = BSpline.design_matrix(inside, knots, 3)
+        if not self.closed:
+            return design
+        fold = sparse.eye(pieces + 3, format="lil")[:, :pieces]
+        for k in range(3):
+            fold[pieces + k, k] = 1.0
+        return design @ fold.tocsr()
+
+    def bends(self) -> Floats:
+        """(k, m) second differences of the coefficients."""
+        count = len(self.values)
+        if self.closed:
+            eye = np.eye(count)
+            return np.asarray(np.roll(eye, 1, 0) - 2 * eye + np.roll(eye, -1, 0))
+        return np.asarray(np.diff(np.eye(count), 2, axis=0))
+
+    def at(self, s: Floats) -> Floats:
+        """Return (N, k) values at s [m]."""
+        return np.asarray(self.basis(s) @ self.values)
+
+
+@dataclass(frozen=True, eq=False)
 class Course:
     """Frames along a line.
 
@@ -317,6 +373,18 @@ class Course:
         points = self.points + y[:, None] * self.axes[:, 1] + z[:, None] * self.axes[:, 2]
         out = np.cos(roll)[:, None] * self.axes[:, 2] + np.sin(roll)[:, None] * self.axes[:, 1]
         return _with_openings(points, out, self.closed, self.eyes)
+
+    def through(self, places: Sequence[JointPlace]) -> Course:
+        """Return frames along a smooth line near to the places of a joint."""
+        s = np.array([place.s for place in places])
+        origin, axes = self.at(s)
+        aside = np.array([place.q for place in places])
+        roll = np.array([place.roll for place in places])[:, None]
+        points = origin + np.einsum("ni,nij->nj", aside, axes[:, 1:])
+        out = np.cos(roll) * axes[:, 2] + np.sin(roll) * axes[:, 1]
+        smooth = np.hstack([points, out])
+        led = Spline.through(self.length, self.closed, s, smooth).at(self.s)
+        return _with_openings(led[:, :3], led[:, 3:], self.closed, self.eyes)
 
 
 def course(line: Floats, eyes: Floats, closed: bool, beyond: float) -> Course:

@@ -14,67 +14,11 @@ import numpy as np
 
 from flangeye.maths.statistics import SIGMA_OF_MAD
 from flangeye.types import Floats, Indices
-from flangeye_plugins.seam.rough import JointPlace, turn
+from flangeye_plugins.seam.rough import JointPlace, Spline, turn
 from flangeye_plugins.seam.template import OFFSETS, Section
 
 WIDE = 18e-3
 """From a face's end, what of it takes part [m]: plates are flat so far."""
-
-
-@dataclass(frozen=True, eq=False)
-class Spline:
-    """Cubic B-splines of y, z and roll over a line.
-
-    Attributes:
-        length: Of the line [m].
-        closed: Whether it comes back to its start.
-        values: (m, 3) coefficients.
-    """
-
-    length: float
-    closed: bool
-    values: Floats
-
-    @classmethod
-    def through(cls, length: float, closed: bool, s: Floats, values: Floats) -> Spline:
-        """Return the smooth line nearest to values (N, 3) at s [m]."""
-        # Between the knots of the line [m]
-        knots = 30e-3
-        count = max(round(length / knots), 8 if closed else 1) + (0 if closed else 3)
-        empty = cls(length, closed, np.zeros((count, 3)))
-        design = empty.basis(s).toarray()
-        bends = empty.bends()
-        normal = design.T @ design + 0.01 * bends.T @ bends + 1e-9 * np.eye(count)
-        return replace(empty, values=np.linalg.solve(normal, design.T @ values))
-
-    def basis(self, s: Floats) -> Any:
-        """Return the sparse (N, m) basis at s [m]."""
-        from scipy import sparse
-        from scipy.interpolate import BSpline
-
-        count = len(self.values)
-        pieces = count if self.closed else count - 3
-        knots = np.arange(-3, pieces + 4) * (self.length / pieces)
-        inside = np.clip(s, 0.0, self.length * (1 - 1e-12))
-        design = BSpline.design_matrix(inside, knots, 3)
-        if not self.closed:
-            return design
-        fold = sparse.eye(pieces + 3, format="lil")[:, :pieces]
-        for k in range(3):
-            fold[pieces + k, k] = 1.0
-        return design @ fold.tocsr()
-
-    def bends(self) -> Floats:
-        """(k, m) second differences of the coefficients."""
-        count = len(self.values)
-        if self.closed:
-            eye = np.eye(count)
-            return np.asarray(np.roll(eye, 1, 0) - 2 * eye + np.roll(eye, -1, 0))
-        return np.asarray(np.diff(np.eye(count), 2, axis=0))
-
-    def at(self, s: Floats) -> Floats:
-        """(N, 3) y, z [m] and roll [rad] at s."""
-        return np.asarray(self.basis(s) @ self.values)
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,7 @@ import numpy as np
 
 from flangeye.errors import StageError
 from flangeye.types import Floats, Seam
-from flangeye_plugins.weld.frame import WorkSurface
+from flangeye_plugins.weld.frame import rolled_out
 from flangeye_plugins.weld.path import CHORD
 from flangeye_plugins.weld.settings import WeldTactileParams
 
@@ -72,7 +72,7 @@ def leg_of(seam: Seam, params: WeldTactileParams) -> Seam:
         StageError: It has corners and no leg is chosen, or the other way round, or the tool has no
             room beyond one of the leg's ends, or for an arc.
     """
-    corners = corners_of(WorkSurface(seam.points_in_base, seam.openings_in_base).points)
+    corners = corners_of(rolled_out(seam.points_in_base, seam.openings_in_base))
     if params.corner_radius is not None:
         return _rounded(seam, corners, params, params.corner_radius)
     if params.leg is None:

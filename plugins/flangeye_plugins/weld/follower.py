@@ -263,7 +263,7 @@ class Follower:
             sensing.felt, self.pressing.wanted = swept[-1].seam, swept[-1].deflection
         seam.contact.seat(sensing.seen, self.wanted, task.settings.preload)
         self.phase = "following"
-        if task.before is None and task.settings.ends is not None:
+        if task.before is None and task.feels_ends:
             seam.back()
 
     def _finish(self) -> None:

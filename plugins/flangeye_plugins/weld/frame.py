@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
-from scipy.spatial import KDTree
 
 from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.models.finger import Finger, FingerGeometry
@@ -65,6 +64,10 @@ def body_from(torch: Floats, work: float, travel: float) -> LeaningTool:
     return LeaningTool(np.asarray(turn @ leans), np.asarray(turn @ leans @ torch))
 
 
+TOGETHER = 1e-3
+"""A seam whose ends are nearer to each other goes once around [m]."""
+
+
 class Stand(NamedTuple):
     """Where something is on the surface.
 
@@ -94,19 +97,21 @@ class Stand(NamedTuple):
 class WorkSurface:
     """The surface along a seam, and the plane into which it is rolled out.
 
-    The plane's x leads along the seam as a whole, its z out of the work.
+    The plane's x leads along the seam as a whole, its z out of the work. A seam whose ends meet
+    goes once around: the plane goes on beyond both, by half a turn.
 
     Attributes:
-        points: (N, 3) of the seam in the plane, all of height zero [m].
+        points: (N, 3) of the seam in the plane, all of height zero [m]; of one that goes once
+            around with half a turn more at each end.
         path: The seam in the plane.
     """
 
     def __init__(self, points: Floats, openings: Floats) -> None:
         """Take the surface through (N, 3) points of a seam and across its openings (N, 3)."""
-        self.points = _rolled_out(points, openings)
-        self.path = Path(self.points)
-        chords = np.linalg.norm(np.diff(self.points, axis=0), axis=1)
-        along = np.concatenate([[0.0], np.cumsum(chords)])
+        points, openings, wraps = _gone_around(points, openings)
+        self.points = rolled_out(points, openings)
+        self.path = Path(self.points, wraps)
+        along = _along(self.points)
         ticks = self.path.step * np.arange(len(self.path.points), dtype=np.float64)
         line = _interpolated(ticks, along, points)
         ahead = np.gradient(line, self.path.step, axis=0)
@@ -114,21 +119,23 @@ class WorkSurface:
         width = max(1, round(CHORD / self.path.step))
         up = uniform_filter1d(_interpolated(ticks, along, openings), width, 0, mode="nearest")
         self._rows: Floats = np.hstack([line, ahead, up])
-        self._plain, self._nearest = self._rows.tolist(), KDTree(self.path.points[:, :2])
+        self._plain = self._rows.tolist()
 
     def line(self, s: Floats) -> tuple[Floats, Floats]:
         """Return points (K, 3) at arc lengths (K,), and axes (K, 3, 3) there, as columns.
 
-        The seam goes on straight beyond both ends.
+        An open seam goes on straight beyond both ends.
         """
-        inside = np.clip(s, 0.0, self.path.length) / self.path.step
-        index = np.minimum(inside.astype(int), len(self._rows) - 2)
-        share = (inside - index)[:, None]
+        path = self.path
+        inside = np.clip(s, path.first, path.last)
+        ticks = (inside - path.first) / path.step
+        index = np.minimum(ticks.astype(int), len(self._rows) - 2)
+        share = (ticks - index)[:, None]
         row = (1.0 - share) * self._rows[index] + share * self._rows[index + 1]
         ahead = row[:, 3:6] / np.linalg.norm(row[:, 3:6], axis=1)[:, None]
         left = np.cross(row[:, 6:], ahead)
         left /= np.linalg.norm(left, axis=1)[:, None]
-        beyond = (s - inside * self.path.step)[:, None]
+        beyond = (s - inside)[:, None]
         axes = np.stack([ahead, left, np.cross(ahead, left)], axis=2)
         return row[:, :3] + beyond * ahead, axes
 
@@ -146,8 +153,8 @@ class WorkSurface:
         """Return point, direction and opening (9,) at an arc length."""
         # Called several times a cycle: plain floats are ten times faster than arrays of one.
         path = self.path
-        inside = 0.0 if s < 0.0 else path.length if s > path.length else s
-        share = inside / path.step
+        inside = path.first if s < path.first else path.last if s > path.last else s
+        share = (inside - path.first) / path.step
         index = min(int(share), len(self._plain) - 2)
         share -= index
         here, there = self._plain[index], self._plain[index + 1]
@@ -163,7 +170,8 @@ class WorkSurface:
         # Beyond a curve's centre a foot runs away.
         far = 30e-3
         if near is None or math.dist((px, py, pz), self._at(near)[:3]) > far:
-            away = np.linalg.norm(point - self._rows[:, :3], axis=1)
+            before = round(-self.path.first / self.path.step)
+            away = np.linalg.norm(point - self._rows[before:, :3], axis=1)
             # Of a seam that goes once around its start.
             near = float(np.argmax(away < away.min() + 1e-3)) * self.path.step
         for _ in range(3):
@@ -192,11 +200,17 @@ class WorkSurface:
         whole = self._rows[:, 6:].mean(axis=0)
         return max(float(off @ stand.axes[:, 2]), float(off @ whole / math.sqrt(whole @ whole)))
 
-    def unrolled(self, points: Floats) -> Floats:
-        """Return points (K, 3) of the plane, in base."""
-        s = self._nearest.query(points[:, :2])[1] * self.path.step
-        there, tangents = self.path.evaluate(s)
-        s = s + np.einsum("ki,ki->k", points[:, :2] - there[:, :2], tangents)
+    def unrolled(self, points: Floats, near: Floats) -> Floats:
+        """Return points (K, 3) of the plane, in base.
+
+        Args:
+            points: In the plane [m]; beside a seam that goes around it may lie on itself.
+            near: (K,) about where beside the seam they are, by arc length [m].
+        """
+        s = near
+        for _ in range(3):
+            there, tangents = self.path.evaluate(s)
+            s = s + np.einsum("ki,ki->k", points[:, :2] - there[:, :2], tangents)
         there, tangents = self.path.evaluate(s)
         off = points[:, :2] - there[:, :2]
         along = np.einsum("ki,ki->k", off, tangents)
@@ -236,7 +250,32 @@ def _interpolated(at: Floats, along: Floats, rows: Floats) -> Floats:
     return np.stack([np.interp(at, along, axis) for axis in rows.T], axis=1)
 
 
-def _rolled_out(points: Floats, openings: Floats) -> Floats:
+def _along(points: Floats) -> Floats:
+    """Return arc lengths (N,) of points (N, D), from the first on."""
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def _gone_around(points: Floats, openings: Floats) -> tuple[Floats, Floats, float]:
+    """Return a seam and its openings with half a turn more at each end, if it goes once around.
+
+    Returns:
+        The points and openings (M, 3), and how far they go on at each end [m].
+    """
+    if np.linalg.norm(points[-1] - points[0]) >= TOGETHER:
+        return points, openings, 0.0
+    rows = np.hstack([points, openings])
+    rows[-1] = rows[0]
+    along = _along(rows[:, :3])
+    half = float(along[-1]) / 2
+    count = len(rows)
+    back = _interpolated(np.linspace(half, along[-1], count), along, rows)
+    forth = _interpolated(np.linspace(0.0, half, count), along, rows)
+    rows = np.vstack([back[:-1], rows, forth[1:]])
+    return rows[:, :3], rows[:, 3:], half
+
+
+def rolled_out(points: Floats, openings: Floats) -> Floats:
     """Return the points (N, 3) of a seam in the plane: as far apart, turning as in the surface."""
     steps = np.diff(points, axis=0)
     lengths = np.linalg.norm(steps, axis=1)
@@ -251,8 +290,7 @@ def _rolled_out(points: Floats, openings: Floats) -> Floats:
     way = lengths[:, None] * np.stack([np.cos(headings), np.sin(headings)], axis=1)
     planar = np.vstack([np.zeros(2), np.cumsum(way, axis=0)])
     whole = planar[-1]
-    # Ends nearer than 1 mm to each other: the seam goes once around.
-    if np.linalg.norm(points[-1] - points[0]) < 1e-3:
+    if np.linalg.norm(points[-1] - points[0]) < TOGETHER:
         whole = planar[moves[0] + 1]
     x, y = whole / np.linalg.norm(whole)
     planar = planar @ np.array([[x, -y], [y, x]])
@@ -275,7 +313,7 @@ class Tool:
         self._angle: float | None = None
         self._s: float | None = None
         # The tip goes on beyond the seam's end.
-        self._ticks = np.arange(-CHORD, surface.path.length + body.distance + CHORD, CHORD / 4)
+        self._ticks = np.arange(-CHORD, surface.path.last + body.distance + CHORD, CHORD / 4)
         self._ups, _ = surface.standing(self._ticks, body.distance)
         self._tilts = np.gradient(self._ups, CHORD / 4, axis=0)
 
@@ -326,11 +364,17 @@ class Tool:
         angular = command.turn * up + _cross(self.up(rotation), up) + going * _cross(up, tilt)
         return np.concatenate([velocity - _cross(angular, tip), angular])
 
-    def base_T_flange(self, position: Floats, angle: float) -> Transform:
-        """Return where the flange is with the tip at (3,) in the plane, the tool at an angle."""
+    def base_T_flange(self, position: Floats, angle: float, near: float) -> Transform:
+        """Return where the flange is with the tip at (3,) in the plane, the tool at an angle.
+
+        Args:
+            position: Of the tip [m].
+            angle: Of the tool in the plane [rad].
+            near: About where beside the seam that is, by arc length [m].
+        """
         surface = self._surface
-        tip = surface.unrolled(position[None])[0]
-        s = surface.foot(tip)
+        tip = surface.unrolled(position[None], np.array([near]))[0]
+        s = surface.foot(tip, near)
         stand, (up, _) = surface.at(s), self._standing(s)
         c, sine = math.cos(angle), math.sin(angle)
         x = stand.unrolled(np.array([c, sine, 0.0]))

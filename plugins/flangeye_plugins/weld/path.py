@@ -33,21 +33,30 @@ class Place(NamedTuple):
 
 
 class Path:
-    """A curve that continues straight beyond both ends; its start has arc length zero.
+    """A curve that continues straight beyond both ends; the seam's start has arc length zero.
 
     Attributes:
-        length: From its first point to its last, in the plane.
+        length: Of the seam, in the plane.
+        first: Arc length of the curve's first point: below zero where the seam goes once around,
+            and the curve goes on around beyond both of its ends.
+        last: Arc length of its last point.
         points: (M, 3) the curve resampled: in the plane, and its height.
         tangents: (M, 2) unit tangents in the plane.
         step: Arc length between two of them [m].
     """
 
-    def __init__(self, points: Floats) -> None:
-        """Resample (N, 3) points: two coordinates in the plane, and the height above it."""
+    def __init__(self, points: Floats, wraps: float = 0.0) -> None:
+        """Resample a curve.
+
+        Args:
+            points: (N, 3) two coordinates in the plane, and the height above it.
+            wraps: How far they go on beyond both ends of a seam that goes once around.
+        """
         chords = np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1)
         along = np.concatenate([[0.0], np.cumsum(chords)])
-        self.length = float(along[-1])
-        ticks = np.linspace(0.0, self.length, max(2, round(self.length / PATH_SPACING)) + 1)
+        known = float(along[-1])
+        self.length, self.first, self.last = known - 2 * wraps, -wraps, known - wraps
+        ticks = np.linspace(0.0, known, max(2, round(known / PATH_SPACING)) + 1)
         self.points = np.stack([np.interp(ticks, along, axis) for axis in points.T], axis=1)
         self.step = float(ticks[1])
         slopes = np.gradient(self.points, self.step, axis=0)
@@ -57,6 +66,11 @@ class Path:
         self._curvature = self._curvatures()
         self._rows = np.column_stack([self.points, self.tangents]).tolist()
         self._last = len(self._rows) - 2
+
+    @property
+    def closed(self) -> bool:
+        """Whether the seam goes once around."""
+        return self.first < 0.0
 
     def _curvatures(self) -> Floats:
         """Return the curvature (M,) by chords, to the left positive.
@@ -77,8 +91,8 @@ class Path:
     def _at(self, s: float) -> tuple[float, float, float, float, float]:
         """Return point, tangent and height at an arc length."""
         # Called several times a cycle: plain floats are ten times faster than arrays of one.
-        inside = 0.0 if s < 0.0 else self.length if s > self.length else s
-        share = inside / self.step
+        inside = self.first if s < self.first else self.last if s > self.last else s
+        share = (inside - self.first) / self.step
         index = int(share)
         if index > self._last:
             index = self._last
@@ -92,9 +106,10 @@ class Path:
 
     def evaluate(self, s: Floats) -> tuple[Floats, Floats]:
         """Return points (K, 3) and unit tangents (K, 2) at arc lengths (K,)."""
-        inside = np.clip(s, 0.0, self.length)
-        index = np.minimum((inside / self.step).astype(int), len(self.points) - 2)
-        share = (inside / self.step - index)[:, None]
+        inside = np.clip(s, self.first, self.last)
+        ticks = (inside - self.first) / self.step
+        index = np.minimum(ticks.astype(int), len(self.points) - 2)
+        share = (ticks - index)[:, None]
         tangent = (1 - share) * self.tangents[index] + share * self.tangents[index + 1]
         tangent /= np.sqrt(np.einsum("ki,ki->k", tangent, tangent))[:, None]
         point = (1 - share) * self.points[index] + share * self.points[index + 1]
@@ -103,19 +118,20 @@ class Path:
 
     def climb(self, s: float) -> float:
         """Return the slope of the height along the path, zero beyond its ends."""
-        if not 0.0 <= s <= self.length:
-            return 0.0
-        return float(self._climb[round(s / self.step)])
+        return float(self._climb[self._tick(s)]) if self.first <= s <= self.last else 0.0
 
     def sharpest(self, start: float, end: float) -> float:
         """Return the largest curvature between two arc lengths [1/m]; none beyond the ends."""
-        low, high = max(int(start / self.step), 0), max(int(end / self.step) + 1, 0)
-        return float(np.abs(self._curvature[low:high]).max(initial=0.0))
+        low, high = (int((s - self.first) / self.step) for s in (start, end))
+        curvature = self._curvature[max(low, 0) : max(high + 1, 0)]
+        return float(np.abs(curvature).max(initial=0.0))
 
     def bend(self, s: float) -> float:
         """Return the curvature at an arc length [1/m], to the left positive; none beyond."""
-        inside = 0.0 <= s <= self.length
-        return float(self._curvature[round(s / self.step)]) if inside else 0.0
+        return float(self._curvature[self._tick(s)]) if self.first <= s <= self.last else 0.0
+
+    def _tick(self, s: float) -> int:
+        return round((s - self.first) / self.step)
 
     def advance(self, point: Floats, s: float, reach: float) -> float:
         """Return the arc length of the foot of ``point`` (2,), at most ``reach`` beyond ``s``.

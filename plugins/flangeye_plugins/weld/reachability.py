@@ -144,20 +144,41 @@ class SeamReach:
         found: list[Floats] = []
         refusals: list[tuple[int, Barrier]] = []
         for first in postures[0]:
-            chain = [first]
+            chain, low, high = [first], first, first
+            turns = np.zeros(len(first))
             for i in range(len(stations)):
                 joints = _nearest(chain[-1], postures[i])
-                bar = self._bars(chain[-1], joints)
+                low, high = np.minimum(low, joints), np.maximum(high, joints)
+                turns = self._whole_turns(low, high)
+                bar = self._bars(chain[-1] + turns, joints + turns)
+                if bar is None and (why := self._beyond(low + turns, high + turns)):
+                    bar = Barrier(2, why)
                 if bar is not None:
                     refusals.append((i, bar))
                     break
                 chain.append(joints)
             else:
-                found.append(np.array(chain[1:]))
+                found.append(np.array(chain[1:]) + turns)
         if not found:
             farthest, bar = max(refusals)
             raise StageError(f"weld.tactile: {stations[farthest].name}, {bar.reason}")
         return found
+
+    def _whole_turns(self, low: Floats, high: Floats) -> Floats:
+        """Return the whole turns (n,) that bring a joint's way within its limits, if any do [rad].
+
+        Args:
+            low: (n,) the least that each joint comes to [rad].
+            high: (n,) the most [rad].
+        """
+        lower, upper = self._task.limits.lower, self._task.limits.upper
+        outside = (low < lower + ROOM) | (high > upper - ROOM)
+        turns = np.round((lower + upper - low - high) / (4 * np.pi))
+        return np.where(outside, 2 * np.pi * turns, 0.0)
+
+    def _beyond(self, low: Floats, high: Floats) -> str | None:
+        limits = self._task.limits
+        return limits.beyond(low, ROOM) or limits.beyond(high, ROOM)
 
     def _turned_to(self, here: Floats, chain: Floats) -> Floats:
         """Return a chain with its joints turned by whole turns towards where they stand."""
@@ -222,13 +243,15 @@ def _stations(task: Task) -> list[Station]:
     count = 1 + int(np.ceil(abs(task.start.angle) / (JUMP / 2)))
     angles = _angle(start) + np.linspace(task.start.angle, 0.0, count)
     # The way from joint to joint ends 50 mm higher.
-    poses = [tool.base_T_flange(above + [0.0, 0.0, 0.05], float(angles[0]))]
-    poses += [tool.base_T_flange(above, float(angle)) for angle in angles]
+    tip = task.start.tip
+    poses = [tool.base_T_flange(above + [0.0, 0.0, 0.05], float(angles[0]), tip)]
+    poses += [tool.base_T_flange(above, float(angle), tip) for angle in angles]
     stations = [Station("above the seam's start", pose) for pose in poses]
     # Every 10 mm: between these the joints turn by less than a degree or two.
-    for s in np.arange(0.0, plan.length + task.finger.torch, 10e-3):
+    for s in np.arange(0.0, plan.length + params.overlapping(plan) + task.finger.torch, 10e-3):
         place = plan.at(float(s))
-        pose = tool.base_T_flange(np.array([*place.point, place.height]), _angle(place))
+        at = np.array([*place.point, place.height])
+        pose = tool.base_T_flange(at, _angle(place), float(s))
         name = f"{s * 1e3:.0f} mm along the seam (the tip goes on beyond its end)"
         stations.append(Station(name, pose))
     return stations

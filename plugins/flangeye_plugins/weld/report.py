@@ -35,6 +35,7 @@ def report_of(  # noqa: PLR0913  all that a weld had
     kept = kept[: len(weld_log.cycles)]  # none where there was no cycle
     cycle = {name: np.array(every[name])[kept] for name in ("time", "angle", "velocity", "turn")}
     robot = np.array(every["position"]).reshape(-1, 3)[kept]
+    at_tip, at_torch = (np.array(every[name])[kept] for name in ("tip", "torch"))
     tip, deflection = _tip_displacements(weld_log, plan, body, kept)
     torch = robot + np.array([turned(body.torch, angle) for angle in cycle["angle"]]).reshape(-1, 3)
     velocity = cycle["velocity"].reshape(-1, 3)
@@ -43,17 +44,17 @@ def report_of(  # noqa: PLR0913  all that a weld had
         completed=not reason,
         reason=reason,
         planned=seam.points_in_base,
-        refined=to_base(_refined(controller, plan)),
+        refined=to_base(*_refined(controller, plan)),
         openings=seam.openings_in_base,
         time=cycle["time"] - cycle["time"][0] if len(kept) else np.zeros(0),
-        tip=to_base(tip),
-        torch=to_base(torch),
-        robot=to_base(robot),
+        tip=to_base(tip, at_tip),
+        torch=to_base(torch, at_torch),
+        robot=to_base(robot, at_tip),
         deflection=controller.side * deflection,
         wanted=np.array(every["wanted"])[kept],
         speed=np.linalg.norm(velocity[:, :2], axis=1),
         turn=cycle["turn"],
-        along=np.array(every["torch"])[kept],
+        along=at_torch,
         phases=tuple(every["phase"][i] for i in kept),
         figures={**_figures(weld_log), **learned_figures(controller)},
         sigma=_stated(np.array(every["sigma"])[kept]),
@@ -146,16 +147,16 @@ def _tip_displacements(
     return tip, np.where(used > 0, across[newest], 0.0)
 
 
-def _refined(controller: Controller, plan: Path) -> Floats:
-    """Return the seam as it was felt, (M, 3) in the plane."""
+def _refined(controller: Controller, plan: Path) -> tuple[Floats, Floats]:
+    """Return the seam as it was felt, (M, 3) in the plane, and its arc lengths (M,)."""
     root = follower_of(controller)
     if root is None or root.seam.refined.empty:
-        return np.zeros((0, 3))
+        return np.zeros((0, 3)), np.zeros(0)
     s = np.arange(0.0, plan.length, 1e-3)
     points, tangents = plan.evaluate(s)
     offsets = np.array([root.seam.refined.offset(x) for x in s.tolist()])
     points[:, :2] += offsets[:, None] * np.stack([-tangents[:, 1], tangents[:, 0]], axis=1)
-    return points
+    return points, s
 
 
 def _figures(weld_log: WeldLog) -> Mapping[str, float]:

@@ -84,7 +84,7 @@ def controller_from(start: Mapping[str, Any]) -> Controller:
     tuples = {name: tuple(start["belief"][name]) for name in ("noise", "arc")}
     belief = Belief(**{**start["belief"], **tuples})
     settings = Following.model_validate(start["settings"])
-    plan, kept = Path(np.array(start["points"])), start.get("kept")
+    plan, kept = Path(np.array(start["points"]), start["wraps"]), start.get("kept")
     before = None if kept is None else _kept_from(kept)
     given = start.get("start")
     at = None if given is None else Start(**given)

@@ -237,6 +237,7 @@ class SeamEstimate:
         self._backed: list[_Sample] | None = None
         self._sat: list[_Sample] = []
         self._moved: list[float] = []
+        self._around = False
 
     def _path(self, noise: float | None = None) -> RefinedPath:
         """Return the path as an earlier weld has felt it; one touch scatters by ``noise`` [m]."""
@@ -313,7 +314,7 @@ class SeamEstimate:
         ):
             return
         task, at = self._task, self._fell_at()
-        if at is None or task.settings.ends is None or not task.belief.two_walls:
+        if at is None or not task.feels_ends or not task.belief.two_walls:
             return
         if abs(at - task.plan.length) <= task.beyond + INSIDE:
             self.end = at
@@ -356,13 +357,24 @@ class SeamEstimate:
             self.lost = None
         elif self.lost is None:
             self.lost = time, s
+        if self._task.plan.closed and s >= self._task.plan.length:
+            self._go_around()
+
+    def _go_around(self) -> None:
+        """Believe that a seam that goes once around is beyond its end where its start was felt."""
+        if self._around:
+            return
+        self._around, task = True, self._task
+        for s, offset, angle, _, doubt in self.refined.samples().tolist():
+            if s < task.settings.overlap + task.settings.ending:
+                self.refined.add(s + task.plan.length, offset, angle, doubt)
 
     def keep(self, until: float) -> None:
         """Believe what was felt up to a time [s], short of where the seam may end."""
         task = self._task
         end = task.plan.length - max(task.settings.ending / 4.0, task.beyond)
         # Between two walls a tip that has fallen off the seam's end is told from one that has not.
-        if task.settings.ends is not None and task.belief.two_walls:
+        if task.feels_ends and task.belief.two_walls:
             end = task.plan.length + task.beyond
         for felt, doubt in self.contact.settled(until):
             sample = _Sample(felt.s, felt.offset, felt.angle, doubt)

@@ -13,6 +13,7 @@ from flangeye.models.finger import FingerPath
 from flangeye.plugin.stage import BoundPart, Choose, Params
 from flangeye.units import Angle, AngularSpeed, Duration, Length, Speed, param
 from flangeye_plugins.weld.joint import JointKind
+from flangeye_plugins.weld.path import Path
 
 Mode = Annotated[str | BoundPart, Choose("controller", words=("tactile", "vision"))]
 """By touch, by the plan alone, or as a controller of a plugin decides."""
@@ -132,6 +133,10 @@ class Following(Params):
         "between two walls, on until it falls off the end. Where it does not, the torch welds so "
         "far beyond.",
     )  # fmt: skip
+    overlap: Length = param(
+        "30 mm", gt=0, description="How far before the stop the torch begins again, to go on; a "
+        "seam that goes once around is welded so far over its start.",
+    )  # fmt: skip
     weave_width: Length = param(
         "0 mm", ge=0, le=0.03,
         description="The torch swings across the seam by this from side to side, the tool turning "
@@ -167,6 +172,10 @@ class Following(Params):
     def set_down(self) -> float:
         """Where on the plan the tip is set down, by arc length: the seam has surely begun [m]."""
         return self.inset if self.ends is None else max(self.inset, self.ends + INSIDE)
+
+    def overlapping(self, plan: Path) -> float:
+        """Return how far beyond its end a seam is welded, over its start [m]."""
+        return self.overlap if plan.closed else 0.0
 
     @property
     def sign(self) -> float:
@@ -223,9 +232,6 @@ class WeldTactileParams(Following):
         None,
         description="A .yaml file of what earlier welds have found of tip, play and clock: read "
         "where it exists, written when a weld is done; delete it to begin anew.",
-    )
-    overlap: Length = param(
-        "30 mm", gt=0, description="How far before the stop the torch begins again, to go on."
     )
 
     @model_validator(mode="after")

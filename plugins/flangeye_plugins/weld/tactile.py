@@ -216,6 +216,7 @@ def start_of(planned: Planned, belief: Belief) -> dict[str, Any]:
     params, kept = planned.params, planned.kept
     return {
         "points": planned.surface.points.tolist(),
+        "wraps": -planned.plan.first,
         "finger": planned.finger.model_dump(mode="json"),
         "belief": asdict(belief),
         "mode": params.model_dump(mode="json", include={"mode"})["mode"],

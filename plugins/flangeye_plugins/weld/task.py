@@ -72,9 +72,14 @@ class WeldTask:
         return Start(self.settings.set_down) if self.given is None else self.given
 
     @property
+    def feels_ends(self) -> bool:
+        """Whether the seam has ends, and these are to be felt."""
+        return self.settings.ends is not None and not self.plan.closed
+
+    @property
     def beyond(self) -> float:
         """How far beyond the planned ends the seam may be [m]."""
-        return self.settings.ends or 0.0
+        return (self.settings.ends or 0.0) if self.feels_ends else 0.0
 
     @property
     def begins(self) -> float:
@@ -84,15 +89,17 @@ class WeldTask:
 
     @property
     def ends(self) -> float:
-        """Where the torch is to end, by arc length [m]."""
-        return self.plan.length + self.beyond + self.lengthwise
+        """Where the torch is to end, by arc length: once around, over its start [m]."""
+        return (
+            self.plan.length + self.beyond + self.lengthwise + self.settings.overlapping(self.plan)
+        )
 
     @property
     def lengthwise(self) -> float:
         """How far along the seam the torch may be off, where its ends matter [m]."""
-        return 0.0 if self.settings.ends is None else BAND * self.belief.along_sigma
+        return BAND * self.belief.along_sigma if self.feels_ends else 0.0
 
     @property
     def margin(self) -> float:
         """How far beyond the plan tip and torch may come [m]."""
-        return self.belief.distance + self.settings.ending + self.beyond + self.lengthwise
+        return self.belief.distance + self.settings.ending + self.ends - self.plan.length

@@ -60,7 +60,7 @@ def test_the_torch_is_told_beside_the_plan_as_it_lies_beside_the_true_seam(workp
         place = planned.at(s)
         angle = float(np.arctan2(place.tangent[1], place.tangent[0]))
         sensor.world.settle(ToolPose(1.0, np.array([*place.point, place.height]), angle))
-        torch = sensor._beside_plan()
+        torch, _ = sensor._beside_plan()
         foot = planned.at(planned.foot(torch[:2], s - 0.04))
         off.append(sensor.world.off)
         told.append(float((torch[:2] - foot.point) @ foot.normal))

@@ -114,13 +114,13 @@ def test_the_workpiece_is_not_its_cad() -> None:
     truth = WorkpieceTruth(
         wave=1e-3, wave_length=20e-3, bow=2e-3, root_gap=1e-3, tacks=(Tack(50e-3),)
     )
-    groove = true_groove(LINE, SECTION, truth, RNG(0))
+    groove = true_groove(Path(LINE), SECTION, truth, RNG(0))
     aside = groove.root.points[:, 1]
     assert 2e-3 < aside.max() < 3e-3
     low, high = groove.relief.at(0.02)[0], groove.relief.at(0.054)[0]
     assert low == pytest.approx(-0.5e-3 / np.tan(SECTION.half_angle))
     assert high - low == pytest.approx(1e-3)
-    rough = true_groove(LINE, SECTION, WorkpieceTruth(spatter=0.1e-3), RNG(0))
+    rough = true_groove(Path(LINE), SECTION, WorkpieceTruth(spatter=0.1e-3), RNG(0))
     assert np.std(rough.relief.fill) == pytest.approx(0.1e-3 * 0.8, rel=0.2)
 
 

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
+import yaml
 
 from flangeye import CalibrationRefused, StageError
 from flangeye.maths.geometry import rigid, rotation_from_rpy, rotation_log
@@ -232,6 +234,21 @@ def test_the_registration_is_as_uncertain_as_it_says() -> None:
         scan, _ = scanned("v-curved", seed=seed, resolution=0.3, distortion=0.0)
         squares.append(squared_error(scan, seed))
     assert 1.0 < np.mean(squares) < 12.0
+
+
+def test_where_one_body_stands_on_another_neither_ends(tmp_path) -> None:
+    from flangeye_plugins.seam.part import CadPart
+
+    plate = trimesh.creation.box(bounds=[[0, 0, 0], [100, 100, 10]])
+    block = trimesh.creation.box(bounds=[[40, 40, 10], [60, 60, 30]])
+    trimesh.util.concatenate([plate, block]).export(tmp_path / "both.stl")
+    groove = {"name": "groove", "points": [[0, 0, 10], [9, 0, 10]], "opening": [0, 0, 1]}
+    told = {"title": "both", "cad": "both.stl", "unit": "mm", "seams": [groove]}
+    (tmp_path / "both.yaml").write_text(yaml.safe_dump(told))
+    part = CadPart(load_workpiece(tmp_path / "both.yaml"))
+    ended = part.beyond_edges(np.random.default_rng(0), 2e-3).points
+    foot = np.abs(ended[:, 2] - 0.01) < 1e-6
+    assert foot.sum() > 500 and (np.abs(ended[foot, :2] - 0.05).max(axis=1) > 0.045).all()
 
 
 def squared_error(scan, seed):

@@ -1,5 +1,7 @@
 """seam.joint: six joints in scans of a ray caster of its own, against the truth, and its refusals."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -154,6 +156,33 @@ def test_an_end_that_a_block_hides(hides: float, told: str | None) -> None:
     off = np.linalg.norm(seam.points_in_base[-1] - truth[1])
     assert off < 4 * seam.figures["end"]
     assert seam.figures["end"] > 2 * seam.figures["start"]
+
+
+@pytest.mark.parametrize("count", [5, 8])
+def test_a_round_groove_is_found_from_a_few_points_about_it(count: int) -> None:
+    """The chords between five points miss the circle by 11 mm, and meet at 72 deg."""
+    scan, truth = scanned("v-ring", seed=2, distortion=0.0)
+    line = truth[np.linspace(0, len(truth) - 1, count, endpoint=False).round().astype(int)]
+    seam = in_groove(scan, line, closed=True)
+    errors = errors_from(seam, truth)
+    assert np.sqrt(np.mean(errors**2)) < 0.15 * MM and errors.max() < 0.3 * MM
+    assert (errors <= tube_radii(seam)).mean() > 0.9
+    assert seam.arc_length[-1] == pytest.approx(2 * np.pi * 60 * MM, rel=2e-3)
+
+
+def test_a_thing_that_lies_across_the_seam_is_told_of() -> None:
+    scan, truth = scanned("v-straight", seed=3)
+    points = scan.cloud.points().astype(np.float64)
+    along = truth[-1] - truth[0]
+    length = np.linalg.norm(along)
+    s = (BASE_T_CAMERA.apply(points) - truth[0]) @ along / length
+    covered = np.abs(s - length / 2) < 15 * MM
+    points[covered, 2] = BASE_T_CAMERA.inverse().apply(truth[:1])[0, 2] - 12 * MM
+    over = replace(scan, cloud=PointCloud(CAMERA, points.astype(np.float32)))
+    with pytest.raises(
+        CalibrationRefused, match="from 8[0-9] to 1[12][0-9] mm along it most points"
+    ):
+        in_groove(over, truth)
 
 
 def test_a_pipe_on_a_plate_is_closed_and_seen_from_around_it() -> None:

@@ -158,7 +158,7 @@ def round_a_corner(turn, joint, shift, plan_turn=0.01, **given):
     body = built_for(asked)
     section, belief = known(Condition(section=JOINTS[joint]), body, asked)
     check_seam(misplanned, surface, belief.distance, asked)
-    seam = Nominal(true, section, Tip(), body.level_R_tool.T @ body.torch, body.level_R_tool)
+    seam = Nominal(Path(true), section, Tip(), body.level_R_tool.T @ body.torch, body.level_R_tool)
     controller = controller_of(plan, belief, asked, "tactile")
     return run_trial(controller, seam, WeldTruth(), start_at(plan, belief, asked, 16e-3), 0)
 

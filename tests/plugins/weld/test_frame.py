@@ -25,7 +25,7 @@ def test_a_flat_surface_is_rolled_out_along_the_seam_and_out_of_the_work() -> No
     in_base = SEAM @ TURN.T + MIDDLE
     assert SURFACE.points == pytest.approx(SEAM, abs=1e-12)
     beside = np.array([[-0.07, 0.01, 0.02], [0.02, -0.03, 0.0], [0.09, 0.02, -0.01]])
-    there = SURFACE.unrolled(beside)
+    there = SURFACE.unrolled(beside, np.array([0.0, 0.05, 0.1]))
     assert there == pytest.approx(beside @ TURN.T + MIDDLE, abs=1e-12)
     for point, place in zip(there, beside, strict=True):
         s = SURFACE.foot(point)
@@ -37,14 +37,22 @@ def test_a_flat_surface_is_rolled_out_along_the_seam_and_out_of_the_work() -> No
     assert uneven.at(0.05).axes == pytest.approx(np.eye(3))
 
 
-@pytest.mark.parametrize(("gap", "along"), [(0.9e-3, [0.0, 1.0, 0.0]), (1.1e-3, [1.0, 0.0, 0.0])])
-def test_a_seam_that_ends_within_a_millimetre_of_its_start_begins_along_itself(
-    gap: float, along: list[float]
+@pytest.mark.parametrize(
+    ("gap", "beyond"),
+    [
+        (0.9e-3, [0.02, 0, 0, 0, 0.02, 0]),  # as the other end goes
+        (1.1e-3, [0, -0.02, 0, -0.02, 0, 0]),  # straight on
+    ],
+)
+def test_a_seam_that_ends_within_a_millimetre_of_its_start_goes_on_around(
+    gap: float, beyond: list[float]
 ) -> None:
-    loop = np.array([[0, 0, 0], [0, 0.1, 0], [0.1, 0.1, 0], [gap, 0, 0]]) + MIDDLE
-    surface = WorkSurface(loop, np.tile([0, 0, 1.0], (4, 1)))
-    x = surface.unrolled(np.array([[0.01, 0.0, 0.0]])) - surface.unrolled(np.zeros((1, 3)))
-    assert x[0] / 0.01 == pytest.approx(along)
+    loop = np.array([[0, 0, 0], [0, 0.1, 0], [0.1, 0.1, 0], [0.1, 0, 0], [gap, 0, 0]]) + MIDDLE
+    surface = WorkSurface(loop, np.tile([0, 0, 1.0], (5, 1)))
+    path = surface.path
+    assert path.closed == (gap < 1e-3) and path.length == pytest.approx(0.4 - gap, abs=1e-3)
+    here, _ = surface.line(np.array([-0.02, path.length + 0.02]))
+    assert here - loop[0] == pytest.approx(np.array([[*beyond[:3]], [*beyond[3:]]]), abs=2e-3)
 
 
 @pytest.mark.parametrize("leans", [(0.0, 0.0), (0.3, -0.2)])
@@ -54,7 +62,7 @@ def test_the_flange_is_where_tip_and_angle_say_and_they_are_read_off_it(
     body = body_from(TOLD.torch_from_tip, *leans)
     tool = Tool(TOLD, SURFACE, body)
     tip = np.array([0.02, -0.01, 0.03])
-    flange = tool.base_T_flange(tip, 0.7)
+    flange = tool.base_T_flange(tip, 0.7, 0.05)
     found = tool.pose(flange, 3.0)
     assert found.position == pytest.approx(tip) and found.angle == pytest.approx(0.7)
     assert found.time == 3.0 and tool.up(flange.rotation) == pytest.approx(TURN[:, 2])
@@ -66,13 +74,14 @@ def test_the_flange_is_where_tip_and_angle_say_and_they_are_read_off_it(
 def test_an_angle_goes_on_where_the_last_one_left_off() -> None:
     tool = Tool(TOLD, SURFACE)
     for angle in (0.0, 2.0, 3.1, 4.0, 6.0, 8.0, 6.5, 4.0):
-        assert tool.pose(tool.base_T_flange(np.zeros(3), angle), 0.0).angle == pytest.approx(angle)
+        flange = tool.base_T_flange(np.zeros(3), angle, 0.05)
+        assert tool.pose(flange, 0.0).angle == pytest.approx(angle)
 
 
 def test_a_tool_that_stands_askew_is_brought_upright_within_a_second() -> None:
     """By a turn about the tip, as fast as the sine of the angle."""
     tool = Tool(TOLD, SURFACE)
-    flange = tool.base_T_flange(np.array([0.02, -0.01, 0.03]), 0.7)
+    flange = tool.base_T_flange(np.array([0.02, -0.01, 0.03]), 0.7, 0.05)
     tip = flange.apply(np.array(TOLD.tip))
     axis = TURN[:, 0]
     turn = rotation_exp(0.1 * axis)

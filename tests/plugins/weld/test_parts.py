@@ -123,7 +123,7 @@ def test_the_flange_moves_as_the_tip_is_told(angle: float, yaw: float, turn: flo
     surface = WorkSurface(points, np.tile(base_T_plane[:3, 2], (2, 1)))
     finger = FINGER.model_copy(update={"tip": (0.03, -0.01, 0.18), "direction": 0.7})
     tool = Tool(finger, surface)
-    flange = tool.base_T_flange(np.array([0.01, 0.02, 0.03]), angle)
+    flange = tool.base_T_flange(np.array([0.01, 0.02, 0.03]), angle, 0.05)
     assert tool.up(flange.rotation) == pytest.approx(base_T_plane[:3, 2])
     before = tool.pose(flange, 0.0)
     np.testing.assert_allclose(before.position, [0.01, 0.02, 0.03], atol=1e-12)

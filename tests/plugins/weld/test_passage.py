@@ -51,7 +51,7 @@ def test_every_chain_of_postures_is_one_smooth_way(name: str, angle: float) -> N
     # The last posture has the tip beyond the seam's end, where the torch comes to it.
     tip = arm.flange(chains[0][-1]) @ [*FINGER.tip, 1.0]
     end = task.plan.at(task.plan.length + FINGER.torch)
-    beyond = task.tool.base_T_flange(np.array([*end.point, end.height]), 0.0)
+    beyond = task.tool.base_T_flange(np.array([*end.point, end.height]), 0.0, task.plan.length)
     assert np.linalg.norm(tip[:3] - beyond.apply(np.array(FINGER.tip))) < 15e-3
 
 

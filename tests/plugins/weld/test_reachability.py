@@ -97,7 +97,8 @@ def test_a_joint_turns_as_fast_as_going_and_turning_together_ask_for() -> None:
 
 def chained(bars: dict[tuple[int, int], Barrier], starts: int = 2, stations: int = 3) -> Any:
     """Chains from postures that start 1 rad apart, of which some are barred at some stations."""
-    found = reach_of()
+    ends = {"lower": np.full(1, -2.0), "upper": np.full(1, 2.0)}
+    found = reach_of(limits=limits(beyond=lambda joints, room: None, **ends))
     firsts = np.arange(starts, dtype=float)[:, None]
     postures = [firsts + 0.01 * i for i in range(stations)]
     asked: list[tuple[int, int]] = []
@@ -121,6 +122,18 @@ def test_every_posture_that_starts_a_whole_chain_is_kept() -> None:
     ]  # fmt: skip
     (one,) = chained({(0, 1): Barrier(0, "table")})
     assert one.ravel() == pytest.approx([1.0, 1.01, 1.02])
+
+
+@pytest.mark.parametrize(("first", "turned"), [(170, -190), (-10, -10), (100, -260)])
+def test_a_joint_that_goes_far_round_begins_a_turn_earlier(first: int, turned: int) -> None:
+    """Once around is 270 deg of a joint: it begins where all of that is within its limits."""
+    box, full = np.zeros(3), np.radians([358.0])
+    found = reach_of(limits=MotionLimits(box, box, 0.0, 0.0, 0.0, -full, full))
+    found._bars = lambda before, joints: None
+    way = np.radians(first + 15.0 * np.arange(19))
+    postures = [np.array([[math.remainder(angle, math.tau)]]) for angle in way]
+    (chain,) = found._drivable([None] * len(way), postures)
+    assert np.degrees(chain.ravel()) == pytest.approx(turned + 15.0 * np.arange(19))
 
 
 def test_of_several_refusals_the_one_that_came_farthest_is_told() -> None:
@@ -271,7 +284,7 @@ def test_the_seam_is_looked_at_from_above_its_start_to_where_the_torch_comes_to_
     surface = WorkSurface(points, np.tile([0.0, 0, 1.0], (len(points), 1)))
     tool = Tool(FINGER, surface)
     plan = surface.path
-    params: Any = SimpleNamespace(clearance=15e-3)
+    params: Any = SimpleNamespace(clearance=15e-3, overlapping=lambda plan: 0.0)
     task: Any = SimpleNamespace(plan=plan, params=params, tool=tool, aside=2e-3, finger=FINGER,
                                 start=Start(5e-3, angle=angle))  # fmt: skip
     stations = _stations(task)

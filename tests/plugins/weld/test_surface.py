@@ -73,9 +73,10 @@ def test_what_is_rolled_out_is_as_long_and_comes_back_to_where_it_was(seam: Any)
     lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
     assert np.linalg.norm(np.diff(surface.points, axis=0), axis=1) == pytest.approx(lengths)
     assert surface.path.length == pytest.approx(lengths.sum())
-    assert surface.unrolled(surface.points) == pytest.approx(points, abs=0.02e-3)
+    along = np.concatenate([[0.0], np.cumsum(lengths)])
+    assert surface.unrolled(surface.points, along) == pytest.approx(points, abs=0.02e-3)
     beside = surface.points[::20] + [0.0, 0.0, 1.5e-3]
-    for place, point in zip(beside, surface.unrolled(beside), strict=True):
+    for place, point in zip(beside, surface.unrolled(beside, along[::20]), strict=True):
         assert surface.rolled(point, surface.foot(point)) == pytest.approx(place, abs=1e-6)
 
 
@@ -96,7 +97,7 @@ def test_the_tool_stands_on_the_surface_with_tip_and_torch_on_the_seam(seam: Any
         angle = float(np.arctan2(*place.tangent[::-1]))
         # Turned until the torch is over the seam
         for _ in range(5):
-            flange = tool.base_T_flange(np.array([*place.point, 0.0]), angle)
+            flange = tool.base_T_flange(np.array([*place.point, 0.0]), angle, s)
             torch = flange.apply(np.array(TOLD.tip) + TOLD.flange_R_tool @ TOLD.torch_from_tip)
             off = surface.rolled(torch, surface.foot(torch))
             behind = path.at(surface.foot(torch))
@@ -117,7 +118,8 @@ def test_the_tip_goes_as_it_is_told_and_the_tool_stays_as_it_is_to_stand(seam: A
     tool, path = Tool(TOLD, surface), surface.path
     s, step = 0.5 * path.length, 1e-3
     place = path.at(s)
-    flange = tool.base_T_flange(np.array([*place.point, -1e-3]), np.arctan2(*place.tangent[::-1]))
+    angle = np.arctan2(*place.tangent[::-1])
+    flange = tool.base_T_flange(np.array([*place.point, -1e-3]), angle, s)
     before = tool.pose(flange, 0.0)
     velocity = np.array([*(5e-3 * place.tangent + 1e-3 * place.normal), 0.5e-3])
     for _ in range(1000):
@@ -132,17 +134,20 @@ def test_the_tip_goes_as_it_is_told_and_the_tool_stays_as_it_is_to_stand(seam: A
     off = after.position[:2] - there.point
     assert off @ there.normal == pytest.approx(1e-3, abs=0.05e-3)
     assert off @ there.tangent == pytest.approx(0.0, abs=0.2e-3)
-    stands = tool.base_T_flange(after.position, after.angle)
+    stands = tool.base_T_flange(after.position, after.angle, s)
     away = tool.up(flange.rotation) @ tool.up(stands.rotation)
     assert away > np.cos(np.radians(0.5))
 
 
-@pytest.mark.parametrize("seam", [pipe_on_plate, pipe_on_pipe])
+@pytest.mark.parametrize(("seam", "end"), [(pipe_on_plate, 360.0), (pipe_on_pipe, 110.0)])
 def test_the_torch_keeps_to_a_seam_that_bends_out_of_every_plane(
-    seam: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    seam: Any, end: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Judged from the flange's poses alone: the torch's distance to the left of the true seam."""
-    points, openings = seam(110.0)
+    """Judged from the flange's poses alone: the torch's distance to the left of the true seam.
+
+    Once around, the torch goes 20 mm over the seam's start.
+    """
+    points, openings = seam(end)
     trimesh.creation.box(bounds=[points.min(axis=0) - 0.02, points.max(axis=0) + 0.02]).export(
         tmp_path / "part.stl"
     )
@@ -168,12 +173,16 @@ def test_the_torch_keeps_to_a_seam_that_bends_out_of_every_plane(
 
     monkeypatch.setattr(SimulatedFinger, "frame", watched)
     report, _ = cell.run(
-        planned, str(tmp_path / "part.yaml"), speed="10 mm/s", ends="3 mm",
+        planned, str(tmp_path / "part.yaml"), speed="10 mm/s", ends="3 mm", overlap="20 mm",
         limits={"joint_speed": "90 deg/s"},
     )  # fmt: skip
     assert report.completed, report.reason
     seen = np.array(where)
     near = np.linalg.norm(seen[:, None] - line, axis=2).argmin(axis=1)
+    begins = int(np.argmax((near > 3) & (near < 12)))
+    seen, near = seen[begins:], near[begins:]
+    along = np.linalg.norm(np.diff(line, axis=0, prepend=line[:1]), axis=1).cumsum()
+    assert along[near[-1]] == pytest.approx(20e-3 if end == 360 else along[-1], abs=4e-3)
     # On the seam, between its ends
     on = (near > 3) & (near < len(line) - 4)
     on &= np.linalg.norm(seen - line[near], axis=1) < 8e-3
