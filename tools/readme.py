@@ -38,7 +38,7 @@ def output_of(command: str, picture: Path | None = None) -> str:
 
 def stamp(quote: str) -> str:
     """Return a hash of all that the picture shows: the run's output, and what draws its report."""
-    drawn = ("report.html.j2", "report.css", "report.js", "look.py")
+    drawn = ("report.html.j2", "report.css", "report.js", "look.py", "summary.py", "still.py")
     texts = [(ROOT / "pipeline/flangeye/report" / name).read_text() for name in drawn]
     return hashlib.sha256("".join([quote, *texts]).encode()).hexdigest()
 
@@ -55,7 +55,7 @@ def photograph(page: Path, picture: Path, text: str) -> None:
         tab = browser.new_page(viewport={"width": 1280, "height": 1280})
         tab.goto(page.as_uri())
         tab.wait_for_timeout(3000)  # plots are drawn after the page has loaded
-        tab.screenshot(path=picture)
+        tab.screenshot(path=picture, timeout=180e3)  # ms; drawn without a graphics card
         browser.close()
     info = PngInfo()
     info.add_text(STAMP, text)

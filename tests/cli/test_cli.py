@@ -61,7 +61,7 @@ def test_refused_is_exit_code_one_with_the_reason(
 ) -> None:
     code, out, _ = flangeye("run", toy_recipe, "--set", "steps.4.max_rms=1 um", "--out", "x")
     assert code == 1
-    assert "What is wrong   verify.toy: " in out
+    assert "What is wrong     verify.toy: " in out
     assert (tmp_path / "x" / "report.html").exists()
 
 
@@ -334,7 +334,7 @@ def test_a_refusal_says_what_to_do(
 ) -> None:
     code, out, _ = flangeye("run", toy_recipe, "--set", "steps.4.max_rms=1 um", "--out", "x")
     assert code == 1
-    assert "Next step       flangeye doctor x/run.mcap" in out
+    assert "Next step         flangeye doctor x/run.mcap" in out
 
 
 def test_solvers_are_compared_by_exchanging_a_step(

@@ -96,7 +96,7 @@ def test_a_refusal_has_three_parts() -> None:
     out = io.StringIO()
     print_refusal(Console(file=out), "what", "how", ["do this", "or that", "never shown"])
     assert [line.split("  ")[0] for line in out.getvalue().splitlines()] == [
-        "What is wrong", "How it is known how", "Next step", "or",
+        "What is wrong", "How it is known", "Next step", "or",
     ]  # fmt: skip
 
 

@@ -538,15 +538,16 @@ def two_poses_of_nobody(folder):
          "where the flange was; put poses.csv beside them, its first line: image,x_mm,"),
         (lambda folder: (folder / "poses.mat").write_bytes(b"MATLAB 7.3 MAT-file"), [],
          "rec/poses.mat: is a MATLAB 7.3 file (HDF5), which is not read; in MATLAB, write it anew"),
-        (odd_heading, [], "rec/log.csv: which columns are the arm's pose is not plain from "
-         "u, v, w, alpha, beta, gamma; add --columns with their names, or numbers from 1, position "
+        (odd_heading, [], "rec/log.csv: it is not clear from u, v, w, alpha, beta, "
+         "gamma which columns are the arm's pose; add --columns with names or numbers from 1, position "
          "first: --columns x,y,z,a,b,c --rotation kuka; or those of the joint angles: --columns "
          "1,2,3,4,5,6 --rotation joints"),
         (odd_heading, ["--columns", "u,v,ww,4,5,6"],
          "rec/log.csv: has no column 'ww'; known: w"),
         (angles_of_nobody, [], "not known: how the rotation in columns rx, ry, rz of log.csv is written (ur, "
          "kuka, fanuc, abb, yaskawa, staubli, kawasaki, doosan, halcon, rpy, quaternion_xyzw, "
-         "quaternion_wxyz, vector, xyz, ZYX, …); add --rotation vector"),
+         "quaternion_wxyz, vector, xyz, ZYX, …); add --rotation vector, or --rotation xyz for roll, "
+         "pitch, yaw; or name the arm with --robot: its maker decides"),
         (images, [], "not known: which printed target is seen; add --target 'charuco: "
          "{columns: 8, rows: 6, square: 30 mm, marker: 22 mm}'"),
         (arrays_of_nobody, [], "not known: which poses are the arm's (poses.npz:A, poses.npz:B); "

@@ -91,7 +91,7 @@ def test_the_image_shows_the_corners_and_what_the_pose_misses(tmp_path: Path) ->
     assert y < 80 < 160 < y + height
     assert view.misses[2][2] < 200  # the third corner's line leads to the left
     assert view.data.startswith("data:image/jpeg;base64,")
-    assert view.summary.startswith("Capture 1: 4 corners; where the pose has them is 0.087 px off")
+    assert view.summary.startswith("Capture 1: 4 corners, 0.087 px rms")
     assert "at most 0.200 px" in view.summary
 
 

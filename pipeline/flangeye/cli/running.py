@@ -180,14 +180,16 @@ def _explain_refusal(
     finding = _first_finding(log, registry, recipe)
     if finding:
         evidence = evidence_of(finding)
-        known = f"with that mended: {evidence}" if evidence else wrong
+        known = f"tried with that mended: {evidence}" if evidence else wrong
         print_refusal(Console(), finding.what, known, finding.choices[:2] or [doctor])
         return
     known = "no mistake was recognised in poses or scans"
-    if result.holdout:
-        known = "poses that took no part disagree with it; " + known
+    failed = [step for step, found in result.verifications.items() if not found.passed]
+    if failed:
+        known = f"{' and '.join(failed)} failed; {known}"
     more = "add poses turned by 20 deg or more; the arm itself may be off"
-    print_refusal(Console(), wrong, known, [doctor, more] if result.holdout else [doctor])
+    held_out = any(step.endswith("verify.holdout") for step in failed)
+    print_refusal(Console(), wrong, known, [doctor, more] if held_out else [doctor])
 
 
 def _after_verification(recipe: Recipe) -> list[str]:

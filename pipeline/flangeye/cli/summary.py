@@ -1,4 +1,4 @@
-"""A bar while a run goes on, and what it prints at its end."""
+"""The progress bar of a run, and the summary printed at its end."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def print_summary(
 
 
 def errors(result: Result) -> Iterator[tuple[str, str, str]]:
-    """Yield the expected and the held-out error: name, figure, and what it is over."""
+    """Yield the expected and the held-out error: name, figure, remark."""
     if found := expected_error(result):
         rms, bound = found
         below = "" if bound is None else f"(95 % below {rounded_mm(bound)} mm)"
@@ -57,7 +57,7 @@ def errors(result: Result) -> Iterator[tuple[str, str, str]]:
     answers = result.answers
     if answers and answers.corrected and answers.corrected.expected_rms is not None:
         figure = f"{rounded_mm(answers.corrected.expected_rms)} mm"
-        yield "  with the arm corrected", figure, "needs its correction too: calibration.yaml"
+        yield "  with the arm corrected", figure, "if the correction in calibration.yaml is applied"
     if held := result.holdout:
         over = f"{held.folds} folds, poses that took no part"
         limit = held.figures.get("limit")
@@ -82,8 +82,9 @@ def _next_steps(result: Result, run: str, formats: int) -> Iterator[tuple[str, s
         use = f"flangeye export {run} --to ros2_launch{_camera_of_several(result)}"
         yield "Use it", use, f"({formats} formats: flangeye export --list)"
     notes, warnings = len(result.provenance.notes), len(result.warnings)
-    action = f"{_count(warnings, 'warning')} above" if warnings else "none needs action"
-    yield "Details", f"flangeye show {run}", f"{_count(notes, 'note')}, {action}"
+    action = f", {_count(warnings, 'warning')} above" if warnings else ", none needs action"
+    action = "" if result.refused and not warnings else action
+    yield "Details", f"flangeye show {run}", _count(notes, "note") + action
 
 
 def _count(number: int, what: str) -> str:
@@ -98,13 +99,13 @@ def _camera_of_several(result: Result) -> str:
 
 def print_refusal(console: Console, wrong: str, known: str, next_steps: Collection[str]) -> None:
     """Print what is wrong, how it is known, and what to do next."""
-    write(console, wrapped(console, f"What is wrong   {wrong}", 16), "red")
-    write(console, wrapped(console, f"How it is known {known}", 16))
+    write(console, wrapped(console, f"What is wrong     {wrong}", 18), "red")
+    write(console, wrapped(console, f"How it is known   {known}", 18))
     for name, step in zip(("Next step", "or"), next_steps, strict=False):
         if step.startswith("- "):  # a line of the recipe, to paste as it stands
-            write(console, f"{name:<15} write in the recipe:\n  {step}")
+            write(console, f"{name:<15}   write in the recipe:\n  {step}")
         else:
-            write(console, wrapped(console, f"{name:<15} {step}", 16))
+            write(console, wrapped(console, f"{name:<15}   {step}", 18))
 
 
 def rows(console: Console, rows: Iterable[tuple[str, str, str]], colour: str = "") -> None:
@@ -160,7 +161,7 @@ class RunProgress:
 
     @hookimpl
     def flangeye_run_started(self, source: Source, total: int | None) -> None:
-        """Start the bar, and print what has to be done about the source."""
+        """Start the bar, and print warnings about the source with their fixes."""
         for each in warnings_of(source.notes):
             write(self._console, wrapped(self._console, f"warning: {each}"), "yellow")
             write(self._console, f"  -> {each.fix}", "yellow")

@@ -36,7 +36,7 @@ WEIGHT = np.repeat([0.02, 1.0], 3)[:, None]
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """Places for one arm: as it is reported, or true.
+    """Estimated transforms, with the arm taken as it reports itself or as it truly is.
 
     Attributes:
         mean: (P,) moves of the places from those of the estimate.
@@ -55,7 +55,7 @@ class Answer:
 
 
 def functional(found: Estimate, a: Floats) -> Answer:
-    """Return the answer p + A delta over the mixture, and over (B, P, K) matrices A alike."""
+    """Return the linear answer p + A delta, averaged over the mixture and (B, P, K) matrices A."""
     p = found.posterior.model.p
     rows = np.concatenate([np.tile(np.eye(p), (len(a), 1, 1)), a], axis=2)
     each = rows @ found.posterior.mean
@@ -64,7 +64,7 @@ def functional(found: Estimate, a: Floats) -> Answer:
     covariance = within.mean(axis=0) + apart.T @ apart / max(len(a) - 1, 1)
     of_effects, noise = shares(found.posterior, rows.mean(axis=0))
     # What is drawn anew at each sighting
-    named = {"scans and poses, one by one": noise}
+    named = {"noise of single scans and poses": noise}
     for effect, share in zip(found.effects, of_effects, strict=True):
         named[effect.name] = named.get(effect.name, 0.0) + share
     return Answer(moves(found, a), 0.5 * (covariance + covariance.T), named)
@@ -92,7 +92,7 @@ def as_reported(found: Estimate, work: Work) -> Answer:
 
 
 def commanded(found: Estimate, work: Work) -> Floats:
-    """Return (B, P, K) what the effects' numbers add to the places, right over each box."""
+    """Return (B, P, K): how the effects move the places in reported coordinates, for each box."""
     return _Commands(found, work.around, work.boxes.astype(float)).answer()
 
 
@@ -233,7 +233,7 @@ def adjoint(pose: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Foreseen:
-    """What the posterior says of sightings at new poses of the work, F times over the mixture.
+    """Predicted sightings at new poses of the work, for F components of the mixture.
 
     Attributes:
         rows: (W, 3, P + K) how places and effects move what is predicted [m].
@@ -251,7 +251,7 @@ class Foreseen:
 
 
 def foreseen(found: Estimate, work: Work) -> Foreseen:
-    """Return what is to be expected at new poses of the work.
+    """Return the prediction of sightings at new poses of the work.
 
     Of the pose's own error, of what the arm does beyond the rigid part, and of the noise of a
     sighting: what errors of poses held out consist of.

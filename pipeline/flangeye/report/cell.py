@@ -1,4 +1,4 @@
-"""The cell as the calibration has it: arm, camera, what it saw and the circles fitted to that."""
+"""3D drawing of the calibrated cell: arm, camera, clouds and fitted circles."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ AXES = 0.2
 
 
 def cell_drawing(facts: Facts) -> PlotlyFigure | None:
-    """Return what was seen, the workspace and the frames.
+    """Return a drawing of clouds, workspace and frames.
 
     In the base where the camera stands there. Where an arm's flange carries the camera also in
     the base, each capture from where the camera was: what stands still must then lie in one place.
@@ -156,7 +156,7 @@ class FoundBody(NamedTuple):
 
 
 def found_body(facts: Facts) -> FoundBody | None:
-    """Return the body that is the target where it was found first; None where none is one.
+    """Return the body used as target, at its first detection; None without one.
 
     None too where it cannot be read here, as one of another version: the rest of the page stands.
     """

@@ -1,4 +1,4 @@
-"""What a log says of its run, in the shape of ``result.json``, finished or not, and its account.
+"""Facts of a run from its log, finished or not, in the shape of ``result.json``.
 
 A finished run brings its own result. For a run that was killed the same document is put together
 from what was logged, with the same functions, so that everything after this has one case.
@@ -52,20 +52,20 @@ class Facts:
 
     @property
     def base_T_camera(self) -> t.Array | None:
-        """(4, 4) the camera's pose in the base, where that is what was estimated."""
+        """(4, 4) camera pose in the base; None if another transform was estimated."""
         found = self.result.transforms.get("base_T_camera")
         return None if found is None else np.array(found.matrix)
 
     @property
     def measured(self) -> list[r.ObservationResult]:
-        """Poses whose circle was fitted, in the order in which they were captured."""
+        """Poses with a fitted circle, in capture order."""
         order = {capture: i for i, capture in enumerate(self.log.poses)}
         fitted = [o for o in self.result.observations if o.centre_in_camera is not None]
         return sorted(fitted, key=lambda o: order.get(o.id, len(order)))
 
     @property
     def residuals(self) -> dict[str, float]:
-        """Residual by pose [m]; empty without an estimate, where they mean nothing."""
+        """Residual by pose [m]; empty without an estimate."""
         if self.estimate is None:
             return {}
         return {o.id: o.residual for o in self.measured if o.residual is not None}
@@ -81,7 +81,7 @@ class Facts:
 
 
 def facts_of(log: RunLog) -> Facts:
-    """Return what ``log`` lets us say."""
+    """Return the facts in ``log``."""
     attached = log.attachments.get("recipe.resolved.yaml", log.attachments.get("recipe.yaml", b""))
     recipe = attached.decode("utf-8", "replace")
     result = r.logged_result(log) or _so_far(log, recipe)
@@ -176,7 +176,7 @@ class RejectedRow:
 
 @dataclass(frozen=True)
 class SetAside:
-    """What was not used, and why.
+    """The captures that were not used, with their reasons.
 
     Attributes:
         rows: One each.
@@ -220,7 +220,7 @@ def _first_of(reasons: list[str]) -> str:
 
 @dataclass(frozen=True)
 class Timing:
-    """What one step took; ``share`` of the slowest, for a bar."""
+    """Duration of one step; ``share`` is relative to the slowest, for a bar."""
 
     step: str
     total: str
@@ -231,7 +231,7 @@ class Timing:
 
 
 def timings_of(facts: Facts) -> list[Timing]:
-    """Return what each step took, in the order of the recipe."""
+    """Return the duration of each step, in recipe order."""
     timing = facts.result.timing
     longest = max((x.seconds for x in timing.values()), default=0.0) or 1.0
     slowest: dict[str, float] = {}
@@ -262,7 +262,7 @@ def _step_order(label: str) -> tuple[int, str]:
 
 
 def provenance_of(facts: Facts) -> list[tuple[str, str]]:
-    """Return what made this result: name and value."""
+    """Return the provenance of a result: recipe, versions, hashes."""
     made, log = facts.result.provenance, facts.log
     rows = {
         "Recipe": made.recipe,

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 
 def write_report(log: RunLog, path: Path, library: Path | None = None) -> None:
-    """Write the report of a run, finished or not, as one HTML file that needs nothing else.
+    """Write the report of a run, finished or not, as one self-contained HTML file.
 
     Args:
         log: What :func:`flangeye.log.read.read_run` gave.
@@ -67,7 +67,7 @@ def render(log: RunLog, library: str | None = None) -> str:
 
 
 def plotly_js() -> bytes:
-    """Return plotly.js as it is installed."""
+    """Return the installed plotly.js as text."""
     import plotly
 
     return (Path(plotly.__file__).parent / "package_data" / "plotly.min.js").read_bytes()
@@ -228,7 +228,7 @@ class ImageView:
 
 
 def missed_view(facts: Facts) -> ImageView | None:
-    """Return the first image in which no target was found, and why; None where there is none."""
+    """Return the first image in which no target was found, and why; None without one."""
     why = {x.id: x.reason for x in facts.log.rejections if x.stage.startswith("fit.")}
     for capture in facts.log.captures() if why else ():
         if capture.id in why and capture.image is not None:
@@ -267,10 +267,10 @@ def _view(name: str, image: t.Image, found: dict[str, t.PoseFeature]) -> ImageVi
     ends = at + scale * misses
     of_each = [rms(f.corners[:, 2:]) for f in found.values()]
     summary = (
-        f"Capture {name}: {len(at)} corners; where the pose has them is {rms(misses):.3f} px off "
-        f"(rms of a coordinate, the lines are {scale:g} times too long), at most "
-        f"{sizes.max():.3f} px. Over the {len(of_each)} images: {np.median(of_each):.3f} px in the "
-        f"median, at most {max(of_each):.3f} px."
+        f"Capture {name}: {len(at)} corners, {rms(misses):.3f} px rms of a coordinate and at most "
+        f"{sizes.max():.3f} px from where the pose puts them; lines are {scale:g} times as long. "
+        f"Over the {len(of_each)} images: {np.median(of_each):.3f} px in the median, at most "
+        f"{max(of_each):.3f} px."
     )
     # The middle of the first pixel is (0, 0), and its corner that of the picture.
     return ImageView(

@@ -1,4 +1,4 @@
-"""Pieces of plotly figures as plain data: what plotly.js reads, without building Python objects.
+"""Plotly figures as plain data, without plotly's slow Python objects.
 
 The page's script sets the theme: text, grid and background.
 """
@@ -68,7 +68,7 @@ def joined(parts: list[Floats]) -> Floats:
 
 
 def frame(matrix: Floats, name: str, length: float) -> list[Trace]:
-    """Return the axes of the frame whose pose is ``matrix`` (4, 4), with its name."""
+    """Return the three axes of a frame at pose ``matrix`` (4, 4), with its name."""
     origin = matrix[:3, 3]
     axes = [
         lines([np.stack([origin, origin + length * matrix[:3, i]])], AXES[i], 6, showlegend=False)

@@ -39,7 +39,7 @@ class Errors:
         return list(dict.fromkeys([*measured, *(i for e in self.held_out.values() for i in e)]))
 
     def group(self, used: bool) -> dict[str, float]:
-        """Return the residuals of the poses that were used, or of the others."""
+        """Return the residuals of used poses, or of the others."""
         ids = [o.id for o in self.poses if o.used is used and o.id in self.residuals]
         return {i: self.residuals[i] for i in ids}
 
@@ -57,7 +57,7 @@ class Errors:
 
     @property
     def summary(self) -> str:
-        """What the plot shows, in words."""
+        """The plot's content in words."""
         used = self.group(used=True)
         if not used:
             return "No pose was used in an estimate."

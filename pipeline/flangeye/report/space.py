@@ -42,7 +42,7 @@ from flangeye.types import BASE, Floats, Observation, Transform
 
 @dataclass(frozen=True)
 class PlotlyFigure:
-    """A figure for plotly, the frame it is in, and what it shows in words."""
+    """A plotly figure, its frame, and a summary in words."""
 
     figure: dict[str, Any]
     frame: str
@@ -72,13 +72,13 @@ def workspace_drawing(facts: Facts) -> PlotlyFigure | None:
     ]
     low, high = millimetres(float(sigma.min())), millimetres(float(sigma.max()))
     summary = (
-        f"Over the workspace box the error to expect (one standard deviation of the mapped point) "
-        f"is {low} to {high} mm."
+        f"Over the workspace box it is {low} to {high} mm (one standard deviation); the expected "
+        "error at the work includes arm and scan as well."
     )
     if facts.result.truth:
         arrows, scale, size = _true_errors(facts, grid, max(box.size))
         traces.append(arrows)
-        summary += f" The true error, drawn {scale:g} times too long, is at most {size} mm there."
+        summary += f" The true error, drawn {scale:g} times as long, is at most {size} mm there."
     return PlotlyFigure(figure3d(traces), in_words(frame), summary)
 
 
@@ -160,7 +160,7 @@ def _true_errors(facts: Facts, grid: Floats, extent: float) -> tuple[Trace, floa
 
 
 def graph_drawing(facts: Facts) -> PlotlyFigure | None:
-    """Return where cameras were, and where they saw targets; None where not all of it was found."""
+    """Return a drawing of camera poses and sighted targets; None if a pose is missing."""
     cell, seen = _cell_of(facts.log, facts.recipe), facts.log.observations()
     found = {name: Transform.named(name, x.matrix) for name, x in facts.result.transforms.items()}
     if cell is None or not seen or not {*cell.unknowns} <= {*found}:

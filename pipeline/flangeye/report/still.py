@@ -1,4 +1,4 @@
-"""A still picture of a cell: the arm, what the scanner sees, the box and the poses, as SVG."""
+"""A still SVG picture of a cell: arm, field of view, workspace box and poses."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ PIXELS = 'vector-effect="non-scaling-stroke"'
 
 @dataclass(frozen=True, eq=False)
 class StillScene:
-    """What a picture shows; all in the base.
+    """The content of a still picture, in the base.
 
     Attributes:
         robot: The arm, drawn from its capsules.
@@ -69,7 +69,7 @@ def _ready(model: str) -> tuple[float, ...]:
 
 
 def scene_of(facts: Facts) -> StillScene | None:
-    """Return the cell as a run found it, its arm at the first pose that was used.
+    """Return the calibrated cell, with its arm at the first used pose.
 
     None where the scanner does not stand in the base, or its models are not known here.
     """

@@ -32,7 +32,7 @@ class Banner:
 
 
 def banner_of(facts: Facts) -> Banner:
-    """Return the verdict and what it means for whoever wants to use the matrix."""
+    """Return the verdict and its reason."""
     result = facts.result
     figures = ["SIMULATED"] if result.simulated else []
     if result.status == "refused":
@@ -100,7 +100,7 @@ def tiles_of(facts: Facts) -> list[KeyFigure]:
 
 
 def evidence_of(facts: Facts) -> list[KeyFigure]:
-    """Return the other errors that the report states, each with what it is taken over."""
+    """Return the other errors in the report, each with a remark."""
     result, found = facts.result, []
     answers = result.answers
     if answers and answers.corrected and answers.corrected.expected_rms is not None:
@@ -121,8 +121,8 @@ def evidence_of(facts: Facts) -> list[KeyFigure]:
 
 
 def next_steps_of(facts: Facts) -> list[tuple[str, str]]:
-    """Return what to do next: a purpose, and its command."""
-    run = shlex.quote(str(facts.log.path.parent.name or "."))
+    """Return what to do next: purposes with their commands."""
+    run = shlex.quote(str(facts.log.path.parent))
     if facts.result.status == "refused":
         return [("Find the cause", f"flangeye doctor {run}/{facts.log.path.name}")]
     if facts.result.status == INCOMPLETE:

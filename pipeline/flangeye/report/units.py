@@ -6,14 +6,14 @@ import math
 
 
 def millimetres(metres: float) -> str:
-    """Return a length [m] in mm without its unit: to a micrometre where that says something."""
+    """Return a length [m] in mm without its unit, to a micrometre where that is significant."""
     value = metres * 1e3
     decimals = 3 if abs(value) < 10 else 2 if abs(value) < 100 else 1
     return f"{value:z.{decimals}f}"
 
 
 def rounded_mm(metres: float) -> str:
-    """Return a length [m] in mm without its unit, as far as it matters at the work: 0.16."""
+    """Return a length [m] in mm without its unit, rounded for people: 0.16."""
     value = metres * 1e3
     decimals = 1 if abs(value) >= 10 else 2 if abs(value) >= 0.1 else 3
     return f"{value:.{decimals}f}"

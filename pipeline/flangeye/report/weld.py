@@ -1,4 +1,4 @@
-"""What the report shows of a weld: paths as in the paper's Fig. 13, deviations, contact, speeds."""
+"""Plots of a weld: paths as in the paper's Fig. 13, deviations, contact, speeds."""
 
 from __future__ import annotations
 
@@ -85,12 +85,12 @@ class _View:
         return np.asarray((points - self._origin) @ self._axes)
 
     def off_plan(self, points: Floats) -> tuple[Floats, Floats]:
-        """Return where along the plan points are, and how far to its left [m]."""
+        """Return the points' arc lengths along the plan, and offsets to its left [m]."""
         return off_line(self.planned, self.flat(points))
 
 
 def off_line(line: Floats, points: Floats) -> tuple[Floats, Floats]:
-    """Return where along a line (M, 2) points (N, 2) are, and how far to its left [m].
+    """Return arc lengths of points (N, 2) along a line (M, 2), and offsets to its left [m].
 
     The line goes on straight beyond its ends.
     """
@@ -252,7 +252,7 @@ def _loop(weld: WeldReport) -> list[tuple[str, str]]:
 
 @dataclass(frozen=True)
 class SeamView:
-    """What the page shows of a seam.
+    """Content of the page about a seam.
 
     Attributes:
         space: The seam on the cloud, for plotly.

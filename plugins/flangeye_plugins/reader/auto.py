@@ -38,7 +38,10 @@ def auto(
     untried = [name for name, reader in bound.items() if reader is None]
     if untried:
         missed.append(f"not tried, for a recipe must give their parameters: {', '.join(untried)}")
-    raise NotThisLayout(f"{path}: no reader knows this layout: {'; '.join(missed)}")
+    raise NotThisLayout(
+        f"{path}: no reader knows this layout; 'flangeye init {path}' writes a recipe for other "
+        f"layouts; tried: {'; '.join(missed)}"
+    )
 
 
 def _bound(reader: Part) -> BoundPart | None:
@@ -60,5 +63,6 @@ def _tried(
         try:
             found[name] = reader(path, **arm)
         except NotThisLayout as error:
-            missed.append(f"{name} ({str(error).removeprefix(f'{path}: ')})")
+            cause, _, _ = str(error).removeprefix(f"{path}: ").partition("; ")
+            missed.append(f"{name} ({cause})")
     return found, missed

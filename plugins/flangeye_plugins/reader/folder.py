@@ -1,4 +1,4 @@
-"""The simplest layout, for recordings of one's own: a folder of scans and a file of poses.
+"""The simplest layout, for one's own recordings: a folder of scans and a file of poses.
 
 ``poses.csv`` has a heading and a row for each cloud or image::
 
@@ -91,7 +91,7 @@ def _poses_file(path: Path) -> Path:
     if not found:
         clouds = sum(1 for p in path.glob("*") if p.suffix.lower() in CLOUDS)
         but = f"clouds ({clouds}), but " if clouds else ""
-        advice = "; 'flangeye init FOLDER' writes a recipe for other tables"
+        advice = f"; 'flangeye init {path}' writes a recipe for other layouts"
         raise NotThisLayout(f"{path}: holds {but}none of {', '.join(named)}{advice}")
     if len(found) > 1:
         raise StageError(f"{path}: holds {' and '.join(f.name for f in found)}; keep one of them")

@@ -181,7 +181,7 @@ def test_clouds_without_poses_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a.pcd").touch()
     assert refused(tmp_path) == (
         f"{tmp_path}: holds clouds (1), but none of poses.csv, poses.yaml, poses.yml, poses.json; "
-        "'flangeye init FOLDER' writes a recipe for other tables"
+        f"'flangeye init {tmp_path}' writes a recipe for other layouts"
     )
 
 
@@ -195,10 +195,10 @@ def test_auto_refuses_what_nobody_knows_and_what_two_know(tmp_path: Path) -> Non
     with pytest.raises(StageError) as error:
         auto(tmp_path)
     assert str(error.value) == (
-        f"{tmp_path}: no reader knows this layout: ancorasir (holds none of calib_data.json, "
+        f"{tmp_path}: no reader knows this layout; 'flangeye init {tmp_path}' writes a recipe for "
+        "other layouts; tried: ancorasir (holds none of calib_data.json, "
         "calibration_robot_pose_data.npy, calibration_robot_pose_data.npz, data.txt, "
-        "readRobot.txt); folder (holds none of poses.csv, poses.yaml, poses.yml, poses.json; "
-        "'flangeye init FOLDER' writes a recipe for other tables)"
+        "readRobot.txt); folder (holds none of poses.csv, poses.yaml, poses.yml, poses.json)"
     )
     (tmp_path / "poses.csv").write_text(HEADING + ROW)
     (tmp_path / "data.txt").write_text("p_robot 6-DoF index:a\n[1, 2, 3, 0, 0, 0, 1]\n")
@@ -241,7 +241,8 @@ def test_auto_asks_the_readers_of_plugins_too(tmp_path: Path) -> None:
     with pytest.raises(StageError) as error:
         chosen(tmp_path)
     assert str(error.value).startswith(
-        f"{tmp_path}: no reader knows this layout: acme (holds no scans.acme); ancorasir (holds "
+        f"{tmp_path}: no reader knows this layout; 'flangeye init {tmp_path}' writes a recipe for "
+        "other layouts; tried: acme (holds no scans.acme); ancorasir (holds "
     )
     untried = str(error.value).partition("; not tried, for a recipe must give their parameters: ")[
         2

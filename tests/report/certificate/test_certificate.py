@@ -129,7 +129,7 @@ def test_the_causes_add_up_to_the_calibrations_uncertainty(result: Result) -> No
     )
     total = float(np.sum(budget_of(result).standard ** 2))
     shares = {s.cause: s.standard**2 / total for s in shares_of(told_of)}
-    expected = {"sag": 0.5, "joint zeros": 0.3, "sizes of all these": 0.196, "others": 0.004}
+    expected = {"sag": 0.5, "joint zeros": 0.3, "sizes of these causes": 0.196, "others": 0.004}
     assert shares == pytest.approx(expected, rel=1e-9)
     assert list(shares) == list(expected)
     (alone,) = shares_of(result)  # a solver that does not say

@@ -46,7 +46,7 @@ WAYS = {"": ("base_T_flange", "flange_T_base"), "target-": ("camera_T_target", "
 
 
 def poses_of(table: Table) -> tuple[list[PoseColumns], Headings]:
-    """Return the poses and points in a table, and what else it holds."""
+    """Return the poses and points in a table, with its other columns."""
     return poses_by_name(table) if table.heading else poses_by_number(table)
 
 
@@ -217,8 +217,8 @@ def _table_of(tables: Sequence[Table], found: Sequence[PoseColumns], questions: 
 def _unplain(table: Table) -> str:
     shown = ", ".join(dict.fromkeys(table.heading)) or f"{len(table.rows[0][1])} numbers a row"
     return (
-        f"{table.file}: which columns are the arm's pose is not plain from {shown}; add --columns "
-        "with their names, or numbers from 1, position first: --columns x,y,z,a,b,c --rotation "
+        f"{table.file}: it is not clear from {shown} which columns are the arm's pose; add "
+        "--columns with names or numbers from 1, position first: --columns x,y,z,a,b,c --rotation "
         "kuka; or those of the joint angles: --columns 1,2,3,4,5,6 --rotation joints"
     )
 
@@ -449,8 +449,11 @@ def _rotation(pose: PoseColumns, questions: Questions, prefix: str, maker: str |
     joints = ", or joints, with --robot" if pose.may_be_joints and not prefix else ""
     known = f"{', '.join(CONVENTIONS)}, vector, xyz, ZYX, …{joints}"
     question = f"how the rotation in columns {shown} of {pose.table.name} is written"
+    example = f"vector, or --{key} xyz for roll, pitch, yaw"
+    if not prefix:
+        example += "; or name the arm with --robot: its maker decides"
     names = one_of(*CONVENTIONS, *PLAIN, "point", "joints", MATRIX, APART)
-    return questions.ask(key, question, usual, "vector", names, known)
+    return questions.ask(key, question, usual, example, names, known)
 
 
 def _length(numbers: Floats, pose: PoseColumns) -> str:

@@ -82,7 +82,7 @@ def print_pdf(page: Path) -> Path | None:
 
 
 def sandbox() -> list[str]:
-    """Return what lets Chromium start: for root it refuses its sandbox, for others it keeps it."""
+    """Return Chromium's sandbox flags: root must switch it off, others keep it."""
     return ["--no-sandbox"] if getattr(os, "geteuid", lambda: 1)() == 0 else []
 
 
@@ -103,7 +103,7 @@ def render(facts: Facts, conditions: Conditions) -> str:
 
 
 def standard_text(row: Contribution | Share) -> str:
-    """Return a standard uncertainty with its unit; one that is only bounded says so."""
+    """Return a standard uncertainty with its unit; "below" if it is only a bound."""
     angle = isinstance(row, Contribution) and row.unit == "rad"
     # Smallest uncertainty that is printed as a number [rad]: 0.0001 degrees
     shown, least = (degrees, 1.75e-6) if angle else (millimetres, LEAST_LENGTH)

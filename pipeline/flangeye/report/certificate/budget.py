@@ -66,7 +66,7 @@ def coverage_factor(freedom: float, probability: float = 0.95) -> float:
 
 @dataclass(frozen=True)
 class Conditions:
-    """What the person says of the place, for it is not measured.
+    """Conditions that a person states, for they are not measured.
 
     Attributes:
         temperature: Temperature of the air [°C], or None.
@@ -93,7 +93,7 @@ class Contribution:
         sensitivity: (3,) derivative of the point's coordinates by it.
         freedom: Degrees of freedom; infinite where it is taken as known.
         evidence: Where the figure comes from.
-        bound: Whether the series shows no such error: ``standard`` is then what it could hide.
+        bound: Whether no such error was seen: ``standard`` is then the size that could stay unseen.
     """
 
     name: str
@@ -113,7 +113,7 @@ class Contribution:
 
 @dataclass(frozen=True, eq=False)
 class Budget:
-    """What is known of one point.
+    """Uncertainty budget of one point.
 
     Attributes:
         point: (3,) in the parent frame [m].
@@ -155,7 +155,7 @@ class Budget:
 
     @property
     def correlated(self) -> list[tuple[str, str, float]]:
-        """Pairs of contributions whose correlation is worth naming, largest first."""
+        """Pairs of contributions correlated by more than 0.3, largest first."""
         names = [c.name for c in self.contributions]
         pairs = zip(*np.triu_indices(len(names), 1), strict=True)
         found = [(names[i], names[j], float(self.correlation[i, j])) for i, j in pairs]
@@ -168,7 +168,7 @@ class Budget:
 
 
 def budget_of(result: Result) -> Budget:
-    """Return the budget of the calibration alone, at the corner of the work that is known least.
+    """Return the budget of the calibration alone, at the least certain corner of the work.
 
     Raises:
         StageError: The run gave no calibration, or nothing says where the work is.
@@ -228,10 +228,10 @@ class Share:
 
 
 def shares_of(result: Result) -> list[Share]:
-    """Return what the calibration's uncertainty comes from, the largest first.
+    """Return the calibration's uncertainty by cause, largest first.
 
-    Their squares add up to that of the budget: what each cause leaves in the answer by the
-    estimator's own model, and what few poses leave open of how large the causes are.
+    Their squares add up to that of the budget: each cause's posterior variance by the estimator's
+    own model, and the uncertainty of the causes' own sizes.
     """
     _, estimate = _estimate_of(result)
     motions = _motions(_worst_corner(result, estimate)[None], np.array(estimate.about))[0]
@@ -247,15 +247,13 @@ def shares_of(result: Result) -> list[Share]:
     least = 0.01  # a cause with a smaller share of the variance is counted among the others
     rows = {cause: v for cause, v in told.items() if v >= least * whole}
     small, rest = sum(told.values()) - sum(rows.values()), whole - sum(told.values())
-    shares = [
-        Share(cause, np.sqrt(v), f"what {used} poses leave open of it") for cause, v in rows.items()
-    ]
+    shares = [Share(cause, np.sqrt(v), f"posterior of {used} poses") for cause, v in rows.items()]
     if small > 0:
         each = f"{len(told) - len(rows)} causes of less than {least:.0%} of the variance each"
         shares.append(Share("others", np.sqrt(small), each))
     if rest > 0:
-        few = "few poses do not tell how large each cause is, nor where exactly the work ends"
-        shares.append(Share("sizes of all these", np.sqrt(rest), few))
+        few = "how large each cause is, is estimated from few poses"
+        shares.append(Share("sizes of these causes", np.sqrt(rest), few))
     return sorted(shares, key=lambda share: -share.standard)
 
 
