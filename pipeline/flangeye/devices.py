@@ -1,4 +1,4 @@
-"""What a robot, a scanner and a tactile sensor must do; everything vendor-specific is behind this.
+"""Interfaces of robots, scanners and tactile sensors; drivers implement them.
 
 A driver is a part (``robot.NAME``, ``scanner.NAME``, ``sensor.NAME``): a function that takes the
 recipe's model and its own parameters and returns an open device. It imports its SDK when it is
@@ -40,7 +40,7 @@ Mode = Literal["ready", "moving", "protective stop", "emergency stop", "not read
 
 
 class DeviceError(StageError):
-    """A device cannot be opened, or is lost: which, why, and what to do."""
+    """A device cannot be opened or was lost; the message says which, why, and what to do."""
 
 
 class FrameDropped(DeviceError):
@@ -71,10 +71,10 @@ class RobotState:
 
 
 class Device(Protocol):
-    """What is open and used as a context; a driver's class may inherit from it."""
+    """A device that is open, used as a context; a driver's class may inherit from it."""
 
     def close(self) -> None:
-        """Let go of the device; safe to call twice."""
+        """Disconnect; safe to call twice."""
         ...
 
     def __enter__(self) -> Self:
@@ -122,7 +122,7 @@ class Robot(Device, Protocol):
         ...
 
     def move_velocity(self, twist: Floats, acceleration: float) -> None:
-        """Go on at a twist (6,) until the next command; brake when none comes for GRACE.
+        """Move at a twist (6,) until the next command; brake if none comes within GRACE.
 
         Acceleration in [m/s^2] and [rad/s^2].
         """
@@ -133,17 +133,17 @@ class Robot(Device, Protocol):
         ...
 
     def stop(self) -> None:
-        """Begin to brake at once, whatever is under way; does nothing on an arm that stands."""
+        """Begin to brake at once; does nothing if the arm is at rest."""
         ...
 
     def close(self) -> None:
-        """Stop and let go of the controller; safe to call twice and after the device was lost."""
+        """Stop and disconnect; safe to call twice, also after the connection was lost."""
         ...
 
 
 @runtime_checkable
 class MovedByHand(Protocol):
-    """What a robot has besides when a person moves it.
+    """Additional interface of a robot that a person moves by hand.
 
     A move then takes as long as it takes, leads past nothing that was planned, and ends near the
     pose asked for, not at it: when the mode is ready again, the state says where.
@@ -185,7 +185,7 @@ class Scanner(Device, Protocol):
     facts: dict[str, str]
 
     def expose(self) -> Callable[[], Scan]:
-        """Return when the exposure has ended and the arm may move on.
+        """Take the exposure; return when it has ended and the arm may move on.
 
         Calling what it returns waits for the data, a few seconds at most, and gives the scan.
         Both may raise; what it returns is called once, and before the next exposure. Only where
@@ -201,7 +201,7 @@ class Scanner(Device, Protocol):
 
 @runtime_checkable
 class HearsLoss(Protocol):
-    """What a scanner has besides that hears at once of its loss: an arm under way then stops."""
+    """Additional interface of a scanner that notices its loss at once, so a moving arm stops."""
 
     def require_alive(self) -> None:
         """Raise DeviceError when the scanner is lost; called some times a second, never waits."""
@@ -210,7 +210,7 @@ class HearsLoss(Protocol):
 
 @runtime_checkable
 class Overhears(Protocol):
-    """What a scanner has besides that takes scans which others asked for.
+    """Additional interface of a scanner that receives scans which others triggered.
 
     Where others move the arm, their program may trigger the scanner as well.
     """
@@ -257,7 +257,7 @@ class KnowsSeams(Protocol):
 
 
 class StateSource(Protocol):
-    """The arm's pose and its time, for a tactile sensor that needs nothing else of the arm."""
+    """Source of the arm's pose and its time, all that a tactile sensor needs of the arm."""
 
     def state(self) -> RobotState:
         """Return the newest sample."""
@@ -302,7 +302,7 @@ class TactileSensor(Device, Protocol):
 
 @dataclass(frozen=True)
 class WeldProfile:
-    """One look at the bead behind a torch.
+    """One measurement of the bead behind the torch.
 
     Attributes:
         offset: How far the bead's middle is to the left of the joint, seen along the weld [m].
@@ -317,7 +317,7 @@ class WeldProfile:
 
 @runtime_checkable
 class Profiler(Device, Protocol):
-    """A profile sensor on the tool that looks at the bead, a fixed way behind the torch.
+    """A profile sensor on the tool that measures the bead at a fixed distance behind the torch.
 
     Attributes:
         name: For people.
@@ -328,7 +328,7 @@ class Profiler(Device, Protocol):
     behind: float
 
     def profile(self) -> WeldProfile | None:
-        """Return the newest look not yet returned, or None; never waits.
+        """Return the newest profile not yet returned, or None; never waits.
 
         Where no bead and joint can be told in a profile there is no look.
 
@@ -363,7 +363,7 @@ class Arc(Device, Protocol):
         ...
 
     def burning(self) -> bool | None:
-        """Return whether the arc is established; None where nothing says so. Never waits."""
+        """Return whether the arc is established; None if there is no such signal. Never waits."""
         ...
 
 

@@ -19,15 +19,15 @@ class RecipeError(FlangeyeError):
 
 
 class StageError(FlangeyeError):
-    """A step cannot do its work at all with the input it was given."""
+    """A step cannot work with the input it was given."""
 
 
 class NothingSeen(StageError):
-    """No capture shows what is looked for."""
+    """No capture shows the target."""
 
 
 class CalibrationRefused(FlangeyeError):
-    """The input was sound, but no answer can be trusted: the reason, and what is missing."""
+    """The input was valid, but no answer is reliable; says why and what is missing."""
 
     exit_code = 1
 

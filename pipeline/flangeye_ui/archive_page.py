@@ -59,7 +59,7 @@ def add(project: Project) -> None:
 
 
 def row_of(run: Path) -> dict[str, Any]:
-    """Return one line of the table; a run without a result, or an unreadable one, says so."""
+    """Return the table's row for a run; of one without a result, a remark."""
     path = run / "result.json"
     if not path.exists():
         return {"run": run.name, "status": "unfinished", "note": "ended before its result"}

@@ -1,4 +1,4 @@
-"""Cell: choose what stands there; the recipe grows beside it, checked as one types."""
+"""Page *Cell*: choose the devices; the recipe beside it is checked while one types."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ class Form:
 
     @ui.refreshable_method
     def steps(self) -> None:
-        """Show every step that has what was searched for, with what is wrong at each field."""
+        """Show every step that matches the search, with its mistakes at each field."""
         data, (_, mistakes) = self._project.data(), self._project.check()
         if any(m.path.startswith("steps") for m in mistakes):
             self._box.value = True
@@ -313,7 +313,7 @@ class Import:
 
 
 class WhatRuns:
-    """What runs under ROS 2, to choose from: ``flangeye init --ros2`` then writes the recipe."""
+    """Choose from what runs under ROS 2; ``flangeye init --ros2`` then writes the recipe."""
 
     def __init__(self, project: Project, form: Form) -> None:
         self._project, self._form = project, form

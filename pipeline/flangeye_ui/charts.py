@@ -1,4 +1,4 @@
-"""Charts of a run: residuals by pose, what of the work was covered, where the flange has been."""
+"""Charts of a run: residuals by pose, coverage of the workspace, path of the flange."""
 
 from __future__ import annotations
 

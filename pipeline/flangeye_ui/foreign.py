@@ -29,7 +29,7 @@ def address_of(folder: Path, path: Path) -> str:
 
 
 def add(folder: Path) -> None:
-    """Serve what lies in the runs and batches of a folder."""
+    """Serve the files of runs and batches in a folder."""
 
     @app.get("/files/{path:path}")
     def file(path: str) -> Response:
@@ -37,7 +37,7 @@ def add(folder: Path) -> None:
 
 
 def answer(folder: Path, path: str) -> Response:
-    """Return a file under its policy; 404 for what is no file of a run or batch."""
+    """Return a file with its security policy; 404 if it belongs to no run or batch."""
     found = _found(folder, path)
     if found is None:
         return PlainTextResponse("no such file of a run\n", 404)

@@ -1,4 +1,4 @@
-"""What every page has: the five steps with what is done, what to do now, and the way on."""
+"""Layout of every page: the five steps, what is done, and the button to go on."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SIMULATED = "SIMULATED: no real arm or scanner; the figures are the simulation's
 
 
 class ActionBar:
-    """The bar below a page: how things stand, and the one button that leads on."""
+    """The bar below a page: the status line, and the primary button."""
 
     def __init__(self) -> None:
         with (
@@ -43,7 +43,7 @@ class ActionBar:
         self._footer.set_visibility(False)
 
     def say(self, text: str) -> None:
-        """Say how things stand, in one line."""
+        """Show a status line."""
         self._footer.set_visibility(True)
         self._said.text = text
 
@@ -61,14 +61,14 @@ class ActionBar:
 
 
 def weigh(button: ui.button, second: bool) -> None:
-    """Draw a button as the one that leads on, or as one beside it."""
+    """Style a button as the primary one, or as a secondary one."""
     plain, filled = "outline", "unelevated"
     button.props(plain if second else filled, remove=filled if second else plain)
 
 
 @contextmanager
 def page(project: Project, title: str) -> Iterator[ActionBar]:
-    """Lay out one page around what is made inside; yield the bar with its primary button."""
+    """Lay out a page around its content; yield the bar with its primary button."""
     ui.add_css(css() + (Path(__file__).parent / "page.css").read_text(encoding="utf-8"))
     ui.add_head_html("<script>document.documentElement.lang = 'en'</script>")
     ui.colors(
@@ -124,17 +124,17 @@ def command_line(text: str) -> ui.label:
 
 
 def warning(text: str) -> ui.label:
-    """Show what a person should know or do, in one line."""
+    """Show a warning in one line."""
     return ui.label(f"⚠ {text}").classes("text-warning")
 
 
 def mistake(text: str) -> ui.label:
-    """Show what is wrong, in one line."""
+    """Show a mistake in one line."""
     return ui.label(text).classes("text-negative").props('role="alert"')
 
 
 async def code_from_terminal() -> str:
-    """Ask for the code that the terminal shows; return it, empty where nobody gave one."""
+    """Ask for the code shown in the terminal; return it, or an empty text."""
     with ui.dialog() as dialog, ui.card():
         ui.label("The arm will move. Is its workspace clear of people?").classes("title")
         ui.label("The terminal of 'flangeye ui' shows a code for this move.")
@@ -148,7 +148,7 @@ async def code_from_terminal() -> str:
 
 
 def code(text: str) -> ui.label:
-    """Show text as it is written: never as markup, whatever is in it."""
+    """Show text literally, without interpreting markup."""
     return ui.label(text).classes("code").props('tabindex=0 role="group" aria-label="Text"')
 
 

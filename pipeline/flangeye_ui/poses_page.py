@@ -32,7 +32,7 @@ def add(project: Project) -> None:
 
 
 class PosePlanner:
-    """The drawing and the plan beside it."""
+    """The drawing of the planned poses, and their list."""
 
     def __init__(self, project: Project, recipe: Recipe, bar: ActionBar) -> None:
         self._project, self._recipe, self._bar = project, recipe, bar
@@ -192,7 +192,7 @@ class PosePlanner:
 
 
 def plan_in(printed: str) -> dict[str, Any]:
-    """Return the plan in what ``flangeye run --json`` printed; words alone where there is none."""
+    """Return the plan in the output of ``flangeye run --json``; only its words without one."""
     for line in printed.splitlines():
         if line.startswith("{"):
             return cast("dict[str, Any]", json.loads(line))

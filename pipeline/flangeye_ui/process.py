@@ -1,4 +1,4 @@
-"""A run as a process of the command line, and what its log says while it goes."""
+"""A run as a child process, followed by its log."""
 
 from __future__ import annotations
 
@@ -81,14 +81,14 @@ class RunProcess:
 
     @property
     def left(self) -> float | None:
-        """Seconds that it takes at most, by the pace so far; None where nobody can say."""
+        """Time left at most, from the pace so far [s]; None if unknown."""
         seen, total = self.view.captures, self.view.total
         if not seen or not total or self.code is not None:
             return None
         return (time.monotonic() - self.began) / seen * max(total - seen, 0)
 
     def stop(self, why: str) -> None:
-        """Stop it as Ctrl-C does: the arm's guard hears it at once."""
+        """Stop the run like Ctrl-C: the arm's guard receives the signal at once."""
         if self.code is None:
             self.stopped = why
             self._process.send_signal(signal.SIGINT)

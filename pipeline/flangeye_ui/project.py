@@ -1,4 +1,4 @@
-"""What all pages of one server share: the folder, the recipe, the run under way."""
+"""State shared by all pages of a server: the folder, the recipe, the present run."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Mistake:
 
 
 class Project:
-    """The state behind the pages; one a server, so that two pages show the same.
+    """The state behind the pages; one per server, so that all browsers show the same.
 
     Attributes:
         folder: Where recipes and runs are.
@@ -78,7 +78,7 @@ class Project:
 
     @property
     def text(self) -> str:
-        """The recipe as it is on disk."""
+        """The recipe's text on disk."""
         return self.recipe_path.read_text(encoding="utf-8")
 
     @text.setter
@@ -94,7 +94,7 @@ class Project:
         return data if isinstance(data, dict) else {}
 
     def edit(self, data: dict[str, Any]) -> None:
-        """Write what differs from the recipe on disk; the rest stays, comments included."""
+        """Write only what differs from the recipe on disk; comments are kept."""
         self.text = edited(self.text if self.data() else "", data)
 
     def check(self) -> tuple[Recipe | None, list[Mistake]]:
@@ -130,7 +130,7 @@ class Project:
         return [p.parent for p in sorted(logs, key=lambda p: p.stat().st_mtime, reverse=True)]
 
     def read(self, run: Path) -> Facts:
-        """Return what a run's log says.
+        """Return the log of a run.
 
         Raises:
             StageError: It cannot be read: damaged, or written by another version.
@@ -146,7 +146,7 @@ class Project:
         return shlex.join(["flangeye", *words])
 
     def run_command(self, words: Sequence[str], patience: float = 300.0) -> str:
-        """Return what a command of flangeye prints, in the folder; it moves nothing."""
+        """Run a flangeye command in the folder and return its output; it moves nothing."""
         line = [sys.executable, "-P", "-m", "flangeye.cli", *words]
         try:
             done = subprocess.run(
@@ -158,7 +158,7 @@ class Project:
         return (done.stdout + done.stderr).strip()
 
     def write_line(self, name: str, params: Mapping[str, Any]) -> None:
-        """Put parameters into a step, or what is no step into a section of the header."""
+        """Put a line into the recipe: parameters into a step, else a section into the header."""
         if "." in name:
             self.write_step(name, params)
         else:
@@ -166,7 +166,7 @@ class Project:
             self.edit({**{k: v for k, v in data.items() if k != "steps"}, "steps": data["steps"]})
 
     def write_step(self, name: str, params: Mapping[str, Any]) -> None:
-        """Put parameters into a step of the recipe; where it has none such, add one in its place.
+        """Set a step's parameters in the recipe; add the step at its place if it is missing.
 
         Of kinds that a recipe has one of, the step that is there makes room.
         """
@@ -187,7 +187,7 @@ class Project:
         self.edit({**data, "steps": steps})
 
     def unfinished(self) -> Path | None:
-        """Return the newest run, if it ended before its result; nothing while one goes."""
+        """Return the newest run if it ended before its result; None while a run goes on."""
         runs = self.runs()
         going = self.run is not None and self.run.code is None
         if going or self.elsewhere() or not runs or (runs[0] / "result.json").exists():
@@ -235,7 +235,7 @@ def _mistake(line: str) -> Mistake:
 
 
 def at(mistakes: list[Mistake], *paths: str) -> Iterator[str]:
-    """Yield what is wrong at a field or within it."""
+    """Yield the mistakes at a field or within it."""
     for mistake in mistakes:
         if any(mistake.path == p or mistake.path.startswith(f"{p}.") for p in paths):
             yield mistake.text
@@ -249,7 +249,7 @@ class MoveCodes:
         self._open: tuple[str, tuple[str, ...], str, float] | None = None
 
     def ask(self, words: Sequence[str], page: str) -> None:
-        """Show a new code in the terminal, with the command that it would start."""
+        """Show a new code in the terminal, with the command that it would allow."""
         digits = 6
         code = f"{secrets.randbelow(10**digits):0{digits}d}"
         # A code is good for so long [s]: time to walk to the terminal and back.

@@ -1,4 +1,4 @@
-"""Result: warnings first, the matrix with what it is worth, and what would make it better."""
+"""Page *Result*: warnings, the matrix with its errors, and what would improve it."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ ASKED = {
 
 
 class TouchBox:
-    """Says where a seen point lies in the base, and how far from there the tip was."""
+    """Shows a scanned point in the base, and the tip's distance from it."""
 
     def __init__(self, project: Project, run: Path, calibration: HandEye) -> None:
         self._project, self._calibration = project, calibration
@@ -293,7 +293,7 @@ def _apply(project: Project, line: dict[str, Any]) -> None:
 
 
 def warnings_of(facts: Facts) -> list[str]:
-    """Return what a log says of itself and of its captures."""
+    """Return the warnings of a log and its captures."""
     aside = [f"{count} set aside: {why}" for count, _, why in set_aside_of(facts).counts]
     return [*facts.log.notes, *aside]
 
@@ -363,7 +363,7 @@ def _residuals(scene: Scene3D, facts: Facts) -> float:
 
 
 class Better:
-    """What would make the calibration better: the motion that is missing."""
+    """Suggestions that would improve the calibration: missing motions."""
 
     def __init__(self, project: Project, run: Path, facts: Facts) -> None:
         self._place = ui.column().classes("w-full gap-1")
@@ -386,7 +386,7 @@ class Better:
 
 
 class Doctor:
-    """The doctor's findings, each with a button that writes the line it gives into the recipe."""
+    """The doctor's findings, each with a button that writes its fix into the recipe."""
 
     def __init__(self, project: Project, run: Path, box: ui.expansion) -> None:
         self._project, self._run, self._asked = project, run, False

@@ -1,4 +1,4 @@
-"""Scan: asks before anything moves, shows what arrives, and stops as fast as Ctrl-C does."""
+"""Page *Scan*: asks before anything moves, shows captures as they arrive, and can stop."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def add(project: Project) -> None:
 
 
 class RunPanel:
-    """What is seen of the run, and the buttons that start and stop it."""
+    """State of the run, with buttons to start and stop it."""
 
     def __init__(self, project: Project, client: Client, bar: ActionBar) -> None:
         self._project, self._me, self._bar = project, client.id, bar
@@ -285,7 +285,7 @@ class RunPanel:
 
 
 class Shot(ui.element):
-    """One scan: its small picture and what became of it.
+    """One scan: its thumbnail and its outcome.
 
     Attributes:
         ended: Whether it says what can be done about it, the run being over.
@@ -300,7 +300,7 @@ class Shot(ui.element):
         self._picture.set_visibility(False)
 
     def show(self, tone: str, verdict: str, picture: str) -> None:
-        """Show these; only what is new is sent."""
+        """Show these scans; only new ones are sent to the browser."""
         if (tone, verdict, picture) == self._shown:
             return
         if picture != self._shown[2]:
@@ -323,7 +323,7 @@ def _time(seconds: float) -> str:
 
 
 def verdict_on(run: RunProcess, capture: str) -> tuple[str, str]:
-    """Return tone and words of what became of a capture so far."""
+    """Return tone and words for the outcome of a capture so far."""
     if capture in run.set_aside:
         return "poor", f"set aside: {run.set_aside[capture]}"
     residuals = run.outlook.residuals if run.outlook else {}
@@ -345,7 +345,7 @@ def _nothing(left: Path | None, other: Path | None) -> str:
 
 
 def status_line(run: RunProcess, mine: bool) -> str:
-    """Return how the run stands, in one line."""
+    """Return the run's status in one line."""
     if run.code is None:
         where = "" if mine else "; another page started it"
         return f"{run.path.name} runs{where}."

@@ -206,7 +206,7 @@ class Scene3D(ui.scene):
         self.run_method("resize")
 
     def look(self, view: str) -> None:
-        """Look from one of the views."""
+        """Switch to one of the views."""
         eye, middle, up = self._of[view]
         self.move_camera(*eye, *middle, *up, 0.0)
 
@@ -230,7 +230,7 @@ class Scene3D(ui.scene):
             box.move(*np.asarray(centre).tolist()).material(SERIES["unused"])
 
     def sees(self, scanner: ScannerModel, base_T_camera: Floats) -> Any:
-        """Draw what the scanner can see, and return the ball that stands for it."""
+        """Draw the scanner's field of view; return the ball that marks the scanner."""
         near, far = frustum(scanner, base_T_camera)
         rays = [np.stack([base_T_camera[:3, 3], corner]) for corner in far[:4]]
         for line in (near, far, *rays):
@@ -258,13 +258,13 @@ class Scene3D(ui.scene):
             part.rotate_R(turn).material(colour)
 
     def pose(self, place: Sequence[float], taken: bool, name: str) -> None:
-        """Draw a pose of the flange, green where it is taken and red where it is left out."""
+        """Draw a pose of the flange: green if used, red if left out."""
         with self:
             ball = self.sphere(0.014).move(*place).with_name(name)
             ball.material(TAKEN if taken else LEFT_OUT)
 
     def say(self, text: str, place: Sequence[float]) -> None:
-        """Write in the picture, in place of what was written last."""
+        """Write a text into the picture, in place of the last one."""
         self.delete_objects(lambda each: each.name == "said")
         if text:
             with self:
@@ -291,7 +291,7 @@ def views_of(places: Floats) -> dict[str, View]:
 
 
 def outline_of(feature: Feature) -> Floats:
-    """Return (N, 3) points of a fitted circle in the camera; of what is no circle, its centre."""
+    """Return (N, 3) points of a fitted circle in the camera; of other features, the centre."""
     if not isinstance(feature, CircleFeature) or feature.normal is None or not feature.radii:
         return np.asarray(feature.centre)[None]
     # Points that a circle is drawn with
@@ -323,7 +323,7 @@ def drawing_of(project: Project) -> str:
 
 
 def base_T_camera_of(recipe: Recipe) -> Floats | None:
-    """Return where the scanner is guessed to stand, or simulated; None where nobody says.
+    """Return the scanner's guessed or simulated pose; None without one.
 
     Raises:
         StageError: The poses that were shown are no poses of this arm.
@@ -344,7 +344,7 @@ def box_of(recipe: Recipe) -> tuple[Floats, Floats] | None:
 
 
 class ScanView:
-    """A scene, and a line that says what became of the scan in it.
+    """A 3D scene, with a line on the outcome of its scan.
 
     Attributes:
         log: What the scans are of; None until it was read.
@@ -360,7 +360,7 @@ class ScanView:
         self._told.text = text
 
     def show(self, capture: str) -> None:
-        """Show a scan: the flange in it, its rim as fitted, and what became of it."""
+        """Show a scan: its flange, the fitted rim, and its outcome."""
         if self.log is None:
             return
         self.say(f"capture {capture}: {fate_of(self.log, capture)}")
@@ -380,7 +380,7 @@ class ScanView:
 
 
 def fate_of(log: RunLog, capture: str) -> str:
-    """Return what became of a capture, in words."""
+    """Return the outcome of a capture in words."""
     for rejection in log.rejections:
         if rejection.id == capture:
             return f"set aside by {rejection.stage}: {rejection.reason}"

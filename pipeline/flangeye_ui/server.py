@@ -108,7 +108,7 @@ def serve(folder: Path, registry: Registry, host: str, port: int, browser: bool)
 
 
 def say(line: str) -> None:
-    """Print a line that the person at the terminal needs at once."""
+    """Print a line to the terminal at once."""
     print(line, flush=True)  # noqa: T201
 
 
@@ -126,7 +126,7 @@ def way_in(folder: Path, address: str) -> Iterator[Path]:
 
 
 def show(file: Path) -> None:
-    """Open a file in a browser, where there is one."""
+    """Open a file in the browser, if there is one."""
     if not webbrowser.open(file.as_uri()):
         say("no browser was found here; open the address yourself")
 
@@ -159,7 +159,7 @@ class Keys:
     """
 
     def __init__(self, issued: Callable[[str], None]) -> None:
-        """Make the first token; ``issued`` hears of each that follows when one was used."""
+        """Create the first token; ``issued`` is called with each new token after one is used."""
         name = secrets.token_urlsafe(12)
         self.path, self._cookie, self._issued = f"/{name}", f"flangeye-{name}", issued
         self.token = secrets.token_urlsafe(16)
@@ -182,7 +182,7 @@ class Keys:
 
 
 def cookies(headers: Headers, name: str) -> Iterator[bytes]:
-    """Yield the values of all cookies of a name; what others put beside them is skipped."""
+    """Yield the values of all cookies of a name; malformed entries are skipped."""
     for key, line in headers.raw:
         for crumb in line.split(b";") if key.lower() == b"cookie" else ():
             found, _, value = crumb.strip().partition(b"=")
@@ -236,7 +236,7 @@ class Gate:
         return HTMLResponse(page, headers={"set-cookie": cookie, "cache-control": "no-store"})
 
     def is_ours(self, host: str) -> bool:
-        """Return whether a Host names this server by an address, not by a name somebody rebound."""
+        """Return whether a Host header names this server by address, against DNS rebinding."""
         name, _, port = host.rpartition(":")
         if port != str(self._port):
             return False

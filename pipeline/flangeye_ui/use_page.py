@@ -143,7 +143,7 @@ class Systems:
 
 
 class CertificateForm:
-    """The certificate: what a person adds, what it will say, and the file."""
+    """The certificate: fields that a person fills in, a preview, and the file."""
 
     def __init__(self, project: Project, run: Path, facts: Facts, box: ui.expansion) -> None:
         self._project, self._run, self._facts = project, run, facts

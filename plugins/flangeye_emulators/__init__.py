@@ -1,4 +1,4 @@
-"""What stands in for hardware: simulated cells, and controllers, scanners and fingers on loopback.
+"""Replacements of hardware: simulated cells; emulated controllers, scanners and fingers.
 
 Offered to the engine as a vendor's plugin is. Nothing here runs on a real cell.
 """

@@ -49,7 +49,7 @@ class SimulatedRobotParams(Params):
 
 
 class SimulatedRobot(Device):
-    """An arm whose time passes in :meth:`wait_cycle` and nowhere else.
+    """An arm whose time passes only in :meth:`wait_cycle`.
 
     It keeps to what the controllers on loopback keep to: a move begins at rest, goes with limited
     speed and acceleration, and a joint's limit or a singularity on the way is a protective stop.
@@ -78,7 +78,7 @@ class SimulatedRobot(Device):
         self._stopped_by = ""
 
     def state(self) -> RobotState:
-        """Return the arm as it is in this cycle; time counts from zero."""
+        """Return the arm's state in this cycle; time counts from zero."""
         self._looked = self.cycles
         return RobotState(
             base_T_flange=Transform(BASE, FLANGE, self.arm.stance.base_T_tcp),
@@ -91,7 +91,7 @@ class SimulatedRobot(Device):
         )
 
     def true_flange(self) -> Floats:
-        """Return where the flange really is (4, 4). For the simulation; a stage must not look."""
+        """Return the flange's true pose (4, 4). For the simulation; stages must not use it."""
         return self.arm.true_flange()
 
     def move_joints(self, joints: Floats, speed: float, acceleration: float) -> None:
@@ -104,13 +104,13 @@ class SimulatedRobot(Device):
         self._begin(lambda: linear_move(self.arm.stance.base_T_tcp, target, speed, acceleration))
 
     def move_velocity(self, twist: Floats, acceleration: float) -> None:
-        """Go on at a twist (6,); it brakes when the next command is :data:`GRACE` late."""
+        """Move at a twist (6,); it brakes when the next command is :data:`GRACE` late."""
         self._require_ready()
         self._looked = self.cycles
         self._mover.go_on(twist, acceleration, GRACE)
 
     def wait_cycle(self) -> None:
-        """Let one cycle pass; a motion that nobody looked at for SILENT ends."""
+        """Pass one cycle; a motion ends if its state is not read for SILENT."""
         self.cycles += 1
         if (self.cycles - self._looked) * self.period > SILENT:
             self._mover.halt()
@@ -120,7 +120,7 @@ class SimulatedRobot(Device):
             self.protective_stop(str(fault))
 
     def stop(self) -> None:
-        """Begin to brake, in the next cycle."""
+        """Begin to brake in the next cycle."""
         self._mover.halt()
 
     def protective_stop(self, why: str) -> None:
@@ -133,7 +133,7 @@ class SimulatedRobot(Device):
         self._stopped_by = ""
 
     def close(self) -> None:
-        """Stop; its time passes only in :meth:`wait_cycle`, so it does not run on."""
+        """Stop."""
         self.stop()
 
     def _begin(self, plan: Plan) -> None:
@@ -268,7 +268,7 @@ def _end(controller: subprocess.Popen[str] | None) -> None:
 
 
 class OnEmulator(Device):
-    """An arm whose controller ends with it; everything else is the arm's own driver."""
+    """An arm with an emulated controller, which ends with it; else the arm's own driver."""
 
     def __init__(self, robot: Robot, controller: subprocess.Popen[str] | None) -> None:
         self._robot, self._controller = robot, controller
@@ -289,7 +289,7 @@ class OnEmulator(Device):
         self._robot.move_linear(base_T_flange, speed, acceleration)
 
     def move_velocity(self, twist: Floats, acceleration: float) -> None:
-        """Go on at a twist (6,)."""
+        """Move at a twist (6,)."""
         self._robot.move_velocity(twist, acceleration)
 
     def wait_cycle(self) -> None:
@@ -301,7 +301,7 @@ class OnEmulator(Device):
         self._robot.stop()
 
     def close(self) -> None:
-        """Let go of the arm, and end its controller."""
+        """Disconnect, and end the controller."""
         try:
             self._robot.close()
         finally:

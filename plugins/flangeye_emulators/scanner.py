@@ -66,7 +66,7 @@ def scanner_mounted(model: ScannerModel | None, params: MountedParams) -> Scanne
 
 
 class MountedScanner(OpenScanner):
-    """A simulated scanner on a flange; time stands still while it exposes.
+    """A simulated scanner on a flange; simulated time stops during an exposure.
 
     Attributes:
         true_seams: By name, (N, 3) in ``base`` [m]. A stage that plans must not look.
@@ -85,7 +85,7 @@ class MountedScanner(OpenScanner):
         self._flange_T_camera = params.flange_T_camera
 
     def expose(self) -> Callable[[], Scan]:
-        """Look from where the arm stands.
+        """Scan from the arm's present pose.
 
         Raises:
             DeviceError: The arm is gone.
@@ -195,11 +195,11 @@ class LoopbackScanner(OpenScanner):
             )
 
     def prepare(self) -> None:
-        """Do what takes long before the arm moves: who renders does not hear of its faults."""
+        """Load slow data before the arm moves, as faults go unnoticed while rendering."""
         self._studio.prepare(self._stance())
 
     def expose(self) -> Callable[[], Scan]:
-        """Look at the arm for as long as the exposure lasts."""
+        """Scan the arm for the duration of an exposure."""
         self._require_present()
         self._count += 1
         index, dropped = self._count, self._faults.random() < self._params.dropped
@@ -217,7 +217,7 @@ class LoopbackScanner(OpenScanner):
         return transfer
 
     def close(self) -> None:
-        """Let go of the controller."""
+        """Disconnect from the controller."""
         self._control.close()
 
     def _require_present(self) -> None:
@@ -255,7 +255,7 @@ class TrueStance(NamedTuple):
 
 
 class CellScene:
-    """The cell, the scanner, and what it sees of an arm."""
+    """The simulated cell and scanner, with an arm that may move."""
 
     def __init__(
         self,
@@ -295,7 +295,7 @@ class CellScene:
         return looks[0] if len(looks) == 1 else np.mean(looks, axis=0, dtype=np.float32)
 
     def prepare(self, stance: TrueStance) -> None:
-        """Load and compute now, with the arm as it stands, what the first scan would wait for."""
+        """Compute in advance, at the arm's present pose, what the first scan needs."""
         self._scene(stance)
 
     def _look(self, stance: TrueStance, seed: Sequence[int]) -> Image:

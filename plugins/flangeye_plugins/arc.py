@@ -20,7 +20,7 @@ class ManualArcParams(ArcTimes, Params):
 
 
 class ManualArc(Device):
-    """Tells a person what to do, on standard error and with the terminal's bell.
+    """Tells a person what to do, on standard error and by the terminal's bell.
 
     Attributes:
         name: For people.
@@ -31,19 +31,19 @@ class ManualArc(Device):
         self._burns = self._flows = False
 
     def gas(self, on: bool) -> None:
-        """Tell them to open or close the gas."""
+        """Tell the person to open or close the gas."""
         if on != self._flows:
             self._flows = on
             self._tell("GAS ON" if on else "GAS OFF")
 
     def burn(self, on: bool) -> None:
-        """Tell them to strike the arc, or to end it."""
+        """Tell the person to strike or end the arc."""
         if on != self._burns:
             self._burns = on
             self._tell("STRIKE THE ARC NOW" if on else "END THE ARC NOW")
 
     def burning(self) -> bool | None:
-        """Nothing says."""
+        """Return None: no signal tells."""
         return None
 
     def close(self) -> None:
@@ -108,7 +108,7 @@ class UrDigitalArc(Device):
             raise
 
     def gas(self, on: bool) -> None:
-        """Switch the gas valve, where it has an output of its own."""
+        """Switch the gas valve, if it has an output of its own."""
         if self._params.gas is not None:
             self._set(self._params.gas, on)
 
@@ -117,14 +117,14 @@ class UrDigitalArc(Device):
         self._set(self._params.output, on)
 
     def burning(self) -> bool | None:
-        """Return whether the input is high in the newest package; None where there is no input."""
+        """Return whether the arc's input is high in the newest package; None without an input."""
         if self._params.established is None:
             return None
         self._read()
         return bool(self._inputs >> self._params.established & 1)
 
     def close(self) -> None:
-        """Switch all off, and let go of the controller."""
+        """Switch everything off, and disconnect."""
         if self._closed:
             return
         try:

@@ -183,7 +183,7 @@ class ReadingGuide:
         self._flange_R_tool = finger.flange_R_tool
 
     def take(self, count: int) -> list[TagReading]:
-        """Return new readings where the arm now stands, as many as come in time."""
+        """Return new readings at the arm's present pose, as many as come in time."""
         found: list[TagReading] = []
         began = self._drive.tick().time_ns
         # Longest wait for the readings of one place [s]
@@ -196,7 +196,7 @@ class ReadingGuide:
         return found
 
     def held(self) -> Iterator[Held]:
-        """Move the arm about where it stands, the tip held; yield what is read at each place."""
+        """Move the arm about its present pose with the tip held fixed; yield the readings."""
         start = self._drive.tick()
         base_R_tool = start.base_T_flange.rotation @ self._flange_R_tool
         for stroke in _strokes():
@@ -240,7 +240,7 @@ class Pivoted(NamedTuple):
 
 
 class Hand:
-    """Asks a person to bring a point to the mark, and looks where the arm then is."""
+    """Asks a person to bring a point to the mark, then reads the arm's pose."""
 
     def __init__(
         self, robot: Robot, ask: Callable[[str], None], look: Callable[[], list[TagReading]]
@@ -249,7 +249,7 @@ class Hand:
         self._robot, self._ask, self._look = robot, ask, look
 
     def tip(self, finger: Finger, calibration: Calibration) -> Pivot:
-        """Return where the tip is: its finger gives way, and says by how much."""
+        """Return the tip's place, corrected for the finger's measured deflection."""
         feels = Interpreter(finger.model_copy(update={"calibration": calibration}))
         poses, displaced = [], []
         for attitude in ATTITUDES:
@@ -274,7 +274,7 @@ class Hand:
 
 
 def with_body(finger: Finger, found: Pivoted) -> Finger:
-    """Return a finger's file with its tip and torch as they were found, and how well.
+    """Return a finger's file with the estimated tip and torch, and their covariances.
 
     The tool's x is the direction from torch to tip, seen along the flange's z, to which its own
     axis is parallel. What is uncertain of the torch is so relative to the tip.
@@ -297,7 +297,7 @@ def with_body(finger: Finger, found: Pivoted) -> Finger:
 
 
 def summary_lines(found: Pivoted) -> list[str]:
-    """Return what was found, for people."""
+    """Return the results as text."""
     tip, torch = (
         "'" + ", ".join(f"{x * 1e3:.2f} mm" for x in point.point) + "'" for point in found
     )

@@ -1,4 +1,4 @@
-"""``profiler.*``: sensors that look at the bead behind the torch. Add one: a new module.
+"""``profiler.*``: sensors that measure the bead behind the torch. Add one: a new module.
 
 Profile sensors with an evaluation of their own, which send what they measure as lines of text.
 
@@ -50,7 +50,7 @@ class TcpParams(Params):
 
 
 class TcpProfiler(Device):
-    """Reads lines in a thread of its own, and keeps the newest look.
+    """Reads lines in a thread, and keeps the newest profile.
 
     Attributes:
         name: For people.
@@ -83,7 +83,7 @@ class TcpProfiler(Device):
         self._thread.start()
 
     def profile(self) -> WeldProfile | None:
-        """Return the newest look not yet returned, or None.
+        """Return the newest profile not yet returned, or None.
 
         Raises:
             DeviceError: The sensor has ended the connection, or sends no lines.
@@ -96,7 +96,7 @@ class TcpProfiler(Device):
         return profile
 
     def close(self) -> None:
-        """Let go of the connection."""
+        """Disconnect."""
         self._closing = True
         self._thread.join(PATIENCE)
         self._socket.close()

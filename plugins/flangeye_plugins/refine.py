@@ -165,7 +165,7 @@ class ArmParams(Params):
 
     @property
     def corrects_arm(self) -> bool:
-        """Whether the arm's own error may be found."""
+        """Whether an arm's own errors may be estimated."""
         return True
 
 

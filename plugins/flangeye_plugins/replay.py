@@ -56,7 +56,7 @@ class WeldReplay(LoggedWeld):
         super().take(note)
 
     def account(self) -> ReplayedStep:
-        """Return how what was decided again compares."""
+        """Return how the repeated decisions compare with the logged ones."""
         # Commands that differ by less are the same [m/s, rad/s]; other processors round otherwise
         return ReplayedStep(
             what=f"{self.cycles} cycles from {len(self.felt)} images",
@@ -80,7 +80,7 @@ class WeldReplay(LoggedWeld):
             self.felt[self.newest] = None if feeling is None else touch_of(feeling)
 
     def feel(self, logged: Mapping[str, Any]) -> None:
-        """Compare what was felt in the newest image."""
+        """Compare the measurement in the newest image."""
         felt = self.felt.get(self.newest)
         if felt is not None:
             off = np.abs(felt.displacement - np.array(logged["displacement"])).max()

@@ -42,7 +42,7 @@ class FileScanParams(Params):
 
 @stage("scan.file")
 def scan_file(params: FileScanParams) -> WorkpieceScan:
-    """Read a scan of the workpiece, taken by the calibrated scanner from where it stands.
+    """Read a scan of the workpiece, taken by the calibrated scanner at its calibrated pose.
 
     Raises:
         StageError: There is no cloud, or it cannot be read.

@@ -91,7 +91,7 @@ class OpenCVCamera(Device):
         return frame
 
     def close(self) -> None:
-        """Let go of the camera."""
+        """Disconnect from the camera."""
         self._closing = True
         if self._thread.is_alive():
             self._thread.join(timeout=1.0)
@@ -149,7 +149,7 @@ class McapParams(Params):
 
 
 class RecordedImages(Device):
-    """Gives recorded images when the robot's clock has come to them.
+    """Replays recorded images at the pace of the robot's clock.
 
     Attributes:
         name: For people.
@@ -169,7 +169,7 @@ class RecordedImages(Device):
         self._next = next(images, None)
 
     def frame(self) -> SensorFrame | None:
-        """Return the next image whose time has come, or None.
+        """Return the next image that is due, or None.
 
         Raises:
             DeviceError: The recording has ended.
@@ -184,7 +184,7 @@ class RecordedImages(Device):
         return SensorFrame(image, taken)
 
     def close(self) -> None:
-        """Nothing to let go of."""
+        """Do nothing; there is no device."""
 
 
 @part("sensor.image_folder")

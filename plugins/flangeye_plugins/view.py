@@ -1,4 +1,4 @@
-"""What is guessed of the scanner's place before the first scan: enough to plan poses in view."""
+"""A guess of the scanner's pose before the first scan, good enough to plan poses in view."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ _LOCAL = {
 
 @contextmanager
 def scratch() -> Iterator[Path]:
-    """Give a folder of this process's own; those of batches that are gone are removed."""
+    """Make a folder for this process; remove those of processes that have ended."""
     remove_forgotten()
     with tempfile.TemporaryDirectory(
         prefix=f"{PREFIX}{os.getpid()}-", ignore_cleanup_errors=True
@@ -90,7 +90,7 @@ def scratch() -> Iterator[Path]:
 
 
 def remove_forgotten() -> None:
-    """Remove the folders of this user's batches whose process is gone."""
+    """Remove the folders of this user's batches whose process has ended."""
     import psutil
 
     for folder in Path(tempfile.gettempdir()).glob(f"{PREFIX}*-*"):
@@ -184,7 +184,7 @@ def _track_semaphores() -> None:
 
 @contextmanager
 def remote_client(address: str, tls: Tls | None = None) -> Iterator[Client]:
-    """Connect to a running scheduler, encrypted if files are given, and leave it running.
+    """Connect to a running scheduler, encrypted if files are given; never shut it down.
 
     Raises:
         BatchError: No scheduler answers there.
@@ -245,7 +245,7 @@ def worker_count(client: Client) -> int:
 
 
 class Pace:
-    """How much to have submitted, and how long each chunk is to be.
+    """Decides how many sessions to submit ahead, and how many go into one chunk.
 
     Some seconds of work, so that nothing counts beside it; less towards the end, so that all
     workers come to it together.
@@ -257,14 +257,14 @@ class Pace:
         self._workers, self._asked = 0, -np.inf
 
     def workers(self) -> int:
-        """Return how many workers there are, or were some seconds ago; at least one."""
+        """Return the number of workers, counted anew every few seconds; at least one."""
         # How long a count of the workers is believed [s]
         if time.monotonic() > self._asked + 5.0:
             self._workers, self._asked = worker_count(self._client), time.monotonic()
         return max(1, self._workers)
 
     def size(self) -> int:
-        """Return how many sessions the next chunk is to have."""
+        """Return the number of sessions for the next chunk."""
         if not self._ended:
             return 1
         mean = max(self._seconds / self._ended, 1e-6)
@@ -287,7 +287,7 @@ class Pace:
                 yield Chunk(block, some)
 
     def ended(self, told: ChunkTold) -> None:
-        """Take note of what a chunk took."""
+        """Learn from a finished chunk how long a session takes."""
         self._ended += told.counts.total()
         self._seconds += told.seconds
 

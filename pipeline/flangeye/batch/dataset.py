@@ -71,7 +71,7 @@ def row_of(session: BatchSession, outcome: SessionOutcome, columns: Mapping[str,
 
 
 class Ledger:
-    """Which sessions are asked for, and where each stands: 24 bytes a session."""
+    """The sessions of a batch and the row of each in the tables; 24 bytes a session."""
 
     def __init__(self, sessions: Iterable[BatchSession]) -> None:
         self.numbers = np.fromiter((int(s.number, 16) for s in sessions), np.uint64)
@@ -79,7 +79,7 @@ class Ledger:
         self._sorted = self.numbers[self._order]
 
     def positions(self, ids: Iterable[str]) -> Ints:
-        """Return where sessions stand, by their ids; -1 for those that are not asked for."""
+        """Return the rows of sessions by their ids; -1 for sessions that are not in the batch."""
         numbers = np.fromiter((int(each[-16:], 16) for each in ids), np.uint64)
         if not len(self.numbers):
             return np.full(len(numbers), -1)

@@ -1,4 +1,4 @@
-"""One session: what is asked of it, and what became of it, a row of the tables."""
+"""One session of a batch: its request, and its outcome as a row of the tables."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MARKER = "session.json"
 
 @dataclass(frozen=True)
 class SessionOutcome:
-    """What became of one session; SI units.
+    """The outcome of one session; SI units.
 
     Attributes:
         status: How it ended; ``failed`` is a foreseen mistake such as an unreadable archive,
@@ -88,7 +88,7 @@ def mark_finished(place: Storage, folder: str, key: str, outcome: SessionOutcome
 
 
 def finished_outcome(place: Storage, folder: str, key: str, report: bool) -> SessionOutcome | None:
-    """Return what :func:`mark_finished` left; None when the session has to run.
+    """Return the outcome that :func:`mark_finished` stored; None if the session has to run.
 
     Args:
         place: The batch's folder.
@@ -129,7 +129,7 @@ class Tls:
 
 @dataclass(frozen=True)
 class Request:
-    """What the command line asks for.
+    """A batch as requested on the command line.
 
     Attributes:
         recipe: File, or name of a bundled recipe.

@@ -31,7 +31,7 @@ from flangeye.result import sha256
 
 
 class Fingerprints:
-    """Fingerprints of files and folders, each looked at once."""
+    """Hashes of files and folders; each is computed once."""
 
     def __init__(self) -> None:
         self._known: dict[Path, str] = {}
@@ -46,7 +46,7 @@ class Fingerprints:
         return self._known[path]
 
     def of_archive(self, archive: str) -> str:
-        """Return the same for an archive by path, or by URL from what its store says."""
+        """Return the hash of an archive by path, or of a URL from the store's listing."""
         return print_of(archive) if is_url(archive) else self.of(Path(archive))
 
     def of_recipe(self, recipe: Recipe) -> list[str]:
@@ -56,7 +56,7 @@ class Fingerprints:
 
 
 def common_key(recipe: Recipe, software: Software, prints: Fingerprints) -> str:
-    """Return the hash of what sessions that differ in seed and archive alone have in common.
+    """Return the hash of everything that sessions share apart from seed and archive.
 
     It is of the recipe, the models and files that it names, and what computes.
     """
@@ -195,7 +195,7 @@ class BatchSession:
 
 @dataclass(frozen=True)
 class Variant:
-    """What sessions that differ in seed and archive alone have in common.
+    """The recipe and parameters that sessions share; they differ in seed and archive only.
 
     Attributes:
         overrides: All of them.
@@ -240,7 +240,7 @@ class BatchPlan:
                     )  # fmt: skip
 
     def values(self) -> dict[str, list[str]]:
-        """Return path in the recipe -> all its values, for what differs between sessions."""
+        """Return, for each recipe path that differs between sessions, all its values."""
         paths = self.variants[0].varied
         return {path: list({v.varied[path]: None for v in self.variants}) for path in paths}
 

@@ -1,4 +1,4 @@
-"""What people see while a batch runs, and at its end: the tally of its sessions."""
+"""The tally that a batch prints while it runs and at its end."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ Names = tuple[Any, ...]
 
 @dataclass(frozen=True)
 class VariantTold:
-    """What the sessions of one variant came to.
+    """Summary of the sessions of one variant.
 
     Attributes:
         names: Its values, in the order of :meth:`Tally.by`.
@@ -113,12 +113,12 @@ class Tally:
         return all(status in ACCEPTED for status, n in self.counts.items() if n)
 
     def figures(self) -> dict[str, NDArray[np.float64]]:
-        """Return what the accepted sessions have: figure -> values [m]."""
+        """Return the figures of the accepted sessions: name -> values [m]."""
         whole = np.concatenate([np.empty((len(FIGURES), 0)), *self._figures], axis=1)
         return {name: v[~np.isnan(v)] for name, v in zip(FIGURES, whole, strict=True)}
 
     def shown(self) -> list[Row]:
-        """Return all rows while they are few, else those without a calibration, then the worst."""
+        """Return all rows if they are few, else those without a calibration, then the worst."""
         return [] if self._worst is None else list(self._worst.to_pylist())
 
     def by(self) -> list[str]:
@@ -126,7 +126,7 @@ class Tally:
         return [*(["archive"] if self._archives else []), *self.varied]
 
     def variants(self) -> list[VariantTold]:
-        """Return what each variant came to; none where nothing was repeated, or they are many."""
+        """Return a summary of each variant; none if nothing was repeated or there are many."""
         if len(self._variants) > self.most_listed or len(self._variants) == self.total:
             return []
         members, statuses = np.concatenate(self._members), np.concatenate(self._statuses)
@@ -177,7 +177,7 @@ class Tally:
 
 @dataclass(frozen=True)
 class Batch:
-    """What a batch came to.
+    """Summary of a batch.
 
     Attributes:
         out: Its folder, path or URL.
@@ -234,7 +234,7 @@ class BatchProgress:
         self._console.print(printable(line), markup=False, highlight=False, soft_wrap=True)
 
     def ended(self, told: ChunkTold) -> None:
-        """Count the sessions of a chunk, and say what was wrong with some."""
+        """Count the sessions of a chunk, and print the first errors."""
         self._counts.update(told.counts)
         for session, outcome in told.bad:
             self._tell(session, outcome)

@@ -1,4 +1,4 @@
-"""``flangeye regress``: recordings with what is known of them, run as a batch and compared."""
+"""``flangeye regress``: run known recordings as a batch and compare with expectations."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ManifestComparison:
-    """What became of one manifest.
+    """The comparison of one manifest with its results.
 
     Attributes:
         name: The manifest's file, without its ending.
@@ -53,7 +53,7 @@ def compare(
     registry: Registry,
     console: Console,
 ) -> list[ManifestComparison]:
-    """Return how the recordings of manifests compare with what is expected, in their order.
+    """Return each manifest's comparison of results with expectations, in their order.
 
     Args:
         manifests: By their files.

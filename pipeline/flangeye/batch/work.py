@@ -1,4 +1,4 @@
-"""What a worker does: sessions one after the other, whose failures are values and cost no other."""
+"""A batch worker: runs sessions one by one; a failure is a value and stops no other session."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ READY = f"{STARTS}/ready"
 
 @dataclass(frozen=True)
 class Job:
-    """What all sessions of a batch have in common.
+    """What all sessions of a batch share.
 
     Attributes:
         out: The batch's folder, the same path or URL on every worker.
@@ -89,7 +89,7 @@ class Chunk:
 
 @dataclass(frozen=True)
 class ChunkTold:
-    """What became of a chunk; its rows are written.
+    """Summary of a chunk whose rows are written.
 
     Attributes:
         counts: Status -> sessions.

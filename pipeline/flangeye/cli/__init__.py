@@ -1,4 +1,4 @@
-"""The ``flangeye`` command: parse, delegate, say what happened. No logic of the field is here.
+"""The ``flangeye`` command: parse options, call the library, print. No calibration logic here.
 
 Modules are imported inside the commands, so that ``--help`` answers at once.
 """

@@ -1,4 +1,4 @@
-"""The ``flangeye`` command itself, and what its commands share."""
+"""The ``flangeye`` command, and what its subcommands share."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ app = typer.Typer(
 
 
 def complete_recipe(typed: str) -> list[str]:
-    """Return the bundled recipes that begin as typed; the shell completes files itself."""
+    """Return the bundled recipes that match a prefix; the shell completes files itself."""
     from flangeye.recipe.find import recipe_names
 
     return [name for name in recipe_names() if name.startswith(typed)]
@@ -121,7 +121,7 @@ def read_recipe(name: str, registry: Registry, overrides: Sequence[str] | None =
 
 
 def ask(question: str, instead: str, default: str | None = None) -> str:
-    """Return what a person answers; ``default`` for an empty line.
+    """Ask at the terminal and return the answer; ``default`` for an empty line.
 
     Raises:
         FlangeyeError: There is nobody to answer; says what to give ``instead``.

@@ -1,4 +1,4 @@
-"""What there is: arms, scanners, standards, recipes, stages, parts, plugins; and new files."""
+"""List arms, scanners, standards, recipes, stages, parts and plugins; create new models."""
 
 from __future__ import annotations
 

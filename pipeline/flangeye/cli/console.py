@@ -24,12 +24,12 @@ if TYPE_CHECKING:
 
 
 def say(text: object, err: bool = False) -> None:
-    """Write a line; what others wrote in it reaches the terminal as text, never as commands."""
+    """Print a line; control characters from foreign text are escaped."""
     print(printable(str(text)), file=sys.stderr if err else sys.stdout, flush=True)
 
 
 def write(console: Console, text: str, style: str = "") -> None:
-    """Write lines in a colour, where the output is a terminal; no markup of others is followed."""
+    """Print lines, in colour on a terminal; markup in foreign text is not interpreted."""
     console.print(printable(text), style=style, markup=False, highlight=False, soft_wrap=True)
 
 
@@ -48,7 +48,7 @@ def width(console: Console) -> int:
 
 
 def say_notes(notes: Sequence[str]) -> None:
-    """Say beside the output what the person should know."""
+    """Print notes and warnings to standard error."""
     if notes:
         from flangeye.types.arrays import as_line
 
@@ -58,7 +58,7 @@ def say_notes(notes: Sequence[str]) -> None:
 
 @contextmanager
 def at_work(what: str, steps: int | None = None) -> Iterator[Callable[[], None]]:
-    """Show in a terminal what takes its time, with a bar and the time left if steps are known.
+    """Show a progress bar on a terminal, with the time left if the number of steps is known.
 
     Yields what is called after each step; after the last one a further round begins.
     """
@@ -153,7 +153,7 @@ def require_gathered(log: RunLog) -> None:
 
 @contextmanager
 def of_foreign(path: Path, what: str) -> Iterator[None]:
-    """Take any failure for the fault of a log that others may have written."""
+    """Report any failure in the context as damage of a log from an unknown source."""
     from flangeye.log.records import reason_of
 
     try:

@@ -1,4 +1,4 @@
-"""``flangeye init``: a recipe for what a folder holds, or for what runs."""
+"""``flangeye init``: write a recipe for a folder of recordings or a running ROS 2 cell."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A run's calibration for others: as a file, as tables, or on a graph."""
+"""Export a run's calibration: as a file, as tables, or on a ROS 2 graph."""
 
 from __future__ import annotations
 

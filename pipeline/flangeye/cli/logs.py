@@ -1,4 +1,4 @@
-"""What happened in a run, while it goes and afterwards."""
+"""Commands that read the log of a run: show, report, watch."""
 
 from __future__ import annotations
 

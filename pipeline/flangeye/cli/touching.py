@@ -1,4 +1,4 @@
-"""What ``flangeye touch`` does: points of a calibration's scanner, the arm of its recipe."""
+"""``flangeye touch``: move the arm to scanned points and compare with the prediction."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``flangeye doctor``: names what is wrong with an archive, instead of giving a bad number."""
+"""``flangeye doctor``: find mistakes in recordings and the line that mends each."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ __all__ = [
 
 
 def as_text(diagnosis: Diagnosis) -> str:
-    """Return what was found, a few lines for each finding."""
+    """Return the findings as text, a few lines each."""
     session = diagnosis.session
     head = f"{int(session.seen.sum())} of {len(session)} samples have a target in them"
     lines = [f"{head}; {len(diagnosis.checks)} checks", *_idle(diagnosis)]
@@ -57,7 +57,7 @@ def _details(finding: Finding) -> list[str]:
 
 
 def evidence_of(finding: Finding) -> str:
-    """Return by how much a correction shrinks the errors; empty where they say nothing."""
+    """Return by how much a correction reduces the errors; empty if it was not computed."""
     if finding.before is None or finding.after is None:
         return ""
     error = f"error {_error(finding.before)} before, {_error(finding.after)} after"
@@ -65,7 +65,7 @@ def evidence_of(finding: Finding) -> str:
 
 
 def fix_lines(finding: Finding, indent: str) -> list[str]:
-    """Return what to do, a line for each choice; none where nothing is to be done."""
+    """Return the fixes, one line for each choice; empty if there is none."""
     if not finding.fix:
         return []
     first, *others = finding.choices
@@ -73,7 +73,7 @@ def fix_lines(finding: Finding, indent: str) -> list[str]:
 
 
 def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
-    """Return what was found as plain data, SI units."""
+    """Return the findings as plain data, SI units."""
     return {
         "damage": list(diagnosis.session.damage),
         "samples": len(diagnosis.session),

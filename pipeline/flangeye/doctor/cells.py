@@ -1,4 +1,4 @@
-"""What is wrong with the recordings of a cell: each mistake tried on its whole graph.
+"""Mistakes in the recordings of a cell: each one is tried on the whole graph.
 
 A mistake is named only where the cell without it foretells sightings held out far better, of all
 cameras together, and is mended by a line of the recipe: of the reader's tables, or of ``cell:``.
@@ -63,7 +63,7 @@ class Suspicion:
 def examine_cell(
     observations: Sequence[Observation], cell: Cell, tables: Mapping[str, Any] | None = None
 ) -> Diagnosis:
-    """Return the mistake that explains most; else sightings that do not belong to their poses.
+    """Return the mistake that explains most, else the sightings that do not fit their poses.
 
     Args:
         observations: Every sighting.
@@ -287,7 +287,7 @@ class Foretold:
 
 
 def foretold(observations: Sequence[Observation], cell: Cell) -> Foretold:
-    """Return the error with which the others predict each sighting; infinite without a solution."""
+    """Return each sighting's error as predicted by the others; infinite without a solution."""
     try:
         found = rough(problem_of(observations, cell), cell.freedoms)
     except (FlangeyeError, np.linalg.LinAlgError):

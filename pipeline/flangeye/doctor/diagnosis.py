@@ -1,4 +1,4 @@
-"""What a ``check`` part takes and gives: a session as arrays, and findings about it.
+"""Input and output of ``check`` parts: a session as arrays, and findings about it.
 
 A check is a part ``check.<name>``, a function of a :class:`RecordedSession` (and its own
 parameters) that returns the :class:`Finding` s it can defend, or raises :class:`NotApplicable`.
@@ -37,12 +37,12 @@ CERTAIN = float("inf")
 
 
 class NotApplicable(Exception):
-    """What a check looks for cannot show in this session, and why not."""
+    """This session cannot show the mistake that a check looks for; the message says why."""
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedSession:
-    """N robot poses and what was seen at each, in the order they were recorded.
+    """N robot poses with the measurement at each, in recording order.
 
     Attributes:
         ids: Name of each.
@@ -98,12 +98,12 @@ class RecordedSession:
 
     @property
     def seen(self) -> Mask:
-        """(N,) where something was found."""
+        """(N,) whether the target was measured."""
         return np.asarray(np.isfinite(self.centres[:, 0]))
 
     @property
     def arms(self) -> tuple[Arms, ...]:
-        """Whose poses may share a mistake, the likeliest first."""
+        """The arms whose poses a check may correct, likeliest first."""
         return ("both",) if self.seconds is None else ("both", "first", "second")
 
     @property
@@ -123,7 +123,7 @@ class RecordedSession:
             )
 
     def require_poses(self) -> None:
-        """Go on only where a mistake in the flanges' poses would show.
+        """Raise NotApplicable unless a mistake in the flange poses would show.
 
         Raises:
             NotApplicable: There are too few samples, or all poses follow from joint angles.
@@ -149,18 +149,18 @@ class RecordedSession:
         )
 
     def without(self, mask: Mask) -> RecordedSession:
-        """Return the session with the samples of a mask left out by the recipe."""
+        """Return the session without masked samples, left out by a line of the recipe."""
         names = [name for name, gone in zip(self.ids, mask, strict=True) if gone]
         earlier = self.changes.get("leave_out", [])
         kept = replace(self.where(~mask), again=None)
         return kept.with_changes(leave_out=[*earlier, *names])
 
     def with_changes(self, **changes: Any) -> RecordedSession:
-        """Return the session as the acquire step gives it with other parameters."""
+        """Return the session as read with other parameters of the acquire step."""
         return replace(self, changes={**self.changes, **changes})
 
     def read_with(self, **correction: Any) -> RecordedSession:
-        """Return the session as ``reader.corrected`` with a correction would give it."""
+        """Return the session as read through ``reader.corrected`` with a correction."""
         stated = {k: value for k, value in correction.items() if (k, value) != ("arms", "both")}
         reader = {"corrected": {"reader": self.reader, **stated}}
         return replace(self, reader=reader, again=None)
@@ -184,7 +184,7 @@ class RecordedSession:
         return replace(self, poses=poses, motions=None)
 
     def step(self) -> str:
-        """Return the acquire step that gives this session, as a line of the recipe."""
+        """Return the acquire step that reads this session, as a line of the recipe."""
         return f"- {self.acquire}: {_flow({'reader': self.reader, **self.changes})}"
 
 
@@ -243,7 +243,7 @@ class Finding:
 
     @property
     def choices(self) -> list[str]:
-        """What to do, the likeliest first."""
+        """The fixes, likeliest first."""
         return self.fix.split(OR_ELSE)
 
     @property
@@ -296,7 +296,7 @@ class Check(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """What the checks found.
+    """All findings of the checks.
 
     Attributes:
         session: What they looked at.
@@ -316,7 +316,7 @@ class Diagnosis:
 def examine(
     session: RecordedSession, checks: Iterable[Part], checked: Callable[[], None] = lambda: None
 ) -> Diagnosis:
-    """Look for mistakes, the most telling first.
+    """Run the checks; return their findings, the most significant first.
 
     Each check has counted the alternatives it tried; here the checks are counted (Bonferroni), so
     that a session without a mistake gives any finding with :data:`FALSE_ALARM` at most.

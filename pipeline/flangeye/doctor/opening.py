@@ -1,4 +1,4 @@
-"""From an archive, and the recipe that would run on it, to the arrays that checks look at.
+"""Read an archive, with the recipe that would run on it, into the arrays that checks use.
 
 The reader's poses are taken as they are, whatever is wrong with them.
 
@@ -46,7 +46,7 @@ from flangeye.types import Floats
 
 
 class State(NamedTuple):
-    """What else was recorded of the arms: joints (n,) [rad], and base2_T_flange2 (4, 4) [m]."""
+    """The arms' further records: joints (n,) [rad], and base2_T_flange2 (4, 4) [m]."""
 
     joints: Floats | None
     second: Floats | None
@@ -58,7 +58,7 @@ def in_configuration(
     arm: Arm | None,
     states: Mapping[str, State],
 ) -> RecordedSession:
-    """Add who carries what, and where the target is in what carries it.
+    """Add the configuration: who carries camera and target, and where the target is mounted.
 
     Args:
         session: The session of one arm beside its camera, as far as is known.
@@ -113,7 +113,7 @@ def _bare(session: RecordedSession, index: int, states: Mapping[str, State]) -> 
 
 
 def open_session(path: Path, registry: Registry, recipe: Recipe | None = None) -> RecordedSession:
-    """Return what an archive holds, as checks see it.
+    """Return an archive as a session for checks.
 
     Args:
         path: A run.mcap, or a folder that a reader knows.
@@ -136,7 +136,7 @@ def open_session(path: Path, registry: Registry, recipe: Recipe | None = None) -
 def open_cell(
     path: Path, registry: Registry, recipe: Recipe | None = None
 ) -> tuple[Sequence[t.Observation], Cell, Mapping[str, Any]] | None:
-    """Return a cell's sightings, what stands on what, and how tables were read; None if it is none.
+    """Return a cell's sightings, its graph, and how tables were read; None if it is no cell.
 
     Args:
         path: A run.mcap, or a folder that the recipe's reader knows.
@@ -420,7 +420,7 @@ class _Seen(NamedTuple):
 def found_in(
     archive: Archive, first: Step, recipe: Recipe, registry: Registry
 ) -> tuple[dict[str, t.Feature], tuple[Finding, ...], tuple[str, str] | None]:
-    """Return what the recipe's steps find in the scans, in another unit if they find nothing.
+    """Return the features that the recipe finds in the scans; try other units if it finds none.
 
     Returns:
         The features by id; what the captures set aside tell; the unit they were found in and why

@@ -1,4 +1,4 @@
-"""The calibration of a cell: from what was observed to the transforms that people get."""
+"""The calibration of a cell: from observations to the transforms with their covariances."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def calibrate(
 
 
 def answered(session: Session, options: Options, method: str) -> HandEye:
-    """Return what :func:`calibrate` does of a session.
+    """Return the calibration of a session; the second half of :func:`calibrate`.
 
     Raises:
         CalibrationRefused: The motion leaves something unknown.
@@ -150,7 +150,7 @@ def calibrate_at(
     options: Options,
     method: str,
 ) -> HandEye:
-    """Return the calibration whose places another method found, with what the model says of them.
+    """Return the calibration with places from another method, and the model's covariance.
 
     Every observation took part. Its covariance is about these places: it holds what the likeliest
     ones are away from them.

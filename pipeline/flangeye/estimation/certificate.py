@@ -39,7 +39,7 @@ GAP = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Certificate:
-    """What could be shown.
+    """Result of :func:`certify`: a local minimum, and a bound on any better one.
 
     Attributes:
         places: (K, 4, 4) at the bottom of the valley.
@@ -57,7 +57,7 @@ class Certificate:
 
 
 def certify(sightings: LiftedSightings, places: Floats) -> Certificate:
-    """Return what can be shown of the valley in which the unknowns (K, 4, 4) lie."""
+    """Return a certificate for the local minimum near the unknowns (K, 4, 4)."""
     squares = squares_of(sightings, places)
     found = squares.descend(np.tile(np.eye(4), (len(places), 1, 1)))
     cost = squares.cost(found)
@@ -161,7 +161,7 @@ class _Dual(NamedTuple):
         return np.concatenate([part.ravel() for part in parts])
 
     def sought(self, still: Floats, tries: int, start: Floats | None = None) -> Floats:
-        """Return multipliers whose matrix is semidefinite, or as near to it as could be found.
+        """Return dual multipliers whose matrix is positive semidefinite, or nearly so.
 
         Args:
             still: (n, n) projector across what the matrix has to leave as naught.
@@ -194,7 +194,7 @@ class _Dual(NamedTuple):
         return True
 
     def missing(self, multipliers: Floats) -> float:
-        """Return the least share that they show to be all that is missing: no cost is negative."""
+        """Return the smallest relative gap that the multipliers prove, 1 at most."""
         # Shares of the cost that may be missing, as they are tried
         return next(
             (float(each) for each in np.geomspace(GAP, 1.0, 31) if self.shows(multipliers, each)),
@@ -202,7 +202,7 @@ class _Dual(NamedTuple):
         )
 
     def lacks(self, multipliers: Floats) -> Floats:
-        """Return what every matrix lacks of being semidefinite (n, n), as near as it comes."""
+        """Return the (n, n) distance of the dual matrix from the nearest semidefinite one."""
         # Where there is no certificate, so many for a better place
         matrix = self.at(self.sought(np.eye(len(self.bare)), 50, multipliers))
         return np.asarray(_nearest(matrix) - matrix)

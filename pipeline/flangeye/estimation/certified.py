@@ -1,4 +1,4 @@
-"""What is said of an answer of which somebody asks if it is the best: for any graph of frames.
+"""Certify that an answer is the global optimum, for any graph of frames.
 
 Between a camera and what it saw the graph has known places and unknown ones. From any of its frames
 on one may look at it: places that then lead the other way go over as their inverses. Where two at
@@ -26,7 +26,7 @@ NOT_CERTIFIED = "not certified as globally optimal"
 
 
 class CertificateVerdict(NamedTuple):
-    """What is said of an answer.
+    """Whether an answer is certified as optimal, and a better one if found.
 
     Attributes:
         note: In words.
@@ -38,7 +38,7 @@ class CertificateVerdict(NamedTuple):
 
 
 class PathStep(NamedTuple):
-    """One frame on a way, or back from it to what it stands on."""
+    """One frame on the path between camera and target, forwards or inverted."""
 
     name: str
     back: bool
@@ -97,14 +97,14 @@ class CertifiedAnswer:
         return first, second
 
     def place(self, step: PathStep, times: Indices) -> Floats:
-        """Return the (M, 4, 4) places of a step whose frame's is known."""
+        """Return the (M, 4, 4) places of a step whose frame is known."""
         place = np.asarray(self.frames[step.name].place)
         every = np.broadcast_to(place, (len(times), 4, 4)) if place.ndim == 2 else place[times]
         return invert(every) if step.back else every
 
 
 def answer_of(found: Estimate) -> CertifiedAnswer:
-    """Return the answer for the sightings that agree; what may be wrong stays as it was found."""
+    """Return the answer for the inlying sightings, with the effects kept at their estimates."""
     problem, model, kept = found.problem, found.posterior.model, found.inliers
     s = problem.seen.where(kept)
     frames, ends = dict(problem.frames), list(problem.ends)
@@ -131,7 +131,7 @@ def answer_of(found: Estimate) -> CertifiedAnswer:
 
 
 def verdict_of(answer: CertifiedAnswer) -> CertificateVerdict:
-    """Return whether the sightings that agree have no better answer than the one found."""
+    """Return whether any answer fits the inlying sightings better than the one found."""
     root = _seen_from(answer)
     if root is None:
         return CertificateVerdict(_not_certifiable(answer))
@@ -157,7 +157,7 @@ def certificate_notes(answer: CertifiedAnswer) -> tuple[str, ...]:
 
 
 def moved_note() -> str:
-    """Return what is said where the certificate led to a better answer."""
+    """Return the note for an answer that the certificate has improved."""
     return "what the search had found was not the best: the certificate led to a likelier answer"
 
 

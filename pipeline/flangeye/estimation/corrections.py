@@ -1,4 +1,4 @@
-"""What was found wrong with arms, as a controller or a robot's file can take it."""
+"""Arm errors as a correction that a controller or a robot's file can take."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ not rigid over the work; the rigid part stays in the camera's pose."""
 
 
 def put_right(found: Estimate) -> Floats:
-    """Return (K,) what a correction takes of the effects' numbers.
+    """Return (K,) the part of the effects' values that a correction removes.
 
     Those that it has numbers for, and in its smooth error what else displaces the flange at the
     session's poses.
@@ -34,7 +34,7 @@ def put_right(found: Estimate) -> Floats:
 
 
 def corrections_of(found: Estimate, tool_offset: Floats) -> dict[str, ArmCorrection]:
-    """Return what to correct, by arm; nothing of what carries neither camera nor target."""
+    """Return the correction of each arm that carries a camera or a target."""
     numbers = put_right(found)
     return {c.arm: _correction(found, c, tool_offset, numbers) for c in _flanges(found)}
 

@@ -52,7 +52,7 @@ class Estimate:
 
     @property
     def fit(self) -> Fit:
-        """At the most likely sizes."""
+        """The fit at the most likely sizes."""
         return self.posterior.mode
 
     def numbers(self, kind: str) -> list[tuple[Effect, Floats, Floats]]:
@@ -67,7 +67,7 @@ class Estimate:
         return out
 
     def outgrown(self, kind: str) -> bool:
-        """Whether an effect is larger than its prior leaves likely: two deviations or more."""
+        """Whether an effect's estimated size exceeds its prior by two standard deviations."""
         sizes = self.posterior.mode.sizes
         return any(
             np.log(sizes[k] / effect.size) > 2 * np.log(effect.factor)
@@ -234,7 +234,7 @@ def _improved(
 
 
 def judged(model: LinearModel, found: Fit) -> tuple[Floats, Mask]:
-    """Return (N,) squared distances from what the others predict, and which agree with them."""
+    """Return (N,) squared distances from the others' prediction, and the mask of inliers."""
     noise, q = model.noise(found.sizes), model.projectors
     left, spread = left_out(model, found)
     covariance = q @ (noise + spread) @ q + (np.eye(6) - q)

@@ -18,7 +18,7 @@ from flangeye.types import Floats, Observation
 def roll_note(
     observations: Sequence[Observation], base_R_camera: Floats, covariance: Floats
 ) -> str:
-    """Return a note on the plate's turn about its own axis, or that it is not observable.
+    """Return a note on the flange roll, or that it is not observable.
 
     Args:
         observations: The poses that agree.

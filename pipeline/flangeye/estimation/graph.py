@@ -1,4 +1,4 @@
-r"""A cell as a graph of frames, and what its cameras are predicted to see. Arrays only.
+r"""A cell as a graph of frames, with the sightings its cameras should have. Arrays only.
 
 Every frame stands on another, down to one root. A frame's place on its parent is known, unknown, or
 reported by a controller at each time (a *carrier*: an arm's flange or link, a rail's carriage). A
@@ -30,7 +30,7 @@ Places = Mapping[str, Floats]
 
 @dataclass(frozen=True, eq=False)
 class Sightings:
-    """What cameras saw of targets, N times: poses, each with what was measured of it.
+    """N measurements of targets by cameras: poses, with the directions that were measured.
 
     Attributes:
         times: (N,) index of the reported poses.
@@ -80,7 +80,7 @@ class Sightings:
 
 @dataclass(frozen=True, eq=False)
 class Carrier:
-    """What an arm moves: its flange, or one of its links; or what a rail or a positioner moves.
+    """A frame that a controller moves: a flange or link of an arm, or a rail or positioner.
 
     Attributes:
         frame: What it moves.
@@ -106,7 +106,7 @@ class Carrier:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """What is given: the graph, who moves in it, and what was seen.
+    """The estimation problem: the frame graph, its carriers, and the sightings.
 
     Attributes:
         frames: By name; the root has no entry.
@@ -122,7 +122,7 @@ class Problem:
 
     @property
     def unknown(self) -> list[str]:
-        """Frames whose places are to be found."""
+        """Frames whose places are to be estimated."""
         return [name for name, frame in self.frames.items() if frame.place is None]
 
     @property
@@ -135,7 +135,7 @@ class Problem:
         return replace(self, seen=self.seen.where(chosen))
 
     def at(self, times: Indices) -> Problem:
-        """Return the problem of some times, in order, and of what was seen then."""
+        """Return the problem restricted to some times, in order, with their sightings."""
         seen = self.seen.where(np.isin(self.seen.times, times))
         frames = {n: f.at(times) for n, f in self.frames.items()}
         carriers = [
@@ -165,7 +165,7 @@ class Problem:
         return replace(self, frames=frames)
 
     def residuals(self, places: Places) -> Floats:
-        """Return (N, 6) measured minus predicted, across what was measured [rad, m]."""
+        """Return (N, 6) measured minus predicted, zero in unmeasured directions [rad, m]."""
         s, out = self.seen, np.zeros((len(self.seen), 6))
         for k, ends in enumerate(self.ends):
             rows = s.pairs == k
@@ -194,7 +194,7 @@ class Problem:
         return np.concatenate([np.zeros(0), *each])
 
     def linearised(self, places: Places) -> Linear:
-        """Return what is predicted at some places, and how each frame moves it."""
+        """Return the sightings predicted at some places, with their derivatives by each frame."""
         s, moved = self.seen, [*self.unknown, *self.moving]
         residuals, turns = np.zeros((len(s), 6)), np.zeros((len(s), 3, 3))
         blocks = {name: np.zeros((len(s), 6, 6)) for name in moved}

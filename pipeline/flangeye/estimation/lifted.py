@@ -29,7 +29,7 @@ TOLD = 1e-7
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """One side of N sightings, ``A U B V C``; U is none where one place or none is unknown.
+    """One side of the N equations, ``A U B V C``; ``u`` is None if it has at most one unknown.
 
     Attributes:
         a: (N, 4, 4) before U.
@@ -100,7 +100,7 @@ class Family(NamedTuple):
     shift: Indices
 
     def columns(self, u: int, v: int) -> Indices:
-        """Return where entries of v and a one stand (13,), or products (169,) if u is the first."""
+        """Return the indices of v's entries and a one (13,), or of the products with u (169,)."""
         if v == self.first:
             return np.concatenate([self.at[1:, 0], self.shift, [0]])
         last = self.of(v)
@@ -113,12 +113,12 @@ class Family(NamedTuple):
         return out.ravel()
 
     def of(self, other: int) -> Indices:
-        """Return (10, 12) where products with the entries of one of the others stand."""
+        """Return the (10, 12) feature indices of products with another unknown's entries."""
         k = self.after.index(other)
         return self.at[:, 1 + 12 * k : 13 + 12 * k]
 
     def factors(self, places: Floats) -> tuple[Floats, Floats]:
-        """Return a one and the first's rotation, and a one and the entries of the others."""
+        """Return (1, rotation of the first) and (1, entries of the others)."""
         each = [np.append(p[:3, :3], p[:3, 3]) for p in places[list(self.after)]]
         return np.append(1.0, places[self.first, :3, :3]), np.concatenate([np.ones(1), *each])
 
@@ -158,7 +158,7 @@ class Squares:
         return out
 
     def cost(self, places: Floats) -> float:
-        """Return what the squared errors come to."""
+        """Return the sum of squared errors at places (K, 4, 4)."""
         at = self.features(places)
         return max(float(at @ self.quadratic @ at), 0.0)
 
@@ -183,12 +183,12 @@ class Squares:
 
     @cached_property
     def root(self) -> Floats:
-        """(n, n) whose square is the quadratic."""
+        """(n, n) matrix R with R'R equal to the quadratic."""
         values, vectors = np.linalg.eigh(self.quadratic)
         return np.asarray(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T)
 
     def alike(self, places: Floats) -> Floats:
-        """Return features (m, n) of places that fit as well as those at a minimum.
+        """Return features (m, n) of other places with the same cost as a minimum.
 
         A circle may be turned about itself, and what is seen as a point about any axis.
         """
@@ -234,7 +234,7 @@ def _moves(place: Floats) -> Floats:
 
 
 def squares_of(sightings: LiftedSightings, places: Floats) -> Squares:
-    """Return the squares by what the unknowns are beyond those places (K, 4, 4)."""
+    """Return the squared errors as a quadratic in the change from places (K, 4, 4)."""
     sides = [side.about(places) for side in (sightings.camera, sightings.target)]
     index = np.concatenate([side.unknowns for side in sides], axis=1)
     pairs = {(u, v) for u, v in index.reshape(-1, 2).tolist() if u < len(places)}

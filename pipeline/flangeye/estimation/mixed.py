@@ -58,7 +58,7 @@ class Sizes:
 
 @dataclass(frozen=True, eq=False)
 class LinearModel:
-    """What was seen, near one set of places; all across what was measured alone.
+    """The sightings linearised at given places, projected onto the measured directions.
 
     Attributes:
         residuals: (N, 6) measured minus predicted, in ``camera`` [rad, m].
@@ -86,7 +86,7 @@ class LinearModel:
     shares: Floats
 
     def noise(self, sizes: Floats) -> Floats:
-        """Return (N, 6, 6) covariances of the noise; the identity across what was not measured."""
+        """Return (N, 6, 6) noise covariances; the identity in unmeasured directions."""
         amounts = sizes[self.factors].prod(axis=1)
         return np.asarray(self.still + np.tensordot(amounts, self.causes, axes=1))
 
@@ -149,7 +149,7 @@ class Fit:
 
 
 class Told(NamedTuple):
-    """What sightings alone tell, at one set of variance components.
+    """The whitened sightings at given variance components.
 
     Attributes:
         whitening: (N, 6, 6) roots of the inverse covariances of the noise, each by its share.
@@ -165,7 +165,7 @@ class Told(NamedTuple):
 
 
 def told(model: LinearModel, sizes: Floats) -> Told:
-    """Return what the sightings tell at (S,) sizes of the noise."""
+    """Return the whitened sightings at (S,) sizes of the noise."""
     roots = np.linalg.cholesky(model.noise(sizes))
     whitening = np.sqrt(model.shares)[:, None, None] * np.linalg.inv(roots)
     errors = (whitening @ model.residuals[..., None]).ravel()
@@ -243,7 +243,7 @@ def _gradient(model: LinearModel, found: Fit, known: Told, left: Floats) -> Floa
 
 
 def spread_of(rows: Floats, covariance: Floats) -> Floats:
-    """Return (N, 6, 6) covariances of (N, 6, K) rows times what has a covariance (K, K)."""
+    """Return (N, 6, 6) covariances of (N, 6, K) rows times a variable of covariance (K, K)."""
     flat = rows.reshape(-1, rows.shape[2]) @ covariance
     return np.asarray(flat.reshape(rows.shape) @ np.swapaxes(rows, 1, 2))
 
@@ -285,7 +285,7 @@ class Posterior:
 
 
 def shares(known: Posterior, rows: Floats) -> tuple[Floats, Floats]:
-    """Return what the covariance of (A, P + K) rows of the unknowns is made of.
+    """Return the covariance of (A, P + K) rows of the unknowns, split by cause.
 
     The error of Henderson's solution is V (Lambda delta - H'W e), so that of each effect is
     V_k V_k' / s_k^2; the noise has the rest of V.
@@ -304,7 +304,7 @@ def shares(known: Posterior, rows: Floats) -> tuple[Floats, Floats]:
 
 
 def mode_of(model: LinearModel, start: Floats | None = None, steps: int = 60) -> Floats:
-    """Return (Z,) the most likely sizes, as standard normal numbers, by L-BFGS."""
+    """Return (Z,) the most likely sizes, as standard normal values, by L-BFGS."""
     from scipy.optimize import minimize
 
     prior, model = model.sizes, model.telling()
@@ -384,7 +384,7 @@ def _draws(count: int, samples: int) -> Floats:
 
 
 def left_out(model: LinearModel, found: Fit) -> tuple[Floats, Floats]:
-    """Return (N, 6) residuals and (N, 6, 6) covariances of each sighting by all the others.
+    """Return each sighting's leave-one-out residual (N, 6) and its covariance (N, 6, 6).
 
     In closed form (the leave-one-out residual of Cook & Weisberg 1982): a sighting that took part
     has drawn the fit towards itself by H V H'W, which is taken back.

@@ -53,7 +53,7 @@ class WeakMoves:
 
 
 def weak_moves(information: Floats, limits: Floats) -> WeakMoves:
-    """Return the moves of P unknowns whose standard deviation is beyond its limit.
+    """Return the directions of P unknowns whose standard deviation exceeds its limit.
 
     Args:
         information: (P, P) Fisher information.
@@ -68,7 +68,7 @@ def weak_moves(information: Floats, limits: Floats) -> WeakMoves:
 def telling(
     information: Floats, limits: Floats, further: Mapping[Motion, Floats]
 ) -> tuple[list[Motion], WeakMoves]:
-    """Return the motions that would show the weak moves, as few as do, and what stays weak.
+    """Return motions, chosen greedily, that make the weak moves observable, and what stays weak.
 
     Greedy: each time the motion that makes the weak moves known best.
 
@@ -157,7 +157,7 @@ def require_several_places(tcps: Floats) -> None:
 
 
 def require_same_units(centres: Floats, tcps: Floats) -> None:
-    """Refuse centres that are not as far apart as the TCPs are, both (N, 3).
+    """Refuse centres (N, 3) whose spread does not match that of the TCPs (N, 3).
 
     Medians of all pairwise distances are compared: neither the camera's place nor a few wrong
     centres matter.
@@ -393,7 +393,7 @@ def _called(problem: Problem, name: str) -> str:
 
 
 def missing_motion(problem: Problem, places: Places) -> str:
-    """Return what the arms did not do, in words."""
+    """Return in words which motion of the arms is missing."""
     camera, _ = problem.ends[0]
     if problem.unknown == [camera] and not (problem.seen.ranks == 6).all():
         return _line_of(problem, places)
@@ -421,7 +421,7 @@ def _line_of(problem: Problem, places: Places) -> str:
 
 
 def require_turns(problem: Problem) -> None:
-    """Refuse arms that stood still or never turned, before any start is looked for.
+    """Refuse arms that stood still or never rotated, before the search for an initial guess.
 
     Raises:
         CalibrationRefused: Names the arm.

@@ -46,7 +46,7 @@ def so_far(observations: Sequence[Observation], cell: Cell) -> Rough | None:
 
 
 def errors_at_work(found: Rough, cell: Cell, seen: Sequence[Observation]) -> dict[str, float]:
-    """Return, by unknown frame, what it is off by at most at its work, 95 % of the time [m]."""
+    """Return each unknown frame's 95 % bound of the error at its work [m]."""
     work = work_of_frames(found, cell, seen)
     return {
         name: largest_error_quantile(covariance, found.places[name][:3, 3], points)
@@ -78,7 +78,7 @@ def work_of_frames(found: Rough, cell: Cell, seen: Sequence[Observation]) -> Map
 def most_telling(
     rows: Floats, covariance: Floats, levers: Floats, count: int
 ) -> tuple[Indices, Floats]:
-    """Choose sightings one after the other, each the one that leaves the least variance.
+    """Choose sightings greedily; each one minimises the variance that remains.
 
     Args:
         rows: (M, 6, U) of M candidates, whitened.
@@ -119,7 +119,7 @@ def best_next(
 
 
 def foreseen(moments: Sequence[Observation], places: Places, cell: Cell) -> list[Observation]:
-    """Return M sightings of one target by one camera as they would be, by what is known so far.
+    """Return M sightings of one target by one camera, as predicted from the estimate so far.
 
     Args:
         moments: Where the controllers would have what moves, the camera, the target, and by a
@@ -135,7 +135,7 @@ def foreseen(moments: Sequence[Observation], places: Places, cell: Cell) -> list
 
 
 def foreseen_poses(moments: Sequence[Observation], places: Places, cell: Cell) -> Floats:
-    """Return (M, 4, 4) camera_T_target at such moments, by what is known so far."""
+    """Return (M, 4, 4) camera_T_target at such moments, predicted from the estimate so far."""
     frames = {
         name: replace(frame, place=places.get(name, frame.place))
         for name, frame in cell.graph(moments).items()

@@ -40,7 +40,7 @@ class Rough:
 
     @property
     def errors(self) -> Floats:
-        """(N, 6) residuals of each sighting by all the others [rad, m]."""
+        """(N, 6) leave-one-out residuals of each sighting [rad, m]."""
         return left_out(self.model, self.fit)[0]
 
     @property

@@ -1,4 +1,4 @@
-"""From what was observed to one posterior: where to begin, what may be wrong, and what agrees."""
+"""From observations to the posterior: initial guess, effects, and outlier rejection."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ CONFIGURED = (
 
 @dataclass(frozen=True)
 class Asked:
-    """What a solver is asked for.
+    """Options of a solver that change the model.
 
     Attributes:
         normals: Whether circles' normals count.
@@ -141,7 +141,7 @@ def session_of(
 
 
 def effects_of(problem: Problem, scanner: ScannerModel | None, asked: Asked) -> list[Effect]:
-    """Return all that may be wrong with a cell."""
+    """Return all error sources of a cell."""
     arms = dict.fromkeys(carrier.arm for carrier in problem.carriers)
     return [
         *(effect for arm in arms for effect in arm_effects(problem, arm)),

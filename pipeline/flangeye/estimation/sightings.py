@@ -1,4 +1,4 @@
-"""From observations of a cell to the arrays of a problem: what was seen, and what moved it."""
+"""Convert a cell's observations into the arrays of a problem."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def _motions(observations: Sequence[Observation], cell: Cell) -> list[Motion] | 
 
 
 def branches_of(problem: Problem, carrier: Carrier) -> Iterator[Floats]:
-    """Give the (T, n) joints that an arm may have had at its poses, branch by branch [rad].
+    """Yield candidate joint angles (T, n) of an arm at its poses, one IK branch each [rad].
 
     Those recorded are the only ones, if they reach the poses. Nothing where the model is another
     arm's, or unknown.

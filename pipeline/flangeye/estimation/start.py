@@ -1,4 +1,4 @@
-r"""Where to begin: places that most sightings agree on, found without a guess, outliers among them.
+r"""Robust initial guess: places that most sightings agree on, without any prior guess.
 
 The loop of one camera and one target is a circle of unknown places U and of what is known K:
 
@@ -152,7 +152,7 @@ class _Loop(NamedTuple):
 
     @property
     def unknown(self) -> list[str]:
-        """Names of what is unknown on both ways."""
+        """Names of the unknown frames on both paths."""
         return [x for x in (*self.camera, *self.target) if isinstance(x, str)]
 
 
@@ -219,7 +219,7 @@ def _solved(loop: _Loop, rng: np.random.Generator) -> dict[str, Floats] | None:
 
 
 def distances(problem: Problem, places: Places) -> Floats:
-    """Return (N,) squared residuals, turns by what they do at the lever [m^2]."""
+    """Return (N,) squared residuals; rotations count by their lever [m^2]."""
     r = problem.residuals(places)
     return np.asarray((LEVER**2 * r[:, :3] ** 2).sum(axis=1) + (r[:, 3:] ** 2).sum(axis=1))
 
@@ -246,7 +246,7 @@ def _form_of(loop: _Loop) -> _Form | None:
 
 
 def circle_of(problem: Problem) -> tuple[list[tuple[str, bool]], list[Floats]]:
-    """Return the unknowns round the loop of one camera and one target, and what lies between.
+    """Return the unknowns along the loop of one camera and one target, and the known poses between.
 
     Each name with whether its inverse stands there, and the (N, 4, 4) that follow each.
     """

@@ -35,7 +35,7 @@ class Work:
 
 
 def work_of(problem: Problem, places: Places, box: Box | None = None) -> Work:
-    """Return sightings that nobody measured, of the same targets by the same cameras.
+    """Return simulated sightings over the work, of the same targets by the same cameras.
 
     The boxes are filled evenly, the flange turned as in the session, as far as the arm gets there
     near the session's poses: these are too few to say what an arm does between them. Of several

@@ -1,1 +1,1 @@
-"""What is read from disk: YAML with lines, point clouds, recordings, bundled files."""
+"""Reading from disk: YAML with line numbers, point clouds, recordings, bundled files."""

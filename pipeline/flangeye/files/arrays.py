@@ -46,7 +46,7 @@ def read_npz(path: Path, name: str, shape: tuple[int | None, ...]) -> Floats:
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """Return the numbers of an .npz file by name, or of a .npy file, whose name is empty.
+    """Return the arrays of an .npz file by name; the array of a .npy file has an empty name.
 
     What else an .npz file holds, a text beside its arrays, is left out.
 

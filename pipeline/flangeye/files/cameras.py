@@ -54,7 +54,7 @@ class CameraFile(NamedTuple):
     lens_of: str = ""
 
     def note(self) -> str:
-        """Return what to say of it."""
+        """Return the note for people on this calibration file."""
         (fx, _, cx), (_, fy, cy), _ = self.matrix
         lens = f"{len(self.distortion)} coefficients" if self.distortion.any() else "no distortion"
         lens += f" of {self.lens_of}" if self.lens_of else ""
@@ -82,7 +82,7 @@ def cameras_in(folder: Path) -> list[CameraFile]:
 
 
 def camera_in(path: Path) -> CameraFile | None:
-    """Return the calibration that a file holds; None where it holds none.
+    """Return the camera calibration in a file; None if it holds none.
 
     Raises:
         StageError: Its lens is of another model than OpenCV's.

@@ -24,7 +24,7 @@ MOST_PIECES = 200_000
 
 
 def read_dxf(path: Path) -> tuple[Floats, str | None]:
-    """Return the straight pieces (E, 2, 3) of a drawing in its unit, and that unit if it says one.
+    """Return the line segments (E, 2, 3) of a DXF drawing, and its unit if it states one.
 
     Raises:
         StageError: It is no ASCII DXF, is too large, or holds numbers that are none.

@@ -1,4 +1,4 @@
-"""Archives and results elsewhere, by URL: scans are fetched one at a time and let go again.
+"""Remote archives and results, by URL: scans are fetched one at a time and not kept.
 
 The rest of the program knows paths alone. For an archive by URL a folder is made here that has
 every file by its name: the small ones whole, scans and images empty until somebody reads them.
@@ -33,7 +33,7 @@ def is_this_machine(host: str) -> bool:
 
 @contextmanager
 def archive_at(place: str | None) -> Iterator[Path | None]:
-    """Yield an archive's path: its own, or for a URL that of a folder that stands for it.
+    """Yield an archive's path; for a URL, that of a local folder that mirrors it on demand.
 
     Raises:
         StageError: Nothing is there, it cannot be reached, or the URL is of another kind.
@@ -105,20 +105,20 @@ def is_elsewhere(path: Path) -> bool:
 
 
 def digest_elsewhere(path: Path) -> str | None:
-    """Return a hash of what the store says of a file's content; None for a file that is here."""
+    """Return a hash of a remote file's content from the store; None for a local file."""
     stand_in = _of(path)
     return _state(stand_in.later[path]) if stand_in and path in stand_in.later else None
 
 
 def with_urls(text: str) -> str:
-    """Return a text with URLs for the folders that stand for them."""
+    """Replace the paths of mirror folders in a text by their URLs."""
     for root, stand_in in _STANDING_IN.items():
         text = text.replace(str(root), stand_in.url.rstrip("/"))
     return text
 
 
 def print_of(url: str) -> str:
-    """Return a hash of an archive's names and of what the store says of each content."""
+    """Return a hash of a remote archive's names and contents, from the store's listing."""
     stand_in = _StandIn(url, Path("/"))
     lines = [f"{name}\0{_state(about)}\n" for name, about in sorted(stand_in.listed().items())]
     return hashlib.sha256("".join(lines).encode()).hexdigest()
@@ -139,7 +139,7 @@ class _StandIn:
         self._names: dict[Path, str] = {}
 
     def listed(self) -> dict[str, Mapping[str, Any]]:
-        """Return name below the URL -> what the store says of the file; "" if it is one itself."""
+        """Return the store's entries below a URL by name; the name is "" for a single file."""
         with reaching(self.url):
             found = self._system.find(self._there, detail=True)
         if not found:

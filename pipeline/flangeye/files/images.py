@@ -1,4 +1,4 @@
-"""Decode images that others made: bounded, and refused in our words."""
+"""Decode image files, with bounded size and one-line errors."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ RecipePath = Annotated[Path, BeforeValidator(_beside_recipe), WHOLE]
 def bundled_file(
     kind: str, folder: str, own: Sequence[str] = (".yaml",)
 ) -> Callable[[Any, ValidationInfo], Path]:
-    """Return the check of a parameter that names a file of ``data/FOLDER`` or one's own.
+    """Return a validator for a parameter that names a bundled file of ``data/FOLDER`` or one's own.
 
     Args:
         kind: What it is, for people: ``workpiece``.
@@ -160,10 +160,10 @@ def _entries(kind: Kind) -> dict[str, str]:
 
 
 class Storage(Protocol):
-    """What many processes read from and write to; names are relative, with ``/``."""
+    """A store that many processes read and write; names are relative, with ``/``."""
 
     def read(self, name: str) -> bytes | None:
-        """Return what a file holds; None if it is not there."""
+        """Return a file's content; None if it does not exist."""
         ...
 
     def write(self, name: str, content: bytes) -> None:

@@ -18,12 +18,12 @@ def python_command(*words: str) -> list[str]:
 
 
 def keep_current_folder_out() -> None:
-    """Let no child of this process import from its current folder, whoever starts it."""
+    """Keep child processes from importing modules of their current folder."""
     os.environ["PYTHONSAFEPATH"] = "1"
 
 
 def busy() -> str:
-    """Return what to do about a computer that has more to do than it can; else nothing."""
+    """Return advice if this computer is overloaded, else an empty text."""
     cores = os.cpu_count() or 1
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
     if load <= cores:
@@ -35,11 +35,11 @@ def busy() -> str:
 
 
 class PipeEndedError(Exception):
-    """The other process has ended; how, and its last words."""
+    """The child process has ended; with its exit code and last output."""
 
 
 class Pipe:
-    """A process, read in the background so that waiting for it can end."""
+    """A child process read by a background thread, so that a wait can time out."""
 
     def __init__(
         self, command: Sequence[str], environment: Mapping[str, str] | None = None

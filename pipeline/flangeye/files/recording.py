@@ -1,4 +1,4 @@
-"""What a ``reader`` part gives: recorded scans and robot poses, before any cloud is decoded.
+"""The output of ``reader`` parts: recorded scans and robot poses, clouds not yet decoded.
 
 A reader is a part ``reader.<name>``, a function of a path (and its own parameters) that returns
 an :class:`Archive`. It reads the poses, finds the clouds, and raises :class:`NotThisLayout` when
@@ -39,12 +39,12 @@ class Reader(Protocol):
 
 
 class NotThisLayout(StageError):
-    """The path holds nothing that this reader knows; says what it looked for."""
+    """The path does not have the layout of this reader; says what was expected."""
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """One pose of an archive, and what was recorded there.
+    """One pose of an archive with its recordings.
 
     Attributes:
         id: Unique within the archive.
@@ -93,7 +93,7 @@ class Recording:
 
 @dataclass(frozen=True, eq=False)
 class Archive:
-    """What a reader found.
+    """The recordings that a reader found.
 
     Attributes:
         layout: How notes call the layout, for example ``ancorasir aubo``.
@@ -228,7 +228,7 @@ def _name_below(root: Path, path: Path) -> str:
 
 
 def check_distinct_clouds(recordings: Sequence[Recording], digests: dict[Path, str]) -> None:
-    """Refuse a scan that stands at two poses; a verification scan used for training above all.
+    """Refuse a scan that appears at two poses, or both in training and in verification.
 
     Raises:
         StageError: Names both files.

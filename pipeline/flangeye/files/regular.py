@@ -1,4 +1,4 @@
-"""Files of others are read if regular and of an expected size; own ones are written whole."""
+"""Read only regular files of bounded size; write files atomically."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def open_regular(path: Path, error: type[FlangeyeError] = StageError) -> BinaryI
 def read_regular(
     path: Path, limit: int = MAX_TEXT, error: type[FlangeyeError] = StageError
 ) -> bytes:
-    """Return what a regular file holds.
+    """Return the content of a regular file.
 
     Raises:
         FlangeyeError: As :func:`open_regular`, or the file is longer than ``limit`` [bytes].
@@ -75,7 +75,7 @@ def read_text(path: Path, limit: int = MAX_TEXT, error: type[FlangeyeError] = St
 
 
 def read_any_text(path: Path) -> str:
-    """Return the text of a table in UTF-8, in UTF-16 as Excel writes it, or else in Latin-1.
+    """Return a text file decoded as UTF-8, UTF-16 (Excel), or else Latin-1.
 
     Raises:
         StageError: As :func:`read_regular`, or it is no text.
@@ -96,7 +96,7 @@ def _reason(failure: Exception) -> str:
 
 
 def write_whole(path: Path, content: str | bytes, error: type[FlangeyeError] = StageError) -> None:
-    """Write a file so that whoever looks, after a crash too, finds the old one or the new one.
+    """Write a file atomically: after a crash it is the old one or the new one, never a part.
 
     Args:
         path: The file, whose folder is made where there is none; what is no regular file, such

@@ -1,4 +1,4 @@
-"""The scans beside poses: clouds, and images; and which of two lists of names belong together."""
+"""Find the scans that belong to poses: clouds and images, paired by name or number."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def natural(text: str) -> list[tuple[int, str]]:
 
 
 def numbers_of(names: Sequence[str]) -> list[tuple[int, ...]]:
-    """Return the numbers that distinguish names: ``(7,)`` of cam0_07; empty where there is none."""
+    """Return the numbers that distinguish names: ``(7,)`` of cam0_07; empty if there is none."""
     runs = [tuple(map(int, re.findall(r"\d+", name))) for name in names]
     if len({len(run) for run in runs}) > 1:
         return [run[-1:] for run in runs]
@@ -34,7 +34,7 @@ def numbers_of(names: Sequence[str]) -> list[tuple[int, ...]]:
 
 
 def partners(where: str, poses: Sequence[str], others: Sequence[str]) -> tuple[list[int], str]:
-    """Return for each pose which of the others belongs to it, and a note of how they were paired.
+    """Return for each pose the matching name, and a note of how they were paired.
 
     Args:
         where: What messages begin with.
@@ -135,7 +135,7 @@ def scans_in(folder: Path, stem: str = "*") -> list[Path]:
 
 
 def texts_of_points(files: Iterable[Path]) -> set[Path]:
-    """Return the texts that hold a cloud each: three or more, named alike but for a number."""
+    """Return the text files that hold a cloud each: three or more, numbered alike."""
     alike: dict[str, list[Path]] = defaultdict(list)
     for path in files:
         if path.suffix.lower() in POINTS:

@@ -1,4 +1,4 @@
-"""Turn pydantic's complaints into ours: what is wrong, and what is allowed."""
+"""Turn pydantic's validation errors into one-line messages that name what is allowed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Text that others wrote, before it reaches a terminal."""
+"""Make foreign text safe to print on a terminal."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ LONGEST = 160
 
 
 def require_name(where: str, name: str) -> str:
-    """Return a name that a file gives to a link, a joint or a frame.
+    """Return a name that a file gives to a link, joint or frame; refuse odd ones.
 
     Raises:
         RecipeError: It has other characters than names have, or more than 128.
@@ -38,7 +38,7 @@ def printable(text: str) -> str:
 
 
 def reason_of(error: BaseException) -> str:
-    """Return what a library says of damaged input, as one short line."""
+    """Return a library's message about damaged input as one short line."""
     line = printable(str(error)).strip().partition("\n")[0].strip()
     return line[:LONGEST] or type(error).__name__
 

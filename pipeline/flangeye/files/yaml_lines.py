@@ -62,7 +62,7 @@ def read_yaml(path: Path) -> Document:
 
 
 def parse_yaml(text: str, name: str) -> Document:
-    """Parse YAML text; ``name`` is what messages call it.
+    """Parse YAML text; messages begin with ``name``.
 
     Raises:
         RecipeError: Names the line and the cure.
@@ -100,7 +100,7 @@ def _composed(text: str, name: str) -> yaml.Node | None:
 
 
 def parse_value(text: str, name: str) -> Any:
-    """Parse one YAML value, as ``--set`` gives it."""
+    """Parse one YAML value, as given to ``--set``."""
     return parse_yaml(text, name).data
 
 
@@ -180,7 +180,7 @@ def _scalar(text: str, plain: bool) -> Any:
 
 
 class Edit(NamedTuple):
-    """Characters of a text, from ``start`` to before ``end``, and what stands there instead."""
+    """Replace the characters of a text from ``start`` to before ``end``."""
 
     start: int
     end: int

@@ -1,4 +1,4 @@
-"""Our values as Foxglove messages, so that any MCAP viewer shows a run without a plugin.
+"""Convert our values to Foxglove messages, so that any MCAP viewer shows a run.
 
 The messages are protobuf with the published schemas; each function builds one.
 """
@@ -21,7 +21,7 @@ ERROR, WARNING, INFO = 4, 3, 2
 
 
 def point_cloud(cloud: PointCloud, xyz: NDArray[np.float32], time_ns: int) -> Any:
-    """Return ``xyz`` (N, 3) float32, as it is, as a foxglove.PointCloud in the cloud's frame."""
+    """Return ``xyz`` (N, 3) float32, unchanged, as a foxglove.PointCloud in the cloud's frame."""
     from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
     from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud as Message
 
@@ -42,7 +42,7 @@ def points_of(message: Any) -> NDArray[np.float32]:
 
 
 def frame_transform(transform: Transform, time_ns: int) -> Any:
-    """Return a foxglove.FrameTransform: where the child stands in the parent."""
+    """Return a foxglove.FrameTransform: the child's pose in the parent."""
     from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 
     message = FrameTransform(parent_frame_id=transform.parent, child_frame_id=transform.child)

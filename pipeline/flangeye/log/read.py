@@ -108,7 +108,7 @@ class JournalEntry:
 
 @dataclass
 class RunLog:
-    """What a log holds, its raw clouds aside (see :meth:`captures`).
+    """The content of a log, except its raw clouds (see :meth:`captures`).
 
     Attributes:
         path: The file.
@@ -145,7 +145,7 @@ class RunLog:
 
     @property
     def notes(self) -> list[str]:
-        """The log's damage in a few lines, for whoever runs on it."""
+        """The log's damage in a few lines, for those who use it."""
         kept = f"kept: {len(self.poses)} captures, {len(self.entries)} values of steps"
         told_at_most = 10
         told = [f"{self.path}: damaged: {what}; {kept}" for what in self.damage[:told_at_most]]
@@ -163,18 +163,18 @@ class RunLog:
             raise StageError(f"{self.notes[0]}{more}")
 
     def text(self, name: str) -> str | None:
-        """Return an attached text, such as ``recipe.yaml``; None when there is none."""
+        """Return an attached text, such as ``recipe.yaml``; None if it is not attached."""
         raw = self.attachments.get(name)
         return None if raw is None else raw.decode()
 
     @property
     def has_recipe(self) -> bool:
-        """Whether it says what was run."""
+        """Whether the log has the recipe of its run."""
         return not {"recipe.yaml", "recipe.resolved.yaml"}.isdisjoint(self.attachments)
 
     @property
     def models(self) -> dict[str, bytes]:
-        """The attached models of the recipe's own, by the name that it gives them."""
+        """The recipe's own models attached to the log, by the name the recipe gives them."""
         return {k: v for k, v in self.attachments.items() if k.startswith("models/")}
 
     @property
@@ -205,7 +205,7 @@ class RunLog:
         return given + fitted
 
     def flange_clouds(self) -> Iterator[tuple[t.Capture, t.FlangeCloud]]:
-        """Yield each segmented flange with its capture, whose own cloud is the flange's."""
+        """Yield each segmented flange as a cloud, with its capture."""
         for entry in self.of_kind("segment"):
             if str(entry.capture) not in self.poses:
                 continue  # its pose is in the damaged part
@@ -220,7 +220,7 @@ class RunLog:
         )
 
     def calibration(self, stage: str | None = None) -> t.HandEye | None:
-        """Return what ``stage`` gave, or the last calibration of any, if it came so far."""
+        """Return the calibration of ``stage``, or the last one of any stage; None without one."""
         if stage is not None:
             found: t.HandEye | None = self.given(stage)
             return found
@@ -239,7 +239,7 @@ class RunLog:
         yield from (reading for reading in self.readings() if isinstance(reading, t.Capture))
 
     def readings(self) -> Iterator[t.Capture | t.Rejection]:
-        """Yield the captures; one that cannot be read is given as its rejection."""
+        """Yield the captures; a capture that cannot be read is yielded as its rejection."""
         capture, parts = "", dict[str, Any]()
         # Many thousands of poses without a scan are not read once more
         for message in _messages(self.path) if self.poses else ():
@@ -273,7 +273,7 @@ class RunLog:
 
     @property
     def last_joints(self) -> Any:
-        """(n,) joint angles at the last capture [rad]; None where they are not known."""
+        """(n,) joint angles at the last capture [rad]; None if unknown."""
         return self._pose(next(reversed(self.poses)))[1] if self.poses else None
 
     def _pose(self, capture: str) -> tuple[t.Poses, Any]:
@@ -308,7 +308,7 @@ class RunLog:
 
 
 def log_of(path: Path) -> Path:
-    """Return the log of a run that is given as its folder, or as any of the files in it."""
+    """Return the log of a run, given as its folder or any file in it."""
     if path.is_dir():
         return path / "run.mcap"
     beside = path.parent / "run.mcap"
@@ -317,7 +317,7 @@ def log_of(path: Path) -> Path:
 
 
 def is_log(path: Path) -> bool:
-    """Return whether a file may be a log of ours; other programs write MCAP too."""
+    """Return whether a file may be a flangeye log; other programs write MCAP too."""
     if path.suffix != ".mcap" or not path.is_file():
         return False
     with path.open("rb") as file:
@@ -327,7 +327,7 @@ def is_log(path: Path) -> bool:
 
 
 def read_run(path: Path) -> RunLog:
-    """Read a log, or that of a run's folder, as far as it goes.
+    """Read the log of a run, given as a file or folder, up to its first damage.
 
     Raises:
         StageError: The file is missing, empty, or not an MCAP file of ours.
@@ -341,7 +341,7 @@ def read_run(path: Path) -> RunLog:
 
 
 def read_notes(path: Path, steps: Set[str] | None = None) -> Iterator[JournalEntry]:
-    """Yield what steps wrote into their logs, in order, as far as the log goes.
+    """Yield the notes that steps logged, in order, up to the first damage.
 
     Args:
         path: The log.
@@ -369,7 +369,7 @@ def _note(message: LogMessage) -> JournalEntry:
 
 
 def take(log: RunLog, message: LogMessage, clouds: dict[str, t.PointCloud]) -> None:
-    """Take one message into what is known of a run; what cannot be read is named in its damage.
+    """Add one message to what is known of a run; unreadable ones are counted as damage.
 
     Args:
         log: What is known so far.

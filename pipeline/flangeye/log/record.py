@@ -1,4 +1,4 @@
-"""Write a run to MCAP as it happens; a hook implementation, so no stage can forget to log.
+"""Log a run to MCAP while it runs; a hook implementation, so no stage can forget to log.
 
 Channels (``N.stage`` is a step's label, such as ``2.fit.rim``):
 
@@ -155,7 +155,7 @@ class Recorder:
     def flangeye_stage_finished(
         self, step: str, capture: str | None, value: Any, seconds: float
     ) -> None:
-        """Log what a step gave, and a mirror of it for viewers."""
+        """Log a step's result, and a copy of it for viewers."""
         self.gathered = True
         topic, clouds = f"/step/{step}", clouds_of(value)
         for name, cloud in clouds.items():
@@ -203,14 +203,14 @@ class Recorder:
         self.close()
 
     def ended(self, reason: str) -> None:
-        """Say that the run ended early, and why; whoever watches it need not wait."""
+        """Log that the run ended early, and why; a viewer that follows it stops waiting."""
         with suppress(LogWriteError):  # a full disk has been told already
             if not self._file.closed:
                 self._log(reason, foxglove.ERROR)
                 self._json("/ended", "Ended", {"reason": reason})
 
     def close(self) -> None:
-        """Close the file as it is; a log without its end can still be read."""
+        """Close the file as it is; a log without an end can still be read."""
         try:
             self._file.close()
         except OSError as error:

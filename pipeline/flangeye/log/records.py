@@ -1,4 +1,4 @@
-"""The one door through which logs are read: checked, bounded, and past what is damaged.
+"""The only reader of log files: checks sizes and CRCs, and skips damaged parts.
 
 A log may be torn, changed, or made by anybody. Checksums of chunks and attachments are compared,
 hashes of the recipe and the result too; what a chunk expands to is bounded before it is expanded.
@@ -87,11 +87,11 @@ class LogMessage(NamedTuple):
 
 
 class NotMcapError(ValueError):
-    """The file does not begin as an MCAP file does."""
+    """The file does not begin with the MCAP magic bytes."""
 
 
 class DamageError(ValueError):
-    """A part of a log is not as it was written: what is wrong with it."""
+    """A part of a log is damaged; the message says how."""
 
 
 @dataclass
@@ -120,11 +120,11 @@ class LogFile:
 
     @property
     def may_be_ours(self) -> bool:
-        """Whether the log says that flangeye wrote it, or was killed before it could."""
+        """Whether the log was written by flangeye, or ended before it could say so."""
         return self.library.startswith("flangeye") or not self._read
 
     def messages(self, file: IO[bytes], size: int = MAX_RECORD) -> Iterator[LogMessage]:
-        """Yield the messages until the log's end, or as far as it goes.
+        """Yield the messages up to the log's end or its first unreadable part.
 
         Args:
             file: Stands at the log's first byte; may wait for more.
@@ -283,7 +283,7 @@ def _decompressed(chunk: Chunk) -> bytes:
 
 
 def reason_of(error: Exception) -> str:
-    """Return what is wrong with foreign content, in one short line without its own wording."""
+    """Return the fault of foreign content as one short line, without quoting it."""
     if isinstance(error, KeyError):
         return f"it lacks {error}"
     if isinstance(error, RecursionError):

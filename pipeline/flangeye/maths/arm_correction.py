@@ -136,7 +136,7 @@ def corrected_view(
 
 
 def reported_flange(base_T_flange: Floats, correction: ArmCorrection, arm: Arm | None) -> Floats:
-    """Return the (4, 4) pose to command, so that the corrected arm puts its flange at a pose.
+    """Return the (4, 4) pose to command so that the corrected arm reaches a pose.
 
     The inverse of :func:`corrected_flange` without the circle's place on the flange, by repeated
     substitution: a correction changes little over its own size.
@@ -179,7 +179,7 @@ def _near(arm: Arm, base_T_flange: Floats, near: Floats) -> Floats:
 
 
 def follow(arm: Arm, base_T_flange: Floats, near: Floats) -> Floats:
-    """Return the joint angles (..., n) that reach (..., 4, 4) poses on the branch of ``near``.
+    """Return the joint angles (..., n) that reach (..., 4, 4) poses on the IK branch of ``near``.
 
     Newton's method in small steps: a configuration leads to its own branch.
 
@@ -198,7 +198,7 @@ def follow(arm: Arm, base_T_flange: Floats, near: Floats) -> Floats:
 
 
 def reached_from(arm: Arm, base_T_flange: Floats, near: Floats) -> tuple[Floats, Mask]:
-    """Return joint angles (..., n) near others (..., n), and which (...) poses they reach.
+    """Return joint angles (..., n) reached from a start (..., n), and (...) whether they converged.
 
     See :func:`follow`.
     """

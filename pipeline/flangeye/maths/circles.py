@@ -60,7 +60,7 @@ def sectors(offsets: Floats, bins: int) -> Indices:
 
 
 def vote_centre(edges: tuple[tuple[Floats, float], ...], start: Floats, reach: float) -> Floats:
-    """Return the (2,) centre that most edge points agree on, their circles' radii being given.
+    """Return the (2,) centre that most edge points agree on, given their circles' radii.
 
     Every edge point votes for all centres one radius away from it (Hough 1962, Duda and Hart
     1972). Half a rim, or a rim with stray points, still has a single peak.

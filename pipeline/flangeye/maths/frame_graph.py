@@ -1,4 +1,4 @@
-"""What stands on what: a graph of frames, down to one root. Arrays only."""
+"""A graph of frames, each standing on its parent, down to one root. Arrays only."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flangeye.types import Floats, Indices
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """What stands on what.
+    """One frame of the graph: its parent and its place there.
 
     Attributes:
         parent: Its parent frame.
@@ -32,7 +32,7 @@ class Frame:
 
 
 def chain(frames: Mapping[str, Frame], name: str) -> list[str]:
-    """Return the frames from the root to one, the root left out.
+    """Return the frames from the root to one, without the root.
 
     Raises:
         StageError: A frame is its own parent.

@@ -26,7 +26,7 @@ from flangeye.types import Floats
 
 
 class JointAxis(Protocol):
-    """One joint: what comes before it, its axis, and its limits.
+    """One joint: the fixed transform before it, its axis, and its limits.
 
     Denavit-Hartenberg conventions read ``a, alpha, d, theta``, ``urdf`` reads ``xyz, rpy, axis``.
     """
@@ -114,7 +114,7 @@ def altered(joint: JointAxis, convention: str, lengths: Floats) -> dict[str, Any
 
 
 class Altered:
-    """A joint some of whose parameters are others."""
+    """A joint whose parameters differ from the model's."""
 
     def __init__(self, joint: JointAxis, changes: dict[str, Any]) -> None:
         self._joint, self._changes = joint, changes
@@ -218,7 +218,7 @@ class Arm:
         return columns
 
     def link_twists(self, joints: Floats, link: int | None = None) -> Floats:
-        """Return what each joint's own geometry does to the flange, (..., n) -> (..., 6, n, 3).
+        """Return the flange's Jacobian by link parameters a, d, alpha: (..., n) -> (..., 6, n, 3).
 
         Its twist in ``base``, taken at its origin, for a unit of the joint's ``a``, ``d`` and
         ``alpha`` (see :meth:`altered`); or that of a link, which the joints beyond do not move.
@@ -249,7 +249,7 @@ class Arm:
         return np.asarray(np.sqrt(np.maximum(np.linalg.det(gram), 0.0)))
 
     def inverse(self, base_T_flange: Floats, starts: int = 48, iterations: int = 40) -> Floats:
-        """Return joint angles within the limits that reach a pose, (K, n), K may be zero.
+        """Return the joint angles (K, n) within the limits that reach a pose; K may be zero.
 
         In closed form where six joints allow it (:mod:`flangeye.maths.offset_wrist`); an arm that
         differs a little from such a one, as a calibrated arm does, is polished from there. Six

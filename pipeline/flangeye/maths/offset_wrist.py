@@ -29,7 +29,7 @@ Numbers = NDArray[np.complex128]
 
 @dataclass(frozen=True, eq=False)
 class OffsetWrist:
-    """What a pose is solved with, in a frame whose z is axis 1 and whose y is axis 2 at zero.
+    """Geometry of an arm with an offset wrist; z is axis 1, y is axis 2 at zero.
 
     Parts across axis 2 are complex numbers z + ix: turning joints 2 and 3 multiplies them. So are
     vectors across axis 1, y - ix where joint 1 is looked for.
@@ -275,7 +275,7 @@ ClosedForm = Callable[[Floats], Floats]
 
 
 class Undecomposed(ArithmeticError):
-    """EAIK met a pose that its decomposition of the arm does not solve."""
+    """EAIK cannot solve a pose with its decomposition of the arm."""
 
 
 def closed_form(directions: Floats, points: Floats, flange: Floats) -> ClosedForm | None:

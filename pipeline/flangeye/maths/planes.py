@@ -1,4 +1,4 @@
-"""Planes in points: what finding a flange and fitting it have in common. Arrays only.
+"""Plane fits shared by flange detection and rim fitting. Arrays only.
 
 Robust without drawing lots: every function gives the same answer whatever the order of the
 points, and there is no seed.
@@ -180,7 +180,7 @@ class _Slabs:
         return np.abs(heights, out=heights)
 
     def fit(self, rows: _Rows, chosen: Mask, counts: Indices, which: Indices) -> None:
-        """Turn some planes to the (Q, K) points chosen, ``counts`` (Q,): total least squares."""
+        """Refit planes to the (Q, K) chosen points, ``counts`` (Q,), by total least squares."""
         sums = (rows.moments @ chosen[..., None].astype(rows.moments.dtype))[..., 0]
         moments = sums / counts[:, None]
         means = moments[:, :3]
@@ -191,7 +191,7 @@ class _Slabs:
         self.normals[which] = np.where(away[:, None], -normals, normals)
 
     def planes(self, rough: Sequence[Plane]) -> list[Plane | None]:
-        """Return the planes where they are."""
+        """Return the planes as they are now."""
         places = zip(self.points, self.normals, self.sigmas, self.found, rough, strict=True)
         return [
             Plane(start.point + point, normal, float(sigma)) if found else None

@@ -1,4 +1,4 @@
-"""Robot poses as they were meant: the changes that undo mistakes in recordings. Arrays only.
+"""Undo mistakes in recorded robot poses: inverses, tool offsets, orders. Arrays only.
 
 Poses are (N, 4, 4) ``base_T_flange`` [m], in the order they were recorded.
 """
@@ -22,7 +22,7 @@ def scaled(poses: Floats, factor: float | Floats) -> Floats:
 
 
 def inverted(poses: Floats) -> Floats:
-    """Return the inverse of each pose: ``flange_T_base`` was given."""
+    """Return the inverse of each pose, for recordings of ``flange_T_base``."""
     return np.asarray(np.linalg.inv(poses))
 
 
@@ -134,7 +134,7 @@ def delaying(poses: Floats, times: Floats) -> Callable[[float], tuple[Floats, Ma
 
 
 def without_tool(poses: Floats, offset: Floats) -> Floats:
-    """Return the flange's poses, where those of a point (3,) in ``flange`` [m] were given."""
+    """Return flange poses from poses of a point (3,) in ``flange`` [m]."""
     out = np.array(poses)
     out[..., :3, 3] -= poses[..., :3, :3] @ offset
     return out

@@ -377,7 +377,7 @@ def pose_of_numbers(
 
 
 def nearest_rigid(matrix: Floats) -> Floats:
-    """Return the pose (4, 4) of a matrix (3, 4) whose rotation is written with few digits.
+    """Return the rigid pose (4, 4) nearest to a matrix (3, 4) written with few digits.
 
     Raises:
         ValueError: A value is not finite, or the rotation is none.

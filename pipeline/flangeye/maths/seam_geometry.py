@@ -23,7 +23,7 @@ def tube_radii(seam: Seam, probability: float = 0.95) -> Floats:
 
 
 def across(covariances: Floats, tangents: Floats) -> Floats:
-    """Return (N, 3, 3) covariances without what lies along the unit tangents (N, 3)."""
+    """Return (N, 3, 3) covariances projected across the unit tangents (N, 3)."""
     keep = np.eye(3) - tangents[:, :, None] * tangents[:, None, :]
     return np.asarray(keep @ covariances @ keep)
 
@@ -108,7 +108,7 @@ def sharp_edges(vertices: Floats, triangles: NDArray[np.int32], angle: float) ->
 
 
 def chained(pieces: Floats, tolerance: float) -> list[Floats]:
-    """Return polylines (N, 3) of straight pieces (E, 2, 3) whose ends meet within a tolerance.
+    """Join line segments (E, 2, 3) whose ends meet within a tolerance into polylines (N, 3).
 
     A line goes on where exactly two pieces meet without a sharp turn; a closed one ends where it
     began.

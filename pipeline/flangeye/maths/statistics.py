@@ -19,7 +19,7 @@ SIGMA_OF_MAD = 1.4826
 
 
 def median(values: NDArray[T]) -> NDArray[T]:
-    """Return the medians (...) of (..., n) finite values, one at least, as ``np.median`` does.
+    """Return the medians (...) of (..., n) finite values, n at least 1, as ``np.median`` does.
 
     It sorts out what it needs alone, five to ten times as fast.
     """
@@ -84,7 +84,7 @@ def corners_of(centre: Floats, size: Floats) -> Floats:
 def largest_error_quantile(
     covariance: Floats, about: Floats, corners: Floats, probability: float = 0.95
 ) -> float:
-    """Return what the largest error anywhere in a box stays below with ``probability`` [m].
+    """Return the quantile of the largest error anywhere in a box, at ``probability`` [m].
 
     The error of a small pose error is an affine function of the place, so its length is largest
     in a corner. The distribution of the largest corner has no closed form: it is drawn, always
@@ -109,7 +109,7 @@ def largest_error_quantile(
 
 
 def without_shared(observation: Observation, found: Floats) -> Observation:
-    """Return an observation as it is without the errors that all of its session share.
+    """Return an observation without the errors that its whole session shares.
 
     Args:
         observation: As it was measured.

@@ -1,4 +1,4 @@
-"""Recorded streams: poses with times, when the arm stood still, and how far two clocks are apart.
+"""Recorded streams: poses with times, standstills, and the offset of two clocks.
 
 Times are (N,) ascending [s], poses (N, 4, 4) [m]. Arrays only.
 """
@@ -35,7 +35,7 @@ class Span:
 
 
 def standstills(times: Floats, poses: Floats) -> list[Span]:
-    """Return when the arm stood still, in order."""
+    """Return the intervals in which the arm stood still, in order."""
     found: list[Span] = []
     first = 0
     while first < len(times):
@@ -113,7 +113,7 @@ def with_joints(motion: Motion, at: float, of: str, stream: tuple[Floats, Floats
 
 
 def later(motion: Motion, delay: float) -> Motion | None:
-    """Return how the flange passed the moment ``delay`` later [s]; None beyond what was kept."""
+    """Return the flange's motion about the moment ``delay`` later [s]; None beyond the record."""
     if not motion.times[0] <= delay <= motion.times[-1]:
         return None
     return replace(motion, times=motion.times - delay)
@@ -159,7 +159,7 @@ def turning(times: Floats, poses: Floats) -> tuple[Floats, Floats]:
 def clock_offset(
     first: tuple[Floats, Floats], second: tuple[Floats, Floats]
 ) -> tuple[float, float]:
-    """Return what to add to the second stream's times, and the correlation there.
+    """Return the offset to add to the second stream's times, and its correlation.
 
     Args:
         first: Times (N,) and a signal of motion (N,) there, of the first stream.
@@ -208,7 +208,7 @@ def offset_into(spans: list[Span], at: Floats) -> float:
 
 
 def apart(poses: Floats, distance: float, angle: float) -> list[int]:
-    """Return which poses to keep so that each is away from the kept one before it [m, rad]."""
+    """Return the indices of poses that are far enough from the one kept before [m, rad]."""
     kept: list[int] = []
     for i, pose in enumerate(poses):
         if kept:

@@ -1,1 +1,1 @@
-"""What a recipe names: robots, scanners, flange standards, boards, workpieces, configurations."""
+"""Models that recipes name: robots, scanners, flange standards, boards, workpieces, mountings."""

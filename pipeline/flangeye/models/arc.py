@@ -8,7 +8,7 @@ from flangeye.units import Duration, param
 
 
 class ArcTimes(BaseModel):
-    """What comes before and after the arc; see the power source's manual for its own."""
+    """Gas and arc times of a power source; its manual states them."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

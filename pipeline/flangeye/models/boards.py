@@ -1,4 +1,4 @@
-"""Flat printed targets: where their corners are, and how they look.
+"""Flat printed targets: the places of their corners, and their images.
 
 The frame ``target`` has its origin in the middle of the board, x to the right, y up and z towards
 whoever looks at it. Lengths are those of the print [m].
@@ -88,7 +88,7 @@ class Board:
         return self.place(np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]]))
 
     def place(self, from_top_left: Floats) -> Floats:
-        """Return (N, 2) places, right and down from the top left corner [m], in ``target``."""
+        """Return positions (N, 2), right and down from the top left corner, in ``target`` [m]."""
         width, height = self.size
         x, y = from_top_left[:, 0] - width / 2, height / 2 - from_top_left[:, 1]
         return np.stack([x, y, np.zeros(len(x))], axis=1)

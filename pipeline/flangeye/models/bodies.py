@@ -52,7 +52,7 @@ class TargetBody:
         return hashlib.sha256(self.vertices.tobytes() + self.triangles.tobytes()).hexdigest()
 
     def at(self, joints: Floats | None) -> TargetBody:
-        """Return it as it is at an arm's joint angles (n,) [rad]: a rigid one always the same."""
+        """Return the body at an arm's joint angles (n,) [rad]; a rigid one is always the same."""
         return self
 
     def edges(self, most: int) -> Floats:
@@ -173,7 +173,7 @@ def body_names() -> list[str]:
 
 
 def load_body(name: str, unit: LengthUnit | None, near: Path) -> TargetBody:
-    """Return the body ``name``: a bundled one, or a mesh beside the recipe.
+    """Return the body ``name``: a bundled one, or a mesh file beside the recipe.
 
     Args:
         name: A bundled body's name, or a path with the suffix of a mesh.

@@ -1,4 +1,4 @@
-"""A cell: any number of arms, rails, positioners, cameras and targets, and what stands on what.
+"""A cell: any number of arms, rails, positioners, cameras and targets, and who carries whom.
 
 What moves has two frames: ``NAME_base``, which stands somewhere, and ``NAME``, which its controller
 places in that base: an arm's flange, a rail's carriage, a positioner's plate. Cameras and targets
@@ -81,13 +81,13 @@ class Link:
 
     @property
     def frame(self) -> str:
-        """What its frame is called."""
+        """Name of its frame."""
         return f"{self.arm}_link{self.number}"
 
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """What stands on what.
+    """Who carries whom in a cell.
 
     Attributes:
         frames: By name. The place of what moves is None here: observations have it.
@@ -113,7 +113,7 @@ class Cell:
 
     @property
     def unknown_frames(self) -> tuple[str, ...]:
-        """Frames whose place is to be found, the cameras' first."""
+        """Frames whose places are to be estimated, cameras first."""
         unknown = [n for n, f in self.frames.items() if f.place is None and n not in self.measured]
         return tuple(sorted(unknown, key=lambda name: name not in self.cameras))
 
@@ -180,7 +180,7 @@ class Cell:
         return f"{self.frames[frame].parent}_T_{frame}"
 
     def describe(self) -> str:
-        """Return one line: where each camera and target stands, and what is unknown."""
+        """Return one line: where each camera and target is mounted, and what is unknown."""
         ends = (*self.cameras, *self.targets)
         chains = (" - ".join(("base", *chain(self.frames, end))) for end in ends)
         return f"cell: {'; '.join(chains)}; to be found: {', '.join(self.unknowns)}"

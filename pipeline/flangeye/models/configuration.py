@@ -1,4 +1,4 @@
-"""Who carries the camera, who carries the target, and what therefore has to be found.
+"""Mountings: who carries the camera and the target, and so which transforms are unknown.
 
 All configurations are one loop of frames, read from the robot's base:
 
@@ -78,7 +78,7 @@ class Configuration:
 
     @cached_property
     def place(self) -> Floats | None:
-        """(4, 4) of the target in the frame that carries it; None where it is to be found."""
+        """(4, 4) of the target in the frame that carries it; None if it is to be estimated."""
         if self.stands is None or self.stands == ORIGIN:
             return None if self.stands is None else np.eye(4)
         position, rpy = self.stands
@@ -91,7 +91,7 @@ class Configuration:
 
     @property
     def other_base(self) -> str | None:
-        """Name of the unknown pose of the second arm's base, where there is one."""
+        """Name of the unknown transform to the second arm's base, if there is one."""
         return f"{BASE}_T_{BASE2}" if self.target == FLANGE2 else None
 
     @property
@@ -222,7 +222,7 @@ class Ends:
 
 
 class Layout(Protocol):
-    """What stands on what: a :class:`Configuration`, or a cell of many cameras and targets."""
+    """A :class:`Configuration`, or a cell of many cameras and targets."""
 
     @property
     def is_default(self) -> bool:
@@ -260,7 +260,7 @@ class Layout(Protocol):
 
 
 def looks_exchanged(carried: float, standing: float) -> bool:
-    """Whether camera and target seem to stand for each other.
+    """Whether camera and target seem to be swapped.
 
     With both the arm's and the markers' poses inverted, one fits as the other does. Arms carry
     what they carry near the flange, and what stands before them is further from their base.
@@ -273,7 +273,7 @@ def looks_exchanged(carried: float, standing: float) -> bool:
 
 
 def mapped_and_expected(ends: Ends, observations: Sequence[Observation]) -> tuple[Floats, Floats]:
-    """Return where targets were seen, and where they should be: (N, 3) each, in ``base``."""
+    """Return the targets as measured and as expected: (N, 3) each, in ``base``."""
     seen = np.array([o.feature.centre for o in observations]).reshape(-1, 3)
     offsets = np.array([o.centre_in_mount for o in observations]).reshape(-1, 3)
     return each_applied(ends.camera, seen), each_applied(ends.target, offsets)

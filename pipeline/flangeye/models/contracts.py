@@ -1,4 +1,4 @@
-"""How the parts that know models are called, and what they give: one Protocol a kind of part.
+"""Protocols of the parts that use models: one for each kind of part.
 
 ``@part`` holds every part against the Protocol of its kind; the table is
 :data:`flangeye.plugin.stage.PARTS`. A part may ask for ``params``, ``siblings`` and
@@ -28,7 +28,7 @@ class Cost(Protocol):
 
 
 class ErrorMeasure(Protocol):
-    """``error``: the error of a candidate, or None where it cannot be measured."""
+    """``error``: the error of a candidate pose, or None if it cannot be measured."""
 
     def __call__(
         self,

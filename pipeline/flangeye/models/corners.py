@@ -79,13 +79,13 @@ class SeenBoard(NamedTuple):
 
     @property
     def fit(self) -> str:
-        """The stage that finds it, with what is known of its parameters, as a recipe writes it."""
+        """The fit stage for the board, with the known parameters, as a recipe writes it."""
         name = "aruco" if self.kind == "marker" else self.kind
         return f"{name}: {{{', '.join(f'{key}: {value}' for key, value in self.params.items())}}}"
 
 
 def board_seen(view: Grey) -> SeenBoard | None:
-    """Return the board that an image shows, of any family and size; None where it shows none.
+    """Return the board in an image, of any family and size; None if there is none.
 
     Args:
         view: (H, W) grey or (H, W, 3) RGB.

@@ -1,4 +1,4 @@
-"""A UR's factory calibration: the arm as it was built, from the files its users have.
+"""A UR's factory calibration: the arm as built, read from files that its users have.
 
 Two of them: ``calibration.conf`` from the controller (``/root/.urcontrol``), what has to be added
 to the Denavit-Hartenberg table; and the ``kinematics`` file that the ROS driver's

@@ -1,4 +1,4 @@
-"""The tool: a compliant finger whose camera watches a tag, and a torch behind its tip.
+"""The tool: a compliant finger whose camera observes a tag, and a torch behind its tip.
 
 The tool's axes: x from the torch to the tip (t_d of the paper), z out of the work, y to the left.
 """
@@ -28,7 +28,7 @@ class Tag(Model):
 
 
 class Lens(Model):
-    """The camera in the finger, in pixels; found by an ordinary camera calibration."""
+    """The finger camera's intrinsics [px], from an ordinary camera calibration."""
 
     width: int = Field(gt=0)
     height: int = Field(gt=0)
@@ -45,7 +45,7 @@ class Lens(Model):
 
 
 class Calibration(Model):
-    """What ``flangeye tactile calibrate`` finds."""
+    """Result of ``flangeye tactile calibrate``."""
 
     rest: tuple[Length, Length, Length] = Field(description="The tag in the camera, undeformed.")
     rotation: tuple[Angle, Angle, Angle] = Field(description="Its rotation vector there.")

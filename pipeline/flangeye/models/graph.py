@@ -1,4 +1,4 @@
-"""What plugins offer beside stages and parts: graphs of what runs, and emulators.
+"""Plugin offers beside stages and parts: graphs of running nodes, and emulators.
 
 The engine knows no middleware. A plugin offers its graphs by name through the hook
 ``flangeye_graphs``: ``flangeye init --ros2`` and ``flangeye publish`` use the one named ``ros2``.
@@ -71,7 +71,7 @@ class RunningCell:
 
 
 class Ask(Protocol):
-    """How a graph asks for what it cannot see."""
+    """Callback by which a graph asks the person what it cannot detect."""
 
     def __call__(self, flag: str, question: str, default: str | None, example: str = "") -> str:
         """Return the answer to a question: given by the option ``flag``, a person, or by default.
@@ -90,7 +90,7 @@ class Graph(Device, Protocol):
         ...
 
     def running(self) -> list[Running]:
-        """Return what runs and is of use to a recipe; publishes nothing and calls no service."""
+        """Return the running nodes that a recipe can use; publishes nothing, calls no service."""
         ...
 
     def cell(self, ask: Ask, name: str) -> RunningCell:
@@ -121,7 +121,7 @@ class Graph(Device, Protocol):
         ...
 
     def stay(self) -> None:
-        """Never return: what was published stays.
+        """Block for ever, so that published transforms stay.
 
         Raises:
             DeviceError: The graph was lost.
@@ -131,7 +131,7 @@ class Graph(Device, Protocol):
 
 @dataclass(frozen=True)
 class EmulatorOptions:
-    """What the person asks of a controller on loopback.
+    """Options of an emulated controller.
 
     Attributes:
         robot: Which arm.

@@ -21,7 +21,7 @@ from flangeye.models.targets import load_standard
 
 
 def load_model(kind: Literal["robots", "scanners"], name: str, near: Path | None = None) -> Any:
-    """Return the robot or scanner ``name``: a bundled model, or a path to a file of one's own.
+    """Return the robot or scanner ``name``: a bundled model, or a path to one's own file.
 
     A scanner's file with no more than a name and a range is a :class:`ScannerData`; with more, it
     has all that a simulation needs.
@@ -58,7 +58,7 @@ def _path(kind: str, name: str, near: Path | None) -> Path:
 
 
 def write_robot(path: Path, robot: RobotModel) -> str:
-    """Write an arm's file and return what to compare with the pendant: the flange at zero.
+    """Write an arm's file; return its flange pose at zero, to compare with the pendant.
 
     Raises:
         RecipeError: The file exists, or the arm's plate is not known.
@@ -105,7 +105,7 @@ def robot_of_joints(
 
 
 def write_scanner(path: Path, values: Mapping[str, Any]) -> str:
-    """Write a scanner's file from what is known of it; nothing that is None.
+    """Write a scanner's file from the values given; None is left out.
 
     Raises:
         RecipeError: The file exists, or a value is wrong: names the line.

@@ -1,4 +1,4 @@
-"""What every model read from ``data/`` is: checked, frozen, in SI units.
+"""Base of all models read from ``data/``: validated, frozen, in SI units.
 
 A recipe names robots, scanners, standards and workpieces; each is a YAML file under ``data/``, or a
 file of the user's own, with units on every value and its source beside it.

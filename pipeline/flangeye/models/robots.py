@@ -36,7 +36,7 @@ Finish = Literal["painted", "metal", "anodised"]
 
 
 class FlangeDetails(Model):
-    """What a scanner sees of one robot's flange and the standard does not fix."""
+    """Details of one robot's flange that its standard does not fix."""
 
     standard: str | None = Field(None, description="Designation: ISO 9409-1-50-4-M6 or the like.")
     rim_chamfer: Length = param("0 mm", description="Radial width of the chamfer at the rim.")
@@ -56,7 +56,7 @@ class FlangeDetails(Model):
 
 
 class Joint(Model):
-    """One joint: where it is, what it does, and its limits."""
+    """One joint: its fixed transform, its axis, and its limits."""
 
     a: Length = param("0 mm")
     alpha: Angle = param("0 deg")
@@ -91,7 +91,7 @@ class Placement(Model):
 
 
 class Volume(Model):
-    """A capsule that stands for a piece of the arm, fixed to a link."""
+    """A capsule that bounds a part of the arm, fixed to a link."""
 
     link: int = Field(ge=0, description="0 is the base, n the last link.")
     start: tuple[Length, Length, Length]
@@ -112,7 +112,7 @@ class Bodies(Protocol):
         ...
 
     def meshes(self) -> Iterator[tuple[int, Any]]:
-        """Yield what is seen of each link as a trimesh in its moving frame, and its number."""
+        """Yield each link's visible mesh (trimesh, in its moving frame) and its number."""
         ...
 
 
@@ -149,7 +149,7 @@ class RobotModel(Model):
 
     @property
     def notes(self) -> tuple[Note, ...]:
-        """What was concluded about the arm from its file, for people."""
+        """Notes for people on how the arm was derived from its file."""
         return self._notes
 
     def from_urdf(self, bodies: Bodies, notes: tuple[Note, ...]) -> RobotModel:
@@ -159,7 +159,7 @@ class RobotModel(Model):
         return arm
 
     def meshes(self) -> list[tuple[int, Any]]:
-        """Return what is seen of the arm, a trimesh [m] and the number of the frame it moves with.
+        """Return the arm's visible meshes: a trimesh [m] and the number of its moving frame.
 
         Nothing of an arm that is not given by a URDF, or whose meshes are not there.
         """

@@ -1,4 +1,4 @@
-"""3D scanners: what they see, how finely, how wrongly, and in which unit their files are."""
+"""3D scanners: field of view, resolution, errors, and the unit of their files."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from flangeye.units import Angle, Length, param
 
 
 class ScannerData(Model):
-    """What reading an archive needs of a scanner: what to call it and, if known, its range."""
+    """What reading an archive needs of a scanner: its name and, if known, its range."""
 
     model: str
     near: Length | None = None
@@ -39,7 +39,7 @@ class ScannerData(Model):
 
 
 class ScannerModel(ScannerData):
-    """A 3D scanner: what it sees, how finely, and how wrongly."""
+    """A 3D scanner: field of view, resolution and errors."""
 
     maker: str
     principle: Literal["structured light", "active stereo", "time of flight", "laser line"]

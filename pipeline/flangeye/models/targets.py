@@ -19,7 +19,7 @@ from flangeye.units import Length, param
 
 
 class Flange(BaseModel):
-    """The circle to look for, as this robot and this recipe have it. All SI, radii.
+    """The circle to look for on this robot, as the recipe states it. All SI, radii.
 
     Attributes:
         name: For people.
@@ -73,7 +73,7 @@ def plate_of(robot: RobotModel) -> Flange:
 
 
 def flange_of(details: FlangeDetails, standard: FlangeStandard) -> Flange:
-    """Return the circle of ``standard`` as it shows on an arm."""
+    """Return the circle of ``standard`` as seen on an arm."""
     n, pin = standard.threads, details.pin_angle
     # The pin hole lies on a bisector of the threads (ISO 9409-1, clause 4).
     holes = tuple((pin or 0.0) + pi / n + 2 * pi * i / n for i in range(n))

@@ -61,7 +61,7 @@ class Urdf:
         return joints[::-1]
 
     def moved(self) -> list[str]:
-        """Return the links that a joint moves, each looked at once."""
+        """Return the links that a joint moves; each is visited once."""
         known: dict[str, bool] = {}
         for name in self.links:
             new, at = list[str](), name

@@ -1,4 +1,4 @@
-"""What a URDF says a link fills: a mesh or a simple body, as the capsule round it."""
+"""Bounding capsules of a URDF's links, from their meshes or simple bodies."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from flangeye.types import Floats
 
 
 class MissingMesh(RecipeError):
-    """A mesh is not where the URDF says."""
+    """A mesh file that the URDF names does not exist."""
 
 
 def capsule_of(body: ET.Element, urdf: Path, packages: Mapping[str, Path]) -> Capsule:
@@ -206,13 +206,13 @@ class Capsule(NamedTuple):
 
     @property
     def volume(self) -> float:
-        """What it fills [m^3]."""
+        """Volume of the capsule [m^3]."""
         length = float(np.linalg.norm(self.end - self.start))
         return float(np.pi * self.radius**2 * (length + 4 / 3 * self.radius))
 
 
 def fit_capsule(points: Floats) -> Capsule:
-    """Return a small capsule that holds (N, 3) points: the least along any of six directions.
+    """Return a small capsule around (N, 3) points: the smallest along any of six directions.
 
     The directions are the coordinate axes, as links are drawn, and the points' principal axes.
     """

@@ -1,4 +1,4 @@
-"""What of the work the poses have been in: which cells of its box, and turned which way."""
+"""Coverage of the workspace by the poses so far: cells of its box, and rotations."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Coverage:
         )
 
     def lacking(self) -> list[str]:
-        """Say which motion would add most: turns that were left out, sides that were not seen."""
+        """Return in words the motion that would add most: missing rotations or regions."""
         out = []
         far = np.radians(20.0)  # as the solver asks for
         for name, turns in zip("xyz", self.turns, strict=True):
@@ -58,7 +58,7 @@ class Coverage:
 
 
 def coverage_of(box: Box, poses: Iterable[Floats]) -> Coverage:
-    """Return what (4, 4) poses of the flange in the base covered of a box."""
+    """Return the part of a box that (4, 4) flange poses in the base have covered."""
     found = np.array(list(poses)).reshape(-1, 4, 4)
     cells = 3  # the cells at the corners of the box are where a turn shows most
     places = np.zeros((cells,) * 3, np.intp)

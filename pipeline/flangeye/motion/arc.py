@@ -84,7 +84,7 @@ class ArcedArm(Device):
             raise DeviceError(f"{self.arc.name}: the arc does not burn")
 
     def move_velocity(self, twist: Floats, acceleration: float) -> None:
-        """Go on at a twist (6,); a seventh number is what the arc is to do."""
+        """Move the flange at a twist (6,); a seventh number is the arc's state to set."""
         level = float(twist[6]) if len(twist) == 7 else OFF
         self._robot.move_velocity(np.asarray(twist[:6]), acceleration)
         if level != self._level:
@@ -102,7 +102,7 @@ class ArcedArm(Device):
         self._level = level
 
     def quench(self) -> None:
-        """End the arc at once; gas flows on for its time."""
+        """End the arc at once; the gas flows on for its post-flow time."""
         if self._level == OFF:
             return
         burned, self._level = self._level == BURN, OFF
@@ -129,7 +129,7 @@ class ArcedArm(Device):
             self._robot.stop()
 
     def close(self) -> None:
-        """End the arc, let the gas flow on for a little, and let go of both."""
+        """End the arc, wait for the gas's post-flow, and disconnect from source and arm."""
         # Longest flow of gas when the arm is let go of [s]: half of the time that a guard has to
         # end
         until = time.monotonic() + 1.5

@@ -41,14 +41,14 @@ Told = Callable[[RobotState], None]
 
 
 def run_number() -> int:
-    """Return the number of the run's process, in the run itself and in its guard alike."""
+    """Return the process number of the run, in the run itself and in its guard process."""
     if multiprocessing.current_process().name == GUARD:
         return os.getppid()
     return os.getpid()
 
 
 class WatchedArm:
-    """An arm that somebody watches.
+    """An arm under guard: a watchdog process checks it and can stop it.
 
     Attributes:
         name: For people.
@@ -70,7 +70,7 @@ class WatchedArm:
 
     @property
     def state(self) -> RobotState:
-        """What the arm last said: at rest, where it stands."""
+        """The last state of the arm, read while it was at rest."""
         return self._state
 
     def go(self, route: Route) -> None:
@@ -92,7 +92,7 @@ class WatchedArm:
         return self._state
 
     def lead(self, how: str, *motion: Any) -> None:
-        """Tell an arm that is led how to go on: ``velocity`` or ``linear``, and its arguments."""
+        """Send the next servo command: ``velocity`` or ``linear``, and its arguments."""
         self._say(how, motion)
         self._asked = how == "velocity"  # who says a velocity waits for the next cycle
 
@@ -112,7 +112,7 @@ class WatchedArm:
         return self._state
 
     def during(self, start_ns: int, end_ns: int) -> list[RememberedState]:
-        """Return where the arm was in an interval that has ended, as far as is known.
+        """Return the arm's poses in a past interval, as far as recorded.
 
         What else the guard says meanwhile, a safety fault too, is heard by the next :meth:`wait`.
         """
@@ -158,7 +158,7 @@ class WatchedArm:
 def watched(
     driver: RobotDriver, model: RobotModel, limits: MotionLimits, told: Told = lambda state: None
 ) -> Iterator[WatchedArm]:
-    """Open an arm under guard; when the context ends, the arm is stopped and let go of.
+    """Open an arm under guard; at the end of the context it is stopped and disconnected.
 
     Args:
         driver: Opens the arm. It runs in the guard's process, or, where the driver has to talk

@@ -10,7 +10,7 @@ from flangeye.types import Floats
 
 
 class ArmVolume:
-    """The capsules that stand for an arm."""
+    """The capsules that bound an arm."""
 
     def __init__(self, robot: RobotModel) -> None:
         """Take them from the catalogue.

@@ -94,7 +94,7 @@ class Executor:
         self._supervisor.led()
 
     def shift(self, base_T_flange: Transform, speed: float) -> RobotState:
-        """Move the flange a little, straight to a pose; return when the arm stands there.
+        """Move the flange a small way in a straight line; return when the arm stands.
 
         Raises:
             DeviceError: The arm was stopped for a safety fault: the reason.
@@ -133,7 +133,7 @@ def _moves(state: RobotState) -> bool:
 
 @contextmanager
 def led(driver: RobotDriver, model: RobotModel, limits: MotionLimits) -> Iterator[Robot]:
-    """Open an arm to lead it: under guard, or here where it is simulated or moved by a person.
+    """Open an arm for servoing: under guard, or directly if it is simulated or moved by hand.
 
     Args:
         driver: Opens the arm, in the guard's process.
@@ -152,7 +152,7 @@ def led(driver: RobotDriver, model: RobotModel, limits: MotionLimits) -> Iterato
 
 
 class LedArm(Device):
-    """The program's side of an arm that it leads; see :class:`flangeye.devices.Robot`.
+    """A servoed arm, as the control loop sees it; see :class:`flangeye.devices.Robot`.
 
     A safety fault raises DeviceError where the next cycle is waited for, a stop by the operator
     RunStopped.
@@ -183,7 +183,7 @@ class LedArm(Device):
         self._arm.lead("linear", base_T_flange, speed, acceleration)
 
     def move_velocity(self, twist: Floats, acceleration: float) -> None:
-        """Go on at a twist (6,); the guard stops the arm when the next one does not come."""
+        """Move at a twist (6,); the guard stops the arm if the next command is late."""
         self._arm.lead("velocity", twist, acceleration)
 
     def wait_cycle(self) -> None:
@@ -195,5 +195,5 @@ class LedArm(Device):
         self._arm.stop()
 
     def close(self) -> None:
-        """Stop; the guard lets go of the arm when its own context ends."""
+        """Stop; the guard disconnects when its own context ends."""
         self._arm.stop()

@@ -1,4 +1,4 @@
-"""What an arm must keep to: the recipe's limits, within those of the arm itself."""
+"""Motion limits: those of the recipe, within those of the arm itself."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from flangeye.types import Floats
 
 
 class Margins(NamedTuple):
-    """How far poses keep away from what an arm must not do.
+    """Safety margins of poses to limits, singularities and collisions.
 
     Attributes:
         limits: What it must keep to.
@@ -47,7 +47,7 @@ class Refusal(NamedTuple):
 
 
 class Reach:
-    """What an arm can show a scanner.
+    """The poses at which an arm can show its flange to a scanner.
 
     Attributes:
         arm: Its kinematics.
@@ -117,7 +117,7 @@ class Reach:
         return chosen[1]
 
     def start_from(self, joints: Floats) -> None:
-        """Prefer postures near (n,) joint angles, where the arm stands [rad]."""
+        """Prefer IK solutions near (n,) joint angles, the arm's present ones [rad]."""
         self._start = self.home = joints
 
     def _rolls(self, centre: Floats) -> list[Floats]:
@@ -131,7 +131,7 @@ class Reach:
         return poses
 
     def joints(self, base_T_flange: Floats) -> Floats | None:
-        """Return joint angles for a pose (4, 4), those nearest to home, or None if there are none.
+        """Return the joint angles of a pose (4, 4) that are nearest to home; None if unreachable.
 
         None means: out of view or range, out of reach or limits, touching the table or itself, or
         with a link between scanner and flange.
@@ -306,7 +306,7 @@ def poses_near(
     rng: np.random.Generator,
     spread: tuple[Any, float] = (POINT_WITHIN, NEAR_TILT),
 ) -> list[PlannedPose]:
-    """Return poses drawn around a point (3,): as many as asked for, or as can be found.
+    """Return up to so many reachable poses drawn around a point (3,).
 
     Args:
         place: (3,) in ``base`` [m].
@@ -329,7 +329,7 @@ def poses_near(
 
 
 def tilted(place: Floats, facing: Floats, tilt: float, rng: np.random.Generator) -> Floats:
-    """Return a pose (4, 4) at a point whose roll, pitch and yaw from facing stay below ``tilt``."""
+    """Return a pose (4, 4) at a point, its roll, pitch and yaw from facing below ``tilt``."""
     roll, pitch, yaw = rng.uniform(-tilt, tilt, 3)
     return rigid(rotation_from_rpy(roll, pitch, yaw) @ facing, place)
 

@@ -55,7 +55,7 @@ class Route(NamedTuple):
 
 
 class Barred(NamedTuple):
-    """There is no way: what stands in it."""
+    """There is no collision-free path; the message says what is in the way."""
 
     reason: str
 

@@ -1,4 +1,4 @@
-"""What follows a seam, one decision a cycle: the contract of ``controller`` parts, and its types.
+"""Contract of ``controller`` parts, which follow a seam cycle by cycle, and its types.
 
 Arrays and plain values in the plane of the work: its z is the height above it. No devices, no
 clock. A controller that is known to diverge says so where it is declared,
@@ -58,7 +58,7 @@ class Touch:
 
 @dataclass(frozen=True, eq=False)
 class Command:
-    """What the robot shall do until the next cycle.
+    """The command to the robot for one control cycle.
 
     Attributes:
         velocity: (3,) of the end point P_r [m/s].
@@ -74,7 +74,7 @@ STILL = Command(np.zeros(3), 0.0)
 
 @dataclass(frozen=True, eq=False)
 class FollowingTask:
-    """What a controller is asked to do.
+    """The task of a controller: which seam, with which tool and limits.
 
     Attributes:
         points: (M, 3) of the planned seam, evenly spaced in the plane [m].
@@ -106,7 +106,7 @@ class FollowingTask:
 
 
 class Controller(Protocol):
-    """What moves the tool along a seam."""
+    """Moves the tool along a seam."""
 
     @property
     def mode(self) -> str:
@@ -115,12 +115,12 @@ class Controller(Protocol):
 
     @property
     def side(self) -> float:
-        """The wall that is pressed, 1 for the left one, -1 for the right."""
+        """Which wall is pressed: 1 for the left one, -1 for the right."""
         ...
 
     @property
     def phase(self) -> Phase:
-        """What it is doing."""
+        """The controller's present phase."""
         ...
 
     @property
@@ -150,7 +150,7 @@ class Controller(Protocol):
 
     @property
     def bound(self) -> float:
-        """What its distance from the seam does not exceed [m]."""
+        """Upper bound of the torch's distance from the seam [m]."""
         ...
 
     @property
@@ -159,12 +159,12 @@ class Controller(Protocol):
         ...
 
     def step(self, pose: ToolPose, touches: Sequence[Touch]) -> Command:
-        """Return the command for this cycle; ``touches`` are the measurements not yet given."""
+        """Return the command for this cycle; ``touches`` are measurements since the last one."""
         ...
 
 
 class ControllerPart(Protocol):
-    """``controller``: makes what follows one seam."""
+    """``controller``: creates the controller that follows a seam."""
 
     def __call__(self, task: FollowingTask) -> Controller:
         """Return a controller at the start of its task."""

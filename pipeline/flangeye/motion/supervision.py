@@ -23,7 +23,7 @@ class SafetyFault(Exception):
 
 
 class RememberedState(NamedTuple):
-    """What is remembered of a state."""
+    """The state that the supervisor keeps of the last sample."""
 
     time_ns: int
     base_T_flange: Floats
@@ -31,7 +31,7 @@ class RememberedState(NamedTuple):
 
 
 class Supervisor:
-    """What is expected of an arm, and what it does.
+    """Judges each sample of an arm against its commanded motion.
 
     Attributes:
         samples: The last seconds, newest last.
@@ -51,18 +51,18 @@ class Supervisor:
         self._led = False
 
     def set_off(self, leg: Leg) -> None:
-        """Expect the arm to drive a leg from where it is."""
+        """Expect the arm to drive a leg from its present place."""
         newest = self.samples[-1]
         self.leg, self._from, self._led = leg, newest.joints, False
         self._since_ns, self._stood_ns, self._ready_ns = newest.time_ns, 0, 0
 
     def halted(self) -> None:
-        """Expect the arm to stand, wherever it comes to rest."""
+        """Expect the arm to stop, wherever it comes to rest."""
         self.leg, self._led = None, False
         self._halted_ns = self.samples[-1].time_ns if self.samples else 0
 
     def led(self) -> None:
-        """Expect the arm to go where it is led from cycle to cycle, within its limits."""
+        """Expect the arm to follow servo commands within its limits."""
         self.leg, self._led = None, True
 
     @property
@@ -71,7 +71,7 @@ class Supervisor:
         return self.leg is not None or self._led
 
     def judge(self, state: RobotState) -> bool:
-        """Take in a sample; return whether the leg under way has ended and the arm has settled.
+        """Process a sample; return whether the present leg has ended and the arm has settled.
 
         Raises:
             SafetyFault: The arm must stop.
@@ -95,7 +95,7 @@ class Supervisor:
         return self._settled(state, self.leg)
 
     def check_model(self, state: RobotState) -> None:
-        """Doubt an arm that is not the model's, or has a tool set that nobody knows of.
+        """Refuse an arm that differs from its model, or has an unknown tool set.
 
         Raises:
             SafetyFault: The controller's flange and the model's are apart.

@@ -61,7 +61,7 @@ class Toucher:
     ask: Callable[[str], None]
 
     def touch(self, points: Floats, move: bool) -> Iterator[Touched]:
-        """Yield what was touched at each point (N, 3) in ``base``.
+        """Drive the tip to points (N, 3) in ``base``; yield each contact.
 
         With ``move`` the arm goes to :data:`SHORT` before each, in the orientation that it has.
         It is let go of before the person is asked to jog, and is only read afterwards.

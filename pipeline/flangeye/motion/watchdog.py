@@ -1,4 +1,4 @@
-"""The watch at work: a loop beside the program that owns the arm and stops it on any safety fault.
+"""The watchdog process: owns the arm's connection and stops the arm on any safety fault.
 
 It runs in a process of its own, where no computation of the program can delay it. It hears of
 Ctrl-C and Ctrl-Z through a pipe that the interpreter's signal handler writes to at once, whatever
@@ -36,7 +36,7 @@ GUARDING, LEADING = 2, 1
 
 
 def take_precedence(priority: int) -> None:
-    """Let the calling thread come first, and what it starts from now on."""
+    """Give the calling thread, and threads it starts, real-time priority."""
     with contextlib.suppress(OSError, AttributeError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
 
@@ -66,7 +66,7 @@ SLOW, HUNG = 2.0 * GRACE, 10.0 * GRACE
 
 
 class Charge(NamedTuple):
-    """What a guard is given.
+    """Configuration of a guard process.
 
     Attributes:
         open: Opens the arm.
@@ -97,7 +97,7 @@ class Report(NamedTuple):
 
 
 def watchdog_process(wire: Connection, charge: Charge, alarm: Connection) -> None:
-    """Guard an arm until the program lets go; the main function of the guard's process."""
+    """Guard an arm until the program disconnects; main function of the guard process."""
     for told in STOPS:
         signal.signal(told, signal.SIG_IGN)  # the alarm tells, and sooner
     for ending in (signal.SIGTERM, signal.SIGHUP):
@@ -108,7 +108,7 @@ def watchdog_process(wire: Connection, charge: Charge, alarm: Connection) -> Non
 
 
 def guard(wire: Connection, charge: Charge) -> None:
-    """Open the arm and guard it until the program lets go."""
+    """Open the arm and guard it until the program disconnects."""
     try:
         with charge.open() as robot:
             Watchdog(robot, wire, charge).run()

@@ -52,7 +52,7 @@ def describe_one(registry: Registry, name: str) -> str:
 
 
 def parameter_lines(params: type[BaseModel], prefix: str = "") -> list[str]:
-    """Return two lines a parameter: name, unit, default and limits; then what it means."""
+    """Return two lines a parameter: name, unit, default, limits; then its description."""
     lines = []
     for name, field in params.model_fields.items():
         kind = _kind(params, name, field)

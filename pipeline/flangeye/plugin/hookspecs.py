@@ -1,4 +1,4 @@
-"""The hooks a plugin may implement: what it offers, and the events of a run."""
+"""The hooks that plugins may implement: their offers, and the events of a run."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def flangeye_stages() -> Iterable[Stage] | Mapping[str, str]:  # type: ignore[em
 
 @hookspec
 def flangeye_parts() -> Iterable[Part] | Mapping[str, str]:  # type: ignore[empty-body]
-    """Return the parts (costs, readers, plans) that parameters may choose, or where they are."""
+    """Return the parts (costs, readers, plans) that parameters may name, or their import paths."""
 
 
 @hookspec
@@ -41,7 +41,7 @@ def flangeye_emulators() -> Iterable[Emulator]:  # type: ignore[empty-body]
 
 @hookspec
 def flangeye_graphs() -> Mapping[str, Callable[[], Graph]]:  # type: ignore[empty-body]
-    """Return what joins the networks of nodes this plugin knows, by name."""
+    """Return, by name, the graphs of running nodes that this plugin can join."""
 
 
 @hookspec

@@ -1,4 +1,4 @@
-"""Find the installed plugins and what they offer."""
+"""Find the installed plugins and the stages and parts they offer."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class PluginNotFoundError(FlangeyeError, LookupError):
-    """No installed plugin offers what a recipe asks for."""
+    """No installed plugin offers a stage or part that a recipe names."""
 
 
 class DuplicatePluginError(FlangeyeError):
@@ -90,7 +90,7 @@ class Offered(MutableMapping[str, Kind]):
 
 @dataclass
 class Registry:
-    """What the installed plugins offer, and the plugins that could not be loaded.
+    """The stages and parts of installed plugins, and the plugins that failed to load.
 
     Attributes:
         hooks: The plugins themselves, to be told about runs.
@@ -156,7 +156,7 @@ class Registry:
         }
 
     def versions(self) -> dict[str, str]:
-        """Return each loaded plugin's entry point and the version of what installed it."""
+        """Return each loaded plugin's entry point and the version of its distribution."""
         return {
             plugin: package.version if package else "unknown"
             for plugin, package in self.installed.items()
@@ -176,7 +176,7 @@ class Registry:
         return PluginNotFoundError(f"no {sort} '{name}'{hint}{failed}")
 
     def everything(self) -> dict[str, Plugin]:
-        """Return every stage and part; what cannot be imported is noted in ``broken``."""
+        """Return all stages and parts; those that fail to import are listed in ``broken``."""
         found: dict[str, Plugin] = {}
         for offered in (self.stages, self.parts):
             for name in offered:

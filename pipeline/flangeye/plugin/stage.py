@@ -49,12 +49,12 @@ class Params(BaseModel):
     )
 
     def requires(self) -> Mapping[type, str]:
-        """Return what these values need of the recipe's header, by type, and what for."""
+        """Return the sections of the recipe's header that these values need, by type, and why."""
         return {}
 
 
 class PlaceParams(Params):
-    """A pose, in the frame of what carries it."""
+    """A pose in the frame of its carrier."""
 
     position: tuple[Length, Length, Length] = param(("0 mm", "0 mm", "0 mm"))
     rpy: tuple[Angle, Angle, Angle] = param(
@@ -70,7 +70,7 @@ class PlaceParams(Params):
 
 @dataclass(frozen=True)
 class Contract:
-    """What every stage of one kind must take and must give.
+    """The inputs and outputs that all stages of a kind must have.
 
     Attributes:
         takes: Types of the value the kind works on, of which it needs one; none for the first.
@@ -185,7 +185,7 @@ PARTS: Mapping[str, PartKind] = {
 
 @dataclass(frozen=True)
 class Plugin:
-    """A registered function: ``kind.name`` and what its signature declares.
+    """A registered function: ``kind.name`` and its signature's declarations.
 
     Attributes:
         name: ``kind.name``.
@@ -306,7 +306,7 @@ class BoundPart:
 
 
 class PartLookup(Protocol):
-    """What the validation of a recipe passes as context: parts on offer, the folder, the arm."""
+    """Context of a recipe's validation: available parts, the recipe's folder, the arm."""
 
     folder: Path
     robot: RobotModel | None

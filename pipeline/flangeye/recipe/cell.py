@@ -173,7 +173,7 @@ def _frames(section: CellSection) -> dict[str, Frame]:
 
 
 def place_of(given: Place) -> Floats | None:
-    """Return (4, 4) of a place as a recipe has it; None where it is to be found."""
+    """Return the (4, 4) pose given in a recipe; None if it is to be estimated."""
     if isinstance(given, PlaceParams):
         return given.matrix
     return np.eye(4) if given == "known" else None

@@ -1,4 +1,4 @@
-"""What a recipe's header offers its stages, by type: models, targets, configuration, devices.
+"""Values of a recipe's header for its stages, by type: models, mounting, devices.
 
 What a section should have given and could not is there as None, so that a mistake in it is told
 once, where it was made, and not again by every step that needs it.

@@ -18,12 +18,12 @@ def recipe_names() -> dict[str, Path]:
 
 
 def is_recipe(path: Path) -> bool:
-    """Return whether a path is a file that a recipe may be written in."""
+    """Return whether a path looks like a recipe file."""
     return path.suffix in (".yaml", ".yml") and path.is_file()
 
 
 def find_recipe(name: str) -> Path:
-    """Return the path of a recipe given as a path or as a bundled name.
+    """Return the path of a recipe, given as a path or a bundled name.
 
     Raises:
         RecipeError: Neither exists; names the nearest bundled recipes.

@@ -32,7 +32,7 @@ class BoxSection(RecipeSection):
 
 
 class LimitsSection(RecipeSection):
-    """What the arm must keep to; required where a driver is named, for a real arm may be there."""
+    """The arm's motion limits; required with a driver, which may move a real arm."""
 
     box: BoxSection = Field(description="The flange's centre stays inside, in the robot's base.")
     speed: Speed = param("100 mm/s", gt=0, le=1.0, description="Largest speed of the flange.")
@@ -46,7 +46,7 @@ class LimitsSection(RecipeSection):
 
 
 class NamedSection(RecipeSection):
-    """A section whose one word is its model: ``robot: ur10e``."""
+    """A section that may be one word, its model: ``robot: ur10e``."""
 
     word: ClassVar[str] = "model"
 
@@ -160,7 +160,7 @@ class SphereSection(RecipeSection):
 
 
 class FeatureSection(RecipeSection):
-    """Which circle to look for; by default the flange the robot's file names."""
+    """The circle to look for; by default the flange in the robot's file."""
 
     standard: str | None = Field(
         None, description="Designation such as ISO 9409-1-50-4-M6, or a .yaml file of your own."
@@ -174,7 +174,7 @@ class FeatureSection(RecipeSection):
 
 
 class TargetSection(NamedSection):
-    """A body of known shape that is looked for in the flange's place: what the arm carries."""
+    """A body of known shape on the flange that is looked for instead of the flange."""
 
     word: ClassVar[str] = "body"
 
@@ -201,7 +201,7 @@ Place = Literal["known", "unknown"] | PlaceParams
 
 
 class ConfigurationSection(RecipeSection):
-    """Who carries the camera and who the target; what has to be found follows."""
+    """Who carries the camera and the target; the unknown transforms follow."""
 
     name: Literal["eye-on-base", "eye-in-hand", "eye-on-arm", "two-arms"] = "eye-on-base"
     camera: str | None = Field(
@@ -242,7 +242,7 @@ class CellArmSection(SecondRobotSection, MountedSection):
 
 
 class AxisSection(MountedSection):
-    """What rails and positioners have in common."""
+    """Common section of rails and positioners."""
 
     axis: tuple[float, float, float] = Field(description="Its direction in its base.")
 
@@ -267,7 +267,7 @@ class PositionerSection(AxisSection):
 
 
 class StandingSection(NamedSection, MountedSection):
-    """A camera or a target of a cell; its one word is what it stands on."""
+    """A camera or target of a cell; may be one word, its parent frame."""
 
     word: ClassVar[str] = "on"
 
@@ -280,7 +280,7 @@ class StandingSection(NamedSection, MountedSection):
 
 
 class CellSection(RecipeSection):
-    """Several cameras, arms, rails and targets: what stands on what. One run solves all of it."""
+    """A cell of several cameras, arms, rails and targets, solved in one run."""
 
     arms: dict[FrameName, CellArmSection] = Field(default_factory=dict)
     rails: dict[FrameName, RailSection] = Field(default_factory=dict)
@@ -294,7 +294,7 @@ class WorkspaceSection(BoxSection):
 
 
 class LogSection(RecipeSection):
-    """What goes into run.mcap besides the results, which always do."""
+    """What run.mcap holds besides the results."""
 
     clouds: Literal["preview", "full"] = Field(
         "preview", description="Raw scans: thinned for viewing, or whole, to segment again later."

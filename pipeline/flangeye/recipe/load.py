@@ -1,4 +1,4 @@
-"""Read a recipe: YAML in, checked steps out, every mistake at once with its line."""
+"""Load a recipe: YAML in, validated steps out; every mistake is reported with its line."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Recipe:
 
     @cached_property
     def files(self) -> dict[str, str]:
-        """Name -> text of what repeats it elsewhere: itself resolved, and models of its own."""
+        """Name -> text of the files that repeat the run elsewhere: recipe and its own models."""
         driven = self.header.robot is not None and self.header.robot.driver is not None
         data, models = written_out(self.header, self.context, driven or self.archive is None)
         data["steps"] = self._steps_as_data()
@@ -76,7 +76,7 @@ class Recipe:
 
     @property
     def archive(self) -> Path | None:
-        """What its first step reads; None where it simulates, or drives an arm."""
+        """The archive that its first step reads; None if it simulates or drives an arm."""
         path = getattr(self.steps[0].params, "path", None)
         return path if isinstance(path, Path) else None
 
@@ -88,7 +88,7 @@ class Recipe:
 
     @property
     def notes(self) -> tuple[t.Note, ...]:
-        """What was concluded from its own files, for people."""
+        """Notes for people on how its own files were read."""
         robot = self.context.get(RobotModel)
         return robot.notes if robot else ()
 
@@ -293,7 +293,7 @@ class _Checker:
 
 
 def leave_out(data: dict[Hashable, Any], paths: Iterable[tuple[Hashable, ...]]) -> None:
-    """Take the deepest part of each path that exists out of a recipe's data, and rows whole."""
+    """Delete the deepest existing prefix of each path from the data; list items go as a whole."""
     gone: list[tuple[Hashable, ...]] = []
     for path in paths:
         if any(path[: len(each)] == each for each in gone):
@@ -327,7 +327,7 @@ def _at(data: Any, path: Iterable[Hashable]) -> Any:
 
 
 def describe_recipe(path: Path, registry: Registry, overrides: Sequence[str] = ()) -> str:
-    """Check a recipe; return how many steps it has and what it solves for.
+    """Check a recipe; return its number of steps and the transforms it solves for.
 
     Args:
         path: The recipe.

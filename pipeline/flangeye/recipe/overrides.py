@@ -108,7 +108,7 @@ def _exchange(steps: list[Any], index: int, value: Any, path: str) -> None:
 
 
 def params_given(plugin: Plugin, values: Sequence[str], registry: Registry) -> Params | None:
-    """Return a plugin's parameters from ``name=value`` texts; None where it takes none.
+    """Return a plugin's parameters from ``name=value`` texts; None if it has no parameters.
 
     Raises:
         RecipeError: Names every mistake.

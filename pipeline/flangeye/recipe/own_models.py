@@ -1,4 +1,4 @@
-"""Models of a recipe's own files, carried with a run: its log is read where they are not."""
+"""A recipe's own model files, stored in the log so that it can be read elsewhere."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from flangeye.recipe.header import Header
 
 
 def sections(header: Header) -> dict[str, Any]:
-    """Return a recipe's sections as data; a cell says itself what stands where."""
+    """Return a recipe's model sections as data; of a cell, from all its members."""
     data = header.model_dump(mode="json", exclude_none=True)
     if header.cell:
         del data["configuration"]
@@ -89,7 +89,7 @@ def _text(model: Model) -> str:
 
 @contextmanager
 def carried_files(models: Mapping[str, bytes]) -> Iterator[Path]:
-    """Give the folder that a recipe's models are in while it is read: the shell's without any.
+    """Give the folder in which a log's model files lie while it is read.
 
     Args:
         models: Name -> content, as a log has them; other names are not written.

@@ -116,7 +116,7 @@ class Step:
 
 
 class StepOrder:
-    """Walks the steps and says where one stands that cannot stand there."""
+    """Checks the order of steps: each must get the inputs it needs."""
 
     def __init__(self, complain: Complain, given: Mapping[Any, Any]) -> None:
         """Start before the first step.
@@ -135,7 +135,7 @@ class StepOrder:
         self._kinds: list[str] = []
 
     def visit(self, index: int, name: str, stage: Stage | None) -> None:
-        """Check one step against those before it; ``stage`` is None when it is not installed."""
+        """Check one step against those before it; ``stage`` is None if it is not installed."""
         kind = name.partition(".")[0]
         if kind not in KINDS:
             return
@@ -166,12 +166,12 @@ class StepOrder:
         self._kinds.append(kind)
 
     def require(self, index: int, name: str, params: Params | None) -> None:
-        """Check that the recipe gives what the values of a step's parameters need."""
+        """Check that the recipe has the sections that a step's parameters need."""
         for need, purpose in (params.requires() if params else {}).items():
             self._need(("steps", index, name), need, purpose)
 
     def lose_track(self) -> None:
-        """Take note of an entry that is no step: what it would have given is not known."""
+        """Note an entry that is no valid step: its output is unknown from here on."""
         self._lost = True
 
     def _need(self, at: tuple[Hashable, ...], need: Any, purpose: str) -> None:
@@ -180,7 +180,7 @@ class StepOrder:
             self._complain(at, _missing(need, purpose))
 
     def finish(self) -> None:
-        """Check what only the whole list can show."""
+        """Check the list as a whole, after all steps were visited."""
         if "solve" not in self._kinds and self._kinds and not self._lost:
             self._complain(
                 ("steps",),

@@ -202,7 +202,7 @@ def _weld_truth(weld: t.WeldReport, true_seams: list[t.Array]) -> WeldTruthResul
 def calibrated_pose(
     result: Result, anyway: bool = False, camera: str | None = None
 ) -> t.CalibratedPose:
-    """Return the camera's pose with what has to be said of it; of a cell, all that was found.
+    """Return the camera's pose with its caveats; of a cell, all transforms.
 
     Args:
         result: Result of a run.
@@ -230,7 +230,7 @@ def calibrated_pose(
 
 
 def cameras_of(result: Result) -> dict[str, str]:
-    """Return the transform of each camera that was found, by the camera's name in its cell."""
+    """Return the estimated transform of each camera, by its name in the cell."""
     looked = {o.camera for o in result.observations}
     children = {name.partition("_T_")[2]: name for name in result.transforms}
     return {child: name for child, name in children.items() if child in looked}
@@ -296,7 +296,7 @@ def require_one(format_name: str, pose: t.CalibratedPose, result: Result) -> Non
 
 
 def status_of(result: Result) -> str:
-    """Return the verdict, with the word that it is of a simulation where it is."""
+    """Return the verdict, with "(simulated)" where it applies."""
     return f"{result.status} (simulated)" if result.simulated else result.status
 
 

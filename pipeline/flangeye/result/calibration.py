@@ -84,7 +84,7 @@ def warnings_result(notes: Iterable[t.Note]) -> list[WarningResult]:
 
 
 def standing_warnings(result: Result) -> list[WarningResult]:
-    """Return the warnings that follow from a finished result itself, beside those of its steps.
+    """Return warnings that follow from the result itself, beside those of its steps.
 
     An estimate that is arbitrary in some direction, a calibration that nothing judged, a session
     most of whose captures were rejected, and an expected error that poses held out contradict.
@@ -208,7 +208,7 @@ def workspace_result(box: t.Box) -> WorkspaceResult:
 def truth_result(
     calibration: t.HandEye, truth: t.Truth, box: t.Box, robots: Robots = (DEFAULT, None)
 ) -> TruthResult:
-    """Return how far the estimate maps points of the workspace from where they are.
+    """Return the mapping error of the estimate over the workspace, against the truth.
 
     What is marked as unobservable does not count.
 

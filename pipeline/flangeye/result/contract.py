@@ -1,4 +1,4 @@
-"""What ``result.json`` says: a model for each of its sections."""
+"""The schema of ``result.json``: a model for each section."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ class TransformErrorResult(_Part):
 
 
 class TruthResult(_Part):
-    """Simulation only: what the calibration is really worth."""
+    """Simulation only: the calibration's true error."""
 
     base_T_camera: Matrix | None = Field(None, description="Where the camera is, if it stands.")
     transforms: dict[str, Matrix] = Field(
@@ -192,7 +192,7 @@ class WeldTruthResult(_Part):
 
 
 class WeldResult(_Part):
-    """What the torch did."""
+    """The torch's result."""
 
     mode: str
     completed: bool
@@ -216,7 +216,7 @@ class FieldResult(_Part):
 
 
 class CorrectionResult(_Part):
-    """What is wrong with where the arm says its flange is, estimated with the transforms."""
+    """Estimated errors of the arm, with which its poses can be corrected."""
 
     tool_offset: Point = Field(description="The circle's centre in the flange frame [m].")
     joint_offsets: Vector | None = Field(None, description="To add to the joint angles [rad].")
@@ -258,7 +258,7 @@ class AnswersResult(_Part):
 
 
 class StageTiming(_Part):
-    """What one step took, the steps it pulled from excluded."""
+    """Duration of one step, without the steps it pulls from."""
 
     seconds: float
     calls: int
@@ -269,14 +269,14 @@ class StageTiming(_Part):
 
 
 class WarningResult(_Part):
-    """What is to be done."""
+    """A warning, and what to do about it."""
 
     text: str = Field(description="What is wrong, one line.")
     fix: str = Field(description="A command, a line of the recipe, or what to do at the cell.")
 
 
 class Provenance(_Part):
-    """What made this result."""
+    """Provenance of the result."""
 
     versions: dict[str, str]
     plugins: dict[str, str]

@@ -17,7 +17,7 @@ R = TypeVar("R")
 
 @dataclass(frozen=True)
 class Done:
-    """What a call gave, or raised, and what it took.
+    """A finished call: its result or exception, and its duration.
 
     Attributes:
         value: What it gave; None if it raised.
@@ -40,7 +40,7 @@ class Done:
         return cls(value, error, time.perf_counter() - start)
 
     def result(self) -> Any:
-        """Return what the call gave, or raise what it raised."""
+        """Return the call's result, or raise its exception."""
         if self.error is not None:
             raise self.error
         return self.value
@@ -56,7 +56,7 @@ def cores() -> int:
 def worked_ahead(
     items: Iterator[T], work: Callable[[T], R], workers: int
 ) -> Generator[tuple[T, Callable[[], R]]]:
-    """Yield each item in order with what gives its result, or raises what the work raised.
+    """Yield each item in order with a function that returns or raises its result.
 
     Items are pulled in this thread and worked on in others, as many as there are workers and one
     that waits, fewer where the work is done sooner than the next is there: what is held in memory

@@ -97,7 +97,7 @@ class RunFolder:
             self._write(f"{EXPORTS}/{name}", text)
 
     def discard(self) -> None:
-        """Remove log and folder: the run never got as far as a result worth keeping."""
+        """Delete log and folder: the run ended before a result worth keeping."""
         with suppress(OSError):  # somebody else put something there
             self.log.unlink(missing_ok=True)
             self.path.rmdir()

@@ -24,7 +24,7 @@ from flangeye.recipe.load import Recipe
 
 @dataclass
 class Outcome:
-    """What a run came to.
+    """The outcome of a run, filled in step by step.
 
     Attributes:
         source: Where the captures came from.
@@ -67,7 +67,7 @@ class Outcome:
 
 @dataclass
 class Truths:
-    """What a simulation knows, kept from every stage until the answer is final.
+    """The truth of a simulation, kept from every stage until the result is final.
 
     Attributes:
         cell: The true unknowns.
@@ -154,7 +154,7 @@ def _provenance(outcome: Outcome, recipe: Recipe, registry: Registry) -> r.Prove
 
 
 class Stopwatch:
-    """Exclusive time per label: while an inner step runs, the outer one stands still.
+    """Exclusive time per label: the outer step's clock stops while an inner step runs.
 
     Attributes:
         seconds: By label.
@@ -182,7 +182,7 @@ class Stopwatch:
             self._running.pop()
 
     def add(self, label: str, seconds: float) -> None:
-        """Charge what was done meanwhile, on another core, to ``label``."""
+        """Add time that was spent on another core to ``label``."""
         self.calls[label] += 1
         self.seconds[label] += seconds
 

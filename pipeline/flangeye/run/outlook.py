@@ -1,4 +1,4 @@
-"""What the poses so far are worth: while a run goes, after it was killed, or when it is done."""
+"""Quality of a calibration from the poses so far: during a run, or after it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from flangeye.run.runner import Runner
 
 @dataclass(frozen=True, eq=False)
 class Outlook:
-    """What a calibration of the poses so far would be.
+    """The calibration that the poses so far would give.
 
     Attributes:
         residuals: By pose, of those that the solver used [m].
@@ -53,7 +53,7 @@ class Outlook:
 
 
 def outlook_of_log(log: RunLog, registry: Registry) -> Outlook:
-    """Return the outlook of a log by its own recipe; the run may be going on, killed or done."""
+    """Return the outlook of a log by its own recipe; the run may still go on."""
     recipe = recipe_of_log(log, registry)
     return outlook(recipe, registry, log.observations(), log.source or t.Source(fingerprint=""))
 
@@ -61,7 +61,7 @@ def outlook_of_log(log: RunLog, registry: Registry) -> Outlook:
 def outlook(
     recipe: Recipe, registry: Registry, seen: Sequence[t.Observation], source: t.Source
 ) -> Outlook:
-    """Return what the recipe's solve step makes of what was seen so far.
+    """Return the result of the recipe's solve step on the observations so far.
 
     Args:
         recipe: The run's recipe.

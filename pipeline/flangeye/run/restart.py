@@ -1,4 +1,4 @@
-"""What a run starts from: nothing, a log of an earlier run, or a run that ended early.
+"""Starting points of a run: nothing, a log of an earlier run, or a run that ended early.
 
 The runner asks a starting point for what it has; what it has not is done. A log is a source like
 any other.
@@ -35,7 +35,7 @@ Each = TypeVar("Each", bound=_Named)
 
 
 class Gathered(NamedTuple):
-    """A capture that an earlier run took, and what that run made of it."""
+    """A capture of an earlier run, with that run's results for it."""
 
     capture: t.Capture
     flange: t.FlangeCloud | None
@@ -57,11 +57,11 @@ class FromNothing:
 
     @property
     def first(self) -> int:
-        """How many captures are taken before what an earlier run gathered is counted."""
+        """How many captures are taken before those of the earlier run are counted."""
         return 0
 
     def stream(self, acquire: Acquire) -> t.Captures | t.Observations:
-        """Return what the steps work on."""
+        """Return the input of the first step."""
         stream: t.Captures | t.Observations = acquire()
         return stream
 
@@ -70,7 +70,7 @@ class FromNothing:
         return True
 
     def given(self, step: Step) -> Any:
-        """Return what a step that runs once, and is not done, gave."""
+        """Return the logged result of a step that runs once, if it is not run again."""
         raise NotImplementedError(f"{step.label} is to be done")
 
     def segmented(self, capture: str) -> t.FlangeCloud | None:
@@ -86,13 +86,13 @@ class FromNothing:
         return []
 
     def gathered(self) -> Iterator[Gathered]:
-        """Return what an earlier run gathered, which is logged again."""
+        """Return the captures of an earlier run, to be logged again."""
         return iter(())
 
 
 @dataclass(frozen=True)
 class FromLog(FromNothing):
-    """What the steps before one gave is read back from a log (``--from``, ``--at``).
+    """Start in the middle: results of earlier steps are read from a log (``--from``, ``--at``).
 
     Attributes:
         log: The log.
@@ -120,7 +120,7 @@ class FromLog(FromNothing):
         return self.kind == "fit" and bool(self.log.of_kind("segment"))
 
     def stream(self, acquire: Acquire) -> t.Captures | t.Observations:
-        """Return what the log gives to the step ``at``.
+        """Return the logged inputs of the step ``at``.
 
         Raises:
             StageError: The log does not hold it.
@@ -152,7 +152,7 @@ class FromLog(FromNothing):
         return self.at <= step.index
 
     def given(self, step: Step) -> Any:
-        """Return what a step that runs once gave.
+        """Return the logged result of a step that runs once.
 
         Raises:
             StageError: The run ended before.
@@ -230,7 +230,7 @@ class FromEarlierRun(FromNothing):
         return [r for r in self.log.rejections if r.id not in self.retaken]
 
     def gathered(self) -> Iterator[Gathered]:
-        """Return what that run gathered, so that the new log stands by itself."""
+        """Return the earlier run's captures, so that the new log is complete in itself."""
         fitted = {o.id: o for o in self.log.observations()}
         unsegmented = ((capture, None) for capture in self.log.captures())
         for capture, flange in self.log.flange_clouds() if self.segments else unsegmented:
@@ -276,7 +276,7 @@ def _named(option: str, wanted: Collection[str], log: RunLog) -> frozenset[str]:
 def earlier_run(
     path: Path, registry: Registry, retaken: Collection[str] = ()
 ) -> tuple[Recipe, FromNothing]:
-    """Return the recipe of a run that ended early, and what it gathered.
+    """Return the recipe and captures of a run that ended early.
 
     A run that was stopped in its weld is gone on with at the weld, which goes back and overlaps.
 
@@ -323,12 +323,12 @@ def _begun_weld(log: RunLog, recipe: Recipe) -> Step | None:
 
 
 def resumable(recipe: Recipe) -> bool:
-    """Return whether the recipe's source leaves out what an earlier run already took."""
+    """Return whether the recipe's source can skip captures that an earlier run took."""
     return any(t.Resumed in get_args(need) for need in recipe.steps[0].stage.needs.values())
 
 
 def restart_hint(recipe: Recipe, called: str, log: Path) -> str:
-    """Return the command that runs on what a log holds, with other parameters.
+    """Return the command that reruns from a log with other parameters.
 
     Args:
         recipe: What was run.

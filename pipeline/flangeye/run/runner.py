@@ -85,7 +85,7 @@ class Runner:
         return result
 
     def observe(self) -> t.Observations:
-        """Return what the steps before the solver give, as it is pulled."""
+        """Yield the observations of the steps before the solver, on demand."""
         self._observe(FromNothing())
         observations: t.Observations = self._values[t.Observations]
         return observations
@@ -96,14 +96,14 @@ class Runner:
         return self._outcome.rejections
 
     def take(self, count: int | None) -> list[t.Observation]:
-        """Return the first ``count`` observations, or all, and let go of the source."""
+        """Return the first ``count`` observations, or all, and close the source."""
         try:
             return list(islice(self.observe(), count))
         finally:
             self._finish_acquiring()
 
     def solve(self, observations: Sequence[t.Observation], source: t.Source) -> t.HandEye:
-        """Return what the recipe's solve step makes of observations that are there."""
+        """Return the result of the recipe's solve step on given observations."""
         self._outcome.source = source
         self._values[t.Box] = self._values[t.Box] or source.workspace
         return self._solve_subset(observations)

@@ -1,4 +1,4 @@
-"""One session: a recipe run with its log into a folder, for ``run`` and for ``batch`` alike."""
+"""Run a recipe with its log into a folder; used by ``run`` and ``batch``."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from flangeye.types import ArchivePath
 
 @dataclass(frozen=True)
 class Start:
-    """What a run starts from, besides its recipe.
+    """Starting point of a run, besides its recipe.
 
     Attributes:
         archive: Recordings to run on, if any.

@@ -29,7 +29,7 @@ WRITTEN: Mapping[str, Any] = {"number": "number", "rotation": "xyzw", "length": 
 
 
 def write_tables(log: RunLog, folder: Path, registry: Registry) -> list[Path]:
-    """Write a table of each thing that moves, one of what each camera saw, and a recipe.
+    """Write a table for each moving carrier and each camera, and a recipe that reads them.
 
     What cameras saw are the scans, where the log has them whole, else what was found in them.
 

@@ -1,4 +1,4 @@
-"""The conformance kit: what every plugin of a kind must do, as tests a vendor inherits.
+"""The conformance kit: tests that every plugin of a kind must pass; vendors inherit them.
 
 ``class TestMyFit(FitConformance): stage = my_fit`` in a test module is all that pytest needs; it
 then runs every ``test_…`` method of the class. Nothing here imports pytest: a method that finds a
@@ -84,7 +84,7 @@ class CheckConformance(Conformance):
     kind = "check"
 
     def found(self, recordings: RecordedSession) -> list[Finding]:
-        """Return what the check finds; nothing where it does not apply."""
+        """Return the check's findings; none if it does not apply."""
         try:
             findings = list(self.call({}, recordings))
         except NotApplicable:
@@ -134,7 +134,7 @@ class ReplayConformance(Conformance):
 
 
 class GuideConformance(Conformance):
-    """A ``guide`` part: a person is led through a procedure. What it does is for its own tests."""
+    """A ``guide`` part leads a person through a procedure; its own tests cover the procedure."""
 
     kind = "guide"
 
@@ -197,7 +197,7 @@ class ErrorConformance(Conformance):
         require_repeats(lambda: self.measured(CAMERA, observed(work_points())))
 
     def test_the_true_pose_has_next_to_no_error(self) -> None:
-        """What is left is the noise."""
+        """Only the noise remains."""
         off = np.linalg.norm(self.measured(CAMERA, observed(work_points())).displacement())
         require(off < 0.1e-3, f"the true pose is said to be {1e3 * off:.3f} mm off")
 
@@ -213,7 +213,7 @@ class ErrorConformance(Conformance):
         require_refusal(lambda: self.measured(CAMERA, []), type(None), "no pose kept")
 
     def test_it_measures_in_the_cameras_frame(self) -> None:
-        """The motion takes what was measured onto what the candidate predicts."""
+        """The motion maps the measurement onto the candidate's prediction."""
         candidate = CAMERA.copy()
         candidate[:3, 3] += [1e-3, -2e-3, 2e-3]
         off = self.measured(candidate, observed(work_points())).displacement()
@@ -227,7 +227,7 @@ class ExportConformance(Conformance):
     kind = "export"
 
     def file(self, carrier: str = t.BASE, yaw: float = 0.3) -> t.ExportedFile:
-        """Return what the stage writes for a pose in ``carrier``."""
+        """Return the file that the stage writes for a pose in ``carrier``."""
         matrix = rigid(rotation_from_rpy(0.1, -0.2, yaw), np.array([0.5, -0.25, 1.0]))
         pose = t.CalibratedPose(t.Transform(carrier, t.CAMERA, matrix), REMARKS)
         file: t.ExportedFile = self.call({t.CalibratedPose: pose})

@@ -1,4 +1,4 @@
-"""What plugins of every kind have in common: they are found, they declare, they repeat."""
+"""Tests for plugins of every kind: they are found, declare themselves, and are deterministic."""
 
 from __future__ import annotations
 
@@ -72,11 +72,11 @@ class Conformance:
 
     @cached_property
     def flange(self) -> Flange:
-        """What the kit's arm carries."""
+        """The flange plate of the kit's arm."""
         return plate_of(self.robot)
 
     def context(self) -> Mapping[Any, Any]:
-        """Return what the plugin may ask for by type, besides what its kind works on."""
+        """Return the values that the plugin may request by type, besides its input."""
         return {}
 
     def call(self, given: Mapping[Any, Any] | None = None, *arguments: Any) -> Any:
@@ -175,7 +175,7 @@ def require_type(value: Any, kind: type[T]) -> T:
 
 
 def require_repeats(call: Callable[[], Any]) -> None:
-    """Raise AssertionError unless two calls give the same, to the last bit."""
+    """Raise AssertionError unless two calls give the same result, to the last bit."""
     require(plain(call()) == plain(call()), "two calls with equal input differ")
 
 
@@ -220,7 +220,7 @@ def require_refusal(call: Callable[[], Any], rejected: type, what: str) -> None:
 
 
 def from_log(value: Any) -> Any:
-    """Return a value as it comes back from an MCAP log."""
+    """Return a value after a round trip through an MCAP log."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "run.mcap"
         with closing(Recorder(path, {"recipe.yaml": ""}, full_clouds=True)) as recorder:
@@ -230,7 +230,7 @@ def from_log(value: Any) -> Any:
 
 
 def require_round_trip(value: Any, through: Callable[[Any], Any] = from_log) -> None:
-    """Raise AssertionError unless a value comes back from a log as it went in."""
+    """Raise AssertionError unless a value is unchanged by a round trip through a log."""
     try:
         back = through(value)
     except Exception as error:

@@ -111,7 +111,7 @@ class DriverConformance(Conformance):
 
 
 class RobotConformance(DriverConformance):
-    """A ``robot`` part. It moves the last joint by 0.1 rad, at 0.3 rad/s: see that it may."""
+    """A ``robot`` part. It moves the last joint by 0.1 rad at 0.3 rad/s: make sure it may."""
 
     kind = "robot"
 
@@ -154,7 +154,7 @@ class RobotConformance(DriverConformance):
                 )
 
     def test_it_stops_at_once(self) -> None:
-        """In the middle of a move, and it stays where it stopped."""
+        """Stopped in the middle of a move, it stays at rest."""
         with self.opened() as robot:
             start = robot.state().joints
             self._under_way(robot, start)
@@ -167,7 +167,7 @@ class RobotConformance(DriverConformance):
             self._until_still(robot)
 
     def test_silence_alone_ends_a_move(self) -> None:
-        """Nobody looks any more: at rest within RESTS, well before the goal, and it stays so.
+        """If its state is no longer read it stops within RESTS, before the goal, and stays.
 
         The program, its guard or the driver's own processes may be frozen, and then let go of.
         """
@@ -192,7 +192,7 @@ class RobotConformance(DriverConformance):
             self._until_still(robot)
 
     def test_a_velocity_ends_without_commands(self) -> None:
-        """Nobody asks any more: it brakes after GRACE."""
+        """Without commands it brakes after GRACE."""
         with self.opened() as robot:
             start = robot.state().joints
             robot.move_velocity(np.array([0.0, 0.0, 0.01, 0.0, 0.0, 0.0]), 0.2)
@@ -241,7 +241,7 @@ class RobotConformance(DriverConformance):
 
 
 class ScannerConformance(DriverConformance):
-    """A ``scanner`` part. What it looks at must give points; where, does not matter."""
+    """A ``scanner`` part. It must look at something that gives points."""
 
     kind = "scanner"
 
@@ -268,7 +268,7 @@ class ScannerConformance(DriverConformance):
         require(near < depth < far, f"the scan's middle is {depth:.3g} m away: not in metres?")
 
     def test_it_says_its_unit_and_layout(self) -> None:
-        """The device's own report, for the log; and the layout is as it says."""
+        """The device reports its unit and layout, and its clouds have that layout."""
         with self.opened() as scanner:
             facts = {name.lower(): value for name, value in scanner.facts.items()}
             require(any("unit" in name for name in facts), "facts do not say the device's unit")
@@ -277,7 +277,7 @@ class ScannerConformance(DriverConformance):
             require(cloud.organised, "the device says organised, the cloud is not")
 
     def test_an_exposure_has_its_time(self) -> None:
-        """Begun after it was asked for, ended before it was given, on this computer's clock."""
+        """The exposure lies between request and return, on this computer's clock."""
         with self.opened() as scanner:
             before = time.monotonic_ns()
             scan = self.scanned(scanner)
@@ -306,12 +306,12 @@ class ScannerConformance(DriverConformance):
 
 
 class SensorConformance(DriverConformance):
-    """A ``sensor`` part. A tactile sensor that is on gives frames by itself."""
+    """A ``sensor`` part. A tactile sensor that is on must deliver frames by itself."""
 
     kind = "sensor"
 
     def context(self) -> Mapping[Any, Any]:
-        """Return an arm that stands, and the bundled finger."""
+        """Return an arm at rest, and the bundled finger."""
         finger = read_model(bundled("data") / "fingers" / "srm.yaml", Finger)
         return {StateSource: _Standing(), Finger: finger}
 
@@ -327,7 +327,7 @@ class SensorConformance(DriverConformance):
         require(times == sorted(set(times)), "frames are not in order, or one came twice")
 
     def test_its_camera_is_calibrated(self) -> None:
-        """A pinhole matrix in pixels, of the images it gives."""
+        """A pinhole matrix [px] for the images it delivers."""
         with self.opened() as sensor:
             image = self.frames(sensor, 1)[0].image
             matrix = np.asarray(sensor.camera_matrix)
@@ -351,15 +351,15 @@ class ProfilerConformance(DriverConformance):
     kind = "profiler"
 
     def context(self) -> Mapping[Any, Any]:
-        """Return an arm that stands; there is no finger's sensor beside a profile sensor alone."""
+        """Return an arm at rest; a profile sensor alone needs no finger."""
         return {StateSource: _Standing(), TactileSensor: None}
 
     def looks(self, profiler: Profiler, count: int) -> list[WeldProfile]:
-        """Return the next looks."""
+        """Return the next profiles."""
         return _given(profiler.profile, count, "looks")
 
     def test_its_looks_are_in_metres_with_a_time(self) -> None:
-        """One after the other, each given once, with how well it is known."""
+        """Each profile is given once, in order, with its uncertainty."""
         with self.opened() as profiler:
             require(isinstance(profiler, Profiler), "it lacks methods of devices.Profiler")
             looks = self.looks(profiler, 5)
@@ -375,7 +375,7 @@ class ProfilerConformance(DriverConformance):
         require(0.0 < behind < 0.5, f"it looks {behind} m behind the torch")
 
     def test_asking_does_not_wait(self) -> None:
-        """The state is read at once: the control loop does so 500 times a second."""
+        """Reading the state returns at once: the control loop does so 500 times a second."""
         with self.opened() as profiler:
             self.looks(profiler, 1)
             for _ in range(20):
@@ -384,7 +384,7 @@ class ProfilerConformance(DriverConformance):
 
 
 class ArcConformance(DriverConformance):
-    """An ``arc`` part: a power source whose wire and gas are away, so that nothing burns."""
+    """An ``arc`` part: a power source. Remove wire and gas first, so that nothing burns."""
 
     kind = "arc"
 

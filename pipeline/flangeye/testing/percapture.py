@@ -83,7 +83,7 @@ MIRRORED = Change(np.diag([-1.0, 1.0, 1.0]))
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A scan and what is true of it, in ``camera``.
+    """A scan and its truth, in ``camera``.
 
     Attributes:
         xyz: (H, W, 3) organised points [m], NaN where there is none.
@@ -112,7 +112,7 @@ class Scene:
         return Capture("0", cloud, by_frame(Transform(BASE, FLANGE, np.eye(4))))
 
     def flange_cloud(self) -> FlangeCloud:
-        """Return what a segment stage cuts out: the points near the feature, with a rough start."""
+        """Return the output of a segment stage: points near the feature, with a rough start."""
         points = self.xyz.reshape(-1, 3)
         points = points[np.isfinite(points).all(axis=1)]
         near = np.linalg.norm(points - self.centre, axis=1) < 1.15 * self.radius
@@ -198,11 +198,11 @@ class PerCaptureConformance(Conformance):
         return sphere_scene(BALL) if self.feature == "sphere" else flange_scene(self.flange)
 
     def given(self, scene: Scene) -> dict[Any, Any]:
-        """Return what the stage works on."""
+        """Return the stage's input."""
         raise NotImplementedError
 
     def answer(self, change: Change = SAME) -> tuple[Any, Scene]:
-        """Return what the stage makes of the changed scene, and the scene."""
+        """Return the stage's output on the changed scene, and the scene."""
         scene = self.scene().changed(change)
         known: Mapping[Any, Any] = {
             Flange: scaled_flange(self.flange, change.scale),
@@ -289,7 +289,7 @@ class FitConformance(PerCaptureConformance):
     kind = "fit"
 
     def given(self, scene: Scene) -> dict[Any, Any]:
-        """Return what a segment stage would have cut out."""
+        """Return the segmented points."""
         return {FlangeCloud: scene.flange_cloud(), Capture: scene.capture()}
 
     def test_its_covariances_are_covariances(self) -> None:

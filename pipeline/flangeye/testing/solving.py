@@ -48,7 +48,7 @@ HERE = np.eye(4)
 def observed(
     points: Floats, base_T_camera: Floats = CAMERA, noise: float = NOISE, normals: bool = True
 ) -> list[t.Observation]:
-    """Return what is observed of flanges at (N, 3) points in ``base``."""
+    """Return observations of flanges at (N, 3) points in ``base``."""
     rng = np.random.default_rng(1)
     true = t.Transform(t.BASE, t.CAMERA, base_T_camera)
     observations = []
@@ -88,7 +88,7 @@ def reference_solution(observations: Sequence[t.Observation]) -> t.HandEye:
 
 
 def elsewhere(observations: Sequence[t.Observation], motion: Floats) -> list[t.Observation]:
-    """Return the same scans for a robot whose base stands elsewhere."""
+    """Return the same scans for a robot whose base is at another place."""
     moved = t.Transform(t.BASE, t.BASE, motion)
     return [replace(o, poses={**o.poses, t.FLANGE: moved @ o.base_T_flange}) for o in observations]
 
@@ -99,7 +99,7 @@ class SolvingConformance(Conformance):
     gives: ClassVar[type] = t.HandEye
 
     def given(self, observations: Sequence[t.Observation], motion: Floats) -> dict[Any, Any]:
-        """Return what the stage works on: the plain calibration, and what the runner knows."""
+        """Return the stage's input: the plain calibration, and the runner's values."""
         return {t.HandEye: reference_solution(observations), **self.known(observations, motion)}
 
     def answer(self, observations: Sequence[t.Observation], motion: Floats = HERE) -> Any:
@@ -113,13 +113,13 @@ class SolvingConformance(Conformance):
         return t.Views([t.VerificationView("view", cloud, pose)])
 
     def stream(self, observations: Sequence[t.Observation]) -> t.Observations:
-        """Return observations as a recipe's earlier steps give them."""
+        """Return observations as the steps before give them."""
         workspace = t.Box(WORK, SIZE)
         source = t.Source("kit", workspace=workspace)
         return t.Observations(observations, source, len(observations))
 
     def known(self, observations: Sequence[t.Observation], motion: Floats = HERE) -> dict[Any, Any]:
-        """Return what the runner knows beside the calibration."""
+        """Return the runner's values beside the calibration."""
         return {
             t.Observations: self.stream(observations),
             t.Solver: reference_solution,
@@ -154,7 +154,7 @@ class SolveConformance(SolvingConformance):
     tolerance: ClassVar[float] = 0.15e-3
 
     def given(self, observations: Sequence[t.Observation], motion: Floats) -> dict[Any, Any]:
-        """Return what the stage works on."""
+        """Return the stage's input."""
         return self.known(observations, motion)
 
     def test_it_finds_the_camera_in_metres(self) -> None:
@@ -163,7 +163,7 @@ class SolveConformance(SolvingConformance):
         self._require_pose(answer, CAMERA, self.tolerance, "a known cell")
 
     def test_it_accounts_for_every_observation(self) -> None:
-        """One pair for each that was pulled, and residuals that are what they say."""
+        """One pair for each observation, with correct residuals."""
         observations = observed(work_points())
         answer = self.answer(observations)
         ids = [pair.observation.id for pair in answer.pairs]
@@ -185,7 +185,7 @@ class SolveConformance(SolvingConformance):
         require_covariance(answer.camera.covariance, "the pose's covariance")
 
     def test_it_moves_with_the_base(self) -> None:
-        """The same scans for a robot that stands elsewhere."""
+        """If the robot's base is moved, the answer moves with it."""
         moved = elsewhere(observed(work_points()), MOTION)
         within = 2 * self.tolerance
         self._require_pose(self.answer(moved), MOTION @ CAMERA, within, "a base elsewhere")
@@ -198,7 +198,7 @@ class SolveConformance(SolvingConformance):
         self._require_pose(answer, camera, 1.25 * self.tolerance, "a larger cell")
 
     def test_it_never_gives_a_mirror_image(self) -> None:
-        """Centres in one plane fit their mirror image as well: only the proper one is a pose."""
+        """Centres in one plane fit their mirror image too: only a proper rotation is a pose."""
         points = work_points()
         points[:, 2] = WORK[2]
         answer = self.answer(observed(points, noise=NOISE / 5))
@@ -233,7 +233,7 @@ class RefineConformance(SolvingConformance):
         require_covariance(answer.camera.covariance, "the pose's covariance")
 
     def test_it_moves_with_the_base(self) -> None:
-        """The same scans for a robot that stands elsewhere."""
+        """If the robot's base is moved, the answer moves with it."""
         answer = self.answer(elsewhere(observed(work_points()), MOTION), MOTION)
         self._require_pose(answer, MOTION @ CAMERA, 2 * self.tolerance, "a base elsewhere")
 
@@ -263,7 +263,7 @@ class VerifyConformance(SolvingConformance):
             require(np.isfinite(figure), f"'{name}' is {figure}")
 
     def test_it_moves_with_the_base(self) -> None:
-        """A robot that stands elsewhere is judged the same."""
+        """If the robot's base is moved, the verdict is the same."""
         observations = observed(work_points())
         here = self.answer(observations)
         # The same without a turn: boxes stay boxes.

@@ -102,7 +102,7 @@ class AcquireConformance(Conformance):
             require_round_trip(capture, logged)
 
     def test_a_missing_archive_is_refused(self) -> None:
-        """Where it needs recordings, it says in one line that there are none."""
+        """Without the recordings it needs, it is refused in one line."""
         if t.ArchivePath in self.plugin.needs.values():
             for path in (None, Path("no/such/recordings")):
                 given = {t.ArchivePath: t.ArchivePath(path)}
@@ -114,7 +114,7 @@ class AcquireConformance(Conformance):
 
 
 def logged(capture: t.Capture) -> t.Capture:
-    """Return a capture as it comes back from an MCAP log with whole clouds."""
+    """Return a capture after a round trip through an MCAP log with whole clouds."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "run.mcap"
         with closing(Recorder(path, {"recipe.yaml": ""}, full_clouds=True)) as recorder:
@@ -135,7 +135,7 @@ class ReaderConformance(Conformance):
     archive: ClassVar[Path]
 
     def read(self, path: Path | None = None) -> Archive:
-        """Return what the reader makes of a path."""
+        """Return the reader's output for a path."""
         return require_type(self.call({}, path or self.archive), Archive)
 
     def test_it_gives_the_same_twice(self) -> None:
@@ -173,7 +173,7 @@ class PlanConformance(Conformance):
     kind = "plan"
 
     def planned(self, seed: int = 0, moved: Floats | None = None) -> Any:
-        """Return the plan for the kit's site, or for one whose work is elsewhere."""
+        """Return the plan for the kit's site, or for one whose work is at another place."""
         shift = np.zeros(3) if moved is None else moved
         arm = Arm(self.robot)
         eye = CAMERA[:3, 3] + shift
@@ -192,11 +192,11 @@ class PlanConformance(Conformance):
         return np.array(found)
 
     def test_it_gives_the_same_twice(self) -> None:
-        """The generator it is given is its only randomness."""
+        """Its only randomness is the given generator."""
         require(np.array_equal(self.poses(3), self.poses(3)), "two plans with one seed differ")
 
     def test_its_poses_are_poses_inside_its_box(self) -> None:
-        """Rigid, in metres, and where the plan says it works."""
+        """Poses are rigid, in metres, and in the planned region."""
         plan = self.planned()
         for pose in self.poses():
             t.Transform(t.BASE, t.FLANGE, pose)
@@ -204,7 +204,7 @@ class PlanConformance(Conformance):
             require((outside < 1e-6).all(), f"a pose is {outside.max():.3g} m outside the box")
 
     def test_its_poses_tell_the_camera(self) -> None:
-        """Three or more, not all on a line: no camera could be found from those."""
+        """Three poses or more, not on a line, so that the camera is observable."""
         centres = self.poses()[:, :3, 3]
         require(len(centres) >= 3, f"{len(centres)} poses, 3 are needed")
         spread = np.linalg.svd(centres - centres.mean(axis=0), compute_uv=False)
@@ -217,7 +217,7 @@ class PlanConformance(Conformance):
         require_close(there[:, :3, 3], here[:, :3, 3] + shift, 1e-6, "a pose of a moved site [m]")
 
     def test_a_site_that_shows_nothing_is_no_crash(self) -> None:
-        """Where the arm can show its flange nowhere, the plan is empty, or it says why."""
+        """If the arm can show its flange nowhere, the plan is empty or says why."""
         site = Site(
             centre=np.zeros(3), eye=np.ones(3), facing=lambda p: None, joints=lambda p: None
         )
@@ -238,7 +238,7 @@ def _facing(point: Floats, eye: Floats) -> Floats:
 
 
 class ViewConformance(Conformance):
-    """A ``view`` part: where the scanner stands, before anything is known."""
+    """A ``view`` part: the scanner's pose before any scan."""
 
     kind = "view"
 

@@ -1,4 +1,4 @@
-"""``scan``, ``seam`` and ``weld`` stages (``context`` gives what they need), and controllers."""
+"""Conformance of ``scan``, ``seam`` and ``weld`` stages (with ``context``), and controllers."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class OnceConformance(Conformance):
     gives: type
 
     def answer(self) -> Any:
-        """Return what the stage gives."""
+        """Return the stage's output."""
         value = self.call({t.VerifiedHandEye: verified(), t.Seam: straight_seam()})
         return require_type(value, self.gives)
 
@@ -112,7 +112,7 @@ class ControllerConformance(Conformance):
     kind = "controller"
 
     def commands(self) -> list[Command]:
-        """Return what it commands."""
+        """Return the controller's commands."""
         controller, task = self.call(None, straight_task()), straight_task()
         felt, given = np.array([0.0, -task.deflection, -task.preload]), []
         period = 8e-3  # between two cycles of a controller [s]

@@ -160,7 +160,7 @@ __all__ = [
 
 @dataclass(frozen=True, eq=False)
 class CalibratedPose:
-    """What an ``export`` takes.
+    """Input of an ``export`` stage.
 
     Attributes:
         transform: Where the camera is in what carries it: ``base_T_camera`` or
@@ -186,7 +186,7 @@ class CalibratedPose:
 
     @property
     def stands(self) -> bool:
-        """Whether the camera stands in the base, and is not carried by the arm."""
+        """Whether the camera is fixed in the base, not carried by the arm."""
         return self.transform.parent == BASE
 
     def comment(self, mark: str) -> str:
@@ -200,7 +200,7 @@ def _one_line(text: str) -> str:
 
 @dataclass(frozen=True)
 class ExportedFile:
-    """What an ``export`` gives.
+    """Output of an ``export`` stage.
 
     Attributes:
         name: File name, without a folder.
@@ -220,13 +220,13 @@ class ExportedFile:
 
 @dataclass(frozen=True)
 class ArchivePath:
-    """What ``--archive`` named on the command line, if anything."""
+    """The path given by ``--archive``, if any."""
 
     path: Path | None = None
 
 
 class StageLog(Protocol):
-    """Logs a value under a name, at once, with the step that asked for it.
+    """Logs a named value at once, with the step that logs it.
 
     For what a stage does while it runs: where the arm is, what a loop measured and commanded.
     """
@@ -238,7 +238,7 @@ class StageLog(Protocol):
 
 @dataclass(frozen=True)
 class Progress:
-    """What a solver knows while it still takes poses.
+    """The state of a solver that still takes poses.
 
     Attributes:
         poses: How many it has.
@@ -319,7 +319,7 @@ class Seam:
 
 @dataclass(frozen=True, eq=False)
 class WeldReport:
-    """What the tip, the torch and the robot did, in ``base``, in at most a few thousand samples.
+    """Motion of tip, torch and robot in ``base``, in at most a few thousand samples.
 
     Attributes:
         mode: How the seam was followed.
@@ -387,11 +387,11 @@ class WeldReport:
 
     @property
     def opening(self) -> Array:
-        """(3,) the openings' mean: to look at it from."""
+        """(3,) the openings' mean direction, for a view of the seam."""
         mean = self.openings.mean(axis=0)
         return np.asarray(mean / np.linalg.norm(mean))
 
     def openings_beside(self, line: Array) -> Array:
-        """Return the openings (M, 3) beside a line (M, 3) that is near the plan."""
+        """Return the openings (M, 3) at points of a line (M, 3) near the plan."""
         away = np.linalg.norm(line[:, None] - self.planned, axis=2)
         return np.asarray(self.openings[away.argmin(axis=1)])

@@ -72,7 +72,7 @@ def freeze(instance: Any, **shapes: tuple[int, ...]) -> None:
 
 
 class Warn(str):
-    """A note that asks for something: printed at once, first in the report and on the page.
+    """A note with something to do: printed at once, first in the report and on the page.
 
     The text says what is wrong, in one line.
 
@@ -112,7 +112,7 @@ as a text, and a :class:`Warn` as ``{text, fix}``."""
 
 
 def as_line(note: str) -> str:
-    """Return a note as commands say it: what it is, and what mends it."""
+    """Return a note as one line: its text, and its fix."""
     return f"warning: {note}; {note.fix}" if isinstance(note, Warn) else f"note: {note}"
 
 

@@ -38,7 +38,7 @@ class Pair:
 
 @dataclass(frozen=True, eq=False)
 class SmoothField:
-    """A smooth displacement of the flange over the workspace: what an arm's many errors leave.
+    """A smooth displacement of the flange over the workspace: the arm's remaining errors.
 
     A Gaussian process of low order: the features of the squared-exponential kernel up to the
     second power of the place, less the rigid motion that comes nearest to each over the
@@ -64,7 +64,7 @@ class SmoothField:
 
 @dataclass(frozen=True, eq=False)
 class ArmCorrection:
-    """What a solver found wrong with where the arm says its flange is.
+    """Estimated errors of an arm against its controller's model.
 
     Attributes:
         tool_offset: (3,) the seen circle's centre in ``flange`` [m].
@@ -131,7 +131,7 @@ class ExpectedError:
 
 @dataclass(frozen=True, eq=False)
 class HandEye:
-    """A calibration that nobody has verified yet.
+    """A calibration that is not verified yet.
 
     Attributes:
         camera: The camera's pose in the frame that carries it: ``base_T_camera`` where it stands
@@ -181,7 +181,7 @@ class HandEye:
         return replace(self, correction=known, corrected=None, arms={})
 
     def as_corrected(self) -> HandEye | None:
-        """Return the answer for the arm corrected, alone; None where no error of it was found."""
+        """Return the answer for the corrected arm; None if no correction was estimated."""
         if self.corrected is not None:
             found = self.corrected
             answer = replace(self, camera=found.camera, correction=found.correction)
@@ -193,7 +193,7 @@ class HandEye:
 
     @property
     def base_T_camera(self) -> TransformEstimate:
-        """The camera's pose in the robot's base, for those who can use nothing else."""
+        """The camera's pose in the robot's base, for users of nothing else."""
         if self.camera.transform.parent != BASE:
             raise FrameMismatchError(
                 f"the calibration is {self.camera.transform.name}, and base_T_camera is needed"
@@ -224,14 +224,14 @@ class PoseError:
         freeze(self, motion=(4, 4), at=(3,), base_R_camera=(3, 3))
 
     def displacement(self, at: Floats | None = None) -> Floats:
-        """Return the (3,) way that it moves a place, or else the work, in ``camera`` [m]."""
+        """Return (3,) by how much it moves a place, by default the work, in ``camera`` [m]."""
         at = self.at if at is None else at
         return np.asarray(self.motion[:3, :3] @ at + self.motion[:3, 3] - at)
 
 
 @dataclass(frozen=True, eq=False)
 class Verification:
-    """What a ``verify`` stage found.
+    """Output of a ``verify`` stage.
 
     Attributes:
         passed: Whether the calibration may be used.

@@ -1,4 +1,4 @@
-"""What was measured of a target in one capture, and why a capture was set aside."""
+"""Measurements of a target in one capture, and reasons why a capture is rejected."""
 
 from __future__ import annotations
 
@@ -53,13 +53,13 @@ class CircleFeature:
 
     @property
     def centre_covariance(self) -> Floats:
-        """(3, 3) of the centre [m^2]: what every feature has."""
+        """(3, 3) covariance of the centre [m^2]; every feature has one."""
         return self.covariance
 
 
 @dataclass(frozen=True, eq=False)
 class PoseFeature:
-    """A target whose whole pose was measured, such as a marker.
+    """A target whose full pose was measured, such as a marker.
 
     Attributes:
         camera_T_target: Its pose; the target's z points towards the scanner.
@@ -107,7 +107,7 @@ Feature = CircleFeature | PoseFeature
 
 @dataclass(frozen=True, eq=False)
 class Rejected:
-    """What a per-capture stage returns instead of a value: the capture is set aside, and why.
+    """Output of a per-capture stage that rejects its capture, with the reason.
 
     Attributes:
         reason: The same text for all captures that are set aside for it.
@@ -122,7 +122,7 @@ class Rejected:
 
 @dataclass(frozen=True, eq=False)
 class Rejection:
-    """A capture that was set aside: which, by which stage, and why, as :class:`Rejected` says."""
+    """A rejected capture: its name, the stage, and the reason as in :class:`Rejected`."""
 
     id: str
     stage: str
@@ -136,7 +136,7 @@ class Rejection:
 
     @property
     def kind(self) -> tuple[str, str, str]:
-        """What rejections for one reason share: stage, reason without its numbers, fix."""
+        """Key that rejections for the same reason share: stage, reason without its numbers, fix."""
         return self.stage, re.sub(r"\(.*\)|\d[\d.]*", "", self.reason), self.fix
 
 
@@ -166,20 +166,20 @@ class Observation(Placed):
 
     @property
     def circle(self) -> CircleFeature:
-        """The feature, for those who can use nothing but a circle."""
+        """The feature, for users of circles only."""
         if isinstance(self.feature, CircleFeature):
             return self.feature
         raise FrameMismatchError(f"observation {self.id} is a pose, and a circle is needed")
 
     @property
     def centre_in_mount(self) -> Floats:
-        """(3,) where the link that carries the target has what was seen, if that is known [m]."""
+        """(3,) the target in the link that carries it, if that is known [m]."""
         feature = self.feature
         return feature.centre_in_flange if isinstance(feature, CircleFeature) else np.zeros(3)
 
     @property
     def tcp_in_base(self) -> Floats:
-        """(3,) the flange's centre, or what it carries, as the controller reports it [m]."""
+        """(3,) the flange's centre, or the carried target, as the controller reports it [m]."""
         return self.base_T_flange.apply(self.centre_in_mount)
 
 

@@ -152,12 +152,12 @@ Poses = Mapping[str, Transform]
 
 
 def by_frame(*transforms: Transform | None) -> Poses:
-    """Return transforms by the frame they place; what is None is left out."""
+    """Return transforms by their child frame; None is left out."""
     return {each.child: each for each in transforms if each is not None}
 
 
 class Placed:
-    """What was seen while controllers reported poses."""
+    """A measurement, with the poses that controllers reported at its time."""
 
     poses: Poses
 
@@ -197,7 +197,7 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class TransformEstimate:
-    """A transform that was estimated, with what is known of its error.
+    """An estimated transform with its covariance.
 
     Attributes:
         transform: The estimate.

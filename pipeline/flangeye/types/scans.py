@@ -1,4 +1,4 @@
-"""What sensors gave: clouds, images, and the captures they came with."""
+"""Sensor data: clouds, images, and captures."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Role = Literal["calibration", "verification"]
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """What a calibrated camera saw.
+    """An image of a calibrated camera.
 
     Attributes:
         pixels: (H, W) grey or (H, W, 3) RGB, uint8.
@@ -49,7 +49,7 @@ class Image:
 
 @dataclass(frozen=True, eq=False)
 class Capture(Placed):
-    """One look at the flange: where the robot says it stood, and what the scanner saw.
+    """One scan of the target, with the robot's pose at that time.
 
     Attributes:
         id: Unique within a run.
@@ -105,7 +105,7 @@ class FlangeCloud:
 
 @dataclass(frozen=True, eq=False)
 class ScanPlace:
-    """Where an arm stood while the scanner on its flange took one cloud.
+    """The arm's pose while the scanner on its flange took a cloud.
 
     Attributes:
         points: How many points it took there.
@@ -123,7 +123,7 @@ class ScanPlace:
 
 @dataclass(frozen=True, eq=False)
 class WorkpieceScan:
-    """What the scanner saw of the workpiece.
+    """A scan of the workpiece.
 
     Attributes:
         cloud: In ``camera``; of several places the clouds one after the other, each in ``camera``

@@ -1,4 +1,4 @@
-"""Values that arrive one at a time, and where they come from."""
+"""Streams of values that arrive one at a time, and their sources."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Stream(Generic[T]):
 
 
 class Captures(Stream[Capture | Rejection]):
-    """What an ``acquire`` stage gives. Captures are large, so those pulled are not kept.
+    """Output of an ``acquire`` stage. Captures are large, so they are not kept.
 
     A source that knows a capture to be useless gives its ``Rejection`` in its place.
 
@@ -75,7 +75,7 @@ class Captures(Stream[Capture | Rejection]):
 
     @property
     def idle(self) -> float | None:
-        """Share of the time in which an arm stood while nothing was exposed; None without one."""
+        """Share of the time in which the arm stood without an exposure; None without an arm."""
         return None
 
     def close(self) -> None:
@@ -85,12 +85,12 @@ class Captures(Stream[Capture | Rejection]):
 
 
 class Observations(Stream[Observation]):
-    """What a ``solve`` stage takes; an ``acquire`` stage may give it where no clouds exist."""
+    """Input of a ``solve`` stage; an ``acquire`` stage may give it if there are no clouds."""
 
 
 @dataclass(frozen=True)
 class Earlier:
-    """What was observed in this run before the capture at hand, in order.
+    """The observations of this run before the present capture, in order.
 
     A ``segment`` stage that asks for it is given one capture after the other.
     """
@@ -104,7 +104,7 @@ class Views(list[VerificationView]):
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What a simulated cell knows and no real one does. No stage can ask for it.
+    """The truth of a simulated cell. No stage can request it.
 
     Attributes:
         camera: Where the camera is, in the frame that carries it.

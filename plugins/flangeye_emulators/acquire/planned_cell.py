@@ -1,4 +1,4 @@
-"""What simulated sessions of cells have in common: parameters, moments, and who sees whom."""
+"""Shared by simulated cell sessions: parameters, moments, and who sees whom."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from flangeye_emulators.world.session import DRAWS, CameraView, disturbed
 
 
 class CellSessionParams(ArmsParams):
-    """What simulated sessions of cells have in common."""
+    """Common parameters of simulated cell sessions."""
 
     sightings: int = Field(
         60,
@@ -87,7 +87,7 @@ class PlannedCell:
     chooses: bool
 
     def sightings(self, seen: Callable[[], Sequence[Observation]]) -> Iterator[Sighting]:
-        """Yield what is seen, as it is asked for.
+        """Yield the sightings on demand.
 
         Args:
             seen: Gives what came of the sightings so far.
@@ -96,7 +96,7 @@ class PlannedCell:
 
 
 class NextBest:
-    """Chooses the sighting with the largest expected information, given those so far.
+    """Chooses the sighting with the largest expected information, given those before.
 
     Until that tells where everything is, sightings are those a person would show: each pair in
     turn. A choice at which the camera does not see the target after all gives nothing, and counts.
@@ -110,7 +110,7 @@ class NextBest:
         self._found: Rough | None = None
 
     def sightings(self, seen: Callable[[], Sequence[Observation]]) -> Iterator[Sighting]:
-        """Yield what is seen, as many at most as were to be scheduled."""
+        """Yield at most as many sightings as were scheduled."""
         moments, cell = self._planned.moments, self._planned.moments.cell
         for _ in self._planned.scheduled:
             before = seen()
@@ -150,7 +150,7 @@ class NextBest:
 def plan_cell(
     cell: Cell, seed: int, params: CellSessionParams, view: CameraView, rng: np.random.Generator
 ) -> PlannedCell:
-    """Draw where everything that moves is, and deal the moments to who sees whom.
+    """Draw the poses of everything that moves, and assign the moments to camera-target pairs.
 
     Raises:
         StageError: The place of an unknown is not given, or a camera or target takes part in too
@@ -177,7 +177,7 @@ def _require_places(cell: Cell, params: CellSessionParams) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """What the controllers report at N moments, and where things are.
+    """The poses at N moments: as controllers report them, and as they truly are.
 
     Attributes:
         cell: What stands on what.
@@ -212,7 +212,7 @@ class Moments:
         return np.asarray(invert(self.place(i, camera)) @ self.place(i, target))
 
     def poses(self, i: int) -> Poses:
-        """Return what the controllers report at one moment."""
+        """Return the poses reported at one moment."""
         return {
             name: Transform(f"{name}_base", name, places[i])
             for name, places in self.reported.items()
@@ -223,7 +223,7 @@ class Moments:
         return {name: joints[i] for name, joints in self.joints.items()}
 
     def exact(self, i: int, camera: str, target: str) -> Observation:
-        """Return what a camera without noise sees."""
+        """Return a noise-free measurement of the camera."""
         return replace(
             noise_free(self.pose(i, camera, target), i, self.poses(i), None),
             id=name_of((i, camera, target)),
@@ -234,7 +234,7 @@ class Moments:
 
 
 def name_of(sighting: Sighting) -> str:
-    """Return what a sighting is called."""
+    """Return the name of a sighting."""
     i, camera, target = sighting
     return f"{i:04d}-{camera}-{target}"
 
@@ -263,7 +263,7 @@ def _draw(cell: Cell, params: CellSessionParams, rng: np.random.Generator) -> Mo
 
 
 class Drawn(NamedTuple):
-    """Where something that moves is at N moments.
+    """The poses of a moving carrier at N moments.
 
     Attributes:
         reported: (N, 4, 4) by its controller.

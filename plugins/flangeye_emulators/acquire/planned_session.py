@@ -1,4 +1,4 @@
-"""What simulated sessions of any configuration have in common: parameters, and the plan."""
+"""Shared by simulated sessions of any configuration: parameters, and the plan."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ FIELD = float(np.radians(50.0)), float(np.radians(40.0))
 
 
 class ArmsParams(Params):
-    """What all simulated sessions say of the arms."""
+    """Common parameters of simulated arms."""
 
     arm: ArmErrors = Field(
         default_factory=ArmErrors,
@@ -76,7 +76,7 @@ class ArmsParams(Params):
 
 
 class SessionParams(ArmsParams):
-    """What simulated sessions have in common."""
+    """Common parameters of simulated sessions."""
 
     poses: int = Field(20, ge=3, description="Number of captures.")
     spread: Angle = param("17 deg", gt=0, description="Largest change of a joint from there.")
@@ -99,7 +99,7 @@ class SessionParams(ArmsParams):
 
 
 class ViewParams(SessionParams):
-    """What simulated sessions of cameras that see an area have in common."""
+    """Common parameters of simulated sessions with area cameras."""
 
     distance: Length = param(
         "650 mm", gt=0, description="Distance from camera to target at the first pose."
@@ -115,14 +115,14 @@ class OutlierParams(Params):
 def noise_free(
     camera_T_target: Floats, index: int, poses: Poses, joints: Floats | None
 ) -> Observation:
-    """Return what a camera without noise sees at a pose, beside what the controllers report."""
+    """Return a camera's noise-free measurement at a pose, with the reported poses."""
     seen = PoseFeature(Transform(CAMERA, TARGET, camera_T_target), np.zeros((6, 6)))
     return Observation(f"exact-{index}", seen, poses, joints)
 
 
 @dataclass(frozen=True, eq=False)
 class PlannedSession:
-    """A session that was planned: what the arms report, where they are, where all is."""
+    """A planned session: reported poses, true poses, and the true transforms."""
 
     configuration: Configuration
     reported: ArmPoses
@@ -146,12 +146,12 @@ class PlannedSession:
         return replace(self, reported=self.reported.where(chosen), actual=self.actual.where(chosen))
 
     def noise_free(self) -> tuple[Observation, ...]:
-        """Return what a camera without noise sees at each pose, beside what the arms report."""
+        """Return a camera's noise-free measurement at each pose, with the reported poses."""
         seen = seen_from(self.actual, self.places)
         return tuple(noise_free(pose, i, *self.poses(i)) for i, pose in enumerate(seen))
 
     def poses(self, i: int) -> tuple[Poses, Floats | None]:
-        """Return what the controllers report at a pose, and the joints."""
+        """Return the reported poses and joints at a pose of the plan."""
         reported = self.reported
         second = None
         if self.configuration.other_base:

@@ -54,7 +54,7 @@ class SimulatedCellParams(OutlierParams, CellSessionParams):
 
     @property
     def view(self) -> CameraView:
-        """What the cameras see."""
+        """The field of view of the cameras."""
         near = 0.3  # nearest that cameras see [m]
         if self.wide:
             return CameraView(

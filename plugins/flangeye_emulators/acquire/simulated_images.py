@@ -33,7 +33,7 @@ from flangeye_emulators.world.session import CameraView, seen_from
 
 
 def camera_of(pixels: Pixels, camera: BoardCamera) -> BoardCamera:
-    """Return a camera whose pixels are those of a scanner."""
+    """Return a camera with the same pixels as a scanner."""
     height, width = pixels.shape
     focal = 1 / pixels.size
     focal_y = (height - 1) / (2 * abs(float(pixels.y[0])))

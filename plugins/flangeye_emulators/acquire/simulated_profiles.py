@@ -44,12 +44,12 @@ class ProfilesParams(SessionParams):
 
 @dataclass(frozen=True)
 class ProfileView(CameraView):
-    """What a line scanner can see of a sphere: one that its laser passes beside the centre."""
+    """The poses at which a line scanner's laser meets the sphere beside its centre."""
 
     radius: float = 0.0
 
     def first(self) -> Floats:
-        """Return (4, 4) camera_T_target at the first pose: the laser passes 0.7 radii beside."""
+        """Return (4, 4) camera_T_target at the first pose, the laser 0.7 radii off centre."""
         pose = super().first()
         pose[1, 3] = 0.7 * self.radius
         return pose

@@ -126,7 +126,7 @@ class _Set:
     session: PlannedSession
 
     def bodies(self, i: int) -> list[SolidBody]:
-        """Return what there is to see at a pose, in ``base``."""
+        """Return the bodies in view at a pose, in ``base``."""
         actual, places = self.session.actual, self.session.places
         if self.second is not None and actual.second is not None:
             other = self._arm(self.second, actual.second[i], actual.target[i])

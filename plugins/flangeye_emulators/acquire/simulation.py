@@ -1,4 +1,4 @@
-"""What ``acquire.simulated`` does: an arm is led before a scanner, and every scan made."""
+"""The simulation of ``acquire.simulated``: moves an arm before a scanner and renders each scan."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ VERSION = 1
 
 
 class Setting(NamedTuple):
-    """What stands before what, as ``acquire.simulated`` has it."""
+    """The simulated cell: scanner, arm and target."""
 
     robot: RobotModel
     scanner: ScannerModel
@@ -246,7 +246,7 @@ class _Session:
         return tuple(noise_free(seen[i], i, reported[i], joints[i]) for i in range(len(joints)))
 
     def captures(self, noise: np.random.SeedSequence, at_once: int) -> Iterator[Capture]:
-        """Make the captures, each when it is asked for, or so many at once ahead of that.
+        """Render the captures on demand, or a given number ahead of demand.
 
         Each has its own generator: they are the same whichever is finished first.
         """
@@ -271,7 +271,7 @@ class _Session:
                     yield made()
 
     def look(self, bodies: Sequence[SolidBody], rng: np.random.Generator) -> PointCloud:
-        """Scan other bodies, given in ``base``, with the same scanner from the same place."""
+        """Scan other bodies, given in ``base``, with the same scanner at the same pose."""
         return PointCloud(CAMERA, self._eye().scan(before_camera(bodies, self.base_T_camera), rng))
 
     def _eye(self) -> StructuredLight | TimeOfFlight:

@@ -1,4 +1,4 @@
-"""Controllers on loopback: what a robot's own controller does, in a process without a robot.
+"""Emulated robot controllers on loopback, each a process of its own.
 
 A vendor's unmodified client library connects to it and cannot tell the difference. The modules
 here know arms, not vendors: poses, paths, speeds, contact, faults, the clock, the control channel.

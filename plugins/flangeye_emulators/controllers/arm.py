@@ -1,4 +1,4 @@
-"""The arm itself: it goes where a motion takes it, within its limits, and feels what it touches."""
+"""The emulated arm: follows motions within its limits, and feels contact forces."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from flangeye_emulators.controllers.poses import (
 
 @dataclass(frozen=True, eq=False)
 class ForceMode:
-    """Along compliant axes the arm seeks a wrench; along the others it follows its motion.
+    """Force control: compliant axes seek a wrench, the others follow the motion.
 
     Attributes:
         base_R_task: (3, 3) the axes.
@@ -72,7 +72,7 @@ def _turned(rotation: Floats, vector: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class SpringSurface:
-    """A plane that gives way like a spring with a damper, without friction.
+    """A frictionless plane that yields like a spring with a damper.
 
     Attributes:
         point: (3,) a point of the undeformed plane in base [m].
@@ -160,14 +160,14 @@ class SimulatedArm:
         self._feel()
 
     def put(self, joints: Floats) -> None:
-        """Stand at ``joints`` (n,) at once: the start of a simulation, not a motion."""
+        """Place the arm at ``joints`` (n,) at once: the start of a simulation, not a motion."""
         self._motion, self._braking = None, False
         self.stance = self.chain.stance(np.array(joints, dtype=np.float64))
         self.speeds, self.twist = np.zeros(len(joints)), np.zeros(6)
         self._feel()
 
     def set_tool(self, flange_T_tcp: Floats) -> None:
-        """Take another point (4, 4) as the tool's; the arm does not move."""
+        """Set the tool frame (4, 4); the arm does not move."""
         self.chain.flange_T_tcp = flange_T_tcp
         self.stance = self.chain.stance(self.stance.joints)
 
@@ -190,13 +190,13 @@ class SimulatedArm:
         return self.chain.flange(self.stance.joints + self.zeros)
 
     def drive(self, motion: ControllerMotion) -> None:
-        """Let ``motion`` move the arm in this cycle; it must be said again in every cycle."""
+        """Apply ``motion`` in this cycle; it must be applied again in every cycle."""
         if self._motion is not motion:
             self._motion, self._braking = motion, False
         self._claimed = True
 
     def step(self) -> None:
-        """Advance one cycle. A motion that nobody drives any more ends in braking.
+        """Advance one cycle. Without a motion in this cycle the arm brakes.
 
         Raises:
             MotionFault: A limit was met: a joint's range or speed, or reach. The arm brakes.
@@ -327,7 +327,7 @@ def joint_zeros(robot: RobotModel, seed: int | None) -> Floats:
 
 
 class ControlUnit(ABC):
-    """What controllers of every make have: an arm advanced cycle by cycle, a log, a force limit.
+    """Common part of all controllers: an arm advanced by cycles, a log, a force limit.
 
     Attributes:
         arm: The arm.

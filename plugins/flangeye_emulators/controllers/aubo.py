@@ -96,7 +96,7 @@ class AuboController(ControlUnit):
         return OK
 
     def halt(self, deceleration: float, in_space: bool) -> int:
-        """Brake and forget what follows."""
+        """Brake and drop the queued moves."""
         self.note("stop")
         self._mover.halt(deceleration, in_space)
         return OK
@@ -215,7 +215,7 @@ def frame(body: bytes) -> bytes:
 
 
 def answer(box: AuboController, body: bytes) -> bytes:
-    """Return the answer to one request, after doing what it says."""
+    """Execute one request and return its answer."""
     if body.startswith(b"__login__"):
         # The client takes any answer.
         return b"OK"

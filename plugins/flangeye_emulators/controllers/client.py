@@ -108,7 +108,7 @@ class EmulatorControl(Device):
         return self.ask("state")
 
     def log(self) -> list[str]:
-        """Return what happened: commands, programs, stops with their reasons."""
+        """Return the log of events: commands, programs, stops with their reasons."""
         return [f"{time:.3f} {what}" for time, what in self.ask("log")["lines"]]
 
     def figures(self) -> dict[str, float]:
@@ -120,7 +120,7 @@ class EmulatorControl(Device):
         self.ask("fault", fault=text)
 
     def clear(self) -> None:
-        """End what can be ended: dead, frozen, slow network; local control; faults to come."""
+        """Clear faults: dead, frozen or slow network, local control, faults to come."""
         self.ask("clear")
 
     def reset(self) -> None:
@@ -128,7 +128,7 @@ class EmulatorControl(Device):
         self.ask("reset")
 
     def set_surfaces(self, *surfaces: SpringSurface) -> None:
-        """Let there be these surfaces and no others."""
+        """Replace all contact surfaces by these."""
         self.ask(
             "surfaces",
             surfaces=[
@@ -143,7 +143,7 @@ class EmulatorControl(Device):
         )
 
     def put(self, joints: Sequence[float] | Floats) -> None:
-        """Stand at joint angles [rad] at once."""
+        """Place the arm at joint angles [rad] at once."""
         self.ask("put", joints=[float(angle) for angle in joints])
 
     def unlock_after(self, seconds: float) -> None:

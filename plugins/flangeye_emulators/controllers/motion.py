@@ -1,4 +1,4 @@
-"""Motions: each gives, cycle by cycle, the target the arm goes to next. Pure and deterministic.
+"""Motions that give the arm's target cycle by cycle. Pure and deterministic.
 
 A motion runs in its own time: when the speed slider is low or a stop is under way, that time runs
 slower than the clock, so the arm slows down on its path and never leaves it.
@@ -69,7 +69,7 @@ POSES: Space = PoseSpace()
 
 
 class Waypoint(NamedTuple):
-    """Where to go, how fast at most, and how far around it the corner may be rounded."""
+    """A target, its speed limit, and its blend radius."""
 
     target: Floats
     speed: float
@@ -187,7 +187,7 @@ SLOWEST = 1e-4
 
 
 class ControllerMotion(Protocol):
-    """What moves the arm.
+    """A motion of the arm in progress.
 
     Attributes:
         done: Whether there is nothing left to do; the last target has been given.
@@ -328,7 +328,7 @@ class Servo:
 
 
 class Phase(NamedTuple):
-    """A stretch of constant acceleration; ``time`` [s] and ``place`` are where it begins."""
+    """A phase of constant acceleration; ``time`` [s] and ``place`` are its start."""
 
     time: float
     place: float

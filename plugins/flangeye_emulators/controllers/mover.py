@@ -1,4 +1,4 @@
-"""What drives an arm from one motion to the next: moves that begin at rest, and velocities."""
+"""Queue of moves from rest to rest, and velocity commands."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Mover:
 
     @property
     def waiting(self) -> int:
-        """How many moves have not begun."""
+        """Number of queued moves that have not begun."""
         return len(self._queue)
 
     @property
@@ -46,7 +46,7 @@ class Mover:
         return self.under_way or self.waiting > 0 or not self.arm.standing
 
     def append(self, plan: Plan) -> None:
-        """Append a move to the queue; it begins when the arm stands still."""
+        """Append a move to the queue; it begins when the arm is at rest."""
         if isinstance(self._motion, Speed):
             self._motion = None
         self._queue.append(plan)
@@ -63,7 +63,7 @@ class Mover:
         self._cycles_left = round(seconds / self.arm.cycle)
 
     def halt(self, deceleration: float | None = None, in_space: bool = True) -> None:
-        """Come to rest, straight on or in joint angles; as fast as it can where nothing is said."""
+        """Come to rest, in a straight line or in joint space, as fast as possible by default."""
         self._queue.clear()
         self._motion = None
         if deceleration is not None and not self.arm.standing:

@@ -32,7 +32,7 @@ class DelayLine:
 
 
 class Network:
-    """The wire of one controller: its ports, its connections, and what is wrong with them.
+    """The network of one controller: ports, connections, and simulated faults.
 
     Attributes:
         host: Address of all ports.
@@ -51,7 +51,7 @@ class Network:
         self._servers: list[asyncio.Server] = []
 
     def offer(self, port: int, factory: Callable[[], Connection]) -> None:
-        """Say what will answer on a port."""
+        """Register the handler of a port."""
         self._ports[port] = factory
 
     async def listen(self) -> None:
@@ -121,14 +121,14 @@ class Connection(asyncio.Protocol):
         self.closed()
 
     def data_received(self, data: bytes) -> None:
-        """Take what a client sent, after the wire's delay."""
+        """Receive a client's data after the simulated delay."""
         self._incoming.push(data, self._network.latency)
 
     def opened(self) -> None:
         """Act on a new connection."""
 
     def received(self, data: bytes) -> None:
-        """Act on what a client sent."""
+        """Handle a client's data."""
 
     def closed(self) -> None:
         """Act on the end of the connection."""
@@ -141,14 +141,14 @@ class Connection(asyncio.Protocol):
             self._outgoing.push(data, self._network.latency)
 
     def stream(self, data: bytes) -> None:
-        """Send what is out of date tomorrow; while the wire is frozen or clogged it is lost."""
+        """Send data of the present moment only; it is dropped while the network is frozen."""
         # Bytes a client may leave unread before stream data is dropped
         clogged = self._transport is None or self._transport.get_write_buffer_size() > 256 * 1024
         if not (self._network.frozen or clogged):
             self._outgoing.push(data, self._network.latency)
 
     def hold(self, frozen: bool) -> None:
-        """Stop or go on reading; going on, send what had to wait."""
+        """Stop or resume reading; on resuming, send the data that waited."""
         if self._transport is None:
             return
         if frozen:
@@ -207,7 +207,7 @@ class Stoppable(Protocol):
 
 
 class FaultInjector:
-    """Causes faults, and ends those that can be ended.
+    """Injects faults, and clears those that can end.
 
     * ``protective-stop``, ``singularity``, ``joint-limit``: a protective stop, with that reason.
     * ``emergency-stop``: the button is pressed, the power goes.
@@ -284,7 +284,7 @@ class Fault(NamedTuple):
 
 
 class Kind(NamedTuple):
-    """A sort of fault: what causes it, and whether it takes a duration."""
+    """A kind of fault: its action, and whether it has a duration."""
 
     cause: Callable[[float | None], None]
     takes_seconds: bool = False
@@ -332,7 +332,7 @@ class Schedule:
         self._waiting.clear()
 
     def step(self, now: float, moving: bool) -> None:
-        """Cause the faults whose time has come."""
+        """Inject the faults that are due."""
         if not self._waiting:
             return
         due = [(f, t) for f, t in self._waiting if (moving if t is None else now >= t)]

@@ -1,4 +1,4 @@
-"""A controller as a process: ports, clock, control channel, whoever made the arm.
+"""A controller process: ports, clock and control channel, for arms of any maker.
 
 The control channel: one JSON object a line asks, one a line answers.
 

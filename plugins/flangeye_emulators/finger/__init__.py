@@ -1,1 +1,1 @@
-"""The compliant finger, simulated: a tip in a groove, and what the camera above its tag sees."""
+"""The simulated compliant finger: a tip in a groove, and its camera's images of the tag."""

@@ -23,7 +23,7 @@ class SimulatedProfilerParams(Params):
 
 
 class SimulatedProfiler(Device):
-    """Looks at the world that the finger stands in, wherever the torch truly is in it.
+    """Measures the simulated bead, at the torch's true place.
 
     Attributes:
         name: For people.
@@ -45,14 +45,14 @@ class SimulatedProfiler(Device):
         return self._look.profile(now)
 
     def close(self) -> None:
-        """Nothing to let go of."""
+        """Do nothing; there is no device."""
 
 
 @part("profiler.simulated")
 def profiler_simulated(
     robot: StateSource, sensor: TactileSensor, seed: Seed, params: SimulatedProfilerParams
 ) -> Profiler:
-    """A look at the bead of a simulated weld, behind the torch."""
+    """A profile of the bead of a simulated weld, behind the torch."""
     if not isinstance(sensor, SimulatedFinger):
         raise StageError(
             f"profiler.simulated sees the weld of sensor.simulated_finger, not of {sensor.name}"
@@ -61,7 +61,7 @@ def profiler_simulated(
 
 
 class LookBehind:
-    """Sees the bead that the torch has laid, and nothing of what a controller takes it for."""
+    """Measures the bead as laid, independently of the controller's estimate."""
 
     def __init__(self, truth: LookTruth, rng: np.random.Generator) -> None:
         self._truth, self._rng = truth, rng
@@ -71,7 +71,7 @@ class LookBehind:
         self._began: float | None = None
 
     def watch(self, time: float, world: WeldWorld) -> None:
-        """See the world as it is now [s]: a bead is laid where the torch is beside the seam."""
+        """Update the world's state [s]; a bead is laid at the torch's place across the seam."""
         s = world.torch_s
         if 0.0 < s < world.groove.root.length:
             again = bisect.bisect_left(self._along, s)  # where it was before, it is molten again
@@ -86,7 +86,7 @@ class LookBehind:
             self._shutter.expose(time, seen + noise)
 
     def profile(self, time: float) -> WeldProfile | None:
-        """Return the next look that has arrived at a time [s], if any."""
+        """Return the next profile that has arrived at a time [s], if any."""
         seen = self._shutter.arrived(time)
         if seen is None:
             return None

@@ -95,7 +95,7 @@ class SimulatedFinger(Device):
         self._torch: list[tuple[float, Floats, float]] = []
 
     def frame(self) -> SensorFrame | None:
-        """Let the tip settle where the arm now is, and return an image that has arrived, if any.
+        """Settle the tip at the arm's present pose; return an image that has arrived, if any.
 
         Raises:
             DeviceError: The camera is lost.
@@ -144,7 +144,7 @@ class SimulatedFinger(Device):
         return np.asarray(world.torch - off), s
 
     def close(self) -> None:
-        """Nothing to let go of."""
+        """Do nothing; there is no device."""
 
     def _shown(self, pose: ToolPose, base_T_flange: Transform) -> Floats:
         """Return what the tag shows of the tip's displacement (3,), along the tool's axes."""
@@ -223,7 +223,7 @@ def sensor_simulated_finger(
 
 @dataclass(frozen=True)
 class Optics:
-    """What is wrong with the images.
+    """Defects of the images.
 
     Attributes:
         blur: Standard deviation [px].
@@ -238,7 +238,7 @@ class Optics:
 
 @dataclass(frozen=True, eq=False)
 class Compliance:
-    """How the tag moves with the tip; nobody but the simulation knows.
+    """The true motion of the tag with the tip; known to the simulation only.
 
     Attributes:
         share: (3,) displacement of the tag per displacement of the tip, in the tool's axes.
@@ -314,7 +314,7 @@ class FingerCamera:
         self._clock = 0.0
 
     def image(self, rotation: Floats, translation: Floats) -> Image:
-        """Return what is seen of a tag at a pose in the camera: (3, 3), and (3,) [m]."""
+        """Return the image of a tag at a pose in the camera: (3, 3), and (3,) [m]."""
         lens = self._lens
         onto = lens.matrix @ np.column_stack([rotation[:, 0], rotation[:, 1], translation])
         seen = np.full((lens.height, lens.width), self.background, dtype=np.uint8)

@@ -1,4 +1,4 @@
-"""A joint between two walls, and where a compliant ball-ended tip comes to rest in it.
+"""A joint between two walls, and the rest position of a compliant ball-ended tip in it.
 
 Quasi-static: the tip takes the place of least elastic energy that the walls leave it, as far as
 friction lets it go there. Lengths [m].

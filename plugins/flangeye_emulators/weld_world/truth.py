@@ -1,4 +1,4 @@
-"""What is true in a simulated weld: its tool's file, and its world's file.
+"""Truth of a simulated weld, from its tool's and its world's files.
 
 A recipe names one of ``data/worlds``, or a file of its own. Lengths [m], angles [rad], times [s];
 in the files each has its unit.
@@ -33,7 +33,7 @@ ToolPath = Annotated[Path, BeforeValidator(bundled_file("true tool", "tools")), 
 
 @dataclass_transform(frozen_default=True)
 def checked(cls: type[T]) -> type[T]:
-    """Return a frozen dataclass of which a file must not name what it does not have."""
+    """Return a frozen dataclass from a file; refuse keys it does not have."""
     return with_config(ConfigDict(extra="forbid"))(dataclass(frozen=True)(cls))
 
 
@@ -64,7 +64,7 @@ class ArmTruth:
 
 @checked
 class ToolTruth:
-    """Where tip and torch really are, beside where the world's file puts them.
+    """True places of tip and torch, relative to the finger's file.
 
     Attributes:
         tip: Ahead, to the left, up.
@@ -81,7 +81,7 @@ class ToolTruth:
 
 @checked
 class FingerTruth:
-    """How the finger deforms, and what its tag shows of it.
+    """True deformation of the finger, and the tag's response.
 
     Attributes:
         lateral: Stiffness across, as a share of the world file's.
@@ -110,7 +110,7 @@ class FingerTruth:
 
 @checked
 class ClockTruth:
-    """When images are taken, when they arrive, and what their timestamps say.
+    """When images are exposed and arrive, and what their timestamps state.
 
     Attributes:
         rate: Images per second.
@@ -144,7 +144,7 @@ class Tack:
 
 @checked
 class WorkpieceTruth:
-    """What the workpiece is like, beside its CAD.
+    """True shape of the workpiece, relative to its CAD.
 
     Attributes:
         wave: Amplitude with which its edges wander.
@@ -186,7 +186,7 @@ class HeatTruth:
 
 @checked
 class LookTruth:
-    """A profile sensor behind the torch: what it sees, and when.
+    """A profile sensor behind the torch: its field of view and timing.
 
     Attributes:
         behind: How far behind the torch it looks.
@@ -201,7 +201,7 @@ class LookTruth:
 
 @checked
 class WeldTruth:
-    """All that is true of a simulated weld: what a world's file holds."""
+    """The whole truth of a simulated weld: the content of a world's file."""
 
     arm: ArmTruth = ArmTruth()
     tool: ToolTruth = ToolTruth()

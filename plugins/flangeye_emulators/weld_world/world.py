@@ -1,4 +1,4 @@
-"""One simulated weld as it really is: its tip at rest, what its tag shows, its torch."""
+"""The true state of one simulated weld: its tip at rest, its tag, its torch."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ GRAIN = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Nominal:
-    """What the files say, which the world differs from.
+    """What the files state; the world differs from it.
 
     Attributes:
         seam: The CAD's, in the plane of the work.
@@ -99,7 +99,7 @@ class WeldWorld:
         return self._tool.axes(pose, level_R_tool), self._tool.rest(pose, level_R_tool)
 
     def settle(self, reported: ToolPose, level_R_tool: Floats | None = None) -> Floats:
-        """Let the tip come to rest; return what its tag shows of its displacement (3,) [m].
+        """Let the tip come to rest; return its displacement as the tag shows it (3,) [m].
 
         Args:
             reported: The tool, as arm and files have it.
@@ -141,7 +141,7 @@ class SeamDistortion:
 
 
 class TrueTool:
-    """Tip and torch of a tool whose file is wrong."""
+    """True tip and torch of a tool whose file is wrong."""
 
     def __init__(self, truth: ToolTruth, torch: Floats) -> None:
         """Take the world file's torch (3,) from the tip, in the tool's axes [m]."""
@@ -161,7 +161,7 @@ class TrueTool:
         return pose.position + turned(level_R_tool @ self._tip, pose.angle)
 
     def torch(self, pose: ToolPose, level_R_tool: Floats) -> Floats:
-        """Return where the torch is (3,)."""
+        """Return the true place of the torch (3,)."""
         return pose.position + turned(level_R_tool @ self._torch, pose.angle)
 
 
@@ -301,14 +301,14 @@ Item = TypeVar("Item")
 
 
 class Stamped(NamedTuple, Generic[Item]):
-    """What was exposed, under the time that its timestamp claims [s]."""
+    """An exposure with its stated timestamp [s]."""
 
     stamp: float
     item: Item
 
 
 class Shutter(Generic[Item]):
-    """Exposures on their way from the camera to who waits for them."""
+    """Exposures in transit from the camera to the reader."""
 
     def __init__(self, truth: ClockTruth, rng: np.random.Generator) -> None:
         self._truth, self._rng = truth, rng
@@ -316,14 +316,14 @@ class Shutter(Generic[Item]):
         self._count = 0
 
     def due(self, age: float) -> bool:
-        """Whether an image is to be taken at this age of the camera [s]; counts it."""
+        """Whether an image is due at this age of the camera [s]; counts it."""
         if age * self._truth.rate < self._count:
             return False
         self._count += 1
         return True
 
     def expose(self, time: float, item: Item) -> None:
-        """Take an image at ``time`` [s]: it may be lost on the way."""
+        """Expose an image at ``time`` [s]; it may be lost in transit."""
         truth = self._truth
         late = max(0.0, truth.latency + truth.jitter * float(self._rng.standard_normal()))
         if self._rng.uniform() < truth.dropped:

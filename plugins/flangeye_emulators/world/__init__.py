@@ -1,1 +1,1 @@
-"""A cell with truth: an arm, its flange, their surroundings, and the scanners that look at them."""
+"""A cell with known truth: an arm, its flange, surroundings, and scanners."""

@@ -1,4 +1,4 @@
-"""An arm that does not stand quite where it says, as real ones do not."""
+"""A simulated arm whose true pose differs from the reported one, as of real arms."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from flangeye.units import Angle, param
 
 
 class ErrorSizes(NamedTuple):
-    """How large an arm's errors are; what is drawn has these standard deviations [rad, m]."""
+    """Standard deviations of an arm's simulated errors [rad, m]."""
 
     zeros: float
     lengths: float = 0.0
@@ -31,7 +31,7 @@ plain fit: 0.35 to 0.7 mm rms, most of it smooth over the workspace."""
 
 
 class ArmErrors(Params):
-    """How far the simulated arm is from what its controller believes."""
+    """Errors of the simulated arm against its controller's model."""
 
     quality: Literal["exact", "kind", "real"] = Field(
         "kind",

@@ -33,7 +33,7 @@ CLUTTER = 6
 
 
 class LaidParams(Params):
-    """A workpiece as it really lies."""
+    """The true pose of a workpiece."""
 
     workpiece: WorkpiecePath = param(
         "v-straight", description="One of data/workpieces, or a .yaml file of one's own."
@@ -133,7 +133,7 @@ class StandingArm(Protocol):
     """An arm in the room."""
 
     def state(self) -> RobotState:
-        """Return what it says of itself."""
+        """Return its reported state."""
         ...
 
     def true_flange(self) -> Floats:
@@ -146,13 +146,13 @@ _NEWEST: list[ref[StandingArm]] = []
 
 
 def enter(arm: StandingArm) -> None:
-    """Let an arm stand in the room, for as long as it lives."""
+    """Register an arm in the room for its lifetime."""
     _ARMS.add(arm)
     _NEWEST[:] = [ref(arm)]
 
 
 def newest() -> StandingArm | None:
-    """Return the arm that came into the room last, which carries what is mounted on an arm."""
+    """Return the arm registered last; it carries whatever is mounted on an arm."""
     return _NEWEST[0]() if _NEWEST else None
 
 

@@ -1,4 +1,4 @@
-"""What a camera sees of a printed board: perspective, lens, blur and noise; and its depth."""
+"""Render a printed board: perspective, lens, blur and noise; and its depth."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PAPER_MARGIN = 1.0
 
 @dataclass(frozen=True, eq=False)
 class BoardCamera:
-    """A camera that looks at boards.
+    """A camera that images boards.
 
     Attributes:
         camera_matrix: (3, 3) [px].
@@ -68,7 +68,7 @@ def render_board(
     rng: np.random.Generator,
     cover: Cover | None = None,
 ) -> Image:
-    """Return what the camera sees of a board on white paper before grey.
+    """Return the camera's image of a board on white paper before grey.
 
     Args:
         board: The print.

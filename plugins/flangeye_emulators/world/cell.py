@@ -1,4 +1,4 @@
-"""The cell that is simulated: an arm on a table, a wall, a stand with a disc that is no flange."""
+"""The simulated cell: an arm on a table, a wall, and a stand with a disc that is no flange."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def stub_mesh(sphere: Sphere) -> Mesh:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedCell:
-    """The things that stand around, in ``base``, and the arm among them.
+    """The surroundings in ``base``, and the arm.
 
     Attributes:
         robot: The arm.
@@ -75,7 +75,7 @@ class SimulatedCell:
     body: TargetBody | None = None
 
     def around(self) -> list[SolidBody]:
-        """Return what does not move."""
+        """Return the static bodies."""
         x, y = self.centre[:2]
         far = x + self.size[0] / 2 + 0.13
         return [

@@ -1,4 +1,4 @@
-"""What each pixel of a camera sees: rays, their first hits, and what is hidden from a light.
+"""Ray casting: the first hit of each pixel, and shadows of a light source.
 
 Rays are followed through every second pixel of every second row; the pixels of the four phases,
 ``SQUARES``, stand for each other where nothing changes between them.
@@ -28,7 +28,7 @@ SQUARES = ((0, 0), (0, 1), (1, 0), (1, 1))
 
 @dataclass(frozen=True, eq=False)
 class SolidBody:
-    """A thing in the cell: its surface, in some frame, and what it is made of."""
+    """A body: its surface, in some frame, and its material."""
 
     mesh: Mesh
     material: Material
@@ -171,7 +171,7 @@ class RaycastScene:
         return _Met(found["t_hit"].numpy(), body, np.ascontiguousarray(normals))
 
     def hidden(self, light: Floats, pixels: Pixels, depth: Image, wanted: Mask) -> Mask:
-        """Return the (H, W) pixels whose points something hides from a light; right where wanted.
+        """Return the (H, W) pixels whose points are in shadow of a light; exact where wanted.
 
         Every second row and column is followed, and the others only where those around them
         disagree: a shadow has to be narrower than two pixels to be missed.

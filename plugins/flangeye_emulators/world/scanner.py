@@ -1,4 +1,4 @@
-"""Where a simulated scanner stands, and what it is by its principle, with its errors.
+"""A simulated scanner by its principle, with its errors and pose.
 
 Structured light: a camera and a projector beside it. Time of flight: one eye, its lamp beside it,
 and the errors of measuring phases. Both round, lose and invent points where the depth steps.
@@ -79,7 +79,7 @@ def distance_to(marked: Mask) -> Image:
 
 
 def distance_within(reach: int, marked: Mask) -> Image:
-    """Return :func:`distance_to` up to ``reach`` [px], and beyond it something at least as large.
+    """Return :func:`distance_to` up to ``reach`` [px]; larger distances may be overestimated.
 
     Most of an image is far from any step: that takes half the time.
     """
@@ -96,7 +96,7 @@ def distance_within(reach: int, marked: Mask) -> Image:
 
 
 def lost(distance: Indices | Image, loss: float, grain: Image) -> Mask:
-    """Return which pixels at a distance from the nearest step a scanner gives up.
+    """Return the pixels that a scanner drops, by their distance from the nearest depth step.
 
     Args:
         distance: Pixels to the nearest one with a step beside it; the step itself is half a pixel
@@ -158,7 +158,7 @@ def _local_average(depth: Image, at: Indices, width: Image, blur: float) -> Imag
 
 
 def fly(depth: Image, beside: Mask, rng: np.random.Generator) -> None:
-    """Move some of the pixels beside a step to between its two sides, in place.
+    """Turn some pixels beside a depth step into flying pixels between its sides, in place.
 
     A pixel that sees both sides reports something between, nearer to what it sees more of.
 
@@ -560,7 +560,7 @@ def _digits(depth: Image) -> Image:
 
 
 class CameraPose(PlaceParams):
-    """Where the scanner stands, in ``base``."""
+    """The scanner's pose in ``base``."""
 
     position: tuple[Length, Length, Length] = param(
         ("600 mm", "-12.5 mm", "1000 mm"), description="The paper's (17): 1 m above the table."
@@ -571,7 +571,7 @@ class CameraPose(PlaceParams):
 
 
 class ScannerQuality(Params):
-    """How good a simulated scanner is, beside its model."""
+    """Errors of a simulated scanner beyond its model."""
 
     noise: float = Field(1.0, ge=0, description="Scale of the scanner's noise and distortion.")
     resolution: float = Field(
@@ -588,7 +588,7 @@ def scanner_of(
 
 
 def before_camera(bodies: Sequence[SolidBody], base_T_camera: Floats) -> RaycastScene:
-    """Return the bodies, given in ``base``, as they stand before the camera."""
+    """Return bodies given in ``base`` in the camera's frame."""
     from flangeye_emulators.world.raycast import RaycastScene
 
     camera_T_base = Transform(BASE, CAMERA, base_T_camera).inverse().matrix

@@ -25,7 +25,7 @@ DRAWS = 4000
 
 @dataclass(frozen=True)
 class CameraView:
-    """What the camera can see.
+    """The camera's field of view.
 
     Attributes:
         distance: To the target at the first pose [m].
@@ -118,7 +118,7 @@ class Cast:
 def draw_arm_poses(
     cast: Cast, home: tuple[Floats, Floats], spread: float, rng: np.random.Generator
 ) -> ArmPoses:
-    """Return the first pose, and others drawn around it, in view or not.
+    """Return the first pose and random ones around it, in view or not.
 
     Args:
         cast: The arms.
@@ -207,7 +207,7 @@ def seen_from(poses: ArmPoses, places: Places) -> Floats:
 
 
 def visible(poses: ArmPoses, places: Places, view: CameraView, count: int) -> ArmPoses:
-    """Return the poses at which the camera sees the target, ``count`` at least.
+    """Return at least ``count`` poses at which the camera sees the target.
 
     Raises:
         StageError: There are too few.

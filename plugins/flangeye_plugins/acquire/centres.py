@@ -1,4 +1,4 @@
-"""Features that somebody has found already: circle centres, or poses of markers."""
+"""Features that another program has detected: circle centres, or poses of markers."""
 
 from __future__ import annotations
 

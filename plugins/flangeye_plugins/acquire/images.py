@@ -49,7 +49,7 @@ Grey = NDArray[np.uint8]
 
 
 class SeenBoardParams(Params):
-    """The board whose views calibrate the camera, as the fit step configures it."""
+    """The board that calibrates the camera, with its fit step's parameters."""
 
     kind: Kind = Field("charuco", description="charuco, checkerboard, or circles.")
     columns: int = Field(ge=3, description="Squares, or circles of a row, from left to right.")
@@ -128,7 +128,7 @@ class CalibratedLens(NamedTuple):
 
 
 def lens_of(images: Mapping[str, Grey], board: Board, start: Image | None = None) -> CalibratedLens:
-    """Return the camera that saw a board, by least squares over all corners and poses (Zhang 2000).
+    """Return the intrinsics of a camera from its images of a board, by least squares (Zhang 2000).
 
     Args:
         images: (H, W) each, by name.
@@ -344,7 +344,7 @@ class ImagesParams(OpeningParams):
     )  # fmt: skip
 
     def camera(self, recording: Recording) -> Camera | None:
-        """Return the camera matrix (3, 3) [px] and distortion: as given, or the archive's own."""
+        """Return the camera matrix (3, 3) [px] and distortion: as given, else from the archive."""
         if self.focal_length is None or self.principal_point is None:
             return recording.camera
         return pinhole(self.focal_length, self.principal_point), np.array(self.distortion)

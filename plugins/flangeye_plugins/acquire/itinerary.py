@@ -106,7 +106,7 @@ class Itinerary:
         return self._reach.why_refused() or "none was tried"
 
     def shown(self, start: Floats | None) -> tuple[str, dict[str, Any]]:
-        """Return the plan for people and for programs: every stop, the way to it, what it takes.
+        """Return the plan as text and data: every stop, the path to it, and its duration.
 
         Args:
             start: (n,) where the arm stands [rad]; None where it does not answer.
@@ -244,7 +244,7 @@ def left_out(refusals: Iterable[Refusal], poses: Iterable[PlannedPose]) -> list[
 
 
 def seconds_of(rows: Iterable[PlanRow]) -> float:
-    """Return what the motion takes [s]."""
+    """Return the duration of the motion [s]."""
     return sum(row.seconds for row in rows)
 
 

@@ -58,7 +58,7 @@ from flangeye_plugins.acquire.itinerary import Itinerary, Stop, itinerary_of
 
 
 class Idle:
-    """The time in which an arm stood while nothing was exposed, since it first set off.
+    """The time in which the arm stood without an exposure, since its first move.
 
     What is computed while the arm is under way, or stands for a scan, costs no time.
     """
@@ -180,7 +180,7 @@ def _source(session: LiveSession, arm: RobotDriver, eye: ScannerDriver) -> Sourc
 
 
 def require_inside(state: RobotState, allowed: MotionLimits) -> None:
-    """Refuse an arm that stands where it must not go: there is no checked way from there.
+    """Refuse an arm that starts outside its limits, where no checked path begins.
 
     Raises:
         StageError: Says where it stands, and what is allowed.
@@ -239,11 +239,11 @@ class LiveCaptures(Captures):
 
     @property
     def idle(self) -> float | None:
-        """Share of the session in which the arm stood while nothing was exposed."""
+        """Share of the session in which the arm stood without an exposure."""
         return self._session.idle.share
 
     def close(self) -> None:
-        """Stop the arm; let go of arm and scanner."""
+        """Stop the arm; disconnect arm and scanner."""
         super().close()
         self._release.close()
 

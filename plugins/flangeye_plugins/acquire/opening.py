@@ -1,4 +1,4 @@
-"""What ``acquire.archive`` and ``acquire.centres`` share: find the archive and read its poses."""
+"""Shared by ``acquire.archive`` and ``acquire.centres``: find the archive, read its poses."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def archive_path(stage: str, given: ArchivePath, params: OpeningParams) -> Path:
 
 
 def open_archive(path: Path, params: OpeningParams) -> Archive:
-    """Return the poses and files at ``path``, those left out gone.
+    """Return the poses and files at ``path``, without those left out.
 
     Raises:
         StageError: The reader cannot read it, it holds no poses, or two have one name.
@@ -111,7 +111,7 @@ def open_archive(path: Path, params: OpeningParams) -> Archive:
 def source_of(
     archive: Archive, told: Iterable[str], digests: dict[Path, str] | None = None
 ) -> Source:
-    """Return where what is taken from an archive comes from.
+    """Return the source of an archive's captures.
 
     Args:
         archive: The archive; its notes come first.
@@ -150,7 +150,7 @@ def poses_of(recording: Recording, cell: Cell | None = None) -> Poses:
 
 
 def observation_of(recording: Recording, feature: Feature, cell: Cell | None = None) -> Observation:
-    """Return a ready-made feature with all that the recording says of the arms."""
+    """Return a detected feature with the arms' recorded poses and joints."""
     return Observation(
         recording.id,
         feature,
@@ -193,7 +193,7 @@ def check_usable(
 
 
 def log_source(log: RunLog, recordings: Sequence[Recording], cell: Cell | None = None) -> Source:
-    """Return where what a log of ours holds comes from: the log, and what it says of itself.
+    """Return the source of a log's captures: the log, and its own notes.
 
     Args:
         log: The log.
@@ -227,7 +227,7 @@ def _place(recording: Recording, name: str, cell: Cell) -> Floats:
 
 
 def check_cell(root: Path, recordings: Sequence[Recording], cell: Cell) -> None:
-    """Refuse recordings that are not of this cell, or that nothing can be found from.
+    """Refuse recordings of another cell, or from which nothing can be estimated.
 
     Raises:
         StageError: A camera, a target or something that moves is unknown or lacks its recordings,

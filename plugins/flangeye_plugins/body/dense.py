@@ -78,7 +78,7 @@ class BodyFit:
     pulls: Floats
 
     def weakest(self, freedoms: int) -> float:
-        """Return the standard deviation of what the scan shows least, of so many directions.
+        """Return the standard deviation of the least certain of so many directions.
 
         In sizes of the body, or radians, of the points alone.
         """
@@ -94,7 +94,7 @@ class BodyFit:
         return int((np.r_[turn, shift] < (0.05 * UNKNOWN) ** 2).sum())
 
     def covariance(self, model_error: float, distortion: Callable[[Floats], Floats]) -> Floats:
-        """Return (6, 6), order (rotation, translation), left perturbation in ``camera``.
+        """Return (6, 6) covariance, order (rotation, translation), left perturbation in ``camera``.
 
         Args:
             model_error: Standard deviation of the surface against the CAD, along each axis [m]; a

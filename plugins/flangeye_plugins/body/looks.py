@@ -1,4 +1,4 @@
-"""What of a body a scanner sees from where, and how well a scan shows it at a pose."""
+"""The visible parts of a body from each direction, and a pose's score against a scan."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ LISTED = 160
 
 @dataclass(frozen=True, eq=False)
 class Looks:
-    """What of a body is seen from where.
+    """The visible parts of a body from each direction.
 
     Attributes:
         shape: The body.
@@ -102,7 +102,7 @@ class Looks:
         return on, ends
 
     def scores(self, poses: Floats, view: CoarseImage, count: int, tolerance: float) -> Floats:
-        """Return (K,) shares of so many points that are seen as they should be, less the others.
+        """Return (K,) scores: the share of visible points in agreement, less contradictions.
 
         Args:
             poses: (K, 4, 4).
@@ -168,7 +168,7 @@ class Looks:
         return np.asarray(pose @ out)
 
     def tolerance(self, view: CoarseImage) -> float:
-        """Return how far off the scan may be [m]."""
+        """Return the largest distance from the scan that counts as agreement [m]."""
         # As a share of the size; three sigma of the scanner's noise at least
         return max(0.01 * self.size, 3 * view.noise)
 
@@ -214,7 +214,7 @@ class Looks:
 
 @lru_cache(maxsize=8)  # a session's body, and how its mesh may be drawn wrongly
 def prepared(body: TargetBody) -> Looks:
-    """Return a body's looks, with its shape; computed once."""
+    """Return a body's looks; computed once for each shape."""
     return Looks(Shape(body.vertices, body.triangles))
 
 

@@ -62,12 +62,12 @@ class BodyVerdict(NamedTuple):
 
     @property
     def trusted(self) -> float:
-        """Share of what was seen in its place that is the body."""
+        """Share of the scan points at its place that agree with it."""
         return self.agree / max(self.agree + self.against, 1)
 
     @property
     def score(self) -> float:
-        """What poses are ranked by: rays for it, less those against it."""
+        """Rank of a pose: rays that agree, less weighted rays that contradict."""
         held = self.agree if self.bounded else 0
         # Rays in favour that one against outweighs: of the true pose there are hardly any
         return held - 10 * self.against - self.goes_on

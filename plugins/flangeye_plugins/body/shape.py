@@ -89,7 +89,7 @@ class Shape:
 
     @cached_property
     def size(self) -> float:
-        """Diagonal of the box around what can be seen [m]."""
+        """Diagonal of the bounding box of its visible surface [m]."""
         return float(np.linalg.norm(np.ptp(self.vertices, axis=0)))
 
     @cached_property

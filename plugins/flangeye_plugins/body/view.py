@@ -40,7 +40,7 @@ class CoarseImage:
         return np.stack([*np.meshgrid(x, y), np.ones((rows, columns))], axis=-1)
 
     def cells(self, points: Floats) -> tuple[Indices, Mask]:
-        """Return the flat index of the cell that each of (..., 3) points is seen in, and if any."""
+        """Return the flat index of the cell that sees each point, and whether one does."""
         rows, columns = self.xyz.shape[:2]
         z = np.maximum(points[..., 2], 1e-6)
         column = (points[..., 0] / z - self.low[0]) / self.angle
@@ -84,7 +84,7 @@ class CoarseImage:
 
     @cached_property
     def nearest_end(self) -> Indices:
-        """(H, W) flat index of the cell nearest to each in which a surface ends; else its own."""
+        """(H, W) flat index of the nearest cell at a surface's edge; its own if there is none."""
         from scipy.ndimage import distance_transform_edt
 
         found = self.ends[0]
@@ -107,7 +107,7 @@ class CoarseImage:
         return np.concatenate([self.xyz, self.normals], axis=-1).reshape(-1, 6).astype(np.float32)
 
     def to_end(self, placed: Floats, outwards: Floats) -> tuple[Floats, Floats]:
-        """Return how a surface's end is seen where a face should end.
+        """Return the offset to the scan's nearest surface edge, and the edge's alignment.
 
         Args:
             placed: (..., 3) where [m].

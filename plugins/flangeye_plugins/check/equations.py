@@ -1,4 +1,4 @@
-"""A session as equations, and many variants of it at once.
+"""A session as equations, with many variants of it solved at once.
 
 One form holds for every configuration. ``carrier_T_camera`` is the camera in what holds it (the
 base, a link or the flange), ``carrier_T_mount`` what holds the target, seen from there as the
@@ -109,7 +109,7 @@ def _carriers(session: RecordedSession) -> tuple[Floats, Floats]:
 
 
 class VariantUnknowns(NamedTuple):
-    """What a variant leaves to be found.
+    """The unknowns of a variant.
 
     Attributes:
         rotation: (K, 3, 3) ``carrier_R_camera``.
@@ -351,7 +351,7 @@ def _transforms(equations: Equations) -> tuple[Floats, Floats]:
 
 
 def positions(equations: Equations, rotations: Rotations) -> tuple[Floats, Floats, Floats]:
-    """Return positions (K, 3) of X and Y, and of the place, which are linear given rotations.
+    """Return positions (K, 3) of X, Y and the place, linear once rotations are known.
 
     A place that is known stays.
     """

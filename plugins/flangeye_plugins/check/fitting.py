@@ -1,4 +1,4 @@
-"""The best calibration of every variant at once, with its likelihood; a few bad samples allowed.
+"""Fit many variants of a session at once, each with its likelihood; robust to a few bad samples.
 
 Errors of a centre, of a normal and of a rotation are each taken as multivariate t with four
 degrees of freedom and a scale of their own: close to normal in the middle, and a sample that is
@@ -95,7 +95,7 @@ def fit(equations: Equations) -> VariantFits:
 
 
 def errors_at(equations: Equations, unknowns: VariantUnknowns) -> Floats:
-    """Return (K, N, B) lengths of every kind of error where the unknowns are as given [m, rad]."""
+    """Return (K, N, B) lengths of every kind of error at given unknowns [m, rad]."""
     blocks = _blocks(equations, unknowns)
     lengths = [np.linalg.norm(block.residuals, axis=-1) for block in blocks]
     return np.stack(np.broadcast_arrays(*lengths), axis=-1)
@@ -283,12 +283,12 @@ def log_of(rotations: Floats) -> Floats:
 
 @lru_cache(maxsize=2)
 def fit_of(session: RecordedSession) -> VariantFits:
-    """Return the best calibration of a session as it is; a session is known by its identity."""
+    """Return the best calibration of an unchanged session; cached by identity."""
     return fit(equations_of(session))
 
 
 def named(arms: Arms, session: RecordedSession) -> str:
-    """Return whose poses, as messages call them."""
+    """Return whose poses are meant, in the words of messages."""
     if session.seconds is None:
         return "the robot's"
     return {"both": "both arms'", "first": "the first arm's", "second": "the second arm's"}[arms]
@@ -303,7 +303,7 @@ EXPLAINED = 0.2
 
 
 class Significance(NamedTuple):
-    """How an alternative compares with the session as it is.
+    """Comparison of an alternative with the unchanged session.
 
     Attributes:
         which: Index of the alternative.
@@ -338,7 +338,7 @@ def best_of(
     tried: int | None = None,
     against: Indices | None = None,
 ) -> Significance:
-    """Return the alternative with the largest likelihood ratio to the session as it is.
+    """Return the alternative with the largest likelihood ratio to the unchanged session.
 
     Args:
         null: The session as it is: once, or on several choices of its samples.
@@ -368,7 +368,7 @@ def best_of(
 
 
 def narrowed(starts: Indices, ratios: Callable[[Indices], Floats]) -> Indices:
-    """Return the (K,) starts about the likeliest, found by ever finer steps: linear in samples.
+    """Return the (K,) starts about the likeliest, by a coarse-to-fine search; linear in samples.
 
     Evidence for a change grows from both sides towards where it was.
 
@@ -409,7 +409,7 @@ def exceedance(ratio: float, count: float, further: int, freedom: float, effect:
 
 
 def negligible(kinds: int) -> Floats:
-    """Return (B,) what is negligible of each kind of error [m, rad]."""
+    """Return (B,) negligible sizes of each kind of error [m, rad]."""
     # What is negligible of a normal's or a marker's rotation: 4 mrad
     # Error that an arm's kinematics or a scanner may have without anybody's mistake [m]
     return np.array([0.5e-3, *[4e-3] * (kinds - 1)])

@@ -1,4 +1,4 @@
-"""Poses of other samples or made up by a driver; and what moved that was taken as fixed."""
+"""Checks of order and constancy: shuffled or repeated poses, and parts that moved."""
 
 from __future__ import annotations
 

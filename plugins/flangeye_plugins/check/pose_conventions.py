@@ -48,7 +48,7 @@ _WAYS: Mapping[str, tuple[Change, str]] = {
 
 
 class Reading(NamedTuple):
-    """A session with its rotations read in another convention: whose, before and after."""
+    """A session with its rotations read in another convention: whose, from and to."""
 
     session: RecordedSession
     whose: str

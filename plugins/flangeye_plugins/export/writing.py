@@ -20,7 +20,7 @@ FRAME = r"^[A-Za-z_][A-Za-z0-9_/]*$"
 
 
 class NamedParams(Params):
-    """What the pose is called."""
+    """The name of the pose."""
 
     name: str = Field(
         "camera",
@@ -43,7 +43,7 @@ class NamedParams(Params):
 
 
 class NumberedParams(NamedParams):
-    """What the pose is called, and where the controller keeps it."""
+    """The name of the pose, and its number in the controller."""
 
     number: int = Field(
         1, ge=0, le=999, description="Number of the frame or tool in the controller."
@@ -73,7 +73,7 @@ class FramesParams(NamedParams):
 
 
 class LengthParams(NamedParams):
-    """What the pose is called, and its unit."""
+    """The name of the pose, and its unit."""
 
     length: Literal["m", "mm"] = Field("m", description="Unit of the translation.")
 
@@ -85,7 +85,7 @@ class LengthParams(NamedParams):
 
 
 class ZividExportParams(LengthParams):
-    """What the pose is called, and its unit."""
+    """The name of the pose, and its unit."""
 
     length: Literal["m", "mm"] = Field("mm", description="Unit; Zivid's points are in mm.")
 

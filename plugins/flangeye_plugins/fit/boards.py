@@ -29,7 +29,7 @@ NO_IMAGE = "there is no image; printed targets are found in the scanner's image"
 
 
 class PrintedTargetParams(ScannerErrorParams):
-    """What fits of printed targets share."""
+    """Common parameters of fits of printed targets."""
 
     depth: Literal["auto", "off", "only"] = Field(
         "auto",
@@ -43,7 +43,7 @@ class PrintedTargetParams(ScannerErrorParams):
 
 
 class DictionaryParams(PrintedTargetParams):
-    """What fits of targets with markers share."""
+    """Common parameters of fits of targets with markers."""
 
     dictionary: Dictionary = Field(
         "4X4_50", description="Family of the markers, as OpenCV names it."
@@ -51,7 +51,7 @@ class DictionaryParams(PrintedTargetParams):
 
 
 class SquaresParams(PrintedTargetParams):
-    """What fits of boards of squares share."""
+    """Common parameters of fits of boards of squares."""
 
     columns: int = Field(ge=3, description="Squares from left to right, inner and outer.")
     rows: int = Field(ge=3, description="Squares from top to bottom.")
@@ -184,7 +184,7 @@ def fit_aruco(capture: Capture, params: MarkerParams) -> PoseFeature | Rejected:
 def fit_board(
     capture: Capture, board: Board, params: PrintedTargetParams
 ) -> PoseFeature | Rejected:
-    """Return a board's pose with its covariance, or why there is none."""
+    """Return a board's pose with its covariance, or the reason for a rejection."""
     if capture.image is None:
         return Rejected(NO_IMAGE)
     corners = find_corners(board, capture.image)

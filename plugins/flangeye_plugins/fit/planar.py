@@ -143,7 +143,7 @@ def moved_by_camera(corners: Corners, image: Image, pose: Floats) -> Floats:
 
 
 def middles_beside_centres(corners: Corners, image: Image, pose: Floats, radius: float) -> Floats:
-    """Return how far (N, 2) the middles of discs' images lie beside those of their centres [px].
+    """Return the offsets (N, 2) of discs' image centroids from their centres' images [px].
 
     A disc about P in the plane of u and v has the image with the dual conic M diag(1, 1, -1) M',
     M = [r u, r v, P]; its middle is that of the conic (Heikkila 2000, section 3).
@@ -169,7 +169,7 @@ def middles_beside_centres(corners: Corners, image: Image, pose: Floats, radius:
 
 
 def points_of(corners: Corners, cloud: PointCloud) -> Floats:
-    """Return where the scanner has the corners (N, 3) [m]; NaN where it has too few points.
+    """Return the corners as the scanner measured them (N, 3) [m]; NaN with too few points.
 
     The points about a corner are taken as a plane, linear in the pixel: the corner lies between
     pixels, and many points are better than one.

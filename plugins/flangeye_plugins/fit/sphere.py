@@ -66,7 +66,7 @@ class SphereFit(NamedTuple):
 
     @property
     def weights(self) -> Floats:
-        """(N,) what each point counts."""
+        """(N,) weight of each point."""
         return cauchy_weights(self.residuals, self.scale)
 
     @property

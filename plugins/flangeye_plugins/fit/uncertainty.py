@@ -16,7 +16,7 @@ residuals on the published clouds."""
 
 
 class ScannerErrorParams(Params):
-    """What fits to a scan share."""
+    """Common parameters of fits to a scan."""
 
     scanner_error: Length = param(
         "0.06 mm",

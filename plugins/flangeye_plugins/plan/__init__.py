@@ -23,7 +23,7 @@ Point = tuple[Length, Length, Length]
 
 
 class PlanParams(Params):
-    """Where plans look for poses."""
+    """The region in which plans look for poses."""
 
     centre: Point | None = Field(
         None, description="Centre of the work; before the scanner if not given."
@@ -122,7 +122,7 @@ class Chooser:
         self._visited: list[Floats] = []
 
     def poses(self) -> Iterator[PlannedPose]:
-        """Yield poses that the arm can take, the most telling of each moment."""
+        """Yield reachable poses, at each step the most informative one."""
         facing = self._site.facing(self._work.centre)
         while facing is not None and len(self._visited) < self._params.count:
             chosen = self._choose(facing)

@@ -1,4 +1,4 @@
-"""Tables of a cell: one of each arm, rail or positioner, and one of what each camera saw.
+"""Tables of a cell: one for each arm, rail or positioner, and one for each camera.
 
 They are joined by the number of the pose, by time, or, where tables have neither, row by row.
 """
@@ -44,7 +44,7 @@ from flangeye_plugins.reader.pairing import MatchedPose, PairingParams, pair
 
 
 class JoinedParams(Params):
-    """A table beside the others."""
+    """A further table, joined with the others."""
 
     file: str = Field(description="The table's name, beside the others.")
     number: Column | None = Field(
@@ -53,7 +53,7 @@ class JoinedParams(Params):
 
 
 class SeenParams(JoinedParams):
-    """What one camera saw of one target."""
+    """Columns of one target as one camera measured it."""
 
     camera: str = Field(description="Name of the camera in the recipe's cell.")
     target: str = Field(description="Name of the target in the recipe's cell.")
@@ -81,7 +81,7 @@ class AxisTableParams(JoinedParams, TimesParams):
 
 
 class SightingsParams(SeenParams, SeenPoseParams, OwnTableParams):
-    """One target as one camera saw it; empty cells where it did not."""
+    """One target as one camera measured it; empty cells mean not seen."""
 
 
 class ScansParams(SeenParams):
@@ -115,7 +115,7 @@ class CellParams(Params):
 
 @dataclass(frozen=True, eq=False)
 class Moved:
-    """What a controller recorded.
+    """Recorded poses of one controller.
 
     Attributes:
         name: Of what moves.
@@ -136,7 +136,7 @@ class Moved:
 
 @dataclass(frozen=True, eq=False)
 class CameraTable:
-    """What a camera recorded of a target: (4, 4), (3,) or a scan, None where it did not see it."""
+    """Recorded targets of a camera: (4, 4), (3,) or a scan each; None if not seen."""
 
     given: SightingsParams | ScansParams
     text: Table

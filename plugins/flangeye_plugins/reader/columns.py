@@ -56,7 +56,7 @@ class WrittenParams(Params):
 
     @classmethod
     def more(cls) -> tuple[str, ...]:
-        """Return what else may be written here than whole poses."""
+        """Return what may be written here other than full poses."""
         return ()
 
     def value(self, where: str, numbers: Floats) -> Floats:
@@ -113,7 +113,7 @@ class FlangePoseParams(ColumnsParams):
 
 
 class SeenPoseParams(ColumnsParams):
-    """A target as a camera saw it; empty cells where it did not."""
+    """A target as a camera measured it; empty cells mean not seen."""
 
     pose: Literal["camera_T_target", "target_T_camera"] = Field(
         "camera_T_target", description="Whose pose it is. rotation: point gives its place alone."

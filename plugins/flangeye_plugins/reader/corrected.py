@@ -1,4 +1,4 @@
-"""``reader.corrected``: an archive whose poses were recorded with a mistake that is now known.
+"""``reader.corrected``: an archive whose poses contain a known mistake, which is undone.
 
 ``flangeye doctor`` names the mistake and gives the line to put into the recipe::
 
@@ -34,7 +34,7 @@ from flangeye.units import Duration, Length, param
 
 
 class PoseMistake(Params):
-    """What was wrong with poses, undone in the order of this list."""
+    """Mistakes of poses, undone in the order of this list."""
 
     rotation: tuple[str, str] | None = Field(
         None, description="Conventions of the rotations: the one in which that reader read them, "
@@ -74,7 +74,7 @@ class PoseMistake(Params):
 
 
 class CorrectedParams(Params):
-    """What was wrong; one level undoes it in the order of this list."""
+    """The mistakes of an archive, undone in the order of this list."""
 
     reader: Annotated[BoundPart, Choose("reader")] = param(
         description="Reader of the archive as it was recorded."

@@ -1,4 +1,4 @@
-"""Pair an arm's recorded poses with what a camera recorded on another clock."""
+"""Pair an arm's recorded poses with a camera's records of another clock."""
 
 from __future__ import annotations
 

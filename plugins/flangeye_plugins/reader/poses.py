@@ -1,4 +1,4 @@
-"""Robot poses as files give them, checked, as (4, 4) matrices in metres."""
+"""Robot poses from files, validated, as (4, 4) matrices in metres."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def pose_from_quaternion(where: str, position: Numbers, xyzw: Numbers) -> Floats
 
 
 def pose_from_rotation_vector(where: str, position: Numbers, vector: Numbers) -> Floats:
-    """Return the pose of a position [m] and a rotation vector [rad], as UR controllers give it.
+    """Return the pose of a position [m] and a rotation vector [rad], as UR controllers use.
 
     Raises:
         StageError: A value is not finite.
@@ -44,7 +44,7 @@ def pose_from_rotation_vector(where: str, position: Numbers, vector: Numbers) ->
 
 
 def pose_from_matrix(where: str, matrix: Floats) -> Floats:
-    """Return a (4, 4) pose [m] after a look at it.
+    """Return a (4, 4) pose [m], validated.
 
     Raises:
         StageError: A value is not finite, or the rotation is not one.

@@ -52,7 +52,7 @@ ARM = "robot: NAME ('flangeye robots' lists them) or robot: {urdf: arm.urdf} in 
 
 
 class BagParams(Params):
-    """What is looked for in the bag; found where it is the only one of its sort."""
+    """Topics and frames in the bag; each is found if it is the only one of its type."""
 
     clouds: str | None = Field(None, description="Topic of the clouds (PointCloud2).")
     images: str | None = Field(None, description="Topic of the images (Image, CompressedImage).")
@@ -76,7 +76,7 @@ class BagParams(Params):
 
 @dataclass
 class Bag:
-    """What the first look at a bag gives.
+    """Contents of a bag from a first pass.
 
     Attributes:
         path: The bag.
@@ -105,7 +105,7 @@ class Bag:
         return [topic for topic, kind in self.topics.items() if kind in types]
 
     def only(self, what: str, given: str | None, *types: str) -> str | None:
-        """Return the topic that was named, or the only one of its types; None where there is none.
+        """Return the named topic, or the only one of its types; None without one.
 
         Raises:
             StageError: It does not exist, or there are several and none was named.
@@ -274,7 +274,7 @@ def _joints(bag: Bag, params: BagParams) -> Stream | None:
 
 @dataclass
 class Target:
-    """The target as somebody measured it: times and poses in the camera."""
+    """The target's poses in the camera with their times, from another program."""
 
     times: Floats
     poses: Floats
@@ -312,7 +312,7 @@ class Scans:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was set aside: for each topic how many messages are damaged, and the first."""
+        """Notes on damaged messages: for each topic their number, and the first."""
         return tuple(
             f"set aside {len(errors)} of {len(self.bag.stamps[topic])} messages of {topic}, the "
             f"first of them number {min(errors)}: {errors[min(errors)]}"
@@ -330,7 +330,7 @@ class Scans:
         return np.array(self.bag.stamps[self.first])
 
     def signals(self, arm: Stream) -> tuple[Signal, Signal] | None:
-        """Difference of each from the one before, where they are frequent enough to compare."""
+        """Difference of each value from the one before, if they are frequent enough to compare."""
         # From so many measurements a second on, their own change tells when something moved
         if len(self.times) < 20 or len(arm[0]) < 20 or np.median(np.diff(self.times)) > 1 / 3.0:
             return None

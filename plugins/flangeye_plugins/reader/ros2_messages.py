@@ -46,7 +46,7 @@ class Raw:
     decode: Callable[[], Any]
 
     def read(self, use: Callable[[Any], T]) -> T:
-        """Return what a function makes of the message.
+        """Return the result of a function on the message.
 
         Raises:
             StageError: It is damaged, or not what its type says.
@@ -63,7 +63,7 @@ class Raw:
 
     @property
     def stamp(self) -> float:
-        """``header.stamp`` [s] of a message that begins with a header; else when received."""
+        """``header.stamp`` [s] of a message that begins with a header; else its time of receipt."""
         return stamp_of(self.data) * 1e-9 or self.received
 
     @property
@@ -188,7 +188,7 @@ def _scratch() -> TemporaryDirectory[str]:
 
 
 def scratch(bag: Path) -> Path:
-    """Return a folder for what is taken out of one bag."""
+    """Return a temporary folder for files unpacked from a bag."""
     folder = Path(_scratch().name) / f"{abs(hash(bag.resolve())):x}"
     folder.mkdir(exist_ok=True)
     return folder

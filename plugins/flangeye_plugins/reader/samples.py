@@ -1,4 +1,4 @@
-"""What other tools save, each as ``reader.table`` reads it.
+"""Sample files of other tools, each read through ``reader.table``.
 
 easy_handeye and easy_handeye2 (IFL-CAMP, marcoesposito1988): ``samples:``, a list of ``robot`` and
 ``tracking`` transforms, or ``hand_world_samples`` and ``camera_marker_samples``; metres, xyzw. The

@@ -1,4 +1,4 @@
-"""A table of poses in any convention that is stated, with scans beside it or the target in it.
+"""A table of poses in any stated convention, with scans beside it or targets in it.
 
 CSV and the like, one row a pose, with or without a heading, any separator, decimal points or
 commas: the scan's file name, if it is given, then the numbers of the pose; or whatever columns
@@ -51,7 +51,7 @@ JOINTS = "joints"
 
 
 class OtherParams(ColumnsParams):
-    """Something else that was measured: in the same rows, or in a table of its own."""
+    """Further measurements: in the same rows, or in a table of their own."""
 
     file: str | tuple[str, ...] | None = Field(
         None, description="A table of its own, or tables side by side; joined by time, by the "
@@ -69,7 +69,7 @@ class OtherParams(ColumnsParams):
 
 
 class TargetParams(SeenPoseParams, OtherParams):
-    """The target as the camera saw it; empty cells where it did not."""
+    """The target as the camera measured it; empty cells mean not seen."""
 
 
 class SecondParams(OtherParams):
@@ -107,7 +107,7 @@ class TableParams(FlangePoseParams, JointsParams, CloudUnitParams):
 
     @classmethod
     def more(cls) -> tuple[str, ...]:
-        """Joint angles may be all there is."""
+        """Return joint angles: a table may have them in place of poses."""
         return (JOINTS,)
 
     @model_validator(mode="after")

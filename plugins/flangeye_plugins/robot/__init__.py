@@ -1,1 +1,1 @@
-"""``robot.*``: arms, a folder for each maker, whose client is imported when it connects."""
+"""``robot.*``: drivers, a folder for each maker; client libraries are imported on connecting."""

@@ -57,7 +57,7 @@ MODES: dict[str, tuple[Mode, str]] = {
 
 
 def require_answer(name: str, host: str, realtime: bool) -> None:
-    """Connect once, and let go again.
+    """Check that the robot answers: connect once, then disconnect.
 
     Args:
         name: Name of the robot, for messages.
@@ -96,7 +96,7 @@ def cannot_connect(name: str, why: str) -> DeviceError:
 
 
 def one_line(text: str) -> str:
-    """Return what the library says, without its own line ends."""
+    """Return the library's message as one line."""
     return " ".join(text.split())
 
 
@@ -131,7 +131,7 @@ def robot_franky(model: RobotModel, params: FrankyParams) -> Robot:
 
 
 def opened(robot: FrankyRobot, model: RobotModel, params: FrankyParams) -> FrankyRobot:
-    """Return a connected robot after a look at it.
+    """Return a connected robot after checking its state.
 
     Raises:
         DeviceError: Tool or arm are not the recipe's, or it is not ready.
@@ -221,7 +221,7 @@ class FrankyRobot(Device):
         self._start(motion, sdk.CartesianStopMotion)
 
     def move_velocity(self, twist: Floats, acceleration: float) -> None:
-        """Go on at a twist (6,) of the flange; the library itself ends it after GRACE."""
+        """Move the flange at a twist (6,); the library stops unless renewed within GRACE."""
         sdk = self._sdk
         base_T_tool = np.array(self._ask(lambda: self._robot.state).O_T_EE.matrix)
         at_tool = twist_at_tool(twist, base_T_tool @ self._tool_T_flange, base_T_tool)
@@ -245,7 +245,7 @@ class FrankyRobot(Device):
                 self._ask(lambda: self._robot.move(stopping(), asynchronous=True))
 
     def close(self) -> None:
-        """Stop the arm; the library lets go when it is forgotten."""
+        """Stop the arm; the library disconnects when the object is deleted."""
         if self._closed:
             return
         with self._commands:

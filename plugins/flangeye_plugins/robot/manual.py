@@ -22,7 +22,7 @@ from flangeye.types import BASE, FLANGE, Floats, Transform
 
 
 class OperatorConsole:
-    """Says things, and hears lines without ever waiting for one.
+    """Prints to the terminal, and reads typed lines without waiting.
 
     No thread reads: one that waits for input when the interpreter ends takes it down with it.
     """
@@ -40,7 +40,7 @@ class OperatorConsole:
         self._said.flush()
 
     def line(self, patience: float = 0.0) -> str | None:
-        """Return a line that has been typed, blank ones aside; None while there is none.
+        """Return a typed line, ignoring blank ones; None if there is none yet.
 
         Args:
             patience: How long to wait for one [s].
@@ -141,7 +141,7 @@ class ManualRobot(Device):
             self._listen(patience=self._period)
 
     def state(self) -> RobotState:
-        """Return where the arm stands, as the person last said."""
+        """Return the arm's pose as the person last entered it."""
         self._listen()
         return RobotState(
             base_T_flange=Transform(BASE, FLANGE, self._pose),
@@ -167,7 +167,7 @@ class ManualRobot(Device):
         self._ask(base_T_flange.matrix, self._joints)
 
     def move_velocity(self, twist: Floats, acceleration: float) -> None:
-        """Refuse: nobody follows a velocity by hand."""
+        """Refuse: a person cannot follow a velocity."""
         raise DeviceError(f"{self.name}: it is moved by hand to poses; it takes no velocities")
 
     def wait_cycle(self) -> None:
@@ -175,7 +175,7 @@ class ManualRobot(Device):
         time.sleep(self._period)
 
     def stop(self) -> None:
-        """Tell the person to leave the arm where it is."""
+        """Tell the person to stop moving the arm."""
         if self._waiting:
             self._waiting, self._stopped = False, True
             self._desk.say("Stop: leave the arm where it is.")
@@ -265,7 +265,7 @@ def fault(
     asked: Floats | None,
     tolerance: Tolerance,
 ) -> str | None:
-    """Return what is strange about a pose, and the probable mistake; None if nothing is.
+    """Return what is implausible about a pose, and the probable mistake; None if nothing.
 
     Args:
         numbers: As typed, in the convention.

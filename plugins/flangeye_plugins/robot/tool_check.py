@@ -1,4 +1,4 @@
-"""What a driver checks in a controller it has opened: its tool and its arm; and their levers."""
+"""Checks of a controller's tool and arm model; twists and wrenches at tool and flange."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from flangeye.units import Angle, Length, param
 
 
 class ToolOffset(Params):
-    """The tool the controller is meant to have set, from the flange."""
+    """The tool offset that the controller should have set, from the flange."""
 
     position: tuple[Length, Length, Length] = param(("0 mm", "0 mm", "0 mm"))
     rotation: tuple[Angle, Angle, Angle] = param(
@@ -29,7 +29,7 @@ class ToolOffset(Params):
 
 
 class ControllerParams(Params):
-    """What every driver of a controller is given."""
+    """Common parameters of controller drivers."""
 
     host: str = Field(min_length=1, description="Address of the controller: 192.168.1.10.")
     tool: ToolOffset = Field(
@@ -85,13 +85,13 @@ def require_model(name: str, state: RobotState, model: RobotModel) -> None:
 
 
 def twist_at_tool(twist: Floats, base_T_flange: Floats, base_T_tool: Floats) -> list[float]:
-    """Return a (6,) twist of the flange as it is at the tool's tip, both in base."""
+    """Convert a (6,) twist of the flange to the tool's tip, both in base."""
     lever = base_T_tool[:3, 3] - base_T_flange[:3, 3]
     return [*(twist[:3] + hat(twist[3:]) @ lever).tolist(), *(float(turn) for turn in twist[3:])]
 
 
 def wrench_at_flange(wrench: Floats, base_T_flange: Floats, base_T_tool: Floats) -> Floats:
-    """Return a (6,) wrench on the tool's tip as it is at the flange's centre, both in base."""
+    """Convert a (6,) wrench on the tool's tip to the flange's centre, both in base."""
     lever = base_T_tool[:3, 3] - base_T_flange[:3, 3]
     return np.concatenate([wrench[:3], wrench[3:] + hat(lever) @ wrench[:3]])
 

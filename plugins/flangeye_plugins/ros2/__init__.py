@@ -1,1 +1,1 @@
-"""ROS 2 as this computer has it: a bridge process under its own Python, and what it carries."""
+"""Access to ROS 2: a bridge process under ROS 2's own Python, and its protocol."""

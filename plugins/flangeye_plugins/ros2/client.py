@@ -31,7 +31,7 @@ MATCHING = 0.5
 
 
 class GraphMessage(NamedTuple):
-    """A message as it came.
+    """A received message, serialised.
 
     Attributes:
         number: How many of its topic had come, with it.
@@ -109,7 +109,7 @@ class Bridge(Device):
         return f"(ROS_DOMAIN_ID {domain}, RMW_IMPLEMENTATION {self.middleware})"
 
     def topics(self) -> dict[str, Topic]:
-        """Return what is known of the running graph, by topic."""
+        """Return the topics of the running graph."""
         return {
             name: Topic(name, about["type"], tuple(about["publishers"]), about["subscribers"])
             for name, about in self._ask("graph").items()
@@ -120,11 +120,11 @@ class Bridge(Device):
         return dict(self._ask("services"))
 
     def until_known(self) -> float:
-        """Return when discovery has ended, by ``time.monotonic`` [s]: nothing new comes then."""
+        """Return when discovery has finished, by ``time.monotonic`` [s]."""
         return max(self._began + self.discovery, time.monotonic() + MATCHING)
 
     def awaited(self, look: Callable[[], Found]) -> Found:
-        """Return what there is, as soon as there is something and as long as it may appear."""
+        """Return what was discovered, waiting for it at most until discovery has finished."""
         until = self.until_known()
         while not (found := look()) and time.monotonic() < until:
             time.sleep(0.05)
@@ -137,7 +137,7 @@ class Bridge(Device):
     # --- what comes
 
     def follow(self, topic: str, kind: str, always: bool = True, take: Take | None = None) -> None:
-        """Subscribe, as soon as somebody publishes.
+        """Subscribe to a topic as soon as it is published.
 
         Args:
             topic: Its name.
@@ -170,7 +170,7 @@ class Bridge(Device):
         return found if found and found.number > after else None
 
     def want(self, topic: str, since_ns: int | None = None) -> int:
-        """Ask for a topic's newest message since a moment, or else, or without one, for the next.
+        """Request a topic's newest message since a given time, or else its next one.
 
         Returns:
             The number after which it comes.
@@ -205,7 +205,7 @@ class Bridge(Device):
         )
 
     def stamp_ns(self, local_ns: int) -> int:
-        """Return what a message of a moment, by ``time.monotonic_ns``, is stamped with."""
+        """Return the message stamp that belongs to a time of ``time.monotonic_ns``."""
         tick = self.newest(CLOCK) if self._sim_time else None
         if tick is None:
             return local_ns + time.time_ns() - time.monotonic_ns()
@@ -226,11 +226,11 @@ class Bridge(Device):
         self._send({"ask": "publish", "topic": topic, "size": len(data)}, data)
 
     def find(self, service: str) -> None:
-        """Find a ``std_srvs/srv/Trigger``; raises DeviceError where nobody offers it."""
+        """Find a ``std_srvs/srv/Trigger`` service; raise DeviceError if there is none."""
         self._ask("find", service=service)
 
     def trigger(self, service: str, patience: float) -> None:
-        """Call a service that was found and wait for its answer.
+        """Call a Trigger service and wait for its answer.
 
         Raises:
             DeviceError: It has ended, does not answer in time [s], or says that it failed.

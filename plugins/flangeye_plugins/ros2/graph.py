@@ -1,4 +1,4 @@
-"""The ROS 2 graph of this terminal: what runs there as a recipe names it, and a pose told to it."""
+"""The ROS 2 graph: inspect what runs for a recipe, and publish a calibrated pose."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ TF, STATIC, TF_TYPE = "/tf", "/tf_static", "tf2_msgs/msg/TFMessage"
 
 
 class StampedFrame(NamedTuple):
-    """A frame: its parent, its pose there (4, 4), and when that came; never for one that stands."""
+    """A tf frame: its parent, its pose there (4, 4), and its time; None if static."""
 
     parent: str
     pose: Floats
@@ -161,7 +161,7 @@ TRIGGERS = re.compile(r"capture|trigger|acquire|scan|grab|snap|frame", re.IGNORE
 
 
 class Ros2Graph(Device):
-    """What runs; see :class:`flangeye.models.graph.Graph`."""
+    """The running ROS 2 graph; see :class:`flangeye.models.graph.Graph`."""
 
     # For how long messages are counted [s]; a camera that runs by itself gives one in that
     # time.
@@ -378,7 +378,7 @@ class Heard(NamedTuple):
 
     @property
     def line(self) -> str:
-        """What it is, for people."""
+        """One line of text about the topic."""
         name, kind = self.topic.name, self.topic.type.rpartition("/")[2]
         often = f"{self.rate:.3g} Hz" if self.newest else "silent"
         frame = f", frame {self.frame}" if self.frame else ""
@@ -397,7 +397,7 @@ def controllers_in(topics: Iterable[Topic]) -> list[str]:
 
 
 def described_arm(text: str, path: Path, ask: Ask) -> tuple[UrdfArm, dict[str, Any]]:
-    """Return the arm of a URDF that is to be saved at ``path``, and its section of a recipe.
+    """Return the arm of a URDF to be saved at ``path``, and the recipe's section for it.
 
     Raises:
         RecipeError: It is none, or does not tell which link is the base.

@@ -71,7 +71,7 @@ def types() -> Any:
 
 
 def decoded(data: bytes, kind: str, use: Callable[[Any], Any] = lambda message: message) -> Any:
-    """Return what a function makes of the message of a type in serialised ``data``.
+    """Return the result of a function on a deserialised message.
 
     Raises:
         StageError: It is damaged, or not of this type.
@@ -167,7 +167,7 @@ def intrinsics_of(message: Any, rectified: bool = False) -> tuple[Floats, Floats
 
 
 def values_of(message: Any) -> NDArray[Any]:
-    """Return what a ``sensor_msgs/Image`` holds: (H, W) or (H, W, channels), as it was sent.
+    """Return the pixels of a ``sensor_msgs/Image``: (H, W) or (H, W, channels), unconverted.
 
     Raises:
         StageError: Its encoding is not known.

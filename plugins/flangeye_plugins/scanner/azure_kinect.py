@@ -150,7 +150,7 @@ class AzureKinect(OpenScanner):
         return decode
 
     def close(self) -> None:
-        """Let go of the camera."""
+        """Disconnect from the camera."""
         self._pipe.close()
 
     def _array(self, shape: list[int], kind: Any) -> Any:

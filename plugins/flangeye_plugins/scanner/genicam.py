@@ -46,7 +46,7 @@ class RangeLayout:
     facts: dict[str, str]
 
     def coordinates(self, parts: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
-        """Return (H, W, 3) in the device's unit, NaN where it measured nothing.
+        """Return (H, W, 3) in the device's unit, NaN where nothing was measured.
 
         Args:
             parts: A frame's components by pixel format.
@@ -68,7 +68,7 @@ class RangeLayout:
 
 
 def configure(nodes: Any) -> RangeLayout:
-    """Ask a device for organised range maps, and return what it says it will give.
+    """Set a device to organised range maps, and return the format of its data.
 
     Settings that the device does not have or does not let go of are left; what matters is read
     back.
@@ -300,7 +300,7 @@ class GenicamScanner(OpenScanner):
         return lambda: self._scan(layout.coordinates(parts), layout.per_metre, times)
 
     def close(self) -> None:
-        """Let go of the device and the producer."""
+        """Disconnect from the device, and unload the producer."""
         if not self._closed:
             self._closed = True
             self._acquirer.destroy()

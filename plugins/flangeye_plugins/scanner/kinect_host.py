@@ -1,4 +1,4 @@
-"""Holds an Azure Kinect, or one's recording, in a process of its own; see ``azure_kinect.py``.
+"""Process that runs an Azure Kinect, or its recording; see ``azure_kinect.py``.
 
 Runs under any Python that has pyk4a, without flangeye: libk4a may abort the process it is in, and
 the wheel of pyk4a needs NumPy 1. Takes ``next`` a line on standard input; answers on standard
@@ -19,7 +19,7 @@ class NoDepthError(Exception):
 
 
 def main() -> None:
-    """Open what the first argument describes, and answer until the input ends."""
+    """Open the device that the first argument describes; answer requests until the input ends."""
     # libk4a logs to standard output.
     out = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)

@@ -28,7 +28,7 @@ class MechEyeParams(Params):
 
 @part("scanner.mech_eye")
 def scanner_mech_eye(model: ScannerModel | None, params: MechEyeParams) -> Scanner:
-    """Scan with a Mech-Eye camera, with the settings its own viewer left in it.
+    """Scan with a Mech-Eye camera, with the settings saved by its viewer.
 
     A scan far out of the model's range is refused.
 
@@ -105,5 +105,5 @@ class MechEye(OpenScanner):
         return decode
 
     def close(self) -> None:
-        """Let go of the camera."""
+        """Disconnect from the camera."""
         self._camera.disconnect()

@@ -1,4 +1,4 @@
-"""What all open scanners share."""
+"""Common parts of open scanners."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class ColourCamera(NamedTuple):
 
 
 class DepthView:
-    """The depth camera by its calibration, and the colour camera beside it."""
+    """Calibration of a depth camera and of the colour camera beside it."""
 
     def __init__(
         self,
@@ -64,7 +64,7 @@ class DepthView:
         return np.asarray(xyz, dtype=np.float32)
 
     def coloured(self, xyz: Numbers, colour: Numbers) -> Image | None:
-        """Return what the colour camera saw, as the depth camera would have seen it.
+        """Return the colour image as seen from the depth camera.
 
         Args:
             xyz: (H, W, 3) points [mm]; black where there is none, or the colour image ends.
@@ -125,7 +125,7 @@ def require_in_range(name: str, cloud: PointCloud, model: ScannerModel | None) -
 
 
 class OpenScanner(Device):
-    """A scanner that is in use; a driver adds ``expose``, and ``close`` where there is a device."""
+    """A scanner in use; drivers add ``expose``, and ``close`` if there is a device."""
 
     def __init__(
         self, name: str, facts: Mapping[str, str], model: ScannerModel | None = None
@@ -136,7 +136,7 @@ class OpenScanner(Device):
         self._model = model
 
     def close(self) -> None:
-        """Let go of the device; safe to call twice."""
+        """Disconnect; safe to call twice."""
 
     def _scan(
         self,

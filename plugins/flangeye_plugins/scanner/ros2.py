@@ -140,7 +140,7 @@ class Ros2Scanner(OpenScanner):
         return self._exposed(time.monotonic_ns(), DeviceError)
 
     def overhear(self, since_ns: int) -> Callable[[], Scan]:
-        """Take a message stamped since a moment, where nobody here triggers; see ``Overhears``."""
+        """Take a message stamped after a given time, triggered by others; see ``Overhears``."""
         if self._params.trigger:
             return self.expose()
         return self._exposed(since_ns, FrameDropped)
@@ -176,7 +176,7 @@ class Ros2Scanner(OpenScanner):
             self._bridge.newest(topic)
 
     def close(self) -> None:
-        """Let go of ROS 2."""
+        """Disconnect from ROS 2."""
         self._bridge.close()
 
     # --- what is there

@@ -52,7 +52,7 @@ def scanner_watched_folder(model: ScannerModel | None, params: WatchedFolderPara
 
 
 class Stamp(NamedTuple):
-    """What changes when a file does; times may be coarse or late on network shares."""
+    """Size and times of a file, to detect a change; times may be coarse on network shares."""
 
     inode: int
     size: int
@@ -60,7 +60,7 @@ class Stamp(NamedTuple):
 
 
 class Arrival(NamedTuple):
-    """A new file: how it looked last, since when it looks so, and when it was not there yet."""
+    """A new file: its last stamp, since when it has that, and when it was not there yet."""
 
     stamp: Stamp
     since: float
@@ -80,7 +80,7 @@ class WatchedFolder(OpenScanner):
         self._closed = threading.Event()
 
     def expose(self) -> Callable[[], Scan]:
-        """Wait for the next file, for as long as ``timeout`` says: a person may have to act.
+        """Wait up to ``timeout`` for the next file: a person may have to act.
 
         The exposure is said to have begun when the folder was last seen without the file, so a
         file that came while the arm moved cannot pass for one of where it stands. The person is

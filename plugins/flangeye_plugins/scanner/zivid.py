@@ -98,7 +98,7 @@ class ZividScanner(OpenScanner):
         return transfer
 
     def close(self) -> None:
-        """Let go of the camera."""
+        """Disconnect from the camera."""
         if self._camera is not None:
             camera, self._camera = self._camera, None
             camera.disconnect()

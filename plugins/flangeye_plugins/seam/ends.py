@@ -18,7 +18,7 @@ SEAM_WITHIN = 8e-3
 
 
 def last_in_lanes(lanes: Floats, way: Floats, pitch: float) -> tuple[NDArray[np.intp], Floats]:
-    """Return the last point of every lane, and how far beyond it (L,) the surface goes on [m].
+    """Return each lane's last point, and the distance (L,) from there to the surface's end [m].
 
     A surface ends on average half a spacing beyond the last pixel that is on it.
 
@@ -97,7 +97,7 @@ class End:
 
 
 def surface_end(way: Floats, past: Mask, covered: Mask, pitch: float) -> End | None:
-    """Return where a surface ends, from where its lanes do; None where it has too few.
+    """Return where a surface ends, from the ends of its lanes; None with too few lanes.
 
     The median over lanes, of those behind which the scanner sees something farther away where
     there are enough. Lanes that end at two places are no sample of one.
@@ -151,7 +151,7 @@ def soonest(ends: list[End], limit: float) -> tuple[float, float]:
 
 
 class Rays:
-    """What the scanner saw along its rays, from one or more places, about a line."""
+    """The scanner's rays about a line, from one or more poses."""
 
     def __init__(self, eyes: Floats, clouds: tuple[Floats, ...], line: Floats) -> None:
         """Keep what lies in the directions of a line.
@@ -176,7 +176,7 @@ class Rays:
                 self._places.append((eye, cKDTree(rays[about]), far[about]))
 
     def past(self, points: Floats, pitch: float, tolerance: float) -> tuple[Mask, Mask]:
-        """Return at which of points (N, 3) it saw only what is farther away, and what is nearer.
+        """Return for points (N, 3) whether the scan is only behind them, and if before them.
 
         Args:
             points: Where something might be [m].

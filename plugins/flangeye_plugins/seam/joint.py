@@ -93,7 +93,7 @@ class Found:
         return self.local[(s > self.ends[0]) & (s < self.ends[1])]
 
     def again(self, points: Floats, reach: float) -> Found:
-        """Return the same beside frames along the line that was found."""
+        """Return the same slab beside frames along the line that was found."""
         line = self.course.moved(*self.swept.spline.at(self.course.s).T)
         flat = Spline.through(line.length, line.closed, line.s, np.zeros((len(line.s), 3)))
         local = line.local(points, reach)[1]

@@ -1,4 +1,4 @@
-"""From a line in the scan to a planned seam in the base, however the line was found."""
+"""Plan a seam in the base from a line in the scan, however the line was found."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SPACING = 2e-3
 
 
 class SeamParams(Params):
-    """What the stages that plan a seam share."""
+    """Common parameters of stages that plan a seam."""
 
     arm: Literal["as-reported", "corrected"] = Field(
         "as-reported",
@@ -43,7 +43,7 @@ class SeamParams(Params):
 
 
 def scanner_covariance(scanner: ScannerModel | None, distance: float) -> Floats:
-    """Return the (6, 6) covariance, about the part, of what a scanner's own distortion does to it.
+    """Return a part's (6, 6) pose covariance, about the part, from scanner distortion.
 
     A smooth error over the scanner's volume moves and turns a part as a whole; no residual shows
     it. Its size is the model's, in every direction alike; its slope that of a field which
@@ -148,7 +148,7 @@ def refuse_outside(stage: str, points_in_base: Floats, workspace: Box | None) ->
 
 
 def cloud_around(points: Floats, seam: Floats, base_T_camera: Transform) -> PointCloud:
-    """Return what of points is around a seam (N, 3), both in ``camera``, thinned, in ``base``."""
+    """Return the points around a seam (N, 3), both in ``camera``, thinned, in ``base``."""
     low, high = seam.min(axis=0), seam.max(axis=0)
     margin = 0.3 * np.linalg.norm(high - low) + 0.03
     points = points[((points > low - margin) & (points < high + margin)).all(axis=1)]

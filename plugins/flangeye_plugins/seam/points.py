@@ -1,4 +1,4 @@
-"""What a scan shows: points with normals, as a CAD has them too, and how far each ray went."""
+"""Points with normals, from a scan or a CAD, and the depth of each ray."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def thinned(points: NDArray[Any], voxel: float) -> Floats:
 
 
 def facing_camera(points: Floats) -> Oriented:
-    """Return the points, given in ``camera``, with normals towards the camera."""
+    """Return points in ``camera`` with their normals turned towards the camera."""
     import open3d as o3d
 
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
@@ -57,7 +57,7 @@ def facing_camera(points: Floats) -> Oriented:
 def spread_over_normals(
     surface: Oriented, count: int, rng: np.random.Generator, cell: float = 0.25
 ) -> Oriented:
-    """Return about ``count`` of the points, as many of every direction as can be had.
+    """Return about ``count`` of the points, evenly over the directions of their normals.
 
     Normal-space sampling (Rusinkiewicz and Levoy 2001): a groove is small beside its plate and
     the bench, and yet it is what tells where the part lies.
@@ -114,7 +114,7 @@ class DepthMap:
 
 
 def depth_map(points: Singles) -> DepthMap:
-    """Return the map of a scan, (N, 3) finite points in ``camera``, at about its own resolution."""
+    """Return the depth map of a scan, (N, 3) finite points in ``camera``."""
     rays = points[:, :2] / points[:, 2:]
     low, high = rays.min(axis=0), rays.max(axis=0)
     pitch = _pitch(rays, low, high)

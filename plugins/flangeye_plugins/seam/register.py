@@ -70,7 +70,7 @@ class RayEvidence:
 
 
 def slid(fit: CadFit, evidence: RayEvidence) -> CadFit:
-    """Slide a part along what its planes leave open to where its outline agrees.
+    """Slide a part in the directions that its planes leave free, to where its outline agrees.
 
     A block with a straight groove can slide along it without any distance to a plane changing;
     where it begins and ends is then all there is to go by. Its deviation is a quarter of the

@@ -27,7 +27,7 @@ class Line(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class JointPlace:
-    """Where a joint may be in a slab: at (2,) q, rolled, of some shape; its score is at most 1."""
+    """A hypothesis of a joint in a slab: place (2,) q, roll and shape; score at most 1."""
 
     s: float
     q: Floats
@@ -335,7 +335,7 @@ class Course:
         return np.asarray(self.step * np.arange(len(self.points)), dtype=np.float64)
 
     def local(self, points: Floats, reach: float) -> tuple[Floats, Floats]:
-        """Return which of (N, 3) points are within reach [m], and (M, 5) what they are here.
+        """Return which of (N, 3) points are within reach [m], and (M, 5) their local coordinates.
 
         Their s, y and z [m], and y and z of the unit vectors towards the scanner.
         """

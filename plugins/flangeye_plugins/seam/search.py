@@ -29,7 +29,7 @@ class Candidates:
 
 @dataclass(frozen=True, eq=False)
 class SeamModel:
-    """What a scan of the part should show, and what not.
+    """Samples of a part: points that a scan should show, and points where there is nothing.
 
     Attributes:
         surface: Samples of the CAD, normals outwards.
@@ -48,7 +48,7 @@ class SeamModel:
 
 
 def model_of(part: CadPart, rng: np.random.Generator, by: float) -> SeamModel:
-    """Return what a part should look like; its edges are looked at ``by`` [m] beyond them."""
+    """Return samples of a part, with empty points ``by`` [m] beyond its edges."""
     return SeamModel(part.sample(rng), part.beyond_edges(rng, by))
 
 
@@ -80,7 +80,7 @@ def find_poses(
 
 
 def agreement(poses: Floats, model: SeamModel, seen: DepthMap, tolerance: float) -> Floats:
-    """Return (K,) scores: the share seen of what should be, less what should not be as it is.
+    """Return (K,) scores: share of expected points seen, less contradictions.
 
     Args:
         poses: (K, 4, 4) ``camera_T_part``.

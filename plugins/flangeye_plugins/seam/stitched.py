@@ -35,7 +35,7 @@ from flangeye_plugins.seam.points import facing_camera, thinned
 
 
 class OfPose(Protocol):
-    """What calibration and arm do to points that were mapped to the base."""
+    """Covariance of points mapped to the base, from calibration and arm."""
 
     def __call__(self, points_in_base: Floats) -> Floats:
         """Return the (K, 3, 3) covariances [m^2] of (K, 3) points."""
@@ -44,7 +44,7 @@ class OfPose(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class PlacedScan:
-    """A scan, and what is known of where it stands.
+    """A scan with its pose and covariance.
 
     Attributes:
         base_T_camera: Of the camera; of several places, of the middle one.
@@ -67,7 +67,7 @@ class PlacedScan:
         return np.concatenate(self.clouds)
 
     def of_scanner(self, line: Floats, scanner: ScannerModel | None) -> Floats:
-        """Return the (K, 3, 3) covariances [m^2] that the scanner's own distortion gives a line.
+        """Return the (K, 3, 3) covariances [m^2] of a line from the scanner's own distortion.
 
         It moves and turns what one place sees as a whole: about the line's middle, or, of several
         places, about what the nearest has straight ahead.

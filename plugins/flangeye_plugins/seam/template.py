@@ -90,7 +90,7 @@ class Section:
 
     @property
     def angles(self) -> Floats:
-        """(4,) of the normals [rad]; NaN where there is no half-plane."""
+        """(4,) angles of the normals [rad]; NaN where there is no half-plane."""
         return np.radians(self.joint.angles) + self.shape[:4]
 
     @property
@@ -123,14 +123,14 @@ class Section:
 
     @property
     def half_angle(self) -> float | None:
-        """Between the opening and what meets at the seam [rad]; None of parallel edges."""
+        """Half the angle between the faces that meet at the seam [rad]; None for parallel edges."""
         first, second = self.angles[list(self.meeting)]
         half = (np.pi - abs(first - second)) / 2
         return None if self.joint.gap else float(half)
 
     @property
     def opening(self) -> float:
-        """Angle from z of the opening, half way between what meets at the seam [rad]."""
+        """Angle from z of the bisector of the faces that meet at the seam [rad]."""
         which = list(FACES if self.joint.gap else self.meeting)
         return float(self.angles[which].mean())
 

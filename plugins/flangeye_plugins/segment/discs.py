@@ -65,7 +65,7 @@ class PlanarPiece(NamedTuple):
 
 
 class Patch(NamedTuple):
-    """A patch of a bent piece, which proposes a plane.
+    """A flat patch of a curved surface, from which a plane is proposed.
 
     Attributes:
         piece: Whose patch it is.
@@ -190,7 +190,7 @@ SECTORS = 48
 
 
 class DiscLimits(NamedTuple):
-    """What a disc must fulfil to be taken for the flange.
+    """Limits that a disc must satisfy to be the flange.
 
     Attributes:
         incidence: Largest angle of the normal to the line of sight [rad].
@@ -248,7 +248,7 @@ def of_size(part: PlanarPiece, cell: tuple[int, int], pitch: float, flange: Flan
 def compare(
     disc: Disc, around: Floats, nearby: Floats, pitch: float, flange: Flange, limits: DiscLimits
 ) -> Disc:
-    """Return a disc of the right size with what else keeps it from being the flange, if anything.
+    """Return a disc of the right size, with the reason why it is not the flange, if any.
 
     Args:
         disc: From :func:`of_size`.
@@ -439,7 +439,7 @@ def crop(xyz: Singles, view: Grid, disc: Disc, radius: float, margin: float) -> 
 
 
 def in_box(points: Singles, centre: NDArray[np.float64], reach: float) -> Singles:
-    """Return the (n, 3) points within ``reach`` of a centre along every axis, NaN left out."""
+    """Return the (n, 3) points within ``reach`` of a centre along every axis, without NaN."""
     # One column at a time, each on what the last has left, depth, which tells most, first: a
     # tenth of the time of all at once.
     for k in (2, 1, 0):

@@ -39,7 +39,7 @@ with large recesses besides its holes 0.35."""
 
 
 def find_discs(view: Grid, flange: Flange, limits: DiscLimits) -> list[Disc]:
-    """Return every flat part of the scene as a disc, with what keeps it from being the flange."""
+    """Return every flat part of the scene as a disc, with the reason why it is not the flange."""
     smooth, noise = smooth_surface(view, limits.crease)
     some = view.xyz.reshape(-1, 3)[:, 2].take(np.flatnonzero(smooth)[::7])
     pitch = view.angle * float(median(some)) if len(some) else np.inf
@@ -192,7 +192,7 @@ def connected_pieces(mask: Mask, fewest: int) -> Iterator[Indices]:
 def choose(
     discs: list[Disc], cut: Callable[[Disc], Singles], flange: Flange
 ) -> tuple[Disc, Singles] | str:
-    """Return the disc that is the flange with its points, or why there is none.
+    """Return the flange's disc with its points, or why there is none.
 
     Args:
         discs: All flat parts of the scene.

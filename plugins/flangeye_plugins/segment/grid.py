@@ -15,7 +15,7 @@ from flangeye.types import Floats, Indices, Singles
 
 
 class Grid(NamedTuple):
-    """Points whose neighbours in the array are neighbours in the scanner's view.
+    """An organised cloud: neighbours in the array are neighbours in the scanner's view.
 
     Attributes:
         xyz: (H, W, 3) positions, a missing one NaN [m].

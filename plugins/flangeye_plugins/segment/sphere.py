@@ -36,7 +36,7 @@ class SegmentSphereParams(RangeParams):
 
 
 class Candidate(NamedTuple):
-    """A place where the sphere may be.
+    """A possible place of the sphere.
 
     Attributes:
         centre: (3,) [m].
@@ -85,7 +85,7 @@ def segment_sphere(
 def find_spheres(
     view: Grid, radius: float, tolerance: float, sized: bool = True
 ) -> list[Candidate]:
-    """Return places where a sphere of this radius may be, the best first, none overlapping.
+    """Return possible places of a sphere of this radius, best first, none overlapping.
 
     Args:
         view: The scene; missing points are NaN.
@@ -123,7 +123,7 @@ def surface_normals(xyz: Singles) -> Floats:
 
 
 def most_voted(votes: Floats, cell: float, apart: float) -> list[Floats]:
-    """Return the means of the (N, 3) votes where they are densest, at most ``CANDIDATES``.
+    """Return the densest means of the (N, 3) votes, at most ``CANDIDATES``.
 
     Args:
         votes: (N, 3) [m].

@@ -32,7 +32,7 @@ class LimitsParams(Params):
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Largest standard deviations of what is observable: of a rotation [rad], a place [m]."""
+        """Largest standard deviations still observable: of a rotation [rad], a place [m]."""
         return self.rotation_limit, 20e-3
 
 
@@ -66,7 +66,7 @@ def hand_eye(
     rejected: Mapping[str, str] | None = None,
     notes: Sequence[str] = (),
 ) -> HandEye:
-    """Return the calibration with one pair for each observation, in the order given.
+    """Return the calibration, with one pair for each observation in the given order.
 
     Args:
         observations: Everything the solver pulled.

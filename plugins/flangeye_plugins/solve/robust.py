@@ -57,7 +57,7 @@ class RobustParams(LimitsParams):
 
     @property
     def corrects_arm(self) -> bool:
-        """Whether the arm's own error may be found; read where a step asks for that answer."""
+        """Whether the arm's own error may be estimated; read if a step asks for that answer."""
         return True
 
 

@@ -1,1 +1,1 @@
-"""``verify.*``: whether a calibration may be used. Add a test of it: a new module here."""
+"""``verify.*``: tests whether a calibration may be used. Add one: a new module here."""

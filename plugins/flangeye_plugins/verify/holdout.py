@@ -126,7 +126,7 @@ def deal(count: int, folds: int, seed: int) -> list[Indices]:
 
 
 def deal_moments(observations: Sequence[Observation], folds: int, seed: int) -> list[Indices]:
-    """Return the indices of each fold; what cameras saw of the same poses falls in one.
+    """Return the indices of each fold; all sightings of one moment go into the same fold.
 
     Else the error of a pose that one camera saw would be known from what the other saw.
     """

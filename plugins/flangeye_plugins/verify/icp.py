@@ -1,4 +1,4 @@
-"""The paper's own check, equation (11): the flange as it was seen against the flange as it is."""
+"""The paper's own check, equation (11): the scanned flange against the flange's true shape."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class CadCloud(Params):
 
 
 class IcpSettings(Params):
-    """What every comparison with the flange's shape needs."""
+    """Common settings of comparisons with the flange's shape."""
 
     cad: CadCloud | None = Field(
         None, description="The flange's shape; by default made from its dimensions."
@@ -136,7 +136,7 @@ def require_views(views: Views) -> Views:
 
 
 def shape_of(flange: Flange, settings: IcpSettings) -> SampledSurface:
-    """Return the flange's surface: from its CAD cloud when given, else from its dimensions.
+    """Return the flange's surface from its CAD cloud if given, else from its dimensions.
 
     Raises:
         StageError: The CAD cloud cannot be read.

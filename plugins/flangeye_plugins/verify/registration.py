@@ -44,7 +44,7 @@ class SampledSurface:
 
 @lru_cache(maxsize=8)
 def surface_of(flange: Flange, spacing: float = 0.5e-3) -> SampledSurface:
-    """Sample what a scanner can see of a flange: face, chamfers, walls, bore, wrist behind it.
+    """Sample the visible surface of a flange: face, chamfers, walls, bore, wrist behind it.
 
     Args:
         flange: The plate as this robot has it.

@@ -1,1 +1,1 @@
-"""``weld.*``: following a seam by touch, torch behind; what leads it is a ``controller.*``."""
+"""``weld.*``: follow a seam by touch, with the torch behind; a ``controller.*`` part steers."""

@@ -1,4 +1,4 @@
-"""From where the arm is to above the seam's start; before that, whether the finger is seen."""
+"""The path to above the seam's start; before it, a check that the camera sees the finger."""
 
 from __future__ import annotations
 

@@ -76,16 +76,16 @@ class Belief:
 
     @property
     def joint(self) -> WeldJoint | None:
-        """The walls, where they are known."""
+        """The joint's walls; None if unknown."""
         return None if self.half_angle is None else WeldJoint(self.half_angle, self.lean)
 
     @property
     def beside(self) -> float:
-        """How far to the left of the seam the tip is when it touches both walls [m]."""
+        """Offset of a tip that touches both walls, to the left of the seam [m]."""
         return 0.0 if self.joint is None else self.joint.seat(self.radius)[0]
 
     def set_down(self, settings: Following) -> float:
-        """Return how far to the left of the plan the tip is set down [m].
+        """Return the place where the tip is set down, to the left of the plan [m].
 
         Where one wall alone stands upright it comes down on the other side of the seam.
         """
@@ -171,7 +171,7 @@ class Belief:
 
 @dataclass(frozen=True)
 class Learned:
-    """What the sweep found.
+    """Estimates of the sweep.
 
     Attributes:
         gain: The finger shows displacements larger by this share.
@@ -209,13 +209,13 @@ class Learned:
 
     @property
     def kept(self) -> float:
-        """How likely play stays where the wall presses it; what wobbles by more goes through it."""
+        """Probability that play stays taken up by the pressed wall."""
         # Pressed to one side, the deflection still changes by 0.2 mm back and forth.
         return self.reversal / (self.reversal + 0.2e-3)
 
     @property
     def systematic(self) -> float:
-        """Variance of what is alike in measurements that follow each other, of the tip [m^2].
+        """Variance common to successive measurements of the tip [m^2].
 
         Play, taken for ``kept`` of its half width, is at the pressed side as often and anywhere in
         its width otherwise; and what the sweep left unexplained.
@@ -237,7 +237,7 @@ class Learned:
 def belief_of(
     finger: Finger, body: LeaningTool, half_angle: float | None, settings: Following
 ) -> Belief:
-    """Return what a finger's file, the tool's stand and the plan say."""
+    """Return the prior from a finger's file, the tool's orientation and the plan."""
     known = finger.calibration
     lateral, axial = Belief.lateral, Belief.axial
     if known is not None and known.lateral is not None and known.axial is not None:

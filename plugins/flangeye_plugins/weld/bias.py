@@ -1,4 +1,4 @@
-"""What a look behind the torch says of the error that nothing else at the weld can measure.
+"""Estimate the torch's bias, which only a profile of the bead behind it can measure.
 
 The torch is off the seam by what is measured of it and a bias: ``off = raw + b``. In b are the
 torch's place on the tool, its yaw, and how far heat has moved the seam since the tip felt it. All
@@ -89,7 +89,7 @@ class Bias:
 
     @property
     def looked(self) -> bool:
-        """Whether there has been a look that was believed."""
+        """Whether any profile was accepted."""
         return self._seen > -math.inf
 
     def variance(self, s: float) -> float:
@@ -103,7 +103,7 @@ class Bias:
         return min(grown + self._sigma**2, self.prior + self.value**2)
 
     def look(self, s: float, bias: float, sigma: float, others: float) -> None:
-        """Take in a look.
+        """Process a profile of the bead.
 
         Args:
             s: Arc length of the place that was looked at [m].

@@ -1,4 +1,4 @@
-"""How far the torch may be from the seam, predicted along the whole plan before anything moves.
+"""Predict the torch's error bound along the whole plan, before anything moves.
 
 The variance of the torch across the seam, at each place of the plan, is the follower's own sum, as
 far as it is known beforehand: what the files state of torch, arm and heat; the torch's distance to

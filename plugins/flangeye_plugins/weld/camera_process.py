@@ -1,4 +1,4 @@
-"""The finger's camera in a process of its own, beside the control loop.
+"""Runs the finger's camera in its own process, beside the control loop.
 
 There its images are taken and read, and drawn where it is simulated: none of that keeps a cycle
 waiting, and a camera's client that crashes takes no weld with it. The process answers one question
@@ -39,7 +39,7 @@ TORCH = "torch"
 
 
 class Seeing(NamedTuple):
-    """What is open in the process.
+    """The open camera and profiler of the process.
 
     Attributes:
         latest: Where the arm is.
@@ -78,7 +78,7 @@ class CameraProcess:
         self._thread = threading.Thread(target=self._watch, name="finger", daemon=True)
 
     def seen(self) -> list[TagObservation]:
-        """Return what has arrived; raise DeviceError where the camera is lost."""
+        """Return new readings; raise DeviceError if the camera is lost."""
         if self._error is not None:
             raise self._error
         sights: list[TagObservation] = []
@@ -87,7 +87,7 @@ class CameraProcess:
         return sights
 
     def looks(self) -> list[WeldProfile]:
-        """Return what has arrived from behind the torch."""
+        """Return new profiles from behind the torch."""
         looks: list[WeldProfile] = []
         while not self._looks.empty():
             looks.append(self._looks.get())
@@ -173,7 +173,7 @@ class CameraProcess:
 
 
 def camera_process(wire: Connection, job: CameraJob) -> None:
-    """Open the camera and answer until the program lets go; the main function of the process."""
+    """Open the camera and answer requests; main function of the camera process."""
     for told in (signal.SIGINT, signal.SIGTSTP):
         signal.signal(told, signal.SIG_IGN)  # the program is told, and ends this
     latest = LatestState(job.state)

@@ -1,4 +1,4 @@
-"""What is checked before anything moves; every refusal says what to change."""
+"""Checks of a weld before anything moves; every refusal says what to change."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SEATING = 1.4
 
 
 def check_finger(finger: Finger, settings: Following) -> None:
-    """Refuse a deflection that the finger does not stand, a force beyond the limit, or its tag.
+    """Refuse a deflection or force beyond the finger's limits, or a tag out of view.
 
     Raises:
         StageError: Which, and what is allowed.

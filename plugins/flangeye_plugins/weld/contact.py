@@ -51,7 +51,7 @@ RARE = 1e-3
 
 
 class Felt(NamedTuple):
-    """A measurement against what was expected of a seated tip [m].
+    """A measurement relative to the one expected of a seated tip [m].
 
     Attributes:
         time: [s].
@@ -135,17 +135,17 @@ class Contact:
 
     @property
     def free(self) -> float:
-        """How likely it is that no wall holds the tip."""
+        """Probability that no wall holds the tip."""
         return float(self.likely[Mode.FREE])
 
     @property
     def strained(self) -> float:
-        """By how much the tip is pressed aside, as a share of what it is known to stand."""
+        """Deflection as a share of the largest one at which the tip is known to stay seated."""
         stands = self.steady * max(self.compression, 1e-9)
         return abs(self.deflection) / stands
 
     def take(self, felt: Felt, side: float) -> None:
-        """Weigh the modes by a measurement; ``side`` is pressed, 1 for the left."""
+        """Update the modes by a measurement; wall ``side`` is pressed, 1 for the left."""
         # Deflection and compression are filtered over 0.1 s.
         kept = math.exp(-(felt.time - self._time) / 0.1)
         self.deflection += (1.0 - kept) * (felt.deflection - self.deflection)
@@ -166,11 +166,11 @@ class Contact:
         self._spread *= 1.0 - gain
 
     def forget(self) -> None:
-        """Drop what was taken and has not counted yet: it was felt where no wall held the tip."""
+        """Drop measurements not yet used: they were made while no wall held the tip."""
         self._newest.clear()
 
     def settled(self, until: float) -> Iterator[tuple[Felt, float]]:
-        """Return what was felt up to a time [s] and counts, each with its doubt [m^2]."""
+        """Yield measurements up to a time [s] that count, each with its extra variance [m^2]."""
         since, off = np.ones(4), []
         for weighed in reversed(self._newest):
             likely = weighed.likely * since

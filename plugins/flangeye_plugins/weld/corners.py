@@ -66,7 +66,7 @@ def _turn(planar: Floats, along: Floats, s: float) -> float:
 
 
 def leg_of(seam: Seam, params: WeldTactileParams) -> Seam:
-    """Return the leg of a plan that is to be welded: all of it where it has no corner to stop at.
+    """Return the leg of a plan to weld: the whole plan if it has no corner to stop at.
 
     Raises:
         StageError: It has corners and no leg is chosen, or the other way round, or the tool has no

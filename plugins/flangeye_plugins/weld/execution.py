@@ -1,4 +1,4 @@
-"""The control loop, in simulated time or in real time, and what the tip must keep to in it."""
+"""The control loop, in simulated or real time, with its limits on the tip."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from flangeye_plugins.weld.weld_log import Cycle, WeldLog
 
 
 class Bounds:
-    """Judges each cycle before its command is given."""
+    """Checks each cycle before its command is sent."""
 
     def __init__(self, finger: Finger, plan: Path) -> None:
         self._finger, self._plan = finger, plan
 
     def check(self, pose: ToolPose, progress: float, felt: Iterable[TipDisplacement]) -> None:
-        """Stop a tip that is astray, or that is pressed harder than it may be.
+        """Raise if the tip is off the plan or pressed harder than allowed.
 
         Args:
             pose: Pose of the tool.
@@ -69,7 +69,7 @@ class Bounds:
 
 @dataclass(frozen=True, eq=False)
 class WeldCell:
-    """What a weld works with.
+    """The devices of a weld.
 
     Attributes:
         drive: The arm.
@@ -89,7 +89,7 @@ class WeldCell:
 
 
 def follow(cell: WeldCell, controller: Controller, weld_log: WeldLog, longest: float) -> str:
-    """Follow the seam; return why it ended early, or nothing when it came to its end.
+    """Follow the seam; return why it ended early, or an empty text at its end.
 
     Whatever happens the arm is told to stop, and the chronicle holds all up to then.
     """
@@ -206,7 +206,7 @@ def _turn(
 
 
 def touch_of(feeling: TipDisplacement) -> Touch:
-    """Return what the controller needs of a feeling."""
+    """Return a measurement as the controller takes it."""
     return Touch(feeling.time_ns * 1e-9, feeling.displacement)
 
 

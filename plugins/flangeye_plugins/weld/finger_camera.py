@@ -1,4 +1,4 @@
-"""Reading the finger beside the control loop: images in, feelings out."""
+"""Turns the finger's images into measurements of the tip, beside the control loop."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from flangeye_plugins.weld.touch.tip_displacement import Interpreter, TipDisplac
 
 
 class TagObservation(NamedTuple):
-    """One image, and what was felt in it.
+    """One image and its measurement.
 
     Attributes:
         time_ns: Middle of its exposure.
@@ -52,7 +52,7 @@ class FingerReader:
         self._region = RegionOfInterest()
 
     def read(self, frame: SensorFrame) -> TagObservation:
-        """Return what is felt in an image."""
+        """Return the measurement in an image."""
         for piece in self._region.pieces(frame.image):
             reading = self._detector.find(piece.image)
             if reading is not None:
@@ -61,7 +61,7 @@ class FingerReader:
         return self._observation(piece, frame.time_ns, reading)
 
     def reread(self, piece: ImageRegion, time_ns: int) -> TagObservation:
-        """Return what is felt in a piece that was read before, from a log."""
+        """Return the measurement in a logged crop of an image."""
         return self._observation(piece, time_ns, self._detector.find(piece.image))
 
     def _observation(
@@ -89,7 +89,7 @@ class LatestState:
 
 
 class CameraJob(NamedTuple):
-    """What opens a finger's camera, in this process or another.
+    """Opens a finger's camera, in this process or another.
 
     Attributes:
         sensor: Opens it, given finger, arm and seed.
@@ -111,20 +111,20 @@ class CameraJob(NamedTuple):
         return sensor
 
     def profiler(self, robot: StateSource, camera: TactileSensor) -> Profiler | None:
-        """Open the look behind the torch, if there is one, beside the open camera."""
+        """Open the profiler behind the torch, if there is one, beside the open camera."""
         return None if self.look is None else self.look(robot, camera, self.seed)
 
 
 class FingerCameraReader(Protocol):
-    """Gives what was seen since the last cycle, oldest first."""
+    """Gives all measurements since the last cycle, oldest first."""
 
     @property
     def behind(self) -> float | None:
-        """How far behind the torch the look is [m]; None where there is none."""
+        """Distance of the profile behind the torch [m]; None without a profiler."""
         ...
 
     def looks(self) -> list[WeldProfile]:
-        """Return new looks at the bead; never waits.
+        """Return new profiles of the bead; never waits.
 
         Raises:
             DeviceError: The profile sensor is lost.
@@ -144,7 +144,7 @@ class FingerCameraReader(Protocol):
         ...
 
     def true_torch(self) -> tuple[Floats, Floats] | None:
-        """Return where a simulated torch really was, once the weld has ended; else None."""
+        """Return the true path of a simulated torch after the weld; else None."""
         ...
 
     def __enter__(self) -> Self: ...
@@ -171,16 +171,16 @@ class SteppedReader:
 
     @property
     def behind(self) -> float | None:
-        """How far behind the torch the look is [m]; None where there is none."""
+        """Distance of the profile behind the torch [m]; None without a profiler."""
         return None if self._look is None else self._look.behind
 
     def looks(self) -> list[WeldProfile]:
-        """Return the look that has arrived; raise DeviceError where the sensor is lost."""
+        """Return new profiles; raise DeviceError if the sensor is lost."""
         profile = None if self._look is None else self._look.profile()
         return [] if profile is None else [profile]
 
     def seen(self) -> list[TagObservation]:
-        """Return what has arrived; raise DeviceError where the camera is lost."""
+        """Return new measurements; raise DeviceError if the camera is lost."""
         frame = self._sensor.frame()
         return [] if frame is None else [self._reader.read(frame)]
 

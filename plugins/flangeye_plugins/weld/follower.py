@@ -98,7 +98,7 @@ class Follower:
 
     @property
     def side(self) -> float:
-        """The wall that is pressed, 1 for the left one."""
+        """The pressed wall, 1 for the left one."""
         return self.pressing.side
 
     @property
@@ -123,7 +123,7 @@ class Follower:
 
     @property
     def bound(self) -> float:
-        """What the torch's distance from the seam does not exceed [m]."""
+        """Upper bound of the torch's distance from the seam [m]."""
         return self.welding.bound
 
     @property
@@ -133,7 +133,7 @@ class Follower:
 
     @property
     def aim(self) -> float:
-        """How far to the left of the seam the torch is to be [m]."""
+        """Target of the torch, to the left of the seam [m]."""
         return self.lead.aim
 
     @property
@@ -143,7 +143,7 @@ class Follower:
 
     @property
     def arc(self) -> float:
-        """What the arc is to do: OFF, GAS or BURN of :mod:`flangeye.motion.arc`."""
+        """Commanded state of the arc: OFF, GAS or BURN of :mod:`flangeye.motion.arc`."""
         over = self.phase in ("done", "stopped") or not self.task.touch
         return OFF if over else self.welding.striking.level(self.now or 0.0)
 

@@ -1,4 +1,4 @@
-"""The surface of the work along a seam, and how the tool stands and leans on it.
+"""The work surface along a seam, and the tool's orientation on it.
 
 A seam may climb, bend and twist. It is followed as if its surface were rolled out flat: as long as
 it is, with its curvature in the surface (the geodesic one), its openings all upwards. What happens
@@ -51,7 +51,7 @@ def leaning(work: float, travel: float) -> Floats:
 
 
 def body_of(finger: Finger, settings: Following) -> LeaningTool:
-    """Return the finger's tool as it stands while the seam is followed."""
+    """Return the finger's tool in its orientation along the seam."""
     work = settings.sign * settings.work_angle
     return body_from(finger.torch_from_tip, work, settings.travel_angle)
 
@@ -88,7 +88,7 @@ class Stand(NamedTuple):
         return np.array([along * tx - left * ty, along * ty + left * tx, up])
 
     def unrolled(self, vector: Floats) -> Floats:
-        """Return a vector (3,) in the plane as it is in base."""
+        """Convert a vector (3,) in the plane to base."""
         x, y, z = vector.tolist()
         tx, ty = self.place.tangent.tolist()
         return np.asarray(self.axes @ np.array([x * tx + y * ty, y * tx - x * ty, z]))
@@ -165,7 +165,7 @@ class WorkSurface:
         return [x + beyond * tx, y + beyond * ty, z + beyond * tz, tx, ty, tz, *up]
 
     def foot(self, point: Floats, near: float | None = None) -> float:
-        """Return the arc length beside a point (3,) in base, near another if one is known [m]."""
+        """Return the arc length nearest to a point (3,) in base, near another one if given [m]."""
         px, py, pz = point.tolist()
         # Beyond a curve's centre a foot runs away.
         far = 30e-3
@@ -183,14 +183,14 @@ class WorkSurface:
         return near
 
     def rolled(self, point: Floats, s: float) -> Floats:
-        """Return a point (3,) in base, beside an arc length, as it is in the plane (3,)."""
+        """Convert a point (3,) in base, near an arc length, to the plane (3,)."""
         stand = self.at(s)
         off = stand.rolled(point - stand.point)
         off[:2] += stand.place.point
         return off
 
     def height(self, point: Floats) -> float:
-        """Return how high a point (3,) in base is above the seam beside it [m].
+        """Return the height of a point (3,) in base above the seam next to it [m].
 
         Along the opening there or along all of them, whichever is more: one that leans says
         nothing of what is far from it.
@@ -231,7 +231,7 @@ class WorkSurface:
         return float(np.arccos(np.clip(np.concatenate(cosines), -1.0, 1.0)).max(initial=0.0))
 
     def standing(self, s: Floats, distance: float) -> tuple[Floats, Floats]:
-        """Return how the tool stands with its tip at arc lengths (K,): (K, 3) upwards, in base.
+        """Return the tool's axis with its tip at arc lengths (K,): (K, 3) upwards, in base.
 
         Its torch is on the seam ``distance`` behind the tip, at the arc lengths (K,) that come
         second; about that line it stands as the opening does at the tip.
@@ -342,7 +342,7 @@ class Tool:
         return float(np.linalg.norm(self._tilts, axis=1).max())
 
     def lowest(self, base_T_flange: Floats) -> float:
-        """Return how high the lower one of tip and torch is above the seam beside it [m].
+        """Return the smaller height of tip and torch above the seam [m].
 
         Args:
             base_T_flange: (4, 4) pose of the flange.

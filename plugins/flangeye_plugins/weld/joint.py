@@ -1,4 +1,4 @@
-"""A joint in cross-section: where a ball comes to rest between two walls, and what holds it there.
+"""Cross-section of a joint: where a ball rests between two walls, and what keeps it there.
 
 Seen along the seam the left wall leans by ``left`` from the plane's normal, the right one by
 ``right``; a ball that touches both has its centre on their bisector. Where the two differ (a fillet
@@ -28,7 +28,7 @@ class WeldJoint:
 
     @property
     def left(self) -> float:
-        """The left wall's angle from the plane's normal [rad]."""
+        """Angle of the left wall from the plane's normal [rad]."""
         return self.half_angle + self.lean
 
     @property
@@ -37,7 +37,7 @@ class WeldJoint:
         return self.half_angle - self.lean
 
     def seat(self, radius: float) -> tuple[float, float]:
-        """Return where the centre of a ball of a radius rests: to the left of the seam, above it.
+        """Return the centre of a seated ball of a radius: to the left of the seam, and above it.
 
         Both [m]: the point of the bisector that is one radius away from either wall.
         """
@@ -76,7 +76,7 @@ def joint_of(
 
 
 def edges_half_angle(gap: float, radius: float) -> float:
-    """Return the half angle [rad] of the groove that a ball on two square edges is as good as in.
+    """Return the half angle [rad] of the groove that holds a ball like two square edges.
 
     Climbing out, the ball turns about an edge: at first at a right angle to the line from the edge
     to its centre, whose sine to the normal is ``gap / 2 radius``.

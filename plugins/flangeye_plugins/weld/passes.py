@@ -40,7 +40,7 @@ GAIN = 2.0
 
 
 class Traced:
-    """What the root pass leaves: where the seam is, how well known, and how high the tool was.
+    """Result of the root pass: the seam with its variance, and the tool's height.
 
     Attributes:
         rows: Of each piece of the root pass: the torch's arc length, the end point's height and the
@@ -73,7 +73,7 @@ class Traced:
 
 
 class Passes:
-    """The root pass by touch, then the others along what it has found.
+    """The root pass by touch, then further passes along the seam it found.
 
     Attributes:
         root: The root pass.
@@ -140,7 +140,7 @@ class Passes:
 
     @property
     def arc(self) -> float:
-        """What the arc is to do: OFF, GAS or BURN of :mod:`flangeye.motion.arc`."""
+        """Commanded state of the arc: OFF, GAS or BURN of :mod:`flangeye.motion.arc`."""
         if not self.number:
             return self.root.arc
         return self._striking.level(self._now) if self.phase == "passing" else OFF
@@ -264,7 +264,7 @@ class Passes:
 
 
 def follower_of(controller: Controller) -> Follower | None:
-    """Return what follows the seam by touch; of several passes the root's."""
+    """Return the follower by touch; of several passes, the root's."""
     if isinstance(controller, Passes):
         return controller.root
     return controller if isinstance(controller, Follower) else None

@@ -1,4 +1,4 @@
-"""What a weld has found of tip, play and clock is what the next one expects: a file between them.
+"""A file that passes estimates of tip, play and clock from one weld to the next.
 
 The sweep at the start starts from these instead of from the finger's file, and ends with less
 doubt. The file is plain YAML: to read, and to delete when finger or camera were changed. What was
@@ -34,7 +34,7 @@ class WeldPrior(Model):
 
 
 def with_prior(belief: Belief, path: Path | None, finger: str) -> Belief:
-    """Return a belief with what earlier welds have found; as it is where there is no file yet.
+    """Return a belief updated by earlier welds; unchanged if there is no file yet.
 
     Raises:
         StageError: The file is of another finger.
@@ -54,7 +54,7 @@ def with_prior(belief: Belief, path: Path | None, finger: str) -> Belief:
 
 
 def keep_posterior(path: Path, finger: str, learned: Learned) -> None:
-    """Write what a weld has found, for the next one.
+    """Write a weld's estimates for the next one.
 
     Raises:
         StageError: The file cannot be written.

@@ -1,4 +1,4 @@
-"""A small sweep of the seated tip before the weld: what finger, clock and arm really do.
+"""A small sweep of the seated tip before the weld, which identifies finger, clock and arm.
 
 The tip is held by the groove's walls, as in a punch mark, while the arm moves across by ``D`` to
 one side and to the other. With the tip at ``y0`` and the end point at ``P`` the true displacement
@@ -41,7 +41,7 @@ LONGEST = 4.0
 
 
 class Probing:
-    """The sweep: where to go next, what was felt, and what follows from it.
+    """The sweep: its next motion, its measurements, and the estimates from them.
 
     Attributes:
         over: Whether the sweep has been made.
@@ -69,7 +69,7 @@ class Probing:
         self._felt: list[tuple[float, float, float, float]] = []
 
     def begin(self, noise: float) -> None:
-        """Begin, with a finger of which one measurement across scatters by ``noise`` [m]."""
+        """Begin, with the noise of one measurement across the seam [m]."""
         self._noise = (max(self._noise[0], noise), self._noise[1])
 
     def velocity(self, elapsed: float) -> tuple[float, float]:
@@ -146,7 +146,7 @@ class Probing:
         self._felt.append((time, across, height, along))
 
     def learned(self) -> Learned | str | None:
-        """Return what was found, or why the weld must not begin; None: it is swept again."""
+        """Return the estimates, or why the weld must not begin; None to repeat the sweep."""
         if len(self._felt) < 15:  # four unknowns, and as many again for what is unexplained
             return "the tag was seen too seldom while the finger was probed"
         felt, cycles = np.array(self._felt), np.array(self._cycles)

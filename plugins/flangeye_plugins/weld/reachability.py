@@ -30,7 +30,7 @@ JUMP = np.radians(30.0)
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What is to be driven.
+    """A motion whose reachability is checked.
 
     Attributes:
         model: The arm.
@@ -54,7 +54,7 @@ class Task:
 
 
 class Station(NamedTuple):
-    """A pose on the way, and what to call it."""
+    """A pose on the path, with its name."""
 
     name: str
     pose: Transform

@@ -54,7 +54,7 @@ class _Field:
 
 
 class RefinedPath:
-    """What the tip felt, by arc length of the plan.
+    """The seam as measured by the tip, by arc length of the plan.
 
     Attributes:
         noise: Standard deviation of one sample [m].
@@ -91,7 +91,7 @@ class RefinedPath:
         self._sure: deque[tuple[float, float, float, float]] = deque()
 
     def add(self, s: float, offset: float, angle: float, doubt: float = 0.0) -> None:
-        """Believe that the seam is ``offset`` to the left of the plan at ``s`` [m].
+        """Add a measurement: the seam is ``offset`` to the left of the plan at ``s`` [m].
 
         The tool then stood at ``angle`` [rad]; ``doubt`` is the variance of how far the tip may
         have been off the seam [m^2]. What follows from it :meth:`renew` finds.
@@ -193,7 +193,7 @@ class RefinedPath:
         self._angles[index] = self._angles[self._next - 1] = angle
 
     def samples(self) -> Floats:
-        """Return what is believed: rows (K, 5) of arc length, offset, angle, count and doubt."""
+        """Return the measurements: rows (K, 5) of arc length, offset, angle, count, variance."""
         filled = np.flatnonzero(self._felt[:, 2])
         along, offset, count = self._felt[filled].T
         return np.column_stack(
@@ -213,7 +213,7 @@ class RefinedPath:
         return float(self._offsets(np.array([s]))[0])
 
     def slope(self, s: float) -> float:
-        """Return how fast the seam leaves the plan to the left, per length of it, before ``s``."""
+        """Return the seam's slope to the left of the plan, before ``s``."""
         before, here = self._offsets(np.array([s - SLOPE, s])).tolist()
         return float((here - before) / SLOPE)
 
@@ -229,7 +229,7 @@ class RefinedPath:
         return float(weights @ spread + self._doubts[max(index - near, 0) : index + near + 1].max())
 
     def worst(self, first: float, last: float) -> tuple[float, float]:
-        """Return where between two arc lengths the seam is known least, and the variance there.
+        """Return the least certain arc length between two, and the variance there.
 
         Up to what later measurements hardly change: the shortest field's length short of the tip.
         """

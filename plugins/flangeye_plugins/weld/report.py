@@ -1,4 +1,4 @@
-"""What a weld amounts to, from what was logged of it."""
+"""The report of a weld, from its log."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def _at(times: Floats, known: Floats, points: Floats) -> Floats:
 
 
 def learned_figures(controller: Controller) -> Mapping[str, float]:
-    """Return what the sweep at the start found."""
+    """Return the sweep's estimates."""
     root = follower_of(controller)
     if root is None:
         return {}

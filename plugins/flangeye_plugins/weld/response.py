@@ -1,4 +1,4 @@
-"""How an arm follows velocities: identified from a sweep, and where it will come to.
+"""The arm's response to velocities: identified from a sweep, used to predict its pose.
 
 After a dead time D it follows with a time constant tau. The commands it has been given but not yet
 carried out take it on by the integral over the last D seconds plus tau times its speed; a servo

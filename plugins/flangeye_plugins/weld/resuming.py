@@ -1,4 +1,4 @@
-"""Resuming a weld that was stopped: what the tip felt is kept, the torch goes back and overlaps.
+"""Resume a stopped weld: measurements are kept, and the torch overlaps the weld's end.
 
 What was felt is in the log: the controller is stepped through the logged poses and displacements as
 far as the log goes, so nothing has to be saved when a weld is stopped, not even by kill -9.
@@ -53,7 +53,7 @@ def controller_of(
 
 
 def task_of(plan: Path, distance: float, settings: Following) -> FollowingTask:
-    """Return what a plugin's controller is asked to do, the torch ``distance`` behind the tip."""
+    """Return the task of a plugin's controller, with the torch ``distance`` behind the tip."""
     return FollowingTask(
         plan.points, plan.tangents, plan.step, distance,
         settings.sign, settings.speed, settings.deflection, settings.preload, settings.servo_gain,
@@ -72,7 +72,7 @@ def _mode_of(logged: str | Mapping[str, Any]) -> Mode:
 
 
 def take_looks(controller: Controller, looks: Sequence[WeldProfile]) -> None:
-    """Tell a controller what was seen behind the torch."""
+    """Give a controller new profiles from behind the torch."""
     follower = follower_of(controller)
     if follower is not None:
         for profile in looks:
@@ -80,7 +80,7 @@ def take_looks(controller: Controller, looks: Sequence[WeldProfile]) -> None:
 
 
 def controller_from(start: Mapping[str, Any]) -> Controller:
-    """Return the controller of a logged weld, as it was at its start."""
+    """Return the controller of a logged weld, in its initial state."""
     tuples = {name: tuple(start["belief"][name]) for name in ("noise", "arc")}
     belief = Belief(**{**start["belief"], **tuples})
     settings = Following.model_validate(start["settings"])
@@ -103,7 +103,7 @@ def _kept_from(value: Mapping[str, Any]) -> ResumePoint:
 
 
 def resume_point_of(log: FilePath, points: Floats) -> ResumePoint | None:
-    """Return what a stopped weld has left; None where its torch had not been on the seam.
+    """Return the state of a stopped weld; None if its torch was not on the seam yet.
 
     Args:
         log: The weld's.
@@ -159,11 +159,11 @@ class LoggedWeld:
         self.newest = sight["number"]
 
     def feel(self, logged: Mapping[str, Any]) -> None:
-        """Take in what was felt in the newest image."""
+        """Process the measurement of the newest image."""
         self.felt[self.newest] = Touch(logged["time_ns"] * 1e-9, np.array(logged["displacement"]))
 
     def decided(self, command: Command, cycles: Mapping[str, list[Any]], i: int) -> None:
-        """Hear what the controller decides in a cycle, the ``i``-th of its block."""
+        """Process the controller's decision in a cycle, the ``i``-th of its block."""
 
     def _decide(self, cycles: Mapping[str, list[Any]]) -> None:
         for i, time in enumerate(cycles["time"]):
@@ -185,7 +185,7 @@ def _require_same(log: FilePath, points: Floats, before: Floats) -> None:
 
 
 def set_back(params: WeldTactileParams, plan: Path, distance: float, kept: ResumePoint) -> Start:
-    """Return where a resumed weld begins so that the torch overlaps.
+    """Return where a resumed weld begins, so that the torch overlaps.
 
     It is lit where the overlap begins, and set down a run-in before that; in a later pass, which
     touches nothing, it comes down right there.

@@ -99,7 +99,7 @@ class SweepSearch:
         return sum(newest) / len(newest) if len(newest) == count else 0.0
 
     def step(self, lateral: float) -> float:
-        """Return how far to go across [m], from where the end point is, left of the plan."""
+        """Return the next step across [m], from the end point's offset to the left of the plan."""
         if not self.down:
             return 0.0
         # A turning point is reached within 0.2 mm.

@@ -1,4 +1,4 @@
-"""What the finger says, which of its touches count, and the seam that follows from them."""
+"""The finger's measurements: which of its touches count, and the seam they give."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ STEADY = 0.03e-3
 
 @dataclass(frozen=True, eq=False)
 class SeamReading:
-    """The seam at the tip: measured while it touches, predicted while it does not.
+    """The seam at the tip: measured in contact, otherwise predicted.
 
     Attributes:
         offset: To the left of the plan [m].
@@ -58,7 +58,7 @@ class Located(NamedTuple):
 
 
 class Sensing:
-    """The finger, and the sweep at the start that tells what it really does.
+    """The finger, and the sweep at the start that identifies it.
 
     Attributes:
         search: Finds the groove.
@@ -87,7 +87,7 @@ class Sensing:
         self.seen = self.heard = now
 
     def true(self, pose: ToolPose) -> ToolPose:
-        """Return a pose with the tip as far ahead as the sweep has found it."""
+        """Return a pose with the tip's offset ahead corrected by the sweep."""
         ahead = self.learned.ahead * np.array([*pose.direction, 0.0])
         return ToolPose(pose.time, pose.position + ahead, pose.angle)
 
@@ -160,7 +160,7 @@ class Sensing:
         return now - self.heard
 
     def smooth(self, felt: SeamReading, noise: float) -> None:
-        """Take in a reading: a mean over as many as their scatter asks for.
+        """Add a reading to a moving mean, whose length depends on the scatter.
 
         Args:
             felt: The reading.
@@ -254,12 +254,12 @@ class SeamEstimate:
         return self._backed is not None
 
     def renew(self, torch: float) -> None:
-        """Take in what a control cycle has time for, with the torch at an arc length [m]."""
+        """Update the path within a cycle's time budget, with the torch at an arc length [m]."""
         if not self.backs:
             self.refined.renew(torch)
 
     def stands(self, found: Learned) -> float:
-        """Return the largest deflection that the sweep has seen the tip stand [m]."""
+        """Return the largest deflection at which the sweep has seen the tip stay seated [m]."""
         return min(found.swept, SWEEP_MARGIN * self._task.settings.deflection)
 
     def begin(
@@ -281,7 +281,7 @@ class SeamEstimate:
         self.arrive(found, torch)
 
     def back(self) -> None:
-        """Go back to where the seam begins: what is felt on the way is kept."""
+        """Go back to where the seam begins; measurements on the way are kept."""
         self._backed = []
 
     def lost_for(self, now: float) -> float:
@@ -289,7 +289,7 @@ class SeamEstimate:
         return 0.0 if self.lost is None else now - self.lost[0]
 
     def arrive(self, found: Learned, torch: float, lost: bool = False) -> None:
-        """Begin the path with what was felt at the sweep, and on the way back to the start.
+        """Begin the path with the measurements of the sweep and of the way back to the start.
 
         Args:
             found: What the sweep found.
@@ -338,7 +338,7 @@ class SeamEstimate:
         return pressed > self._task.settings.preload / 2.0
 
     def weigh(self, time: float, found: Located, learned: Learned, side: float) -> None:
-        """Weigh how the tip touches the wall of a side, 1 for the left.
+        """Update the contact modes by a touch of the wall on a side, 1 for the left.
 
         Args:
             time: Of the touch [s].
@@ -370,7 +370,7 @@ class SeamEstimate:
                 self.refined.add(s + task.plan.length, offset, angle, doubt)
 
     def keep(self, until: float) -> None:
-        """Believe what was felt up to a time [s], short of where the seam may end."""
+        """Add accepted measurements up to a time [s], short of where the seam may end."""
         task = self._task
         end = task.plan.length - max(task.settings.ending / 4.0, task.beyond)
         # Between two walls a tip that has fallen off the seam's end is told from one that has not.
@@ -392,7 +392,7 @@ class SeamEstimate:
         return self.contact.free < 1.0 - LOST and self.contact.deflection > pressing.most / 2.0
 
     def moved(self, found: Located) -> str:
-        """Return why the weld must stop: the seam is not where it was felt before; else nothing."""
+        """Return why the weld must stop if the seam has moved since it was measured; else ""."""
         before = self._task.before
         enough = 15  # measurements tell whether it has moved
         if before is None or len(self._moved) == enough or found.s > before.samples[-1, 0]:

@@ -23,7 +23,7 @@ INSIDE = 1.5e-3
 
 
 class PassParams(Params):
-    """A pass after the root's, along the path that this has found; nothing is touched."""
+    """A pass after the root pass, along the seam it found, without touch."""
 
     across: Length = param("0 mm", ge=-0.03, le=0.03, description="To the left of the seam.")
     up: Length = param(
@@ -161,7 +161,7 @@ class Following(Params):
 
     @property
     def still(self) -> float:
-        """Without an image of the tag for longer the arm stands until one comes [s].
+        """The arm stops if no image of the tag came for this long [s].
 
         It is at rest, since the last image was taken, after this, the images' latency and its
         braking.
@@ -179,7 +179,7 @@ class Following(Params):
 
     @property
     def sign(self) -> float:
-        """1 where the left wall is pressed, -1 for the right one."""
+        """1 if the left wall is pressed, -1 for the right one."""
         return 1.0 if self.side == "left" else -1.0
 
 

@@ -16,7 +16,7 @@ from flangeye_plugins.weld.task import WeldTask
 
 
 class Sway(NamedTuple):
-    """A swing at one time, to the left of the seam.
+    """The weave at one time, to the left of the seam.
 
     Attributes:
         aside: [m].
@@ -64,7 +64,7 @@ class Weave:
 
     @property
     def variance(self) -> float:
-        """Of what it is early or late by, across the seam [m^2]."""
+        """Variance across the seam from errors in its timing [m^2]."""
         # The arm's delay is known to 10 ms: a swing is early or late by it.
         return (self.fastest * 10e-3) ** 2 / 2.0
 
@@ -96,11 +96,11 @@ class Striking:
         return now >= self._ended + self._fills_for
 
     def level(self, now: float) -> float:
-        """Return what the arc is to do now: OFF, GAS or BURN."""
+        """Return the commanded state of the arc: OFF, GAS or BURN."""
         return BURN if now >= self._strikes else GAS if now >= self._gas else OFF
 
     def stands(self, now: float) -> bool:
-        """Return whether the torch has to stand still."""
+        """Return whether the torch must stand still: the arc strikes, or its crater fills."""
         asked, burns = self._strikes < math.inf, now >= self._strikes + self._struck_for
         return (asked and not burns) or self._ended < math.inf
 
@@ -212,7 +212,7 @@ class TorchLead:
     def turn(
         self, velocity: Floats, coming: ToolPose, normal: Floats, off: float, sway: Sway
     ) -> float:
-        """Return the angular velocity [rad/s] that keeps the torch where it is to be.
+        """Return the angular velocity that keeps the torch on its target [rad/s].
 
         Args:
             velocity: (2,) of the robot's end point [m/s].

@@ -108,7 +108,7 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
 
 @dataclass(frozen=True, eq=False)
 class Planned:
-    """A weld as it is decided on before anything moves.
+    """A planned weld, before anything moves.
 
     Attributes:
         seam: The leg that is welded.
@@ -212,7 +212,7 @@ def _plan_text(plan: Path, params: WeldTactileParams) -> str:
 
 
 def start_of(planned: Planned, belief: Belief) -> dict[str, Any]:
-    """Return all that the decisions of a weld follow from, besides what was measured."""
+    """Return all inputs of a weld's decisions other than measurements."""
     params, kept = planned.params, planned.kept
     return {
         "points": planned.surface.points.tolist(),

@@ -1,4 +1,4 @@
-"""What a follower is asked to do, and what a weld that was stopped has left of it."""
+"""The task of a follower, and the state of a stopped weld."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class WeldTask:
 
     @property
     def begins(self) -> float:
-        """Where the torch is to begin to weld, by arc length, if no start is felt [m]."""
+        """Arc length at which the torch begins to weld, unless a start is felt [m]."""
         after = self.start.torch
         return after if after > 0.0 else -self.beyond - self.lengthwise
 

@@ -35,12 +35,12 @@ class Progress:
         return pose.position[:2] - self._distance * pose.direction
 
     def lateral(self, pose: ToolPose) -> float:
-        """Return how far the end point is to the left of where a seated tip is planned [m]."""
+        """Return the end point's offset to the left of a planned, seated tip [m]."""
         place = self.place
         return float((pose.position[:2] - place.point) @ place.normal) - self._beside
 
     def advance(self, pose: ToolPose, coming: ToolPose) -> None:
-        """Go on to where the tool is, and will be; neither tip nor torch ever goes back."""
+        """Update progress by the tool's present and predicted pose; it never decreases."""
         advance = self._plan.advance
         self.tip = advance(coming.position[:2], self.tip, self._reach)
         self.place = self._plan.at(self.tip)
@@ -71,19 +71,19 @@ class Pressing:
         self._lost = self._turned = self._firm = 0.0
 
     def learn(self, found: Learned, swept: float) -> None:
-        """Press by what the sweep has found that the tip stands, ``swept`` at most [m]."""
+        """Limit the deflection to what the sweep showed to be safe, ``swept`` at most [m]."""
         if self._task.belief.two_walls:
             softly = max(swept / SOFTER, found.least)
             self.most = min(softly, self._task.settings.deflection)
 
     def ramp(self, phase: Phase, target: float, elapsed: float) -> None:
-        """Move the wanted deflection towards a target [m], as far as it may in a time [s]."""
+        """Move the wanted deflection towards a target [m], within its rate limit."""
         settings = self._task.settings
         rate = settings.release if phase == "ending" else settings.ramp
         self.wanted += within(target - self.wanted, rate * elapsed)
 
     def feeler(self, variance: float) -> float:
-        """Return by how much the tip goes beyond where a wall is expected that has ended [m].
+        """Return how far the tip reaches beyond a wall that has ended [m].
 
         The less is known of where the seam leads there, its ``variance`` [m^2], the farther, but
         never so far that it would meet the end of the wall head on.
@@ -92,7 +92,7 @@ class Pressing:
         return probe + min(BAND * math.sqrt(variance), probe)
 
     def played(self, phase: Phase, reversal: float) -> float:
-        """Return on which side of its play the finger is: 1 pressed, -1 let go of, and between.
+        """Return the side of the finger's play: 1 pressed, -1 released, and between.
 
         Args:
             phase: What the follower is doing; at the end the tip is let go of.

@@ -1,4 +1,4 @@
-"""What a weld leaves in the log while it runs: images, feelings, and every cycle's decision.
+"""The log of a weld while it runs: images, measurements, and every cycle's decision.
 
 Cycles go to the step's log in blocks, column by column. In real time a thread of its own writes, so
 that the loop never waits for the disk.
@@ -99,7 +99,7 @@ class WeldLog:
             self._put(name, value)
 
     def saw(self, sight: TagObservation) -> int:
-        """Write an image and what was felt in it; return its number."""
+        """Log an image and its measurement; return its number."""
         number, self.sights = self.sights, self.sights + 1
         felt = sight.feeling
         self._note_observation(number, sight)
@@ -119,7 +119,7 @@ class WeldLog:
         self.note("sight", {**told, "tag": sight.feeling is not None})
 
     def looked(self, profile: WeldProfile) -> None:
-        """Write what was seen behind the torch, and that the cycle now under way takes it in."""
+        """Log a profile, and that the present cycle uses it."""
         self.note("look", {"cycle": len(self.cycles), **asdict(profile)})
 
     def turned(self, cycle: Cycle) -> None:
@@ -143,18 +143,18 @@ class WeldLog:
 
 
 class LoggedLooks:
-    """The looks of a log, for a weld that is decided again; each is noted before its cycle."""
+    """The logged profiles, for a repeated weld; each is used in its logged cycle."""
 
     def __init__(self) -> None:
         self._by_cycle: dict[int, list[WeldProfile]] = {}
 
     def take(self, look: Mapping[str, Any]) -> None:
-        """Take in one of them, as it was logged."""
+        """Add one logged profile."""
         told = dict(look)
         self._by_cycle.setdefault(told.pop("cycle"), []).append(WeldProfile(**told))
 
     def of(self, cycle: int) -> list[WeldProfile]:
-        """Return what a cycle took in, by its number."""
+        """Return the profiles of a cycle, by its number."""
         return self._by_cycle.pop(cycle, [])
 
 

@@ -18,7 +18,7 @@ SHORT = 0.01
 
 
 class Welding:
-    """The torch's bound, and the arc that it allows.
+    """The torch's error bound, and the arc, which it permits.
 
     Attributes:
         sigma: Standard deviation of the torch's place across the seam [m].
@@ -51,13 +51,13 @@ class Welding:
         self._swept: float | None = None
 
     def begin(self, now: float) -> None:
-        """The gain that the sweep has found ages from a time on [s]."""
+        """Begin at a time [s], from which the sweep's gain estimate ages."""
         self._swept = now
 
     # --- how well the torch is known --------------------------------------------------------------
 
     def estimate(self, pose: ToolPose) -> str:
-        """Estimate how far the torch may be off, with the tool at a pose; let it weld or not.
+        """Update the torch's error bound for a tool pose; strike the arc where it permits.
 
         Returns:
             Why the weld must not go on, or nothing.
@@ -119,7 +119,7 @@ class Welding:
 
     @property
     def share_fixed(self) -> float:
-        """Share of the torch's variance that a look behind it alone could lessen."""
+        """Share of the torch's variance that only a profile behind it could reduce."""
         torch = self._progress.torch
         fixed = self.bias.variance(torch) if self.bias.looked else self.bias.prior
         return fixed / max(self.sigma**2, fixed)
@@ -136,13 +136,13 @@ class Welding:
 
     @property
     def ends(self) -> float:
-        """Where the torch is to end, by arc length [m]: where an end was felt, there."""
+        """Arc length at which the torch ends [m]; from the felt end if there is one."""
         felt = self._seam.end
         return self._task.ends if felt is None else felt + self._task.lengthwise
 
     @property
     def begins(self) -> float:
-        """Where the torch is to begin to weld, by arc length [m]: where a start was felt, there."""
+        """Arc length at which the torch begins to weld [m]; from the felt start if there is one."""
         felt = self._seam.start
         return self._task.begins if felt is None else felt - self._task.lengthwise
 
@@ -152,7 +152,7 @@ class Welding:
         return self.lit is not None and self.share >= 1.0 - SHORT
 
     def too_uncertain(self, bound: float, where: str = "") -> str:
-        """Return why a weld is refused, or stopped, whose bound is too wide [m]."""
+        """Return the reason for refusing or stopping a weld with too wide a bound [m]."""
         return (
             f"the torch is known to {bound * 1e3:.2f} mm only{where}, max_error is "
             f"{self._task.settings.max_error * 1e3:.3g} mm"

@@ -42,7 +42,7 @@ __all__ = [
 def from_archive(
     path: Path, stored: StoredCalibration, registry: Registry, overrides: Sequence[str] = ()
 ) -> MonitorCheck:
-    """Return what an archive shows of the flange: one check.
+    """Return one check: the flange as measured in an archive.
 
     Args:
         path: A later run's folder or ``run.mcap``, or recordings that a reader knows; those are

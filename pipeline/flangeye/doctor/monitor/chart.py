@@ -46,7 +46,7 @@ def write_chart(history: History, test: DriftTest, path: Path) -> None:
 
 
 def sentence(finding: CheckFinding) -> str:
-    """Return what a check says, in words."""
+    """Return a check's finding as a sentence."""
     how_far = f"the work is off by {finding.shift * 1e3:.2f} mm at its worst corner"
     if finding.since is None:
         return f"{how_far}, which is within what the calibration allows."

@@ -1,4 +1,4 @@
-"""Every check of a calibration, one JSON line each, under one checksum: what was seen and found."""
+"""The history of checks of a calibration: one JSON line a check, under one checksum."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 @dataclass(frozen=True, eq=False)
 class MonitorCheck:
-    """What was seen at one check.
+    """The measurements of one check.
 
     Attributes:
         source: Where it came from, for people.
@@ -46,7 +46,7 @@ class MonitorCheck:
 
 @dataclass(frozen=True)
 class CheckFinding:
-    """What one check says.
+    """The verdict of one check.
 
     Attributes:
         check: Its number, from 0.
@@ -89,7 +89,7 @@ class History:
 
     @classmethod
     def read(cls, path: Path, key: str) -> History:
-        """Read the file, or begin a history where there is none.
+        """Read the history file, or return an empty history if it does not exist.
 
         Raises:
             StageError: It cannot be read, was changed, or is the history of another calibration.
@@ -136,7 +136,7 @@ class History:
         self.checks.append(check)
 
     def write(self) -> None:
-        """Write the file whole, beside the old one, and put it in its place.
+        """Write the file beside the old one, then replace the old one.
 
         Raises:
             StageError: It cannot be written.
@@ -195,7 +195,7 @@ def only_user(path: Path) -> Iterator[None]:
 
 
 def prints_of(seen: Sequence[t.Observation]) -> set[bytes]:
-    """Return a key that is unique to each scan: no two give the same centre to the last bit."""
+    """Return a key for each scan: no two scans give the same centre to the last bit."""
     return {each.feature.centre.tobytes() for each in seen}
 
 

@@ -1,4 +1,4 @@
-"""The calibration that is watched: its pose, what is known of it, and the cell it belongs to."""
+"""The calibration that is monitored: its pose, covariance, and cell."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class StoredCalibration:
 
     @cached_property
     def recipe(self) -> str:
-        """The recipe that found it, with every default written out."""
+        """The recipe of that calibration, with every default written out."""
         return self.log.attachments.get("recipe.resolved.yaml", b"").decode()
 
     @cached_property
@@ -62,7 +62,7 @@ class StoredCalibration:
         return _arm_of(self.log)
 
     def refuse_another_arm(self, log: RunLog) -> None:
-        """Refuse a later run of an arm that is built otherwise.
+        """Refuse a run whose arm has other kinematics.
 
         Raises:
             StageError: Its flange stands elsewhere with every joint at zero.
@@ -85,7 +85,7 @@ class StoredCalibration:
 
     @cached_property
     def used(self) -> list[t.Observation]:
-        """The sightings that it was made from."""
+        """The sightings that the calibration was computed from."""
         return [pair.observation for pair in self.calibration.pairs if pair.used]
 
     @cached_property

@@ -35,7 +35,7 @@ OPEN = "none"
 def take(
     stored: StoredCalibration, history: History, check: MonitorCheck, test: DriftTest
 ) -> CheckFinding:
-    """Add a check to the history, without its misfits, and what it says; return that.
+    """Add a check without its outliers to the history; return its verdict.
 
     Raises:
         StageError: Its scans are in the history, or no single change of the cell explains them.
@@ -85,7 +85,7 @@ def _before(stored: StoredCalibration, history: History, test: DriftTest) -> Inf
 
 
 def judge(stored: StoredCalibration, history: History, test: DriftTest) -> CheckFinding:
-    """Return what the history's last check says; what has moved stays moved.
+    """Return the verdict of the last check; once MOVED, it stays MOVED.
 
     Args:
         stored: The calibration.

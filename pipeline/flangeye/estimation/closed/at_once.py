@@ -1,4 +1,4 @@
-"""Rotation and translation at once: AX = XB by dual quaternions, AX = ZB by Shah, and by Li."""
+"""Closed forms of rotation and translation together: AX = XB by dual quaternions, AX = ZB."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ FEWEST_KRONECKER = 12
 
 
 def kronecker(a: Floats, b: Floats, c: Floats) -> Triple:
-    """Return X, Y, Z (4, 4) linearly, each (N, 4, 4) given; N is 12 at least.
+    """Return X, Y, Z (4, 4) by linear least squares, from at least 12 poses each (N, 4, 4).
 
     ``A X B`` is linear in the 9 entries of X, ``Y C Z`` in the 81 products of those of Y and Z
     (as in Wang, Wu, Meng & Ren, IROS 2014, there with quaternions). The null vector holds both;
@@ -51,7 +51,7 @@ def kronecker(a: Floats, b: Floats, c: Floats) -> Triple:
 
 
 def best_rotations(given: Triple, rng: np.random.Generator) -> Triple:
-    """Return the rotations X, Y, Z (3, 3) that fit best of those found from many random starts.
+    """Return the rotations X, Y, Z (3, 3) with the least error over many random starts.
 
     All starts alternate for a few rounds together, and the best of them go on by Gauss and Newton,
     which takes a hundredth of the steps near the end.
@@ -151,7 +151,7 @@ def with_translations(given: Triple, rotations: Triple) -> Triple:
 
 
 def two_steps(a: Floats, b: Floats, c: Floats) -> Triple:
-    """Return X, Y, Z (4, 4) by the paper's (6), each (N, 4, 4) given.
+    """Return X, Y, Z (4, 4) by the paper's equation (6), from poses each (N, 4, 4).
 
     (a) The poses at which the second arm rests are eye-in-hand for the first; (b) those at which
     the first rests are eye-on-base for the second; (c) chains the two.

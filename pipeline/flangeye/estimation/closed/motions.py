@@ -1,4 +1,4 @@
-"""What poses give to closed forms: the motions between them, AX = XB.
+"""Relative motions between poses, for closed forms of AX = XB.
 
 One arm, whoever carries camera and target: with ``G = carrier_T_target_carrier`` of the
 controllers, turned round, and ``M = camera_T_target`` measured, ``G X M`` is the same at every

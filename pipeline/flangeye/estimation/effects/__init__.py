@@ -1,1 +1,1 @@
-"""What can be wrong with a cell: one effect a file, each a design block and a typical size."""
+"""Errors that a cell can have: each effect has a design block and a typical size."""

@@ -50,7 +50,7 @@ EACH = 1.8
 
 
 def arm_effects(problem: Problem, arm: str) -> list[Effect]:
-    """Return what may be wrong with one arm, or rail, all of it of one quality."""
+    """Return the effects of one arm or rail; their sizes share one quality."""
     carriers = [c for c in problem.carriers if c.arm == arm]
     accuracy = carriers[0].accuracy or ACCURACY
     effects = []
@@ -76,7 +76,7 @@ def arm_effects(problem: Problem, arm: str) -> list[Effect]:
 
 @dataclass(frozen=True, eq=False)
 class Scatter:
-    """What a cause adds to the noise of each sighting, anew at every pose.
+    """Noise that a cause adds to each sighting, independent from pose to pose.
 
     Attributes:
         covariances: Gives (N, 6, 6) of sightings, of size one.
@@ -92,7 +92,7 @@ class Scatter:
 
 
 def arm_scatters(problem: Problem) -> list[Scatter]:
-    """Return what scatters of each arm from pose to pose.
+    """Return the arms' noise from pose to pose.
 
     Backlash depends on how the arm came to a pose. Where its joints are not known, what they do is
     not known to be smooth either, but by where the flange is.
@@ -185,7 +185,7 @@ def _field_block(problem: Problem, linear: Linear, frame: str, field: SmoothFiel
 
 @lru_cache(maxsize=16)
 def displacements(carrier: Carrier) -> dict[str, Floats]:
-    """Return (T, 6, K) twists of what is carried, in the arm's base at its origin, of each kind."""
+    """Return (T, 6, K) twists of the carried frame, in the arm's base about its origin, by kind."""
     arm, joints = known(carrier)
     link = carrier.link
     columns = arm.jacobian(joints, link)

@@ -16,7 +16,7 @@ TIMES = 2.0
 
 
 def camera_effects(problem: Problem, size_unknown: bool = False) -> list[Effect]:
-    """Return what the features share of each camera's intrinsics, and the size of each target."""
+    """Return the effects of each camera's intrinsics and each target's size."""
     s, effects = problem.seen, []
     if s.shared.any():
         for camera in dict.fromkeys(camera for camera, _ in problem.ends):

@@ -43,7 +43,7 @@ def _delay(camera: str) -> Block:
 def delayed(
     observations: Sequence[Observation], cell: Cell, delays: Mapping[str, float]
 ) -> list[Observation] | None:
-    """Return observations with all that moves where it was so much later; None beyond the record.
+    """Return the observations with the arm where it was a delay later; None beyond the record.
 
     Args:
         observations: With how everything passed.

@@ -1,4 +1,4 @@
-"""What an effect is."""
+"""One error source of the mixed model: its design block, size and cause."""
 
 from __future__ import annotations
 

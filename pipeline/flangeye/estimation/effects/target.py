@@ -16,7 +16,7 @@ TIMES = 2.0
 
 
 def target_effects(problem: Problem) -> list[Effect]:
-    """Return what circles and faces may have wrong alike at all poses.
+    """Return the errors of circles and faces that are the same at all poses.
 
     Where a target's place is unknown, a tilt and an offset are part of it.
     """
@@ -37,7 +37,7 @@ def target_effects(problem: Problem) -> list[Effect]:
 
 
 def wrong_offset(problem: Problem, effects: Sequence[Effect]) -> list[Effect] | None:
-    """Return the effects with an offset of millimetres instead; None where there is no circle."""
+    """Return the effects with a circle offset of millimetres; None without a circle."""
     if not any(effect.kind == "offset" for effect in effects):
         return None
     return [

@@ -22,7 +22,7 @@ LARGEST = 1e-3
 def blame(
     before: Information, after: CheckSightings, about: Floats, scanner: Floats, daily: float
 ) -> Mapping[str, float]:
-    """Return the probability that each part explains what is seen after a change, likeliest first.
+    """Return each part's probability of having caused a change, likeliest first.
 
     The scanner turned, shifted or both, the flange replaced (so that the circle is elsewhere on
     it), and, where the arm's kinematics are known, one joint or the arm re-mastered.

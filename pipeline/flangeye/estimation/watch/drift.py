@@ -100,7 +100,7 @@ class DriftTest:
 
 @dataclass(frozen=True, eq=False)
 class DriftVerdict:
-    """What the last check says.
+    """The verdict of the last check.
 
     Attributes:
         state: OK, DEGRADED or MOVED.
@@ -121,7 +121,7 @@ class DriftVerdict:
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """Information about the camera's motion and the arm from checks: matrix and vector.
+    """Information matrix and vector of the camera's motion and the arm's error weights.
 
     Attributes:
         matrix: (..., 6 + K, 6 + K).
@@ -170,7 +170,7 @@ def allowance(deviation: float) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """What is known before the first check.
+    """Prior of the camera's motion and of the arm's error, before the first check.
 
     Attributes:
         told: By the calibration, of the camera's motion since and of the arm's error.
@@ -241,7 +241,7 @@ def verdict(checks: Information, prior: Prior, corners: Floats, test: DriftTest)
 def moved_since(
     checks: Information, prior: Prior, corners: Floats, test: DriftTest, since: int, ratio: float
 ) -> DriftVerdict:
-    """Return how far the camera is from where it was before check ``since``."""
+    """Return the camera's motion between the checks before ``since`` and those after it."""
     start = prior.told.loosened(test.seasonal)
     before = start.plus(checks.summed(max(since - test.reference, 0), since))
     change = _change(checks.summed(since, len(checks.matrix)), before)
@@ -261,7 +261,7 @@ def misfits(sightings: CheckSightings, before: Information, test: DriftTest) -> 
 
 
 def largest_shift(motion: Floats, corners: Floats) -> float:
-    """Return how far a motion (6,) moves the corner that it moves most [m]."""
+    """Return by how much a motion (6,) moves the work's corner that it moves most [m]."""
     return float(np.linalg.norm(np.cross(motion[:3], corners) + motion[3:], axis=1).max())
 
 

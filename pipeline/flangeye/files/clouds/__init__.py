@@ -24,7 +24,7 @@ from flangeye.types import CAMERA, PointCloud
 
 
 def mark_missing(xyz: Points) -> str:
-    """Set the points that stand for none to NaN, in place.
+    """Set the values by which scanners mark missing points to NaN, in place.
 
     A point that is repeated is none where it is the scanner's own origin, or farther than all
     others; so are points of one depth that is :data:`FARTHER` than all others.

@@ -31,7 +31,7 @@ Header = Mapping[str, list[str]]
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """Where the file says the scanner stood, in the frame of its points and their unit.
+    """The scanner's pose as a PCD file states it, in the frame and unit of its points.
 
     Attributes:
         words: Position and quaternion, w first, as written.
@@ -46,7 +46,7 @@ class Viewpoint:
         return np.asarray((xyz - np.array(self.words[:3])) @ turn, dtype=np.float32)
 
     def note(self, applied: bool) -> str:
-        """Return what to say of it."""
+        """Return the note for people on this viewpoint."""
         shown = f"VIEWPOINT {' '.join(f'{word:g}' for word in self.words)}"
         if applied:
             return f"points turned into the scanner's frame by {shown}"

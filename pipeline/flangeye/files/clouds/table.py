@@ -20,7 +20,7 @@ from flangeye.files.regular import open_regular
 
 
 def refuse(path: Path | str, what: str) -> NoReturn:
-    """Raise the StageError of a file: its path, and what is wrong with it."""
+    """Raise StageError with a file's path and what is wrong with it."""
     raise StageError(f"{path}: {what}")
 
 
@@ -94,7 +94,7 @@ class LzfError(ValueError):
 
 
 def decompress(data: bytes, wanted: int) -> bytearray:
-    """Return the first ``wanted`` bytes that ``data`` stands for; the rest is not decoded.
+    """Return the first ``wanted`` bytes of LZF data; the rest is not decoded.
 
     Raises:
         LzfError: The stream ends early, or refers to what was never written.
@@ -144,7 +144,7 @@ Points = NDArray[np.float32]
 
 
 class PointTable(Protocol):
-    """Where a file keeps its points, as its header says."""
+    """Where and how a file stores its points, as its header states."""
 
     @property
     def shape(self) -> Shape:

@@ -26,14 +26,14 @@ MATRICES = ((4, 4), (3, 3), (3, 4))
 
 
 class TableDocument(NamedTuple):
-    """What a file holds, and where its records stand, as messages begin with it."""
+    """The content of a file, and the place of each record for messages."""
 
     data: Any
     where: Callable[[int], str]
 
 
 def document_of(file: Path) -> TableDocument | None:
-    """Return what a file holds as mappings, lists, numbers and arrays; None if it is plain text.
+    """Return a file's content as mappings, lists, numbers and arrays; None for plain text.
 
     Raises:
         StageError: It cannot be read, or is damaged.

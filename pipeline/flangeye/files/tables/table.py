@@ -24,7 +24,7 @@ Row = tuple[str, tuple[Cell, ...]]
 
 
 class Rows(NamedTuple):
-    """What one source gives: a block of a text, a program, the lists of one length in a document.
+    """The rows of one source: a text block, a robot program, or lists of equal length.
 
     Attributes:
         heading: Names of the columns; empty without a heading.
@@ -64,7 +64,7 @@ class Table:
     convention: str | None = None
 
     def where(self, row: int) -> str:
-        """Return what messages about a row begin with."""
+        """Return the prefix of messages about a row: file and line."""
         return self.rows[row][0]
 
     def index(self, column: Column) -> int:
@@ -85,7 +85,7 @@ class Table:
         raise StageError(f"{self.file}: has no column '{column}'; {known}")
 
     def indices(self, columns: Sequence[Column]) -> list[int]:
-        """Return which columns are meant, from 0; ``pose`` is also all of ``pose.0``, ``pose.1``.
+        """Return the indices of columns, from 0; ``pose`` also means all of ``pose.0``, ``pose.1``.
 
         Raises:
             StageError: There is none of a name; names the nearest.
@@ -123,7 +123,7 @@ class Table:
 
 
 def number_of(cell: Cell) -> float | None:
-    """Return the number in a cell, with a decimal point or comma; None if it is none."""
+    """Return the number in a cell, with decimal point or comma; None if it is no number."""
     if not isinstance(cell, str):
         return cell
     text = cell.replace(",", ".") if re.fullmatch(r"[-+]?\d+,\d+([eE][-+]?\d+)?", cell) else cell

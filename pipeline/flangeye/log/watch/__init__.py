@@ -1,4 +1,4 @@
-"""``flangeye watch``: a run as it goes, in the terminal and in Foxglove; all of it from its log."""
+"""``flangeye watch``: follow a run live by its log, in the terminal and in Foxglove."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ if TYPE_CHECKING:
 
 
 class WaitingFile(io.RawIOBase):
-    """A file whose end is not its end: reading waits until there is more."""
+    """A file that is still written: reading at its end waits for more."""
 
     def __init__(self, file: BinaryIO, wait: Callable[[], None]) -> None:
         """Take a file; ``wait`` is called while there is nothing new, and may raise to give up."""
         self._file, self._wait = file, wait
 
     def readinto(self, buffer: Buffer) -> int:
-        """Fill as much of the buffer as there is, and at least a byte."""
+        """Fill the buffer with what is available; wait for one byte at least."""
         while not (new := self._file.read(len(memoryview(buffer)))):
             self._wait()
         memoryview(buffer)[: len(new)] = new
         return len(new)
 
     def readable(self) -> bool:
-        """Say that it can be read."""
+        """Return True: the file can be read."""
         return True
 
     def close(self) -> None:
@@ -214,7 +214,7 @@ HERE = "127.0.0.1"
 
 @contextmanager
 def foxglove_server(port: int) -> Iterator[Send]:
-    """Serve on a port of this machine alone; what is given is sent to whoever may watch.
+    """Serve messages to Foxglove on a local port; whatever is given is sent to all clients.
 
     Raises:
         StageError: foxglove-sdk is not installed, or the port is taken.
@@ -259,7 +259,7 @@ def _opened(channel: Channel) -> foxglove.Channel:  # type: ignore[name-defined]
 
 @contextmanager
 def gate(port: int, inside: tuple[str, int]) -> Iterator[None]:
-    """Hand on what may pass, from a port of this machine to a server, while the context lasts.
+    """Forward allowed connections from a local port to a server while the context lasts.
 
     Raises:
         OSError: The port is taken.

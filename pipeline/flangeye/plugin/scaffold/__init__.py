@@ -14,7 +14,7 @@ TEMPLATES = Path(__file__).parent / "templates"
 
 
 def kinds() -> dict[str, str]:
-    """Return the kinds a plugin can be written for, and what each is."""
+    """Return the kinds of plugins that can be created, with a description of each."""
     meanings = {kind: contract.meaning for kind, contract in KINDS.items()} | {
         kind: part.meaning for kind, part in PARTS.items()
     }

@@ -1,4 +1,4 @@
-"""``flangeye init``: from what a folder holds, or what runs, to a recipe that passes."""
+"""``flangeye init``: draft a valid recipe from a folder of recordings or a running cell."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["Draft", "Questions", "draft_live", "draft_recipe", "look"]
 
 
 def draft_live(cell: RunningCell, questions: Questions, out: Path) -> Draft:
-    """Return a recipe for an arm whose flange faces a camera beside it.
+    """Return a recipe for a running arm whose flange faces a camera beside it.
 
     Args:
         cell: What runs.

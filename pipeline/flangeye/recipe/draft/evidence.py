@@ -1,4 +1,4 @@
-"""What numbers alone show: which are poses, how written, and who carries the camera.
+"""Infer from numbers alone which are poses, in which convention, and where the camera is mounted.
 
 Between two captures arm and target turn by the same angle, whatever the frames: a convention in
 which they do not is the wrong one. A camera in the hand and one beside the robot, and a target's
@@ -35,7 +35,7 @@ TURN = 2 * math.pi + 0.01
 
 
 def poses_by_number(table: Table) -> tuple[list[PoseColumns], Headings]:
-    """Return the poses in a table whose columns have no names, the running index left out."""
+    """Return the poses in a table without column names; a running index is left out."""
     columns = [i for i, cell in enumerate(table.rows[0][1]) if number_of(cell) is not None]
     texts = [i for i in range(len(table.rows[0][1])) if i not in columns]
     rest = Headings(scan=texts[0] + 1 if len(texts) == 1 else None)
@@ -184,7 +184,7 @@ LOOSE_PLACE = 2e-3
 
 
 class Writing(NamedTuple):
-    """One way in which a row of numbers may be a pose: as written, or at an arm's joint angles."""
+    """One way to read a row as a pose: a pose convention, or an arm's joint angles."""
 
     rotation: str
     length: LengthUnit
@@ -192,7 +192,7 @@ class Writing(NamedTuple):
     kinematics: Arm | None = None
 
     def poses(self, numbers: Floats) -> Floats | None:
-        """Return (N, 4, 4) poses [m]; None where a row is none in this convention."""
+        """Return (N, 4, 4) poses [m]; None if a row is no valid pose in this convention."""
         if self.kinematics is not None:
             return self.kinematics.flange(np.radians(numbers) if self.angle == "deg" else numbers)
         try:
@@ -204,7 +204,7 @@ class Writing(NamedTuple):
 
 @dataclass(frozen=True)
 class Choice:
-    """What fits best, and how much better than the next.
+    """The best hypothesis, and by how much it beats the next.
 
     Attributes:
         arm: How the arm's poses are written.
@@ -293,7 +293,7 @@ def _turned(poses: Floats | None) -> Floats | None:
 
 
 class Mounting(NamedTuple):
-    """Who carries the camera, and which way round the target's poses are."""
+    """Where the camera is mounted, and the direction of the target's poses."""
 
     camera: str
     target: str

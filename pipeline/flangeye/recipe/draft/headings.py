@@ -92,7 +92,7 @@ ROTATIONS = _rotations()
 
 @dataclass(frozen=True)
 class PoseColumns:
-    """Columns that hold a pose, a point or joint angles, as far as names and numbers show.
+    """Columns that hold a pose, a point or joint angles, inferred from names and numbers.
 
     Attributes:
         table: Where.
@@ -125,14 +125,14 @@ class PoseColumns:
 
     @property
     def may_be_joints(self) -> bool:
-        """Whether it is joint angles, or numbers without names that may be."""
+        """Whether the columns are joint angles, or unnamed numbers that may be."""
         numbers = [column for column in self.columns if isinstance(column, int)]
         nameless = len(numbers) == len(self.columns) == 6 and numbers == sorted(numbers)
         return self.rotations == JOINTS or (nameless and not self.rotations)
 
     @property
     def role(self) -> str | None:
-        """``arm`` or ``target``: by the columns, the program or the file; None where none says."""
+        """``arm`` or ``target``, from the names of columns, program or file; None if unknown."""
         if self.table.convention is not None and not self._is_echo:
             return "arm"
         opencv = "target" if self.called.lower() in _OPENCV else None
@@ -143,7 +143,7 @@ class PoseColumns:
 
     @property
     def frames(self) -> tuple[str, str] | None:
-        """Frames A and B of A_T_B, as a name says."""
+        """Frames A and B of A_T_B, from a name; None if no name has them."""
         names = (self.called, *re.split(r"[/:]", self.table.name)[::-1])
         found = next((found for name in names if (found := frames_in(name))), None)
         # ROS's tf_echo prints the pose of the frame that is named last, base_to_tool0 or base2tool0
@@ -176,7 +176,7 @@ class Group:
 
 @dataclass(frozen=True)
 class Headings:
-    """What a table holds beside poses.
+    """What a table's heading names beside poses: times, scans, joints.
 
     Attributes:
         scan: Column of the scans' names.
@@ -194,7 +194,7 @@ class Headings:
 
 
 def poses_by_name(table: Table) -> tuple[list[PoseColumns], Headings]:
-    """Return the poses and points in a table with a heading, and what else its names say."""
+    """Return the poses and points in a table with a heading, and its other named columns."""
     groups, rest = _grouped(table)
     found = [_pose(table, group) for group in groups.values()]
     return [pose for pose in found if pose is not None], rest
@@ -359,7 +359,7 @@ def _matrix_entries(group: Group) -> tuple[Column, ...]:
 
 
 def frames_in(name: str) -> tuple[str, str] | None:
-    """Return frames A and B of A_T_B, as a name says; None where it does not."""
+    """Return frames A and B of A_T_B in a name; None if it has none."""
     to = _TO.search(name)
     match = to or _IN.search(name) or _OF.search(name)
     if match is None:
@@ -379,7 +379,7 @@ def is_inverse(frames: tuple[str, str]) -> bool:
 
 
 def role_in(name: str) -> str | None:
-    """Return ``arm`` or ``target``, as a name says; None where it does not."""
+    """Return ``arm`` or ``target`` by a name; None if it says neither."""
     frames = frames_in(name.rpartition(":")[2])
     if frames is not None:
         return "target" if "camera" in frames else "arm"

@@ -1,4 +1,4 @@
-"""From what was seen and answered to a recipe's text."""
+"""Write a recipe's text from a survey and its answers."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Draft:
 def draft_recipe(
     survey: FolderSurvey, out: Path, questions: Questions, registry: Registry
 ) -> Draft:
-    """Return a recipe for what was seen.
+    """Return a recipe for a surveyed folder.
 
     Args:
         survey: What the folder holds.

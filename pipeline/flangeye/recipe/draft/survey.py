@@ -1,4 +1,4 @@
-"""What a folder holds, and what a person is asked about it."""
+"""Survey a folder of recordings, and ask a person what it does not show."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ FEWEST_ROWS = 3
 
 @dataclass(frozen=True)
 class FolderSurvey:
-    """What was seen.
+    """The contents of a folder of recordings.
 
     Attributes:
         folder: Where.
@@ -134,7 +134,7 @@ class FolderSurvey:
         return [p for p in self.files if p.suffix.lower() in suffixes and p not in read]
 
     def lines(self) -> list[str]:
-        """Return what was seen, a line each for people."""
+        """Return the survey as lines of text."""
         unread = (".npz", ".mat", *CONVERSIONS, *VENDOR)
         told = [
             f"{what}: {', '.join(f'{n} {suffix}' for suffix, n in sorted(kinds.items()))}"
@@ -149,7 +149,7 @@ class FolderSurvey:
 
 
 def look(folder: Path) -> FolderSurvey:
-    """Return what a folder holds.
+    """Return a survey of a folder.
 
     Raises:
         RecipeError: There is none, or it is empty.
@@ -170,7 +170,7 @@ def look(folder: Path) -> FolderSurvey:
 
 
 def places(folder: Path, files: Sequence[Path]) -> Iterator[tuple[str, list[Path]]]:
-    """Yield files as a recipe names them, those that are named alike under one pattern."""
+    """Yield files as a recipe names them; files named alike share one pattern."""
     groups: dict[str, list[Path]] = defaultdict(list)
     known = (
         ".csv", ".txt", ".dat", ".tsv", ".tum", ".log", ".mod", ".src", ".ls", ".script", *KINDS,

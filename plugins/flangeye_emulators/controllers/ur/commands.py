@@ -160,7 +160,7 @@ def _end_of_run(script: ControlScript, index: int) -> int:
 
 
 def travel(arm: SimulatedArm, run: list[Move]) -> Travel:
-    """Return the ride through moves of one kind, from where the arm stands."""
+    """Return a motion through moves of one kind, from the arm's present place."""
     acceleration = min(move.acceleration for move in run)
     if run[0].kind == "movej":
         targets = [joints_at(arm, m.target) if m.is_pose else m.target for m in run]
@@ -223,7 +223,7 @@ def _keep_speed(script: ControlScript) -> Thread:
 
 
 def stop_speed(script: ControlScript) -> Thread:
-    """15, speedStop: as the velocity was meant, in space or in joints."""
+    """15, speedStop: stop in the space of the velocity command, Cartesian or joint."""
     deceleration = script.number(0)
     in_space = script.orders.speed is None or script.orders.speed.in_space
     script.kill("speed")
@@ -299,7 +299,7 @@ def stop_jog(script: ControlScript) -> Thread:
 
 
 def force_mode(script: ControlScript) -> None:
-    """6, forceMode: give way along axes of a frame that is fixed in the base."""
+    """6, forceMode: comply along axes of a frame fixed in the base."""
     kind = script.integer(1)
     plain = 2  # the frame is taken as it is given
     if kind != plain:
@@ -337,7 +337,7 @@ def set_force_gain(script: ControlScript) -> None:
 
 
 def zero_force_sensor(script: ControlScript) -> None:
-    """8, zeroFtSensor: what is felt now counts as nothing."""
+    """8, zeroFtSensor: the present force becomes zero."""
     script.arm.zero_force()
 
 
@@ -426,7 +426,7 @@ def read_contact_detection(script: ControlScript) -> None:
 
 
 def end_move_at_contact(script: ControlScript) -> Thread:
-    """254, given by the script itself."""
+    """254, issued by the script itself."""
     script.abandon_move()
     yield from go_back_to_contact(script, script.orders.contact_steps)
 
@@ -506,7 +506,7 @@ def set_watchdog(script: ControlScript) -> None:
 
 
 def accept(script: ControlScript) -> None:
-    """Do nothing: what is set has no effect on this arm."""
+    """Accept a setting that has no effect on this arm."""
     del script
 
 

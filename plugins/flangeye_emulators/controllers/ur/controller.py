@@ -28,7 +28,7 @@ UR10e 120 and 180 deg/s; the CB3 arms alike)."""
 
 
 class RefusedError(Exception):
-    """The controller does not do what it was asked; the words are the dashboard's."""
+    """The controller refuses a command; the text is the dashboard's."""
 
 
 class URController(ControlUnit):
@@ -148,7 +148,7 @@ class URController(ControlUnit):
         self.runtime, self.arm.held = Runtime.PAUSED, True
 
     def play(self) -> None:
-        """Go on with a paused program.
+        """Resume a paused program.
 
         Raises:
             RefusedError: None is paused, it cannot go on from here, or a stop is in force.
@@ -169,7 +169,7 @@ class URController(ControlUnit):
     # Safety and power
 
     def protective_stop(self, why: str) -> None:
-        """Stop the arm on its path, brakes where it cannot stay on it, and hold the program."""
+        """Stop the arm on its path, or by brakes if it leaves it, and pause the program."""
         if self.safety is not SafetyMode.NORMAL:
             return
         self.note(f"protective stop: {why}")
@@ -212,7 +212,7 @@ class URController(ControlUnit):
         self.robot_mode = RobotMode.POWER_OFF
 
     def power_on(self) -> None:
-        """Give power; the brakes stay on."""
+        """Power on; the brakes stay on."""
         if self.safety is SafetyMode.NORMAL and self.robot_mode is RobotMode.POWER_OFF:
             self.robot_mode = RobotMode.IDLE
 
@@ -278,7 +278,7 @@ def joint_speeds_of(robot: RobotModel) -> NDArray[np.float64]:
 
 
 def dashboard_name_of(robot: RobotModel) -> str:
-    """Return the name the dashboard gives the arm: ``UR5`` for a UR5e too."""
+    """Return the arm's name on the dashboard: ``UR5`` for a UR5e too."""
     return robot.model.rstrip("e").upper()
 
 

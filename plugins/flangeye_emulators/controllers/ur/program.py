@@ -1,4 +1,4 @@
-"""A program in cycles: a main thread and others, of which one at a time may move the arm."""
+"""A program in cycles: a main thread and others; only one at a time may move the arm."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ MAIN = "main"
 
 
 class ProgramError(Exception):
-    """What URScript calls a runtime error: the program stops."""
+    """A URScript runtime error; the program stops."""
 
 
 class Program:
@@ -90,7 +90,7 @@ class Program:
         yield from self.follow(plan())
 
     def follow(self, motion: ControllerMotion) -> Thread:
-        """Go through a motion from where the arm is and as fast as it is."""
+        """Run a motion from the arm's present place and speed."""
         while not motion.done:
             self.drive(motion)
             yield

@@ -160,7 +160,7 @@ OUTPUTS: dict[str, Output] = {
 
 
 def write_inputs(box: URController, values: dict[str, float]) -> None:
-    """Do what one input package says: registers, outputs, the speed slider."""
+    """Apply one input package: registers, outputs, the speed slider."""
     for name, value in values.items():
         group, _, number = name.rpartition("_")
         if group == "input_int_register":
@@ -187,7 +187,7 @@ _FREQUENCY = struct.Struct(">d")
 
 
 class RtdePort:
-    """The RTDE port of a controller: its sessions, and who may write which input."""
+    """The RTDE port of a controller: its sessions, and which session writes which input."""
 
     def __init__(self, network: Network, box: URController) -> None:
         self._network = network
@@ -201,7 +201,7 @@ class RtdePort:
             session.publish(cycle)
 
     def claim(self, names: list[str], session: RtdeSession) -> list[str]:
-        """Return those inputs that another session writes; if there are none, claim them all."""
+        """Claim inputs for a session; return those that another session has claimed."""
         taken = [
             name
             for name in names
@@ -234,7 +234,7 @@ class RtdeSession(Connection):
         self._port.sessions.add(self)
 
     def closed(self) -> None:
-        """Give the inputs free."""
+        """Release the session's inputs."""
         self._started = False
         self._port.sessions.discard(self)
 
@@ -334,7 +334,7 @@ class OutputRecipe:
     """
 
     def __init__(self, names: Sequence[str]) -> None:
-        """Look the names up."""
+        """Look up the recipe's variables."""
         self.types = [OUTPUTS[name].type if name in OUTPUTS else NOT_FOUND for name in names]
         self.valid = NOT_FOUND not in self.types
         if self.valid:
@@ -373,7 +373,7 @@ class InputRecipe:
                 place += len(struct.unpack(f">{FORMATS[type_]}", bytes(_size(type_))))
 
     def apply(self, body: bytes, box: URController) -> None:
-        """Do what a package says; one that is too short is dropped.
+        """Apply a package; a package that is too short is dropped.
 
         ur_rtde sends packages that are longer than their recipe; what is beyond is not read.
         """

@@ -1,4 +1,4 @@
-"""The registers of ur_rtde's control script, and what its threads share."""
+"""The registers of ur_rtde's control script, and the state its threads share."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class ControlScript(Program):
             self.box.registers.output_double[self.offset + i] = value
 
     def show_progress(self, value: int | None) -> None:
-        """Show how far an operation in the background is; None when there is none.
+        """Set the progress register of a background operation; None if none runs.
 
         Bits 0-14 the progress, 15 whether one runs, 16-22 a count of writes, 24-30 of operations.
         """
@@ -160,7 +160,7 @@ class ScriptSource(NamedTuple):
 
 
 def take_program(text: str) -> tuple[ScriptSource | None, str]:
-    """Return the first whole program in ``text``, if there is one, and what comes after it."""
+    """Return the first complete program in ``text``, if any, and the rest of the text."""
     begins = re.search(r"^def (\w+)\(\):", text, flags=re.M)
     end = re.compile(r"\nend[ \t]*(?=\n|$)")
     ends = end.search(text, begins.end()) if begins else None
@@ -176,7 +176,7 @@ def register_offset(program: str) -> int:
 
 
 def injected_path(program: str) -> list[Move]:
-    """Return the moves ur_rtde wrote into its control script; empty when there are none."""
+    """Return the moves that ur_rtde wrote into its control script; empty without any."""
     _, begins, rest = program.partition("# inject move path\n")
     if not begins:
         return []
@@ -191,7 +191,7 @@ def find_move(line: str) -> Move | None:
 
 
 def parse_move(found: re.Match[str]) -> Move:
-    """Return the move that was found; URScript's defaults where it does not say."""
+    """Return a parsed move, with URScript's defaults for what it omits."""
     kind, is_pose, target, options = found.groups()
     joint = kind == "movej"
     given = {

@@ -63,7 +63,7 @@ class DashboardSession(LineConnection):
 
 
 def answer(box: URController, text: str) -> str:
-    """Return the answer to one command, after doing what it says."""
+    """Execute one command and return its answer."""
     lowered = text.lower()
     for command, act in ANSWERS.items():
         if lowered == command or lowered.startswith(command + " "):

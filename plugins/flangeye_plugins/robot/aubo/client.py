@@ -68,7 +68,7 @@ class AuboClient:
         self.config: Any = robot.getRobotConfig()
 
     def ask(self, what: str, question: Callable[[], T]) -> T:
-        """Return what the library answers.
+        """Call a query of the library and return its answer.
 
         Raises:
             DeviceError: It raises: the connection is lost, or the controller refuses.
@@ -89,7 +89,7 @@ class AuboClient:
         )
 
     def command(self, what: str, order: Callable[[], int]) -> None:
-        """Give a command.
+        """Call a command of the library.
 
         Raises:
             DeviceError: It was not taken.
@@ -121,7 +121,7 @@ def _say_nothing(*_: object) -> None:
 
 
 class Ride:
-    """One move: velocities towards the goal, renewed at every look at the arm.
+    """One move: velocities towards the goal, renewed at every reading of the arm.
 
     It begins at rest, heads straight for the goal with a trapezoidal profile of speed, comes to
     rest near it, and leaves the last bit to the controller. A ride that nobody looked at for SILENT

@@ -116,7 +116,7 @@ class AuboRobot(Device):
         self._closed = False
 
     def state(self) -> RobotState:
-        """Read the arm, and send a move that is under way on.
+        """Read the arm's state; also continues a move that is under way.
 
         It is read once more where this computer was too busy to read it at one time.
         """
@@ -204,7 +204,7 @@ class AuboRobot(Device):
         )  # fmt: skip
 
     def move_velocity(self, twist: Floats, acceleration: float) -> None:
-        """Go on at a twist (6,) of the flange; the controller itself ends it after GRACE."""
+        """Move the flange at a twist (6,); the controller stops unless renewed within GRACE."""
         base_T_tool = POSE.matrix(self._ask("pose", self._client.state.getTcpPose))
         self._require_able()
         at_tool = twist_at_tool(twist, base_T_tool @ self._tool_T_flange, base_T_tool)
@@ -232,7 +232,7 @@ class AuboRobot(Device):
             self._client.command("stop", lambda: motion.stopLine(stop, stop))
 
     def close(self) -> None:
-        """Stop the arm and let go of the connection."""
+        """Stop the arm and disconnect."""
         if self._closed:
             return
         if not self._reads_only:

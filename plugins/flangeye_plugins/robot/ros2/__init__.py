@@ -1,1 +1,1 @@
-"""Any arm that ROS 2 has a driver for: one that it moves, and one that somebody else moves."""
+"""Arms with a ROS 2 driver: moved by us, or by others."""

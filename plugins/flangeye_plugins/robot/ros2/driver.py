@@ -1,4 +1,4 @@
-"""``robot.ros2`` moves an arm under ROS 2; ``robot.ros2_freedrive`` listens to one others move."""
+"""``robot.ros2`` moves an arm under ROS 2; ``robot.ros2_freedrive`` follows one moved by others."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ class Ros2Arm(Listener):
         self._begin(pieces.linear_path(self.arm, start, goal, speed, acceleration))
 
     def move_velocity(self, twist: Floats, acceleration: float) -> None:
-        """Go on at a twist (6,) of the flange."""
+        """Move the flange at a twist (6,)."""
         joints = self._fresh().joints
         jacobian = self.arm.jacobian(joints)
         speeds = np.linalg.lstsq(jacobian, np.concatenate([twist[3:], twist[:3]]), rcond=None)[0]
@@ -126,7 +126,7 @@ class Ros2Arm(Listener):
         motion.ask(speeds, acceleration / max(lever, 1.0))
 
     def wait_cycle(self) -> None:
-        """Wait for the next joint state, and lead the arm on: it stops where nobody waits."""
+        """Wait for the next joint state, and extend the motion; it ends if this is not called."""
         super().wait_cycle()
         silent = time.monotonic() - self._renewed
         if self._motion is not None and silent > SILENT:
@@ -146,7 +146,7 @@ class Ros2Arm(Listener):
             self._motion, self._ended = None, time.monotonic() + pieces.STOPPING
 
     def close(self) -> None:
-        """Stop, and let go of ROS 2."""
+        """Stop, and disconnect from ROS 2."""
         try:
             if not self._bridge.closed and self._motion is not None:
                 self.stop()
@@ -238,7 +238,7 @@ class FreedriveArm(Listener):
         super().__init__("robot.ros2_freedrive", model, params, bridge)
 
     def move_joints(self, joints: Floats, speed: float, acceleration: float) -> None:
-        """Wait until the arm was moved on and stands still; suggest the most informative pose."""
+        """Wait until others have moved the arm and it stands; suggest the most informative pose."""
         del speed, acceleration
         pose = self.arm.flange(joints)
         lean = np.degrees(np.arccos(np.clip(pose[:3, 2] @ self._facing(), -1.0, 1.0)))
@@ -255,11 +255,11 @@ class FreedriveArm(Listener):
         self.move_joints(found[0] if len(found) else self._fresh().joints, speed, acceleration)
 
     def move_velocity(self, twist: Floats, acceleration: float) -> None:
-        """Refuse: others move it."""
+        """Refuse: others move the arm."""
         raise DeviceError(f"{self.name}: others move it; it cannot be led")
 
     def stop(self) -> None:
-        """Do nothing: the arm is somebody else's."""
+        """Do nothing: others move the arm."""
 
     def _facing(self) -> Floats:
         return self.arm.flange(self._fresh().joints)[:3, 2]

@@ -118,7 +118,7 @@ class Listener(Device):
             self._fresh()
 
     def close(self) -> None:
-        """Let go of ROS 2."""
+        """Disconnect from ROS 2."""
         self._bridge.close()
 
     def speeds(self) -> Floats:

@@ -1,4 +1,4 @@
-"""Motions in pieces that end by themselves: what is not renewed leaves the arm standing.
+"""Motions published in short pieces: if they are not renewed, the arm stops at their end.
 
 A piece holds where the motion has just been, leads a little way along it, and then to rest. The
 controller replaces the piece before. When no more come, because anything on the way here has died,
@@ -50,7 +50,7 @@ class Point(NamedTuple):
 
 
 class DrivenMotion(ABC):
-    """What is driven in pieces.
+    """A motion that is published in pieces.
 
     Attributes:
         done: Whether there is nothing left to lead to.
@@ -204,7 +204,7 @@ class Velocity(DrivenMotion):
 
 
 def brake(last: Point, deceleration: float) -> list[Point]:
-    """Return the point at which joints come to rest; none where they stand.
+    """Return the point at which the joints come to rest; none if they are at rest.
 
     With positions and speeds at both ends a controller's cubic is the parabola of a constant
     deceleration.

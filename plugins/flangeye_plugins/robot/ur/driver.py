@@ -64,7 +64,7 @@ SAFETY_NAMES = {
 
 
 class DashboardFacts(NamedTuple):
-    """What the dashboard says.
+    """State and versions reported by the dashboard.
 
     Attributes:
         version: Version of the controller's software.
@@ -140,7 +140,7 @@ def _reason(error: OSError) -> str:
 
 
 class Condition(NamedTuple):
-    """What the controller is able to do.
+    """State of the controller, and what to do about it.
 
     Attributes:
         mode: As in :class:`flangeye.devices.RobotState`.
@@ -152,7 +152,7 @@ class Condition(NamedTuple):
 
 
 def condition_of(sample: CycleSample, commanded: bool) -> Condition:
-    """Return what the controller is able to do; the worst comes first.
+    """Return the controller's state; of several faults, the most severe.
 
     Args:
         sample: The newest one.
@@ -289,7 +289,7 @@ class UrRobot(Device):
         self._seen = sample.number
 
     def stop(self) -> None:
-        """Brake; where the client does not answer, stop the program through the dashboard."""
+        """Brake; if the client library does not answer, stop the program through the dashboard."""
         try:
             self._command("stop")
         except DeviceError:

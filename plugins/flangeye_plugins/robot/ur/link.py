@@ -27,7 +27,7 @@ LEAVING = 0.6
 
 
 class CycleSample(NamedTuple):
-    """What the controller sent in one cycle.
+    """The controller's data of one cycle.
 
     Attributes:
         number: Samples since the connection was made.
@@ -100,7 +100,7 @@ class ControllerLink:
             raise
 
     def sample(self) -> CycleSample | None:
-        """Return the newest sample; None while there is none.
+        """Return the newest sample; None before the first.
 
         Raises:
             DeviceError: The process is gone, with the connection or without.
@@ -117,11 +117,11 @@ class ControllerLink:
         return None
 
     def look(self) -> None:
-        """Prove to the process that somebody watches the arm: without, a motion ends."""
+        """Renew the watchdog: without it a motion ends."""
         worker.LOOK.pack_into(self._memory, worker.SIZE, time.monotonic())
 
     def request(self, what: str, **arguments: Any) -> Any:
-        """Let the library do something, and return what it gives.
+        """Send a call to the library's process, and return its result.
 
         Raises:
             DeviceError: It did not do it, or did not answer: then its process is ended.

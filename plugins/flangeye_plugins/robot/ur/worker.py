@@ -48,11 +48,11 @@ SILENT = 0.15
 
 
 class WorkerRefused(Exception):
-    """The library or the controller did not do what it was asked."""
+    """The library or the controller refused a command."""
 
 
 class SampleClock:
-    """Tells when the controller took a sample, by this computer's clock.
+    """Converts the controller's sample times to this computer's clock.
 
     The earliest arrival, seen over time, has the least delay in it; delays only ever add.
     """
@@ -126,7 +126,7 @@ class Publisher(threading.Thread):
 
 
 class Commander:
-    """Gives the library its commands, one at a time.
+    """Passes commands to the library, one at a time.
 
     Attributes:
         remote: Whether programs may come through the network: 1, 0, or -1 where it cannot be asked.
@@ -143,7 +143,7 @@ class Commander:
         self._stopping: Callable[[float], Any] = control.stopL
 
     def busy(self) -> bool:
-        """Return whether a command is under way, or has yet to begin."""
+        """Return whether a command is running or queued."""
         now = time.monotonic()
         if now < self._velocity_until:
             return True
@@ -163,7 +163,7 @@ class Commander:
         self._require(self._control.moveL(pose, speed, acceleration, True))
 
     def move_velocity(self, twist: Sequence[float], acceleration: float) -> None:
-        """Go on at a twist of the tool."""
+        """Move at a twist of the tool."""
         if self._velocity_until == -math.inf and self.busy():
             self.stop()
         self._require(self._control.speedL(twist, acceleration, self._period))
@@ -183,7 +183,7 @@ class Commander:
         return list(self._control.getTCPOffset())
 
     def idle(self) -> None:
-        """Do what is due when no command comes."""
+        """Do periodic work between commands: the watchdog, and ends of motions."""
         if self._receive.getRuntimeState() != self.playing:
             return
         # The time comes first: who is held up after reading must not take a look for an old one.
@@ -194,7 +194,7 @@ class Commander:
         self._control.kickWatchdog()
 
     def answered(self) -> None:
-        """Note that the owner was here: while it waits for an answer it looks at nothing."""
+        """Renew the watchdog: while the owner waits for an answer it cannot do so itself."""
         self._answered = time.monotonic()
 
     def _looked(self) -> float:
@@ -228,7 +228,7 @@ class Commander:
 
 
 class Onlooker:
-    """Stands where the commander does in a process that reads and does nothing else."""
+    """Takes the commander's place in a process that only reads."""
 
     remote = -1
 
@@ -240,10 +240,10 @@ class Onlooker:
         """Do nothing when no command comes."""
 
     def answered(self) -> None:
-        """Do nothing when one was answered."""
+        """Do nothing: there is no watchdog to renew."""
 
     def give_up(self) -> None:
-        """End the process; the arm never heard of it."""
+        """End the process without stopping the arm, which it never commanded."""
         os._exit(0)
 
 
@@ -290,12 +290,12 @@ def ask_dashboard(host: str, patience: float = 1.0) -> Any:
 
 
 def read_remote(answer: str) -> int:
-    """Return 1 for remote control, 0 for local, -1 where the controller does not know the word."""
+    """Return 1 for remote control, 0 for local, -1 if the controller does not know the command."""
     return {"true": 1, "false": 0}.get(answer.lower(), -1)
 
 
 def serve(line: socket.socket, commander: Commander | Onlooker) -> None:
-    """Do what comes through the socket until it ends."""
+    """Execute requests from the socket until it closes."""
     while True:
         # Longest silence towards the controller [s]
         ready, _, _ = select.select([line], [], [], 0.02)
@@ -319,7 +319,7 @@ def answer(commander: Commander | Onlooker, request: dict[str, Any]) -> dict[str
 
 
 def one_line(error: Exception) -> str:
-    """Return what the library says, without its own line ends."""
+    """Return the library's message as one line."""
     return " ".join(str(error).split()) or type(error).__name__
 
 

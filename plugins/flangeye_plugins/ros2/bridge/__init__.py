@@ -1,1 +1,1 @@
-"""A folder of its own: the other Python looks for modules here first, and finds no others."""
+"""In a folder of its own, so that the bridge's Python imports these modules and no others."""

@@ -31,11 +31,11 @@ Request = dict[str, Any]
 
 
 class RequestRefused(Exception):
-    """What was asked for cannot be done: why."""
+    """A request cannot be executed; the message says why."""
 
 
 class FramedOutput:
-    """Standard output, one whole frame at a time; what libraries print goes to standard error."""
+    """Standard output as frames; output of libraries goes to standard error."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -43,7 +43,7 @@ class FramedOutput:
         os.dup2(2, 1)
 
     def say(self, header: Request, body: bytes = b"") -> None:
-        """Write a frame; whoever does not listen any more ends this process."""
+        """Write a frame; exit if the reader has gone."""
         line = json.dumps({**header, "size": len(body)}).encode() + b"\n"
         try:
             with self._lock:
@@ -54,7 +54,7 @@ class FramedOutput:
 
 
 class BridgeNode:
-    """A node, and what was asked of it."""
+    """The ROS 2 node of the bridge, and its pending requests."""
 
     def __init__(self, node: Any, output: FramedOutput) -> None:
         self._node, self._output = node, output
@@ -116,7 +116,7 @@ class BridgeNode:
             self._node.destroy_subscription(each)
 
     def want(self, topic: str, since_ns: int) -> Any:
-        """Pass on a topic's newest message, if it came since a moment, or else the next one."""
+        """Forward a topic's newest message since a given time, or else its next one."""
         self._wanted[topic] = True  # first: one that comes meanwhile is not to be missed
         if topic in self._newest and self._newest[topic][0] >= since_ns:
             self._pass_on(topic)
@@ -148,7 +148,7 @@ class BridgeNode:
             raise RequestRefused(f"nobody offers the service {service}")
 
     def trigger(self, service: str, call: int) -> Any:
-        """Call a service that was found; the answer comes as a frame with the call's number."""
+        """Call a service; its answer is sent as a frame with the call's number."""
         client = self._clients[service]
         if not client.service_is_ready():
             raise RequestRefused(f"nobody offers the service {service} any more")
@@ -182,7 +182,7 @@ class BridgeNode:
 
 
 def matching(infos: list[Any]) -> list[QoSProfile]:
-    """Return qualities of service with which subscriptions hear all of some publishers.
+    """Return subscription QoS profiles that are compatible with some publishers.
 
     Where some keep what they published last and others do not, it takes two subscriptions: what
     comes from now on may then come twice.
@@ -213,7 +213,7 @@ def type_of(name: str) -> Any:
 
 
 def serve(bridge: BridgeNode, output: FramedOutput) -> None:
-    """Do what is asked until the input ends; then nothing here is wanted any more."""
+    """Execute requests until the input ends."""
     stream = sys.stdin.buffer
     while line := stream.readline():
         request = json.loads(line)

@@ -1,1 +1,1 @@
-"""What the finger's camera says: the tag in an image, and how the tip is displaced."""
+"""The tag in the finger camera's image, and the tip's displacement from it."""

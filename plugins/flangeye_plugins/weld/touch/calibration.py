@@ -1,4 +1,4 @@
-"""What a finger's rest pose, gain, noise and stiffness are, from readings. Arrays only.
+"""Estimate a finger's rest pose, gain, noise and stiffness from readings. Arrays only.
 
 The tip is held in a punch mark while the robot moves a little: then it is displaced, seen from the
 tool, by exactly what the robot moved, the other way.
@@ -35,7 +35,7 @@ class Held:
 
 
 def calibrate(rest: Sequence[TagReading], held: Sequence[Held], source: str) -> Calibration:
-    """Return the calibration that explains the readings best (least squares).
+    """Return the least-squares calibration of the readings.
 
     Args:
         rest: Readings of the undeformed finger.

@@ -37,7 +37,7 @@ class Pivot:
 
 
 def pivot(what: str, poses: Sequence[Floats], displaced: Sequence[Floats] | None = None) -> Pivot:
-    """Return the point that was at one place in all poses (least squares), with its covariance.
+    """Return the point that is fixed in all poses (least squares), with its covariance.
 
     Args:
         what: Its name, for people.

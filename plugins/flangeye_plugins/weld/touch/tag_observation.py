@@ -36,7 +36,7 @@ class RegionOfInterest:
         self._corners: Floats | None = None
 
     def pieces(self, image: Image) -> Iterator[ImageRegion]:
-        """Yield where to look, one after the other until the tag is found."""
+        """Yield crops to search, in order, until the tag is found."""
         if self._corners is not None:
             low = np.maximum(np.floor(self._corners.min(axis=0)).astype(int) - TAG_MARGIN, 0)
             high = np.ceil(self._corners.max(axis=0)).astype(int) + TAG_MARGIN
@@ -44,7 +44,7 @@ class RegionOfInterest:
         yield ImageRegion(image, (0, 0))
 
     def follow(self, piece: ImageRegion, corners: Floats | None) -> None:
-        """Look here next: at corners (4, 2) in a piece [px], or everywhere."""
+        """Search next around corners (4, 2) in a crop [px], or everywhere."""
         self._corners = None if corners is None else corners + np.array(piece.corner)
 
 
@@ -108,7 +108,7 @@ class TagDetector:
         self._last: tuple[Any, Any] | None = _rest(finger)
 
     def find(self, image: Image) -> TagReading | None:
-        """Return the tag's pose, or None where it is not in the image."""
+        """Return the tag's pose; None if the image does not show it."""
         corners = self._corners(image.pixels)
         if corners is None:
             return None
