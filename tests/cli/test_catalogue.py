@@ -112,7 +112,7 @@ def test_a_file_that_is_there_is_told_before_anything_is_asked(kind: str, tmp_pa
     out = tmp_path / "mine.yaml"
     out.touch()
     done = CliRunner().invoke(commands(), [kind, "mine", "--out", str(out)])
-    assert str(done.exception) == f"{out}: is there already; take another name with --out"
+    assert str(done.exception) == f"{out}: exists already; choose another name with --out"
     assert not done.output
 
 

@@ -52,7 +52,7 @@ def test_a_refused_run_says_on_the_console_which_motion_is_missing(
     code, out, _ = command("run", TWO, *words, "--out", tmp_path / "still")
     assert code == 1
     out = " ".join(out.split())
-    assert "What is wrong the sightings do not tell where left and right and marker are" in out
+    assert "What is wrong the sightings do not determine where left and right and marker are" in out
     assert "turn arm about (" in out
     assert "of arm_base by 20 deg or more, and see it again" in out
     assert f"Next step flangeye doctor {tmp_path / 'still' / 'run.mcap'}" in out

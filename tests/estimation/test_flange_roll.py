@@ -46,15 +46,15 @@ def test_the_middle_one_is_told_with_its_deviation(middle: float, rotation: floa
         np.diag([0.1, 1.0, 0.2]) * np.radians(rotation) ** 2,
     )
     deviation = np.hypot(1.25 * 1.4826 / np.sqrt(5), rotation)
-    assert said.startswith(f"the plate is turned by {middle:.2f} +- {deviation:.2f} deg about its")
-    assert said.endswith("in 5 poses): the camera's pose does not depend on it")
+    assert f"frame: {middle:.2f} +- {deviation:.2f} deg (bolt pattern" in said
+    assert said.endswith("in 5 poses); the camera's pose does not depend on it")
 
 
 def test_the_holes_of_two_poses_tell_nothing() -> None:
     every = seen(np.full(5, 0.2))
     for one in every[:3]:
         one.circle.roll = None
-    told = "the holes were told apart in 2 of 5 poses"
+    told = "the bolt holes show in 2 of 5 poses"
     assert told in roll_note(every, CAMERA, STILL)
     every[2].circle.roll = every[3].circle.roll
-    assert "is turned by" in roll_note(every, CAMERA, STILL)
+    assert "+-" in roll_note(every, CAMERA, STILL)

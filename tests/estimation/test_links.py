@@ -118,7 +118,7 @@ def test_the_next_best_sighting_knows_where_the_link_is() -> None:
 
 def test_the_arm_that_stood_still_is_told_to_move_its_link() -> None:
     cell, seen, _ = session("steps.0.spread=0.1 deg", "steps.0.sightings=12")
-    with pytest.raises(Exception, match="the sightings do not tell where .*forearm.* are: .* turn arm_link3 about"):  # fmt: skip
+    with pytest.raises(Exception, match="the sightings do not determine where .*forearm.* are: .* turn arm_link3 about"):  # fmt: skip
         solve_cell(seen, cell, RobustParams())
 
 

@@ -25,7 +25,7 @@ def test_pure_translation_is_named() -> None:
     shifts = moves(np.random.default_rng(0), 12, 0.0)
     made = session(MARKER, np.random.default_rng(4), n=12, poses=shifts)
     assert refusal(made) == (
-        "the camera's pose cannot be told from these poses: the arm moved without turning; turn "
+        "the camera's pose is not observable from these poses: the arm moved without turning; turn "
         "it by 20 deg or more about two axes"
     )
 
@@ -43,7 +43,7 @@ def test_parallel_axes_are_named() -> None:
     poses = parallel(np.random.default_rng(0), 12)
     made = session(MARKER, np.random.default_rng(5), n=12, poses=poses)
     told = refusal(made)
-    assert told.startswith("translation of the camera's pose cannot be told from these poses: ")
+    assert told.startswith("translation of the camera's pose is not observable from these poses: ")
     assert "the arm turned about one axis only, (" in told
     assert told.endswith(
         "so that translation along it does not show; tilt it about another axis too, or, where it "
@@ -77,7 +77,7 @@ def test_only_the_last_joint_is_named() -> None:
 def test_an_arm_that_rests_is_named() -> None:
     made = session(TWO, np.random.default_rng(8), n=14)
     assert refusal(_with_resting_second_arm(made)) == (
-        "the camera's pose cannot be told from these poses: the second arm stood still; move it too"
+        "the camera's pose is not observable from these poses: the second arm stood still; move it too"
     )
 
 
@@ -167,7 +167,9 @@ def test_noise_that_is_not_stated_is_found() -> None:
     rng = np.random.default_rng(15)
     made = session(MARKER, rng, n=60, noise=Noise(arm_shift=5e-4))
     (note,) = solved(made).notes
-    beyond = float(note.removeprefix("noise beyond the features' own: ").split(" mm")[0])
+    beyond = float(
+        note.removeprefix("estimated noise of a pose beyond its feature's: ").split(" mm")[0]
+    )
     assert 0.4 < beyond < 0.65
 
 
@@ -208,7 +210,7 @@ def resized(made, factor):
 def test_a_size_that_is_unknown_is_found(factor: float) -> None:
     made = session(MARKER, np.random.default_rng(17), n=20)
     found = solved(resized(made, factor), target_size="unknown")
-    (note,) = [n for n in found.notes if "times as large" in n]
+    (note,) = [n for n in found.notes if "times the size" in n]
     told, _, sigma = note.split("target is ")[1].split()[:3]
     assert abs(float(told) - 1 / factor) < 4 * float(sigma) < 0.02 / factor
     error = errors(found.camera, made.truth["flange_T_camera"])
@@ -224,5 +226,5 @@ def test_a_size_that_the_motion_does_not_tell_is_refused() -> None:
     poses = moves(np.random.default_rng(0), 12, 0.3, reach=0.0)
     made = session(MARKER, np.random.default_rng(18), n=12, poses=poses, noise=Noise().scaled(20))
     told = refusal(made, target_size="unknown")
-    assert told.startswith("the target's size is told to ")
+    assert told.startswith("the target's size is known to ")
     assert told.endswith("move the arm further between poses, or say target_size: known")

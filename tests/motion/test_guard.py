@@ -169,7 +169,7 @@ def test_an_arm_that_does_not_set_off_is_noticed(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(robot.arm, "step", lambda: None)
     with watched(driver_of(robot), MODEL, LIMITS) as arm:
         arm.go(way_to(arm, j1=0.8))
-        with pytest.raises(DeviceError, match="has not set off 1 s after it was told to"):
+        with pytest.raises(DeviceError, match="has not moved 1 s after the command"):
             arm.wait()
 
 

@@ -46,7 +46,7 @@ def test_a_program_that_leads_and_says_nothing_any_more_is_ended() -> None:
     robot = StandIn()
     heard = guarded(robot, [*velocities(100, 150), (1000, ("velocity", (SIDEWAYS, 0.5)))])
     (fault,) = [report.content for report in heard if report.what == "fault"]
-    assert fault == "the program that leads the arm said nothing for 1 s"
+    assert fault == "the program that moves the arm sent no command for 1 s"
     stopped = [cycle for name, cycle in robot.asked if name == "stop"]
     # In the first cycle after 0.2 s, and after 1 s.
     assert [cycle - 150 for cycle in stopped] == [round(t / robot.period) for t in (0.2, 1.0)]

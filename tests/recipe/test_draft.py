@@ -143,8 +143,10 @@ def test_scans_without_a_flange_bring_up_the_mesh(folder: Path) -> None:
 def test_defaults_are_told_and_answers_are_not(folder: Path) -> None:
     shutil.copytree(SAMPLE, folder, dirs_exist_ok=True)
     told = init("--robot", "ur5", "--scanner", "phoxi-m")
-    assert "assumed: what carries the camera (base or flange): base (--camera says" in told
-    assert "--robot says" not in told
+    assert (
+        "assumed: where the camera is mounted (base or flange): base (--camera changes it)" in told
+    )
+    assert "--robot changes it" not in told
     assert recipe(folder).header.robot.model == "ur5"
 
 
@@ -544,7 +546,7 @@ def two_poses_of_nobody(folder):
          "1,2,3,4,5,6 --rotation joints"),
         (odd_heading, ["--columns", "u,v,ww,4,5,6"],
          "rec/log.csv: has no column 'ww'; known: w"),
-        (angles_of_nobody, [], "not known: how the rotation in columns rx, ry, rz of log.csv is written (ur, "
+        (angles_of_nobody, [], "not known: rotation convention of columns rx, ry, rz of log.csv (ur, "
          "kuka, fanuc, abb, yaskawa, staubli, kawasaki, doosan, halcon, rpy, quaternion_xyzw, "
          "quaternion_wxyz, vector, xyz, ZYX, …); add --rotation vector, or --rotation xyz for roll, "
          "pitch, yaw; or name the arm with --robot: its maker decides"),
@@ -567,8 +569,8 @@ def two_poses_of_nobody(folder):
         (meshes, [], "rec/scan_0.stl: is a mesh, not a scan; sample it to points as .ply: "),
         (lambda folder: (folder / "scan.e57").write_text("x"), [],
          "rec/scan.e57: is an E57 scan, which is not read; save it as .ply"),
-        (tables_of_other_lengths, [], "rec/marker.csv: has 4 rows, robot.csv has 5; take the "
-         "surplus away, or give each a column time"),
+        (tables_of_other_lengths, [], "rec/marker.csv: has 4 rows, robot.csv has 5; remove "
+         "the surplus, or give each a column time"),
         (two_tables_of_nobody, [], "not known: which poses are the arm's (a.csv, b.csv); add "
          "--table a.csv"),
         (two_poses_of_nobody, [], "not known: which poses are the arm's (log.csv:a, log.csv:b); "
@@ -612,7 +614,7 @@ def test_a_bag_of_unknown_frames_is_answered_with_the_readers_line(folder: Path)
     with pytest.raises(StageError) as refused:
         init()
     assert str(refused.value) == (
-        "rec: nothing tells where the flange is; write reader: {ros2_bag: {base: …, flange: "
+        "rec: no topic gives the flange's pose; write reader: {ros2_bag: {base: …, flange: "
         "…}} (frames of tf: end, map); flangeye init takes such lines as --reader '{…}' and "
         "--robot NAME"
     )
@@ -636,7 +638,7 @@ def test_a_recipe_is_not_written_over(folder: Path) -> None:
     sample(folder)
     init("--robot", "ur5")
     done = CliRunner().invoke(commands(), ["init", "rec", "--yes"])
-    assert str(done.exception) == "recipe.yaml: is there already; take another name with --out"
+    assert str(done.exception) == "recipe.yaml: exists already; choose another name with --out"
 
 
 def test_a_folder_of_one_bag_is_refused_before_a_question(folder: Path) -> None:

@@ -52,8 +52,8 @@ def write_ply(path: Path, source: Path) -> None:
 @pytest.mark.parametrize(
     ("heading", "angles", "scan", "guessed"),
     [
-        ("x,y,z,rx,ry,rz", vectors, "scan_{number:02d}.ply", "ur (--rotation says otherwise)"),
-        ("X;Y;Z;A;B;C", kuka, "scans/part_{number}.ply", "kuka (--rotation says otherwise)"),
+        ("x,y,z,rx,ry,rz", vectors, "scan_{number:02d}.ply", "ur (--rotation changes it)"),
+        ("X;Y;Z;A;B;C", kuka, "scans/part_{number}.ply", "kuka (--rotation changes it)"),
     ],
     ids=["mm-and-degrees", "kuka-semicolons-subfolder-other-names"],
 )
@@ -70,9 +70,9 @@ def test_three_commands_lead_to_a_launch_file(
     assert guessed in said
     assert "paired in order: row 1 with" in said
     for assumed in (
-        "which way round the arm's poses are",
-        "what is seen",
-        "what carries the camera",
+        "direction of the arm's poses",
+        "what the scans show",
+        "where the camera is mounted",
     ):
         assert f"assumed: {assumed}" in said
 

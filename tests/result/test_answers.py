@@ -167,12 +167,12 @@ def test_what_a_result_asks_for_whatever_its_steps_noted() -> None:
 
 @pytest.mark.parametrize(
     ("expected", "told"),
-    [((0.5e-3, 0.9e-3), None), ((0.2e-3, 0.4e-3), "more than by chance"),
-     ((1.0e-3, 1.8e-3), "less than by chance")],
+    [((0.5e-3, 0.9e-3), None), ((0.2e-3, 0.4e-3), "more than chance explains"),
+     ((1.0e-3, 1.8e-3), "less than chance explains")],
 )  # fmt: skip
 def test_an_expected_error_that_poses_held_out_contradict_is_said(expected, told) -> None:
     stated = r.expected_error_result(calibration(expected=ExpectedError(*expected)))
     found = document(calibration(), {"poses": 16.0}).model_copy(update={"expected_error": stated})
-    warnings = [w.text for w in r.standing_warnings(found) if "held out" in w.text]
+    warnings = [w.text for w in r.standing_warnings(found) if "held-out" in w.text]
     assert len(warnings) == (told is not None)
     assert all(told in text and "0.50 mm" in text for text in warnings)

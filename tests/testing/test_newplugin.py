@@ -114,5 +114,5 @@ def test_nothing_is_written_over(tmp_path: Path) -> None:
     with pytest.raises(StageError) as error:
         write_plugin("acme", "cost", tmp_path)
     assert str(error.value) == (
-        f"{tmp_path / 'flangeye-acme'} is there already; remove it, or choose another name"
+        f"{tmp_path / 'flangeye-acme'} exists already; remove it, or choose another name"
     )

@@ -84,7 +84,7 @@ def init(
     from flangeye.recipe.load import load_recipe
 
     if out.exists():
-        raise RecipeError(f"{out}: is there already; take another name with --out")
+        raise RecipeError(f"{out}: exists already; choose another name with --out")
     registry = load_plugins()
     given = {name: answers[name.replace("-", "_")] for name in ANSWERS}
     questions = Questions(given, None if yes else _prompt)
@@ -93,7 +93,7 @@ def init(
     new = [path for path in texts if not path.exists()]
     for path in set(texts) - set(new):
         if path.read_bytes() != texts[path].encode():
-            raise RecipeError(f"{path}: is there already; take another name with --out")
+            raise RecipeError(f"{path}: exists already; choose another name with --out")
     for path in new:
         path.write_bytes(texts[path].encode())
     try:

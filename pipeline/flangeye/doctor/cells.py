@@ -251,8 +251,8 @@ def _mispaired(observations: Sequence[Observation], cell: Cell) -> list[Finding]
     return [
         Finding(
             "mis-paired pose",
-            f"{len(far)} of {len(observations)} sightings do not belong to the poses beside them: "
-            "the others agree without them",
+            f"{len(far)} of {len(observations)} sightings do not fit their poses; the others "
+            "agree without them",
             f"- acquire.samples: {{leave_out: [{', '.join(far)}]}}",
             tuple(far),
         )

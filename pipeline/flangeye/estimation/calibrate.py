@@ -384,8 +384,8 @@ def _notes(session: Session, weak: Floats, options: Options) -> list[Note]:
     found, cell = session.found, session.cell
     turn, shift = _noise_beyond(found)
     notes: list[Note] = [
-        f"noise beyond the features' own: {shift * 1e3:.3f} mm and {np.degrees(turn):.3f} deg "
-        "per axis"
+        f"estimated noise of a pose beyond its feature's: {shift * 1e3:.3f} mm and "
+        f"{np.degrees(turn):.3f} deg per axis"
     ]
     if len(found.problem.ends) > 1:
         who = Counter((o.camera, o.target) for o in session.observations)

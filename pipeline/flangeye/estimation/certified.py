@@ -139,8 +139,8 @@ def verdict_of(answer: CertifiedAnswer) -> CertificateVerdict:
     if not shown.optimal:
         share = min(shown.missing / max(shown.cost, 1e-300), 1)
         note = (
-            f"{NOT_CERTIFIED} (gap {share:.1%}): another answer may leave squared errors less by "
-            "so much"
+            f"{NOT_CERTIFIED} (gap {share:.1%}): another answer may have squared errors "
+            "smaller by that share"
         )
         return CertificateVerdict(note, _named(shown.better, root, answer))
     away = _far_away(shown, root, answer)

@@ -29,9 +29,8 @@ def roll_note(
     # Fewer have no scatter that means anything
     if len(turns) < 3:
         return (
-            "a constant turn of the plate about its own axis (flange roll) does not show, for the "
-            f"holes were told apart in {len(turns)} of {len(observations)} poses: the camera's "
-            "pose does not depend on it"
+            f"flange roll is not observable: the bolt holes show in {len(turns)} of "
+            f"{len(observations)} poses; the camera's pose does not depend on it"
         )
     mean = np.angle(np.exp(1j * turns).mean())  # the angles may lie about half a turn
     off = np.angle(np.exp(1j * (turns - mean)))
@@ -42,9 +41,8 @@ def roll_note(
     # A median's standard deviation is 1.25 times a mean's.
     deviation = np.hypot(1.25 * of_one / np.sqrt(len(turns)), rotation)
     return (
-        f"the plate is turned by {middle:.2f} +- {np.degrees(deviation):.2f} deg about "
-        f"its own axis against the controller's frame (flange roll, from the bolt pattern in "
-        f"{len(turns)} poses): the camera's pose does not depend on it"
+        f"flange roll against the controller's frame: {middle:.2f} +- {np.degrees(deviation):.2f} "
+        f"deg (bolt pattern in {len(turns)} poses); the camera's pose does not depend on it"
     )
 
 

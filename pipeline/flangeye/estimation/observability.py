@@ -383,7 +383,7 @@ def _of_what(problem: Problem, weak: Floats) -> str:
     of_camera = [kind for (name, kind), size in shares.items() if size > NAMED and name == camera]
     named = camera if of_camera else max(shares, key=lambda key: shares[key])[0]
     what = " and ".join(of_camera) if of_camera else "part"
-    return f"{what} of {names[named]} cannot be told from these poses"
+    return f"{what} of {names[named]} is not observable from these poses"
 
 
 def _called(problem: Problem, name: str) -> str:
@@ -431,7 +431,7 @@ def require_turns(problem: Problem) -> None:
     for name, poses in _arms(problem):
         if not _turns(poses):
             raise CalibrationRefused(
-                f"the camera's pose cannot be told from these poses: {name} {_fault_of(poses)}"
+                f"the camera's pose is not observable from these poses: {name} {_fault_of(poses)}"
             )
 
 
@@ -476,7 +476,7 @@ def _untold(
     cures = _asked(problem, motions)
     cures += [_tie(problem, _named(problem, left, scale))] if untied else []
     return (
-        f"the sightings do not tell where {' and '.join(named)} "
+        f"the sightings do not determine where {' and '.join(named)} "
         f"{'are' if len(named) > 1 else 'is'}: a common "
         f"{'turn' if share[0] > share[1] else 'shift'} hardly changes them; {'; '.join(cures)}"
     )
@@ -510,16 +510,16 @@ def _tie(problem: Problem, named: Sequence[str]) -> str:
     still = [end for end in ends if end not in moved]
     if not moved:
         return (
-            f"no sighting that agrees with others has {' or '.join(named)} in it: let a camera "
-            "see it, or it a target, and check what it saw"
+            f"no inlier involves {' or '.join(named)}: let a camera see it, or let it see a "
+            "target, and check its sightings"
         )
     if not still or any((camera in moved) != (target in moved) for camera, target in seen):
         return (
-            f"no motion shows where {' and '.join(named)} "
-            f"stand{'' if len(named) > 1 else 's'}: say it of {named[0]} (place: in the recipe)"
+            f"no motion makes {' and '.join(named)} observable: state the place of {named[0]} in "
+            "the recipe"
         )
     return (
-        f"no sighting ties {' and '.join(moved)} to {' and '.join(still)}: let a camera of the "
+        f"no sighting connects {' and '.join(moved)} to {' and '.join(still)}: let a camera of the "
         "one see a target of the other"
     )
 

@@ -199,14 +199,14 @@ def _require_agreement(problem: Problem, places: Places, agree: Mask) -> None:
     if len(problem.ends) == 1:
         _require_right_handed(problem, places)
         raise CalibrationRefused(
-            f"the poses agree with one answer to {shift * 1e3:.1f} mm and {np.degrees(turn):.1f} "
+            f"the poses fit one calibration to {shift * 1e3:.1f} mm and {np.degrees(turn):.1f} "
             "deg only: check that each scan belongs to its robot pose, and " + CONFIGURED
         )
     sizes = [np.median(distances(problem.of_pair(k), places)) for k in range(len(problem.ends))]
     camera, target = problem.ends[int(np.argmax(sizes))]
     raise CalibrationRefused(
-        f"the sightings agree with one answer to {shift * 1e3:.1f} mm and {np.degrees(turn):.1f} "
-        f"deg only, those of {target} by {camera} least: check that each belongs to the poses "
+        f"the sightings fit one calibration to {shift * 1e3:.1f} mm and {np.degrees(turn):.1f} "
+        f"deg only, worst those of {target} by {camera}: check that each belongs to the poses "
         f"beside it (join: clock_offset, where the clock of {camera} is another), and that the "
         "cell stands as the recipe says"
     )
@@ -258,7 +258,7 @@ def _require_majority(found: Estimate) -> None:
     agree, given = int(found.inliers.sum()), len(found.inliers)
     if agree < max(3, given / 2):
         raise CalibrationRefused(
-            f"only {agree} of {given} poses agree with one answer: check that each scan belongs "
+            f"only {agree} of {given} poses fit one calibration: check that each scan belongs "
             "to its robot pose, and " + CONFIGURED
         )
 
@@ -383,14 +383,14 @@ def _with_size(session: Session, factor: float) -> Session:
     # Taken for found when it is known to half the prior's deviation
     if known > 0.05:
         raise CalibrationRefused(
-            f"the target's size is told to {known:.1%} only: move the arm further between poses, "
+            f"the target's size is known to {known:.1%} only: move the arm further between poses, "
             "or say target_size: known"
         )
     sigma = known * factor
     digits = max(4, 1 - int(np.floor(np.log10(max(sigma, 1e-9)))))
     return session.noted(
-        f"by the arm's own motion the target is {factor:.{digits}f} +- {sigma:.{digits}f} times as "
-        "large as was said where it was fitted, and is taken to be"
+        f"by the arm's motion the target is {factor:.{digits}f} +- {sigma:.{digits}f} times the "
+        "size that its fit step states; this estimate is used"
     )
 
 
@@ -427,7 +427,7 @@ def _require_size(session: Session) -> None:
     if gross := _size_far_off(session):
         raise CalibrationRefused(
             f"the target fits the arm's motion far better if it is {gross:.3g} times as large as "
-            "was said where it was fitted: measure the print (target_size: unknown finds it)"
+            "its fit step states: measure the print (target_size: unknown finds it)"
         )
     share, sigma, kind = max(told, key=lambda each: abs(each[0]) / each[1])
     if abs(share) <= session.asked.size_limit or (share / sigma) ** 2 < chi2_quantile(

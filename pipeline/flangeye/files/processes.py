@@ -29,7 +29,7 @@ def busy() -> str:
     if load <= cores:
         return ""
     return (
-        f"; this computer is busy (load {load:.1f} on {cores} cores): end what else runs on it, "
+        f"; this computer is busy (load {load:.1f} on {cores} cores): end other programs, "
         "then start again"
     )
 

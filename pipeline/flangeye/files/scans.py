@@ -78,7 +78,7 @@ def in_order(where: str, count: int, what: str, names: Sequence[str]) -> str:
     if count != len(names):
         raise StageError(
             f"{where}: has {count} {what}, but the folder {len(names)} scans{missing}; name the "
-            "scan of each pose in a column called scan, or take the surplus away"
+            "scan of each pose in a column called scan, or remove the surplus"
         )
     last = f", …, row {count} with {names[-1]}" if count > 1 else ""
     return f"{what} without names are paired in order: row 1 with {names[0]}{last}{missing}"
@@ -199,7 +199,7 @@ def scans_of(
     if poses.apart:
         lone = next((file for file in poses.files if not scans_in(file.parent)), None)
         if lone is not None:
-            raise StageError(f"{lone}: no scan lies beside it; put it there, or take the pose away")
+            raise StageError(f"{lone}: no scan lies beside it; put it there, or remove the pose")
         return [scans_in(file.parent) for file in poses.files], []
     all_places = {p: _scans_by_stem(p, taken) for p in (folder, *sorted(folder.glob("*/")))}
     places = {p: found for p, found in all_places.items() if found} or {folder: {}}
@@ -256,7 +256,7 @@ def _together(
         named = " and ".join(str(path.relative_to(path.parent.parent)) for path in twice)
         raise StageError(
             f"{where}: {named} could both belong to one pose; name the scan of each pose in a "
-            "column called scan, or take one folder away"
+            "column called scan, or remove one folder"
         )
     return scans, list(dict.fromkeys(note for _, notes in found for note in notes))
 

@@ -134,4 +134,4 @@ def require_new(path: Path) -> None:
     if path.suffix not in (".yaml", ".yml"):
         raise RecipeError(f"{path}: a model's file ends in .yaml")
     if path.exists():
-        raise RecipeError(f"{path}: is there already; take another name with --out")
+        raise RecipeError(f"{path}: exists already; choose another name with --out")

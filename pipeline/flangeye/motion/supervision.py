@@ -156,7 +156,7 @@ class Supervisor:
         set_off = np.abs(state.joints - self._from).max() > self.arrived
         start = 1.0  # an arm that has not set off after this did not take the command [s]
         if waited > start and not set_off and np.abs(way).max() > 2 * self.arrived:
-            raise SafetyFault(f"the arm has not set off {start:.0f} s after it was told to")
+            raise SafetyFault(f"the arm has not moved {start:.0f} s after the command")
         self._keep_going(state, leg, set_off)
         if waited > 2.0 * leg.seconds + 2.0:
             raise SafetyFault(

@@ -206,7 +206,7 @@ class Watchdog:
             return
         silent = 1e-9 * (self._supervisor.samples[-1].time_ns - self._led_ns)
         if silent > HUNG:
-            self._bar(f"the program that leads the arm said nothing for {HUNG:.0f} s")
+            self._bar(f"the program that moves the arm sent no command for {HUNG:.0f} s")
         elif silent > SLOW and not self._paused:
             self._paused = True  # the driver brakes by itself, and before: not on that alone
             try:

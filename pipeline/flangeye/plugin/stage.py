@@ -114,7 +114,7 @@ KINDS: Mapping[str, Contract] = {
         (t.HandEye,), (t.Verification,), (t.VerifiedHandEye,), "whether the pose may be used"
     ),
     "export": Contract(
-        (t.CalibratedPose,), (t.ExportedFile,), (), "the pose as another program takes it"
+        (t.CalibratedPose,), (t.ExportedFile,), (), "the pose in another program's format"
     ),
     "scan": Contract((), (t.WorkpieceScan,), (t.WorkpieceScan,), "a scan of the workpiece"),
     "seam": Contract((t.VerifiedHandEye,), (t.Seam,), (t.Seam,), "where to weld"),
@@ -157,20 +157,20 @@ PARTS: Mapping[str, PartKind] = {
         "a scanner that acquire.live can trigger", "flangeye.models.contracts:ScannerPart"
     ),
     "replay": PartKind(
-        "repeats from its log what a step decided, and compares", "flangeye.run.replay:Repeat"
+        "repeats a step's decisions from its log, and compares", "flangeye.run.replay:Repeat"
     ),
     "guide": PartKind(
         "a guided procedure with the devices of a recipe", "flangeye.recipe.load:Guide"
     ),
     "controller": PartKind(
-        "what leads tool and torch along a seam in weld.tactile",
+        "moves tool and torch along a seam in weld.tactile",
         "flangeye.motion.seam_following:ControllerPart",
     ),
     "sensor": PartKind(
         "a tactile sensor that weld.tactile can read", "flangeye.models.contracts:SensorPart"
     ),
     "profiler": PartKind(
-        "a look at the bead behind the torch, for weld.tactile",
+        "a profile sensor behind the torch, for weld.tactile",
         "flangeye.models.contracts:ProfilerPart",
     ),
     "arc": PartKind(

@@ -129,7 +129,7 @@ def body_of(target: TargetSection, robot: RobotModel | None, folder: Path) -> Ta
     if target.body != ARM:
         if target.links:
             raise RecipeError(
-                f"target.links: is for body: {ARM} only; take it away, or write body: {ARM}"
+                f"target.links: is for body: {ARM} only; remove it, or write body: {ARM}"
             )
         return load_body(target.body, target.unit, folder)
     if target.at != "flange":
@@ -210,7 +210,7 @@ def _configuration(header: Header, context: Context) -> Configuration:
     stands = _stands(section.place)
     if body := header.target:
         if section.place != "known":
-            raise RecipeError("place: a body's place is said by target: {at: …}; take place: away")
+            raise RecipeError("place: target: {at: …} states a body's place; remove place:")
         if body.at == "unknown":
             stands = None
         elif body.at not in targets:

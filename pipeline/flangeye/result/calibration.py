@@ -118,8 +118,8 @@ def _unlike(result: Result) -> str | None:
         return None
     more = "more" if held.rms > expected.p95 else "less"
     return (
-        f"poses held out are off by {held.rms * 1e3:.2f} mm rms, {more} than by chance where "
-        f"{expected.rms * 1e3:.2f} mm is expected"
+        f"held-out error {held.rms * 1e3:.2f} mm rms, expected {expected.rms * 1e3:.2f} mm: "
+        f"{more} than chance explains"
     )
 
 

@@ -33,8 +33,8 @@ class TransformResult(_Part):
         "estimate is arbitrary and the covariance says nothing.",
     )
     shares: dict[str, Matrix] = Field(
-        {}, description="6x6 of the covariance by what causes it; the rest is what few poses leave "
-        "open of how large each cause is."
+        {}, description="6x6 parts of the covariance by cause; the remainder is the uncertainty of "
+        "the causes' sizes."
     )  # fmt: skip
 
     @model_validator(mode="after")
@@ -236,7 +236,7 @@ class AnswerResult(_Part):
 
     transforms: dict[str, TransformResult]
     correction: CorrectionResult | None = Field(
-        None, description="What the poses hold with: without it they are another arm's."
+        None, description="The arm correction that these poses require."
     )
     arms: dict[str, CorrectionResult] = Field(
         default_factory=dict, description="The same of a cell's arms, by their names."
@@ -284,7 +284,7 @@ class Provenance(_Part):
     recipe_hash: str = Field(description="SHA-256 of recipe.resolved.yaml.")
     input_hash: str = Field(description="Hash of everything the captures are made from.")
     seed: int
-    notes: list[str] = Field(description="What the source and the steps put on record.")
+    notes: list[str] = Field(description="Notes of the source and the steps.")
 
 
 class Result(_Part):
@@ -313,8 +313,8 @@ class Result(_Part):
     )
     true: dict[str, TransformResult] = Field(
         default_factory=dict,
-        description="The transforms in the arm's true base, for metrology: with all that the arm "
-        "may do wrong alike at every pose in their covariances.",
+        description="The transforms in the arm's true base, for metrology: their covariances "
+        "include arm errors common to all poses.",
     )
     observations: list[ObservationResult]
     workspace: WorkspaceResult | None = None
@@ -329,7 +329,7 @@ class Result(_Part):
     warnings: list[WarningResult] = Field(
         default_factory=list, description="What is to be done, and the line that does it."
     )
-    notes: list[str] = Field(default_factory=list, description="What the steps put on record.")
+    notes: list[str] = Field(default_factory=list, description="Notes of the steps.")
     exports: dict[str, str] = Field(
         default_factory=dict, description="What export steps wrote: file name -> content."
     )

@@ -225,8 +225,9 @@ def _require_views(seen: int, looked: Mapping[str, Corners | Rejected]) -> None:
         missed = {n: found.reason for n, found in looked.items() if isinstance(found, Rejected)}
         why = next((f"; {name}: {reason}" for name, reason in missed.items()), "")
         raise StageError(
-            f"{seen} of {len(looked)} images show the board, {fewest} are needed to tell the "
-            f"camera; take more, or write focal_length: [fx, fy] and principal_point: [cx, cy]{why}"
+            f"{seen} of {len(looked)} images show the board, {fewest} are needed to calibrate the "
+            "camera; take more, or write focal_length: [fx, fy] and principal_point: [cx, cy]"
+            f"{why}"
         )
 
 
@@ -286,8 +287,8 @@ def _require_tilted(seen: Mapping[str, Corners]) -> None:
     least = 0.02
     if spread < least:
         raise StageError(
-            f"the {len(seen)} views do not tell the focal length: {TOO_ALIKE} (depth changes by "
-            f"{spread:.1%} across the board between them, {least:.0%} is needed)"
+            f"the {len(seen)} views do not determine the focal length: {TOO_ALIKE} (depth changes "
+            f"by {spread:.1%} across the board between them, {least:.0%} is needed)"
         )
 
 

@@ -315,7 +315,7 @@ def _moved_finding(session: RecordedSession, evidence: Significance, start: int)
     shorter = later if later.sum() <= len(session) / 2 else ~later
     name = session.ids[start]
     what = (
-        f"the camera or what it looks at moved before '{name}', or the poses are written another "
+        f"the camera or its target moved before '{name}', or the poses are written another "
         "way from there on: the samples before and after fit two calibrations"
     )
     kept = session.without(shorter)

@@ -237,8 +237,8 @@ def exchanged(session: RecordedSession) -> Findings:
     what = (
         f"as they are read, the arm carries the {carried_by[session.carried][0]} "
         f"{carried:.2f} m from its flange, and the {carried_by[session.carried][1]} stands "
-        f"{standing:.2f} m from its base: the poses of robot and markers are both the other way "
-        "round, which fits as well"
+        f"{standing:.2f} m from its base: the poses of robot and markers are both inverted, "
+        "which fits as well"
     )
     misfit = fit_of(session).misfit()
     yield Finding("pose direction", what, other.step(), (), misfit, misfit, corrected_session=other)

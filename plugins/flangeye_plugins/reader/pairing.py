@@ -101,12 +101,12 @@ def _offset(
     if signals is not None and min(len(times) for times, _ in signals) > 20:
         offset, alike = clock_offset(*signals)
         if alike > 0:
-            how = f"estimated by how both move (correlation {alike:.2f})"
+            how = f"estimated from both motions (correlation {alike:.2f})"
             return offset, f"clock offset {_ms(offset)}, {how}"
     if len(spans) >= MIN_CAPTURES:
         offset = offset_into(list(spans), events)
         return offset, f"clock offset {_ms(offset)}, the least that fits the standstills"
-    return 0.0, "clock offset taken to be 0 ms: nothing tells it"
+    return 0.0, "clock offset assumed to be 0 ms: the recording does not show it"
 
 
 def _ms(seconds: float) -> str:

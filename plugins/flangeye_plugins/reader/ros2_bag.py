@@ -209,7 +209,7 @@ def _arm(
         return in_order(*bag.poses[others[0]]), f"the flange's poses from {others[0]}", joints
     if robot is not None and bag.joints:
         return *_by_kinematics(bag, joints, robot), joints
-    raise StageError(f"{bag.path}: nothing tells where the flange is; {_ways(bag)}")
+    raise StageError(f"{bag.path}: no topic gives the flange's pose; {_ways(bag)}")
 
 
 def _by_kinematics(bag: Bag, joints: Stream | None, robot: RobotModel | None) -> tuple[Stream, str]:

@@ -271,7 +271,7 @@ def _partners(text: Table, other: Table) -> tuple[list[int], list[str]]:
     if len(other.rows) != len(text.rows):
         raise StageError(
             f"{other.file}: has {len(other.rows)} rows, {text.name} has {len(text.rows)}; give "
-            "each a time: to join them by it, or take the surplus away"
+            "each a time: to join them by it, or remove the surplus"
         )
     told = [] if other is text else [f"paired row by row: {text.name} with {other.name}"]
     return list(range(len(text.rows))), told

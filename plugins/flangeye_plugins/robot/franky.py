@@ -48,7 +48,10 @@ MODES: dict[str, tuple[Mode, str]] = {
     "Idle": ("ready", ""),
     "Move": ("moving", ""),
     "Guiding": ("not ready", "the arm is being guided by hand: let go of it"),
-    "Reflex": ("protective stop", "a limit or a collision stopped it: look why, recover in Desk"),
+    "Reflex": (
+        "protective stop",
+        "a limit or a collision stopped it: find the cause, recover in Desk",
+    ),
     "UserStopped": ("emergency stop", "the stop button is pressed: release it"),
     "AutomaticErrorRecovery": ("not ready", "it recovers from an error"),
     "Other": ("not ready", "joints locked or FCI off: unlock and activate FCI in Desk"),

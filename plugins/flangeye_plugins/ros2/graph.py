@@ -128,7 +128,7 @@ class Frames:
             )
             if age > stale:
                 raise DeviceError(
-                    f"{self._asker}: tf has not told of {name} for {age:.2f} s, at most {stale} s "
+                    f"{self._asker}: tf has not updated {name} for {age:.2f} s, at most {stale} s "
                     "are allowed"
                 )
             pose, name = frame.pose @ pose, frame.parent

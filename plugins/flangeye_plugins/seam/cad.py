@@ -115,7 +115,7 @@ def _deviation(covariances: Floats, limit: float) -> float:
     if deviation > limit:
         way = ", ".join(f"{x:.2f}" for x in vectors[worst, :, -1])
         raise CalibrationRefused(
-            f"{STAGE}: the scan does not tell where the seam lies along ({way}) in camera: "
+            f"{STAGE}: the scan does not determine where the seam lies along ({way}) in camera: "
             f"standard deviation {deviation * 1e3:.2g} mm, limit {limit * 1e3:g} mm "
             "(max_deviation); let the scanner see more of the part"
         )

@@ -28,25 +28,24 @@ class RobustParams(LimitsParams):
     )
     unobservable: Literal["refuse", "mark"] = Field(
         "refuse",
-        description="What to do about translations that the motion cannot show, as the height "
+        description="What to do about translations that are not observable, such as the height "
         "with an arm of four joints: refuse, or solve for the rest and mark them.",
     )
     size_limit: float = Field(
         0.005,
         gt=0,
-        description="Share by which a marker may be larger or smaller than its fit was told, as "
-        "the arm's motion shows it; beyond, the calibration is refused.",
+        description="Largest relative error of a marker's size, as estimated from the arm's "
+        "motion; beyond it the calibration is refused.",
     )
     target_size: Literal["known", "unknown"] = Field(
         "known",
-        description="Whether a marker's size was said where it was fitted, or its poses are right "
-        "but for one factor on all distances, as those of a single moving camera: then the arm's "
-        "own motion tells it.",
+        description="Whether the fit step states a marker's size, or all its distances have one "
+        "unknown factor, as those of a single moving camera; the arm's motion then determines it.",
     )
     certify: bool = Field(
         False,
-        description="Say whether the answer is certified as globally optimal, by a dual "
-        "certificate, or not; where that leads to a better answer, that is given.",
+        description="Try to certify the answer as globally optimal, by a dual certificate; if "
+        "that finds a better answer, it is given.",
     )
     required: Length | None = param(
         None,

@@ -222,8 +222,8 @@ def _exchanged(calibration: HandEye, cell: Cell) -> str | None:
         return None
     return (
         f"the arm would carry the one {carried:.2f} m from its flange, the other would stand "
-        f"{standing:.2f} m from its base: the poses of robot and markers are probably both the "
-        "other way round, which fits as well; if they are right, say where the target is "
+        f"{standing:.2f} m from its base: the poses of robot and markers are probably both "
+        "inverted, which fits as well; if they are right, state the target's place "
         "(configuration: {place: …})"
     )
 

@@ -210,8 +210,8 @@ class Probing:
         left = 0.04e-3 + noise + 0.3 * abs(play)
         if found.unexplained > left:
             return found, (
-                f"the finger's displacement is not understood: {found.unexplained * 1e3:.2f} mm "
-                "are left unexplained by gain, play and delay"
+                f"gain, play and delay leave {found.unexplained * 1e3:.2f} mm of the finger's "
+                "displacement unexplained"
             )
         return found, self._climbs(felt, at[best], gain, bend)
 

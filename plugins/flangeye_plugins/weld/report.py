@@ -76,8 +76,8 @@ def _advice(controller: Controller) -> tuple[Note, ...]:
     if root.welding.bias.looked or fixed < 0.5:
         return ()
     return (
-        f"{fixed:.0%} of the torch's variance is what the files state of it: "
-        "a look behind the torch ('look') would lessen it, nothing ahead of it can",
+        f"{fixed:.0%} of the torch's variance comes from the files' tolerances: "
+        "only a profile behind the torch ('look') can reduce it",
     )
 
 

@@ -120,8 +120,8 @@ def test_scans_that_contradict_each_other_check_nothing(cell: Path, tmp_path: Pa
     done = monitor(cell, tmp_path / "h.jsonl", "ok-00", "torn")
     assert isinstance(done.exception, StageError)
     assert str(done.exception).endswith(
-        "torn: nothing is checked: no one change of scanner, flange or arm explains its 3 scans; "
-        "look at them and scan again; where the scanner was moved far, calibrate"
+        "torn: nothing is checked: no single change of scanner, flange or arm explains its 3 scans; "
+        "inspect them and scan again, or calibrate if the scanner was moved far"
     )
     assert len(done.stdout.splitlines()) == 1, "the check before is said and kept"
 

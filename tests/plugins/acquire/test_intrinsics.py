@@ -125,7 +125,9 @@ def test_images_without_a_board_are_left_out_and_named(views: Any) -> None:
 
 def test_too_few_or_too_equal_views_are_refused(views: Any) -> None:
     few = {name: views[name] for name in "0123"}
-    with pytest.raises(StageError, match="^4 of 4 images show the board, 6 are needed to tell the"):
+    with pytest.raises(
+        StageError, match="^4 of 4 images show the board, 6 are needed to calibrate"
+    ):
         lens_of(few, BOARD)
     other = replace(BOARD, dictionary="6X6_250")
     with pytest.raises(StageError, match=r"^0 of 4 .*; 0: 0 corners of .*: write dictionary: "):

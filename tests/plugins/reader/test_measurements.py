@@ -148,7 +148,7 @@ def test_two_streams_are_paired_and_their_clocks_compared(
     found = archive.recordings
     told = float(archive.notes[0].split("clock offset ")[1].split(" ms")[0])
     assert told == pytest.approx(-1e3 * offset, abs=5)
-    assert "estimated by how both move" in archive.notes[0]
+    assert "estimated from both motions" in archive.notes[0]
     wrong = [
         np.linalg.norm(
             (np.linalg.inv(base_T_camera) @ r.base_T_flange @ flange_T_target)[:3, 3]
@@ -224,8 +224,7 @@ def test_streams_without_a_common_time_are_refused(tmp_path: Path) -> None:
         ({"columns": [99]}, "a.csv: has no column 99; they are 1 to 9"),
         ({"time": "v"}, "a.csv:3: its time is not after the row before it"),
         ({"columns": [*"xyzabcd"], "target": {"rotation": "point", "length": "m", "file": "b.csv"}},
-         "b.csv: has 1 rows, a.csv has 6; give each a time: to join them by it, or take the surplus "
-         "away"),
+         "b.csv: has 1 rows, a.csv has 6; give each a time: to join them by it, or remove the surplus"),
     ],
 )  # fmt: skip
 def test_a_mistake_in_a_table_is_one_line(

@@ -369,9 +369,9 @@ def test_a_bag_of_a_simulated_session_gives_the_same_matrix(bag: Callable[..., A
          "(a PoseStamped topic, or a frame of tf)"),
         ("tf two", {}, "clouds: name one of /a, /b, for example reader: {ros2_bag: {clouds: /a}}"),
         ("tf two", {"clouds": "/c"}, "clouds: no topic '/c'; of this type: /a, /b"),
-        ("two", {"clouds": "/a"}, "nothing tells where the flange is; it has neither tf nor "
+        ("two", {"clouds": "/a"}, "no topic gives the flange's pose; it has neither tf nor "
          "PoseStamped nor JointState"),
-        ("two joints odd", {"clouds": "/a"}, "nothing tells where the flange is; write reader: "
+        ("two joints odd", {"clouds": "/a"}, "no topic gives the flange's pose; write reader: "
          "{ros2_bag: {base: …, flange: …}} (frames of tf: end, map) or robot: NAME ('flangeye "
          "robots' lists them) or robot: {urdf: arm.urdf} in the recipe (for the angles of "
          "/joints)"),

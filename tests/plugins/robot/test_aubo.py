@@ -133,7 +133,7 @@ def test_another_arm_than_the_recipes_is_refused(controller: Any) -> None:
         (
             "protective-stop",
             "protective stop",
-            "protective stop: look why, then release it at the pendant",
+            "protective stop: find the cause, then release it at the pendant",
         ),
         ("emergency-stop", "emergency stop", "emergency stop: release the button"),
     ],

@@ -189,7 +189,11 @@ def test_a_hand_the_recipe_does_not_know_is_refused_and_one_it_knows_is_taken_of
 @pytest.mark.parametrize(
     ("mode", "said", "message"),
     [
-        ("Reflex", "protective stop", "a limit or a collision stopped it: look why, recover in"),
+        (
+            "Reflex",
+            "protective stop",
+            "a limit or a collision stopped it: find the cause, recover in",
+        ),
         ("UserStopped", "emergency stop", "the stop button is pressed: release it"),
         ("Guiding", "not ready", "the arm is being guided by hand"),
         ("Other", "not ready", "joints locked or FCI off"),

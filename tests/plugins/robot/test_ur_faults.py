@@ -180,7 +180,7 @@ def test_a_controller_that_is_lost_is_noticed(lanes: Any, fault: str, times: Any
 @pytest.mark.parametrize(
     ("fault", "said"),
     [
-        ("protective-stop", ("protective stop: look why, then release it at the pendant",)),
+        ("protective-stop", ("protective stop: find the cause, then release it at the pendant",)),
         ("emergency-stop", ("emergency stop: release the button",)),
         ("remote-control-off", (LOCAL,)),
     ],
@@ -195,7 +195,7 @@ def test_a_controller_that_stops_says_why(
 @pytest.mark.parametrize(
     ("fault", "message"),
     [
-        ("protective-stop", "protective stop: look why, then release it at the pendant"),
+        ("protective-stop", "protective stop: find the cause, then release it at the pendant"),
         ("emergency-stop", "emergency stop: release the button"),
         ("remote-control-off", LOCAL),
         ("freeze", "its dashboard server does not answer (nothing within 0.5 s)"),
@@ -242,7 +242,7 @@ def test_a_stopped_arm_takes_no_command(lanes: Any, move: int) -> None:
         with in_time(1.0), pytest.raises(DeviceError) as error:
             start(robot, move)
     assert str(error.value) == (
-        f"ur5e at {process.host}: protective stop: look why, then release it at the pendant"
+        f"ur5e at {process.host}: protective stop: find the cause, then release it at the pendant"
     )
 
 

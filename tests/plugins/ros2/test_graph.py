@@ -74,7 +74,7 @@ def test_the_pose_may_come_from_tf_and_is_lost_with_it(env):
         with robot_ros2_freedrive.function(ARM, params) as robot:
             assert np.allclose(robot.state().base_T_flange.matrix, flange, atol=1e-6)
             tree.kill()
-            with pytest.raises(DeviceError, match="tf has not told of tool0 for"):
+            with pytest.raises(DeviceError, match="tf has not updated tool0 for"):
                 for _ in range(100):
                     robot.wait_cycle()
                     robot.state()
@@ -179,7 +179,7 @@ def test_init_keeps_what_is_there_and_finds_a_service_outside_the_namespace(env,
         mine = tmp_path / "recipe.urdf"
         mine.write_text("mine")
         _, wrong = Terminal(tmp_path, env).run(*words, expect=2)
-        assert wrong == "error: recipe.urdf: is there already; take another name with --out\n"
+        assert wrong == "error: recipe.urdf: exists already; choose another name with --out\n"
         assert mine.read_text() == "mine"
         Terminal(tmp_path, env).run(*words, "--out", "cell.yaml")
         assert "trigger: /capture" in (tmp_path / "cell.yaml").read_text()

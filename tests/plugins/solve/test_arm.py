@@ -130,9 +130,7 @@ def clocked(poses: Sequence[Observation], turn: float) -> list[Observation]:
 def test_a_constant_flange_roll_is_estimated_from_the_holes(ur5: RobotModel, turn: float) -> None:
     plain = simulate(ur5, 20)
     calibration = solver(ur5)(clocked(plain, np.radians(turn)))
-    (note,) = [
-        n for n in calibration.notes if "(flange roll, from the bolt pattern in 20 poses)" in n
-    ]
+    (note,) = [n for n in calibration.notes if "(bolt pattern in 20 poses)" in n]
     found, deviation = (float(n) for n in re.findall(r"by (\S+) \+- (\S+) deg", note)[0])
     assert abs((found - turn + 180) % 360 - 180) <= 4 * deviation
     assert deviation < 0.2

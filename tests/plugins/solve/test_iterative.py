@@ -160,8 +160,8 @@ def test_an_error_that_stays_infinite_is_refused() -> None:
     with pytest.raises(CalibrationRefused) as refused:
         run(simulate(12), parameters(error=never.bind(), reserve=0))
     assert str(refused.value) == (
-        "no pool of 4 out of 12 poses could be measured: the error was infinite each time; "
-        "check the verification view and the flange's model, or measure with error: holdout"
+        "no pool of 4 out of 12 poses gives a finite error; check the verification view and the "
+        "flange's model, or set error: holdout"
     )
 
 

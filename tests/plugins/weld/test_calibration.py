@@ -73,7 +73,7 @@ def test_a_tip_stays_in_its_mark_to_two_tenths(left: float, told: bool) -> None:
         calibrate(RESTS, some, "")
         return
     with pytest.raises(
-        StageError, match="leaves 0.2[012] mm of the tip's unexplained, at most 0.20"
+        StageError, match="leaves 0.2[012] mm of the tip's motion unexplained, at most 0.20"
     ):
         calibrate(RESTS, some, "")
 

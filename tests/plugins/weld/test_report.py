@@ -169,4 +169,4 @@ def test_a_look_behind_is_recommended_where_the_files_are_most_of_what_is_unknow
     advice = _advice(controller)
     assert bool(advice) == told
     if told:
-        assert advice[0].startswith("73% of the torch's variance is what the files state")
+        assert advice[0].startswith("73% of the torch's variance comes from the files' tolerances")

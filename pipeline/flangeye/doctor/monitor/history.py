@@ -188,7 +188,7 @@ def only_user(path: Path) -> Iterator[None]:
             yield
     except BlockingIOError:
         raise StageError(
-            f"{path}: another program has kept it for {patience:.0f} s; end it, and check again"
+            f"{path}: another program has locked it for {patience:.0f} s; end it, and check again"
         ) from None
     except OSError as error:
         raise StageError(f"{lock}: cannot be written: {error.strerror or error}") from None
@@ -246,4 +246,4 @@ def _require_usable(number: int, check: MonitorCheck, finding: CheckFinding) -> 
         if t.FLANGE not in seen.poses:
             raise DamageError(f"sighting {seen.id}: it has no pose of the flange")
         if (np.linalg.eigvalsh(seen.circle.covariance) <= 0).any():
-            raise DamageError(f"sighting {seen.id}: its covariance is none")
+            raise DamageError(f"sighting {seen.id}: its covariance is not valid")

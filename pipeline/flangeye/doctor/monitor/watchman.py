@@ -68,9 +68,9 @@ def _without_misfits(
     scanner = stored.estimate.transform.translation
     if wrong.any() and not explained(before, seen, stored.estimate.about, scanner, test.daily):
         raise StageError(
-            f"{check.source}: nothing is checked: no one change of scanner, flange or arm explains "
-            f"its {len(wrong)} scans; look at them and scan again; where the scanner was moved "
-            "far, calibrate"
+            f"{check.source}: nothing is checked: no single change of scanner, flange or arm "
+            f"explains its {len(wrong)} scans; inspect them and scan again, or calibrate if the "
+            "scanner was moved far"
         )
     return check, ()
 

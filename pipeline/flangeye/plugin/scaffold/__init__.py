@@ -36,7 +36,7 @@ def write_plugin(name: str, kind: str, into: Path) -> Path:
     _require_usable(name, kind)
     folder = into / f"flangeye-{name.replace('_', '-')}"
     if folder.exists():
-        raise StageError(f"{folder} is there already; remove it, or choose another name")
+        raise StageError(f"{folder} exists already; remove it, or choose another name")
     for path, text in _files(name, kind).items():
         file = folder / path
         write_whole(file, text)

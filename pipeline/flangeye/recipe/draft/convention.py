@@ -109,7 +109,7 @@ def _require_as_many(tables: Sequence[Table], arm: PoseColumns) -> None:
     if other is not None and len(other.rows) != len(arm.table.rows):
         raise RecipeError(
             f"{other.file}: has {len(other.rows)} rows, {arm.table.name} has "
-            f"{len(arm.table.rows)}; take the surplus away, or give each a column time"
+            f"{len(arm.table.rows)}; remove the surplus, or give each a column time"
         )
 
 
@@ -161,13 +161,11 @@ def _likeliest(poses: Sequence[PoseColumns], questions: Questions) -> PoseColumn
     first = upright[0]
     if len(likely) > 1 and named:
         rest = ", ".join(p.name for p in likely if p is not first)
-        questions.assumed.append(
-            f"the arm's poses: {first.name}, not {rest} (--table says otherwise)"
-        )
+        questions.assumed.append(f"the arm's poses: {first.name}, not {rest} (--table changes it)")
     elif len(likely) > 1 and _in_order(likely):
         questions.assumed.append(
             f"the arm's poses: {_place(first)}, which stand before {_place(likely[1])} "
-            "(--table or --columns says otherwise)"
+            "(--table or --columns changes it)"
         )
     elif len(likely) > 1:
         known = ", ".join(p.name for p in likely)
@@ -179,7 +177,7 @@ def _likeliest(poses: Sequence[PoseColumns], questions: Questions) -> PoseColumn
             raise RecipeError(f"--table {answer}: is no table of poses; known: {known}")
         first = matching[0]
     if first.guess:
-        questions.assumed.append(f"{first.table.name}: {first.guess} (--columns says otherwise)")
+        questions.assumed.append(f"{first.table.name}: {first.guess} (--columns changes it)")
     return first
 
 
@@ -448,7 +446,7 @@ def _rotation(pose: PoseColumns, questions: Questions, prefix: str, maker: str |
     shown = ", ".join(map(str, pose.columns[3:] or pose.columns))
     joints = ", or joints, with --robot" if pose.may_be_joints and not prefix else ""
     known = f"{', '.join(CONVENTIONS)}, vector, xyz, ZYX, …{joints}"
-    question = f"how the rotation in columns {shown} of {pose.table.name} is written"
+    question = f"rotation convention of columns {shown} of {pose.table.name}"
     example = f"vector, or --{key} xyz for roll, pitch, yaw"
     if not prefix:
         example += "; or name the arm with --robot: its maker decides"
@@ -482,7 +480,7 @@ def _direction(pose: PoseColumns, questions: Questions, prefix: str) -> str:
         name = pose.called or pose.table.name
         questions.likely[f"{prefix}pose"] = (likely[0], f"{likely[1]}; {name} says {named}")
     whose = "the arm's" if not prefix else "the target's"
-    question = f"which way round {whose} poses are ({' or '.join(ways)})"
+    question = f"direction of {whose} poses ({' or '.join(ways)})"
     return questions.ask(f"{prefix}pose", question, named or ways[0], check=one_of(*ways))
 
 

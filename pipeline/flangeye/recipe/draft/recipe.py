@@ -203,7 +203,7 @@ def _what(archive: Archive, questions: Questions) -> tuple[str, dict[str, Any]]:
     if any(r.cloud for r in records):
         answer = questions.ask(
             "target",
-            "what is seen (flange, 'body: MESH' for a tool, sphere, charuco, checkerboard, "
+            "what the scans show (flange, 'body: MESH' for a tool, sphere, charuco, checkerboard, "
             "circles, aruco)",
             "flange",
             check=_target,
@@ -306,7 +306,7 @@ def _camera(archive: Archive, target: Mapping[str, Any], questions: Questions) -
         name = str(cameras[0].path.relative_to(archive.root))
         others = [camera.path.name for camera in cameras[1:]]
         instead = f", not {', '.join(others)}" if others else ""
-        questions.assumed.append(f"{cameras[0].note()}{instead} (camera_file says otherwise)")
+        questions.assumed.append(f"{cameras[0].note()}{instead} (camera_file changes it)")
         return {"camera_file": name}
     if kind == "aruco":
         return {}
@@ -323,7 +323,7 @@ def _has_plate(robot: Mapping[str, Any]) -> bool:
 
 def _configuration(target: Mapping[str, Any], questions: Questions) -> dict[str, Any]:
     """Return who carries what; empty for a camera beside the robot that sees its flange."""
-    question = "what carries the camera (base or flange)"
+    question = "where the camera is mounted (base or flange)"
     carried = questions.ask("camera", question, "base", check=one_of("base", "flange"))
     if carried not in ("base", "flange"):
         raise RecipeError(f"--camera {carried}: is neither base nor flange")

@@ -75,7 +75,7 @@ class Questions:
             default, shown = self.likely.get(flag, (default, ""))
             if self.prompt is None and default is not None:
                 reason = f"{shown}; " if shown else ""
-                self.assumed.append(f"{question}: {default} ({reason}--{flag} says otherwise)")
+                self.assumed.append(f"{question}: {default} ({reason}--{flag} changes it)")
                 answer = default
             else:
                 asked = f"{question} ({known})" if known else question

@@ -34,7 +34,7 @@ SAFETY: dict[str, tuple[Mode, str]] = {
     "Violation": ("not ready", "safety violation: look at the pendant"),
     "ProtectiveStop": (
         "protective stop",
-        "protective stop: look why, then release it at the pendant",
+        "protective stop: find the cause, then release it at the pendant",
     ),
     "SafeguardStop": ("protective stop", "safeguard stop: somebody is in the cell"),
     "SystemEmergencyStop": ("emergency stop", "emergency stop of the system: release it"),

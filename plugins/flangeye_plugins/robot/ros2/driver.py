@@ -256,7 +256,7 @@ class FreedriveArm(Listener):
 
     def move_velocity(self, twist: Floats, acceleration: float) -> None:
         """Refuse: others move the arm."""
-        raise DeviceError(f"{self.name}: others move it; it cannot be led")
+        raise DeviceError(f"{self.name}: others move it; it cannot be servoed")
 
     def stop(self) -> None:
         """Do nothing: others move the arm."""

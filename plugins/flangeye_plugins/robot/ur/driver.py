@@ -37,7 +37,7 @@ REMOTE = "it is in local control: choose Remote Control at the top right of the 
 POWER = "the arm has no power or its brakes are on: switch it on at the pendant"
 
 SAFETY: dict[int, tuple[Mode, str]] = {
-    3: ("protective stop", "protective stop: look why, then release it at the pendant"),
+    3: ("protective stop", "protective stop: find the cause, then release it at the pendant"),
     4: ("not ready", "the arm is outside its safety limits: move it back in recovery mode"),
     5: ("protective stop", "safeguard stop: somebody is in the cell"),
     6: ("emergency stop", "emergency stop of the system: release it"),

@@ -59,7 +59,7 @@ def calibrate(rest: Sequence[TagReading], held: Sequence[Held], source: str) -> 
     if unexplained > 0.2e-3:
         raise StageError(
             f"calibration: the tag's motion leaves {unexplained * 1e3:.2f} mm of the tip's "
-            f"unexplained, at most 0.20 mm are allowed; did the tip slide in its mark?"
+            f"motion unexplained, at most 0.20 mm are allowed; did the tip slide in its mark?"
         )
     noise = np.std([gain @ (r.translation - place) for r in rest], axis=0)
     lateral, axial = _stiffness(held)
