@@ -86,7 +86,7 @@ class Device(Protocol):
 
 @runtime_checkable
 class Robot(Device, Protocol):
-    """An arm. Opened by its driver, used as a context, closed for good at the end.
+    """An arm: opened by its driver, used as a context, disconnected at the end.
 
     Every method but close raises DeviceError when the arm is lost, and a command also when the
     controller is in a mode in which it cannot move.
@@ -216,7 +216,7 @@ class Overhears(Protocol):
     """
 
     def overhear(self, since_ns: int) -> Callable[[], Scan]:
-        """Return the newest scan taken since a moment, or the next one; see ``Scanner.expose``.
+        """Return the newest scan since a given time, or the next one; see ``Scanner.expose``.
 
         Raises:
             FrameDropped: Nobody took one in time.
@@ -407,7 +407,7 @@ class ScannerDriver:
 
 @dataclass(frozen=True)
 class MotionAllowed:
-    """Whether the person asked for motion (``--move``); without it, nothing moves.
+    """Whether the user allowed motion (``--move``); without it, nothing moves.
 
     Attributes:
         allowed: Whether the arm may be moved.

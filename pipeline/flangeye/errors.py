@@ -1,4 +1,4 @@
-"""The ways a run ends early, and the exit code each one has.
+"""Exceptions that end a run early, each with its exit code.
 
 A message says where, what is wrong, what is allowed and what to do; the command line prints
 it as it is, without a traceback.
@@ -39,7 +39,7 @@ class RunStopped(FlangeyeError):
 
 
 class NothingMoved(FlangeyeError):
-    """Motion was not asked for: the message is the plan, for people. Nothing is wrong.
+    """Motion was not allowed: the message is the plan. Nothing is wrong.
 
     Attributes:
         plan: The same for programs, as JSON has it; None where the stage has only words.

@@ -38,7 +38,7 @@ def replay_tactile(log: FilePath, step: str) -> ReplayedStep:
 
 
 class WeldReplay(LoggedWeld):
-    """Goes through the log of a weld in its order, its images read again."""
+    """Repeats a weld from its log in order, reading its images anew."""
 
     def __init__(self, start: Mapping[str, Any]) -> None:
         """Set up controller and finger as they were."""
@@ -50,7 +50,7 @@ class WeldReplay(LoggedWeld):
         self._worst_feeling = self._worst_command = 0.0
 
     def take(self, note: JournalEntry) -> None:
-        """Take in the next line of the log."""
+        """Process the next log entry."""
         if note.name == "image":
             self._pixels = note.value
         super().take(note)

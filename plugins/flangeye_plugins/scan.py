@@ -153,7 +153,7 @@ def routes_along(
     params: AlongParams,
     here: Floats,
 ) -> list[Route]:
-    """Return the checked ways from joint angles (n,) to each place in turn.
+    """Return the checked paths from joint angles (n,) to each place in turn.
 
     Raises:
         StageError: A place cannot be reached from the one before: which, and what bars it.

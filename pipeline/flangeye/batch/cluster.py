@@ -272,7 +272,7 @@ class Pace:
         return max(1, int(wanted))
 
     def asks(self, chunks: int, sessions: int, share: float = 1.0) -> bool:
-        """Return whether the scheduler is asked for more than so much, or than a share of it."""
+        """Return whether to submit more than so many sessions; ``share`` scales the limits."""
         if chunks < share * AHEAD * self.workers():
             return True
         # Sessions that a scheduler elsewhere is to know of at least: its workers may only be
@@ -280,7 +280,7 @@ class Pace:
         return self._client.cluster is None and sessions < share * 256
 
     def cut(self, sessions: Iterable[tuple[int, BatchSession]]) -> Iterator[Chunk]:
-        """Yield chunks, as long as is right when each is asked for."""
+        """Yield chunks on demand, each of the size that is then right."""
         for block, members in groupby(sessions, key=lambda each: each[0] // BLOCK):
             while some := [session for _, session in islice(members, self.size())]:
                 self._left -= len(some)

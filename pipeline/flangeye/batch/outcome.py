@@ -78,7 +78,7 @@ def outcome_of(result: Result) -> SessionOutcome:
 
 
 def mark_finished(place: Storage, folder: str, key: str, outcome: SessionOutcome) -> None:
-    """Leave the outcome in a session's folder, whole or not at all.
+    """Write the outcome into a session's folder, atomically.
 
     Raises:
         StageError: It cannot be written.

@@ -212,7 +212,7 @@ class Variant:
 
 @dataclass(frozen=True)
 class BatchPlan:
-    """The sessions of a batch; each is made when it is come to, so none of them are held.
+    """The sessions of a batch; each is created on demand, so none are held in memory.
 
     Attributes:
         recipe: Absolute path.

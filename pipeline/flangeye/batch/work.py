@@ -171,7 +171,7 @@ class Recipes:
 
 
 def run_session(job: Job, session: BatchSession, recipes: Recipes) -> SessionOutcome:
-    """Run one session into its folder; whatever goes wrong is in the outcome."""
+    """Run one session into its folder; any failure becomes its outcome."""
     begun = time.perf_counter()
     try:
         known = finished_outcome(job.place, session.id, session.key, job.report)

@@ -34,7 +34,7 @@ def write(console: Console, text: str, style: str = "") -> None:
 
 
 def wrapped(console: Console, text: str, indent: int = 2) -> str:
-    """Return a text in the lines that the terminal shows; commands stay whole."""
+    """Return a text wrapped to the terminal's width; commands are not broken."""
     return textwrap.fill(
         text, width(console), subsequent_indent=" " * indent, break_long_words=False,
         break_on_hyphens=False, drop_whitespace=True, replace_whitespace=False,

@@ -17,7 +17,7 @@ app.add_typer(tactile, name="tactile")
 
 @tactile.callback()
 def tactile_group() -> None:
-    """Keep 'calibrate' a word of its own, though it is the only one yet."""
+    """Keep 'calibrate' a subcommand, though it is the only one yet."""
 
 
 @tactile.command("calibrate")

@@ -1,4 +1,4 @@
-"""Keep watch over a calibration; the local page."""
+"""Commands to monitor a calibration, and the local page."""
 
 from __future__ import annotations
 

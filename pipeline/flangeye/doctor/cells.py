@@ -282,7 +282,7 @@ class Foretold:
 
     @property
     def ordinary(self) -> bool:
-        """Whether sound sightings have such errors, too."""
+        """Whether errors of this size occur without a mistake."""
         return self.size <= 1
 
 

@@ -201,7 +201,7 @@ class Misfit(NamedTuple):
 
     @property
     def numbers(self) -> Floats:
-        """(1,) or (2,) those there are."""
+        """(1,) or (2,) the errors that exist."""
         return np.array([x for x in self if x is not None])
 
 
@@ -237,7 +237,7 @@ class Finding:
 
     @property
     def hopeless(self) -> bool:
-        """Whether it is certain, of most samples, and only new recordings help."""
+        """Whether the mistake surely affects most samples, so that only new recordings help."""
         certain = self.gain == CERTAIN and bool(self.samples)
         return certain and self.corrected_session is None and not self.note
 

@@ -224,7 +224,7 @@ class _Commands:
 
 
 def adjoint(pose: Floats) -> Floats:
-    """Return (6, 6) that takes a twist about a frame's origin to its parent's, in its axes."""
+    """Return (6, 6) that converts a twist about a frame's origin to its parent's."""
     out = np.zeros((6, 6))
     out[:3, :3] = out[3:, 3:] = pose[:3, :3]
     out[3:, :3] = hat(pose[:3, 3]) @ pose[:3, :3]

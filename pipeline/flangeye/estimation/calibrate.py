@@ -186,7 +186,7 @@ def calibrate_at(
 def with_expected_error(
     calibration: HandEye, cell: Cell, scanner: ScannerModel | None, work: Box | None
 ) -> HandEye:
-    """Return a calibration by any method with the error to expect of it at the work.
+    """Return a calibration by any method with its expected error at the work.
 
     As it was, where the model refuses its observations or has unknowns that the method leaves out.
     """

@@ -1,4 +1,4 @@
-r"""Whether an answer is the best of all, not only of its neighbourhood. Arrays only.
+r"""Certify a local minimum as the global one. Arrays only.
 
 Squared errors are a quadratic ``r' Q r`` of features of the unknown places
 (:mod:`flangeye.estimation.lifted`).
@@ -114,7 +114,7 @@ class _Block(NamedTuple):
     others: Floats
 
     def naught(self, matrix: Floats) -> Floats:
-        """Return the part of a matrix over the family's features that vanishes for all places."""
+        """Return the projection of a matrix onto those whose quadratic vanishes for all places."""
         size = len(matrix) // 10
         pairs = matrix.reshape(10, size, 10, size).swapaxes(1, 2).reshape(100, -1)
         told = self.first @ (self.first.T @ pairs @ self.others) @ self.others.T

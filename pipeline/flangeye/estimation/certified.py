@@ -73,7 +73,7 @@ class CertifiedAnswer:
         return np.flatnonzero([each == ends for each in self.ends])
 
     def ways(self, ends: tuple[str, str], root: str = "") -> tuple[list[PathStep], list[PathStep]]:
-        """Return the frames that lead to a camera and to a target, from where both ways part.
+        """Return the paths to a camera and to a target, from the frame where they part.
 
         Args:
             ends: The camera and the target.

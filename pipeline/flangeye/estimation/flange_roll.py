@@ -1,4 +1,4 @@
-"""How the flange is turned about its own axis against the controller's frame: from its holes.
+"""Flange roll: the rotation of the bolt pattern about the flange's axis.
 
 The camera's pose does not depend on it, since centres and normals do not show it; a seam found in
 the flange's frame, or a registration of its whole shape, does.

@@ -74,7 +74,7 @@ class Sightings:
         return out
 
     def where(self, chosen: Mask | NDArray[np.intp]) -> Sightings:
-        """Return some of them."""
+        """Return a subset of the sightings."""
         return Sightings(**{each.name: getattr(self, each.name)[chosen] for each in fields(self)})
 
 

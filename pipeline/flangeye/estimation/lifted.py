@@ -1,4 +1,4 @@
-r"""Squared errors of sightings over unknown places as one quadratic. Arrays only.
+r"""Squared errors of sightings as one quadratic in lifted features of the unknowns. Arrays only.
 
 Where a sighting says ``A U B V C = A' U' B' V' C'``, with any of K unknown places or none for each
 of U, V, U' and V', either side is linear in the entries of V, of U, and in the products of U's
@@ -46,7 +46,7 @@ class Side:
     c: Floats
 
     def about(self, places: Floats) -> Side:
-        """Return the same with unknowns from those places (K, 4, 4) on."""
+        """Return the same side with unknowns relative to places (K, 4, 4)."""
         every = np.concatenate([places, np.eye(4)[None]])
         return Side(self.a @ every[self.u], self.u, self.b @ every[self.v], self.v, self.c)
 
@@ -61,13 +61,13 @@ class Side:
         return np.stack([self.u, self.v], axis=1)
 
     def where(self, which: Mask) -> Side:
-        """Return some of them."""
+        """Return a subset of the sightings."""
         return Side(*(getattr(self, f.name)[which] for f in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)
 class LiftedSightings:
-    """N sightings of which both sides are the same place.
+    """N sightings as equations, whose two sides are the same place.
 
     Attributes:
         camera: To the camera, and what it saw.
@@ -84,7 +84,7 @@ class LiftedSightings:
 
 
 class Family(NamedTuple):
-    """An unknown place, those that come after it in products, and their features.
+    """An unknown, the unknowns multiplied with it, and the indices of their features.
 
     Attributes:
         first: Which of the unknowns it is.
@@ -124,7 +124,7 @@ class Family(NamedTuple):
 
 
 def families_of(pairs: Collection[tuple[int, int]], count: int) -> tuple[list[Family], int]:
-    """Return the families of K unknowns, of which some pairs come in products; and all features."""
+    """Return the families of K unknowns, given the pairs in products; and their features."""
     firsts = {v: u for u, v in pairs}
     out, size, shifts = list[Family](), 1, 3 * (count - len(firsts))
     for k in sorted({*range(count)} - firsts.keys()):
@@ -175,7 +175,7 @@ class Squares:
         return out.reshape(len(out), -1)
 
     def with_shifts(self, places: Floats) -> Floats:
-        """Return places (K, 4, 4) with the best translations of those that are first."""
+        """Return places (K, 4, 4) with the best translations of each family's first."""
         out = places.copy()
         firsts = [family.first for family in self.families]
         out[firsts, :3, 3] = (self.shifts @ self.features(places)).reshape(-1, 3)

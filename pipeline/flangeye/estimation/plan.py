@@ -61,7 +61,7 @@ def _blocks(found: Rough) -> list[Floats]:
 
 
 def work_of_frames(found: Rough, cell: Cell, seen: Sequence[Observation]) -> Mapping[str, Floats]:
-    """Return (k, 3) where each unknown frame has to be right, in its parent [m].
+    """Return points (k, 3) at which each unknown frame must be accurate, in its parent [m].
 
     A camera where it saw something; what else there is about its origin.
     """
@@ -105,7 +105,7 @@ def most_telling(
 def best_next(
     candidates: Sequence[Observation], found: Rough, cell: Cell, seen: Sequence[Observation]
 ) -> int:
-    """Return which candidate is expected to shrink the error at the work most.
+    """Return the candidate that is expected to reduce the error at the work most.
 
     Args:
         candidates: M sightings as they would be, by what is known so far.

@@ -48,7 +48,7 @@ for the estimate judges again."""
 
 
 def begin(problem: Problem) -> tuple[Places, Floats]:
-    """Return (4, 4) of each unknown, and (N,) squared distances there in units of the noise.
+    """Return an initial guess of the unknowns, and (N,) squared distances in units of the noise.
 
     Raises:
         CalibrationRefused: Nothing gives a start.
@@ -66,7 +66,7 @@ def begin(problem: Problem) -> tuple[Places, Floats]:
 
 
 def agreeing(problem: Problem, squares: Floats) -> Mask:
-    """Return (N,) which sightings may agree with a start, by their squared distances there."""
+    """Return (N,) which sightings are consistent with a guess, by their squared distances."""
     return np.asarray(squares <= GOOD * np.maximum(_middles(problem, squares), 1.0))
 
 

@@ -1,4 +1,4 @@
-"""The calibration of a camera, from the files in which programs keep one.
+"""Read a camera's calibration from the files of common programs.
 
 ``camera_info`` of ROS, OpenCV's storage, kalibr's camchain, COLMAP's ``cameras.txt``, RealSense's
 and Zivid's intrinsics, arrays of NumPy, and text with labels: each by its own names.

@@ -1,4 +1,4 @@
-"""Turns a .mat file into .npz, from standard input to output: a program of its own.
+"""Program that converts a .mat file to .npz, from standard input to standard output.
 
 A damaged file can crash scipy's parser, or let it ask for any memory. Nothing of flangeye is
 imported here.

@@ -113,7 +113,7 @@ def settings_file() -> Path:
 
 
 def find_named(kind: Kind, name: str) -> Path | None:
-    """Return the file that this machine's user gave a name, None when there is no such name.
+    """Return the file that this machine's settings give a name; None without one.
 
     Raises:
         DeviceError: The settings cannot be read, or the entry is no file by its whole path.

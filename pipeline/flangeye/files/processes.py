@@ -13,7 +13,7 @@ from typing import IO, cast
 
 
 def python_command(*words: str) -> list[str]:
-    """Return a command of this Python that imports nothing from the current folder."""
+    """Return a command of this Python that does not import from the current folder."""
     return [sys.executable, "-P", *words]
 
 
@@ -70,7 +70,7 @@ class Pipe:
             reader.start()
 
     def write(self, data: bytes) -> None:
-        """Send something.
+        """Send a line or bytes.
 
         Raises:
             OSError: The process has ended.

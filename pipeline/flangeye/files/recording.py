@@ -196,7 +196,7 @@ def _check_motion(root: Path, recordings: Sequence[Recording], anywhere: bool, f
 
 
 def digests_of(files: Iterable[Path]) -> dict[Path, str]:
-    """Return the SHA-256 of every file's content; elsewhere, of the checksum the store has of it.
+    """Return the SHA-256 of every file's content; for remote files, of the store's checksum.
 
     Raises:
         StageError: A file cannot be read.

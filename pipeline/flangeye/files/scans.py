@@ -175,7 +175,7 @@ class Poses:
 
     @property
     def apart(self) -> bool:
-        """Whether each pose has a folder of its own."""
+        """Whether each pose has its own folder."""
         return len({file.parent for file in self.files}) == self.count > 1
 
 
@@ -271,7 +271,7 @@ def is_cloud(path: Path) -> bool:
 
 
 def recording_of(name: str, pose: Floats, scans: Sequence[Path]) -> Recording:
-    """Return a pose with its cloud and its image, whichever there are.
+    """Return a pose with its cloud, its image, or both.
 
     Raises:
         StageError: It has two of one sort, or a file is neither.

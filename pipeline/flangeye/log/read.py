@@ -1,4 +1,4 @@
-"""Read a run's MCAP back, finished or killed half way: for people, and to run again.
+"""Read a run's MCAP log, complete or not, to show it or to run from it again.
 
 Read from front to back: a file without its end is read as far as its last whole message, and there
 is one way for both. What is damaged or foreign is named in ``RunLog.damage`` and left out; the rest

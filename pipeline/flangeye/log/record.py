@@ -189,7 +189,7 @@ class Recorder:
 
     @hookimpl
     def flangeye_capture_finished(self, capture: str) -> None:
-        """Mark that nothing more will come of a capture."""
+        """Log that a capture is finished."""
         self._json("/capture/finished", "Finished", {"capture": capture})
 
     @hookimpl

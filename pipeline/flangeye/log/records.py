@@ -53,7 +53,7 @@ WIDTH = 12
 
 
 class Channel(NamedTuple):
-    """Where messages come from.
+    """A message channel: its topic and schema.
 
     Attributes:
         topic: Its name.

@@ -1,4 +1,4 @@
-"""Where the flange is, when the arm's own report of it is known to be wrong. Arrays only."""
+"""The flange's true pose, given a model of the arm's reporting errors. Arrays only."""
 
 from __future__ import annotations
 

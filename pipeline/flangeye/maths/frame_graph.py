@@ -47,7 +47,7 @@ def chain(frames: Mapping[str, Frame], name: str) -> list[str]:
 
 
 def composed(frames: Mapping[str, Frame], name: str) -> Floats:
-    """Return root_T_frame, (4, 4) or (M, 4, 4); every place on the way is known.
+    """Return root_T_frame, (4, 4) or (M, 4, 4), if every place on the path is known.
 
     The root itself is the identity.
     """

@@ -34,7 +34,7 @@ def transposed(poses: Floats) -> Floats:
 
 
 def reread(poses: Floats, read_as: str, written_as: str) -> Floats:
-    """Return the poses with their rotations' numbers read another way.
+    """Return the poses with their rotation numbers read in another convention.
 
     Args:
         poses: As they were read.
@@ -88,7 +88,7 @@ def shifted(poses: Floats, by: int, start: int = 0) -> tuple[Floats, Mask]:
 
 
 def sources(count: int, by: int, start: int = 0) -> tuple[NDArray[np.intp], Mask]:
-    """Return (N,) from which sample each gets its pose, its own if from none, and which get one.
+    """Return (N,) the sample from which each gets its pose, and which get one at all.
 
     Args:
         count: Samples there are.
@@ -102,7 +102,7 @@ def sources(count: int, by: int, start: int = 0) -> tuple[NDArray[np.intp], Mask
 
 
 def delayed(poses: Floats, times: Floats, delay: float) -> tuple[Floats, Mask]:
-    """Return the poses the arm had ``delay`` later, and for which samples they are known.
+    """Return the poses ``delay`` later, and for which samples they are known.
 
     Between two samples the arm is taken to move evenly.
 
@@ -115,7 +115,7 @@ def delayed(poses: Floats, times: Floats, delay: float) -> tuple[Floats, Mask]:
 
 
 def delaying(poses: Floats, times: Floats) -> Callable[[float], tuple[Floats, Mask]]:
-    """Return :func:`delayed` of poses for many delays: half of its work is the same for all."""
+    """Return a function like :func:`delayed` that is fast for many delays."""
     from scipy.spatial.transform import Rotation, Slerp
 
     turning = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))

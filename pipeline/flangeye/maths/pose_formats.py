@@ -1,4 +1,4 @@
-"""How controllers, files and people write a pose: as a row of numbers, each in its own way.
+"""Pose conventions of controllers, files and people: a pose as a row of numbers.
 
 A pose is a (4, 4) ``parent_T_child`` in metres here and nowhere else. Outside it is a position and
 a rotation vector, a quaternion, or three angles about axes in some order. The sources of each
@@ -341,7 +341,7 @@ PLAIN = ("xyzw", "wxyz", "vector", *EULER_ORDERS)
 
 
 def written(rotation: str, length: LengthUnit, angle: AngleUnit) -> PoseConvention:
-    """Return the convention of a rotation, by its maker's name or plainly, in stated units."""
+    """Return the convention of a rotation, given a maker's name or an order, in given units."""
     known = CONVENTIONS.get(rotation)
     plain = known.rotation if known else rotation
     labels = ("x", "y", "z", "a", "b", "c", "d")[: 7 if plain in PLAIN[:2] else 6]

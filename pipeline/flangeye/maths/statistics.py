@@ -42,7 +42,7 @@ def chi2_quantile(probability: float, freedom: int) -> float:
 
 
 def spread_evenly(count: int, dims: int) -> Floats:
-    """Return (count, dims) points of the unit cube, each coordinate at every count-th part of it.
+    """Return (count, dims) points of the unit cube as a Latin hypercube.
 
     A Latin hypercube (McKay et al. 1979), the same at every call.
     """
@@ -65,7 +65,7 @@ def f_quantile(probability: float, freedom: int, noise_freedom: float) -> float:
 
 
 def covariance_inflation(freedom: float, parameters: int = 6, probability: float = 0.95) -> float:
-    """Return the factor that makes a region scaled by an estimated variance hold its share.
+    """Return the factor that keeps a region's coverage if its variance is only estimated.
 
     People draw regions with the chi-square quantile, which takes the noise as known. When it was
     estimated from ``freedom`` degrees of freedom, the squared distance follows

@@ -56,7 +56,7 @@ class TargetBody:
         return self
 
     def edges(self, most: int) -> Floats:
-        """Return (E, 2, 3) the ends of its sharp edges, the longest of them [m]: a line drawing."""
+        """Return the longest sharp edges (E, 2, 3) [m], for a line drawing."""
         import trimesh
 
         mesh = trimesh.Trimesh(self.vertices, self.triangles)

@@ -124,7 +124,7 @@ class Cell:
 
     @property
     def freedoms(self) -> dict[str, Floats]:
-        """(6, k) unit twists that each thing can be moved by, in its base; see ``solve_graph``."""
+        """(6, k) unit twists in which each carrier can move, in its base; see ``solve_graph``."""
         able = {
             name: mover.freedoms if isinstance(mover, Axis) else _freedoms_of(mover)
             for name, mover in self.movers.items()
@@ -139,7 +139,7 @@ class Cell:
         return {n: mover for n, mover in self.movers.items() if isinstance(mover, RobotModel)}
 
     def passing(self, motion: Motion) -> Motion:
-        """Return how everything passed: rails, positioners and links where recorded values say."""
+        """Return the recorded motion of rails, positioners and links about each capture."""
         axes = {n: mover for n, mover in self.movers.items() if isinstance(mover, Axis)}
         placed = {
             name: np.array([axes[name].place(float(value)) for value in values[:, 0]])
@@ -190,7 +190,7 @@ class Cell:
         observations: Sequence[Observation],
         transforms: Mapping[str, Transform] | None = None,
     ) -> dict[str, Frame]:
-        """Return the frames with the places that N observations have of them.
+        """Return the frame graph with the places reported in N observations.
 
         Args:
             observations: Their controllers' poses.

@@ -93,7 +93,7 @@ def median_distance(cloud: PointCloud) -> float:
 
 
 def times_outside(distance: float, scanner: ScannerData) -> float:
-    """Return how many times nearer than near or farther than far; 1 or less is inside."""
+    """Return by which factor a distance is outside the range; 1 or less is inside."""
     near, far = scanner.range
     return max(near / max(distance, 1e-12), distance / far)
 

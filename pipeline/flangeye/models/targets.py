@@ -49,7 +49,7 @@ class Flange(BaseModel):
 
     @property
     def behind(self) -> float:
-        """How far the circle lies behind the origin of ``flange``: a wrist's circle does [m]."""
+        """Distance of the circle behind the origin of ``flange``, for a circle on the wrist [m]."""
         return self.details.thickness if self.bore is None else 0.0
 
     @property
@@ -185,7 +185,7 @@ TICKS = 720
 
 
 class HoleMatch(NamedTuple):
-    """The rotation at which the empty places of a face are most like the flange's holes.
+    """The rotation at which the gaps of a face match the flange's holes best.
 
     Attributes:
         angle: From the first axis to the flange's x axis, about the normal [rad], in (-pi, pi].
@@ -239,7 +239,7 @@ def roll_angle(flat: Floats, flange: Flange) -> float | None:
 
 
 def emptiness(flat: Floats, pitch: float, half_width: float) -> Floats | None:
-    """Return how empty a ring is at each of ``TICKS`` angles, 0 (as full as most) to 1 (empty).
+    """Return the emptiness of a ring at ``TICKS`` angles, from 0 (full) to 1 (empty).
 
     Args:
         flat: (N, 2) points about the centre [m].

@@ -1,4 +1,4 @@
-"""The program's side of a guarded arm."""
+"""A guarded arm, as the program sees it; the guard is another process."""
 
 from __future__ import annotations
 

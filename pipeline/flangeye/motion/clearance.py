@@ -1,4 +1,4 @@
-"""Whether an arm keeps clear: of the table, of itself, and of the scanner's view of the flange."""
+"""Clearance of an arm from the table, itself, and the scanner's view of the flange."""
 
 from __future__ import annotations
 

@@ -173,7 +173,7 @@ class LedArm(Device):
         return self._state
 
     def move_joints(self, joints: Floats, speed: float, acceleration: float) -> None:
-        """Start a move to joint angles (n,) [rad], which the guard watches as any leg."""
+        """Start a move to joint angles (n,) [rad], supervised by the guard."""
         way = float(np.abs(joints - self._state.joints).max())
         seconds = way / speed + speed / acceleration
         self._arm.go(Route((Leg(joints, speed, acceleration, seconds),)))

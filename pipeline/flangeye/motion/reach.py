@@ -1,4 +1,4 @@
-"""Which flange poses a cell allows: in view, in reach, the arm out of the way; plans of them."""
+"""Flange poses that a cell allows: in view, reachable, with the arm out of the view; and plans."""
 
 from __future__ import annotations
 
@@ -335,7 +335,7 @@ def tilted(place: Floats, facing: Floats, tilt: float, rng: np.random.Generator)
 
 
 def read_state(driver: RobotDriver) -> tuple[str, RobotState]:
-    """Return an arm's name and its state; nothing is started on its controller, nothing commanded.
+    """Return an arm's name and state without starting or commanding anything.
 
     Raises:
         DeviceError: The driver has no way to read alone, or the arm cannot be read: why.

@@ -1,4 +1,4 @@
-"""A way from pose to pose that was checked from end to end before anything moves."""
+"""Collision-free paths between poses, checked before anything moves."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Barred(NamedTuple):
 
 
 class Router:
-    """Finds ways for one arm within its limits."""
+    """Finds collision-free paths of one arm within its limits."""
 
     def __init__(self, robot: RobotModel, limits: MotionLimits, home: Floats) -> None:
         """Set up; ``home`` (n,) is a posture to go by where the straight way is barred [rad]."""
@@ -69,7 +69,7 @@ class Router:
         self._limits, self._home = limits, home
 
     def route(self, start: Floats, goal: Floats) -> Route | Barred:
-        """Return a way from joint angles (n,) to joint angles (n,)."""
+        """Return a path between joint angles (n,) and (n,)."""
         straight = self._leg(start, goal)
         if isinstance(straight, Leg):
             return Route((straight,))

@@ -155,7 +155,7 @@ class Controller(Protocol):
 
     @property
     def band(self) -> float:
-        """The same for 95 % of the seam [m]."""
+        """The bound that holds for 95 % of the seam [m]."""
         ...
 
     def step(self, pose: ToolPose, touches: Sequence[Touch]) -> Command:

@@ -1,4 +1,4 @@
-"""A tip on points that the scanner saw: the arm goes near, slowly; a person jogs the rest."""
+"""Bring a tip to scanned points: the arm approaches slowly, a person jogs the rest."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ def take_precedence(priority: int) -> None:
 
 @contextlib.contextmanager
 def precedence(priority: int) -> Iterator[None]:
-    """Let the calling thread come first for a while."""
+    """Give the calling thread real-time priority while the context lasts."""
     take_precedence(priority)
     try:
         yield
@@ -121,7 +121,7 @@ def guard(wire: Connection, charge: Charge) -> None:
 
 
 class Watchdog:
-    """One arm under guard."""
+    """Guards one arm."""
 
     def __init__(self, robot: Robot, wire: Connection, charge: Charge) -> None:
         self._robot, self._wire, self._charge = robot, wire, charge

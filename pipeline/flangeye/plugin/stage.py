@@ -259,7 +259,7 @@ class Part(Plugin):
 
     @property
     def can_only_read(self) -> bool:
-        """Whether a robot part takes ``reads_only``, with which it starts and commands nothing."""
+        """Whether a robot part takes ``reads_only``: it then starts and commands nothing."""
         return "reads_only" in self.needs
 
     def bind(self, params: Params | None = None) -> BoundPart:

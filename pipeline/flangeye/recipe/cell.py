@@ -1,4 +1,4 @@
-"""From a recipe's ``cell`` section to the cell: each frame once, and everything on something."""
+"""From a recipe's ``cell`` section to the graph of frames."""
 
 from __future__ import annotations
 

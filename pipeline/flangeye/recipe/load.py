@@ -39,7 +39,7 @@ PLACEHOLDERS: Mapping[Hashable, Any] = {"title": "untitled", "steps": ["none"]}
 
 @dataclass(frozen=True)
 class Recipe:
-    """A recipe that was checked whole and can run.
+    """A validated recipe that can run.
 
     Attributes:
         name: File name without its suffix.
@@ -70,7 +70,7 @@ class Recipe:
         return {"recipe.resolved.yaml": text, **models}
 
     def with_seed(self, seed: int) -> Recipe:
-        """Return the recipe with another seed, as if it had been written so."""
+        """Return the recipe with another seed."""
         header = self.header.model_copy(update={"seed": seed})
         return replace(self, header=header, context={**self.context, t.Seed: seed})
 

@@ -251,7 +251,7 @@ def timings_of(facts: Facts) -> list[Timing]:
 
 
 def idle_of(facts: Facts) -> str:
-    """Return how much of its session an arm had nothing to do; empty without an arm."""
+    """Return the arm's idle share of the session; empty without an arm."""
     shares = [spent.idle for spent in facts.result.timing.values() if spent.idle is not None]
     return f"{max(shares):.1%}" if shares else ""
 

@@ -121,14 +121,14 @@ class WorkspaceResult(_Part):
 
 
 class ExpectedErrorResult(_Part):
-    """How far off the arm will be when it is sent to a point that the camera saw."""
+    """Expected error when the arm is sent to a scanned point."""
 
     rms: float = Field(description="Root mean square over the work [m].")
     p95: float = Field(description="95 % of the errors are below [m].")
 
 
 class TransformErrorResult(_Part):
-    """Simulation only: how far one transform is off."""
+    """Simulation only: true error of one transform."""
 
     rotation: float = Field(description="[rad]")
     translation: float = Field(description="Error of the point its covariance is taken about [m].")
@@ -159,7 +159,7 @@ class TruthResult(_Part):
 
 
 class SeamTruthResult(_Part):
-    """Simulation only: how far the planned seam is from the true one."""
+    """Simulation only: true error of the planned seam."""
 
     rms: float = Field(description="Distance of the planned points from the true seam [m].")
     max: float
@@ -185,7 +185,7 @@ class SeamResult(_Part):
 
 
 class WeldTruthResult(_Part):
-    """Simulation only: how far the torch was from the true seam, across it, after the lead-in."""
+    """Simulation only: the torch's true distance across the seam, after the lead-in."""
 
     rms: float = Field(description="[m]")
     max: float

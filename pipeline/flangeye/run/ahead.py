@@ -1,4 +1,4 @@
-"""Work on the next items while the last is looked at: ordered, bounded, the same answers."""
+"""Process the next items in other threads, in order and bounded, with the same results."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ def record_run(
     report: bool = True,
     library: Path | None = None,
 ) -> Result:
-    """Run with a log; leave the folder whole, or not at all when nothing was gathered.
+    """Run a recipe with a log; delete the folder if nothing was recorded.
 
     Plugins registered with ``registry`` are told what happens, as ever.
 
@@ -72,7 +72,7 @@ def record_run(
 def record_scans(
     recipe: Recipe, registry: Registry, folder: RunFolder, motion: MotionAllowed, count: int
 ) -> None:
-    """Take the first ``count`` flanges that a recipe finds, with a log, and solve nothing.
+    """Log the first ``count`` flanges that a recipe finds, and solve nothing.
 
     Raises:
         FlangeyeError: As :func:`record_run`.

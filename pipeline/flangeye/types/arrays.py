@@ -1,4 +1,4 @@
-"""Arrays as values hold them (read-only, of a checked shape, finite), and notes of a step."""
+"""Validated read-only arrays of values, and notes of a step."""
 
 from __future__ import annotations
 

@@ -94,7 +94,7 @@ class ArmCorrection:
 
 @dataclass(frozen=True, eq=False)
 class CorrectedArm:
-    """The answer for the arm corrected: the pose and the correction hold together.
+    """The pose for the corrected arm; pose and correction belong together.
 
     Attributes:
         camera: As in :class:`HandEye`.
@@ -118,7 +118,7 @@ class CorrectedArm:
 
 @dataclass(frozen=True)
 class ExpectedError:
-    """How far off the arm will be when it is sent to a point that the camera saw.
+    """Expected error when the arm is sent to a scanned point.
 
     Attributes:
         rms: Root mean square over the work [m].
@@ -208,7 +208,7 @@ class HandEye:
 
 @dataclass(frozen=True, eq=False)
 class PoseError:
-    """How far a candidate calibration is off, and where that matters.
+    """Error of a candidate calibration, and the point at which it matters.
 
     Attributes:
         motion: (4, 4) in ``camera``; takes what was measured onto what was predicted.

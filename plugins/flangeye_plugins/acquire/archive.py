@@ -216,7 +216,7 @@ def _camera_note(usable: Iterable[Recording], camera: CameraParams | None) -> li
         ]
     (fx, _, cx), (_, fy, cy), _ = image.camera_matrix
     told = f"focal length {fx:.1f}, {fy:.1f} px, principal point {cx:.1f}, {cy:.1f} px"
-    return [f"camera of the images: {told}, by the clouds under them"]
+    return [f"camera of the images: {told}, estimated from their organised clouds"]
 
 
 def _image(recording: Recording, cloud: PointCloud, camera: CameraParams | None) -> Image | None:

@@ -1,4 +1,4 @@
-"""Where a live session sends the arm, and how it gets there; all checked before anything moves."""
+"""The stops of a live session and the paths between, checked before anything moves."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ class Itinerary:
             yield Stop(self._planned[-1], "calibration", pose)
 
     def way(self, start: Floats, stop: Stop) -> Route | Barred:
-        """Return the way to a stop from joint angles (n,)."""
+        """Return the path to a stop from joint angles (n,)."""
         return self._router.route(start, stop.pose.joints)
 
     def why_not(self) -> str:

@@ -67,7 +67,7 @@ class Idle:
         self._began = self._stands_since = self._idle = 0
 
     def leaves(self, time_ns: int) -> None:
-        """The arm sets off; before the first time it had no session to be idle in."""
+        """Note that the arm starts to move; the session's clock starts with the first move."""
         if self._began:
             self._idle += time_ns - self._stands_since
         else:
@@ -273,7 +273,7 @@ class LiveSession:
     idle: Idle = field(default_factory=Idle)
 
     def captures(self) -> Iterator[Capture | Rejection]:
-        """Take the captures; while one is transferred and fitted the arm is under way again."""
+        """Take the captures; while one is transferred and fitted the arm moves on."""
         taken: Callable[[], Capture | Rejection] | None = None
         for stop in self.itinerary.stops():
             if stop.id in self.done:
@@ -360,7 +360,7 @@ def within(samples: Sequence[RememberedState], start_ns: int, end_ns: int) -> li
 
 
 def movement(samples: Sequence[RememberedState]) -> float:
-    """Return how far a point 0.1 m off the flange's centre moved at most [m]."""
+    """Return how far a point 0.1 m off the flange's centre moved, at most [m]."""
     return float(movements(samples).max())
 
 

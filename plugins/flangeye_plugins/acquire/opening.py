@@ -211,7 +211,7 @@ def log_source(log: RunLog, recordings: Sequence[Recording], cell: Cell | None =
 
 
 def cell_poses(recording: Recording, cell: Cell) -> Poses:
-    """Return the poses of everything that moves in the cell, in one recording."""
+    """Return the poses of all carriers of the cell in one recording."""
     return {
         name: Transform(f"{name}_base", name, _place(recording, name, cell))
         for name in cell.movers

@@ -1,4 +1,4 @@
-"""Where a body is in a scan: guesses, settled and held against all that the scanner saw.
+"""Find a body in a scan: pose hypotheses, refined and tested against the scanner's rays.
 
 Guesses lay edges of the body on edges of the scan. Where a face ends, its normal and the direction
 in which it ends are a frame. Every such frame of the body is laid on every one of the scan, and a
@@ -47,7 +47,7 @@ class BodyVerdict(NamedTuple):
 
     @property
     def bounded(self) -> bool:
-        """Whether the body is seen to end, or nothing at all is seen around it."""
+        """Whether the body's outline is seen, or nothing is seen around it."""
         # Least share of the body's outline that is seen to end before something farther:
         # without, any face of a box is a plate
         ended = 0.03
@@ -290,7 +290,7 @@ class BodySearch:
         return self.looks.shape
 
     def everywhere(self) -> list[FoundPose]:
-        """Return distinct poses that the body may have, the best first."""
+        """Return distinct candidate poses of the body, best first."""
         # Coarse cells have less noise
         view = view_of(self.points, self.shape.size / 60)
         poses = guesses(view, self.looks, 1500)
@@ -309,7 +309,7 @@ class BodySearch:
         return self._distinct(found + self.near(self._twins(found[0]))) if found else []
 
     def near(self, poses: Floats) -> list[FoundPose]:
-        """Return the best of (K, 4, 4) poses, laid on the scan's own points, the best first."""
+        """Return the best of (K, 4, 4) poses, refined on the scan's own points, best first."""
         if not len(poses):
             return []
         scores = [judged(self.shape, self._fine, pose, self._rough).score for pose in poses]
@@ -356,7 +356,7 @@ def around(points: Singles, shape: Shape, pose: Floats) -> Singles:
 
 
 def distinct(poses: Floats, scores: Floats, looks: Looks) -> Indices:
-    """Return the indices of poses of which none is nearly another, the best first."""
+    """Return the indices of poses that differ from each other, best first."""
     order = np.argsort(-scores, kind="stable")
     centres = poses[order, :3, :3] @ looks.centre + poses[order, :3, 3]
     # One pose, where they differ by less in place, as a share of the size, and in turn

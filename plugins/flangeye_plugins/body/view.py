@@ -237,7 +237,7 @@ def _along(ends: OrientedPoints, angle: float) -> OrientedPoints:
 
 
 def spacing_of(points: Singles) -> float:
-    """Return how far (N, 3) points are apart at unit depth: root of seen area over their number."""
+    """Return the mean spacing of (N, 3) points, seen at unit depth."""
     u, v = (points[:, :2] / points[:, 2:]).T
     across = max(float(np.ptp(u)), float(np.ptp(v)), 1e-6) / 64
     cell = ((u - u.min()) / across).astype(np.int64) * 65 + ((v - v.min()) / across).astype(

@@ -435,7 +435,7 @@ def helps(session: RecordedSession, corrected: RecordedSession) -> bool:
 
 
 def explained(session: RecordedSession) -> bool:
-    """Whether the samples foretell each other: those that have nothing in common do not."""
+    """Whether the samples predict each other, which unrelated ones do not."""
     return bool(_foretold(session)[0] <= EXPLAINED)
 
 

@@ -26,7 +26,7 @@ class Circles(NamedTuple):
 
 
 def circle_residuals(circles: Circles, points: Floats, ring: NDArray[np.intp]) -> Floats:
-    """Return how far outside its own circle each point lies, (N,) [m].
+    """Return each point's distance outside its own circle, (N,) [m].
 
     Args:
         circles: The circles.

@@ -50,7 +50,7 @@ class PlanarPose(NamedTuple):
 
 
 def poses_from_pixels(corners: Corners, image: Image, expected: float) -> list[PlanarPose]:
-    """Return the poses that a flat target's corners allow, the best first: one or two.
+    """Return the one or two poses that explain a flat target's corners, best first.
 
     A plane seen in perspective has two poses that fit nearly alike, tilted towards and away from
     the camera; the flatter the perspective the more alike (Collins & Bartoli 2014, IPPE). Both

@@ -1,4 +1,4 @@
-"""The centre of a calibration sphere, from the cap of it that a scanner sees."""
+"""Estimate the centre of a calibration sphere from the cap that a scanner sees."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class SphereFit(NamedTuple):
 
     @property
     def residuals(self) -> Floats:
-        """(N,) how far outside the sphere each point lies [m]."""
+        """(N,) distance of each point outside the sphere [m]."""
         return np.asarray(np.linalg.norm(self.points - self.centre, axis=1) - self.radius)
 
     @property

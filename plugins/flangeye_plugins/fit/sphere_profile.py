@@ -175,8 +175,8 @@ def _refined(points: Floats, centre: Floats, radius: float, tolerance: float) ->
 
 def _no_arc(radius: float) -> str:
     return (
-        f"no circle that a sphere {2e3 * radius:g} mm across leaves in the laser's plane, its "
-        "middle away from the scanner"
+        f"the profile shows no arc of a sphere {2e3 * radius:g} mm across whose centre lies behind "
+        "the surface"
     )
 
 

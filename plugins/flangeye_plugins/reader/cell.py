@@ -70,11 +70,11 @@ class OwnTableParams(JoinedParams, ColumnsParams):
 
 
 class ArmTableParams(FlangePoseParams, OwnTableParams, JointsParams):
-    """Where an arm's controller had its flange."""
+    """Columns of an arm's flange pose, as its controller reports it."""
 
 
 class AxisTableParams(JoinedParams, TimesParams):
-    """Where a rail's or a positioner's controller had it."""
+    """Columns of a rail's or positioner's pose, as its controller reports it."""
 
     column: Column = Field(description="Column of the value.")
     unit: Literal["m", "mm", "rad", "deg"] = Field(description="Unit of the value.")
@@ -147,7 +147,7 @@ class CameraTable:
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """Where controllers had everything when something was seen.
+    """The reported poses of all carriers at one moment.
 
     Attributes:
         at: Of what moves, by name: (4, 4), or the value of an axis [m or rad].

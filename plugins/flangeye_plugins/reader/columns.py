@@ -104,7 +104,7 @@ class ColumnsParams(TimesParams, WrittenParams):
 
 
 class FlangePoseParams(ColumnsParams):
-    """Where an arm's controller had its flange."""
+    """Columns of an arm's flange pose, as its controller reports it."""
 
     pose: Literal["base_T_flange", "flange_T_base"] = Field(
         "base_T_flange",

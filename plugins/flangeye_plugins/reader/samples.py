@@ -30,7 +30,7 @@ from flangeye_plugins.reader.table import TableParams, table
 
 
 class EasyHandeyeParams(Params):
-    """Which way round the robot's poses were written."""
+    """The direction of the robot's poses."""
 
     calibration: Literal["eye_on_base", "eye_in_hand"] = Field(
         description="The type it was sampled for: with eye_on_base the tool writes the robot's "

@@ -179,7 +179,7 @@ class FrankyRobot(Device):
         threading.Thread(target=self._end_unwatched, daemon=True).start()
 
     def state(self) -> RobotState:
-        """Return the newest sample, tool taken off."""
+        """Return the newest state, converted from tool to flange."""
         self._looked = time.monotonic()
         sample = self._ask(lambda: self._robot.state)
         under_way, trouble = self._motion()
@@ -241,7 +241,7 @@ class FrankyRobot(Device):
         time.sleep(self.period - time.monotonic() % self.period)
 
     def stop(self) -> None:
-        """Brake as the motion under way is made."""
+        """Brake in the space of the present motion, joint or Cartesian."""
         with self._commands:
             if self._stopping is not None and self._motion()[0]:
                 stopping = self._stopping

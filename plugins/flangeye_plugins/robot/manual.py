@@ -181,7 +181,7 @@ class ManualRobot(Device):
             self._desk.say("Stop: leave the arm where it is.")
 
     def close(self) -> None:
-        """Do nothing; the arm is the person's."""
+        """Do nothing; a person moves the arm."""
 
     def _mode(self) -> Mode:
         if self._stopped:
@@ -247,7 +247,7 @@ class ManualRobot(Device):
 
 
 class Tolerance(NamedTuple):
-    """How near to the pose asked for a pose has to be.
+    """Largest distance of a pose from the requested one.
 
     Attributes:
         distance: [m]

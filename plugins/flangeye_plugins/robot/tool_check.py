@@ -63,7 +63,7 @@ def require_tool(
 
 
 def require_model(name: str, state: RobotState, model: RobotModel) -> None:
-    """Do nothing when the flange is where the model's kinematics put it.
+    """Refuse an arm whose flange is not where the model's kinematics put it.
 
     Raises:
         DeviceError: It is not, or has another number of joints.

@@ -1,4 +1,4 @@
-"""Our end of the bridge, a process under the Python of the sourced distribution."""
+"""Our side of the bridge, a process under ROS 2's own Python."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ Found = TypeVar("Found")
 
 
 class Bridge(Device):
-    """A node in a process of its own.
+    """A ROS 2 node in its own process.
 
     Attributes:
         asker: Who is told of in errors: the driver.

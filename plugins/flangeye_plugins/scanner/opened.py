@@ -110,7 +110,7 @@ def cloud_of(xyz: NDArray[Any], per_metre: float) -> PointCloud:
 
 
 def require_in_range(name: str, cloud: PointCloud, model: ScannerModel | None) -> None:
-    """Raise DeviceError where a cloud is so far out of the model's range that its unit is wrong."""
+    """Raise DeviceError if a cloud is so far out of range that its unit must be wrong."""
     if model is None:
         return
     distance = median_distance(cloud)

@@ -96,7 +96,7 @@ def scanner_ros2(model: ScannerModel | None, params: Ros2ScannerParams) -> Scann
 
 
 class NothingCame(DeviceError):
-    """No message of a topic could be taken in time, though its publisher runs."""
+    """No message of a topic arrived in time, though its publisher runs."""
 
 
 class Camera(NamedTuple):

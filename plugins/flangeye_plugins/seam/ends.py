@@ -90,7 +90,7 @@ class End:
 
     @property
     def sharp(self) -> bool:
-        """Whether the last points of the surface are at one place, and nothing is over it there."""
+        """Whether the surface ends sharply, with nothing above its end."""
         # An end that is known less well is not sharp [m]
         loose = 0.5e-3
         return self.deviation < loose and not self.covered
@@ -124,7 +124,7 @@ def surface_end(way: Floats, past: Mask, covered: Mask, pitch: float) -> End | N
 
 
 def soonest(ends: list[End], limit: float) -> tuple[float, float]:
-    """Return the end that a seam comes to first, from those of its surfaces, and its deviation [m].
+    """Return the end that a seam reaches first, from those of its surfaces, with its deviation [m].
 
     Surfaces that go on to the limit of what is looked at do not end; where none ends the deviation
     is infinite.

@@ -1,4 +1,4 @@
-"""Register a CAD to a scan: find it, fit it, and say why not where the answer is not to be had.
+"""Register a CAD to a scan: find the part, fit it, and reject poor or ambiguous fits.
 
 Fitted poses are held against what the scanner saw, finely: for judging them, and to end a slide.
 """
@@ -27,7 +27,7 @@ FINE = 200
 
 
 class RayEvidence:
-    """Evidence for a part's pose: the rays that agree with it and against it."""
+    """Evidence for a part's pose: rays that agree with it, and rays that contradict."""
 
     def __init__(
         self, part: CadPart, seam: CadSeam, seen: DepthMap, rng: np.random.Generator

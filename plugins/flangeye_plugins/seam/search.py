@@ -1,4 +1,4 @@
-"""Find roughly where a part lies in a scan, among other things and partly hidden.
+"""Coarse search for a part in a scan with clutter and occlusion.
 
 Pairs of oriented points that are alike on the scan and on the CAD (Drost et al. 2010) each give a
 pose of the part; every pose is then held against what the scanner saw along its rays, for and

@@ -92,7 +92,7 @@ class PlacedScan:
 def seen_in_base(
     stage: str, scan: WorkpieceScan, answer: HandEye, robot: RobotModel | None
 ) -> PlacedScan:
-    """Return a scan in the base, from wherever it was taken.
+    """Return a scan in the base, for a fixed scanner or one on the arm.
 
     Args:
         stage: Who asks, for the refusal.

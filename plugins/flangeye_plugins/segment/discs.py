@@ -341,7 +341,7 @@ def incidence(centre: Floats, normal: Floats) -> float:
 def rim_ratio(
     flat: Floats, centre: Floats, pitch: float, radius: float
 ) -> tuple[float, float | None]:
-    """Return how much likelier an edge is a rim than another disc's, and that disc's radius [m].
+    """Return the likelihood ratio of a rim against another disc's edge, and that disc's radius [m].
 
     In each sector the edge lies on the circle, within the tolerance, or anywhere. The other disc is
     the circle that fits the edge best; the ratio is against no disc at all where that is the rim.

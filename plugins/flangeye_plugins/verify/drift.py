@@ -1,4 +1,4 @@
-"""``verify.drift``: the run's own sightings against an earlier calibration of the same cell."""
+"""``verify.drift``: compare a run's sightings with an earlier calibration of the same cell."""
 
 from __future__ import annotations
 

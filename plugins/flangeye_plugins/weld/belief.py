@@ -103,7 +103,7 @@ class Belief:
         return np.asarray(facing @ free @ facing)
 
     def flat(self, side: float) -> float:
-        """Return how far a tip goes aside that climbs the wall on a side by one."""
+        """Return the sideways motion of a tip per unit of climbing the wall on a side."""
         if self.joint is None:
             return 1.0
         # Nothing climbs a wall that leans by less than one degree.
@@ -132,7 +132,7 @@ class Belief:
         return float(aside / max(settings.friction * into, 1e-9))
 
     def remedy(self, settings: Following, share: float) -> tuple[float, float]:
-        """Return a deflection, and instead of it a preload [m], that seat the tip by a share."""
+        """Return a deflection, or else a preload [m], that gives the seating a wanted share."""
         forces, wall = self.pressing(settings), share * self._steepness(settings)
         per_deflection = wall * forces[0, 0] - forces[1, 0]
         per_preload = forces[1, 1] - wall * forces[0, 1]
@@ -140,7 +140,7 @@ class Belief:
         return settings.preload / ratio, settings.deflection * ratio
 
     def fixed_variance(self, settings: Following) -> float:
-        """Return the variance of the torch that nothing measured along the seam lessens [m^2].
+        """Return the torch's variance that measurements ahead of it cannot reduce [m^2].
 
         The arm is off when the tip passes a place and when the torch does: oppositely at worst, as
         one that waves along its way is with both half a wave apart.

@@ -55,7 +55,7 @@ class Seeing(NamedTuple):
 
 
 class CameraProcess:
-    """Reads a finger's camera in another process: the loop never waits for an image.
+    """Runs a finger's camera in another process, so that the loop never waits for an image.
 
     A look behind the torch is read there too.
 

@@ -124,13 +124,13 @@ class Contact:
         self._newest: deque[_Weighed] = deque()
 
     def seat(self, time: float, deflection: float, compression: float) -> None:
-        """Take it for certain that the tip is seated and pressed [m]; what it stands is known."""
+        """Set the state: the tip is seated and pressed [m], and its safe deflection is known."""
         self.likely = np.array([1.0, 0.0, 0.0, 0.0])
         self.deflection, self.compression, self._time = deflection, compression, time
         self._spread = math.inf
 
     def lose(self) -> None:
-        """Take it for certain that no wall holds the tip."""
+        """Set the state: no wall holds the tip."""
         self.likely, self.deflection = np.array([0.0, 0.0, 0.0, 1.0]), 0.0
 
     @property

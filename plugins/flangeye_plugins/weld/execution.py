@@ -144,7 +144,7 @@ class WeldClock:
 
     @contextmanager
     def aside(self) -> Iterator[None]:
-        """Leave out what is done meanwhile."""
+        """Exclude the time spent in the context from the cycle's computing time."""
         began, since = time.thread_time(), time.perf_counter()
         yield
         self._aside += time.thread_time() - began

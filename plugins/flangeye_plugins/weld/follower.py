@@ -79,7 +79,7 @@ class Follower:
         return command
 
     def looked(self, profile: WeldProfile) -> None:
-        """Take in how far the bead lies from the joint, seen behind the torch."""
+        """Process a profile of the bead behind the torch."""
         if self.phase not in ("done", "stopped"):
             self._stop(self.welding.look(profile))
 
@@ -128,7 +128,7 @@ class Follower:
 
     @property
     def band(self) -> float:
-        """The same for 95 % of the seam [m]."""
+        """The bound that holds for 95 % of the seam [m]."""
         return self.welding.band
 
     @property

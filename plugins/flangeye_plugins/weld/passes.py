@@ -1,4 +1,4 @@
-"""Passes after the root's: the torch goes along the refined path again, aside of it and higher.
+"""Passes after the root pass: the torch follows the refined path again, offset and higher.
 
 The root pass is found by touch. After it nothing is touched: the tool stands along the path, its
 tip above what was welded, and the torch is steered by

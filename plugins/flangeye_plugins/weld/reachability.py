@@ -1,4 +1,4 @@
-"""The arm's way to the seam and along it, in joint angles: checked before anything moves."""
+"""The arm's path to the seam and along it, in joint space, checked before anything moves."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Station(NamedTuple):
 
 
 class Barrier(NamedTuple):
-    """Why the arm must not be in a posture, and how near it came to being allowed."""
+    """Why a posture is not allowed, and how nearly it was."""
 
     rank: int
     reason: str
@@ -90,7 +90,7 @@ class SeamReach:
         self._chains = self._drivable(stations, postures)
 
     def to_start(self, here: Floats) -> Route:
-        """Return a checked way from joint angles (n,) to above the seam's start.
+        """Return a checked path from joint angles (n,) to above the seam's start.
 
         Raises:
             StageError: There is none: what bars it.

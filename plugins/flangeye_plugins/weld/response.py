@@ -34,12 +34,12 @@ class _Told(NamedTuple):
     way: Floats
 
     def way_at(self, time: float) -> Floats:
-        """Return the way (4,) up to a time while this command lasts."""
+        """Return the displacement (4,) up to a time while this command lasts."""
         return self.way + (time - self.time) * self.command
 
 
 class Response:
-    """Where an arm that is late will come to.
+    """Predicts the pose of an arm that lags behind its commands.
 
     Attributes:
         dead_time: [s].
@@ -64,7 +64,7 @@ class Response:
         self._commands.append(_Told(time, np.array([*command.velocity, command.turn]), way))
 
     def ahead(self, pose: ToolPose) -> ToolPose:
-        """Return where the tool will be once every command has taken effect."""
+        """Return the tool's pose once all commands have taken effect."""
         if not self._commands:
             return pose
         sent = pose.time - self.dead_time  # what is carried out now
@@ -79,7 +79,7 @@ class Response:
 
 
 def identify(cycles: Floats) -> tuple[float, float]:
-    """Return dead time and lag [s] that explain best how an arm moved along one axis.
+    """Return the dead time and lag [s] that best explain an arm's motion along one axis.
 
     Args:
         cycles: (K, 3) time [s], velocity commanded [m/s], where the arm was reported [m].

@@ -144,7 +144,7 @@ class LoggedWeld:
         self._looks = LoggedLooks()
 
     def take(self, note: JournalEntry) -> None:
-        """Take in the next line of the log."""
+        """Process the next log entry."""
         if note.name == "sight":
             self.see(note.value)
         elif note.name == "feeling":

@@ -1,4 +1,4 @@
-"""Finding the groove at the start: down until something is touched, then across, both ways.
+"""Find the groove at the start: down until contact, then across, in both directions.
 
 Every decision is taken on the mean of several measurements, as many as their scatter asks for.
 """

@@ -92,11 +92,11 @@ class Sensing:
         return ToolPose(pose.time, pose.position + ahead, pose.angle)
 
     def watch(self, pose: ToolPose) -> None:
-        """Remember where the tool is, for the touches to come."""
+        """Record the tool's pose, for later touches."""
         self._track.add(pose)
 
     def take(self, touch: Touch, now: float) -> tuple[ToolPose, Touch] | None:
-        """Return a new touch in level axes, with the pose the tool had then (13); None: too old.
+        """Return a new touch in level axes, with the tool's pose then (13); None if too old.
 
         Args:
             touch: As it was measured.
@@ -156,7 +156,7 @@ class Sensing:
         return self._swept[-20:]
 
     def silence(self, now: float) -> float:
-        """Return for how long no image of the tag has come [s]."""
+        """Return the time since the last image of the tag [s]."""
         return now - self.heard
 
     def smooth(self, felt: SeamReading, noise: float) -> None:
@@ -285,7 +285,7 @@ class SeamEstimate:
         self._backed = []
 
     def lost_for(self, now: float) -> float:
-        """Return for how long no wall holds the tip [s]; 0 while one does."""
+        """Return the time since a wall last held the tip [s]; 0 while one does."""
         return 0.0 if self.lost is None else now - self.lost[0]
 
     def arrive(self, found: Learned, torch: float, lost: bool = False) -> None:
@@ -306,7 +306,7 @@ class SeamEstimate:
         self._backed = None
 
     def leave(self, phase: Phase, now: float) -> None:
-        """Take it that the seam ends where the tip fell off it, if it may end there."""
+        """Accept the place where the tip fell off as the seam's end, if it is plausible."""
         if (
             self.end is not None
             or phase != "ending"
@@ -333,7 +333,7 @@ class SeamEstimate:
 
     @property
     def bears(self) -> bool:
-        """Whether the joint holds up the tip, by the mean of the last touches."""
+        """Whether the joint supports the tip, by the mean of the last touches."""
         pressed = float(np.mean(self._pressed or [0.0]))
         return pressed > self._task.settings.preload / 2.0
 

@@ -1,4 +1,4 @@
-"""The torch: how fast the tool must turn to keep it on the seam, its weave, its gas and arc."""
+"""The torch: the tool's rotation that keeps it on the seam, its weave, its gas and arc."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far tip and torch have come along the plan, and how hard the tip is pressed."""
+"""Progress of tip and torch along the plan, and the deflection asked of the tip."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ class Pressing:
         return task.plan.length - max(task.settings.ending, task.beyond) - release
 
     def slack_for(self, tip: float, deflection: float, play: float) -> float:
-        """Return how far the tip has gone as if no wall held it [m].
+        """Return the distance over which the tip has moved as if no wall held it [m].
 
         The servo presses it again within a few millimetres where there is a wall. Where there is
         none the finger shows its play, whatever is asked of it.
@@ -151,5 +151,5 @@ class Pressing:
 
 
 def within(value: float, most: float) -> float:
-    """Return a value, at most so large to both sides; NumPy's clip takes ten times as long."""
+    """Clip a value to +-limit; NumPy's clip is ten times slower."""
     return min(max(value, -most), most)

@@ -1,4 +1,4 @@
-"""How well the torch is known, and whether it may weld: one bound, held against ``max_error``."""
+"""The torch's error bound, and whether it may weld: the bound must stay below ``max_error``."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ class Welding:
         return belief.arm_variance(settings) + self.bias.variance(self._progress.torch)
 
     def look(self, profile: WeldProfile) -> str:
-        """Take in how far the bead lies from the joint, seen behind the torch.
+        """Process the bead's offset from the joint, measured behind the torch.
 
         Returns:
             Why the weld must not go on, or nothing.

@@ -62,8 +62,8 @@ def test_the_point_is_found_with_its_covariance() -> None:
         (CONE[:4], "4 poses, at least 5 are needed"),
         (CONE * [0.1, 0.1, 0.1], "the tool was hardly turned; tilt it about the flange's x and y"),
         (CONE * [0, 0, 1] + np.outer(np.linspace(-0.7, 0.7, 7), [0, 0, 1]),
-         "where the point is along z stays unknown; tilt it about x and y"),
-        (CONE * [1, 0, 0], "where the point is along x stays unknown; tilt it about y and z"),
+         "the point's z in the flange is not observable; tilt it about x and y"),
+        (CONE * [1, 0, 0], "the point's x in the flange is not observable; tilt it about y and z"),
     ],
 )  # fmt: skip
 def test_a_motion_that_is_missing_is_named(turns: NDArray[np.float64], message: str) -> None:

@@ -1,4 +1,4 @@
-"""Whether a stored calibration still holds, check by check: the cell's watchman."""
+"""Check by check, whether a stored calibration still holds."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def from_arm(
     move: bool,
     overrides: Sequence[str] = (),
 ) -> MonitorCheck:
-    """Take scans with the arm, as the calibration's own recipe drives it: one check.
+    """Return one check from new scans, driving the arm as the calibration's recipe does.
 
     They are kept in ``checks/<time>`` beside the calibration's log, as those of any run.
 

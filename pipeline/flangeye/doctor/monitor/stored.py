@@ -76,7 +76,7 @@ class StoredCalibration:
 
     @cached_property
     def corners(self) -> Floats:
-        """(8, 3) of the work, from the point at which the covariance holds [m]."""
+        """(8, 3) corners of the work, relative to the point ``about`` of the covariance [m]."""
         source = self.log.source or t.Source("")
         box = workspace_of(source, None, self.calibration.pairs)
         if box is None:
@@ -90,7 +90,7 @@ class StoredCalibration:
 
     @cached_property
     def pose_error(self) -> ArmPoseErrors:
-        """How wrong the arm's poses are, by this calibration's residuals."""
+        """The arm's pose error, estimated from this calibration's residuals."""
         bare, circles = self._bare(self.used, _one_check(self.used))
         return pose_error_of(bare.residuals, bare.effects, bare.covariances, circles)
 

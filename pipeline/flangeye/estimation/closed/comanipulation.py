@@ -126,7 +126,7 @@ def _third(form: Floats, first: Floats, second: Floats) -> Floats:
 
 
 def random_rotations(rng: np.random.Generator, count: tuple[int, ...] = ()) -> Triple:
-    """Return three rotations (*count, 3, 3) drawn evenly from all there are."""
+    """Return three random rotations (*count, 3, 3), uniformly distributed."""
     x, y, z = (rotation_from_quaternion(q) for q in rng.standard_normal((3, *count, 4)))
     return x, y, z
 

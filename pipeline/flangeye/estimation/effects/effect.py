@@ -14,7 +14,7 @@ Block = Callable[[Problem, Linear], Floats]
 
 @dataclass(frozen=True, eq=False)
 class Effect:
-    """One thing that can be wrong with a cell.
+    """One error source of a cell.
 
     Attributes:
         name: For the person, as in "joint zeros".

@@ -46,7 +46,7 @@ State = Literal["OK", "DEGRADED", "MOVED"]
 
 @dataclass(frozen=True, eq=False)
 class CheckSightings:
-    """N sightings of the target, against the stored calibration.
+    """N sightings of the target, relative to the stored calibration.
 
     Attributes:
         residuals: (N, 5) of the centre in base [m], and of the normal across the flange's axis.
@@ -138,7 +138,7 @@ class Information:
         return cls(matrix, matrix @ np.broadcast_to(mean, len(matrix)))
 
     def loosened(self, deviation: float) -> Information:
-        """Return the same after a motion of the camera by ``deviation`` [m]; see ``allowance``."""
+        """Return it after an unknown camera motion of ``deviation`` [m]; see ``allowance``."""
         covariance = self.covariance
         covariance[:6, :6] += allowance(deviation)
         return Information.of_covariance(covariance, self.mean)
@@ -250,7 +250,7 @@ def moved_since(
 
 
 def misfits(sightings: CheckSightings, before: Information, test: DriftTest) -> NDArray[np.bool_]:
-    """Return which of N sightings (N,) cannot be, by themselves, while nothing moved."""
+    """Return (N,) which sightings are outliers if nothing moved."""
     effects = sightings.effects
     spread = effects @ before.covariance @ effects.transpose(0, 2, 1) + sightings.covariances
     motions = effects[..., :6]

@@ -1,4 +1,4 @@
-"""Tables without a header worth the name: NumPy arrays, and text of three or more columns."""
+"""Point tables without a header: NumPy arrays, and text of three or more columns."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def open_npy(path: Path) -> PointTable:
 
 
 def load_npy(path: Path) -> NDArray[Any]:
-    """Return a NumPy array of numbers; nothing a file holds is ever executed.
+    """Return a NumPy array of numbers; pickled objects are never loaded.
 
     Raises:
         StageError: It is missing, truncated, or not an array of numbers.
@@ -65,7 +65,7 @@ def load_npy(path: Path) -> NDArray[Any]:
 
 
 def array_of(where: str, raw: bytes) -> NDArray[Any]:
-    """Return the array that the bytes of a .npy file hold.
+    """Return the array in the bytes of a .npy file.
 
     Raises:
         StageError: As :func:`load_npy`.
@@ -75,7 +75,7 @@ def array_of(where: str, raw: bytes) -> NDArray[Any]:
 
 
 def holds_numbers(file: IO[bytes]) -> bool:
-    """Return whether a .npy file states numbers, of an archive that holds other things too.
+    """Return whether a .npy member of an archive holds numbers.
 
     A header that cannot be read counts: reading its array tells what is wrong.
     """
@@ -142,7 +142,7 @@ class NpyTable:
     axes_first: bool = False
 
     def check(self) -> None:
-        """Its size was checked against the header when it was opened."""
+        """Do nothing: the size was checked when the file was opened."""
 
     def decode(self) -> Points:
         """Load the array."""

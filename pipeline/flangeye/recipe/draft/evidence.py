@@ -220,7 +220,7 @@ class Choice:
 def writing_of(
     arm: Floats, arms: Sequence[Writing], target: Floats, targets: Sequence[Writing]
 ) -> Choice | None:
-    """Return how both are written; None where nothing fits, or several things do.
+    """Return the conventions of both poses; None if no or several conventions fit.
 
     Args:
         arm: (N, k) numbers of the arm's poses.

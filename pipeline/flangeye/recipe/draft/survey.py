@@ -34,7 +34,7 @@ def one_of(*choices: str) -> Check:
 
 @dataclass
 class Questions:
-    """Where answers come from.
+    """Answers to questions: from options, evidence, or a person.
 
     Attributes:
         given: Answers by flag, those asked for as well; None where it was not given.

@@ -155,7 +155,7 @@ class Ride:
         return self._ended or time.monotonic() - self._renewed > SILENT
 
     def renew(self, rest: Floats, left: float, fastest: float) -> None:
-        """Command the next piece of a ride that is not over.
+        """Command the next piece of a move that is not finished.
 
         Args:
             rest: (n,) what is left of the way, in the space of the velocities.

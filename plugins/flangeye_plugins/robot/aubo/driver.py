@@ -173,7 +173,7 @@ class AuboRobot(Device):
         return state, 1e-9 * (ended - began)
 
     def move_joints(self, joints: Floats, speed: float, acceleration: float) -> None:
-        """Start a move to joint angles (n,) [rad]; an arm that moves comes to rest first."""
+        """Start a move to joint angles (n,) [rad]; a moving arm is stopped first."""
         target = [float(angle) for angle in joints]
         motion = self._client.motion
         self._begin(in_joints=True)
@@ -188,7 +188,7 @@ class AuboRobot(Device):
         )  # fmt: skip
 
     def move_linear(self, base_T_flange: Transform, speed: float, acceleration: float) -> None:
-        """Start a straight move of the flange; an arm that moves comes to rest first."""
+        """Start a straight move of the flange; a moving arm is stopped first."""
         base_T_goal = base_T_flange.matrix @ self.offset
         target = POSE.numbers(base_T_goal).tolist()
         motion = self._client.motion
@@ -218,7 +218,7 @@ class AuboRobot(Device):
         time.sleep(self.period - time.monotonic() % self.period)
 
     def stop(self) -> None:
-        """Brake, as the motion under way is made."""
+        """Brake in the space of the present motion, joint or Cartesian."""
         self._begins = self._velocity_until = -np.inf
         self._ride = None
         self._brake()

@@ -47,7 +47,7 @@ class ListenParams(Params):
 
 
 class JointSample(NamedTuple):
-    """Joint angles (n,) [rad], when they were so [ns], and when that came [ns]."""
+    """Joint angles (n,) [rad] with the times of measurement and receipt [ns]."""
 
     joints: Floats
     time_ns: int

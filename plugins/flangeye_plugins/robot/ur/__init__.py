@@ -1,1 +1,1 @@
-"""Arms of Universal Robots: ``driver`` here, the client library in a process of its own."""
+"""Arms of Universal Robots: ``driver`` in this process, the client library in another."""

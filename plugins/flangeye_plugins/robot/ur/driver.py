@@ -101,7 +101,7 @@ def facts_of(name: str, host: str, to_drive: bool = True) -> DashboardFacts:
 
 
 def stop(host: str) -> None:
-    """Stop the controller's program on a way of its own: the last resort.
+    """Stop the controller's program through a separate connection: the last resort.
 
     Raises:
         OSError: Nobody answers.
@@ -243,7 +243,7 @@ class UrRobot(Device):
         self.flange_T_tool: Transform | None = Transform(FLANGE, TOOL, self.offset)
 
     def state(self) -> RobotState:
-        """Return the newest sample, tool taken off."""
+        """Return the newest state, converted from tool to flange."""
         self._link.look()
         sample = self._fresh()
         condition = condition_of(sample, sample.number <= self._commanded)
@@ -260,13 +260,13 @@ class UrRobot(Device):
         )
 
     def move_joints(self, joints: Floats, speed: float, acceleration: float) -> None:
-        """Start a move to joint angles (6,) [rad]; an arm that moves comes to rest first."""
+        """Start a move to joint angles (6,) [rad]; a moving arm is stopped first."""
         self._require_able()
         target = [float(angle) for angle in joints]
         self._command("move_joints", joints=target, speed=speed, acceleration=acceleration)
 
     def move_linear(self, base_T_flange: Transform, speed: float, acceleration: float) -> None:
-        """Start a straight move of the flange; an arm that moves comes to rest first."""
+        """Start a straight move of the flange; a moving arm is stopped first."""
         self._require_able()
         pose = POSE.numbers(base_T_flange.matrix @ self.offset).tolist()
         self._command("move_linear", pose=pose, speed=speed, acceleration=acceleration)
@@ -278,7 +278,7 @@ class UrRobot(Device):
         self._command("move_velocity", twist=at_tool, acceleration=acceleration)
 
     def wait_cycle(self) -> None:
-        """Return when a sample has come that no earlier call waited for."""
+        """Wait for a sample newer than the last one waited for."""
         until = time.monotonic() + self.stale
         late = False
         while (sample := self._link.sample()) is None or sample.number <= self._seen:

@@ -1,4 +1,4 @@
-"""Our end of the process that holds the client library: it is watched, and killed if it hangs."""
+"""Our side of the client library's process: monitors it, and kills it if it hangs."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class CycleSample(NamedTuple):
 
 
 class ControllerLink:
-    """A connection of the client library to one controller, in a process of its own."""
+    """The client library's connection to one controller, in its own process."""
 
     def __init__(
         self, name: str, host: str, period: float, patience: float, reads_only: bool = False

@@ -171,7 +171,7 @@ class Commander:
         self._stopping = self._control.speedStop
 
     def stop(self) -> None:
-        """Brake, if there is anything to brake; the next command finds the arm at rest."""
+        """Brake if the arm moves; the next command starts from rest."""
         if self.busy() or self._velocity_until > -math.inf:
             self._velocity_until = -math.inf
             # Deceleration of a stop: [m/s^2] along a straight way, [rad/s^2] in joints

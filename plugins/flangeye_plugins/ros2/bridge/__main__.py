@@ -83,7 +83,7 @@ class BridgeNode:
         return {name: types[0] for name, types in self._node.get_service_names_and_types()}
 
     def follow(self, topic: str, type: str, always: bool) -> Any:
-        """Subscribe as the publishers publish; return how many there are, none: not subscribed.
+        """Subscribe with the publishers' QoS; return the number of publishers, 0 if there are none.
 
         Args:
             topic: Its name.
@@ -238,7 +238,7 @@ def answer(bridge: BridgeNode, request: Request) -> Request:
 
 
 def be_punctual() -> None:
-    """Let nothing on a busy machine delay this process, where the user may ask for that.
+    """Request real-time priority for this process, if the user may.
 
     An arm is watched through it, and a cloud that is sent without acknowledgement is lost to a
     process that is late: on two cores with a load of fourteen 6 of 10 came, and 1 without this.

@@ -87,8 +87,8 @@ def _require_turned(what: str, rows: Floats) -> None:
             f"each to both sides, by {np.degrees(TILTED) * 1.5:.0f} deg or more"
         )
     raise StageError(
-        f"pivot of the {what}: turned by {np.degrees(turned[0]):.1f} deg about what lies across "
-        f"the flange's {axis}, so where the point is along {axis} stays unknown; tilt it about "
+        f"pivot of the {what}: tilted by {np.degrees(turned[0]):.1f} deg only about {across}, so "
+        f"the point's {axis} in the flange is not observable; tilt it about "
         f"{across}, each to both sides, by {np.degrees(TILTED) * 1.5:.0f} deg or more"
     )
 
