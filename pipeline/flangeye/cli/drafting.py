@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from flangeye.cli.app import app, ask, load_plugins
-from flangeye.cli.console import say
+from flangeye.cli.console import at_work, say
 from flangeye.errors import RecipeError
 
 if TYPE_CHECKING:
@@ -136,7 +136,8 @@ def _shows_target(draft: Draft, folder: Path, out: Path, registry: Registry) -> 
     try:
         # Its paths start at the recipe's folder.
         recipe = parse_recipe(draft.text, out.name, registry, [f"steps.0.path={folder}"])
-        return bool(Runner(recipe, registry, ArchivePath(folder)).take(1))
+        with at_work("looking for the target"):
+            return bool(Runner(recipe, registry, ArchivePath(folder)).take(1))
     except NothingSeen:
         return False
     except FlangeyeError:

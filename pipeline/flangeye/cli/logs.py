@@ -62,7 +62,7 @@ def _print_outlook(read: RunLog) -> None:
 
     require_gathered(read)
     registry = load_plugins()
-    with of_foreign(read.path, "it cannot be judged"):
+    with at_work("assessing the poses"), of_foreign(read.path, "it cannot be judged"):
         found = outlook_of_log(read, registry)
     for line in found.lines():
         say(line)
@@ -74,7 +74,7 @@ def _replay(log: Path) -> None:
     from flangeye.run.replay import replay_steps
 
     same = True
-    with of_foreign(log, "its decisions cannot be made again"):
+    with at_work("repeating"), of_foreign(log, "its decisions cannot be made again"):
         redone_steps = list(replay_steps(log, load_plugins()))
     for step, redone in redone_steps:
         say(f"{step}: {redone.what}: {'the same' if redone.same else 'NOT the same'}")
@@ -99,7 +99,7 @@ def report(
     read = read_run(log)
     path = out or read.path.parent / "report.html"
     require_gathered(read)
-    with of_foreign(read.path, "no report can be made of it"):
+    with at_work("report"), of_foreign(read.path, "no report can be made of it"):
         write_report(read, path)
     say(path)
     name_damage(read)
@@ -133,10 +133,11 @@ def certificate(  # noqa: PLR0913  one argument an option
     from flangeye.report.certificate import Conditions, print_pdf, write_certificate
 
     conditions = Conditions(temperature, spread, place, operator)
-    page = write_certificate(run, out, conditions, camera)
-    say(page)
-    if pdf and (printed := print_pdf(page)):
-        say(printed)
+    with at_work("certificate"):
+        page = write_certificate(run, out, conditions, camera)
+        printed = print_pdf(page) if pdf else None
+    for path in filter(None, (page, printed)):
+        say(path)
 
 
 @app.command()
