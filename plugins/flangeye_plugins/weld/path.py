@@ -127,7 +127,7 @@ class Path:
         return float(np.abs(curvature).max(initial=0.0))
 
     def bend(self, s: float) -> float:
-        """Return the curvature at an arc length [1/m], to the left positive; none beyond."""
+        """Return the curvature at an arc length [1/m], positive to the left; 0 beyond the ends."""
         return float(self._curvature[self._tick(s)]) if self.first <= s <= self.last else 0.0
 
     def _tick(self, s: float) -> int:

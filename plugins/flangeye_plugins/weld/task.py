@@ -73,12 +73,12 @@ class WeldTask:
 
     @property
     def feels_ends(self) -> bool:
-        """Whether the seam has ends, and these are to be felt."""
+        """Whether the seam has ends that the tip feels for."""
         return self.settings.ends is not None and not self.plan.closed
 
     @property
     def beyond(self) -> float:
-        """How far beyond the planned ends the seam may be [m]."""
+        """Largest distance of the seam's true ends beyond the planned ones [m]."""
         return (self.settings.ends or 0.0) if self.feels_ends else 0.0
 
     @property
@@ -89,14 +89,14 @@ class WeldTask:
 
     @property
     def ends(self) -> float:
-        """Where the torch is to end, by arc length: once around, over its start [m]."""
+        """Arc length at which the torch ends; on a closed seam beyond its start [m]."""
         return (
             self.plan.length + self.beyond + self.lengthwise + self.settings.overlapping(self.plan)
         )
 
     @property
     def lengthwise(self) -> float:
-        """How far along the seam the torch may be off, where its ends matter [m]."""
+        """Bound of the torch's error along the seam, if the seam's ends matter [m]."""
         return BAND * self.belief.along_sigma if self.feels_ends else 0.0
 
     @property
