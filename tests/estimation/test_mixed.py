@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flangeye.estimation.mixed import Posterior, fit, left_out, shares
+from flangeye.estimation.mixed import Posterior, fit, left_out, mode_of, shares
 from tests.estimation import foreign
 from tests.estimation.sessions import estimated, robot, score
 
@@ -21,13 +21,26 @@ def test_the_foreign_arms_are_those_of_the_catalogue(arm) -> None:
     assert robot(arm["name"])[1].flange(joints) == pytest.approx(foreign.pose(arm, joints))
 
 
-def test_the_gradient_is_that_of_the_cost(found) -> None:
+def test_the_gradient_and_the_curvature_are_those_of_the_cost(found) -> None:
     model = found.posterior.model
-    z = 0.5 * np.random.default_rng(0).standard_normal(model.sizes.mix.shape[1])
-    exact = model.sizes.mix.T @ fit(model, model.sizes.at(z)).gradient
-    steps = 1e-5 * np.eye(len(z))
-    both = [[fit(model, model.sizes.at(z + x)).cost for x in (step, -step)] for step in steps]
-    assert exact == pytest.approx(np.array([(a - b) / 2e-5 for a, b in both]), rel=1e-2, abs=5e-3)
+    model = model.weighted(np.arange(16) != 3)
+    x = model.sizes.centre + 0.5 * np.random.default_rng(0).standard_normal(len(model.sizes.centre))
+    here = fit(model, np.exp(x), with_slopes=True)
+    steps = 1e-4 * np.eye(len(x))
+    both = [[fit(model, np.exp(y), with_slopes=True) for y in (x + e, x - e)] for e in steps]
+    slopes = np.array([(a.cost - b.cost) / 2e-4 for a, b in both])
+    assert here.gradient == pytest.approx(slopes, rel=1e-4, abs=1e-3)
+    bends = np.array([(a.gradient - b.gradient) / 2e-4 for a, b in both])
+    assert here.curvature == pytest.approx(bends, rel=1e-4, abs=1e-3)
+
+
+def test_the_most_likely_sizes_are_where_the_cost_is_least(found) -> None:
+    model = found.posterior.model
+    mode = mode_of(model)
+    best = fit(model, model.sizes.at(mode.z)).cost + mode.z @ mode.z
+    for step in 0.03 * np.vstack([np.eye(len(mode.z)), -np.eye(len(mode.z))]):
+        z = mode.z + step
+        assert fit(model, model.sizes.at(z)).cost + z @ z > best
 
 
 def test_leaving_one_out_in_closed_form_is_leaving_it_out(found) -> None:
@@ -57,7 +70,7 @@ def test_leaving_a_fold_out_is_fitting_the_others_at_the_same_sizes(sightings) -
 def test_shares_are_what_each_cause_does_to_the_answer(found) -> None:
     known, mode = found.posterior, found.posterior.mode
     model, (n, _, count) = known.model, known.model.design.shape
-    one = Posterior(model, mode, (mode,), np.ones(1))
+    one = Posterior(model, mode, (mode,), np.ones(1), 0.0)
     of_effects, noise = shares(one, np.eye(count)[: model.p])
     gain = (mode.covariance @ (model.weights(mode.sizes) @ model.design).reshape(6 * n, count).T)[
         : model.p

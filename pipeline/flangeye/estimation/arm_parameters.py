@@ -67,7 +67,7 @@ def parameters_of(session: Session) -> ArmParameters:
             "refine.arm: the robot's model does not reach the poses; name the arm that was recorded"
         )
     ways = _ways(session, carrier)
-    costs = np.array([way.posterior.mode.cost for way in ways])
+    costs = np.array([way.posterior.cost for way in ways])
     chances = np.exp((costs.min() - costs) / 2)
     chances /= chances.sum()
     each = [_of_one_way(way, carrier.arm) for way in ways]
@@ -113,7 +113,7 @@ def _loosely(found: Estimate, of_size: Indices) -> Floats:
     # Each other parameter may be off by a hundred times its own size: identified by the poses,
     # not by what is expected
     sizes[np.unique(of_size)] *= 100.0
-    return fit(found.posterior.model, sizes, with_gradient=False).covariance
+    return fit(found.posterior.model, sizes).covariance
 
 
 def _columns(found: Estimate, arm: str) -> tuple[Indices, Indices]:

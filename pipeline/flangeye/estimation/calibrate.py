@@ -127,7 +127,7 @@ def answered(session: Session, options: Options, method: str) -> HandEye:
             for answer, each in zip((uncorrected, righted), commands, strict=True)
         )
         answer = _reported(rest, of_arm, weak)
-        return replace(answer, corrected=_corrected(rest, anew, weak))
+        return replace(answer, corrected=corrected and _corrected(rest, anew, weak))
 
     return replace(
         reported,
@@ -206,7 +206,7 @@ def _at_best(session: Session) -> Session:
     if start is None:
         return session
     there = estimate(found.problem, start, found.effects, found.inliers)
-    if there.posterior.mode.cost >= found.posterior.mode.cost:
+    if there.posterior.cost >= found.posterior.cost:
         return session
     return replace(session, found=there).noted(moved_note())
 

@@ -66,11 +66,11 @@ class Estimate:
             at += count
         return out
 
-    def outgrown(self, kind: str) -> bool:
-        """Whether an effect's estimated size exceeds its prior by two standard deviations."""
+    def outgrown(self, kind: str, deviations: float = 2.0) -> bool:
+        """Whether an effect's estimated size exceeds its prior by so many standard deviations."""
         sizes = self.posterior.mode.sizes
         return any(
-            np.log(sizes[k] / effect.size) > 2 * np.log(effect.factor)
+            np.log(sizes[k] / effect.size) > deviations * np.log(effect.factor)
             for k, effect in enumerate(self.effects)
             if effect.kind == kind
         )
@@ -208,29 +208,18 @@ def estimate(problem: Problem, start: Places, effects: Sequence[Effect], agree: 
     seen: set[bytes] = set()
     # Linearising, sizes and outliers in turn: two or three rounds are usual
     for _ in range(8):
-        z, places, step, good = _improved(problem, places, effects, inliers, z)
-        key = good.tobytes()
+        model = model_at(problem, places, effects, inliers.astype(float))
+        mode = mode_of(model, z)
+        z, found = mode.z, fit(model, model.sizes.at(mode.z))
+        squares, good = judged(model, found)
+        step, key = found.mean[: model.p], good.tobytes()
         # Linearised about for good [rad, m]: what is left is of second order, 1e-10
-        if step < 1e-5 and (key == inliers.tobytes() or key in seen):
+        if np.abs(step).max(initial=0.0) < 1e-5 and (key == inliers.tobytes() or key in seen):
             break
         seen.add(key)
+        places = problem.moved(places, step)
         inliers = good if good.sum() >= 3 else inliers
-    model = model_at(problem, places, effects, inliers.astype(float))
-    known = posterior(model, mode_of(model, z))
-    squares, _ = judged(model, known.mode)
-    return Estimate(problem, effects, places, known, inliers, squares)
-
-
-def _improved(
-    problem: Problem, places: Places, effects: Sequence[Effect], agree: Mask, z: Floats | None
-) -> tuple[Floats, Places, float, Mask]:
-    """Return sizes, places, by how much these moved [rad, m], and what agrees with them."""
-    model = model_at(problem, places, effects, agree.astype(float))
-    z = mode_of(model, z)
-    found = fit(model, model.sizes.at(z), with_gradient=False)
-    step = found.mean[: model.p]
-    moved = float(np.abs(step).max(initial=0.0))
-    return z, problem.moved(places, step), moved, judged(model, found)[1]
+    return Estimate(problem, effects, places, posterior(model, mode, found), inliers, squares)
 
 
 def judged(model: LinearModel, found: Fit) -> tuple[Floats, Mask]:

@@ -125,6 +125,7 @@ class Fit:
         root: (P + K, P + K) lower Cholesky factor of the information with the effects' prior.
         cost: -2 log of the restricted likelihood, but for a constant.
         gradient: (S,) of it by the logarithm of each size.
+        curvature: (S, S) of it likewise.
     """
 
     sizes: Floats
@@ -133,6 +134,7 @@ class Fit:
     root: Floats
     cost: float = 0.0
     gradient: Floats = field(default_factory=lambda: np.zeros(0))
+    curvature: Floats = field(default_factory=lambda: np.zeros((0, 0)))
 
     @cached_property
     def mean(self) -> Floats:
@@ -174,10 +176,10 @@ def told(model: LinearModel, sizes: Floats) -> Told:
     return Told(whitening, rows, errors, float(2 * model.shares @ logs))
 
 
-def fit(model: LinearModel, sizes: Floats, with_gradient: bool = True) -> Fit:
+def fit(model: LinearModel, sizes: Floats, with_slopes: bool = False) -> Fit:
     """Solve Henderson's mixed-model equations at (S,) sizes, with the restricted likelihood.
 
-    Without the gradient it takes half the time.
+    With its gradient and curvature by the sizes it takes five times as long.
 
     Raises:
         numpy.linalg.LinAlgError: The equations are not positive definite.
@@ -192,8 +194,8 @@ def fit(model: LinearModel, sizes: Floats, with_gradient: bool = True) -> Fit:
         + left @ left
         + prior @ found.mean[model.p :] ** 2
     )
-    gradient = _gradient(model, found, known, left.reshape(-1, 6)) if with_gradient else np.zeros(0)
-    return replace(found, cost=cost, gradient=gradient)
+    found = replace(found, cost=cost)
+    return _with_slopes(model, found, known, left) if with_slopes else found
 
 
 def _solved(model: LinearModel, sizes: Floats, information: Floats, right: Floats) -> Fit:
@@ -209,7 +211,8 @@ def _solved(model: LinearModel, sizes: Floats, information: Floats, right: Float
     # information, but what keeps the factorisation positive where the sightings show nothing
     diagonal += 1e-10 * np.where(diagonal > 1e-14 * most, diagonal, most)
     np.fill_diagonal(whole, diagonal)
-    return Fit(sizes, information, right, cholesky(whole.T, lower=True, overwrite_a=True))
+    root = cholesky(whole.T, lower=True, overwrite_a=True, check_finite=False)
+    return Fit(sizes, information, right, root)
 
 
 def told_of_places(model: LinearModel, sizes: Floats) -> Floats:
@@ -223,23 +226,51 @@ def told_of_places(model: LinearModel, sizes: Floats) -> Floats:
     return np.asarray(whole[:p, :p] - whole[:p, p:] @ np.linalg.solve(effects, whole[p:, :p]))
 
 
-def _gradient(model: LinearModel, found: Fit, known: Told, left: Floats) -> Floats:
-    """Return (S,) derivatives of the cost by the logarithms of the sizes.
+def _with_slopes(model: LinearModel, found: Fit, known: Told, left: Floats) -> Fit:
+    r"""Return the fit with the derivatives of its cost by the logarithms x of the sizes.
 
-    Of an effect's: 2 (K_k - (tr V_k + |delta_k|^2) / s_k^2). Of the noise's, with dR by each:
-    tr(W dR) - tr(V H'W dR W H) - e'W dR W e.
+    With P what projects onto the residuals, :math:`P = V^{-1} - V^{-1} G (G'V^{-1}G)^{-1} G'V^{-1}`
+    of all that scatters, V, whose derivatives are V_i, they are
+
+    .. math:: tr(P V_i) - y'P V_i P y, \qquad
+        tr(P V_{ij}) - y'P V_{ij} P y - tr(P V_i P V_j) + 2 y'P V_i P V_j P y
+
+    In Henderson's terms, of an effect P E = W H C / s^2, with C the covariance of all unknowns.
     """
-    sizes, out = found.sizes, np.zeros(len(found.sizes))
-    second = np.diag(found.covariance)[model.p :] + found.mean[model.p :] ** 2
-    np.add.at(out, model.sizes.effect, 2 * (1 - second * sizes[model.sizes.effect] ** -2.0))
-    rows = known.rows.reshape(len(left), 6, -1)
-    spread = spread_of(rows, found.covariance) + left[:, :, None] * left[:, None, :]
-    # dcost/dR, (N, 6, 6)
+    sizes, effect, p = found.sizes, model.sizes.effect, model.p
+    count, n = len(sizes), len(model.residuals)
+    # Of effects, in units of their sizes
+    of = (np.arange(count)[:, None] == effect).astype(float)
+    scale, numbers = sizes[effect], found.mean[p:] / sizes[effect]
+    rest = np.eye(len(effect)) - found.covariance[p:, p:] / np.outer(scale, scale)
+    gradient = 2 * of @ (np.diag(rest) - numbers**2)
+    curvature = np.diag(2 * gradient)
+    curvature -= 4 * of @ (rest**2 - 2 * np.outer(numbers, numbers) * rest) @ of.T
+    # Of the noise, by each cause
+    rows, left = known.rows.reshape(n, 6, -1), left.reshape(n, 6, 1)
+    moved = (known.rows @ found.covariance).reshape(rows.shape)
+    spread = moved @ np.swapaxes(rows, 1, 2) + left * np.swapaxes(left, 1, 2)
     slope = np.swapaxes(known.whitening, 1, 2) @ (np.eye(6) - spread) @ known.whitening
-    by_cause = model.causes.reshape(len(model.causes), -1) @ slope.ravel()
     amounts = sizes[model.factors].prod(axis=1)
-    np.add.at(out, model.factors, (by_cause * amounts)[:, None])
-    return out
+    by_cause = amounts * (model.causes.reshape(len(amounts), -1) @ slope.ravel())
+    powers = (model.factors[..., None] == np.arange(count)).sum(axis=1)
+    gradient += powers.T @ by_cause
+    curvature += (powers.T * by_cause) @ powers
+    # By each two of its sizes, and by one of them and an effect's
+    own = np.flatnonzero(powers.any(axis=0))
+    changes = np.tensordot(powers[:, own].T * amounts, model.causes, axes=1)
+    changes = known.whitening @ changes @ np.swapaxes(known.whitening, 1, 2)
+    turned = (changes @ moved).reshape(len(own), 6 * n, -1)
+    crossed, drawn = np.swapaxes(turned, 1, 2) @ known.rows, left.ravel() @ turned
+    pulled = (changes @ left).reshape(len(own), -1) @ known.rows
+    both = np.tensordot((np.eye(6) - 2 * spread) @ changes, changes, axes=((1, 2, 3), (1, 3, 2)))
+    both += np.tensordot(crossed, crossed, axes=((1, 2), (2, 1))) + 2 * drawn @ pulled.T
+    curvature[np.ix_(own, own)] -= both
+    squares = (turned * moved.reshape(6 * n, -1)).sum(axis=1)[:, p:] / scale**2
+    each = 2 * (squares - 2 * numbers * drawn[:, p:] / scale) @ of.T
+    curvature[own] -= each
+    curvature[:, own] -= each.T
+    return replace(found, gradient=gradient, curvature=curvature)
 
 
 def spread_of(rows: Floats, covariance: Floats) -> Floats:
@@ -257,12 +288,15 @@ class Posterior:
         mode: The fit at the most likely sizes.
         fits: One for each draw of the sizes.
         chances: (F,) weights of the draws; they sum to one.
+        cost: -2 log of the restricted likelihood times the sizes' prior at the mode, but for a
+            constant.
     """
 
     model: LinearModel
     mode: Fit
     fits: tuple[Fit, ...]
     chances: Floats
+    cost: float
 
     @cached_property
     def mean(self) -> Floats:
@@ -281,7 +315,8 @@ class Posterior:
         shares, taken = self.model.shares.copy(), self.model.where(rows)
         shares[rows] = 0.0
         mode, *fits = _told_less(taken, [self.mode, *self.fits])
-        return Posterior(self.model.weighted(shares), mode, tuple(fits), self.chances)
+        left = self.model.weighted(shares)
+        return replace(self, model=left, mode=mode, fits=tuple(fits))
 
 
 def shares(known: Posterior, rows: Floats) -> tuple[Floats, Floats]:
@@ -303,34 +338,58 @@ def shares(known: Posterior, rows: Floats) -> tuple[Floats, Floats]:
     return of_effects, np.asarray(whole - of_effects.sum(axis=0))
 
 
-def mode_of(model: LinearModel, start: Floats | None = None, steps: int = 60) -> Floats:
-    """Return (Z,) the most likely sizes, as standard normal values, by L-BFGS."""
-    from scipy.optimize import minimize
+class Mode(NamedTuple):
+    """The most likely sizes.
 
+    Attributes:
+        z: (Z,) these, as standard normal values.
+        spread: (Z, Z) the root of their covariance by the curvature there.
+    """
+
+    z: Floats
+    spread: Floats
+
+
+def mode_of(model: LinearModel, start: Floats | None = None) -> Mode:
+    """Return the most likely sizes, from a start or those expected beforehand."""
     prior, model = model.sizes, model.telling()
     z = np.zeros(prior.mix.shape[1]) if start is None else start
+    here = fit(model, prior.at(z), with_slopes=True)
+    # Newton's steps: five or six are usual
+    for _ in range(60):
+        slope = prior.mix.T @ here.gradient / 2 + z
+        values, vectors = np.linalg.eigh(prior.mix.T @ here.curvature @ prior.mix / 2)
+        # A size that nothing shows has the prior's curvature, one.
+        values = np.maximum(np.abs(values + 1), 0.25)
+        step = -vectors @ (vectors.T @ slope / values)
+        # Of the likelihood's logarithm; what the step leaves is about the square of that
+        if -slope @ step < 1e-3:
+            break
+        z, here = _better(model, z, here, step * min(1.0, 3.0 / np.linalg.norm(step)))
+    # The symmetric root: eigenvectors have no sign of their own, and draws are to be the same for
+    # sessions that differ by rounding
+    return Mode(z + step, np.asarray(vectors / np.sqrt(values) @ vectors.T))
 
-    def cost(z: Floats) -> tuple[float, Floats]:
-        found = fit(model, prior.at(z))
-        return found.cost + float(z @ z), prior.mix.T @ found.gradient + 2 * z
 
-    options = {"maxiter": steps, "ftol": 1e-7, "gtol": 1e-3}
-    return np.asarray(
-        minimize(cost, z, jac=True, method="L-BFGS-B", bounds=[(-6, 6)] * len(z),
-                 options=options).x
-    )  # fmt: skip
+def _better(model: LinearModel, z: Floats, here: Fit, step: Floats) -> tuple[Floats, Fit]:
+    """Return sizes that are likelier along a step, with their fit; the shortest one, if none is."""
+    for part in 0.5 ** np.arange(10):
+        at = z + part * step
+        there = fit(model, model.sizes.at(at), with_slopes=True)
+        if there.cost + at @ at < here.cost + z @ z:
+            break
+    return at, there
 
 
-def posterior(model: LinearModel, mode: Floats | None = None) -> Posterior:
-    """Return the joint posterior, the sizes integrated over."""
-    z, some = mode_of(model) if mode is None else mode, model.telling()
-    spread, prior = _laplace(some, z), model.sizes
-    at_mode, fits, logs = fit(model, prior.at(z), with_gradient=False), [], []
+def posterior(model: LinearModel, mode: Mode, at_mode: Fit) -> Posterior:
+    """Return the joint posterior, the sizes integrated over about their mode and its fit."""
+    (z, spread), some, prior = mode, model.telling(), model.sizes
+    fits, logs = [], []
     # Half of them mirrored: beside 2,048 draws they state the error of 16 poses equally large,
     # give or take 6 % from session to session
     for draw in _draws(len(z), 32):
         at = z + spread @ draw
-        found = fit(some, prior.at(at), with_gradient=False)
+        found = fit(some, prior.at(at))
         logs.append(0.5 * float(draw @ draw - found.cost - at @ at))
         fits.append(found)
     if some is not model:
@@ -341,38 +400,23 @@ def posterior(model: LinearModel, mode: Floats | None = None) -> Posterior:
             sizes[own] = at_mode.sizes[own]
             fits[k] = _solved(model, sizes, at_mode.information, at_mode.right)
     chances = np.exp(np.array(logs) - max(logs))
-    return Posterior(model, at_mode, tuple(fits), chances / chances.sum())
+    cost = at_mode.cost + float(z @ z)
+    return Posterior(model, at_mode, tuple(fits), chances / chances.sum(), cost)
 
 
 def _told_less(taken: LinearModel, fits: Sequence[Fit]) -> Iterator[Fit]:
     """Give fits without some of their sightings, each at its sizes."""
-    known: dict[bytes, tuple[Floats, Floats]] = {}
-    for each in fits:
-        key = each.sizes[taken.factors].tobytes()  # what is told depends on the noise's alone
-        if key not in known:
-            rows, errors = told(taken, each.sizes)[1:3]
-            known[key] = rows.T @ rows, rows.T @ errors
-        information, right = known[key]
-        yield _solved(taken, each.sizes, each.information - information, each.right - right)
-
-
-def _laplace(model: LinearModel, z: Floats) -> Floats:
-    """Return (Z, Z) the root of the covariance of the sizes about their mode.
-
-    The symmetric one: eigenvectors have no sign of their own, and draws are to be the same for
-    sessions that differ by rounding.
-    """
-    step, prior = 0.05, model.sizes
-
-    def slope(at: Floats) -> Floats:
-        return np.asarray(prior.mix.T @ fit(model, prior.at(at)).gradient / 2 + at)
-
-    here = slope(z)
-    rows = [(slope(z + step * e) - here) / step for e in np.eye(len(z))]
-    curvature = 0.5 * (np.array(rows) + np.array(rows).T)
-    values, vectors = np.linalg.eigh(curvature)
-    # A size that nothing shows has the prior's curvature, one.
-    return np.asarray(vectors / np.sqrt(np.maximum(values, 0.25)) @ vectors.T)
+    # What is told depends on the noise's sizes alone
+    amounts = np.array([each.sizes[taken.factors].prod(axis=1) for each in fits])
+    amounts, which = np.unique(amounts, axis=0, return_inverse=True)
+    noise = taken.still + np.tensordot(amounts, taken.causes, axes=1)
+    whitening = np.sqrt(taken.shares)[:, None, None] * np.linalg.inv(np.linalg.cholesky(noise))
+    rows = (whitening @ taken.design).reshape(len(amounts), -1, taken.design.shape[2])
+    errors = (whitening @ taken.residuals[..., None]).reshape(len(amounts), -1, 1)
+    across = np.swapaxes(rows, 1, 2)
+    information, right = across @ rows, (across @ errors)[..., 0]
+    for k, each in zip(which.ravel(), fits, strict=True):
+        yield _solved(taken, each.sizes, each.information - information[k], each.right - right[k])
 
 
 def _draws(count: int, samples: int) -> Floats:

@@ -60,7 +60,7 @@ def rough(problem: Problem, freedoms: Mapping[str, Floats] | None = None) -> Rou
     agree, effects = agreeing(problem, squares), effects_of(problem, None, Asked())
     for _ in range(2):
         model = model_at(problem, places, effects, agree.astype(float))
-        found = fit(model, model.sizes.at(np.zeros(model.sizes.mix.shape[1])), with_gradient=False)
+        found = fit(model, model.sizes.at(np.zeros(model.sizes.mix.shape[1])))
         places = problem.moved(places, found.mean[: model.p])
         agree = judged(model, found)[1] & agree
     known = told_of_places(model, found.sizes)

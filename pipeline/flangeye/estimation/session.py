@@ -310,9 +310,9 @@ def _with_joints(problem: Problem, arm: str, joints: Floats | None) -> Problem:
 
 def _cost(problem: Problem, places: Places) -> float:
     """Return -2 log of the restricted likelihood at the sizes that are expected beforehand."""
-    effects = effects_of(problem, None, Asked())
+    effects = [effect for effect in effects_of(problem, None, Asked()) if effect.lasting]
     model = model_at(problem, places, effects, np.ones(len(problem.seen)))
-    return fit(model, model.sizes.at(np.zeros(model.sizes.mix.shape[1])), with_gradient=False).cost
+    return fit(model, model.sizes.at(np.zeros(model.sizes.mix.shape[1]))).cost
 
 
 # --- mistakes that are put right -----------------------------------------------------------------
@@ -455,7 +455,8 @@ def _size_far_off(session: Session) -> float | None:
     known of the camera.
     """
     found, observations = session.found, session.observations
-    worse = any(found.outgrown(kind) for kind in ("zeros", "field"))
+    # Beyond six deviations a marker's share of its size is none that can be linearised
+    worse = any(found.outgrown(kind) for kind in ("zeros", "field")) or found.outgrown("size", 6.0)
     if not worse or len(found.problem.ends) > 1 or not (found.problem.seen.ranks == 6).all():
         return None
     try:
@@ -465,9 +466,9 @@ def _size_far_off(session: Session) -> float | None:
     except (StageError, CalibrationRefused):
         return None
     effects = effects_of(problem, session.scanner, session.asked)
-    other = estimate(problem, places, effects, agree).posterior.mode.cost
+    other = estimate(problem, places, effects, agree).posterior.cost
     # The same numbers in another unit of length: three coordinates of each are so much larger.
-    better = found.posterior.mode.cost - other + 6 * len(observations) * np.log(factor)
+    better = found.posterior.cost - other + 6 * len(observations) * np.log(factor)
     return factor if better > chi2_quantile(MISTAKE_CERTAIN, 1) else None
 
 
