@@ -82,7 +82,7 @@ class Scatter:
         covariances: Gives (N, 6, 6) of sightings, of size one.
         size: Prior median of its size.
         factor: By how many times that size is uncertain, one sigma.
-        cause: Whose quality it shares.
+        cause: Whose quality it shares; empty for none.
     """
 
     covariances: Callable[[Problem, Linear], Floats]
@@ -101,8 +101,9 @@ def arm_scatters(problem: Problem) -> list[Scatter]:
     for arm, accuracy in {c.arm: c.accuracy or ACCURACY for c in problem.carriers}.items():
         if _told(problem, arm):
             # Of a joint's angle from pose to pose [rad]: an arm that repeats to 0.03
-            # mm by ISO 9283 at a reach of a metre has 0.03 mrad
-            out.append(Scatter(_backlash(arm), 0.1 * accuracy, EACH, arm))
+            # mm by ISO 9283 at a reach of a metre has 0.03 mrad. What an arm repeats
+            # to says nothing of how true it is: it has a quality of its own
+            out.append(Scatter(_backlash(arm), 0.1 * accuracy, QUALITY, ""))
         else:
             turns, shifts = (_anew(arm, rows) for rows in (slice(3), slice(3, 6)))
             out.append(Scatter(turns, ANEW[0] * accuracy, EACH, arm))
