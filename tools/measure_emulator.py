@@ -34,17 +34,6 @@ def rate(receive, seconds):
     return (stamps[-1] - stamps[0]) / 0.002 / (times[-1] - times[0]), np.diff(times).max()
 
 
-def servo(robot, pose, cycles):
-    """Stream poses as fast as the controller takes them."""
-    for cycle in range(cycles):
-        began = robot.initPeriod()
-        target = list(pose)
-        target[0] += 0.02 * np.sin(cycle / 80)
-        robot.servoL(target, 0.5, 0.5, 0.002, 0.1, 300)
-        robot.waitPeriod(began)
-    robot.servoStop()
-
-
 def main():
     import rtde_control
     import rtde_receive
@@ -66,8 +55,6 @@ def main():
         say(
             f"moveL: {100 * share:.1f} % of a core, {elapsed:.3f} s for {0.2 / 0.1 + 0.1 / 1.2:.3f} s\n"
         )
-        share, elapsed = cpu_share(control, lambda: servo(robot, there, 1000))
-        say(f"servoL: {100 * share:.1f} % of a core, 1000 periods in {elapsed:.3f} s\n")
         packages, gap = rate(receive, 5.0)
         say(
             f"{packages:.1f} packages/s of the controller's time, longest wait {1e3 * gap:.1f} ms\n"

@@ -9,65 +9,12 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flangeye.errors import StageError
 from flangeye.models.robots import RobotModel
 from flangeye.types import Floats
 from flangeye_emulators.controllers.motion import ControllerMotion, stop
-from flangeye_emulators.controllers.poses import (
-    JointStance,
-    ToolChain,
-    UnreachableError,
-    carried,
-    twist_between,
-)
-
-
-@dataclass(frozen=True, eq=False)
-class ForceMode:
-    """Force control: compliant axes seek a wrench, the others follow the motion.
-
-    Attributes:
-        base_R_task: (3, 3) the axes.
-        compliant: (6,) which axes give way.
-        wrench: (6,) to apply to the surroundings, in the task's axes [N, Nm].
-        fastest: (6,) largest speed along each compliant axis [m/s, rad/s].
-        gain: Scales the speed per missing force.
-    """
-
-    base_R_task: Floats
-    compliant: NDArray[np.bool_]
-    wrench: Floats
-    fastest: Floats
-    gain: float
-
-    def yielding(self, pose: Floats, target: Floats, felt: Floats, dt: float) -> Floats:
-        """Return the pose (4, 4) to go to instead of ``target``.
-
-        Args:
-            pose: (4, 4) where the tool is.
-            target: (4, 4) where the motion would take it in this cycle.
-            felt: (6,) wrench of the surroundings on the tool, in base.
-            dt: Length of the cycle [s].
-        """
-        task = self.base_R_task
-        missing = self.wrench + _turned(task.T, felt)
-        # Speed per missing force [m/s/N] and torque [rad/s/Nm], at gain one: at one half
-        # it is stable against anything softer than 250 N/mm and settles against 20 N/mm in
-        # 0.1 s
-        give = np.clip(
-            self.gain * np.array([4e-3, 4e-3, 4e-3, 0.2, 0.2, 0.2]) * missing,
-            -self.fastest,
-            self.fastest,
-        )
-        follow = _turned(task.T, twist_between(pose, target))
-        step = np.where(self.compliant, give * dt, follow)
-        return carried(pose, _turned(task, step), 1.0)
-
-
-def _turned(rotation: Floats, vector: Floats) -> Floats:
-    return np.concatenate([rotation @ vector[:3], rotation @ vector[3:]])
+from flangeye_emulators.controllers.poses import JointStance, ToolChain, UnreachableError
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,15 +74,11 @@ class SimulatedArm:
         speed_limits: (n,) [rad/s].
         cycle: Length of one cycle [s].
         surfaces: What the tool may touch.
-        force_mode: Force control, when it is on.
-        slider: Share of full speed that is asked for, 0 to 1.
         held: Whether a pause or a stop keeps the arm on its path at rest.
         stance: Joints, tool pose, Jacobian.
         speeds: (n,) of the joints [rad/s].
         twist: (6,) of the tool in base [m/s, rad/s].
-        wrench: (6,) of the surroundings on the tool, in base, as touched [N, Nm].
-        felt: (6,) the same, less what counts as none.
-        history: (joints, wrench) of the last cycles, the present last.
+        felt: (6,) wrench of the surroundings on the tool, in base [N, Nm].
         zeros: (n,) true joint angles minus reported ones [rad]: what calibration has to live with.
     """
 
@@ -146,11 +89,7 @@ class SimulatedArm:
         self.chain = ToolChain(robot)
         self.speed_limits, self.cycle, self.zeros = speed_limits, cycle, zeros
         self.surfaces: list[SpringSurface] = []
-        self.force_mode: ForceMode | None = None
-        self.slider, self.held = 1.0, False
-        self._tare = np.zeros(6)
-        # How far back joint angles and forces are kept [s]
-        self.history: deque[tuple[Floats, Floats]] = deque(maxlen=round(1.0 / cycle))
+        self.held = False
         self._fraction = 1.0
         self._motion: ControllerMotion | None = None
         self._braking = False
@@ -170,10 +109,6 @@ class SimulatedArm:
         """Set the tool frame (4, 4); the arm does not move."""
         self.chain.flange_T_tcp = flange_T_tcp
         self.stance = self.chain.stance(self.stance.joints)
-
-    def zero_force(self) -> None:
-        """Let the present wrench count as none."""
-        self._tare = self.wrench
 
     @property
     def standing(self) -> bool:
@@ -207,7 +142,6 @@ class SimulatedArm:
         try:
             self._move()
         except MotionFault:
-            self.force_mode = None
             self._brake()
             self._move()
             raise
@@ -216,13 +150,10 @@ class SimulatedArm:
 
     def _move(self) -> None:
         dt = self.cycle * self._next_fraction()
-        if self._motion is None and self.force_mode is None:
+        if self._motion is None:
             self.speeds, self.twist = np.zeros_like(self.speeds), np.zeros(6)
             return
-        if self._motion is None:
-            self._go_to(self.stance.base_T_tcp, dt)
-            return
-        self._go_to(self._motion.step(dt, self.stance), dt)
+        self._go_to(self._motion.step(dt, self.stance))
         if self._motion.done:
             self._motion, self._braking = None, False
 
@@ -231,16 +162,15 @@ class SimulatedArm:
         if self._braking:
             return 1.0
         # Time in which a pause or a protective stop takes the arm from full speed to none, on its
-        # path
-        # Time in which the speed slider's full range takes effect
-        wanted, time = (0.0, 0.1) if self.held else (self.slider, 0.4)
+        # path, and in which it comes back to full speed
+        wanted, time = (0.0, 0.1) if self.held else (1.0, 0.4)
         step = self.cycle / time
         self._fraction += min(max(wanted - self._fraction, -step), step)
         return self._fraction
 
-    def _go_to(self, target: Floats, dt: float) -> None:
+    def _go_to(self, target: Floats) -> None:
         try:
-            stance = self._stance_at(target, dt)
+            stance = self._stance_at(target)
         except UnreachableError as error:
             raise MotionFault(str(error)) from None
         if not self._braking:
@@ -249,18 +179,12 @@ class SimulatedArm:
         self.twist = stance.jacobian @ self.speeds
         self.stance = stance
 
-    def _stance_at(self, target: Floats, dt: float) -> JointStance:
+    def _stance_at(self, target: Floats) -> JointStance:
         if self._braking:
             return self.chain.stance(np.clip(target, self.chain.lower, self.chain.upper))
-        if target.ndim == 1:
-            stance = self.chain.stance(target)
-            if self.force_mode is None:
-                return stance
-            target = stance.base_T_tcp
-        if self.force_mode is not None:
-            here = self.stance.base_T_tcp
-            target = self.force_mode.yielding(here, target, self.felt, dt)
-        return self.chain.solve(target, self.stance)
+        return (
+            self.chain.stance(target) if target.ndim == 1 else self.chain.solve(target, self.stance)
+        )
 
     def _check(self, joints: Floats) -> None:
         """Refuse joints that are out of their ranges or would have to move too fast."""
@@ -283,11 +207,9 @@ class SimulatedArm:
 
     def _feel(self) -> None:
         position = self.stance.base_T_tcp[:3, 3]
-        self.wrench = np.zeros(6)
+        self.felt = np.zeros(6)
         for surface in self.surfaces:
-            self.wrench[:3] += surface.force(position, self.twist[:3])
-        self.felt = self.wrench - self._tare
-        self.history.append((self.stance.joints, self.felt))
+            self.felt[:3] += surface.force(position, self.twist[:3])
 
 
 def starting_joints(robot: RobotModel, joints: Sequence[float] | Floats | None) -> Floats:
@@ -361,7 +283,7 @@ class ControlUnit(ABC):
         self._cycles += 1
         self._advance()
         # The limit that e-Series arms are shipped with [N]
-        if float(np.linalg.norm(self.arm.wrench[:3])) > 150.0:
+        if float(np.linalg.norm(self.arm.felt[:3])) > 150.0:
             self.protective_stop("the tool meets more than 150 N")
 
     @abstractmethod

@@ -38,7 +38,7 @@ class Mover:
     @property
     def under_way(self) -> bool:
         """Whether a motion is in progress."""
-        return self._motion is not None
+        return self._motion is not None and not self._motion.done
 
     @property
     def busy(self) -> bool:
@@ -60,7 +60,7 @@ class Mover:
             self._motion = Speed(velocity, target, acceleration, in_space)
         self._queue.clear()
         self._motion.target, self._motion.acceleration = np.array(target), acceleration
-        self._cycles_left = round(seconds / self.arm.cycle)
+        self._cycles_left = math.inf if seconds == math.inf else round(seconds / self.arm.cycle)
 
     def halt(self, deceleration: float | None = None, in_space: bool = True) -> None:
         """Come to rest, in a straight line or in joint space, as fast as possible by default."""
@@ -70,12 +70,10 @@ class Mover:
             velocity = self.arm.twist if in_space else self.arm.speeds
             self._motion, self._cycles_left = stop(velocity, deceleration, in_space), math.inf
 
-    def step(self) -> None:
-        """Advance one cycle.
-
-        Raises:
-            MotionFault: The arm met a limit; it brakes, and nothing is left to do.
-        """
+    def drive(self) -> None:
+        """Say what moves the arm in the cycle that comes."""
+        if self._motion is not None and self._motion.done:
+            self._motion = None
         if isinstance(self._motion, Speed):
             self._cycles_left -= 1
             if self._cycles_left < 0:
@@ -85,10 +83,16 @@ class Mover:
             self.begun += 1
         if self._motion is not None:
             self.arm.drive(self._motion)
+
+    def step(self) -> None:
+        """Advance one cycle.
+
+        Raises:
+            MotionFault: The arm met a limit; it brakes, and nothing is left to do.
+        """
+        self.drive()
         try:
             self.arm.step()
         except MotionFault:
             self.halt()
             raise
-        if self._motion is not None and self._motion.done:
-            self._motion = None

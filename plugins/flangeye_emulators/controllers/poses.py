@@ -159,20 +159,6 @@ class ToolChain:
             stance = self.stance(stance.joints + _newton_step(stance.jacobian, error))
         raise UnreachableError("no joint angles reach this pose from where the arm is")
 
-    def solve_any(self, base_T_tcp: Floats, near: Floats) -> Floats:
-        """Return the joint angles that reach a pose, on the branch nearest to ``near``.
-
-        Raises:
-            UnreachableError: No branch reaches it within the joints' limits.
-        """
-        solutions = self._arm.inverse(base_T_tcp @ inverse_pose(self.flange_T_tcp), starts=16)
-        if not len(solutions):
-            raise UnreachableError("no joint angles within the limits reach this pose")
-        turns = solutions + 2 * np.pi * np.round((near - solutions) / (2 * np.pi))
-        fits = (turns >= self.lower) & (turns <= self.upper)
-        solutions = np.where(fits, turns, solutions)
-        return np.asarray(solutions[np.abs(solutions - near).max(axis=1).argmin()])
-
 
 def _newton_step(jacobian: Floats, error: Floats) -> Floats:
     """Return the change of the joints; the smallest one for an arm with joints to spare."""

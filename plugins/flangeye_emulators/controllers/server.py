@@ -184,7 +184,6 @@ class Server:
             "speeds": box.arm.speeds.tolist(),
             "twist": box.arm.twist.tolist(),
             "force": box.arm.felt.tolist(),
-            "slider": box.arm.slider,
             "connections": len(self._network.connections),
         }
 

@@ -7,7 +7,9 @@ import numpy as np
 from flangeye.models.loading import load_model
 from flangeye_emulators.controllers.poses import pose_matrix, twist_between
 from flangeye_emulators.controllers.ur.controller import Runtime, URController
-from flangeye_emulators.controllers.ur.server import DONE, READY, CommandLoop
+from flangeye_emulators.controllers.ur.script import ControlScript
+
+READY, DONE = ControlScript.ready, ControlScript.done
 
 HOME = np.radians([0.0, -90.0, 90.0, -90.0, -90.0, 0.0])
 
@@ -20,13 +22,12 @@ def away(vector, *offset):
 class Desk:
     """A controller that runs the control script, driven through its registers as a client does."""
 
-    def __init__(self, model="ur5e", joints=HOME, path=(), offset=0, zeros=None):
+    def __init__(self, model="ur5e", joints=HOME, offset=0, zeros=None):
         zeros = np.zeros(6) if zeros is None else zeros
         self.box = URController(load_model("robots", model), np.array(joints), zeros)
         self.arm = self.box.arm
         self.offset = offset
-        self.script = CommandLoop(self.box, offset, list(path))
-        self.box.load(self.script, "rtde_control")
+        self.box.load(ControlScript(self.box, offset).cycle, "rtde_control")
         self.trace = []
         self.run(1)
 
@@ -68,9 +69,6 @@ class Desk:
     def given(self, count=6):
         first = self.offset
         return np.array(self.box.registers.output_double[first : first + count])
-
-    def given_integer(self):
-        return self.box.registers.output_int[self.offset + 1]
 
     def progress(self):
         """The progress of a background operation, or None."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
@@ -14,7 +14,6 @@ from flangeye.models.robots import RobotModel
 from flangeye.types import Floats
 from flangeye_emulators.controllers.arm import ControlUnit, MotionFault, SimulatedArm
 from flangeye_emulators.controllers.poses import pose_vector
-from flangeye_emulators.controllers.ur.program import Program, ProgramError
 
 HALF, THIRD = np.pi, 2 * np.pi / 3
 
@@ -45,8 +44,6 @@ class URController(ControlUnit):
         digital_outputs: Bits: standard 0-7, configurable 8-15, tool 16-17.
         wired: Whether standard inputs are as the outputs of their numbers: what an output starts
             says through an input that it runs.
-        analog_outputs: Two ratios, 0 to 1.
-        payload: Mass [kg] and centre of gravity (3,) [m].
     """
 
     def __init__(self, robot: RobotModel, joints: Floats, zeros: Floats) -> None:
@@ -60,9 +57,7 @@ class URController(ControlUnit):
         self.runtime = Runtime.STOPPED
         self.remote_control = True
         self.digital_outputs, self.wired = 0, True
-        self.analog_outputs = [0.0, 0.0]
-        self.payload: tuple[float, Floats] = (0.0, np.zeros(3))
-        self._program: Program | None = None
+        self._program: Callable[[], bool] | None = None
         self._resumable = True
         self._program_began = 0
         self._watchdog: tuple[int, float] | None = None
@@ -86,14 +81,8 @@ class URController(ControlUnit):
             self.protective_stop(str(fault))
 
     def _run_program(self) -> None:
-        if self._program is None or self.runtime is not Runtime.PLAYING:
-            return
-        try:
-            goes_on = self._program.cycle()
-        except ProgramError as error:
-            self.stop_program(f"runtime error: {error}")
-            return
-        if not goes_on:
+        running = self._program if self.runtime is Runtime.PLAYING else None
+        if running is not None and not running():
             self.stop_program("the program ended")
 
     def _check_watchdog(self) -> None:
@@ -115,7 +104,7 @@ class URController(ControlUnit):
 
     # Programs
 
-    def load(self, program: Program, name: str) -> None:
+    def load(self, program: Callable[[], bool], name: str) -> None:
         """Run a program in place of the present one.
 
         Raises:
@@ -125,7 +114,6 @@ class URController(ControlUnit):
         self.note(f"program {name}")
         self._program, self._resumable = program, True
         self._program_began, self._watchdog = self._cycles, None
-        self.arm.force_mode = None
         self.runtime, self.arm.held = Runtime.PLAYING, False
 
     def stop_program(self, why: str) -> None:
@@ -133,7 +121,6 @@ class URController(ControlUnit):
         if self._program is not None:
             self.note(f"program stopped: {why}")
         self._program, self._watchdog = None, None
-        self.arm.force_mode = None
         self.runtime = Runtime.STOPPED
         self.arm.held = self.safety is not SafetyMode.NORMAL
 
@@ -227,7 +214,6 @@ class URController(ControlUnit):
         self.safety, self.robot_mode = SafetyMode.NORMAL, RobotMode.RUNNING
         self.remote_control = True
         self.stop_program("reset")
-        self.arm.slider = 1.0
         self.arm.put(joints)
 
     def modes(self) -> Mapping[str, Any]:

@@ -68,7 +68,7 @@ class Output(NamedTuple):
 
 def _raw_wrench(box: URController) -> Values:
     """Wrench at the flange in the flange's axes, nothing subtracted."""
-    force = box.arm.wrench[:3]
+    force = box.arm.felt[:3]
     tool = inverse_pose(box.arm.chain.flange_T_tcp)
     force_in_flange = tool[:3, :3].T @ box.arm.stance.base_T_tcp[:3, :3].T @ force
     lever = box.arm.chain.flange_T_tcp[:3, 3]
@@ -135,7 +135,7 @@ OUTPUTS: dict[str, Output] = {
     "safety_mode": Output("INT32", lambda box: (box.safety,)),
     "actual_tool_accelerometer": Output("VECTOR3D", _nothing(3)),
     "speed_scaling": Output("DOUBLE", lambda box: (box.arm.fraction,)),
-    "target_speed_fraction": Output("DOUBLE", lambda box: (box.arm.slider,)),
+    "target_speed_fraction": Output("DOUBLE", _ambient(1.0)),
     "actual_momentum": Output("DOUBLE", _nothing(1)),
     "actual_main_voltage": Output("DOUBLE", _ambient(48.0)),
     "actual_robot_voltage": Output("DOUBLE", _ambient(48.0)),
@@ -144,12 +144,12 @@ OUTPUTS: dict[str, Output] = {
     "runtime_state": Output("UINT32", lambda box: (box.runtime,)),
     "standard_analog_input0": Output("DOUBLE", _nothing(1)),
     "standard_analog_input1": Output("DOUBLE", _nothing(1)),
-    "standard_analog_output0": Output("DOUBLE", lambda box: (box.analog_outputs[0],)),
-    "standard_analog_output1": Output("DOUBLE", lambda box: (box.analog_outputs[1],)),
+    "standard_analog_output0": Output("DOUBLE", _nothing(1)),
+    "standard_analog_output1": Output("DOUBLE", _nothing(1)),
     "robot_status_bits": Output("UINT32", _robot_status),
     "safety_status_bits": Output("UINT32", lambda box: (box.safety.status_bits,)),
-    "payload": Output("DOUBLE", lambda box: (box.payload[0],)),
-    "payload_cog": Output("VECTOR3D", lambda box: box.payload[1].tolist()),
+    "payload": Output("DOUBLE", _nothing(1)),
+    "payload_cog": Output("VECTOR3D", _nothing(3)),
     "payload_inertia": _STILL,
     "output_bit_registers0_to_31": Output("UINT32", lambda box: (0,)),
     "output_bit_registers32_to_63": Output("UINT32", lambda box: (0,)),
@@ -160,7 +160,7 @@ OUTPUTS: dict[str, Output] = {
 
 
 def write_inputs(box: URController, values: dict[str, float]) -> None:
-    """Apply one input package: registers, outputs, the speed slider."""
+    """Do what one input package says: registers and digital outputs; no more is imitated."""
     for name, value in values.items():
         group, _, number = name.rpartition("_")
         if group == "input_int_register":
@@ -171,11 +171,6 @@ def write_inputs(box: URController, values: dict[str, float]) -> None:
             mask = int(values.get(f"{name}_mask", 0)) << DIGITAL_SHIFTS[name]
             bits = int(value) << DIGITAL_SHIFTS[name]
             box.digital_outputs = (box.digital_outputs & ~mask) | (bits & mask)
-        elif group == "standard_analog_output" and number in "01":
-            if int(values.get("standard_analog_output_mask", 0)) >> int(number) & 1:
-                box.analog_outputs[int(number)] = value
-        elif name == "speed_slider_fraction" and values.get("speed_slider_mask"):
-            box.arm.slider = min(max(value, 0.0), 1.0)
 
 
 PORT = 30004

@@ -1,72 +1,120 @@
-"""The registers of ur_rtde's control script, and the state its threads share."""
+"""ur_rtde's control script, done natively: it takes commands from the input registers.
+
+Commands are numbers of ur_rtde 1.6. Those that the project's driver gives are here; any other is
+noted, answered as done and has no effect.
+"""
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from functools import partial
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from flangeye.types import Floats
-from flangeye_emulators.controllers.arm import ForceMode
-from flangeye_emulators.controllers.ur.controller import URController
-from flangeye_emulators.controllers.ur.program import Program, Thread
-
-CONTROL_SCRIPT = "rtde_control"
-"""Name of the program that ur_rtde uploads to take its commands."""
-
-_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-
-_MOVE = re.compile(
-    rf"\b(move[jlp])\((p?)\[([^\]]+)\]((?:,\s*[avr]={_NUMBER})*)\)",
-)
+from flangeye_emulators.controllers.motion import Travel, joint_move, linear_move
+from flangeye_emulators.controllers.mover import Mover
+from flangeye_emulators.controllers.poses import pose_matrix, pose_vector
+from flangeye_emulators.controllers.ur.controller import RefusedError, URController
 
 
-class ControlScript(Program):
-    """The control script as its commands see it: arguments, answers, progress, threads.
+class ControlScript:
+    """The script, cycle by cycle."""
 
-    Attributes:
-        box: The controller it runs on.
-        path: Moves that were written into the script.
-        orders: What the threads of the script are to do.
-        internal: A command the script gives itself while the client gives none.
-    """
+    # What the first register tells the client
+    ready: ClassVar[int] = 1
+    done: ClassVar[int] = 2
 
-    def __init__(self, box: URController, offset: int, path: Sequence[Move]) -> None:
+    def __init__(self, box: URController, offset: int) -> None:
         """Run on ``box``; ``offset`` is 24 for a client that uses the upper registers."""
-        super().__init__(box.arm)
-        self.box, self.path, self.offset = box, path, offset
-        self.orders = Orders()
-        self.internal = 0
+        self._box, self._mover, self._offset = box, Mover(box.arm), offset
+        self._begun = self._waits = self._in_background = False
         self._writes = self._operation = 0
+        self._show_progress(None)
+        self._signal(self.ready)
 
-    def integer(self, index: int) -> int:
+    def cycle(self) -> bool:
+        """Do what the client asks for; return whether the script goes on."""
+        code = self._integer(0)
+        if code == 255:  # stop script
+            return False
+        if code == 0:
+            self._begun = False
+            self._signal(self.ready)
+        elif code == 10:  # speedL, given anew in every cycle: the twist is kept until it is stopped
+            self._mover.go_on(self._numbers(0), self._number(6), math.inf)
+            self._signal(self.ready)
+        elif not self._begun:
+            self._box.note(f"command {code}")
+            self._begun, self._waits = True, self._act(code)
+        if self._in_background and not self._mover.busy:
+            self._in_background = False
+            self._show_progress(None)
+        if self._begun and not (self._waits and self._mover.busy):
+            self._signal(self.done)
+        self._mover.drive()
+        return True
+
+    def _act(self, code: int) -> bool:
+        """Do one command; return whether it is done only when the arm rests."""
+        arm = self._box.arm
+        if code in (1, 3):  # moveJ, moveL
+            self._mover.halt()
+            given = self._numbers(0), self._number(6), self._number(7)
+            self._mover.append(partial(self._move, code, *given))
+            return self._client_waits()
+        if code in (33, 34):  # stopL, stopJ: the script stops in joint angles for both
+            self._mover.halt(self._number(0), in_space=False)
+            return self._client_waits()
+        if code == 15:  # speedStop
+            self._mover.halt(self._number(0))
+            return True
+        if code == 29:  # setTcp
+            arm.set_tool(pose_matrix(self._numbers(0)))
+        elif code == 35:  # setWatchdog [Hz]
+            self._box.set_watchdog(self._offset, self._number(0))
+        elif code == 40:  # getTCPOffset
+            tool = pose_vector(arm.chain.flange_T_tcp).tolist()
+            self._box.registers.output_double[self._offset : self._offset + 6] = tool
+        else:
+            self._box.note(f"command {code} is not simulated")
+        return False
+
+    def _move(self, code: int, target: Floats, speed: float, acceleration: float) -> Travel:
+        """Return a move to joint angles, or straight to a pose, from where the arm stands."""
+        stance = self._box.arm.stance
+        if code == 3:
+            return linear_move(stance.base_T_tcp, pose_matrix(target), speed, acceleration)
+        # No joint turns faster than it can
+        way = np.abs(target - stance.joints)
+        fastest = np.min(self._box.arm.speed_limits * way.max() / np.maximum(way, 1e-300))
+        return joint_move(stance.joints, target, min(speed, float(fastest)), acceleration)
+
+    def _client_waits(self) -> bool:
+        """Return whether the client waits for the end; if not, its progress is shown."""
+        self._in_background = self._integer(1) == 1
+        self._show_progress(0 if self._in_background else None)
+        return not self._in_background
+
+    def _integer(self, index: int) -> int:
         """Return an integer argument; 0 is the command itself."""
-        return self.box.registers.input_int[self.offset + index]
+        return self._box.registers.input_int[self._offset + index]
 
-    def number(self, index: int) -> float:
-        """Return a float argument."""
-        return self.box.registers.input_double[self.offset + index]
+    def _number(self, index: int) -> float:
+        return self._box.registers.input_double[self._offset + index]
 
-    def numbers(self, index: int, count: int = 6) -> Floats:
-        """Return float arguments (count,), from ``index`` on."""
-        first = self.offset + index
-        return np.array(self.box.registers.input_double[first : first + count])
+    def _numbers(self, index: int) -> Floats:
+        """Return six float arguments, from ``index`` on."""
+        first = self._offset + index
+        return np.array(self._box.registers.input_double[first : first + 6])
 
-    def give_integer(self, value: int) -> None:
-        """Answer with an integer."""
-        # The third register of the script's own reports progress.
-        self.box.registers.output_int[self.offset + 1] = int(value)
+    def _signal(self, state: int) -> None:
+        self._box.registers.output_int[self._offset] = state
 
-    def give_numbers(self, values: Floats) -> None:
-        """Answer with floats (count,)."""
-        for i, value in enumerate(values.tolist()):
-            self.box.registers.output_double[self.offset + i] = value
-
-    def show_progress(self, value: int | None) -> None:
-        """Set the progress register of a background operation; None if none runs.
+    def _show_progress(self, value: int | None) -> None:
+        """Show how far an operation in the background is; None when there is none.
 
         Bits 0-14 the progress, 15 whether one runs, 16-22 a count of writes, 24-30 of operations.
         """
@@ -75,81 +123,8 @@ class ControlScript(Program):
             self._operation = (self._operation + 1) % 128
         word = self._writes << 16 | self._operation << 24
         if value is not None:
-            word |= 1 << 15 | min(value, 0x7FFF)
-        self.box.registers.output_int[self.offset + 2] = word
-
-    def in_background(self, operation: Thread) -> Thread:
-        """Wrap a thread so that its progress shows."""
-        self.show_progress(0)
-        yield from operation
-        self.show_progress(None)
-
-    def abandon_move(self) -> None:
-        """Kill the move in the background, if there is one."""
-        if self.kill("move"):
-            self.show_progress(None)
-
-
-@dataclass
-class SpeedOrder:
-    """A velocity to keep: a twist (6,) in base, or joint speeds (6,)."""
-
-    in_space: bool
-    target: Floats
-    acceleration: float
-
-
-@dataclass
-class ServoOrder:
-    """Joint angles (6,) to follow."""
-
-    target: Floats
-    lookahead: float
-    gain: float
-
-
-@dataclass
-class Orders:
-    """Latest commands for the threads of the script.
-
-    Attributes:
-        speed: For the speed thread.
-        servo: For the servo thread.
-        force: For the force thread.
-        force_gain: Scales the force mode's speed; the script starts with a half.
-        stops_in_space: Which stop a plain stop command makes. The script looks at what the last
-            stop in the background was, not at the command: joints until there was one.
-        contact_steps: Cycles since the contact that the contact thread found; 0 for none.
-    """
-
-    speed: SpeedOrder | None = None
-    servo: ServoOrder | None = None
-    force: ForceMode | None = None
-    force_gain: float = 0.5
-    stops_in_space: bool = False
-    contact_steps: int = 0
-    jog_axes: Floats = field(default_factory=lambda: np.eye(3))
-
-
-@dataclass(frozen=True, eq=False)
-class Move:
-    """One ``movej``, ``movel`` or ``movep``.
-
-    Attributes:
-        kind: ``movej``, ``movel`` or ``movep``.
-        is_pose: Whether the target is a pose (6,), or joint angles (6,).
-        target: (6,)
-        acceleration: [m/s^2], or [rad/s^2].
-        speed: [m/s], or [rad/s].
-        blend: Radius [m], or [rad].
-    """
-
-    kind: str
-    is_pose: bool
-    target: Floats
-    acceleration: float
-    speed: float
-    blend: float
+            word |= 1 << 15 | value
+        self._box.registers.output_int[self._offset + 2] = word
 
 
 class ScriptSource(NamedTuple):
@@ -169,39 +144,14 @@ def take_program(text: str) -> tuple[ScriptSource | None, str]:
     return ScriptSource(begins[1], text[begins.start() : ends.end()]), text[ends.end() :]
 
 
-def register_offset(program: str) -> int:
-    """Return the first register the control script uses: 0, or 24."""
-    found = re.search(r"reg_offset_int = # int register offset\s*(\d+)", program)
-    return int(found[1]) if found else 0
-
-
-def injected_path(program: str) -> list[Move]:
-    """Return the moves that ur_rtde wrote into its control script; empty without any."""
-    _, begins, rest = program.partition("# inject move path\n")
-    if not begins:
-        return []
-    body = re.split(r"^\s*end\b", rest, maxsplit=1, flags=re.M)[0]
-    return [parse_move(found) for found in _MOVE.finditer(body)]
-
-
-def find_move(line: str) -> Move | None:
-    """Return the move a line makes, if it is one."""
-    found = _MOVE.fullmatch(line.strip())
-    return parse_move(found) if found else None
-
-
-def parse_move(found: re.Match[str]) -> Move:
-    """Return a parsed move, with URScript's defaults for what it omits."""
-    kind, is_pose, target, options = found.groups()
-    joint = kind == "movej"
-    given = {
-        name: float(value) for name, value in re.compile(rf"([avr])=({_NUMBER})").findall(options)
-    }
-    return Move(
-        kind=kind,
-        is_pose=bool(is_pose),
-        target=np.array([float(number) for number in target.split(",")]),
-        acceleration=given.get("a", 1.4 if joint else 1.2),
-        speed=given.get("v", 1.05 if joint else 0.25),
-        blend=given.get("r", 0.0),
-    )
+def run_program(box: URController, source: ScriptSource) -> None:
+    """Run the control script; a controller that is not ready ignores it, as the robot does."""
+    if source.name != "rtde_control":
+        box.note(f"program {source.name} is not simulated")
+        return
+    # The first register it uses: 0, or 24
+    offset = re.search(r"reg_offset_int = # int register offset\s*(\d+)", source.text)
+    try:
+        box.load(ControlScript(box, int(offset[1]) if offset else 0).cycle, source.name)
+    except RefusedError as error:
+        box.note(f"program {source.name} ignored: {error}")
