@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from flangeye.maths.frame_graph import Frame
 from flangeye.maths.geometry import (
     hat,
     invert,
@@ -18,7 +19,7 @@ from flangeye.maths.geometry import (
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.streams import joints_at, passed, pose_at, with_joints
 from flangeye.models.cell import cell_of
-from flangeye.models.configuration import ORIGIN, Configuration, carriers_of
+from flangeye.models.configuration import ORIGIN, Configuration
 from flangeye.models.loading import load_model
 from flangeye.models.robots import RobotModel
 from flangeye.types import (
@@ -117,8 +118,11 @@ def session(
     seen = rigid(rotation_from_rpy(np.pi, 0, 0), np.array([0.0, 0.0, 0.6]))
     # Carriers as reported; the place left over closes the loop at the first pose.
     bare = [_observation(i, None, first, joints, second, configuration) for i in range(n)]
-    carriers = carriers_of(configuration, bare, Arm(ROBOT))
-    a, b, y = carriers.camera, carriers.target, np.eye(4)
+    frames = cell_of(configuration, ROBOT, ROBOT).graph(bare)
+    still = Frame(BASE, np.tile(np.eye(4), (n, 1, 1)))
+    carriers = (configuration.camera, configuration.target)
+    a, b = (np.asarray(frames.get(x, still).place) for x in carriers)
+    y = np.eye(4)
     if configuration.other_base:
         z = rigid(rotation(rng), rng.normal(0, 0.05, 3)) if z is None else z
         y = a[0] @ x @ seen @ invert(b[0] @ z)

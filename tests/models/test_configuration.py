@@ -12,7 +12,8 @@ from flangeye.errors import RecipeError
 from flangeye.log.read import read_run
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.maths.kinematics import Arm
-from flangeye.models.configuration import EVERY, Configuration, carriers_of, mapped_and_expected
+from flangeye.models.cell import cell_of
+from flangeye.models.configuration import EVERY, Configuration, mapped_and_expected
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import parse_recipe
@@ -235,30 +236,31 @@ def test_the_loop_closes_for_two_arms() -> None:
     target = first.base_T_flange.matrix @ x @ first.feature.camera_T_target.matrix
     second = Transform(BASE2, FLANGE2, np.linalg.inv(y) @ target @ np.linalg.inv(z))
     pair = [replace(first, poses=by_frame(first.base_T_flange, second))]
-    mapped, expected = mapped_and_expected(configuration.ends(transforms, pair), pair)
+    mapped, expected = mapped_and_expected(
+        cell_of(configuration, None).ends(transforms, pair), pair
+    )
     assert np.allclose(mapped, expected, atol=1e-12)
 
 
 def test_a_missing_second_pose_is_named() -> None:
     with pytest.raises(StageError) as error:
-        carriers_of(Configuration("two-arms", FLANGE, FLANGE2), [observation()], None)
+        cell_of(Configuration("two-arms", FLANGE, FLANGE2), None).graph([observation()])
     assert str(error.value) == (
-        "observation 7 has no pose of the second arm (base2_T_flange2), which the configuration "
-        "two-arms needs"
+        "observation 7 has no pose of 'flange2', which moves in this cell; it has flange"
     )
 
 
 def test_a_link_is_where_its_joints_put_it(registry: Any) -> None:
-    arm = Arm(recipe(registry, "{}").context[RobotModel])
+    robot = recipe(registry, "{}").context[RobotModel]
     configuration = Configuration("eye-on-arm", "link3", FLANGE, None)
     joints = np.linspace(-1, 1, 6)
-    carriers = carriers_of(configuration, [observation(joints=joints)], arm)
-    assert np.allclose(carriers.camera[0], arm.frames(joints)[3])
+    link = cell_of(configuration, robot).graph([observation(joints=joints)])["link3"]
+    assert np.allclose(link.place[0], Arm(robot).frames(joints)[3])  # type: ignore[index]
     with pytest.raises(StageError) as error:
-        carriers_of(configuration, [observation()], arm)
+        cell_of(configuration, robot).graph([observation()])
     assert str(error.value) == (
-        "where link3 was at observation 7 follows from the joint angles, and there are none: "
-        "record them, and name the robot's model in the recipe"
+        "where link3 was at observation 7 follows from the joint angles of 'flange', and there "
+        "are none: record them, and name the robot's model in the recipe"
     )
 
 

@@ -1,27 +1,21 @@
 """What a run came to: whose layout its truth is compared in."""
 
-from types import SimpleNamespace
 from typing import Any
 
-import pytest
-
-from flangeye.models.cell import Cell
+from flangeye.models.cell import Cell, cell_in, cell_of
 from flangeye.models.configuration import DEFAULT, Configuration
 from flangeye.models.loading import load_model
 from flangeye.models.robots import RobotModel
-from flangeye.run.outcome import _robots
-
-CELL, HAND = object(), Configuration(camera="flange")
+from flangeye.types import BASE, CAMERA, FLANGE
 
 
-@pytest.mark.parametrize(
-    ("given", "layout"),
-    [({}, DEFAULT), ({Configuration: HAND}, HAND), ({Cell: CELL}, CELL)],
-)
-def test_the_layout_is_the_cells_else_the_configurations_else_a_camera_beside_an_arm(
-    given: dict[Any, Any], layout: Any
-) -> None:
-    recipe: Any = SimpleNamespace(context=given)
-    assert _robots(recipe) == (layout, None)
-    recipe.context = {**given, RobotModel: load_model("robots", "ur5")}
-    assert _robots(recipe)[1] is not None
+def test_the_layout_is_the_cells_else_the_configurations_else_a_camera_beside_an_arm() -> None:
+    given: dict[Any, Any] = {}
+    assert cell_in(given).frames[CAMERA].parent == BASE
+    given[Configuration] = Configuration(camera=FLANGE)
+    assert cell_in(given).frames[CAMERA].parent == FLANGE
+    assert not cell_in(given).arms
+    given[RobotModel] = load_model("robots", "ur5")
+    assert cell_in(given).arms == {FLANGE: given[RobotModel]}
+    given[Cell] = cell_of(DEFAULT, None)
+    assert cell_in(given) is given[Cell]

@@ -31,9 +31,8 @@ from flangeye.files.recording import Archive, NotThisLayout, Recording, check_id
 from flangeye.files.yaml_lines import parse_yaml
 from flangeye.log.read import RunLog, is_log, log_of, read_run
 from flangeye.maths.geometry import rigid
-from flangeye.maths.kinematics import Arm
-from flangeye.models.cell import Cell
-from flangeye.models.configuration import DEFAULT, LINK, Configuration, carriers_of
+from flangeye.models.cell import Cell, cell_of
+from flangeye.models.configuration import DEFAULT, LINK, Configuration
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerData
 from flangeye.plugin.registry import Registry
@@ -55,7 +54,7 @@ class State(NamedTuple):
 def in_configuration(
     session: RecordedSession,
     configuration: Configuration,
-    arm: Arm | None,
+    robot: RobotModel | None,
     states: Mapping[str, State],
 ) -> RecordedSession:
     """Add the configuration: who carries camera and target, and where the target is mounted.
@@ -63,7 +62,7 @@ def in_configuration(
     Args:
         session: The session of one arm beside its camera, as far as is known.
         configuration: Says otherwise.
-        arm: The arm's kinematics, where a link carries the camera.
+        robot: The arm, where a link carries the camera.
         states: What else was recorded, by the samples' ids.
 
     Raises:
@@ -82,9 +81,11 @@ def in_configuration(
     links = seconds = None
     if LINK in configuration.camera or configuration.other_base:
         bare = [_bare(session, i, states) for i in range(len(session))]
-        carriers = carriers_of(configuration, bare, arm)
-        links = None if configuration.other_base else carriers.camera
-        seconds = carriers.target if configuration.other_base else None
+        frames = cell_of(configuration, robot).graph(bare)
+        if configuration.other_base:
+            seconds = frames[t.FLANGE2].place
+        else:
+            links = frames[configuration.camera].place
     places = session.places if known is not None else np.full_like(session.places, np.nan)
     return replace(
         session,
@@ -364,9 +365,8 @@ def _as_recipe(
     reach = session.reach if scanner is None else scanner.range
     reader = _written(getattr(first.params, "reader", None))
     configuration: Configuration = recipe.context.get(Configuration) or DEFAULT
-    arm = Arm(robot) if robot else None
     return replace(
-        in_configuration(session, configuration, arm, states),
+        in_configuration(session, configuration, robot, states),
         reach=reach,
         limit=_limit(recipe),
         marks_open=any(getattr(s.params, "unobservable", None) == "mark" for s in recipe.steps),

@@ -10,15 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
 from flangeye.errors import StageError
 from flangeye.maths.frame_graph import Frame, chain, composed
 from flangeye.maths.geometry import rigid, rotation_exp
-from flangeye.models.configuration import LINK, Configuration, Ends
-from flangeye.models.robots import RobotModel
+from flangeye.models.configuration import DEFAULT, LINK, Configuration, Ends
+from flangeye.models.robots import RobotModel, SecondRobot
 from flangeye.types import (
     BASE,
     BASE2,
@@ -34,9 +34,6 @@ from flangeye.types import (
     Observation,
     Transform,
 )
-
-if TYPE_CHECKING:
-    from flangeye.maths.kinematics import Arm
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,8 +100,6 @@ class Cell:
     cameras: tuple[str, ...]
     targets: tuple[str, ...]
     links: Mapping[str, Link] = field(default_factory=dict)
-
-    is_default = False
 
     @property
     def measured(self) -> tuple[str, ...]:
@@ -203,7 +198,7 @@ class Cell:
         found = {x.child: x.matrix for x in (transforms or {}).values()}
         measured = {name: _measured(name, observations) for name in self.movers}
         links = {
-            name: self.link_poses(name, _joints(name, link, observations))
+            name: self.link_poses(name, self._joints(name, link, observations))
             for name, link in self.links.items()
         }
         places = found | measured | links
@@ -212,10 +207,26 @@ class Cell:
             for name, frame in self.frames.items()
         }
 
+    def _joints(self, name: str, link: Link, observations: Sequence[Observation]) -> Floats:
+        joints = [joints_of(o, link.arm) for o in observations]
+        arm = self.arms.get(link.arm)
+        for observation, each in zip(observations, joints, strict=True):
+            if each is None or arm is None or len(each) != len(arm.joints):
+                raise StageError(
+                    f"where {name} was at observation {observation.id} follows from the joint "
+                    f"angles of '{link.arm}', and there are none: record them, and name the "
+                    "robot's model in the recipe"
+                )
+        return np.array(joints)
+
     def corrected(
-        self, observations: Sequence[Observation], calibration: HandEye, arm: Arm | None = None
+        self, observations: Sequence[Observation], calibration: HandEye
     ) -> list[Observation]:
-        """Return observations with the flanges where corrected arms have them; see ``Layout``."""
+        """Return observations with every flange where a calibration's correction has it.
+
+        What the calibration found of all poses alike comes off what was seen. Without a
+        correction they are the observations as they are.
+        """
         from flangeye.maths.arm_correction import corrected_observation
         from flangeye.maths.kinematics import Arm
         from flangeye.maths.statistics import without_shared
@@ -229,12 +240,17 @@ class Cell:
         return moved
 
     def ends(
-        self,
-        transforms: Mapping[str, Transform],
-        observations: Sequence[Observation],
-        arm: Arm | None = None,
+        self, transforms: Mapping[str, Transform], observations: Sequence[Observation]
     ) -> Ends:
-        """Return where camera and target of each observation are; see ``Layout``."""
+        """Return where camera and target of each observation are.
+
+        Args:
+            transforms: The unknowns, by name.
+            observations: Their poses must already be corrected.
+
+        Raises:
+            StageError: A carrier's pose is missing.
+        """
         frames = self.graph(observations, transforms)
         return Ends(
             _of_each(frames, [o.camera for o in observations]),
@@ -283,17 +299,6 @@ def _measured(name: str, observations: Sequence[Observation]) -> Floats:
     return np.array([o.poses[name].matrix for o in observations]).reshape(-1, 4, 4)
 
 
-def _joints(name: str, link: Link, observations: Sequence[Observation]) -> Floats:
-    joints = [joints_of(o, link.arm) for o in observations]
-    for observation, each in zip(observations, joints, strict=True):
-        if each is None:
-            raise StageError(
-                f"where {name} was at observation {observation.id} follows from the joint angles "
-                f"of '{link.arm}', and there are none: record them"
-            )
-    return np.array(joints)
-
-
 def joints_of(observation: Observation, arm: str) -> Array | None:
     """Return the (n,) joint angles of an arm at an observation [rad]; None if not recorded."""
     own = observation.joints if arm == FLANGE else None
@@ -322,6 +327,14 @@ def cell_of(
         number = int(configuration.camera.removeprefix(LINK))
         links[configuration.camera] = Link(FLANGE, number)
     return Cell(frames, movers, (CAMERA,), (TARGET,), links)
+
+
+def cell_in(context: Mapping[Any, Any]) -> Cell:
+    """Return the cell of a recipe's context: its own, or that of its configuration."""
+    configuration, second = context.get(Configuration), context.get(SecondRobot)
+    return context.get(Cell) or cell_of(
+        configuration or DEFAULT, context.get(RobotModel), second.model if second else None
+    )
 
 
 def _of_each(frames: Mapping[str, Frame], names: Sequence[str]) -> Floats:

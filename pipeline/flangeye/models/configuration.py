@@ -16,11 +16,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from flangeye.errors import StageError
 from flangeye.maths.geometry import each_applied, rigid, rotation_from_rpy
 from flangeye.types import (
     BASE,
@@ -30,13 +28,8 @@ from flangeye.types import (
     FLANGE2,
     TARGET,
     Floats,
-    HandEye,
     Observation,
-    Transform,
 )
-
-if TYPE_CHECKING:
-    from flangeye.maths.kinematics import Arm
 
 LINK = "link"
 
@@ -114,32 +107,6 @@ class Configuration:
         """Return one line: the name, the loop and what is unknown in it."""
         return f"{self.name}: {self.equation}; to be found: {', '.join(self.unknowns)}"
 
-    def corrected(
-        self, observations: Sequence[Observation], calibration: HandEye, arm: Arm | None = None
-    ) -> list[Observation]:
-        """Return observations as the calibration corrects them; see :class:`Layout`."""
-        from flangeye.maths.arm_correction import corrected_observation
-        from flangeye.maths.statistics import without_shared
-
-        found, correction = calibration.shared, calibration.correction
-        seen = [without_shared(o, found) for o in observations]
-        return [corrected_observation(o, correction, arm) for o in seen]
-
-    def ends(
-        self,
-        transforms: Mapping[str, Transform],
-        observations: Sequence[Observation],
-        arm: Arm | None = None,
-    ) -> Ends:
-        """Return where camera and target of each observation are; see :class:`Layout`."""
-        carriers = carriers_of(self, observations, arm)
-        camera, target = carriers.camera @ transforms[self.unknowns[0]].matrix, carriers.target
-        if self.other_base:
-            target = transforms[self.other_base].matrix @ target
-        placed = self.place
-        place = transforms[f"{self.target}_T_{TARGET}"].matrix if placed is None else placed
-        return Ends(camera, target @ place)
-
 
 DEFAULT = Configuration(stands=ORIGIN)
 """A camera beside the robot that looks at the flange's own circle."""
@@ -148,64 +115,6 @@ DEFAULT = Configuration(stands=ORIGIN)
 def _pose_of(carrier: str) -> str | None:
     bases = {BASE: None, FLANGE2: f"{BASE2}_T_{FLANGE2}"}
     return bases.get(carrier, f"{BASE}_T_{carrier}")
-
-
-@dataclass(frozen=True, eq=False)
-class Carriers:
-    """The controllers' poses at N observations.
-
-    Attributes:
-        camera: (N, 4, 4) base_T_camera_carrier.
-        target: (N, 4, 4) pose of the frame that carries the target, in its own arm's base.
-    """
-
-    camera: Floats
-    target: Floats
-
-
-def carriers_of(
-    configuration: Configuration, observations: Sequence[Observation], arm: Arm | None
-) -> Carriers:
-    """Return where the controllers say that camera and target were carried.
-
-    Args:
-        configuration: Says by which frames.
-        observations: N of them.
-        arm: The arm's kinematics; needed where a link carries the camera.
-
-    Raises:
-        StageError: An observation lacks the second arm's pose, or the joints a link's follows
-            from.
-    """
-    return Carriers(
-        np.array([_carried(configuration.camera, o, arm) for o in observations]),
-        np.array([_carried(configuration.target, o, arm) for o in observations]),
-    )
-
-
-def _carried(frame: str, observation: Observation, arm: Arm | None) -> Floats:
-    if frame == BASE:
-        return np.eye(4)
-    if frame == FLANGE:
-        return observation.base_T_flange.matrix
-    if frame == FLANGE2:
-        if FLANGE2 not in observation.poses:
-            raise StageError(
-                f"observation {observation.id} has no pose of the second arm (base2_T_flange2), "
-                "which the configuration two-arms needs"
-            )
-        return observation.poses[FLANGE2].matrix
-    return _link(frame, observation, arm)
-
-
-def _link(frame: str, observation: Observation, arm: Arm | None) -> Floats:
-    index = int(frame.removeprefix(LINK))
-    if arm is None or observation.joints is None or len(observation.joints) != arm.n:
-        raise StageError(
-            f"where {frame} was at observation {observation.id} follows from the joint angles, "
-            "and there are none: record them, and name the robot's model in the recipe"
-        )
-    return np.asarray(arm.frames(observation.joints)[index])
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,44 +128,6 @@ class Ends:
 
     camera: Floats
     target: Floats
-
-
-class Layout(Protocol):
-    """A :class:`Configuration`, or a cell of many cameras and targets."""
-
-    @property
-    def is_default(self) -> bool:
-        """Whether it is a camera beside the robot that looks at the flange's own circle."""
-        ...
-
-    def corrected(
-        self, observations: Sequence[Observation], calibration: HandEye, arm: Arm | None = None
-    ) -> list[Observation]:
-        """Return observations with every flange where a calibration's correction has it.
-
-        What was seen is rid of the errors that the calibration found all features to share.
-
-        Args:
-            observations: N of them.
-            calibration: With what it found wrong.
-            arm: The arm's kinematics, where the recipe has one arm.
-        """
-        ...
-
-    def ends(
-        self,
-        transforms: Mapping[str, Transform],
-        observations: Sequence[Observation],
-        arm: Arm | None = None,
-    ) -> Ends:
-        """Return where camera and target of each observation are.
-
-        Args:
-            transforms: The unknowns, found, by name.
-            observations: N of them.
-            arm: The arm's kinematics; needed where a link carries the camera.
-        """
-        ...
 
 
 def looks_exchanged(carried: float, standing: float) -> bool:

@@ -9,12 +9,8 @@ import numpy as np
 
 from flangeye import types as t
 from flangeye.maths.geometry import rotation_log
-from flangeye.maths.kinematics import Arm
-from flangeye.models.configuration import (
-    DEFAULT,
-    Layout,
-    mapped_and_expected,
-)
+from flangeye.models.cell import Cell
+from flangeye.models.configuration import mapped_and_expected
 from flangeye.result.contract import (
     AnswerResult,
     AnswersResult,
@@ -31,8 +27,6 @@ from flangeye.result.contract import (
     WarningResult,
     WorkspaceResult,
 )
-
-Robots = tuple[Layout, Arm | None]
 
 
 def transforms_result(calibration: t.HandEye | None) -> dict[str, TransformResult]:
@@ -206,7 +200,7 @@ def workspace_result(box: t.Box) -> WorkspaceResult:
 
 
 def truth_result(
-    calibration: t.HandEye, truth: t.Truth, box: t.Box, robots: Robots = (DEFAULT, None)
+    calibration: t.HandEye, truth: t.Truth, box: t.Box, cell: Cell | None = None
 ) -> TruthResult:
     """Return the mapping error of the estimate over the workspace, against the truth.
 
@@ -216,7 +210,7 @@ def truth_result(
         calibration: The estimate.
         truth: What the simulation knows.
         box: The workspace.
-        robots: What stands on what, and the kinematics of the arm whose error was corrected.
+        cell: What stands on what; needed where truth has poses that took no part.
     """
     error = calibration.camera.transform.matrix @ truth.camera.inverse().matrix
     known = {x.name: x for x in (truth.camera, *truth.others)}
@@ -229,21 +223,20 @@ def truth_result(
         error_at_centroid=float(_displacement(error, box.centre, free)),
         rms_over_workspace=float(np.sqrt((_displacement(error, box.grid(), free) ** 2).mean())),
         rotation_error=float(np.linalg.norm(rotation_log(error[:3, :3]))),
-        at_work=_at_work(calibration.as_reported(), truth.unseen, robots),
-        at_work_corrected=_at_work(calibration.as_corrected(), truth.unseen, robots),
+        at_work=_at_work(calibration.as_reported(), truth.unseen, cell),
+        at_work_corrected=_at_work(calibration.as_corrected(), truth.unseen, cell),
     )
 
 
 def _at_work(
-    calibration: t.HandEye | None, unseen: Sequence[t.Observation], robots: Robots
+    calibration: t.HandEye | None, unseen: Sequence[t.Observation], cell: Cell | None
 ) -> float | None:
     """Return the rms distance of what is seen from where the (corrected) arm has it [m]."""
-    if calibration is None or not unseen:
+    if calibration is None or cell is None or not unseen:
         return None
-    layout, arm = robots
-    corrected = layout.corrected(unseen, calibration, arm)
+    corrected = cell.corrected(unseen, calibration)
     transforms = {name: x.transform for name, x in calibration.transforms.items()}
-    mapped, expected = mapped_and_expected(layout.ends(transforms, corrected, arm), corrected)
+    mapped, expected = mapped_and_expected(cell.ends(transforms, corrected), corrected)
     return float(np.sqrt(((mapped - expected) ** 2).sum(axis=1).mean()))
 
 

@@ -13,10 +13,7 @@ import numpy as np
 
 from flangeye import result as r
 from flangeye import types as t
-from flangeye.maths.kinematics import Arm
-from flangeye.models.cell import Cell
-from flangeye.models.configuration import DEFAULT, Configuration, Layout
-from flangeye.models.robots import RobotModel
+from flangeye.models.cell import cell_in
 from flangeye.models.workspace import work_of
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import Recipe
@@ -116,16 +113,9 @@ def result_of(
         result.method = calibration.method
         result.workspace = r.workspace_result(box)
         if truth := truths.cell:
-            result.truth = r.truth_result(calibration, truth, box, _robots(recipe))
+            result.truth = r.truth_result(calibration, truth, box, cell_in(recipe.context))
     result.warnings += r.standing_warnings(result)
     return result
-
-
-def _robots(recipe: Recipe) -> tuple[Layout, Arm | None]:
-    given = recipe.context
-    robot = given.get(RobotModel)
-    layout = given.get(Cell) or given.get(Configuration) or DEFAULT
-    return layout, Arm(robot) if robot else None
 
 
 def _timing(watch: Stopwatch) -> dict[str, r.StageTiming]:

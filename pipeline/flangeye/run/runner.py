@@ -20,9 +20,8 @@ import pluggy
 from flangeye import types as t
 from flangeye.devices import MotionAllowed
 from flangeye.errors import CalibrationRefused, FlangeyeError, NothingSeen, StageError
-from flangeye.models.cell import Cell, cell_of
-from flangeye.models.configuration import CELL, DEFAULT, Configuration
-from flangeye.models.robots import RobotModel, SecondRobot
+from flangeye.models.cell import cell_in
+from flangeye.models.configuration import CELL
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import Recipe
@@ -304,11 +303,7 @@ class Runner:
         """Return it with what the model says, where its solver states no error at the work."""
         from flangeye.estimation.calibrate import with_expected_error
 
-        given = self._values.get
-        second = given(SecondRobot)
-        cell = given(Cell) or cell_of(
-            given(Configuration) or DEFAULT, given(RobotModel), second and second.model
-        )
+        cell, given = cell_in(self._values), self._values.get
         return with_expected_error(found, cell, given(ScannerModel), given(t.Box))
 
     def _once(self, step: Step) -> Any:
