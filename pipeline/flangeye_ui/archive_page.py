@@ -12,7 +12,8 @@ from nicegui import ui
 
 from flangeye.errors import FlangeyeError
 from flangeye.report.units import millimetres
-from flangeye.result import Result, status_of
+from flangeye.result import status_of
+from flangeye.result.contract import Result
 from flangeye_ui.charts import FAINT, USED
 from flangeye_ui.foreign import address_of
 from flangeye_ui.layout import command_line, mistake, page

@@ -24,7 +24,7 @@ from flangeye.report.look import SERIES
 from flangeye.report.still import scene_of
 from flangeye.report.summary import banner_of, transform_text
 from flangeye.report.units import rounded_mm
-from flangeye.result import expected_error
+from flangeye.result.sections import expected_error
 from flangeye.run.outlook import Outlook, outlook_of_log
 from flangeye.types import HandEye
 from flangeye.units import parse_quantity

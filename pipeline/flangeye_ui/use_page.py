@@ -9,7 +9,6 @@ from pathlib import Path
 
 from nicegui import ui
 
-from flangeye import result as r
 from flangeye.errors import FlangeyeError
 from flangeye.files.regular import write_whole
 from flangeye.models.configuration import CELL
@@ -17,6 +16,8 @@ from flangeye.plugin.stage import Stage
 from flangeye.report.certificate import render
 from flangeye.report.certificate.budget import Conditions
 from flangeye.report.facts import Facts
+from flangeye.result import calibrated_pose
+from flangeye.result import contract as r
 from flangeye.types import ExportedFile
 from flangeye_ui.foreign import address_of
 from flangeye_ui.layout import ActionBar, code, command_line, mistake, page
@@ -203,7 +204,7 @@ def exported(result: r.Result, exports: Sequence[Stage]) -> dict[str, ExportedFi
     """
     if result.status not in ("verified", "unverified") or not result.transforms:
         return {}
-    pose = r.calibrated_pose(result)
+    pose = calibrated_pose(result)
     files: dict[str, ExportedFile] = {}
     for stage in exports:
         if pose.others and CELL not in stage.serves:

@@ -8,11 +8,11 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from flangeye import result as r
 from flangeye.cli import commands
 from flangeye.cli.app import GROUPS
 from flangeye.cli.console import wrapped, write
 from flangeye.cli.summary import RunProgress, print_refusal, print_summary
+from flangeye.result import contract as r
 from flangeye.types import Rejection, Source, Warn
 
 SCALE = {"text": "the target is 1.3 % larger than configured", "fix": "feature.size: 40.52 mm"}

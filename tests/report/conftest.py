@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye import result as r
 from flangeye import types as t
 from flangeye.log.read import RunLog, read_run
 from flangeye.log.record import Recorder
@@ -21,6 +20,8 @@ from flangeye.maths.geometry import (
     rigid,
     rotation_from_rpy,
 )
+from flangeye.result import contract as r
+from flangeye.result import sections
 
 RIM, BORE = 0.0305, 0.0164
 TRUTH = t.Transform(
@@ -206,17 +207,17 @@ def _result(
         status=status,
         refused=script.refused,
         method=calibration.method if calibration else None,
-        transforms=r.transforms_result(calibration),
-        observations=r.observations_result(pairs, rejections),
-        workspace=r.workspace_result(WORKSPACE) if calibration else None,
-        holdout=r.holdout_result(verifications),
+        transforms=sections.transforms_result(calibration),
+        observations=sections.observations_result(pairs, rejections),
+        workspace=sections.workspace_result(WORKSPACE) if calibration else None,
+        holdout=sections.holdout_result(verifications),
         verifications={
             k: r.VerificationResult(
                 passed=v.passed, reason=v.reason, figures=dict(v.figures), errors=dict(v.errors)
             )
             for k, v in verifications.items()
         },
-        truth=r.truth_result(calibration, t.Truth(TRUTH), WORKSPACE)
+        truth=sections.truth_result(calibration, t.Truth(TRUTH), WORKSPACE)
         if calibration and source.truth
         else None,
         timing={"2.fit.rim": r.StageTiming(seconds=0.36, calls=12)},

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from flangeye import result as r
 from flangeye import types as t
 from flangeye.cli.details import print_details
 from flangeye.log.read import read_run
@@ -17,7 +16,8 @@ from flangeye.log.record import Recorder
 from flangeye.report.facts import Facts
 from flangeye.report.page import render
 from flangeye.report.weld import seam_view
-from flangeye.result import seam_result
+from flangeye.result import contract as r
+from flangeye.result.sections import seam_result
 
 LINE = np.column_stack([np.linspace(0.5, 0.7, 41), np.zeros(41), np.full(41, 0.27)])
 SEAM = t.Seam(

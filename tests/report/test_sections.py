@@ -23,7 +23,7 @@ from flangeye.report.facts import facts_of, idle_of, set_aside_of, timings_of
 from flangeye.report.page import render
 from flangeye.report.summary import banner_of, evidence_of, next_steps_of, tiles_of, transform_text
 from flangeye.report.units import degrees, duration, millimetres
-from flangeye.result import StageTiming
+from flangeye.result.contract import StageTiming
 
 Make = Callable[..., RunLog]
 
@@ -65,7 +65,7 @@ def test_the_matrix_can_be_copied_and_read_back(make_run: Make) -> None:
 
 
 def test_the_matrix_in_words_and_other_units() -> None:
-    from flangeye.result import TransformResult
+    from flangeye.result.contract import TransformResult
 
     matrix = np.eye(4)
     matrix[:3, 3] = [0.1, -0.2, 1.0]

@@ -16,7 +16,7 @@ from flangeye.log.record import Recorder
 from flangeye.report.facts import Facts
 from flangeye.report.page import render
 from flangeye.report.weld import off_line, weld_drawing
-from flangeye.result import Result
+from flangeye.result.contract import Result
 
 TIME = np.linspace(0.0, 40.0, 401)
 LINE = np.column_stack([np.linspace(0.5, 0.7, 201), np.zeros(201), np.full(201, 0.27)])

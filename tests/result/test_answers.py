@@ -7,9 +7,10 @@ import pytest
 import yaml
 from rich.console import Console
 
-from flangeye import result as r
 from flangeye.cli.details import print_details
 from flangeye.maths.geometry import rigid, rotation_exp
+from flangeye.result import contract as r
+from flangeye.result import sections
 from flangeye.run.folder import calibration_yaml
 from flangeye.types import (
     BASE,
@@ -57,8 +58,8 @@ def document(calibration, figures=None):
         core = {"folds": 5, "rms": 0.5e-3, "median": 0.4e-3, "p95": 0.9e-3}
         held = r.HoldoutResult(**core, figures=figures)
     return r.Result(
-        title="A cell", status="verified", transforms=r.transforms_result(calibration),
-        answers=r.answers_result(calibration, held), holdout=held, observations=[],
+        title="A cell", status="verified", transforms=sections.transforms_result(calibration),
+        answers=sections.answers_result(calibration, held), holdout=held, observations=[],
         verifications={}, timing={},
         provenance=r.Provenance(
             versions={}, plugins={}, recipe="", recipe_hash="", input_hash="", seed=0, notes=[]
@@ -152,17 +153,17 @@ def test_the_arms_of_a_cell_are_corrected_by_name() -> None:
 
 def test_what_a_result_asks_for_whatever_its_steps_noted() -> None:
     found = document(calibration(), FIGURES)
-    assert r.standing_warnings(found) == []
+    assert sections.standing_warnings(found) == []
     weak = found.model_copy(deep=True)
     weak.transforms["base_T_camera"].unobservable = [[0, 0, 0, 0, 0, 1.0]]
-    assert "base_T_camera" in r.standing_warnings(weak)[0].text
+    assert "base_T_camera" in sections.standing_warnings(weak)[0].text
     unjudged = found.model_copy(update={"status": "unverified"})
-    assert [w.fix for w in r.standing_warnings(unjudged)] == [
+    assert [w.fix for w in sections.standing_warnings(unjudged)] == [
         "add '- verify.holdout' after the solver"
     ]
     seen = [r.ObservationResult(id=str(i), used=i < 2) for i in range(5)]
     poor = found.model_copy(update={"observations": seen})
-    assert r.standing_warnings(poor)[0].text == "3 of 5 captures were rejected"
+    assert sections.standing_warnings(poor)[0].text == "3 of 5 captures were rejected"
 
 
 @pytest.mark.parametrize(
@@ -171,8 +172,8 @@ def test_what_a_result_asks_for_whatever_its_steps_noted() -> None:
      ((1.0e-3, 1.8e-3), "less than chance explains")],
 )  # fmt: skip
 def test_an_expected_error_that_poses_held_out_contradict_is_said(expected, told) -> None:
-    stated = r.expected_error_result(calibration(expected=ExpectedError(*expected)))
+    stated = sections.expected_error_result(calibration(expected=ExpectedError(*expected)))
     found = document(calibration(), {"poses": 16.0}).model_copy(update={"expected_error": stated})
-    warnings = [w.text for w in r.standing_warnings(found) if "held-out" in w.text]
+    warnings = [w.text for w in sections.standing_warnings(found) if "held out" in w.text]
     assert len(warnings) == (told is not None)
     assert all(told in text and "0.50 mm" in text for text in warnings)

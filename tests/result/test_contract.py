@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from flangeye.result import TransformResult, WorkspaceResult
+from flangeye.result.contract import TransformResult, WorkspaceResult
 
 SOUND: dict[str, Any] = {
     "matrix": np.eye(4).tolist(), "covariance": np.eye(6).tolist(), "about": [0.0, 0.0, 0.0],

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flangeye.result import weld_result
+from flangeye.result.sections import weld_result
 from flangeye.types import CAMERA, PointCloud, WeldReport, WorkpieceScan
 
 SEAM = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]])

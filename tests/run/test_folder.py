@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from flangeye import types as t
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import parse_recipe
-from flangeye.result import Result
+from flangeye.result.contract import Result
 from flangeye.run.folder import FolderError, RunFolder, calibration_yaml
 from flangeye.run.runner import Runner
 from tests.conftest import TOY_RECIPE

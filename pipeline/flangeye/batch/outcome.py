@@ -9,7 +9,7 @@ from typing import Literal
 
 from flangeye.errors import FlangeyeError
 from flangeye.files.paths import Storage
-from flangeye.result import Result
+from flangeye.result.contract import Result
 
 Status = Literal["verified", "unverified", "refused", "failed", "crashed"]
 STATUSES: tuple[Status, ...] = ("verified", "unverified", "refused", "failed", "crashed")

@@ -212,7 +212,7 @@ def schema(
 
     from flangeye.files.regular import write_whole
     from flangeye.recipe.schema import header_line, recipe_schema
-    from flangeye.result import Result
+    from flangeye.result.contract import Result
 
     document = Result.model_json_schema() if result else recipe_schema(load_plugins())
     text = json.dumps(document, indent=2, ensure_ascii=False)

@@ -10,17 +10,16 @@ import numpy as np
 from flangeye.cli.console import wrapped, write
 from flangeye.files.words import printable
 from flangeye.maths.geometry import rpy_from_rotation
-from flangeye.result import (
+from flangeye.result import logged_result, status_of
+from flangeye.result.contract import (
     CorrectionResult,
     HoldoutResult,
     Result,
     TransformResult,
     TruthResult,
     Vector,
-    expected_error,
-    logged_result,
-    status_of,
 )
+from flangeye.result.sections import expected_error
 from flangeye.types import records_of
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from flangeye.doctor.diagnosis import Finding
     from flangeye.plugin.registry import Registry
     from flangeye.recipe.load import Recipe
-    from flangeye.result import Result
+    from flangeye.result.contract import Result
     from flangeye.run.folder import RunFolder
     from flangeye.run.restart import FromNothing
     from flangeye.run.session import Start

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Any
 from flangeye.cli.console import width, wrapped, write
 from flangeye.plugin.hookspecs import hookimpl
 from flangeye.report.units import rounded_mm
-from flangeye.result import Result, expected_error, status_of
+from flangeye.result import status_of
+from flangeye.result.contract import Result
+from flangeye.result.sections import expected_error
 from flangeye.types import Rejection, Source, warnings_of
 
 if TYPE_CHECKING:

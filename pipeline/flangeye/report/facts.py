@@ -15,12 +15,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from flangeye import result as r
 from flangeye import types as t
 from flangeye.files.yaml_lines import parse_yaml
 from flangeye.log.read import RunLog
 from flangeye.models.workspace import work_of
 from flangeye.report.units import duration
+from flangeye.result import contract as r
+from flangeye.result import logged_result, sections, sha256
 from flangeye.units import parse_quantity
 
 INCOMPLETE: Literal["incomplete"] = "incomplete"
@@ -84,7 +85,7 @@ def facts_of(log: RunLog) -> Facts:
     """Return the facts in ``log``."""
     attached = log.attachments.get("recipe.resolved.yaml", log.attachments.get("recipe.yaml", b""))
     recipe = attached.decode("utf-8", "replace")
-    result = r.logged_result(log) or _so_far(log, recipe)
+    result = logged_result(log) or _so_far(log, recipe)
     return Facts(log, result, recipe)
 
 
@@ -101,15 +102,15 @@ def _so_far(log: RunLog, recipe: str) -> r.Result:
         title=str(header.get("title", log.path.name)),
         status=INCOMPLETE,
         method=calibration.method if calibration else None,
-        transforms=r.transforms_result(calibration),
-        expected_error=r.expected_error_result(calibration),
-        observations=r.observations_result(pairs, log.rejections),
-        workspace=r.workspace_result(box) if box else None,
-        holdout=r.holdout_result(verifications),
-        verifications=r.verifications_result(verifications),
+        transforms=sections.transforms_result(calibration),
+        expected_error=sections.expected_error_result(calibration),
+        observations=sections.observations_result(pairs, log.rejections),
+        workspace=sections.workspace_result(box) if box else None,
+        holdout=sections.holdout_result(verifications),
+        verifications=sections.verifications_result(verifications),
         truth=_truth(source, calibration, box),
         simulated=source.simulated,
-        warnings=r.warnings_result(notes),
+        warnings=sections.warnings_result(notes),
         notes=t.records_of(calibration.notes if calibration else ()),
         timing=_timing(log),
         provenance=_provenance(source, t.records_of(notes), header, recipe),
@@ -136,7 +137,7 @@ def _truth(
     if source.truth is None or calibration is None or box is None:
         return None
     # What the arm is like stands in the recipe, which a killed run may not have left.
-    return r.truth_result(calibration, replace(source.truth, unseen=()), box)
+    return sections.truth_result(calibration, replace(source.truth, unseen=()), box)
 
 
 def _timing(log: RunLog) -> dict[str, r.StageTiming]:
@@ -158,7 +159,7 @@ def _provenance(
         versions={},  # the machine that reports need not be the one that ran
         plugins={},
         recipe="",
-        recipe_hash=r.sha256(recipe),
+        recipe_hash=sha256(recipe),
         input_hash=source.fingerprint,
         seed=int(header.get("seed", 0)),
         notes=notes,

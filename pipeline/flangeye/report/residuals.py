@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from flangeye import result as r
 from flangeye.maths.statistics import rms
 from flangeye.report.facts import Facts
 from flangeye.report.look import SERIES
 from flangeye.report.plot import Figure, Trace, plain
 from flangeye.report.units import millimetres
+from flangeye.result import contract as r
 
 
 @dataclass(frozen=True)

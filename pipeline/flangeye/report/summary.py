@@ -7,11 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flangeye import result as r
 from flangeye import types as t
 from flangeye.maths.geometry import quaternion_from_rotation, rpy_from_rotation
 from flangeye.report.facts import INCOMPLETE, Facts
 from flangeye.report.units import degrees, millimetres, rounded_mm
+from flangeye.result import contract as r
+from flangeye.result import sections
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ def banner_of(facts: Facts) -> Banner:
         return Banner("refused", "Refused", figures, _sentence(reason))
     if result.status == INCOMPLETE:
         return Banner(INCOMPLETE, "Incomplete", figures, _sentence(_how_far(facts)))
-    if found := r.expected_error(result):
+    if found := sections.expected_error(result):
         figures = [f"{rounded_mm(found[0])} mm expected", *_limit(result), *figures]
     if result.status == "verified":
         reasons = "; ".join(v.reason for v in result.verifications.values())
@@ -89,7 +90,7 @@ class KeyFigure:
 def tiles_of(facts: Facts) -> list[KeyFigure]:
     """Return the three numbers that decide whether to trust the matrix."""
     result, tiles = facts.result, []
-    if found := r.expected_error(result):
+    if found := sections.expected_error(result):
         rms, bound = found
         note = "rms" if bound is None else f"95 % below {rounded_mm(bound)} mm"
         tiles.append(KeyFigure("Expected error at the work", rounded_mm(rms), "mm", note))

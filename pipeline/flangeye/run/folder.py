@@ -19,8 +19,8 @@ from flangeye.log.record import dump_result
 from flangeye.maths.geometry import quaternion_from_rotation, rpy_from_rotation
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import Recipe, parse_recipe
-from flangeye.result import SIMULATED, Result, TransformResult
-from flangeye.result.contract import AnswerResult
+from flangeye.result import SIMULATED
+from flangeye.result.contract import AnswerResult, Result, TransformResult
 
 EXPORTS = "exports"
 """Where in the folder the files for other programs are."""

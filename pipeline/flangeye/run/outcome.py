@@ -11,12 +11,13 @@ from typing import Literal
 
 import numpy as np
 
-from flangeye import result as r
 from flangeye import types as t
 from flangeye.models.cell import cell_in
 from flangeye.models.workspace import work_of
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import Recipe
+from flangeye.result import contract as r
+from flangeye.result import library_versions, sections, sha256
 
 
 @dataclass
@@ -85,24 +86,24 @@ def result_of(
     """Return the document of a run that ended, refused or not."""
     calibration, pairs = outcome.calibration, outcome.pairs()
     scan = outcome.scan and replace(outcome.scan, truth=truths.seams)
-    holdout = r.holdout_result(outcome.verifications)
+    holdout = sections.holdout_result(outcome.verifications)
     known = calibration.as_reported().correction if calibration else None
     result = r.Result(
         title=recipe.header.title,
         status=outcome.status,
         refused=outcome.refused,
-        transforms=r.transforms_result(calibration),
-        correction=r.correction_result(known),
-        answers=r.answers_result(calibration, holdout),
-        expected_error=r.expected_error_result(calibration),
-        true=r.true_result(calibration),
-        observations=r.observations_result(pairs, outcome.rejections),
+        transforms=sections.transforms_result(calibration),
+        correction=sections.correction_result(known),
+        answers=sections.answers_result(calibration, holdout),
+        expected_error=sections.expected_error_result(calibration),
+        true=sections.true_result(calibration),
+        observations=sections.observations_result(pairs, outcome.rejections),
         holdout=holdout,
-        verifications=r.verifications_result(outcome.verifications),
-        seam=r.seam_result(outcome.seam, scan),
-        weld=r.weld_result(outcome.weld, scan),
+        verifications=sections.verifications_result(outcome.verifications),
+        seam=sections.seam_result(outcome.seam, scan),
+        weld=sections.weld_result(outcome.weld, scan),
         simulated=outcome.source.simulated,
-        warnings=r.warnings_result([*recipe.notes, *outcome.source.notes, *_notes(outcome)]),
+        warnings=sections.warnings_result([*recipe.notes, *outcome.source.notes, *_notes(outcome)]),
         notes=t.records_of(_notes(outcome)),
         exports={file.name: file.text for file in outcome.exports},
         timing=_timing(watch),
@@ -111,10 +112,10 @@ def result_of(
     given = recipe.context.get(t.Box)
     if calibration and (box := work_of(calibration, outcome.source, given)):
         result.method = calibration.method
-        result.workspace = r.workspace_result(box)
+        result.workspace = sections.workspace_result(box)
         if truth := truths.cell:
-            result.truth = r.truth_result(calibration, truth, box, cell_in(recipe.context))
-    result.warnings += r.standing_warnings(result)
+            result.truth = sections.truth_result(calibration, truth, box, cell_in(recipe.context))
+    result.warnings += sections.standing_warnings(result)
     return result
 
 
@@ -133,10 +134,10 @@ def _notes(outcome: Outcome) -> list[str]:
 
 def _provenance(outcome: Outcome, recipe: Recipe, registry: Registry) -> r.Provenance:
     return r.Provenance(
-        versions=r.library_versions(),
+        versions=library_versions(),
         plugins=registry.versions(),
         recipe=recipe.name,
-        recipe_hash=r.sha256(recipe.resolved()),
+        recipe_hash=sha256(recipe.resolved()),
         input_hash=outcome.source.fingerprint,
         seed=recipe.header.seed,
         notes=t.records_of([*recipe.notes, *outcome.source.notes, *_notes(outcome)]),

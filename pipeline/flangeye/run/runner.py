@@ -26,7 +26,8 @@ from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import Recipe
 from flangeye.recipe.steps import Step, bare
-from flangeye.result import Result, calibrated_pose, require_one
+from flangeye.result import calibrated_pose, require_one
+from flangeye.result.contract import Result
 from flangeye.run.ahead import Done, cores, worked_ahead
 from flangeye.run.outcome import Outcome, Stopwatch, Truths, result_of
 from flangeye.run.restart import FromNothing

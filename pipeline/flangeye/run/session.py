@@ -14,7 +14,7 @@ from flangeye.log.record import Recorder
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import Recipe
 from flangeye.report import write_report
-from flangeye.result import Result
+from flangeye.result.contract import Result
 from flangeye.run.folder import RunFolder
 from flangeye.run.restart import FromNothing
 from flangeye.run.runner import Runner

@@ -30,8 +30,7 @@ from flangeye.report.certificate import (
 from flangeye.report.certificate.budget import Share, shares_of
 from flangeye.report.facts import facts_of
 from flangeye.report.units import millimetres
-from flangeye.result import Result
-from flangeye.result.contract import ExpectedErrorResult
+from flangeye.result.contract import ExpectedErrorResult, Result
 from tests.report.conftest import WORKSPACE, Script, scripted
 
 SCANNER = load_model("scanners", "phoxi-m")

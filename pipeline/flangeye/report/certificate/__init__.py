@@ -31,7 +31,8 @@ from flangeye.report.facts import Facts, facts_of, provenance_of
 from flangeye.report.look import css
 from flangeye.report.summary import transform_text
 from flangeye.report.units import degrees, millimetres
-from flangeye.result import expected_error, result_of_camera, status_of
+from flangeye.result import result_of_camera, status_of
+from flangeye.result.sections import expected_error
 
 LEAST_LENGTH = 1e-6
 """Smallest uncertainty that is printed as a number [m]; the page shows three decimals of a mm."""

@@ -19,7 +19,7 @@ from flangeye.errors import StageError
 from flangeye.maths.geometry import hat
 from flangeye.maths.statistics import corners_of
 from flangeye.models.scanners import ScannerModel
-from flangeye.result import Result, TransformResult
+from flangeye.result.contract import Result, TransformResult
 from flangeye.types import Floats
 
 
