@@ -156,7 +156,7 @@ def trial(name, seed):
     )
     if seed % 10 in (1, 2):
         body = wrong(body, seed // 10 * 2 + seed % 10 - 1)
-    points, shape = capture.cloud.points(), prepared(body).shape
+    points, shape = capture.cloud.points(), prepared(body)
     view = view_of(points, body.size / FINE_ACROSS)
     tolerance = max(0.003 * body.size, 3.5 * view.noise)
     visible = there and judged(shape, view, pose, tolerance).shown > VISIBLE
@@ -189,7 +189,7 @@ def peer(points, body):
 
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points.astype(float)))
     scan, of_scan = prepare(cloud.voxel_down_sample(step))
-    outside, normals = prepared(body).shape.outside
+    outside, normals = prepared(body).outside
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(outside))
     cloud.normals = o3d.utility.Vector3dVector(normals)
     model = cloud.voxel_down_sample(step)

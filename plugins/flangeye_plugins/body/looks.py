@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import permutations, product
 from typing import ClassVar
@@ -31,13 +30,8 @@ LISTED = 160
 """Points of the body that stand for what is seen of it from a direction."""
 
 
-@dataclass(frozen=True, eq=False)
-class Looks:
-    """The visible parts of a body from each direction.
-
-    Attributes:
-        shape: The body.
-    """
+class Looks(Shape):
+    """A body's shape, and what of it is seen from where."""
 
     # Points for it that outweigh one that is seen through, or a face that goes on beyond its
     # end.
@@ -45,28 +39,6 @@ class Looks:
 
     # How far beyond the end of a face nothing of it should be seen, as a share of the size.
     beyond: ClassVar[float] = 0.05
-
-    shape: Shape
-
-    @property
-    def size(self) -> float:
-        """Of the body [m]."""
-        return self.shape.size
-
-    @property
-    def centre(self) -> Floats:
-        """(3,) of the body [m]."""
-        return self.shape.centre
-
-    @property
-    def surface(self) -> OrientedPoints:
-        """Points of the body."""
-        return self.shape.surface
-
-    @property
-    def ends(self) -> OrientedPoints:
-        """Points where its faces end."""
-        return self.shape.ends
 
     @cached_property
     def views(self) -> Floats:
@@ -82,8 +54,8 @@ class Looks:
         """
         ends, away = self.ends, self.beyond * self.size
         beyond = ends._replace(points=ends.points + away * ends.directions)
-        free = ~_before(self.shape, beyond.points, self.views, away)
-        on, off = (_seen(self.shape, part, self.views) for part in (self.surface, beyond))
+        free = ~_before(self, beyond.points, self.views, away)
+        on, off = (_seen(self, part, self.views) for part in (self.surface, beyond))
         return on, off & free
 
     @property
@@ -214,8 +186,8 @@ class Looks:
 
 @lru_cache(maxsize=8)  # a session's body, and how its mesh may be drawn wrongly
 def prepared(body: TargetBody) -> Looks:
-    """Return a body's looks; computed once for each shape."""
-    return Looks(Shape(body.vertices, body.triangles))
+    """Return a body's looks, with its shape; computed once."""
+    return Looks(body.vertices, body.triangles)
 
 
 def _apart(points: Floats, seen: Mask) -> Indices:

@@ -284,15 +284,10 @@ class BodySearch:
     points: Singles
     looks: Looks
 
-    @property
-    def shape(self) -> Shape:
-        """The body."""
-        return self.looks.shape
-
     def everywhere(self) -> list[FoundPose]:
         """Return distinct candidate poses of the body, best first."""
         # Coarse cells have less noise
-        view = view_of(self.points, self.shape.size / 60)
+        view = view_of(self.points, self.looks.size / 60)
         poses = guesses(view, self.looks, 1500)
         # Points of the body that settle them, how far from the body the scan is taken for
         # it, move by move, and how far off it may be where it is judged, as shares of the
@@ -302,7 +297,7 @@ class BodySearch:
             (160, (0.04, 0.03, 0.02), 0.02, 80),
         ):
             for reach in reaches:
-                poses = self.looks.settled(poses, view, count, reach * self.shape.size)
+                poses = self.looks.settled(poses, view, count, reach * self.looks.size)
             scores = self.looks.scores(poses, view, count, tolerance)
             poses = poses[distinct(poses, scores, self.looks)[:left]]
         found = self.near(poses)
@@ -312,34 +307,34 @@ class BodySearch:
         """Return the best of (K, 4, 4) poses, refined on the scan's own points, best first."""
         if not len(poses):
             return []
-        scores = [judged(self.shape, self._fine, pose, self._rough).score for pose in poses]
+        scores = [judged(self.looks, self._fine, pose, self._rough).score for pose in poses]
         # Laid on the scan's own points
         poses = poses[distinct(poses, np.array(scores), self.looks)[:8]]
         return self._distinct([one for one in map(self._laid, poses) if one])
 
     @cached_property
     def _fine(self) -> CoarseImage:
-        return view_of(self.points, self.shape.size / FINE_ACROSS)
+        return view_of(self.points, self.looks.size / FINE_ACROSS)
 
     @cached_property
     def _rough(self) -> float:
         return self.looks.tolerance(self._fine)
 
     def _laid(self, pose: Floats) -> FoundPose | None:
-        fit = fitted(around(self.points, self.shape, pose), self.shape, pose, 2000)
+        fit = fitted(around(self.points, self.looks, pose), self.looks, pose, 2000)
         if fit is None:
             return None
         # How far off a cell of the view may be after the body is laid on the scan, as a share of
         # the size.
-        tolerance = max(0.003 * self.shape.size, 3.5 * self._fine.noise)
-        verdict = judged(self.shape, self._fine, fit.pose, tolerance)
+        tolerance = max(0.003 * self.looks.size, 3.5 * self._fine.noise)
+        verdict = judged(self.looks, self._fine, fit.pose, tolerance)
         return FoundPose(fit.pose, verdict, fit.weakest(self.looks.freedoms))
 
     def _twins(self, best: FoundPose) -> Floats:
         """Return quarter turns of a pose that explain the scan nearly as well."""
         # Share of the rays that a turned pose explains as well, to be laid on the scan too
         twins, least = self.looks.twins(best.pose), 0.4 * best.verdict.agree
-        agree = [judged(self.shape, self._fine, pose, self._rough).agree for pose in twins]
+        agree = [judged(self.looks, self._fine, pose, self._rough).agree for pose in twins]
         return np.asarray(twins[np.array(agree) > least])
 
     def _distinct(self, found: list[FoundPose]) -> list[FoundPose]:

@@ -68,7 +68,7 @@ def fit_body(
     if cloud.camera_T_target is None:
         return Rejected("nothing says where the body is; segment.body comes before fit.body")
     body = body.at(capture.joints if capture else None)
-    fit = fitted(cloud.cloud.xyz, prepared(body).shape, cloud.camera_T_target)
+    fit = fitted(cloud.cloud.xyz, prepared(body), cloud.camera_T_target)
     if fit is None:
         return Rejected("too few points on the body")
     if fit.noise > params.max_rms:

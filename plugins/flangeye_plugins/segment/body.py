@@ -85,7 +85,6 @@ def segment_body(
     if len(points) < FEWEST:
         return Rejected("no point between near and far")
     looks = prepared(body)
-    shape = looks.shape
     # A round body shows fewer freedoms
     if looks.freedoms < 6:
         raise StageError(
@@ -103,8 +102,8 @@ def segment_body(
             doubtful = not found and not earlier.observations
             return (doubtful and _misdrawn(points, body, every, passes)) or why
     pose = found[0].pose
-    centre = pose[:3, :3] @ shape.centre + pose[:3, 3]
-    cloud = PointCloud(capture.cloud.frame, around(points, shape, pose))
+    centre = pose[:3, :3] @ looks.centre + pose[:3, 3]
+    cloud = PointCloud(capture.cloud.frame, around(points, looks, pose))
     return FlangeCloud(cloud, centre, -centre / np.linalg.norm(centre), pose)
 
 
@@ -136,13 +135,12 @@ def _misdrawn(
     """Return how a mesh is drawn wrongly, where it would be found otherwise; None where not."""
     from flangeye_plugins.body.looks import Looks, prepared
     from flangeye_plugins.body.search import FINE_ACROSS, BodySearch, opposed
-    from flangeye_plugins.body.shape import Shape
     from flangeye_plugins.body.view import view_of
 
     for what, fix, other in _otherwise(body):
         if any(map(passes, BodySearch(points, prepared(other)).everywhere())):
-            return Rejected(f"{body.name} is {what}: corrected, it would be found", fix=fix)
-    shape = prepared(body).shape
+            return Rejected(f"{body.name} is {what}: so it would be found", fix=fix)
+    shape = prepared(body)
     vertices, facets = shape.facets
     # Parts that stand elsewhere hide some of the rest, and a rest is found in clutter sooner.
     holds = partial(_passes, coverage=0.0, trust=0.93, goes_on=0.1, weakest=FIRM / 2)
@@ -150,7 +148,7 @@ def _misdrawn(
     for pose in (one.pose for one in every):
         gone = opposed(shape, view, pose)
         if gone is not None:
-            rest = Looks(Shape(vertices, facets[~gone].astype(np.int32)))
+            rest = Looks(vertices, facets[~gone].astype(np.int32))
             near = filter(holds, BodySearch(points, rest).near(pose[None]))
             held += [(one.verdict.score, vertices[facets[gone]]) for one in near]
     if not held:

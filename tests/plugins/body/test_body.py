@@ -126,7 +126,7 @@ def test_a_scanner_without_a_model_has_the_distortion_that_is_stated() -> None:
     wide = {"model_error": "0 mm", "scanner_error": "1 mm"}
     feature = fit_body(capture, GRIPPER, FitBodyParams.model_validate(wide))
     assert isinstance(feature, PoseFeature), feature
-    centre = POSE[:3, :3] @ prepared(GRIPPER).shape.centre  # from the body's origin
+    centre = POSE[:3, :3] @ prepared(GRIPPER).centre  # from the body's origin
     about = np.hstack([-hat(centre), np.eye(3)])  # the shift of the centre
     shift = about @ feature.covariance @ about.T
     assert np.sqrt(np.trace(shift) / 3) == pytest.approx(1e-3, rel=0.3)
