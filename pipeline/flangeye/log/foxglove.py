@@ -6,6 +6,7 @@ The messages are protobuf with the published schemas; each function builds one.
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from flangeye.errors import StageError
 from flangeye.maths.geometry import basis_of_plane, quaternion_from_rotation, rigid
 from flangeye.maths.seam_geometry import seam_frames, tube_rings
-from flangeye.types import CircleFeature, Image, PointCloud, Seam, Transform
+from flangeye.types import CircleFeature, Floats, Image, PointCloud, Seam, Transform
 
 ERROR, WARNING, INFO = 4, 3, 2
 
@@ -75,16 +76,37 @@ def compressed_image(image: Image, time_ns: int) -> Any:
 
 def circle_scene(capture: str, circle: CircleFeature, time_ns: int) -> Any:
     """Return a foxglove.SceneUpdate with the fitted circles and the normal, in ``camera``."""
+    lines = [(points, 2.0) for points in circle_lines(circle)]
+    return _scene("camera", f"circle/{capture}", lines, (0.9, 0.3, 0.1), time_ns)
+
+
+def seam_scene(seam: Seam, time_ns: int) -> Any:
+    """Return a foxglove.SceneUpdate with the planned seam and rings of its tube, in ``base``."""
+    lines = [(seam.points_in_base, 3.0), *((ring, 1.0) for ring in tube_rings(seam))]
+    return _scene("base", "seam", lines, (0.0, 0.45, 0.7), time_ns)
+
+
+def _scene(
+    frame: str,
+    name: str,
+    lines: Sequence[tuple[Floats, float]],
+    colour: tuple[float, float, float],
+    time_ns: int,
+) -> Any:
+    """Return a foxglove.SceneUpdate with lines (N, 3), each of a thickness."""
     from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
     from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
     from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
-    entity = SceneEntity(frame_id="camera", id=f"circle/{capture}")
+    entity = SceneEntity(frame_id=frame, id=name)
     entity.timestamp.FromNanoseconds(time_ns)
-    for points in circle_lines(circle):
-        line = entity.lines.add(type=LinePrimitive.LINE_STRIP, thickness=2.0, scale_invariant=True)
+    for points, thickness in lines:
+        line = entity.lines.add(
+            type=LinePrimitive.LINE_STRIP, thickness=thickness, scale_invariant=True
+        )
         line.pose.orientation.w = 1.0
-        line.color.r, line.color.g, line.color.b, line.color.a = 0.9, 0.3, 0.1, 1.0
+        line.color.r, line.color.g, line.color.b = colour
+        line.color.a = 1.0
         for x, y, z in points:
             line.points.add(x=x, y=y, z=z)
     return SceneUpdate(entities=[entity])
@@ -98,25 +120,6 @@ def circle_points(circle: CircleFeature, time_ns: int) -> Any:
     lines = circle_lines(circle, 360) or [circle.centre[None]]
     xyz = np.vstack(lines).astype(np.float32)
     return point_cloud(PointCloud("camera", xyz), xyz, time_ns)
-
-
-def seam_scene(seam: Seam, time_ns: int) -> Any:
-    """Return a foxglove.SceneUpdate with the planned seam and rings of its tube, in ``base``."""
-    from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
-    from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
-    from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
-
-    entity = SceneEntity(frame_id="base", id="seam")
-    entity.timestamp.FromNanoseconds(time_ns)
-    for points, thickness in [(seam.points_in_base, 3.0), *((r, 1.0) for r in tube_rings(seam))]:
-        line = entity.lines.add(
-            type=LinePrimitive.LINE_STRIP, thickness=thickness, scale_invariant=True
-        )
-        line.pose.orientation.w = 1.0
-        line.color.r, line.color.g, line.color.b, line.color.a = 0.0, 0.45, 0.7, 1.0
-        for x, y, z in points:
-            line.points.add(x=x, y=y, z=z)
-    return SceneUpdate(entities=[entity])
 
 
 def seam_poses(seam: Seam, time_ns: int) -> Any:

@@ -114,8 +114,9 @@ def _conventions(rotation: str, angle: str | None) -> Iterator[Convention]:
 
 def _spelt(convention: Convention) -> str:
     rotation, angle = convention
-    plain = CONVENTIONS[rotation].rotation if rotation in CONVENTIONS else rotation
-    return _name(plain) + {"rad": " in radians", "deg": " in degrees"}.get(angle or "", "")
+    return _name(_plain(rotation)) + {"rad": " in radians", "deg": " in degrees"}.get(
+        angle or "", ""
+    )
 
 
 def _of_arms(session: RecordedSession) -> Iterator[Reading]:
@@ -177,14 +178,13 @@ def _readings(stated: str | None) -> Iterator[tuple[str, str]]:
 
 def _stated(session: RecordedSession, of: str | None = None) -> str | None:
     """Return how the recipe says the arm's rotations are written, or the target's, if it does."""
-    if isinstance(session.reader, str):
-        return None
-    ((_, params),) = session.reader.items()
-    stated = params.get(of) if params and of else params
-    rotation = stated.get("rotation") if isinstance(stated, Mapping) else None
-    if rotation not in (*CONVENTIONS, *PLAIN):
-        return None
-    return CONVENTIONS[rotation].rotation if rotation in CONVENTIONS else str(rotation)
+    said = _said(session, of)
+    return said and _plain(said[0])
+
+
+def _plain(rotation: str) -> str:
+    """Return how a convention writes rotations, or what is no convention's name."""
+    return CONVENTIONS[rotation].rotation if rotation in CONVENTIONS else rotation
 
 
 def _name(rotation: str) -> str:
