@@ -23,7 +23,7 @@ def moving(desk):
 
 def test_a_protective_stop_holds_the_arm_on_its_path(desk: Desk) -> None:
     start = desk.pose()
-    target = moving(desk)
+    moving(desk)
     desk.box.protective_stop("test")
     desk.seconds(0.15)
     assert desk.arm.standing
@@ -34,9 +34,6 @@ def test_a_protective_stop_holds_the_arm_on_its_path(desk: Desk) -> None:
     assert np.abs(off).max() < 1e-9
     desk.box.unlock_after = 0.0
     assert answer(desk.box, "unlock protective stop") == "Protective stop releasing"
-    assert answer(desk.box, "play") == "Starting program"
-    desk.seconds(3.0)
-    assert desk.misses(target) < 1e-9
 
 
 def test_a_protective_stop_cannot_be_unlocked_at_once(desk: Desk) -> None:
@@ -53,36 +50,20 @@ def test_a_protective_stop_cannot_be_unlocked_at_once(desk: Desk) -> None:
     assert desk.box.safety is SafetyMode.NORMAL
 
 
-def test_while_stopped_nothing_is_played_or_loaded(desk: Desk) -> None:
+def test_while_stopped_nothing_is_loaded(desk: Desk) -> None:
     desk.box.protective_stop("test")
-    assert answer(desk.box, "play") == "Failed to execute: play"
     run_program(desk.box, SCRIPT)
     assert desk.log()[-1] == "program rtde_control ignored: safety mode PROTECTIVE_STOP"
     assert desk.box.runtime is Runtime.PAUSED
 
 
-def test_a_stop_that_left_the_path_cannot_be_played_on(desk: Desk) -> None:
+def test_a_program_runs_after_a_stop_that_left_the_path(desk: Desk) -> None:
     desk.stream(SPEED, [0.0, 0, 0, 0, 0, 20.0, 40.0, 0], seconds=1.0)
     assert desk.box.safety is SafetyMode.PROTECTIVE_STOP
     desk.box.unlock_after = 0.0
     answer(desk.box, "unlock protective stop")
-    assert answer(desk.box, "play") == "Failed to execute: play"
     run_program(desk.box, SCRIPT)
     assert desk.box.runtime is Runtime.PLAYING
-
-
-def test_pause_and_play(desk: Desk) -> None:
-    target = moving(desk)
-    assert answer(desk.box, "pause") == "Pausing program"
-    assert answer(desk.box, "programState") == "PAUSED loopback.urp"
-    desk.seconds(0.2)
-    held = desk.pose()
-    desk.seconds(0.5)
-    assert np.array_equal(desk.pose(), held)
-    assert answer(desk.box, "pause") == "Failed to execute: pause"
-    assert answer(desk.box, "play") == "Starting program"
-    desk.seconds(2.0)
-    assert desk.misses(target) < 1e-9
 
 
 def test_the_dashboards_stop_brakes_the_arm(desk: Desk) -> None:
@@ -98,7 +79,7 @@ def test_an_emergency_stop_takes_the_power(desk: Desk) -> None:
     desk.box.emergency_stop("test")
     desk.seconds(0.3)
     assert desk.arm.standing
-    assert answer(desk.box, "safetystatus") == "Safetystatus: ROBOT_EMERGENCY_STOP"
+    assert answer(desk.box, "safetymode") == "Safetymode: ROBOT_EMERGENCY_STOP"
     assert answer(desk.box, "robotmode") == "Robotmode: POWER_OFF"
     answer(desk.box, "power on")
     assert answer(desk.box, "robotmode") == "Robotmode: POWER_OFF"

@@ -58,7 +58,6 @@ class URController(ControlUnit):
         self.remote_control = True
         self.digital_outputs, self.wired = 0, True
         self._program: Callable[[], bool] | None = None
-        self._resumable = True
         self._program_began = 0
         self._watchdog: tuple[int, float] | None = None
         self._input_times = [0.0] * Registers.COUNT
@@ -77,7 +76,6 @@ class URController(ControlUnit):
         try:
             self.arm.step()
         except MotionFault as fault:
-            self._resumable = False
             self.protective_stop(str(fault))
 
     def _run_program(self) -> None:
@@ -112,7 +110,7 @@ class URController(ControlUnit):
         """
         self._require_ready()
         self.note(f"program {name}")
-        self._program, self._resumable = program, True
+        self._program = program
         self._program_began, self._watchdog = self._cycles, None
         self.runtime, self.arm.held = Runtime.PLAYING, False
 
@@ -123,27 +121,6 @@ class URController(ControlUnit):
         self._program, self._watchdog = None, None
         self.runtime = Runtime.STOPPED
         self.arm.held = self.safety is not SafetyMode.NORMAL
-
-    def pause(self) -> None:
-        """Hold the program; the arm comes to rest on its path.
-
-        Raises:
-            RefusedError: No program runs.
-        """
-        if self.runtime is not Runtime.PLAYING:
-            raise RefusedError("Failed to execute: pause")
-        self.runtime, self.arm.held = Runtime.PAUSED, True
-
-    def play(self) -> None:
-        """Resume a paused program.
-
-        Raises:
-            RefusedError: None is paused, it cannot go on from here, or a stop is in force.
-        """
-        paused = self.runtime is Runtime.PAUSED and self._resumable
-        if not paused or self.safety is not SafetyMode.NORMAL or not self.remote_control:
-            raise RefusedError("Failed to execute: play")
-        self.runtime, self.arm.held = Runtime.PLAYING, False
 
     def _require_ready(self) -> None:
         if not self.remote_control:
@@ -261,11 +238,6 @@ def control_box_of(robot: RobotModel) -> ControlBox:
 def joint_speeds_of(robot: RobotModel) -> NDArray[np.float64]:
     """Return the (6,) largest joint speeds [rad/s]; those of a UR5 for an arm with another name."""
     return np.array(SPEEDS.get(robot.model.rstrip("e"), SPEEDS["ur5"]))
-
-
-def dashboard_name_of(robot: RobotModel) -> str:
-    """Return the arm's name on the dashboard: ``UR5`` for a UR5e too."""
-    return robot.model.rstrip("e").upper()
 
 
 class RobotMode(IntEnum):

@@ -19,12 +19,10 @@ from flangeye_emulators.controllers.ur.controller import (
     RefusedError,
     Runtime,
     URController,
-    dashboard_name_of,
 )
 from flangeye_emulators.controllers.ur.script import run_program, take_program
 
 PORT = 29999
-PROGRAM_NAME = "loopback.urp"
 
 Answer = Callable[[URController], str]
 
@@ -72,11 +70,6 @@ def _stop(box: URController) -> None:
     box.stop_program("stopped at the dashboard")
 
 
-def _program_state(box: URController) -> str:
-    words = {Runtime.PLAYING: "PLAYING", Runtime.PAUSED: "PAUSED", Runtime.STOPPED: "STOPPED"}
-    return f"{words[box.runtime]} {PROGRAM_NAME}"
-
-
 def _version(box: URController) -> str:
     return f"URSoftware {'.'.join(map(str, box.box.version))} (loopback)"
 
@@ -84,15 +77,11 @@ def _version(box: URController) -> str:
 ANSWERS: dict[str, Answer] = {
     "polyscopeversion": _version,
     "get serial number": lambda box: "20245500001",
-    "get robot model": lambda box: dashboard_name_of(box.robot),
+    "get robot model": lambda box: box.robot.model.rstrip("e").upper(),
     "is in remote control": lambda box: str(box.remote_control).lower(),
     "running": lambda box: f"Program running: {str(box.runtime is Runtime.PLAYING).lower()}",
-    "programstate": _program_state,
     "robotmode": lambda box: f"Robotmode: {box.robot_mode.name}",
     "safetymode": lambda box: f"Safetymode: {box.safety.name}",
-    "safetystatus": lambda box: f"Safetystatus: {box.safety.name}",
-    "play": _doing(URController.play, "Starting program"),
-    "pause": _doing(URController.pause, "Pausing program"),
     "stop": _doing(_stop, "Stopped"),
     "power on": _doing(URController.power_on, "Powering on"),
     "power off": _doing(URController.power_off, "Powering off"),
