@@ -18,7 +18,7 @@ from flangeye.files.recording import NotThisLayout
 from flangeye.files.regular import open_regular
 from flangeye.files.scans import natural
 from flangeye.files.words import reason_of
-from flangeye.log.records import Channel, LogFile
+from flangeye.log.records import LogFile
 from flangeye.maths.streams import interpolated
 from flangeye.types import Floats
 from flangeye_plugins.reader.poses import pose_from_quaternion
@@ -116,10 +116,6 @@ def _guarded(file: Path, read: Callable[[Path], Any]) -> Any:
         return read(file)
     except StageError:
         raise
-    except ModuleNotFoundError:
-        raise StageError(
-            f"{file}: reading ROS 2 bags needs the extra 'ros': pip install 'flangeye[ros]'"
-        ) from None
     except Exception as error:  # damaged bytes can break the libraries in any way
         raise StageError(f"{file}: cannot be read as a ROS 2 bag: {reason_of(error)}") from None
 
@@ -139,24 +135,15 @@ def _mcap_topics(file: Path) -> dict[str, str]:
 
 
 def _mcap_messages(file: Path, topics: Collection[str]) -> Iterator[Raw]:
-    from mcap.records import Schema
-    from mcap_ros2.decoder import DecoderFactory
-
     def refuse(what: str) -> None:
         raise StageError(f"{file}: damaged: {what}")
 
-    factory, decoders = DecoderFactory(), dict[Channel, Callable[[bytes], Any] | None]()
     with open_regular(file) as opened:
         # The library's reader expands chunks before it looks at how large they become.
         for channel, time_ns, data, _ in LogFile(refuse).messages(opened, file.stat().st_size):
-            if channel.topic not in topics:
-                continue
-            if channel not in decoders:
-                described = channel.schema_data, channel.schema_encoding, channel.schema
-                schema = Schema(len(decoders) + 1, *described)
-                decoders[channel] = factory.decoder_for(channel.encoding, schema)
-            if (decode := decoders[channel]) is not None:
-                yield Raw(file, channel.topic, time_ns * 1e-9, data, partial(decode, data))
+            if channel.topic in topics and channel.encoding == "cdr":
+                decode = partial(types().deserialize_cdr, data, channel.schema)
+                yield Raw(file, channel.topic, time_ns * 1e-9, data, decode)
 
 
 def _opened(file: Path) -> AbstractContextManager[sqlite3.Connection]:
