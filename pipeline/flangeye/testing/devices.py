@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -22,10 +22,8 @@ from flangeye.devices import (
     RobotState,
     Scan,
     Scanner,
-    SensorFrame,
     StateSource,
     TactileSensor,
-    WeldProfile,
 )
 from flangeye.files.paths import bundled
 from flangeye.models.finger import Finger
@@ -38,9 +36,6 @@ from flangeye.testing.base import (
     require_round_trip,
 )
 from flangeye.testing.sources import logged
-
-_One = TypeVar("_One")
-
 
 SPEED = 0.3
 """Of joints in the kit's moves [rad/s]: slow enough for a real arm."""
@@ -305,82 +300,83 @@ class ScannerConformance(DriverConformance):
         require_round_trip(capture, logged)
 
 
-class SensorConformance(DriverConformance):
-    """A ``sensor`` part. A tactile sensor that is on must deliver frames by itself."""
+class StreamConformance(DriverConformance):
+    """Base of the two whose device gives one thing after another by itself."""
+
+    # Its method that gives the next, and what that is called
+    gives: ClassVar[str]
+
+    def given(self, device: Any, count: int) -> list[Any]:
+        """Return the next things; there is none for as long as no new one has come."""
+        found: list[Any] = []
+        limit = time.monotonic() + PATIENCE + LATE
+        while len(found) < count and time.monotonic() < limit:
+            one = getattr(device, self.gives)()
+            if one is None:
+                time.sleep(0.002)
+            else:
+                found.append(one)
+        require(
+            len(found) == count, f"{len(found)} {self.gives}s within {PATIENCE:g} s, not {count}"
+        )
+        return found
+
+    def test_it_gives_each_once_with_its_time(self) -> None:
+        """One after the other."""
+        with self.opened() as device:
+            times = [one.time_ns for one in self.given(device, 5)]
+        require(times == sorted(set(times)), f"{self.gives}s are not in order, or one came twice")
+
+    def test_asking_does_not_wait(self) -> None:
+        """It returns at once: the control loop asks 500 times a second."""
+        with self.opened() as device:
+            self.given(device, 1)
+            for _ in range(20):
+                took = _seconds(getattr(device, self.gives))
+                require(took < 0.05 + LATE / 5, f"{self.gives}() took {took:.3f} s")
+
+
+class SensorConformance(StreamConformance):
+    """A ``sensor`` part. A tactile sensor that is on gives frames by itself."""
 
     kind = "sensor"
+    gives = "frame"
 
     def context(self) -> Mapping[Any, Any]:
         """Return an arm at rest, and the bundled finger."""
         finger = read_model(bundled("data") / "fingers" / "srm.yaml", Finger)
         return {StateSource: _Standing(), Finger: finger}
 
-    def frames(self, sensor: TactileSensor, count: int) -> list[SensorFrame]:
-        """Return the next frames."""
-        return _given(sensor.frame, count, "frames")
-
-    def test_its_frames_are_images_with_a_time(self) -> None:
-        """One after the other, each given once."""
-        with self.opened() as sensor:
-            require(isinstance(sensor, TactileSensor), "it lacks methods of devices.TactileSensor")
-            times = [frame.time_ns for frame in self.frames(sensor, 5)]
-        require(times == sorted(set(times)), "frames are not in order, or one came twice")
-
     def test_its_camera_is_calibrated(self) -> None:
         """A pinhole matrix [px] for the images it delivers."""
         with self.opened() as sensor:
-            image = self.frames(sensor, 1)[0].image
+            require(isinstance(sensor, TactileSensor), "it lacks methods of devices.TactileSensor")
+            image = self.given(sensor, 1)[0].image
             matrix = np.asarray(sensor.camera_matrix)
         require(matrix.shape == (3, 3), f"a camera matrix of shape {matrix.shape}")
         rows, columns = image.pixels.shape[:2]
         inside = 0 < matrix[0, 2] < columns and 0 < matrix[1, 2] < rows
         require(inside and matrix[0, 0] > 1, "the camera matrix is not in this image's pixels")
 
-    def test_asking_does_not_wait(self) -> None:
-        """frame() returns at once: the control loop calls it 500 times a second."""
-        with self.opened() as sensor:
-            self.frames(sensor, 1)
-            for _ in range(20):
-                took = _seconds(sensor.frame)
-                require(took < 0.05 + LATE / 5, f"frame() took {took:.3f} s")
 
-
-class ProfilerConformance(DriverConformance):
+class ProfilerConformance(StreamConformance):
     """A ``profiler`` part: a profile sensor that is on, with a bead below it."""
 
     kind = "profiler"
+    gives = "profile"
 
     def context(self) -> Mapping[Any, Any]:
         """Return an arm at rest; a profile sensor alone needs no finger."""
         return {StateSource: _Standing(), TactileSensor: None}
 
-    def looks(self, profiler: Profiler, count: int) -> list[WeldProfile]:
-        """Return the next profiles."""
-        return _given(profiler.profile, count, "looks")
-
-    def test_its_looks_are_in_metres_with_a_time(self) -> None:
-        """Each profile is given once, in order, with its uncertainty."""
+    def test_its_profiles_are_in_metres(self) -> None:
+        """With how well each is known, at a fixed way behind the torch."""
         with self.opened() as profiler:
             require(isinstance(profiler, Profiler), "it lacks methods of devices.Profiler")
-            looks = self.looks(profiler, 5)
-        times = [look.time_ns for look in looks]
-        require(times == sorted(set(times)), "looks are not in order, or one came twice")
+            looks, behind = self.given(profiler, 5), profiler.behind
         require(all(abs(look.offset) < 0.1 for look in looks), "an offset is not in metres")
         require(all(0.0 < look.sigma < 0.01 for look in looks), "a sigma is not in metres")
-
-    def test_it_says_how_far_behind_it_looks(self) -> None:
-        """A fixed way, in metres, behind the torch."""
-        with self.opened() as profiler:
-            behind = profiler.behind
         require(0.0 < behind < 0.5, f"it looks {behind} m behind the torch")
-
-    def test_asking_does_not_wait(self) -> None:
-        """Reading the state returns at once: the control loop does so 500 times a second."""
-        with self.opened() as profiler:
-            self.looks(profiler, 1)
-            for _ in range(20):
-                took = _seconds(profiler.profile)
-                require(took < 0.05 + LATE / 5, f"profile() took {took:.3f} s")
 
 
 class ArcConformance(DriverConformance):
@@ -402,20 +398,6 @@ class ArcConformance(DriverConformance):
         with self.opened() as arc:
             says = arc.burning()
         require(says in (True, False, None), f"burning() returned {says!r}")
-
-
-def _given(ask: Callable[[], _One | None], count: int, things: str) -> list[_One]:
-    """Ask until so many have come; there is none for as long as no new one has."""
-    found: list[_One] = []
-    limit = time.monotonic() + PATIENCE + LATE
-    while len(found) < count and time.monotonic() < limit:
-        one = ask()
-        if one is None:
-            time.sleep(0.002)
-        else:
-            found.append(one)
-    require(len(found) == count, f"{len(found)} {things} within {PATIENCE:g} s, not {count}")
-    return found
 
 
 def _apart(first: RobotState, second: RobotState) -> float:
