@@ -174,6 +174,6 @@ def test_what_a_result_asks_for_whatever_its_steps_noted() -> None:
 def test_an_expected_error_that_poses_held_out_contradict_is_said(expected, told) -> None:
     stated = sections.expected_error_result(calibration(expected=ExpectedError(*expected)))
     found = document(calibration(), {"poses": 16.0}).model_copy(update={"expected_error": stated})
-    warnings = [w.text for w in sections.standing_warnings(found) if "held out" in w.text]
+    warnings = [w.text for w in sections.standing_warnings(found) if "held-out" in w.text]
     assert len(warnings) == (told is not None)
     assert all(told in text and "0.50 mm" in text for text in warnings)

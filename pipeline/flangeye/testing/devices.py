@@ -337,7 +337,7 @@ class StreamConformance(DriverConformance):
 
 
 class SensorConformance(StreamConformance):
-    """A ``sensor`` part. A tactile sensor that is on gives frames by itself."""
+    """A ``sensor`` part. A tactile sensor that is on must deliver frames by itself."""
 
     kind = "sensor"
     gives = "frame"

@@ -186,7 +186,7 @@ class Looks(Shape):
 
 @lru_cache(maxsize=8)  # a session's body, and how its mesh may be drawn wrongly
 def prepared(body: TargetBody) -> Looks:
-    """Return a body's looks, with its shape; computed once."""
+    """Return a body's looks; computed once for each shape."""
     return Looks(body.vertices, body.triangles)
 
 

@@ -139,7 +139,7 @@ def _misdrawn(
 
     for what, fix, other in _otherwise(body):
         if any(map(passes, BodySearch(points, prepared(other)).everywhere())):
-            return Rejected(f"{body.name} is {what}: so it would be found", fix=fix)
+            return Rejected(f"{body.name} is {what}: corrected, it would be found", fix=fix)
     shape = prepared(body)
     vertices, facets = shape.facets
     # Parts that stand elsewhere hide some of the rest, and a rest is found in clutter sooner.

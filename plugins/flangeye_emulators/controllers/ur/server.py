@@ -48,7 +48,7 @@ class DashboardSession(LineConnection):
 
 
 def answer(box: URController, text: str) -> str:
-    """Return the answer to one command, after doing what it says."""
+    """Execute one command and return its answer."""
     act = ANSWERS.get(text.lower())
     if act is None:
         return f"could not understand: '{text}'"
