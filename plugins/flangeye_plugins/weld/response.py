@@ -81,18 +81,26 @@ class Response:
 def identify(cycles: Floats) -> tuple[float, float]:
     """Return the dead time and lag [s] that best explain an arm's motion along one axis.
 
+    Where a controller limits its acceleration, the arm is late for a while after a step and
+    nowhere else: of its ways in a tenth of a second the two fifths that are explained least are
+    left out.
+
     Args:
         cycles: (K, 3) time [s], velocity commanded [m/s], where the arm was reported [m].
     """
     clock = cycles[:, 0]
     grid = np.arange(clock[0], clock[-1], GRID)
     command, where = (np.interp(grid, clock, column) for column in cycles.T[1:])
+    window = round(0.1 / GRID)
+    moved = where[window:] - where[:-window]
     best, found = math.inf, (0.0, 0.0)
     for lag in (1e-3, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3):
         followed = _lagged(command, lag)
         for dead in np.arange(0.0, 0.161, 0.02):
             late = np.concatenate([np.zeros(round(dead / GRID)), followed])[: len(grid)]
-            spread = float(np.var(where - np.cumsum(late) * GRID))
+            told = np.cumsum(late) * GRID
+            off = np.sort(np.abs(moved - (told[window:] - told[:-window])))
+            spread = float(off[: 3 * len(off) // 5].sum())
             if spread < best:
                 best, found = spread, (float(dead), lag if lag > 1e-3 else 0.0)
     return found

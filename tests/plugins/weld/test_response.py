@@ -51,3 +51,14 @@ def test_what_an_arm_does_to_a_stroke_tells_how_late_it_is(dead: float, lag: flo
         place[now] = place[now - 1] + 5e-3 * speed
     found = identify(np.column_stack([clock, command, place + 0.3]))
     assert found == pytest.approx((dead, lag), abs=1e-9)
+
+
+def test_an_arm_whose_controller_limits_its_acceleration_is_late_after_steps_alone() -> None:
+    """Half a second to turn round at the ends, as where the tool's turn is limited with it."""
+    clock = np.arange(0.0, 8.0, 5e-3)
+    command = 4e-3 * np.sign(np.sin(3.0 * clock)) * (0.2 + 0.8 * np.sin(4.0 * clock) ** 2)
+    speed, place = 0.0, np.zeros(len(clock))
+    for now in range(1, len(clock)):
+        speed += float(np.clip(command[now - 1] - speed, -20e-3 * 5e-3, 20e-3 * 5e-3))
+        place[now] = place[now - 1] + 5e-3 * speed
+    assert sum(identify(np.column_stack([clock, command, place]))) <= 0.05
