@@ -13,7 +13,7 @@ from nicegui import ui
 
 from flangeye.errors import FlangeyeError
 from flangeye.files.paths import bundled
-from flangeye.files.yaml_lines import read_yaml
+from flangeye.files.yaml_lines import flow, read_yaml
 from flangeye.models.graph import Running
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import Stage
@@ -436,8 +436,7 @@ def _shown(value: Any) -> str:
     """Return a value as it would stand in the recipe, on one line."""
     if value is None or isinstance(value, str):
         return value or ""
-    text = yaml.safe_dump(value, default_flow_style=True, width=1000)
-    return text.removesuffix("...\n").strip()
+    return flow(value)
 
 
 def _put_step(steps: list[Any], path: list[Any], value: Any) -> None:

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flangeye.errors import RecipeError
-from flangeye.files.yaml_lines import parse_yaml, read_yaml
+from flangeye.files.yaml_lines import flow, parse_yaml, read_yaml
 
 
 @pytest.mark.parametrize(
@@ -76,3 +76,13 @@ def test_any_text_is_read_or_refused(text: str) -> None:
 def test_a_text_of_very_many_digits_is_read_in_one_pass() -> None:
     text = "1" * 400_000 + "x"  # steps that grow with the square would take a day
     assert parse_yaml(f"a: {text}", "x").data == {"a": text}
+
+
+@given(st.text("0189.e+-~nulr", max_size=5))
+def test_a_text_is_written_so_that_it_is_read_as_text(text: str) -> None:
+    assert parse_yaml(f"path: {flow(text)}", "x").data == {"path": text}
+
+
+@pytest.mark.parametrize("name", ["08", "1e3", "0019", "9" * 30])
+def test_a_folder_that_is_called_by_a_number_stays_text(name: str) -> None:
+    assert parse_yaml(f"path: {flow(name)}", "x").data == {"path": name}

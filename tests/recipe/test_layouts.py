@@ -25,6 +25,7 @@ NAMES = ["x", "y", "z", "qx", "qy", "qz", "qw"]
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "init.md"
 SEED = 7
 COUNT = 24
+FLANGE_T_CAMERA = rigid(rotation_exp(np.array([0.1, -0.2, 1.1])), np.array([0.05, 0.02, 0.09]))
 
 
 def session(seed: int) -> tuple[Floats, Floats, Floats]:
@@ -32,11 +33,10 @@ def session(seed: int) -> tuple[Floats, Floats, Floats]:
     rng = np.random.default_rng(seed)
     joints = np.array([0.3, -1.4, 1.6, -1.8, -1.5, 0.2]) + rng.uniform(-0.5, 0.5, (COUNT, 6))
     arm = np.asarray(Arm(load_model("robots", "ur5e")).flange(joints))
-    flange_T_camera = rigid(rotation_exp(np.array([0.1, -0.2, 1.1])), np.array([0.05, 0.02, 0.09]))
     base_T_target = rigid(rotation_exp(np.array([0.1, 0.2, 2.0])), np.array([-0.5, -0.1, 0.0]))
     noise = [rigid(rotation_exp(r), t) for r, t in zip(
         rng.normal(0, 3e-4, (COUNT, 3)), rng.normal(0, 1e-4, (COUNT, 3)), strict=True)]  # fmt: skip
-    seen = np.linalg.inv(arm @ flange_T_camera) @ base_T_target @ np.array(noise)
+    seen = np.linalg.inv(arm @ FLANGE_T_CAMERA) @ base_T_target @ np.array(noise)
     return joints, arm, seen
 
 
@@ -79,6 +79,11 @@ def index_with_gaps(f, j, a, s):
     kept = np.cumsum([1, 2] * (COUNT // 2))
     for name, poses in (("rob", a), ("mark", s)):
         (f / f"{name}.csv").write_text(text(np.column_stack([kept, vector(poses, 1e3)])))
+
+
+def rotation_first(f, j, a, s):
+    for name, poses in (("tcp", a), ("board", s)):
+        (f / f"{name}.txt").write_text(text(vector(poses)[:, [3, 4, 5, 0, 1, 2]]))
 
 
 def blank_lines(f, j, a, s):
@@ -244,6 +249,7 @@ LAYOUTS: dict[str, Callable[..., None]] = {
     "two blocks of rows in one text, arm above marker": blocks,
     "the same without a line between them": halves,
     "a running index, rotation vector before the position": index_column,
+    "rotation vector before the position, in metres, without a heading": rotation_first,
     "an index with gaps, where some images were left out": index_with_gaps,
     "a remark behind `//`, and a blank line after each row": blank_lines,
     "`cam2target.csv`: the camera in the target": cam2target,
@@ -284,6 +290,8 @@ def test_a_layout_is_verified_without_an_edit(
     done = CliRunner().invoke(commands(), ["run", "recipe.yaml", "--out", "out"])
     assert done.exit_code == 0, f"{told.output}{done.output}{done.exception}"
     assert "\nVERIFIED " in done.output
+    answer = json.loads((tmp_path / "out" / "result.json").read_text("utf-8"))["transforms"]
+    assert np.allclose(answer["flange_T_camera"]["matrix"], FLANGE_T_CAMERA, atol=2e-3)
 
 
 def test_the_page_lists_these_layouts() -> None:

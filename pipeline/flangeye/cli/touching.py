@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-import yaml
 
 from flangeye.devices import RobotDriver
 from flangeye.errors import StageError
 from flangeye.files.regular import write_whole
+from flangeye.files.yaml_lines import dumped
 from flangeye.log.read import read_run
 from flangeye.maths.geometry import rpy_from_rotation
 from flangeye.models.robots import RobotModel
@@ -108,7 +108,7 @@ def _step(seen: Floats, tip: Floats, touched: Sequence[Touched]) -> str:
         for point, each in zip(seen, touched, strict=True)
     ]
     step = {"verify.touch": {"tip": _lengths(tip), "touches": touches}}
-    return str(yaml.safe_dump([step], sort_keys=False, default_flow_style=None, width=120))
+    return dumped([step], default_flow_style=None, width=120)
 
 
 def _lengths(point: Floats) -> list[str]:

@@ -217,15 +217,32 @@ def _holds(text: str, data: Mapping[Any, Any]) -> bool:
 
 
 def _whole(data: Mapping[Any, Any]) -> str:
-    return yaml.safe_dump(dict(data), sort_keys=False, allow_unicode=True, width=100)
+    return dumped(dict(data), width=100)
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes in quotes each text that :func:`read_yaml` would take for a number: 08, 1e3."""
+
+    def represent_text(self, text: str) -> yaml.Node:
+        style = None if _scalar(text, plain=True) == text else "'"
+        return self.represent_scalar("tag:yaml.org,2002:str", text, style)
+
+
+_Dumper.add_representer(str, _Dumper.represent_text)
+
+
+def dumped(value: Any, *, default_flow_style: bool | None = False, width: int = 80) -> str:
+    """Return plain data as YAML that :func:`read_yaml` reads back as it was."""
+    text: str = yaml.dump(
+        value, Dumper=_Dumper, default_flow_style=default_flow_style, width=width,
+        sort_keys=False, allow_unicode=True,
+    )  # fmt: skip
+    return text
 
 
 def flow(value: Any) -> str:
     """Return a value as YAML on one line."""
-    text: str = yaml.safe_dump(
-        value, default_flow_style=True, sort_keys=False, allow_unicode=True, width=10_000
-    )
-    return text.removesuffix("...\n").strip()
+    return dumped(value, default_flow_style=True, width=10_000).removesuffix("...\n").strip()
 
 
 def entry(value: Any) -> str:

@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import yaml
 
 from flangeye.errors import RecipeError
 from flangeye.files.paths import bundled
 from flangeye.files.words import nearest
-from flangeye.files.yaml_lines import parse_value, read_yaml
+from flangeye.files.yaml_lines import dumped, parse_value, read_yaml
 from flangeye.maths.kinematics import Arm
 from flangeye.models.model import read_model
 from flangeye.models.robots import RobotModel
@@ -122,7 +121,7 @@ def write_scanner(path: Path, values: Mapping[str, Any]) -> str:
 
 def _write(path: Path, data: Mapping[str, Any]) -> None:
     require_new(path)
-    path.write_text(yaml.safe_dump(dict(data), sort_keys=False, allow_unicode=True), "utf-8")
+    path.write_text(dumped(dict(data)), "utf-8")
 
 
 def require_new(path: Path) -> None:

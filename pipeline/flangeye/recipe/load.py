@@ -10,7 +10,6 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Protocol, get_args
 
-import yaml
 from pydantic import BaseModel, ValidationError
 
 from flangeye import types as t
@@ -18,7 +17,7 @@ from flangeye.devices import MotionAllowed
 from flangeye.errors import RecipeError
 from flangeye.files.regular import read_text
 from flangeye.files.validation import sentence
-from flangeye.files.yaml_lines import MAX_BYTES, Document, parse_yaml, read_yaml
+from flangeye.files.yaml_lines import MAX_BYTES, Document, dumped, parse_yaml, read_yaml
 from flangeye.models.boards import Board
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.registry import Lookup, PluginNotFoundError, Registry
@@ -66,7 +65,7 @@ class Recipe:
         driven = self.header.robot is not None and self.header.robot.driver is not None
         data, models = written_out(self.header, self.context, driven or self.archive is None)
         data["steps"] = self._steps_as_data()
-        text = yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=100)
+        text = dumped(data, width=100)
         return {"recipe.resolved.yaml": text, **models}
 
     def with_seed(self, seed: int) -> Recipe:

@@ -9,8 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import yaml
-
+from flangeye.files.yaml_lines import dumped
 from flangeye.models.bodies import ArmBody, TargetBody
 from flangeye.models.cell import Cell
 from flangeye.models.model import Model
@@ -84,7 +83,7 @@ def _is_file(name: str | None) -> bool:
 
 def _text(model: Model) -> str:
     data = model.model_dump(mode="json", exclude_unset=True)
-    return str(yaml.safe_dump(data, sort_keys=False, allow_unicode=True))
+    return dumped(data)
 
 
 @contextmanager

@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from flangeye.errors import StageError
 from flangeye.files.clouds import write_cloud
 from flangeye.files.regular import write_whole
-from flangeye.files.yaml_lines import parse_yaml
+from flangeye.files.yaml_lines import dumped, parse_yaml
 from flangeye.log.read import RunLog
 from flangeye.maths.geometry import quaternion_from_rotation, rotation_log
 from flangeye.models.cell import Axis, Cell
@@ -147,8 +146,7 @@ def _recipe(text: str, cell: Cell, seen: Sequence[Observation], scans: Mapping[s
     _, *steps = (step for step in data.pop("steps") if scans or not _works_on_scans(step))
     data.pop("description", None)
     document = {**data, "steps": [_acquire(cell, seen, bool(scans)), *steps]}
-    written: str = yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=100)
-    return written
+    return dumped(document, width=100)
 
 
 def _works_on_scans(step: Any) -> bool:

@@ -6,8 +6,6 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from flangeye import types as t
 from flangeye.devices import MotionAllowed
 from flangeye.doctor.monitor.chart import write_chart
@@ -15,7 +13,7 @@ from flangeye.doctor.monitor.history import History, MonitorCheck, as_json, only
 from flangeye.doctor.monitor.stored import StoredCalibration, stored_calibration
 from flangeye.doctor.monitor.watchman import CODES, judge, take
 from flangeye.errors import StageError
-from flangeye.files.yaml_lines import parse_yaml
+from flangeye.files.yaml_lines import dumped, parse_yaml
 from flangeye.log.read import RunLog, log_of, read_run
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import parse_recipe
@@ -112,7 +110,7 @@ def _from_archive(stored: StoredCalibration) -> str:
     name = next((name for name in reads_recordings if name in first), None)
     params = first[name] if name and isinstance(first, dict) else None
     data["steps"][0] = {name or reads_recordings[0]: {**(params or {}), "fewest": 1}}
-    return str(yaml.safe_dump(data, sort_keys=False, allow_unicode=True))
+    return dumped(data)
 
 
 def _steps(stored: StoredCalibration) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from flangeye.models.robots import RobotModel
 from flangeye.recipe.draft.evidence import (
     FARTHEST,
     TURN,
+    Choice,
     Writing,
     mounting_of,
     poses_by_number,
@@ -41,6 +42,7 @@ from flangeye.recipe.draft.headings import (
 from flangeye.recipe.draft.survey import Questions, one_of
 from flangeye.types import Floats
 
+TURN_FIRST = "the rotation stands before the position"
 NAME_THE_ARM = "name the arm: --robot NAME ('flangeye robots' lists them), or its .urdf"
 WAYS = {"": ("base_T_flange", "flange_T_base"), "target-": ("camera_T_target", "target_T_camera")}
 
@@ -70,7 +72,7 @@ def table_params(
     if target is None and not scans:
         _require_as_many(tables, arm)
         arm, target = _halves(arm)
-    arm = _seen_together(arm, target, questions, robot)
+    arm, target = _seen_together(arm, target, questions, robot)
     if arm.rotations == JOINTS:
         params = _of_joints(arm, questions, robot)
     else:
@@ -302,8 +304,8 @@ def _numbers(pose: PoseColumns) -> Floats:
 
 def _seen_together(
     arm: PoseColumns, target: PoseColumns | None, questions: Questions, robot: RobotModel | None
-) -> PoseColumns:
-    """Return the arm's columns, noting what its poses and the target's show as likely answers.
+) -> tuple[PoseColumns, PoseColumns | None]:
+    """Return both columns, noting what the arm's poses and the target's show as likely answers.
 
     Numbers without names that turn with the target as joint angles only are joint angles.
 
@@ -311,21 +313,27 @@ def _seen_together(
         RecipeError: Numbers without names are neither; halves of a table are not arm and target.
     """
     if target is None or not target.is_pose or len(arm.table.rows) != len(target.table.rows):
-        return _within_reach(arm, robot)
-    numbers, seen = _numbers(arm), _numbers(target)
-    kept = np.isfinite(numbers).all(axis=1) & np.isfinite(seen).all(axis=1)
-    numbers, seen = numbers[kept], seen[kept]
-    choice = writing_of(
-        numbers, _writings(arm, numbers, questions, "", robot),
-        seen, _writings(target, seen, questions, "target-", None),
-    )  # fmt: skip
-    if choice is None:
+        return _within_reach(arm, robot), target
+    tried = (
+        (a, t, choice)
+        for a in _orders(arm, questions, "")
+        for t in _orders(target, questions, "target-")
+        if (choice := _choice(a, t, questions, robot)) is not None
+    )
+    found = next(tried, None)
+    if found is None:
         if ":1/2" in arm.table.name:
             raise RecipeError(_alone(arm))
         if arm.rotations != JOINTS and arm.may_be_joints and not questions.given.get("rotation"):
             raise RecipeError(_neither(arm, robot))
-        return arm
-    for prefix, writing in (("", choice.arm), ("target-", choice.target)):
+        return arm, target
+    arm, target, choice = found
+    numbers, seen = _both(arm, target)
+    for pose, prefix, writing in ((arm, "", choice.arm), (target, "target-", choice.target)):
+        if pose.guess == TURN_FIRST:
+            questions.assumed.append(
+                f"{pose.table.name}: {TURN_FIRST} ({choice.told}; --{prefix}columns says otherwise)"
+            )
         questions.likely[f"{prefix}rotation"] = (writing.rotation, choice.told)
         questions.likely[f"{prefix}angle"] = (writing.angle, choice.told)
     if choice.arm.kinematics is not None and arm.rotations != JOINTS:
@@ -334,18 +342,45 @@ def _seen_together(
                                  "otherwise)")  # fmt: skip
     poses, marks = choice.arm.poses(numbers), choice.target.poses(seen)
     if poses is None or marks is None:
-        return arm
+        return arm, target
     asked = questions.given
     way = asked.get("pose") or WAYS[""][bool(arm.frames and is_inverse(arm.frames))]
     camera, upright = asked.get("camera"), asked.get("target-pose")
+    ways = WAYS["target-"][:: -1 if target.frames and is_inverse(target.frames) else 1]
     mounting = mounting_of(
         poses if way == "base_T_flange" else inverted(poses), marks,
-        [camera] if camera else ["base", "flange"], [upright] if upright else WAYS["target-"],
+        [camera] if camera else ["base", "flange"], [upright] if upright else ways,
     )  # fmt: skip
     if mounting is not None:
         questions.likely["camera"] = (mounting.camera, mounting.told)
         questions.likely["target-pose"] = (mounting.target, mounting.told)
-    return arm
+    return arm, target
+
+
+def _orders(pose: PoseColumns, questions: Questions, prefix: str) -> list[PoseColumns]:
+    """Return a pose as it was found, and six numbers without names with the rotation first too."""
+    if not pose.may_be_joints or pose.rotations or questions.given.get(f"{prefix}columns"):
+        return [pose]
+    turned = replace(pose, columns=(*pose.columns[3:], *pose.columns[:3]), guess=TURN_FIRST)
+    return [pose, turned]
+
+
+def _both(arm: PoseColumns, target: PoseColumns) -> tuple[Floats, Floats]:
+    """Return the numbers of both in the rows that have all of them."""
+    numbers, seen = _numbers(arm), _numbers(target)
+    kept = np.isfinite(numbers).all(axis=1) & np.isfinite(seen).all(axis=1)
+    return numbers[kept], seen[kept]
+
+
+def _choice(
+    arm: PoseColumns, target: PoseColumns, questions: Questions, robot: RobotModel | None
+) -> Choice | None:
+    """Return how the numbers of both are written, as far as they show it."""
+    numbers, seen = _both(arm, target)
+    return writing_of(
+        numbers, _writings(arm, numbers, questions, "", robot),
+        seen, _writings(target, seen, questions, "target-", None),
+    )  # fmt: skip
 
 
 def _within_reach(arm: PoseColumns, robot: RobotModel | None) -> PoseColumns:

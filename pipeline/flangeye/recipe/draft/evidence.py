@@ -307,13 +307,14 @@ def mounting_of(
 
     A camera on the flange with ``camera_T_target`` and one beside the robot with
     ``target_T_camera`` are one equation with its unknowns exchanged, so no data tell them apart:
-    of such twins it is the one whose target is written as detectors write it.
+    of such twins it is the one whose target is written as ``targets`` begins.
 
     Args:
         arm: (N, 4, 4) base_T_flange [m].
         seen: (N, 4, 4) poses of the target as they stand in the file [m].
         cameras: What may carry the camera: base, flange.
-        targets: What the target's poses may be: camera_T_target, target_T_camera.
+        targets: What the target's poses may be, the likelier first: camera_T_target,
+            target_T_camera.
     """
     if len(arm) < FEWEST_PAIRS:
         return None
@@ -325,7 +326,9 @@ def mounting_of(
     if others and others[0][0] < CLEARER * max(best, LOOSE_PLACE):
         return None
     beyond = f", the next to {1e3 * others[0][0]:.0f} mm" if others else ""
-    return Mounting(camera, way, f"fits to {1e3 * best:.1f} mm{beyond}")
+    twin = next(((c, t) for c in cameras for t in targets if c != camera and t != way), None)
+    same = f"; so does {twin[0]} with {twin[1]}, the same equation" if twin else ""
+    return Mounting(camera, way, f"fits to {1e3 * best:.1f} mm{beyond}{same}")
 
 
 def _residuals_by_twins(
@@ -333,7 +336,7 @@ def _residuals_by_twins(
 ) -> dict[bool, tuple[float, str, str]]:
     """Return the residual [m] of each equation, with the mounting that it is taken for."""
     twins: dict[bool, tuple[float, str, str]] = {}
-    for way, camera in product(sorted(targets), cameras):  # camera_T_target goes first
+    for way, camera in product(targets, cameras):
         carried = arm if camera == "flange" else inverted(arm)
         found = _residual(carried, seen if way == "camera_T_target" else inverted(seen))
         equation = (camera == "flange") == (way == "camera_T_target")
