@@ -244,8 +244,8 @@ def npy(array: np.ndarray, tmp_path: Path) -> bytes:
 
 DEFECTS = {
     "empty": ("a.pcd", b"", "is empty (0 bytes)"),
-    "another format": ("a.abc", b"solid", "'.abc' is not a point cloud; known: .asc, .csv, .npy, .pcd, "
-                       ".ply, .pts, .txt, .xyz"),
+    "another format": ("a.abc", b"solid", "'.abc' is not a point cloud; known: .asc, .csv, .npy, .npz, "
+                       ".pcd, .ply, .pts, .txt, .xyz"),
     "not pcd": ("a.pcd", b"hello\nworld\n", "is not a PCD file: its header has no DATA line"),
     "not ply": ("a.ply", b"hello\nworld\n", "is not a PLY file: its header has no end_header line"),
     "ply by name only": ("a.ply", b"plx\nend_header\n",
@@ -472,6 +472,17 @@ TABLES_OF_POINTS = {
         "% exported\n//R X Y Z\n" + lines_of(p, "7 {:f} {:f} {:f}")),
     "unit.xyz": lambda f, p: f.write_text("# x_mm y_mm z_mm\n" + lines_of(1e3 * p)),
     "tabs.txt": lambda f, p: f.write_text(lines_of(p, "{:f}\t{:f}\t{:f}").replace(".", ",")),
+    "named.npz": lambda f, p: np.savez(f, colors=p + 1, points=p),
+    "alone.npz": lambda f, p: np.savez(f, p, labels=np.arange(len(p))),
+    "image.npz": lambda f, p: np.savez_compressed(f, xyz=p.reshape(2, 20, 3)),
+    "axes.npz": lambda f, p: np.savez(f, x=p[:, 0], y=p[:, 1], z=p[:, 2]),
+    "mark.csv": lambda f, p: f.write_text("\ufeffx,y,z\n" + lines_of(p, "{},{},{}"), "utf-8"),
+    "bare_mark.csv": lambda f, p: f.write_text("\ufeff" + lines_of(p, "{},{},{}"), "utf-8"),
+    "loud.csv": lambda f, p: f.write_text("X_MM,Y_MM,Z_MM\n" + lines_of(1e3 * p, "{},{},{}")),
+    "cm.csv": lambda f, p: f.write_text("x (cm),y (cm),z (cm)\n" + lines_of(1e2 * p, "{},{},{}")),
+    "paraview.csv": lambda f, p: f.write_text(
+        '"Points:0","Points:1","Points:2"\n' + lines_of(p, "{},{},{}")),
+    "ended.csv": lambda f, p: f.write_text(lines_of(p, "{},{},{},")),
 }  # fmt: skip
 
 
@@ -484,6 +495,17 @@ def test_points_are_read_from_tables_as_other_programs_write_them(
     found = read_cloud(tmp_path / name).points()
     wanted = points[:, ::-1] if name == "records.npy" else points
     np.testing.assert_allclose(found, wanted, atol=1e-6)
+
+
+def test_empty_cells_are_missing_points(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("x,y,z\n1,2,3\n,,\n4,5,\n7,8,9\n")
+    assert read_cloud(tmp_path / "a.csv").points().tolist() == [[1, 2, 3], [7, 8, 9]]
+
+
+def test_arrays_of_which_several_may_be_points_are_refused(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", one=np.ones((9, 3)), two=np.ones((9, 3)))
+    with pytest.raises(StageError, match=r"one \(9, 3\), two \(9, 3\); call one points"):
+        read_cloud(tmp_path / "a.npz")
 
 
 def test_a_pointer_of_git_lfs_is_named_as_such(tmp_path: Path) -> None:

@@ -569,8 +569,8 @@ def two_poses_of_nobody(folder):
         (meshes, [], "rec/scan_0.stl: is a mesh, not a scan; sample it to points as .ply: "),
         (lambda folder: (folder / "scan.e57").write_text("x"), [],
          "rec/scan.e57: is an E57 scan, which is not read; save it as .ply"),
-        (tables_of_other_lengths, [], "rec/marker.csv: has 4 rows, robot.csv has 5; remove "
-         "the surplus, or give each a column time"),
+        (tables_of_other_lengths, [], "rec/marker.csv: has 4 rows, robot.csv has 5; give each "
+         "a column time to join them by it, or remove the surplus"),
         (two_tables_of_nobody, [], "not known: which poses are the arm's (a.csv, b.csv); add "
          "--table a.csv"),
         (two_poses_of_nobody, [], "not known: which poses are the arm's (log.csv:a, log.csv:b); "

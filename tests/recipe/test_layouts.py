@@ -81,6 +81,14 @@ def index_with_gaps(f, j, a, s):
         (f / f"{name}.csv").write_text(text(np.column_stack([kept, vector(poses, 1e3)])))
 
 
+def index_in_no_order(f, j, a, s):
+    kept = 3 + np.random.default_rng(SEED).permutation(COUNT)
+    for name, order in (("robot", kept), ("marker", np.sort(kept))):
+        poses = (a if name == "robot" else s)[order - 3]
+        rows = text(np.column_stack([order, vector(poses, 1e3)]))
+        (f / f"{name}.csv").write_text("id,x_mm,y_mm,z_mm,rx,ry,rz\n" + rows)
+
+
 def rotation_first(f, j, a, s):
     for name, poses in (("tcp", a), ("board", s)):
         (f / f"{name}.txt").write_text(text(vector(poses)[:, [3, 4, 5, 0, 1, 2]]))
@@ -249,6 +257,7 @@ LAYOUTS: dict[str, Callable[..., None]] = {
     "two blocks of rows in one text, arm above marker": blocks,
     "the same without a line between them": halves,
     "a running index, rotation vector before the position": index_column,
+    "rows of one table in no order, with the `id` of the other's": index_in_no_order,
     "rotation vector before the position, in metres, without a heading": rotation_first,
     "an index with gaps, where some images were left out": index_with_gaps,
     "a remark behind `//`, and a blank line after each row": blank_lines,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Sequence
@@ -11,7 +12,7 @@ from itertools import chain
 from pathlib import Path
 
 from flangeye.errors import StageError
-from flangeye.files.clouds.plain import open_text
+from flangeye.files.clouds.plain import open_npz, open_text
 from flangeye.files.clouds.table import read_head
 from flangeye.files.recording import Recording
 from flangeye.types import FLANGE, Floats
@@ -33,13 +34,16 @@ def numbers_of(names: Sequence[str]) -> list[tuple[int, ...]]:
     return [tuple(run[i] for i in telling) or run[-1:] for run in runs]
 
 
-def partners(where: str, poses: Sequence[str], others: Sequence[str]) -> tuple[list[int], str]:
-    """Return for each pose the matching name, and a note of how they were paired.
+def partners(
+    where: str, poses: Sequence[str], others: Sequence[str], what: str = "scans"
+) -> tuple[list[int], str]:
+    """Return for each pose which of the others belongs to it, and a note of how they were paired.
 
     Args:
         where: What messages begin with.
         poses: Names of the poses, without endings.
         others: Names of the scans, or of what was measured at the poses.
+        what: What messages call the others.
 
     Raises:
         StageError: Neither the sets of names nor those of the numbers in them are equal, or two
@@ -48,13 +52,15 @@ def partners(where: str, poses: Sequence[str], others: Sequence[str]) -> tuple[l
     if set(poses) == set(others) and len(set(poses)) == len(poses) == len(others):
         return [others.index(name) for name in poses], f"paired by name: {_example(poses, poses)}"
     if not others:
-        raise StageError(f"{where}: has {len(poses)} poses ({poses[0]}, …), but there are no scans")
+        raise StageError(
+            f"{where}: has {len(poses)} poses ({poses[0]}, …), but there are no {what}"
+        )
     keys, other_keys = numbers_of(poses), numbers_of(others)
     lone = [p for p, k in zip(poses, keys, strict=True) if k not in other_keys or not k]
     other_lone = [o for o, k in zip(others, other_keys, strict=True) if k not in keys or not k]
     twice = len(set(keys)) < len(keys) or len(set(other_keys)) < len(other_keys)
     if lone or other_lone or twice:
-        raise StageError(f"{where}: {_differing(poses, others, lone, other_lone)}")
+        raise StageError(f"{where}: {_differing((poses, lone), (others, other_lone), what)}")
     found = [other_keys.index(key) for key in keys]
     return found, f"paired by number: {_example(poses, [others[i] for i in found])}"
 
@@ -91,9 +97,13 @@ def _example(poses: Sequence[str], others: Sequence[str]) -> str:
 
 
 def _differing(
-    poses: Sequence[str], others: Sequence[str], lone: Sequence[str], other_lone: Sequence[str]
+    ours: tuple[Sequence[str], Sequence[str]],
+    theirs: tuple[Sequence[str], Sequence[str]],
+    what: str,
 ) -> str:
-    count = f"{len(poses)} poses ({poses[0]}, …) and {len(others)} scans ({others[0]}, …)"
+    """Say how names differ: each side's, and those of it without a partner."""
+    (poses, lone), (others, other_lone) = ours, theirs
+    count = f"{len(poses)} poses ({poses[0]}, …) and {len(others)} {what} ({others[0]}, …)"
     if not lone and not other_lone:
         return f"{count} share a number more than once; give each pair one name or number"
     sides = [f"no partner for {_list(names)}" for names in (lone, other_lone) if names]
@@ -107,8 +117,8 @@ def _list(names: Sequence[str]) -> str:
 
 
 CLOUDS = (".pcd", ".ply", ".npy", ".xyz", ".pts", ".asc")
-POINTS = (".csv", ".txt")
-"""Texts that hold points, or poses: their content tells."""
+POINTS = (".csv", ".txt", ".npz")
+"""Files that hold points, or poses: their content tells."""
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 VENDOR = {".zdf": "Zivid's SDK", ".praw": "Photoneo's PhoXi Control", ".mraw": "Mech-Mind's SDK"}
 """Files that only their maker can read, and with what to turn them into others."""
@@ -135,7 +145,10 @@ def scans_in(folder: Path, stem: str = "*") -> list[Path]:
 
 
 def texts_of_points(files: Iterable[Path]) -> set[Path]:
-    """Return the text files that hold a cloud each: three or more, numbered alike."""
+    """Return the texts and archives of arrays that hold a cloud each.
+
+    They are three or more, named alike but for a number.
+    """
     alike: dict[str, list[Path]] = defaultdict(list)
     for path in files:
         if path.suffix.lower() in POINTS:
@@ -145,8 +158,10 @@ def texts_of_points(files: Iterable[Path]) -> set[Path]:
 
 
 def _holds_points(path: Path) -> bool:
-    """Return whether a text holds more points than one capture has poses or a camera numbers."""
+    """Return whether a file holds more points than one capture has poses or a camera numbers."""
     try:
+        if path.suffix.lower() == ".npz":
+            return math.prod(open_npz(path).shape) > 100
         table = open_text(path)
         rotation = re.search(r"\b(qx|rx|roll|yaw)", read_head(path)[:500].decode("latin-1").lower())
     except StageError:

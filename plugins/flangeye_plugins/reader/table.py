@@ -24,8 +24,8 @@ from pydantic import Field, model_validator
 
 from flangeye import StageError, part
 from flangeye.files.recording import Archive, NotThisLayout, Recording
-from flangeye.files.scans import Poses, partners, recording_of, scans_of
-from flangeye.files.tables import Column, Table, files_at, number_of
+from flangeye.files.scans import Poses, recording_of, scans_of
+from flangeye.files.tables import Column, Table, files_at, number_of, rows_together
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.pose_corrections import inverted
 from flangeye.maths.streams import interpolated, mean_pose, passed, turning
@@ -96,8 +96,8 @@ class TableParams(FlangePoseParams, JointsParams, CloudUnitParams):
     length: Literal["m", "mm"] = Field("m", description="Unit of the positions.")
     scan: Column | None = Field(
         None,
-        description="Column of the scans' file names; if not given, the one called scan, or "
-        "the first where it holds text.",
+        description="Column of the scans' file names, or of what the rows are called, as in the "
+        "target's table; if not given, the one called scan, or the first where it holds text.",
     )
     target: TargetParams | None = Field(
         None, description="The target as the camera measured it, in place of scans."
@@ -254,27 +254,13 @@ def _measured(folder: Path, text: Table, poses: Floats, params: TableParams) -> 
     else:
         others, notes = [target, *([second] if second else [])], []
         for at, other in enumerate(others):
-            order, notes = _partners(text, other.table)
+            order, notes = rows_together(text, other.table, params.scan)
             others[at] = other._replace(values=[other.values[i] for i in order])
         recordings = _row_by_row(text, times, poses, others)
         if joints is not None:
             recordings = [replace(r, joints=at) for r, at in zip(recordings, joints, strict=True)]
     layout = f"table, {', '.join(dict.fromkeys(t.name for t in tables))}"
     return Archive(layout, folder, recordings, files, params.cloud_unit, notes)
-
-
-def _partners(text: Table, other: Table) -> tuple[list[int], list[str]]:
-    """Return which row of another table belongs to each, and how that was found."""
-    if other is not text and text.names and other.names:
-        order, note = partners(str(text.file), text.names, other.names)
-        return order, [note]
-    if len(other.rows) != len(text.rows):
-        raise StageError(
-            f"{other.file}: has {len(other.rows)} rows, {text.name} has {len(text.rows)}; give "
-            "each a time: to join them by it, or remove the surplus"
-        )
-    told = [] if other is text else [f"paired row by row: {text.name} with {other.name}"]
-    return list(range(len(text.rows))), told
 
 
 def _row_by_row(

@@ -224,7 +224,8 @@ def test_streams_without_a_common_time_are_refused(tmp_path: Path) -> None:
         ({"columns": [99]}, "a.csv: has no column 99; they are 1 to 9"),
         ({"time": "v"}, "a.csv:3: its time is not after the row before it"),
         ({"columns": [*"xyzabcd"], "target": {"rotation": "point", "length": "m", "file": "b.csv"}},
-         "b.csv: has 1 rows, a.csv has 6; give each a time: to join them by it, or remove the surplus"),
+         "b.csv: has 1 rows, a.csv has 6; give each a column time to join them by it, or remove the "
+         "surplus"),
     ],
 )  # fmt: skip
 def test_a_mistake_in_a_table_is_one_line(

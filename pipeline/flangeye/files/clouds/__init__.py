@@ -16,7 +16,15 @@ from typing import Literal
 import numpy as np
 
 from flangeye.files.clouds.pcd import Viewpoint, open_pcd
-from flangeye.files.clouds.plain import array_of, holds_numbers, load_npy, open_npy, open_text
+from flangeye.files.clouds.plain import (
+    STATED,
+    array_of,
+    holds_numbers,
+    load_npy,
+    open_npy,
+    open_npz,
+    open_text,
+)
 from flangeye.files.clouds.ply import open_ply
 from flangeye.files.clouds.table import Points, PointTable, refuse
 from flangeye.files.elsewhere import at_hand
@@ -81,6 +89,7 @@ _OPENERS: Mapping[str, Callable[[Path], PointTable]] = {
     ".asc": open_text,
     ".csv": open_text,
     ".npy": open_npy,
+    ".npz": open_npz,
     ".pcd": open_pcd,
     ".ply": open_ply,
     ".pts": open_text,
@@ -137,9 +146,9 @@ def read_cloud(
     for note in (missing, viewpoint.note(from_viewpoint) if viewpoint else ""):
         if note and told:
             told(f"{path.name}: {note}")
-    stated = next((known for known in PER_METRE if known == getattr(table, "unit", "")), unit)
-    if stated != "m":
-        xyz /= np.float32(PER_METRE[stated])  # exact to the last bit, which times 0.001 is not
+    per_metre = STATED.get(getattr(table, "unit", "")) or PER_METRE[unit]
+    if per_metre != 1:
+        xyz /= np.float32(per_metre)  # exact to the last bit, which times 0.001 is not
     return PointCloud(CAMERA, xyz.reshape(*table.shape, 3))
 
 

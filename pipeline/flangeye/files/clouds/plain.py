@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 import re
+from codecs import BOM_UTF8
 from dataclasses import dataclass
 from pathlib import Path
 from tokenize import TokenError
@@ -31,6 +32,10 @@ HEADER_ERRORS = (ValueError, TypeError, SyntaxError, TokenError)
 
 NUMBERS = "fiu"
 """Kinds of NumPy's types that are numbers."""
+STATED = {"mm": 1e3, "cm": 1e2, "um": 1e6, "m": 1.0, "inch": 1 / 0.0254, "in": 1 / 0.0254}
+"""How many of a unit that a heading may state are in a metre."""
+WIDEST = 16
+"""Numbers of a point at most: x, y, z, then normals, colours, intensity."""
 
 
 def open_npy(path: Path) -> PointTable:
@@ -46,12 +51,47 @@ def open_npy(path: Path) -> PointTable:
     if fields:
         axes_of(path, fields)
         return NpyTable(path, shape, tuple(fields))
-    widest = 16  # x, y, z, then normals, colours, intensity
-    if len(shape) in (2, 3) and 3 <= shape[-1] <= widest:
+    if _is_wide(shape):
         return NpyTable(path, shape[:-1])
-    if len(shape) in (2, 3) and 3 <= shape[0] <= widest < shape[-1]:
+    if len(shape) in (2, 3) and 3 <= shape[0] <= WIDEST < shape[-1]:
         return NpyTable(path, shape[1:], axes_first=True)
     refuse(path, f"has shape {shape}; a point cloud is (N, 3), (H, W, 3), (3, N) or (3, H, W)")
+
+
+def open_npz(path: Path) -> LoadedTable:
+    """Return the points of an archive of arrays.
+
+    They are its arrays x, y and z, or the array (N, 3) or (H, W, 3) that is called as clouds are,
+    or that is the only one of three, four or six numbers a point.
+
+    Raises:
+        StageError: It holds no such array, or several that none is called so.
+    """
+    from flangeye.files.arrays import read_arrays  # it stands on this module
+
+    read_head(path)
+    arrays = {name.lower(): array for name, array in read_arrays(path).items()}
+    apart = [arrays[axis] for axis in "xyz" if axis in arrays]
+    if len(apart) == 3 and len({array.shape for array in apart}) == 1:
+        return LoadedTable(path, apart[0].shape, np.stack([array.ravel() for array in apart], -1))
+    called = ("points", "xyz", "pts", "cloud", "pointcloud", "point_cloud", "pcd", "vertices")
+    named = [n for n in called if n in arrays and _is_wide(arrays[n].shape)]
+    likely = named[:1] or [name for name, array in arrays.items() if _may_be_points(array.shape)]
+    if len(likely) != 1:
+        held = ", ".join(f"{name} {array.shape}" for name, array in arrays.items())
+        refuse(path, f"which of its arrays are the points is not plain: {held or 'none'}; "
+                     "call one points, (N, 3) or (H, W, 3)")  # fmt: skip
+    array = arrays[likely[0]]
+    return LoadedTable(path, array.shape[:-1], array.reshape(-1, array.shape[-1])[:, :3])
+
+
+def _is_wide(shape: Shape) -> bool:
+    return len(shape) in (2, 3) and 3 <= shape[-1] <= WIDEST
+
+
+def _may_be_points(shape: Shape) -> bool:
+    """Return whether an array without a telling name may be points, and no poses: (N, 4, 4)."""
+    return (len(shape) == 2 or (len(shape) == 3 and shape[1] > 4)) and shape[-1] in (3, 4, 6)
 
 
 def load_npy(path: Path) -> NDArray[Any]:
@@ -156,6 +196,29 @@ class NpyTable:
             return xyz
 
 
+@dataclass(frozen=True)
+class LoadedTable:
+    """Points that had to be loaded to be found.
+
+    Attributes:
+        path: The file.
+        shape: (N,) or (H, W).
+        xyz: (N, 3).
+    """
+
+    path: Path
+    shape: Shape
+    xyz: NDArray[Any]
+
+    def check(self) -> None:
+        """It was read whole when it was opened."""
+
+    def decode(self) -> Points:
+        """Return the points."""
+        with np.errstate(over="ignore"):
+            return self.xyz.astype(np.float32)
+
+
 def open_text(path: Path) -> TextTable:
     """Return the points of a table as text: x, y, z first, or wherever a heading names them.
 
@@ -167,7 +230,9 @@ def open_text(path: Path) -> TextTable:
     Raises:
         StageError: Its first row is neither three numbers or more nor a heading.
     """
-    lines = read_head(path).decode("latin-1").splitlines(keepends=True)
+    head = read_head(path)
+    offset = len(BOM_UTF8) if head.startswith(BOM_UTF8) else 0
+    lines = head[offset:].decode("latin-1").splitlines(keepends=True)
     top = next((i for i, line in enumerate(lines) if is_row(line)), len(lines))
     above = next((line for line in reversed(lines[:top]) if not line.isspace()), "")
     lines = [line for line in lines[top:] if is_row(line)] or [""]
@@ -193,14 +258,18 @@ def open_text(path: Path) -> TextTable:
     if len(units) > 1:
         refuse(path, f"its heading states several units: {', '.join(sorted(units))}")
     return TextTable(
-        path, (rows - skipped,), 0, len(cells), axes, skipped, rows, delimiter,
+        path, (rows - skipped,), offset, len(cells), axes, skipped, rows, delimiter,
         unit=next(iter(units), ""), comma=comma, remarks=remarks,
     )  # fmt: skip
 
 
 def _heading(cells: list[str]) -> list[tuple[str, str]]:
-    """Return the name and the unit of each cell; nothing where all are numbers."""
-    return [] if all(map(_is_number, cells)) else [_axis(cell) for cell in cells]
+    """Return the name and the unit of each cell; nothing where all are numbers or empty."""
+    return (
+        []
+        if all(not cell or _is_number(cell) for cell in cells)
+        else [_axis(cell) for cell in cells]
+    )
 
 
 def _cells(line: str) -> tuple[list[str], str | None, bool]:
@@ -214,9 +283,13 @@ def _cells(line: str) -> tuple[list[str], str | None, bool]:
 
 
 def _axis(cell: str) -> tuple[str, str]:
-    """Return the name and the unit of a heading's cell: ``x_mm``, ``X [mm]``."""
-    match = re.fullmatch(r"([A-Za-z]\w*?)[\s_]*[\[(]?(mm|m|in)?[\])]?", cell.strip('"'))
-    return (match[1], match[2] or "") if match else (cell, "")
+    """Return the name and the unit of a heading's cell: ``x_mm``, ``X [mm]``, ``Points:0``."""
+    cell = cell.strip('"')
+    if numbered := re.fullmatch(r"[^:]+:([012])", cell):  # ParaView's
+        return "xyz"[int(numbered[1])], ""
+    unit = "|".join(STATED)
+    match = re.fullmatch(rf"([a-z]\w*?)[\s_]*[\[(]?({unit})?[\])]?", cell, re.IGNORECASE)
+    return (match[1], (match[2] or "").lower()) if match else (cell, "")
 
 
 def _has_decimal_commas(row: str) -> bool:

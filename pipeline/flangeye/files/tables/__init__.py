@@ -18,13 +18,13 @@ from bisect import bisect
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import numpy as np
 
 from flangeye.errors import StageError
 from flangeye.files.regular import read_any_text
-from flangeye.files.scans import natural
+from flangeye.files.scans import natural, partners
 from flangeye.files.tables.documents import KINDS, document_of
 from flangeye.files.tables.table import (
     Cell,
@@ -48,6 +48,7 @@ __all__ = [
     "files_at",
     "number_of",
     "read_table",
+    "rows_together",
     "tables_in",
 ]
 
@@ -119,6 +120,42 @@ def tables_in(folder: Path, name: str) -> list[Table]:
         return [_table(name, file, found[0])]
     parts = [f"{name}:{rows.part.split(',')[0]}" for rows in found]
     return [_table(n, file, rows) for n, rows in zip(parts, found, strict=True)]
+
+
+def rows_together(
+    table: Table, other: Table, column: Column | None = None
+) -> tuple[list[int], list[str]]:
+    """Return which row of another table belongs to each of a table's, and notes of how.
+
+    They belong together by what both call their rows: the names of their files, or the cells of a
+    column that both have; else row by row.
+
+    Raises:
+        StageError: The names differ, or there are not as many.
+    """
+    if other is table:
+        return list(range(len(table.rows))), []
+    names, others = _row_names(table, column), _row_names(other, column)
+    if names and others:
+        order, note = partners(str(table.file), names, others, f"rows of {other.name}")
+        return order, [note]
+    if len(other.rows) != len(table.rows):
+        raise StageError(
+            f"{other.file}: has {len(other.rows)} rows, {table.name} has {len(table.rows)}; "
+            "give each a column time to join them by it, or remove the surplus"
+        )
+    return list(range(len(table.rows))), [f"paired row by row: {table.name} with {other.name}"]
+
+
+def _row_names(table: Table, column: Column | None) -> Sequence[str]:
+    """Return what a table's rows are called, a different name each; empty where they are not."""
+    if table.names or column is None:
+        return table.names
+    known = column in table.heading or (isinstance(column, int) and column <= len(table.rows[0][1]))
+    cells = table.texts(table.index(column)) if known else []
+    if any(number_of(cell) is not None for cell in cells) and not all(map(str.isdecimal, cells)):
+        return ()
+    return [PurePath(cell).stem for cell in cells] if len(set(cells)) == len(table.rows) else ()
 
 
 def sources(file: Path) -> list[Rows]:

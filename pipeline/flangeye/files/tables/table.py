@@ -104,6 +104,11 @@ class Table:
         """Return the cells of a column."""
         return [str(cells[column]) for _, cells in self.rows]
 
+    def numbers_rows(self, column: int) -> bool:
+        """Return whether the cells of a column are whole numbers, a different one in each row."""
+        cells = self.texts(column)
+        return all(cell.isdecimal() for cell in cells) and len(set(map(int, cells))) == len(cells)
+
     def _listed(self, column: Column) -> list[int]:
         """Return the columns of a list's entries, in their order."""
         if column in self.heading:

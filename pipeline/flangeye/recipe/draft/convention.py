@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from flangeye.errors import RecipeError
-from flangeye.files.tables import Column, Table, read_table
+from flangeye.files.tables import Column, Table, read_table, rows_together
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.pose_corrections import inverted
 from flangeye.maths.pose_formats import (
@@ -77,7 +77,24 @@ def table_params(
         params = _of_joints(arm, questions, robot)
     else:
         params = _written(arm, questions, "", robot.maker if robot else None) | _rest(arm.table)
+    called = _row_names(arm.table, target.table if target else None)
+    params |= {} if called is None else {"scan": called}
     return _file(arm.table) | params | _target_params(arm, target, questions)
+
+
+def _row_names(table: Table, other: Table | None) -> Column | None:
+    """Return the column that calls the rows; None where all tables merely count theirs."""
+    tables = [table, *([other] if other and other is not table else [])]
+    rests = [poses_of(each)[1] for each in tables]
+    column = rests[0].index
+    if rests[0].scan is not None or column is None or len({rest.index for rest in rests}) > 1:
+        return rests[0].scan
+    counted = (_counts(each.numbers([each.index(column)])[:, 0]) for each in tables)
+    return None if all(counted) else column
+
+
+def _counts(numbers: Floats) -> bool:
+    return bool((np.diff(numbers) == 1).all())
 
 
 def _of_joints(arm: PoseColumns, questions: Questions, robot: RobotModel | None) -> dict[str, Any]:
@@ -105,14 +122,11 @@ def _require_as_many(tables: Sequence[Table], arm: PoseColumns) -> None:
     """Refuse a second table whose rows cannot be paired with the arm's.
 
     Raises:
-        RecipeError: There is one with another number of rows.
+        StageError: There is one with another number of rows.
     """
     other = next((t for t in tables if t.files != arm.table.files), None)
     if other is not None and len(other.rows) != len(arm.table.rows):
-        raise RecipeError(
-            f"{other.file}: has {len(other.rows)} rows, {arm.table.name} has "
-            f"{len(arm.table.rows)}; remove the surplus, or give each a column time"
-        )
+        rows_together(arm.table, other, _row_names(arm.table, other))
 
 
 def _alone(arm: PoseColumns) -> str:
@@ -366,8 +380,9 @@ def _orders(pose: PoseColumns, questions: Questions, prefix: str) -> list[PoseCo
 
 
 def _both(arm: PoseColumns, target: PoseColumns) -> tuple[Floats, Floats]:
-    """Return the numbers of both in the rows that have all of them."""
-    numbers, seen = _numbers(arm), _numbers(target)
+    """Return the numbers of both, row by row, where both have all of them."""
+    order, _ = rows_together(arm.table, target.table, _row_names(arm.table, target.table))
+    numbers, seen = _numbers(arm), _numbers(target)[order]
     kept = np.isfinite(numbers).all(axis=1) & np.isfinite(seen).all(axis=1)
     return numbers[kept], seen[kept]
 
@@ -534,7 +549,7 @@ def _target_params(
 def _rest(table: Table) -> dict[str, Any]:
     """Return the columns of a table that are no poses."""
     rest = poses_of(table)[1]
-    params: dict[str, Any] = {} if rest.scan is None else {"scan": rest.scan}
+    params: dict[str, Any] = {}
     if rest.time is not None:
         params |= {"time": rest.time} | ({"time_unit": rest.time_unit} if rest.time_unit else {})
     if rest.joints:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import NamedTuple
 
@@ -44,10 +44,11 @@ def poses_by_number(table: Table) -> tuple[list[PoseColumns], Headings]:
     numbers = table.numbers(columns)
     told = ""
     if _is_index(numbers) and _shape(numbers[:, 1:]):
+        rest = replace(rest, index=columns[0] + 1)
         columns, numbers = columns[1:], numbers[:, 1:]
         told = f"column {columns[0]} is a running index"
     elif _rises(numbers[:, 0]) and _shape(numbers[:, 1:]) and not _shape(numbers):
-        rest = Headings(rest.scan, time=columns[0] + 1)
+        rest = replace(rest, time=columns[0] + 1)
         columns, numbers = columns[1:], numbers[:, 1:]
     found = []
     for start, width in _parts(numbers):
@@ -58,17 +59,20 @@ def poses_by_number(table: Table) -> tuple[list[PoseColumns], Headings]:
 
 
 def _is_index(numbers: Floats) -> bool:
-    """Return whether the first column counts the rows, or those that were kept of more.
+    """Return whether the first column counts the rows, or calls them by whole numbers.
 
     With gaps it counts only before six numbers that are no quaternion's: whole numbers before a
-    position and a quaternion may be times (TUM's trajectories).
+    position and a quaternion may be times (TUM's trajectories). In no order it calls the rows,
+    where others are not whole.
     """
-    first = numbers[:, 0]
-    if len(first) < 3 or bool((first != np.round(first)).any()):
+    first, others = numbers[:, 0], numbers[:, 1:]
+    whole = bool((first == np.round(first)).all())
+    if len(first) < 3 or not whole or len(np.unique(first)) < len(first):
         return False
     counts = bool((np.diff(first) == 1).all())
     six = numbers.shape[1] == 7 and _quaternion_at(numbers) is None
-    return counts or (six and _rises(first))
+    broken = bool((others != np.round(others)).any())
+    return counts or (_rises(first) and six) or (not _rises(first) and broken)
 
 
 def _rises(column: Floats) -> bool:

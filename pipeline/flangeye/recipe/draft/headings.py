@@ -180,6 +180,7 @@ class Headings:
 
     Attributes:
         scan: Column of the scans' names.
+        index: Column of whole numbers that count the rows, or that call them.
         time: Column of the time.
         time_unit: Its unit.
         joints: Columns of joint angles.
@@ -187,6 +188,7 @@ class Headings:
     """
 
     scan: Column | None = None
+    index: Column | None = None
     time: Column | None = None
     time_unit: str | None = None
     joints: tuple[Column, ...] = ()
@@ -216,6 +218,8 @@ def _grouped(table: Table) -> tuple[dict[str, Group], Headings]:
             scans = ("cloud", "scan", "file", "filename", "image", "img", "name", "path")
             if (words and words[-1].lower() in scans) or _is_file(table, index):
                 rest = replace(rest, scan=name)
+        elif _is_index(table, index, words):
+            rest = replace(rest, index=name or index + 1)
         elif joint and not _is_quaternion(table, name):
             unit = next((u for u in _ANGLES if u == words[-1].lower()), None)
             rest = replace(rest, joints=(*rest.joints, name), joint_unit=unit)
@@ -230,6 +234,16 @@ def _grouped(table: Table) -> tuple[dict[str, Group], Headings]:
                 _put(groups, name, words, listed=size == 4)
     joints = rest.joints if len(rest.joints) > 3 else ()
     return groups, replace(rest, joints=joints_in_order(map(str, joints)) or joints)
+
+
+def _is_index(table: Table, index: int, words: Sequence[str]) -> bool:
+    """Return whether a column is called as one that numbers rows or scans, and does so."""
+    called = (
+        "id", "index", "idx", "i", "no", "nr", "num", "number", "n", "count", "row", "sample",
+        "frame", "shot", "capture", "scan", "image", "img", "cloud", "pose", "position", "point",
+        "file", "name",
+    )  # fmt: skip
+    return (words[-1].lower() in called if words else index == 0) and table.numbers_rows(index)
 
 
 def _is_file(table: Table, index: int) -> bool:

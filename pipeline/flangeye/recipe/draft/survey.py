@@ -112,7 +112,7 @@ class FolderSurvey:
         folder: Where.
         files: All files of the folder, and of the folders in it.
         tables: Those that are tables of numbers.
-        points: Texts that hold a cloud each.
+        points: Texts and archives of arrays that hold a cloud each.
         cameras: Calibrations of a camera.
     """
 
@@ -124,7 +124,7 @@ class FolderSurvey:
 
     @property
     def clouds(self) -> list[Path]:
-        """The clouds, those in texts too."""
+        """The clouds, those in texts and archives of arrays too."""
         found = {*self.of(CLOUDS), *self.points}
         return [path for path in self.files if path in found]
 
@@ -136,12 +136,16 @@ class FolderSurvey:
     def lines(self) -> list[str]:
         """Return the survey as lines of text."""
         unread = (".npz", ".mat", *CONVERSIONS, *VENDOR)
+        read = {*self.cameras, *self.points}
         told = [
             f"{what}: {', '.join(f'{n} {suffix}' for suffix, n in sorted(kinds.items()))}"
             for what, paths in (
                 ("clouds", self.clouds),
                 ("images", self.of(IMAGES)),
-                ("not read", [p for p in self.of(unread) if p not in self.cameras]),
+                (
+                    "not read",
+                    [p for p in self.of(unread) if p not in read],
+                ),
             )
             if (kinds := Counter(p.suffix.lower() for p in paths))
         ]
