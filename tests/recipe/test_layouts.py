@@ -145,6 +145,15 @@ def json_per_image(f, j, a, s):
         (f / f"{k}.json").write_text(json.dumps({"robot": arm.tolist(), "marker": seen.tolist()}))
 
 
+def lists_with_units(f, j, a, s):
+    (f / "session.json").write_text(json.dumps([
+        {name: {"quaternion_wxyz": row[[6, 3, 4, 5]].tolist(),
+                "translation_mm": (1e3 * row[:3]).tolist()}
+         for name, row in (("tcp", arm), ("marker", seen))}
+        for arm, seen in zip(quaternion(a), quaternion(s), strict=True)
+    ]))  # fmt: skip
+
+
 def npz_opencv(f, j, a, s):
     np.savez(f / "handeye.npz", R_gripper2base=a[:, :3, :3], t_gripper2base=a[:, :3, 3:],
              R_target2cam=s[:, :3, :3], t_target2cam=s[:, :3, 3:])  # fmt: skip
@@ -267,6 +276,7 @@ LAYOUTS: dict[str, Callable[..., None]] = {
     "OpenCV's storage, `pose1: […]` in two files": opencv_lists,
     "OpenCV's storage, lists `Rotation_Vec` and `Translation_Vec`": opencv_vectors,
     "a JSON for each image, without leading zeros": json_per_image,
+    "JSON of lists `quaternion_wxyz`, `translation_mm`": lists_with_units,
     "`.npz` with `R_gripper2base`, `t_gripper2base`, …": npz_opencv,
     "`R_gripper2base.txt` and `t_gripper2base.txt`, …": separate_files,
     "MATLAB, 4×4×N": matlab,

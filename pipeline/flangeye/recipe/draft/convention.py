@@ -200,7 +200,7 @@ def _likeliest(poses: Sequence[PoseColumns], questions: Questions) -> PoseColumn
 def _in_order(likely: Sequence[PoseColumns]) -> bool:
     """Return whether poses stand in one text beside or above each other, without any name."""
     unnamed = all(not p.called for p in likely)
-    return unnamed and len({p.table.files for p in likely}) == 1 and not likely[0].table.heading
+    return unnamed and len({p.table.files for p in likely}) == 1
 
 
 def _place(pose: PoseColumns) -> str:

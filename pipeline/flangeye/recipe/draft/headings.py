@@ -29,6 +29,8 @@ _PLACES = (
     "trans",
     "tvec",
     "tvecs",
+    "location",
+    "origin",
     "t",
     "p",
     "xyz",
@@ -39,6 +41,8 @@ _TURNS: Mapping[str, str] = {
     "rvec": "v", "rvecs": "v", "rotvec": "v", "rodrigues": "v", "rpy": "e",
 }  # fmt: skip
 """Names of rotations, and what the names of their columns begin with."""
+_ORDERS = ("xyzw", "wxyz")
+"""In the name of a quaternion's list."""
 _OPENCV = ("rvec", "rvecs", "tvec", "tvecs")
 """What OpenCV calls the pose of what a camera sees."""
 _POSES: Mapping[int, str | None] = {6: None, 7: "xyzw", 12: "matrix", 16: "matrix"}
@@ -213,7 +217,9 @@ def _grouped(table: Table) -> tuple[dict[str, Group], Headings]:
         seen[listed] += bool(listed)
         joint = _JOINT.fullmatch(name.lower().replace(" ", "_").rpartition(".")[2])
         joint = joint or _JOINT.fullmatch(name.lower())
-        words = _words(f"{listed}.{'xyzw'[nth]}" if size in (3, 4) else listed if size else name)
+        joint = joint or re.fullmatch(r"(.*\.)?q", listed.lower()) if size > 4 else joint
+        order = "wxyz" if "wxyz" in listed.lower() else "xyzw"
+        words = _of_list(listed, order[nth]) if size in (3, 4) else _words(listed if size else name)
         if number_of(table.rows[0][1][index]) is None:
             scans = ("cloud", "scan", "file", "filename", "image", "img", "name", "path")
             if (words and words[-1].lower() in scans) or _is_file(table, index):
@@ -231,7 +237,9 @@ def _grouped(table: Table) -> tuple[dict[str, Group], Headings]:
             if time and rest.time is None:
                 rest = replace(rest, time=name, time_unit=unit)
             else:
-                _put(groups, name, words, listed=size == 4)
+                stated = any(each.lower() in _ORDERS for each in words)
+                words = [each for each in words if each.lower() not in _ORDERS]
+                _put(groups, name, words, listed=size == 4, ordered=stated or size != 4)
     joints = rest.joints if len(rest.joints) > 3 else ()
     return groups, replace(rest, joints=joints_in_order(map(str, joints)) or joints)
 
@@ -269,6 +277,13 @@ def list_name(name: str) -> str:
     return match[1] if match else ""
 
 
+def _of_list(listed: str, axis: str) -> list[str]:
+    """Return the words of a list's entry, the unit last: ``translation_mm`` has ``x_mm``."""
+    words = _words(listed)
+    unit = words.pop() if len(words) > 1 and words[-1].lower() in (*_LENGTHS, *_ANGLES) else ""
+    return [*words, axis, *filter(None, [unit])]
+
+
 def _words(name: str) -> list[str]:
     """Return the words of a column's name; R of ``R_gripper2base`` is one."""
     words = [w for w in re.split(r"[^0-9a-zA-Z°]+", name.replace("°", "deg")) if w]
@@ -280,6 +295,13 @@ def _words(name: str) -> list[str]:
         ("translation", "vector"): "tvec",
         ("trans", "vec"): "tvec",
         ("rpy", "angles"): "rpy",
+        ("euler", "angles"): "euler",
+        ("euler", "xyz"): "euler",
+        ("axis", "angle"): "rotvec",
+        ("rot", "quat"): "quat",
+        ("rotation", "quaternion"): "quat",
+        ("rotation", "matrix"): "rotation",
+        ("rot", "mat"): "rotation",
     }.items():
         for i in range(len(words) - 1):
             if tuple(w.lower() for w in words[i : i + 2]) == pair:
@@ -294,8 +316,13 @@ def _time(words: Sequence[str]) -> tuple[bool, str | None]:
     return called[-1] in ("time", "timestamp", "stamp", "secs", "sec", "t"), unit
 
 
-def _put(groups: dict[str, Group], name: str, words: list[str], listed: bool) -> None:
-    """Put a column where it belongs: ``robot_x_mm`` is the x of ``robot``, in millimetres."""
+def _put(
+    groups: dict[str, Group], name: str, words: list[str], listed: bool, ordered: bool
+) -> None:
+    """Put a column where it belongs: ``robot_x_mm`` is the x of ``robot``, in millimetres.
+
+    Four listed numbers are a quaternion, whatever they are called.
+    """
     last = words[-1].lower()
     unit = words.pop().lower() if last in (*_LENGTHS, *_ANGLES) and len(words) > 1 else None
     axis, before = words[-1].lower(), words[:-1]
@@ -305,12 +332,12 @@ def _put(groups: dict[str, Group], name: str, words: list[str], listed: bool) ->
     # Behind a name of its own (orientation.roll) only a whole word is no part of the pose's name
     whole = [word for word in _TURNS if len(word) > 1]
     part, before = _without(before, (*_PLACES, *_TURNS) if plain else whole)
-    axis = (_TURNS.get(part, "") if plain else "") + axis
+    axis = ("q" if listed else _TURNS.get(part, "") if plain else "") + axis
     called = "_".join(before) or (part if part in _OPENCV else "")
     group = groups.setdefault("" if called in _OPENCV else called, Group())
     group.words = group.words or called
     group.columns.setdefault(axis, name)
-    group.ordered &= not listed
+    group.ordered &= ordered
     if axis in POSITION and unit in _LENGTHS:
         group.length = unit
     elif unit in _ANGLES:
