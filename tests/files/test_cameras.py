@@ -43,6 +43,8 @@ WRITTEN = {
     "printed.txt": f"camera matrix:\n{K}\ndistortion:\n[{LENS}]\n",
     "own.yaml": f"focal_length: [1201.5, 1203.5]\nprincipal_point: [639.25, 363.75]\ndist: {LENS}\n",
     "odd.json": f'{{"K": {K.tolist()}, "dist_coeff": [{LENS}]}}',
+    "orbbec.json": '{"color_intrinsic": {"fx": 1201.5, "fy": 1203.5, "cx": 639.25, "cy": 363.75}, '
+    '"color_distortion": {"k1": -0.11, "k2": 0.07, "k3": 0.01, "p1": 0.0011, "p2": -0.0012}}',
     "cameras.txt": "# Camera list\n# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
     "1 FULL_OPENCV 1280 720 1201.5 1203.5 639.75 364.25 -0.11 0.07 0.0011 -0.0012 0.01 0 0 0\n",
 }

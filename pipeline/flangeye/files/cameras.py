@@ -103,7 +103,11 @@ def camera_in(path: Path) -> CameraFile | None:
     values, matrix = found[0]
     _require_opencv(path, values)
     others = sum(not np.array_equal(other, matrix) for _, other in found)
-    camera = _checked(path, matrix, _distortion(values))
+    lens = _distortion(values)
+    if not lens.size:  # it may stand in a mapping of its own, one for each camera
+        apart = [each for mapping in _mappings(data) if (each := _distortion(mapping)).size]
+        lens = apart[0] if len(apart) == len(found) else lens
+    camera = _checked(path, matrix, lens)
     return camera and camera._replace(others=others)
 
 
