@@ -385,6 +385,13 @@ def test_a_marker_that_was_printed_in_another_size(factor: float) -> None:
     assert float(finding.what.split()[3]) == pytest.approx(1 / factor, rel=2e-3)
 
 
+def test_a_size_in_images_may_be_the_focal_length_too() -> None:
+    session = replace(session_of("marker"), acquire="acquire.images")
+    finding = only(replace(session, centres=session.centres * 1.05))
+    assert "or the camera's focal length is 0.95" in finding.what
+    assert "where the print is as the recipe says, calibrate the camera: add board" in finding.fix
+
+
 @pytest.mark.parametrize("factor", [1.04, 0.9])
 def test_a_camera_of_another_focal_length(factor: float) -> None:
     session = session_of("marker")

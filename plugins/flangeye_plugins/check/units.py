@@ -226,20 +226,22 @@ def size(session: RecordedSession) -> Findings:
     p = exceedance(ratio, count, 1, count - found.parameters - 1, effect)
     if p < 1 and explained(corrected_session):
         evidence = evidence._replace(probability=min(1.0, len(tried) * p))
+        calibrate = (
+            "calibrate the camera: add board: {kind: …, columns: …, rows: …, square: …} to "
+            "acquire.images, which finds it by its views of the board"
+        )
+        focal = f"the camera's focal length is {factor:.4f} times as long as its calibration says"
         if kind == "focal":
-            what = (
-                f"the camera's focal length is {factor:.4f} times as long as its calibration says"
-            )
-            calibrate = (
-                "calibrate the camera: add board: {kind: …, columns: …, rows: …, square: …} to "
-                "acquire.images, which finds it by its views of the board"
-            )
+            what = focal
             yield evidence.finding("focal length", what, corrected_session, calibrate)
             return
         what = f"the marker is {factor:.4f} times as large as the recipe says"
         fix = f"measure it after printing: its lengths in the fit step times {factor:.4f}"
         if session.acquire == "acquire.samples":
             fix = session.read_with(target={"scale": float(f"{factor:.4f}")}).step()
+        elif session.acquire == "acquire.images":  # where the target stays near the camera's axis
+            what = f"{what}, or {focal}"
+            fix = f"{fix}; where the print is as the recipe says, {calibrate}"
         yield evidence.finding("target size", what, corrected_session, fix)
 
 
