@@ -103,11 +103,12 @@ def _find(name: str, urdf: Path, packages: Mapping[str, Path]) -> Path:
     for folder in folders:
         if _is_file(folder / below):
             return folder / below
-    named, holds = _short(package), _short(below.partition("/")[0])
+    first, slash, _ = below.partition("/")
+    named, holds = _short(package), f"{_short(first)}{slash}"
     looked = ", ".join(map(str, folders)) or f"any folder '{named}' above {urdf.parent}"
     raise MissingMesh(
         f"{urdf}: mesh '{_short(name)}' was not found in {looked}; write "
-        f"robot: {{packages: {{{named}: FOLDER}}}}, where FOLDER holds {holds}/"
+        f"robot: {{packages: {{{named}: FOLDER}}}}, where FOLDER holds {holds}"
     )
 
 

@@ -41,8 +41,6 @@ _TURNS: Mapping[str, str] = {
     "rvec": "v", "rvecs": "v", "rotvec": "v", "rodrigues": "v", "rpy": "e",
 }  # fmt: skip
 """Names of rotations, and what the names of their columns begin with."""
-_ORDERS = ("xyzw", "wxyz")
-"""In the name of a quaternion's list."""
 _OPENCV = ("rvec", "rvecs", "tvec", "tvecs")
 """What OpenCV calls the pose of what a camera sees."""
 _POSES: Mapping[int, str | None] = {6: None, 7: "xyzw", 12: "matrix", 16: "matrix"}
@@ -237,9 +235,9 @@ def _grouped(table: Table) -> tuple[dict[str, Group], Headings]:
             if time and rest.time is None:
                 rest = replace(rest, time=name, time_unit=unit)
             else:
-                stated = any(each.lower() in _ORDERS for each in words)
-                words = [each for each in words if each.lower() not in _ORDERS]
-                _put(groups, name, words, listed=size == 4, ordered=stated or size != 4)
+                plain = [each for each in words if each.lower() not in ("xyzw", "wxyz")]
+                stated = len(plain) < len(words)
+                _put(groups, name, plain, listed=size == 4, ordered=stated or size != 4)
     joints = rest.joints if len(rest.joints) > 3 else ()
     return groups, replace(rest, joints=joints_in_order(map(str, joints)) or joints)
 
