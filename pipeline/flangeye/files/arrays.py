@@ -5,19 +5,14 @@ from __future__ import annotations
 import math
 from pathlib import Path
 from typing import Any
-from zipfile import ZipFile, ZipInfo
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flangeye.errors import StageError
-from flangeye.files.clouds import array_of, holds_numbers, load_npy
-from flangeye.files.regular import open_regular, read_text
-from flangeye.files.words import reason_of
+from flangeye.files.clouds import load_npy, load_npz
+from flangeye.files.regular import read_text
 from flangeye.types import Floats
-
-MAX_ARRAY = 1 << 28
-"""What an array of an .npz file may expand to [bytes]: two million poses."""
 
 
 def read_npy(path: Path, shape: tuple[int | None, ...]) -> Floats:
@@ -39,7 +34,7 @@ def read_npz(path: Path, name: str, shape: tuple[int | None, ...]) -> Floats:
     Raises:
         StageError: It is missing, damaged, or of another shape.
     """
-    arrays = _expanded(path, name)
+    arrays = load_npz(path, name)
     if name not in arrays:
         raise StageError(f"{path}: holds no array '{name}'")
     return _checked(path, arrays[name], shape)
@@ -53,42 +48,7 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     Raises:
         StageError: It is missing or damaged.
     """
-    return {"": load_npy(path)} if path.suffix.lower() == ".npy" else _expanded(path)
-
-
-def _expanded(path: Path, only: str | None = None) -> dict[str, NDArray[Any]]:
-    if not path.exists():
-        raise StageError(f"{path}: does not exist")
-    with open_regular(path) as file:
-        try:
-            with ZipFile(file) as archive:
-                named = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-                return {
-                    name: _member(path, archive, name, info)
-                    for name, info in named.items()
-                    if only == name or (only is None and _of_numbers(archive, info))
-                }
-        except StageError:
-            raise
-        except Exception as error:  # damaged bytes can break the decoders in any way
-            raise StageError(f"{path}: is not a NumPy .npz file: {reason_of(error)}") from None
-
-
-def _of_numbers(archive: ZipFile, info: ZipInfo) -> bool:
-    if info.file_size > MAX_ARRAY:
-        return True  # to be refused by its size, nothing of it expanded
-    with archive.open(info) as content:
-        return holds_numbers(content)
-
-
-def _member(path: Path, archive: ZipFile, name: str, info: ZipInfo) -> NDArray[Any]:
-    """Return one array of the archive: its size is known before any of it is expanded."""
-    if info.file_size > MAX_ARRAY:
-        raise StageError(
-            f"{path}: '{name}' expands to {info.file_size} bytes; at most {MAX_ARRAY} are read"
-        )
-    with archive.open(info) as content:
-        return array_of(f"{path}: '{name}'", content.read())
+    return {"": load_npy(path)} if path.suffix.lower() == ".npy" else load_npz(path)
 
 
 def read_table(path: Path, width: int, rows: slice = slice(None)) -> Floats:

@@ -300,7 +300,7 @@ def test_a_recipe_says_where_the_body_is_drawn(sections, target, place) -> None:
         ("target: {body: gripper, at: base}\n", "target: {at: …} is one of them or unknown"),
         (
             "configuration: {place: unknown}\ntarget: gripper\n",
-            "a body's place is said by target",
+            "states a body's place; remove place:",
         ),
     ],
 )

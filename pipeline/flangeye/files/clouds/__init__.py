@@ -18,9 +18,8 @@ import numpy as np
 from flangeye.files.clouds.pcd import Viewpoint, open_pcd
 from flangeye.files.clouds.plain import (
     STATED,
-    array_of,
-    holds_numbers,
     load_npy,
+    load_npz,
     open_npy,
     open_npz,
     open_text,
@@ -73,10 +72,9 @@ __all__ = [
     "CONVERSIONS",
     "PER_METRE",
     "LengthUnit",
-    "array_of",
     "check_cloud_file",
-    "holds_numbers",
     "load_npy",
+    "load_npz",
     "read_cloud",
     "write_cloud",
 ]

@@ -10,11 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from tokenize import TokenError
 from typing import IO, Any
+from zipfile import ZipFile, ZipInfo
 
 import numpy as np
 from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
+from flangeye.errors import StageError
 from flangeye.files.clouds.table import (
     Points,
     PointTable,
@@ -26,7 +28,11 @@ from flangeye.files.clouds.table import (
     read_head,
     refuse,
 )
+from flangeye.files.regular import open_regular
+from flangeye.files.words import reason_of
 
+MAX_ARRAY = 1 << 28
+"""What an array of an .npz file may expand to [bytes]: two million poses."""
 HEADER_ERRORS = (ValueError, TypeError, SyntaxError, TokenError)
 """What NumPy raises at a header that is none: it parses a Python literal."""
 
@@ -67,10 +73,8 @@ def open_npz(path: Path) -> LoadedTable:
     Raises:
         StageError: It holds no such array, or several that none is called so.
     """
-    from flangeye.files.arrays import read_arrays  # it stands on this module
-
     read_head(path)
-    arrays = {name.lower(): array for name, array in read_arrays(path).items()}
+    arrays = {name.lower(): array for name, array in load_npz(path).items()}
     apart = [arrays[axis] for axis in "xyz" if axis in arrays]
     if len(apart) == 3 and len({array.shape for array in apart}) == 1:
         return LoadedTable(path, apart[0].shape, np.stack([array.ravel() for array in apart], -1))
@@ -104,7 +108,47 @@ def load_npy(path: Path) -> NDArray[Any]:
     return np.asarray(np.load(path, allow_pickle=False))
 
 
-def array_of(where: str, raw: bytes) -> NDArray[Any]:
+def load_npz(path: Path, only: str | None = None) -> dict[str, NDArray[Any]]:
+    """Return the arrays of numbers of an .npz file by name, or ``only`` the one so called.
+
+    Raises:
+        StageError: It is missing or damaged, or an array is too large.
+    """
+    if not path.exists():
+        raise StageError(f"{path}: does not exist")
+    with open_regular(path) as file:
+        try:
+            with ZipFile(file) as archive:
+                named = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+                return {
+                    name: _member(path, archive, name, info)
+                    for name, info in named.items()
+                    if only == name or (only is None and _of_numbers(archive, info))
+                }
+        except StageError:
+            raise
+        except Exception as error:  # damaged bytes can break the decoders in any way
+            raise StageError(f"{path}: is not a NumPy .npz file: {reason_of(error)}") from None
+
+
+def _of_numbers(archive: ZipFile, info: ZipInfo) -> bool:
+    if info.file_size > MAX_ARRAY:
+        return True  # to be refused by its size, nothing of it expanded
+    with archive.open(info) as content:
+        return _holds_numbers(content)
+
+
+def _member(path: Path, archive: ZipFile, name: str, info: ZipInfo) -> NDArray[Any]:
+    """Return one array of the archive: its size is known before any of it is expanded."""
+    if info.file_size > MAX_ARRAY:
+        raise StageError(
+            f"{path}: '{name}' expands to {info.file_size} bytes; at most {MAX_ARRAY} are read"
+        )
+    with archive.open(info) as content:
+        return _array_of(f"{path}: '{name}'", content.read())
+
+
+def _array_of(where: str, raw: bytes) -> NDArray[Any]:
     """Return the array in the bytes of a .npy file.
 
     Raises:
@@ -114,7 +158,7 @@ def array_of(where: str, raw: bytes) -> NDArray[Any]:
     return np.asarray(np.load(io.BytesIO(raw), allow_pickle=False))
 
 
-def holds_numbers(file: IO[bytes]) -> bool:
+def _holds_numbers(file: IO[bytes]) -> bool:
     """Return whether a .npy member of an archive holds numbers.
 
     A header that cannot be read counts: reading its array tells what is wrong.
