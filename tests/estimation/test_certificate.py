@@ -100,7 +100,7 @@ def test_how_much_better_another_answer_may_be_is_said(
     made = session(CONFIGURATIONS["eye-in-hand, marker"], np.random.default_rng(3), n=15)
     found = solved(made, certify=True)
     assert found.notes[-1] == (
-        f"{NOT_CERTIFIED} (gap {told}): another answer may leave squared errors less by so much"
+        f"{NOT_CERTIFIED} (gap {told}): another answer may have squared errors smaller by that share"
     )
 
 

@@ -84,7 +84,7 @@ def test_a_link_is_where_the_joints_have_it() -> None:
         cell.graph([replace(seen, arm_joints={})])
     assert str(error.value) == (
         "where arm_link3 was at observation 7 follows from the joint angles of 'arm', and there "
-        "are none: record them"
+        "are none: record them, and name the robot's model in the recipe"
     )
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flangeye import types as t
+from flangeye.files.elsewhere import with_urls
 from flangeye.maths.geometry import quaternion_from_rotation, rpy_from_rotation
 from flangeye.report.facts import INCOMPLETE, Facts
 from flangeye.report.units import degrees, millimetres, rounded_mm
@@ -123,7 +124,7 @@ def evidence_of(facts: Facts) -> list[KeyFigure]:
 
 def next_steps_of(facts: Facts) -> list[tuple[str, str]]:
     """Return what to do next: purposes with their commands."""
-    run = shlex.quote(str(facts.log.path.parent))
+    run = shlex.quote(with_urls(str(facts.log.path.parent)))
     if facts.result.status == "refused":
         return [("Find the cause", f"flangeye doctor {run}/{facts.log.path.name}")]
     if facts.result.status == INCOMPLETE:

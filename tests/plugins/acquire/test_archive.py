@@ -173,8 +173,8 @@ def test_an_image_beside_a_cloud_comes_with_the_camera_that_the_cloud_implies(
     )
     assert images["three"].pixels[0, 0] == len("three")
     assert (
-        "camera of the images: focal length 40.0, 40.0 px, principal point 9.5, 7.0 px, by the "
-        "clouds under them"
+        "camera of the images: focal length 40.0, 40.0 px, principal point 9.5, 7.0 px, "
+        "estimated from their organised clouds"
     ) in stream.source.notes
 
 

@@ -176,8 +176,8 @@ def test_nothing_new_in_time_is_said(folder: Path) -> None:
     with watch(folder, timeout=SI(0.2)) as scanner, pytest.raises(DeviceError) as error:
         scanner.expose()
     assert str(error.value) == (
-        f"folder {folder}: no whole new cloud within 0.2 s; looked for * (.asc, .csv, .npy, .pcd, "
-        ".ply, .pts, .txt, .xyz)"
+        f"folder {folder}: no whole new cloud within 0.2 s; looked for * (.asc, .csv, .npy, .npz, "
+        ".pcd, .ply, .pts, .txt, .xyz)"
     )
 
 
