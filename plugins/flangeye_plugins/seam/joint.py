@@ -192,10 +192,12 @@ def _found(seen: PlacedScan, rough: Course, params: JointParams) -> Found:
     most_fitted = 400_000
     pitch, points = _solid(points[at[:: -(-len(at) // most_fitted)]])
     at, local = rough.local(points, box)
-    # What is near to a rough line's corners lies askew to it; the second line has none.
-    line = rough.through(_placed(rough, local, points[at], params))
+    normals = facing_camera(points).normals
+    # Beside a rough line's corners the sections are askew: the joint is sought again along the
+    # smooth line through where it was found, which has none.
+    line = rough.through(_placed(rough, local, normals[at], params))
     at, local = line.local(points, box)
-    swept = swept_from(_placed(line, local, points[at], params), line.length, line.closed)
+    swept = swept_from(_placed(line, local, normals[at], params), line.length, line.closed)
     rays = Rays(seen.eyes, seen.clouds, line.points)
     found = Found(line, swept, local, pitch, rays, (0.0, line.length))
     # The second and third time along the line that the first has found
@@ -223,13 +225,12 @@ def _solid(points: Floats) -> tuple[float, Floats]:
     return pitch, points[counts > 3]
 
 
-def _placed(rough: Course, local: Floats, points: Floats, params: JointParams) -> list[JointPlace]:
+def _placed(rough: Course, local: Floats, normals: Floats, params: JointParams) -> list[JointPlace]:
     """Return the joint's way along the rough line."""
     joint = JOINTS[params.joint]
     joints: tuple[JointShape, ...] = (joint,)
     if joint.mirrored() != joint and params.joint != "fillet":
         joints = (joint, joint.mirrored())
-    normals = facing_camera(points).normals
     turned = np.einsum("nij,nj->ni", rough.at(local[:, 0])[1], normals)
     ways = rough_path(local, turned, joints, params.max_residual, params.reach)
     if not ways:
