@@ -255,7 +255,8 @@ def test_a_link_is_where_its_joints_put_it(registry: Any) -> None:
     configuration = Configuration("eye-on-arm", "link3", FLANGE, None)
     joints = np.linspace(-1, 1, 6)
     link = cell_of(configuration, robot).graph([observation(joints=joints)])["link3"]
-    assert np.allclose(link.place[0], Arm(robot).frames(joints)[3])  # type: ignore[index]
+    assert link.place is not None
+    assert np.allclose(link.place[0], Arm(robot).frames(joints)[3])
     with pytest.raises(StageError) as error:
         cell_of(configuration, robot).graph([observation()])
     assert str(error.value) == (

@@ -81,9 +81,8 @@ class Response:
 def identify(cycles: Floats) -> tuple[float, float]:
     """Return the dead time and lag [s] that best explain an arm's motion along one axis.
 
-    Where a controller limits its acceleration, the arm is late for a while after a step and
-    nowhere else: of its ways in a tenth of a second the two fifths that are explained least are
-    left out.
+    A controller that limits acceleration makes the arm late after a step, and nowhere else. So
+    displacements over a tenth of a second are compared, without the worst two fifths of them.
 
     Args:
         cycles: (K, 3) time [s], velocity commanded [m/s], where the arm was reported [m].

@@ -83,7 +83,7 @@ def open_npz(path: Path) -> LoadedTable:
     likely = named[:1] or [name for name, array in arrays.items() if _may_be_points(array.shape)]
     if len(likely) != 1:
         held = ", ".join(f"{name} {array.shape}" for name, array in arrays.items())
-        refuse(path, f"which of its arrays are the points is not plain: {held or 'none'}; "
+        refuse(path, f"it is not clear which of its arrays holds the points: {held or 'none'}; "
                      "call one points, (N, 3) or (H, W, 3)")  # fmt: skip
     array = arrays[likely[0]]
     return LoadedTable(path, array.shape[:-1], array.reshape(-1, array.shape[-1])[:, :3])
