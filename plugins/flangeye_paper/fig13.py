@@ -11,6 +11,7 @@ import numpy as np
 
 from flangeye import FlangeyeError
 from flangeye.log.read import read_run
+from flangeye.maths.geometry import arc_lengths
 from flangeye.maths.seam_geometry import torch_deviation
 from flangeye.types import Floats, WeldReport, WorkpieceScan
 from flangeye_paper.tables import Row, SessionRow, dress, legend, read_sessions, sheet, write_csv
@@ -40,7 +41,7 @@ class SeenWeld:
 
     def deviation(self, part: tuple[float, float] = (0.0, np.inf)) -> Floats:
         """Return the torch's distances from the true seam, on a part of it by arc length [m]."""
-        along = _arc_length(self.truth)
+        along = arc_lengths(self.truth)
         inside = (along >= part[0]) & (along <= part[1])
         return torch_deviation(self.torch, self.truth[inside], self.report.opening)
 
@@ -67,7 +68,7 @@ class SeenWeld:
         """
         along, _ = self._seen(self.report.robot)
         # Where the seam's end begins to matter [m]
-        leaving = along > _arc_length(self.truth)[-1] - 20e-3
+        leaving = along > arc_lengths(self.truth)[-1] - 20e-3
         time = self.report.time[leaving]
         if not len(time):
             return 0.0
@@ -117,11 +118,6 @@ def seen(session: SessionRow) -> SeenWeld:
 def _flat(vectors: Floats, report: WeldReport) -> Floats:
     """Return vectors (..., 3) without what lies along the opening."""
     return np.asarray(vectors - (vectors @ report.opening)[..., None] * report.opening)
-
-
-def _arc_length(line: Floats) -> Floats:
-    steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
-    return np.concatenate([[0.0], np.cumsum(steps)])
 
 
 def _unit(vector: Floats) -> Floats:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from flangeye import stage
-from flangeye.maths.geometry import rotation_exp
+from flangeye.maths.geometry import arc_lengths, rotation_exp
 from flangeye.models.workpiece import load_workpiece
 from flangeye.types import CAMERA, Floats, PointCloud, Seam, Seed, VerifiedHandEye, WorkpieceScan
 from flangeye_emulators.world.bench import LaidParams
@@ -48,7 +48,7 @@ def seam_misplanned(hand_eye: VerifiedHandEye, seed: Seed, params: AsLaidParams)
 
 
 def _dense(points: Floats) -> Floats:
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    along = arc_lengths(points)
     # Between two points of a seam [m]
     ticks = np.linspace(0.0, along[-1], round(along[-1] / 1e-3) + 1)
     return np.stack([np.interp(ticks, along, axis) for axis in points.T], axis=1)

@@ -13,6 +13,12 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 
+def arc_lengths(points: Floats) -> Floats:
+    """Return the way along a polyline from its start to each of its points, (N, D) -> (N,)."""
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
 def hat(vectors: ArrayLike) -> Floats:
     """Return the (..., 3, 3) cross-product matrices of (..., 3) vectors: ``hat(a) @ b = a x b``."""
     v = np.asarray(vectors, dtype=np.float64)

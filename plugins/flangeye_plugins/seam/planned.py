@@ -10,6 +10,7 @@ from pydantic import Field
 
 from flangeye import CalibrationRefused, Params
 from flangeye.maths.arm_correction import reported_flange
+from flangeye.maths.geometry import arc_lengths
 from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
@@ -122,8 +123,7 @@ def resampled(line: Floats, spacing: float) -> Floats:
 
     Further columns of it go along: (N, K) gives (M, K).
     """
-    steps = np.linalg.norm(np.diff(line[:, :3], axis=0), axis=1)
-    arc = np.concatenate([[0.0], np.cumsum(steps)])
+    arc = arc_lengths(line[:, :3])
     at = np.linspace(0.0, arc[-1], max(2, round(arc[-1] / spacing) + 1))
     return np.stack([np.interp(at, arc, column) for column in line.T], axis=1)
 

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from flangeye.maths.geometry import arc_lengths
 from flangeye.types import Floats
 from flangeye_plugins.seam.planned import resampled
 from flangeye_plugins.seam.template import EDGES, FACES, OFFSETS, JointShape, Section
@@ -433,8 +434,7 @@ def _smoothed(points: Floats, cells: float, closed: bool) -> Floats:
 def _with_openings(points: Floats, openings: Floats, closed: bool, eyes: Floats) -> Course:
     """Return the frames of a line at even steps."""
     line = np.vstack([points, points[:1]]) if closed else points
-    lengths = np.linalg.norm(np.diff(line, axis=0), axis=1)
-    arc = np.concatenate([[0.0], np.cumsum(lengths)])
+    arc = arc_lengths(line)
     at = np.linspace(0.0, arc[-1], len(line))
     wrapped = np.vstack([openings, openings[:1]]) if closed else openings
     even = np.stack([np.interp(at, arc, line[:, k]) for k in range(3)], axis=1)

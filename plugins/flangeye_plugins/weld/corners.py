@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flangeye.errors import StageError
+from flangeye.maths.geometry import arc_lengths
 from flangeye.types import Floats, Seam
 from flangeye_plugins.weld.frame import rolled_out
 from flangeye_plugins.weld.path import CHORD
@@ -41,7 +42,7 @@ class Corner(NamedTuple):
 def corners_of(points: Floats) -> list[Corner]:
     """Return the corners of a polyline (N, 3) in the plane of the work, in their order."""
     planar = points[:, :2]
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(planar, axis=0), axis=1))])
+    along = arc_lengths(planar)
     turns = np.array([_turn(planar, along, s) for s in along])
     found: list[Corner] = []
     # A plan that turns by more than 35 degrees within two chords has a corner.
@@ -106,7 +107,7 @@ def _rounded(seam: Seam, corners: list[Corner], params: WeldTactileParams, radiu
     if params.leg is not None:
         raise StageError("weld.tactile: corner_radius leaves no legs; leave out one of the two")
     points = seam.points_in_base
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    along = arc_lengths(points)
     ends = [0.0, *(along[each.point] for each in corners), along[-1]]
     pieces, kept = [], np.full(len(along), True)
     for corner, before, here, after in zip(corners, ends, ends[1:], ends[2:], strict=False):

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from flangeye.maths.geometry import rigid, rotation_from_rpy
+from flangeye.maths.geometry import arc_lengths, rigid, rotation_from_rpy
 from flangeye.models.finger import Finger, FingerGeometry
 from flangeye.motion.seam_following import Command, ToolPose
 from flangeye.types import BASE, FLANGE, Floats, Transform
@@ -111,7 +111,7 @@ class WorkSurface:
         points, openings, wraps = _gone_around(points, openings)
         self.points = rolled_out(points, openings)
         self.path = Path(self.points, wraps)
-        along = _along(self.points)
+        along = arc_lengths(self.points)
         ticks = self.path.step * np.arange(len(self.path.points), dtype=np.float64)
         line = _interpolated(ticks, along, points)
         ahead = np.gradient(line, self.path.step, axis=0)
@@ -250,12 +250,6 @@ def _interpolated(at: Floats, along: Floats, rows: Floats) -> Floats:
     return np.stack([np.interp(at, along, axis) for axis in rows.T], axis=1)
 
 
-def _along(points: Floats) -> Floats:
-    """Return arc lengths (N,) of points (N, D), from the first on."""
-    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    return np.concatenate([[0.0], np.cumsum(steps)])
-
-
 def _gone_around(points: Floats, openings: Floats) -> tuple[Floats, Floats, float]:
     """Return a seam and its openings with half a turn more at each end, if it goes once around.
 
@@ -266,7 +260,7 @@ def _gone_around(points: Floats, openings: Floats) -> tuple[Floats, Floats, floa
         return points, openings, 0.0
     rows = np.hstack([points, openings])
     rows[-1] = rows[0]
-    along = _along(rows[:, :3])
+    along = arc_lengths(rows[:, :3])
     half = float(along[-1]) / 2
     count = len(rows)
     back = _interpolated(np.linspace(half, along[-1], count), along, rows)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from flangeye.maths.geometry import arc_lengths
 from flangeye.types import Floats
 
 PATH_SPACING = 0.5e-3
@@ -52,8 +53,7 @@ class Path:
             points: (N, 3) two coordinates in the plane, and the height above it.
             wraps: How far they go on beyond both ends of a seam that goes once around.
         """
-        chords = np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1)
-        along = np.concatenate([[0.0], np.cumsum(chords)])
+        along = arc_lengths(points[:, :2])
         known = float(along[-1])
         self.length, self.first, self.last = known - 2 * wraps, -wraps, known - wraps
         ticks = np.linspace(0.0, known, max(2, round(known / PATH_SPACING)) + 1)
