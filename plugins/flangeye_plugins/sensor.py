@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from flangeye.devices import Device, DeviceError, SensorFrame, StateSource, TactileSensor
 from flangeye.errors import StageError
 from flangeye.files.images import MAX_FILE, ImageError, decode_image
-from flangeye.files.paths import RecipePath
+from flangeye.files.paths import RecipeFile, RecipePath
 from flangeye.files.regular import read_regular
 from flangeye.files.scans import natural
 from flangeye.log.read import read_notes
@@ -145,7 +145,7 @@ class ImageFolderParams(Params):
 class McapParams(Params):
     """Parameters of ``sensor.mcap``."""
 
-    path: RecipePath = param(description="The run.mcap of a weld; its images, at their times.")
+    path: RecipeFile = param(description="The run.mcap of a weld; its images, at their times.")
 
 
 class RecordedImages(Device):

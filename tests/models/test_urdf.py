@@ -190,6 +190,23 @@ def test_a_flange_that_looks_aside_is_said_with_the_line_that_turns_it(kuka: Pat
     assert Arm(turned).flange(np.zeros(6))[:3, 2] == pytest.approx([1, 0, 0], abs=1e-5)
 
 
+def test_check_asks_for_the_bodies_that_a_move_needs(kuka: Path, tmp_path: Path) -> None:
+    recipe = tmp_path / "cell.yaml"
+    head = "title: T\nrobot: {urdf: kuka/urdf/kr6.urdf}\nscanner: {model: phoxi-m}\n"
+    head += "feature: {standard: ISO 9409-1-40-4-M6}\nsteps: ["
+    tail = ", segment.flange, fit.rim, solve.robust]\n"
+    registry = load_registry()
+    (kuka.parents[1] / "m" / "4.stl").unlink()
+    recipe.write_text(f"{head}acquire.archive: {{path: .}}{tail}")
+    assert "ok, 4 steps" in describe_recipe(recipe, registry)  # nothing moves
+    recipe.write_text(f"{head}acquire.simulated{tail}")
+    with pytest.raises(StageError, match=r"plan its moves: .*mesh 'package://kuka/m/4\.stl'"):
+        describe_recipe(recipe, registry)
+    kuka.write_text(re.sub("<mesh [^>]*>", '<sphere radius="0"/>', kuka.read_text()))
+    with pytest.raises(StageError, match="the <sphere> of link 'link_0' has a radius of 0 mm"):
+        describe_recipe(recipe, registry)
+
+
 def test_an_arm_of_five_joints_is_sent_nowhere(kuka: Path, tmp_path: Path) -> None:
     text = kuka.read_text().replace('"joint_4" type="revolute"', '"joint_4" type="fixed"')
     kuka.write_text(text)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from platformdirs import user_config_path
-from pydantic import BeforeValidator, PlainSerializer, ValidationInfo
+from pydantic import AfterValidator, BeforeValidator, PlainSerializer, ValidationInfo
 
 from flangeye.devices import DeviceError
 from flangeye.files.words import nearest
@@ -41,8 +41,17 @@ def _beside_recipe(value: Any, info: ValidationInfo) -> Path:
     return path if info.context is None else info.context.folder / path
 
 
+def _there(path: Path, info: ValidationInfo) -> Path:
+    if info.context is not None and info.context.needs_files and not path.is_file():
+        raise ValueError(f"no file {path}; a relative path starts at the recipe's folder")
+    return path
+
+
 RecipePath = Annotated[Path, BeforeValidator(_beside_recipe), WHOLE]
 """A path in a parameter; a relative one starts at the recipe's folder."""
+
+RecipeFile = Annotated[RecipePath, AfterValidator(_there)]
+"""The same of a file that has to be there before a recipe runs."""
 
 
 def bundled_file(
@@ -61,7 +70,7 @@ def bundled_file(
         if not isinstance(value, (str, Path)):
             raise ValueError(f"a {kind} is a name or a path to {allowed}")
         if str(value).endswith((*own, ".yml")):
-            return _beside_recipe(value, info)
+            return _there(_beside_recipe(value, info), info)
         path = bundled("data") / folder / f"{value}.yaml"
         if not path.is_file():
             known = sorted(p.stem for p in path.parent.glob("*.yaml"))

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field
 
 from flangeye.files.paths import WHOLE, bundled_file
-from flangeye.models.model import Model
+from flangeye.models.model import Model, readable
 from flangeye.types import Floats
 from flangeye.units import Angle, Force, Length, Stiffness, param
 
@@ -116,6 +116,7 @@ class Finger(FingerGeometry):
 FingerPath = Annotated[
     Path,
     BeforeValidator(bundled_file("finger", "fingers")),
+    readable(Finger),
     WHOLE,
 ]
 """A parameter that names a finger: a bundled one, or a file beside the recipe."""

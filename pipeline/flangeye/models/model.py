@@ -7,9 +7,16 @@ file of the user's own, with units on every value and its source beside it.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    TypeAdapter,
+    ValidationError,
+    ValidationInfo,
+)
 
 from flangeye.errors import RecipeError
 from flangeye.files.validation import sentence
@@ -23,6 +30,17 @@ class Model(BaseModel):
 
 
 M = TypeVar("M")
+
+
+def readable(cls: type[Any]) -> AfterValidator:
+    """Return a validator of a path that reads the file as a run will, before anything moves."""
+
+    def read(path: Path, info: ValidationInfo) -> Path:
+        if info.context is not None and info.context.needs_files:
+            read_model(path, cls)
+        return path
+
+    return AfterValidator(read)
 
 
 def read_model(path: Path, cls: type[M]) -> M:

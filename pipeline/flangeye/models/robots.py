@@ -10,7 +10,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from pydantic import Field, PrivateAttr, field_validator
 
-from flangeye.errors import RecipeError
+from flangeye.errors import RecipeError, StageError
 from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.models.model import Model
 from flangeye.types import Floats, Note
@@ -177,6 +177,19 @@ class RobotModel(Model):
             return self.model_copy(update={"volumes": volumes, "volumes_missing": ""})
         except RecipeError as error:
             return self.model_copy(update={"volumes_missing": str(error)})
+
+    def known_volumes(self) -> tuple[Volume, ...]:
+        """Return the capsules that bound the arm, without which no move is planned.
+
+        Raises:
+            StageError: They are not known; says why, and what to write.
+        """
+        filled = self.filled()
+        if filled.volumes_missing:
+            raise StageError(
+                f"the space the arm fills is needed to plan its moves: {filled.volumes_missing}"
+            )
+        return filled.volumes
 
     @property
     def link_T_flange(self) -> Floats:

@@ -31,7 +31,7 @@ from flangeye.errors import StageError
 from flangeye.files.clouds import PER_METRE, LengthUnit
 from flangeye.files.paths import WHOLE, bundled_file
 from flangeye.files.regular import read_regular
-from flangeye.models.model import Model, read_model
+from flangeye.models.model import Model, read_model, readable
 from flangeye.types import Floats
 from flangeye.units import Angle, Length
 
@@ -110,6 +110,7 @@ class Workpiece:
 WorkpiecePath = Annotated[
     Path,
     BeforeValidator(bundled_file("workpiece", "workpieces")),
+    readable(WorkpieceFile),
     WHOLE,
 ]
 """A parameter that names a workpiece: a bundled one, or a file beside the recipe."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from flangeye.errors import StageError
 from flangeye.models.robots import RobotModel
 from flangeye.types import Floats
 
@@ -18,12 +17,7 @@ class ArmVolume:
         Raises:
             StageError: What the arm fills is not known, so nothing can be said to be clear of it.
         """
-        robot = robot.filled()
-        if robot.volumes_missing:
-            raise StageError(
-                f"the space the arm fills is needed to plan its moves: {robot.volumes_missing}"
-            )
-        volumes = robot.volumes
+        volumes = robot.known_volumes()
         self.links = np.array([volume.link for volume in volumes], dtype=np.intp)
         self.radii = np.array([volume.radius for volume in volumes])
         self._ends = np.array([[v.start, v.end] for v in volumes]).reshape(len(volumes), 2, 3)

@@ -220,11 +220,19 @@ class Registry:
 
 @dataclass(frozen=True)
 class Lookup:
-    """The context in which parameters are validated: parts on offer, paths' folder, the arm."""
+    """The context in which parameters are validated.
+
+    Attributes:
+        registry: The parts on offer.
+        folder: Where relative paths start.
+        robot: The recipe's arm.
+        needs_files: Whether the files that are named have to be there; a log's may be gone.
+    """
 
     registry: Registry
     folder: Path = Path()
     robot: RobotModel | None = None
+    needs_files: bool = False
 
     def part(self, name: str) -> Part:
         """Return the part ``name``; raises as :meth:`Registry.part` does."""

@@ -310,6 +310,7 @@ class PartLookup(Protocol):
 
     folder: Path
     robot: RobotModel | None
+    needs_files: bool
 
     def part(self, name: str) -> Part:
         """Return the part ``kind.name``, or raise LookupError naming the nearest."""

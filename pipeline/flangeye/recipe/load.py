@@ -82,8 +82,7 @@ class Recipe:
     @property
     def plans(self) -> bool:
         """Whether its first step plans poses of an arm, which can be shown without a run."""
-        needs = self.steps[0].stage.needs.values()
-        return any(MotionAllowed in (need, *get_args(need)) for need in needs)
+        return _moves(self.steps[0])
 
     @property
     def notes(self) -> tuple[t.Note, ...]:
@@ -104,6 +103,11 @@ class Recipe:
         ]
 
 
+def _moves(step: Step) -> bool:
+    needs = step.stage.needs.values()
+    return any(MotionAllowed in (need, *get_args(need)) for need in needs)
+
+
 def load_recipe(path: Path, registry: Registry, overrides: Sequence[str] = ()) -> Recipe:
     """Read and check a recipe without running it.
 
@@ -116,7 +120,7 @@ def load_recipe(path: Path, registry: Registry, overrides: Sequence[str] = ()) -
         RecipeError: Names every mistake found, not only the first.
     """
     document = read_yaml(path)
-    return _Checker(document, registry, path.parent.absolute()).check(
+    return _Checker(document, Lookup(registry, path.parent.absolute(), needs_files=True)).check(
         path.stem, read_text(path, MAX_BYTES, RecipeError), overrides
     )
 
@@ -138,19 +142,16 @@ def parse_recipe(
         models: Files of models that come with it, by the name it gives them.
     """
     with carried_files(models) as folder:
-        return _Checker(parse_yaml(text, name), registry, Path(), folder).check(
-            name, text, overrides
-        )
+        checker = _Checker(parse_yaml(text, name), Lookup(registry), folder)
+        return checker.check(name, text, overrides)
 
 
 class _Checker:
     """Collects every mistake of one recipe."""
 
-    def __init__(
-        self, document: Document, registry: Registry, folder: Path, models: Path | None = None
-    ) -> None:
-        self._lookup = Lookup(registry, folder)
-        self._models = models or folder
+    def __init__(self, document: Document, lookup: Lookup, models: Path | None = None) -> None:
+        self._lookup = lookup
+        self._models = models or lookup.folder
         self._document = document
         self._overridden: list[tuple[Hashable, ...]] = []
         self._left_out: list[tuple[Hashable, ...]] = []
@@ -335,6 +336,7 @@ def describe_recipe(path: Path, registry: Registry, overrides: Sequence[str] = (
 
     Raises:
         RecipeError: Names every mistake found.
+        StageError: A step moves the arm, and the space that it fills is not known.
     """
     from flangeye.models.cell import Cell
     from flangeye.models.configuration import Configuration
@@ -344,6 +346,8 @@ def describe_recipe(path: Path, registry: Registry, overrides: Sequence[str] = (
     checked = load_recipe(path, registry, overrides)
     if checked.plans and RobotModel in checked.context:
         _require_reached(path, checked.context[RobotModel])
+    if any(map(_moves, checked.steps)) and RobotModel in checked.context:
+        checked.context[RobotModel].known_volumes()
     loop = checked.context.get(Cell) or checked.context[Configuration]
     lines = (f"{path}: ok, {len(checked.steps)} steps", loop.describe())
     return "\n".join([*lines, *map(as_line, checked.notes)])

@@ -14,6 +14,7 @@ from pydantic import BeforeValidator, ConfigDict, with_config
 
 from flangeye.files.paths import WHOLE, bundled_file
 from flangeye.models.finger import FingerGeometry
+from flangeye.models.model import readable
 from flangeye.units import Angle, Duration, Length, Stiffness, param
 from flangeye_emulators.weld_world.groove import Gap
 
@@ -27,7 +28,9 @@ class ToolFile(FingerGeometry):
     axial: Stiffness = param(gt=0, description="Along the finger.")
 
 
-ToolPath = Annotated[Path, BeforeValidator(bundled_file("true tool", "tools")), WHOLE]
+ToolPath = Annotated[
+    Path, BeforeValidator(bundled_file("true tool", "tools")), readable(ToolFile), WHOLE
+]
 """A parameter that names a world's tool: a bundled one, or a file beside the recipe."""
 
 
@@ -211,5 +214,7 @@ class WeldTruth:
     heat: HeatTruth = HeatTruth()
 
 
-WorldPath = Annotated[Path, BeforeValidator(bundled_file("world", "worlds")), WHOLE]
+WorldPath = Annotated[
+    Path, BeforeValidator(bundled_file("world", "worlds")), readable(WeldTruth), WHOLE
+]
 """A parameter that names a world: a bundled one, or a file beside the recipe."""

@@ -24,7 +24,7 @@ import yaml
 from pydantic import Field
 
 from flangeye import Params, StageError
-from flangeye.files.paths import RecipePath
+from flangeye.files.paths import RecipeFile
 from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.models.urdf import end_of, origin_of, read_urdf
 from flangeye.types import CAMERA, CalibratedPose, ExportedFile, Floats
@@ -219,7 +219,7 @@ class UrdfParams(FramesParams):
     mount_T_optical: OpticalParams | None = Field(
         None, description="Where the optical frame is in the mount link, if that is known."
     )
-    camera_urdf: RecipePath | None = Field(
+    camera_urdf: RecipeFile | None = Field(
         None, description="The camera's own URDF (xacro already run), which tells the same."
     )
 

@@ -17,7 +17,7 @@ import numpy as np
 from pydantic import Field
 
 from flangeye.devices import PATIENCE, DeviceError, FrameDropped, Scan, Scanner
-from flangeye.files.paths import MachineName, RecipePath, find_named, require_named
+from flangeye.files.paths import MachineName, RecipeFile, find_named, require_named
 from flangeye.files.paths import settings_file as machine_settings
 from flangeye.files.processes import Pipe, PipeEndedError, python_command
 from flangeye.models.scanners import ScannerModel
@@ -32,7 +32,7 @@ HOST = Path(__file__).with_name("kinect_host.py")
 class AzureKinectParams(Params):
     """Parameters of ``scanner.azure_kinect``."""
 
-    recording: RecipePath | None = Field(
+    recording: RecipeFile | None = Field(
         None, description="An MKV recording to play instead, one capture an exposure."
     )
     device: int = Field(

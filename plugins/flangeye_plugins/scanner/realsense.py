@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import Field
 
 from flangeye.devices import PATIENCE, DeviceError, Scan, Scanner, load_sdk
-from flangeye.files.paths import RecipePath
+from flangeye.files.paths import RecipeFile
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import part
 from flangeye_plugins.scanner.opened import OpenScanner, SerialParams
@@ -23,7 +23,7 @@ NAME = "scanner.realsense"
 class RealsenseParams(SerialParams):
     """Parameters of ``scanner.realsense``."""
 
-    recording: RecipePath | None = Field(
+    recording: RecipeFile | None = Field(
         None, description="A .db3 or .bag recording to play instead, one frame an exposure."
     )
     # Longest wait for a frame [s]

@@ -10,7 +10,7 @@ from typing import Any
 from pydantic import Field
 
 from flangeye.devices import DeviceError, Scan, Scanner, load_sdk
-from flangeye.files.paths import RecipePath
+from flangeye.files.paths import RecipeFile
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import part
 from flangeye_plugins.scanner.opened import OpenScanner, SerialParams
@@ -19,10 +19,10 @@ from flangeye_plugins.scanner.opened import OpenScanner, SerialParams
 class ZividParams(SerialParams):
     """Parameters of ``scanner.zivid``."""
 
-    settings: RecipePath | None = Field(
+    settings: RecipeFile | None = Field(
         None, description="Settings saved by Zivid Studio (.yml); one default acquisition if none."
     )
-    file_camera: RecipePath | None = Field(
+    file_camera: RecipeFile | None = Field(
         None, description="A file camera (.zfc) to capture from instead."
     )
 

@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from flangeye import RecipePath, StageError, stage
+from flangeye import StageError, stage
 from flangeye.files.clouds import PER_METRE, LengthUnit
 from flangeye.files.drawings import read_dxf
+from flangeye.files.paths import RecipeFile
 from flangeye.files.tables import read_table
 from flangeye.maths.seam_geometry import chained, distances_to_line, sharp_edges
 from flangeye.models.robots import RobotModel
@@ -32,7 +33,7 @@ STAGE = "seam.line"
 class LineParams(SeamParams, PlaceParams):
     """Parameters of ``seam.line``; position and rpy are those of the file's frame in the base."""
 
-    path: RecipePath = Field(
+    path: RecipeFile = Field(
         description="Points or taught poses in order (CSV, YAML, JSON), a drawing (DXF), or CAD "
         "whose sharp edges are lines (STL, PLY, OBJ, STEP)."
     )

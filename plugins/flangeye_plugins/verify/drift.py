@@ -10,7 +10,7 @@ from pydantic import Field
 from flangeye import Params, stage
 from flangeye.doctor.monitor import stored_calibration
 from flangeye.estimation.watch.drift import DriftTest, information_of, verdict
-from flangeye.files.paths import RecipePath
+from flangeye.files.paths import RecipeFile
 from flangeye.types import HandEye, Verification
 from flangeye.units import Length, param
 
@@ -18,7 +18,7 @@ from flangeye.units import Length, param
 class DriftParams(Params):
     """Parameters of ``verify.drift``."""
 
-    reference: RecipePath = Field(description="The run.mcap of the earlier calibration.")
+    reference: RecipeFile = Field(description="The run.mcap of the earlier calibration.")
     limit: Length = param("0.4 mm", gt=0, description="Largest shift at the work that passes.")
     # Probability that a cell that did not move is refused
     false_alarms: ClassVar[float] = 2e-4

@@ -12,7 +12,7 @@ from pydantic import Field
 
 from flangeye import Params, StageError, stage
 from flangeye.files.clouds import LengthUnit
-from flangeye.files.paths import RecipePath
+from flangeye.files.paths import RecipeFile
 from flangeye.maths.arm_correction import corrected_view
 from flangeye.maths.geometry import rotation_from_rpy, rotation_log, rpy_from_rotation
 from flangeye.maths.kinematics import Arm
@@ -39,7 +39,7 @@ from flangeye_plugins.verify.registration import (
 class CadCloud(Params):
     """A point cloud of the flange's CAD model."""
 
-    file: RecipePath = Field(
+    file: RecipeFile = Field(
         description="PCD, PLY, XYZ, CSV or NPY; rows that are not finite are left out."
     )
     unit: LengthUnit = Field(description="Unit of the file's coordinates.")

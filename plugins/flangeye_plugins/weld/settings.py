@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from flangeye.files.paths import RecipePath
+from flangeye.files.paths import RecipeFile, RecipePath
 from flangeye.models.finger import FingerPath
 from flangeye.plugin.stage import BoundPart, Choose, Params
 from flangeye.units import Angle, AngularSpeed, Duration, Length, Speed, param
@@ -224,7 +224,7 @@ class WeldTactileParams(Following):
         description="Tip and torch go round the plan's sharp corners without a stop, on arcs of "
         "this radius. Without it the torch stops there: each leg is a step.",
     )
-    resume: RecipePath | None = Field(
+    resume: RecipeFile | None = Field(
         None,
         description="The run.mcap of a weld that was stopped: goes on with what was felt.",
     )

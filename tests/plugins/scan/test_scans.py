@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from flangeye import StageError
+from flangeye import RecipeError, StageError
 from flangeye.devices import Scan, Scanner, ScannerDriver
 from flangeye.files.clouds import write_cloud
+from flangeye.plugin.registry import load_registry
+from flangeye.recipe.load import load_recipe, parse_recipe
 from flangeye.types import CAMERA, PointCloud, Seed
 from flangeye_emulators.scan import SimulatedScanParams, scan_simulated
 from flangeye_plugins.scan import FileScanParams, scan_file, scan_live
@@ -40,6 +42,27 @@ def test_without_a_simulated_cell_nothing_is_simulated() -> None:
 def test_an_unknown_workpiece_is_named() -> None:
     with pytest.raises(ValidationError, match="no workpiece 'v-strait'; known: v-straight, "):
         SimulatedScanParams(workpiece="v-strait")
+
+
+def test_a_file_of_ones_own_is_read_before_anything_runs(tmp_path: Path) -> None:
+    recipe, own = tmp_path / "weld.yaml", tmp_path / "own.yaml"
+    head = "title: T\nrobot: ur10e\nscanner: {model: phoxi-m}\nsteps:\n- acquire.simulated\n"
+    recipe.write_text(
+        f"{head}- segment.flange\n- fit.rim\n- solve.svd\n- verify.holdout\n"
+        "- scan.simulated: {workpiece: own.yaml}\n- seam.line: {path: taught.csv, unit: mm}\n"
+    )
+    registry = load_registry()
+    with pytest.raises(RecipeError) as missing:
+        load_recipe(recipe, registry)
+    lines = str(missing.value).splitlines()
+    assert f"{recipe}:10: steps.5.scan.simulated.workpiece: no file {own}; a relative" in lines[0]
+    assert f"{recipe}:11: steps.6.seam.line.path: no file {tmp_path / 'taught.csv'}" in lines[1]
+    (tmp_path / "taught.csv").write_text("0,0,0\n10,0,0\n")
+    own.write_text("title: A plate\n")
+    with pytest.raises(RecipeError, match=f"{own}:1: cad: is missing"):
+        load_recipe(recipe, registry)
+    own.unlink()  # what a log carries is read where its files are gone
+    assert len(parse_recipe(recipe.read_text(), "weld", registry).steps) == 7
 
 
 def test_a_file_and_a_folder_of_clouds_are_read(tmp_path: Path) -> None:
