@@ -18,6 +18,7 @@ import numpy as np
 
 from flangeye.errors import StageError
 from flangeye.files.yaml_lines import parse_value
+from flangeye.models.robots import RobotModel
 from flangeye.plugin.stage import BoundPart, Part
 from flangeye.types import Floats, Mask, Motion
 
@@ -58,6 +59,7 @@ class RecordedSession:
         links: (N, 4, 4) base_T_link of the link that carries the camera [m]; None where none does.
         seconds: (N, 4, 4) base2_T_flange2 [m], where a second arm carries the target, else None.
         place: (4, 4) of the target in the flange or base that has it, where that is known [m].
+        robot: The arm's model, where the recipe names one.
         motions: N of them, how the flange passed each; None where not recorded for all of them.
         reach: Nearest and farthest distance that the scanner sees [m].
         reader: The archive's reader, as the recipe writes it.
@@ -82,6 +84,7 @@ class RecordedSession:
     links: Floats | None = None
     seconds: Floats | None = None
     place: Floats = field(default_factory=lambda: np.eye(4))
+    robot: RobotModel | None = None
     motions: tuple[Motion, ...] | None = None
     reach: tuple[float, float] = (0.05, 5.0)
     reader: Reader = "auto"

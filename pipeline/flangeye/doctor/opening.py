@@ -62,7 +62,7 @@ def in_configuration(
     Args:
         session: The session of one arm beside its camera, as far as is known.
         configuration: Says otherwise.
-        robot: The arm, where a link carries the camera.
+        robot: The arm's model, where the recipe names one.
         states: What else was recorded, by the samples' ids.
 
     Raises:
@@ -93,6 +93,7 @@ def in_configuration(
         links=links,
         seconds=seconds,
         place=np.eye(4) if known is None else known,
+        robot=robot,
         places=places,
     )
 

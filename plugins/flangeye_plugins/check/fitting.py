@@ -24,9 +24,26 @@ from typing import NamedTuple
 
 import numpy as np
 
+from flangeye import StageError
 from flangeye.doctor.diagnosis import Arms, Finding, Misfit, RecordedSession
-from flangeye.maths.geometry import hat, rotation_exp
-from flangeye.types import Floats, Indices, Mask
+from flangeye.errors import CalibrationRefused
+from flangeye.estimation.estimate import Estimate
+from flangeye.estimation.session import session_of
+from flangeye.maths.geometry import hat, rigid, rotation_exp
+from flangeye.models.cell import cell_of
+from flangeye.models.configuration import Configuration
+from flangeye.types import (
+    BASE,
+    CAMERA,
+    FLANGE,
+    TARGET,
+    Floats,
+    Indices,
+    Mask,
+    Observation,
+    PoseFeature,
+    Transform,
+)
 from flangeye_plugins.check.equations import Equations, VariantUnknowns, equations_of, start_of
 
 TAILS = 4.0
@@ -479,3 +496,48 @@ def _spread(session: RecordedSession) -> float:
     """Return how far the samples are apart [m]: the arm's places, or what was seen, if farther."""
     sides = (session.poses[session.seen, :3, 3], session.centres[session.seen])
     return max(float(np.linalg.norm(side.std(axis=0))) for side in sides)
+
+
+def likelier(first: RecordedSession, second: RecordedSession) -> float:
+    """Return the logarithm of the ratio of two sessions' restricted likelihoods.
+
+    By the model that a run calibrates with. It knows how a marker's noise and the arm's errors
+    differ, where two readings fit equally well: a marker's position is measured better than its
+    rotation times its distance.
+
+    Args:
+        first: Whole poses of a marker, with one arm; neither its place nor the camera's is known.
+        second: Another reading of the same samples.
+    """
+    found = [_estimated(each) for each in (first, second)]
+    used = [each.inliers for each in found if each is not None]
+    if len(used) == 2 and not (agree := used[0] & used[1]).all():
+        seen = np.flatnonzero(np.isfinite(first.rotations[:, 0, 0]))
+        kept = np.isin(np.arange(len(first)), seen[agree])
+        found = [_estimated(each.where(kept)) for each in (first, second)]
+    costs = [np.inf if each is None else each.posterior.cost for each in found]
+    return 0.0 if costs == [np.inf, np.inf] else 0.5 * (costs[1] - costs[0])
+
+
+def _estimated(session: RecordedSession) -> Estimate | None:
+    """Return the model's estimate from a session's markers; None where it refuses them."""
+    # As good as acquire.samples takes markers for: how good they are is estimated [rad, m]
+    noise = np.diag(np.square([np.radians(0.2)] * 3 + [0.5e-3] * 3))
+    observations = [
+        Observation(
+            name,
+            PoseFeature(Transform(CAMERA, TARGET, rigid(turn, centre)), noise),
+            {FLANGE: Transform(BASE, FLANGE, pose)},
+            None,
+        )
+        for name, pose, turn, centre in zip(
+            session.ids, session.poses, session.rotations, session.centres, strict=True
+        )
+        if np.isfinite(turn).all()
+    ]
+    ends = (BASE, FLANGE) if session.carried == "target" else (FLANGE, BASE)
+    try:
+        configuration = Configuration(camera=ends[0], target=ends[1])
+        return session_of(observations, cell_of(configuration, session.robot), None).found
+    except (CalibrationRefused, StageError):
+        return None

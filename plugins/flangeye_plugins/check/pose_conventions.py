@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -23,12 +23,12 @@ from flangeye.maths.pose_formats import CONVENTIONS, EULER_ORDERS, PLAIN, writte
 from flangeye.models.configuration import looks_exchanged
 from flangeye_plugins.check.equations import equations_of
 from flangeye_plugins.check.fitting import (
-    Significance,
     best_of,
     explained,
     fit,
     fit_of,
     helps,
+    likelier,
     named,
 )
 
@@ -212,12 +212,9 @@ def direction(session: RecordedSession) -> Findings:
     corrected_session, whose, way = tried[evidence.which]
     if evidence.probability == 1 or not helps(session, corrected_session):
         return
-    if way == "inverted" and _marker_rather(session, corrected_session):
-        yield _inverted_marker(session, evidence)
-        return
     what, fix = f"{whose} {_WAYS[way][1]}", corrected_session.step()
     if way == "inverted" and _may_be_mounted_otherwise(session):
-        what, fix = _of_exchanged(session, corrected_session)
+        what, fix, corrected_session = _of_exchanged(session, corrected_session)
     yield evidence.finding("pose direction", what, corrected_session, fix)
 
 
@@ -299,56 +296,43 @@ def _may_be_mounted_otherwise(session: RecordedSession) -> bool:
     return session.links is None and session.seconds is None and unknown
 
 
-def _of_exchanged(session: RecordedSession, turned: RecordedSession) -> tuple[str, str]:
-    """Return what may be wrong, and the lines to choose from, the likeliest first.
+def _of_exchanged(
+    session: RecordedSession, turned: RecordedSession
+) -> tuple[str, str, RecordedSession]:
+    """Return what may be wrong, the lines to choose from, and the session by the first of them.
 
     The samples fit each of three: with the arm's poses inverted camera and target are as far from
     flange and base as they are from base and flange with another mounting, or inverted markers.
+    Distances tell the first from the others, and the likelihood the last.
     """
     # Where the camera then is, and how to say so
     held, name = {
         "target": ("in the hand", "eye-in-hand"),
         "camera": ("beside the robot", "eye-on-base"),
     }[session.carried]
-    mounted = f"the camera is {held}", f"configuration: {{name: {name}, place: unknown}}"
-    choices = [mounted, ("the poses are flange_T_base", turned.step())]
+    mounted = f"the camera is {held}", f"configuration: {{name: {name}, place: unknown}}", turned
+    arm = "the poses are flange_T_base", turned.step(), turned
+    choices = [mounted, arm]
     if looks_exchanged(*_distances(turned)):
         choices = [mounted]
     elif looks_exchanged(*reversed(_distances(turned))):
-        choices = [choices[1]]
+        choices = [arm]
     if np.isfinite(session.rotations).any() and mounted in choices:
-        other = _marker_inverted(session)
-        rather = len(choices) == 1 and _off_axis(other) < _off_axis(session)
-        at = 0 if rather else len(choices)
-        choices.insert(at, ("the target's poses are target_T_camera", other.step()))
-    what = ", or ".join(each for each, _ in choices)
+        other = _with_markers(session, inverted).read_with(target={"inverted": True})
+        marker = "the target's poses are target_T_camera", other.step(), other
+        carried: Literal["camera", "target"] = "camera" if name == "eye-in-hand" else "target"
+        sure = likelier(other, replace(session, carried=carried))
+        # A thousand times likelier: the data tell
+        if abs(sure) < np.log(1000):
+            choices.append(marker)
+        elif sure > 0:
+            choices = [marker]
+    what = ", or ".join(each for each, _, _ in choices)
     fits = ": the samples fit each" if len(choices) > 1 else ""
-    return what + fits, OR_ELSE.join(line for _, line in choices)
-
-
-def _marker_rather(session: RecordedSession, turned: RecordedSession) -> bool:
-    """Whether targets lie where no lens sees them, and do not the other way round."""
-    if not np.isfinite(session.rotations).any() or not _may_be_mounted_otherwise(session):
-        return False
-    if looks_exchanged(*reversed(_distances(turned))):
-        return False
-    # No lens of a scanner or depth camera sees further from its axis; Azure Kinect's, wide
-    return bool(_off_axis(session) > np.radians(60) >= _off_axis(_marker_inverted(session)))
+    return what + fits, OR_ELSE.join(line for _, line, _ in choices), choices[0][2]
 
 
 def _off_axis(session: RecordedSession) -> float:
     """Return the largest angle between what was seen and the camera's axis [rad]."""
     x, y, z = session.centres.T
     return float(np.nanmax(np.arctan2(np.hypot(x, y), z)))
-
-
-def _marker_inverted(session: RecordedSession) -> RecordedSession:
-    return _with_markers(session, inverted).read_with(target={"inverted": True})
-
-
-def _inverted_marker(session: RecordedSession, evidence: Significance) -> Finding:
-    what = (
-        f"the markers' poses are target_T_camera: as they are read, one is "
-        f"{np.degrees(_off_axis(session)):.0f} deg from the camera's axis"
-    )
-    return evidence.finding("inverted marker", what, _marker_inverted(session))
