@@ -223,6 +223,24 @@ def matrix_headings(f, j, a, s):
         (f / f"{file}.csv").write_text(",".join([*names, "tx", "ty", "tz"]) + "\n" + text(rows))
 
 
+def axis_first(f, j, a, s):
+    names = [f"{n}_robot" for n in NAMES]
+    names += [f"T{k // 4}{k % 4}_camera" for k in range(12)]
+    rows = np.hstack([quaternion(a), s[:, :3].reshape(-1, 12)])
+    (f / "measured.csv").write_text(",".join(names) + "\n" + text(rows))
+
+
+def counted_entries(f, j, a, s):
+    names = [f"tcp_{n}" for n in NAMES] + [f"cam_m{k}" for k in range(16)]
+    rows = np.hstack([quaternion(a), s.reshape(-1, 16)])
+    (f / "measured.tsv").write_text("\t".join(names) + "\n" + text(rows, "\t"))
+
+
+def opencv_hand_eye(f, j, a, s):
+    storage(f, "hand_eye.xml", [(f"{n}_{k}", p) for n, ps in (("flange", a), ("aruco", s))
+                                for k, p in enumerate(ps)])  # fmt: skip
+
+
 def yaml_nested(f, j, a, s):
     (f / "poses.yaml").write_text(json.dumps([
         {name: {"position": dict(zip("xyz", row[:3], strict=True)),
@@ -290,6 +308,9 @@ LAYOUTS: dict[str, Callable[..., None]] = {
     "JSON of arrays, `T_base_flange`, `T_cam_board`": json_arrays,
     "what ROS's `tf_echo` prints, `base_to_tool0`": tf_echo,
     "headings r11, r12, … r33, tx, ty, tz": matrix_headings,
+    "headings x_robot, qx_robot, …, T00_camera, T01_camera, …": axis_first,
+    "headings of a matrix that count: cam_m0 to cam_m15": counted_entries,
+    "`hand_eye.xml` of OpenCV, `flange_0`, `aruco_0`, …": opencv_hand_eye,
     "YAML of records: position, orientation.roll, …": yaml_nested,
     "joint angles without names, and the arm's `.urdf`": joints_alone,
     "joint angles of ROS by alphabet, and the arm's `.urdf`": joints_of_ros,

@@ -51,11 +51,15 @@ _JOINT = re.compile(
 )
 
 
-SEEN = re.compile(r"target|mark|cam|board|tag|cent(er|re)|seen|sphere|object|optical|track|detect")
+SEEN = re.compile(
+    r"target|mark|cam|board|tag|aruco|pattern|checker|chess|fiducial|cent(er|re)|seen|sphere|object|"
+    r"optical|track|detect"
+)
 """In the name of what a camera measured."""
 
 _ARM = re.compile(
-    r"robot|arm|joint|gripper|flange|hand|tool|tcp|effector|(?<![a-z])(?:ee|rob)(?![a-z])"
+    r"robot|arm|joint|gripper|flange|(?<!eye.in.)hand(?!.?eye)|tool|tcp|effector|"
+    r"(?<![a-z])(?:ee|rob)(?![a-z])"
 )
 
 _FRAMES: Mapping[str, str] = {
@@ -69,6 +73,8 @@ _FRAMES: Mapping[str, str] = {
     }.items()
     for name in names.split()
 }
+_ENTRY = re.compile(r"(?:r|m|t|rot|mat)([0-3])([0-3])")
+"""Entry of a matrix in row and column: ``r11``, ``m03``."""
 _TO = re.compile(r"(?<![a-zA-Z])([a-zA-Z]+)(?:2|_to_|To)([a-zA-Z]+)")
 _IN = re.compile(r"(?<![a-zA-Z])([a-z]+)_?[TH]_?([a-z]+)(?![a-zA-Z])")
 _OF = re.compile(r"(?<![a-zA-Z])[TH]_([a-z]+)_([a-z]+)")
@@ -323,6 +329,8 @@ def _put(
     """
     last = words[-1].lower()
     unit = words.pop().lower() if last in (*_LENGTHS, *_ANGLES) and len(words) > 1 else None
+    if _is_axis(words[0]) and not _is_axis(words[-1]):  # ``x_robot``
+        words = [*words[1:], words[0]]
     axis, before = words[-1].lower(), words[:-1]
     if len(axis) == 2 and axis[0] in "pt" and axis[1] in "xyz":
         axis = axis[1]
@@ -340,6 +348,12 @@ def _put(
         group.length = unit
     elif unit in _ANGLES:
         group.angle = unit
+
+
+def _is_axis(word: str) -> bool:
+    """Return whether a word calls one number of a pose: an axis, an angle, an entry of a matrix."""
+    axes = {*POSITION, *(label for labels in ROTATIONS for label in labels)}
+    return word.lower() in axes or _ENTRY.fullmatch(word.lower()) is not None
 
 
 def _without(words: list[str], parts: Sequence[str]) -> tuple[str, list[str]]:
@@ -390,10 +404,16 @@ def _pose(table: Table, group: Group) -> PoseColumns | None:
 
 
 def _matrix_entries(group: Group) -> tuple[Column, ...]:
-    """Return the columns that are named as the entries of a matrix, row by row."""
-    # Entry of a matrix in row and column: ``r11``, ``m03``.
+    """Return the columns that are named as the entries of a matrix, row by row.
+
+    They are called by row and column, ``r11``, or counted: ``m0`` to ``m15``.
+    """
+    counted = {int(m[1]): column for name, column in group.columns.items()
+               if (m := re.fullmatch(r"[a-z]+(\d+)", name))}  # fmt: skip
+    if len(counted) in (12, 16) and max(counted) - min(counted) < len(counted):
+        return tuple(counted[at] for at in sorted(counted))
     named = {m.groups(): column for name, column in group.columns.items()
-             if (m := re.fullmatch(r"(?:r|m|t|rot|mat)([0-3])([0-3])", name))}  # fmt: skip
+             if (m := _ENTRY.fullmatch(name))}  # fmt: skip
     return tuple(named[at] for at in sorted(named))
 
 
