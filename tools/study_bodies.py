@@ -26,10 +26,7 @@ from flangeye.models.loading import load_model
 from flangeye.models.targets import plate_of
 from flangeye.types import CAMERA, Capture, Earlier, PointCloud, PoseFeature, Rejected
 from flangeye_emulators.world.mesh import (
-    FINISHES,
-    METAL,
-    PAINTED,
-    TABLE,
+    MATERIALS,
     Mesh,
     box,
     capsule,
@@ -74,11 +71,13 @@ def as_made(body, rng):
 def wrist():
     plate = plate_of(load_model("robots", "ur5e", Path()))
     arm = [([0, 0, -0.06], [0, 0.12, -0.07], 0.04), ([0, 0.12, -0.07], [-0.35, 0.15, -0.15], 0.045)]
-    links = [SolidBody(capsule(np.array(a), np.array(b), r), PAINTED) for a, b, r in arm]
-    finish = FINISHES[plate.details.finish]
+    links = [
+        SolidBody(capsule(np.array(a), np.array(b), r), MATERIALS["painted"]) for a, b, r in arm
+    ]
+    finish = MATERIALS[plate.details.finish]
     return [
         SolidBody(flange_mesh(plate), finish),
-        SolidBody(wrist_mesh(plate), PAINTED),
+        SolidBody(wrist_mesh(plate), MATERIALS["painted"]),
         *links,
     ]
 
@@ -95,11 +94,11 @@ def scene(rng, body):
     depth = rng.uniform(0.55, 0.85)
     centre = np.array([rng.uniform(-0.15, 0.15) * depth, rng.uniform(-0.12, 0.12) * depth, depth])
     pose = rigid(rotation, centre - rotation @ body.centre)
-    own = SolidBody(Mesh(body.vertices, body.triangles), METAL)
+    own = SolidBody(Mesh(body.vertices, body.triangles), MATERIALS["metal"])
     bodies = [one.moved(pose) for one in [*wrist(), own]]
     tilt = rotation_from_rpy(rng.uniform(-0.3, 0.3), rng.uniform(-0.3, 0.3), 0.0)
     table = box([-1, -1, 0], [1, 1, 0.05]).moved(rigid(tilt, [0, 0, rng.uniform(0.95, 1.1)]))
-    bodies.append(SolidBody(table, TABLE))
+    bodies.append(SolidBody(table, MATERIALS["table"]))
     for k in range(6):
         z = rng.uniform(0.6, 1.0)
         at = np.array([rng.uniform(-0.4, 0.4) * z, rng.uniform(-0.3, 0.3) * z, z])
@@ -114,7 +113,7 @@ def scene(rng, body):
             else capsule(np.zeros(3), np.array([0, 0, length]), radius, 32)
         )
         if np.linalg.norm(at - centre) > 0.6 * body.size:
-            bodies.append(SolidBody(mesh.moved(rigid(turned(rng), at)), PAINTED))
+            bodies.append(SolidBody(mesh.moved(rigid(turned(rng), at)), MATERIALS["painted"]))
     return bodies, pose
 
 

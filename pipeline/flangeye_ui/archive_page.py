@@ -11,30 +11,25 @@ from typing import Any
 from nicegui import ui
 
 from flangeye.errors import FlangeyeError
+from flangeye.report.look import LIGHT
 from flangeye.report.units import millimetres
 from flangeye.result import status_of
 from flangeye.result.contract import Result
-from flangeye_ui.charts import FAINT, USED
 from flangeye_ui.foreign import address_of
 from flangeye_ui.layout import command_line, mistake, page
 from flangeye_ui.project import Project
 from flangeye_ui.scene import ScanView
 
-WIDE_ONLY = ("used", "held", "note")
-"""Columns that a phone has no room for; the run's result has them."""
 COLUMNS = [
     {"name": key, "label": label, "field": key, "align": "left", "sortable": True}
-    | (dict.fromkeys(("classes", "headerClasses"), "gt-xs") if key in WIDE_ONLY else {})
-    for key, label in (
-        ("run", "Run"), ("status", "Status"), ("used", "Poses used"),
-        ("held", "Held-out error, mm"), ("expected", "Expected error, mm"), ("note", "Note"),
+    | (dict.fromkeys(("classes", "headerClasses"), "gt-xs") if wide else {})
+    for key, label, wide in (
+        ("run", "Run", False), ("status", "Status", False), ("used", "Poses used", True),
+        ("held", "Held-out error, mm", True), ("expected", "Expected error, mm", False),
+        ("note", "Note", True),
     )
 ]  # fmt: skip
-OPENS = """<q-td :props="props">
-  <a class="nicegui-link" :href="'result?run=' + encodeURIComponent(props.value)">
-    {{ props.value }}</a>
-</q-td>"""
-"""A run's name, which leads to its result."""
+"""The wide ones are those a phone has no room for; the run's result has them."""
 
 
 def add(project: Project) -> None:
@@ -49,7 +44,14 @@ def add(project: Project) -> None:
                 return
             table = ui.table(columns=COLUMNS, rows=rows, row_key="run")
             table.classes("w-full").props("dense wrap-cells")
-            table.add_slot("body-cell-run", OPENS)
+            # A run's name leads to its result.
+            table.add_slot(
+                "body-cell-run",
+                """<q-td :props="props">
+                  <a class="nicegui-link" :href="'result?run=' + encodeURIComponent(props.value)">
+                    {{ props.value }}</a>
+                </q-td>""",
+            )
             if len(rows) > 1:
                 ui.echart(comparison(rows)).classes("w-full h-48").props('aria-label="Errors"')
             _reports(project)
@@ -89,17 +91,19 @@ def comparison(rows: list[dict[str, Any]]) -> dict[str, Any]:
             "data": [float(row[key]) if row.get(key) else None for row in ordered],
         }
         for key, label, colour in (
-            ("held", "held-out error, mm", USED), ("expected", "expected error, mm", "#3a7ebf")
+            ("held", "held-out error, mm", LIGHT["verified"]),
+            ("expected", "expected error, mm", LIGHT["bar"]),
         )
     ]  # fmt: skip
     return {
         "animation": False, "tooltip": {"trigger": "axis"}, "series": series,
-        "legend": {"top": 0, "textStyle": {"color": FAINT}},
+        "legend": {"top": 0, "textStyle": {"color": LIGHT["axis"]}},
         "grid": {"left": 45, "right": 10, "top": 35, "bottom": 25},
         "xAxis": {"type": "category", "data": [r["run"] for r in ordered],
-                  "axisLabel": {"color": FAINT}},
-        "yAxis": {"type": "value", "name": "mm", "nameTextStyle": {"color": FAINT},
-                  "axisLabel": {"color": FAINT}, "splitLine": {"lineStyle": {"opacity": 0.3}}},
+                  "axisLabel": {"color": LIGHT["axis"]}},
+        "yAxis": {"type": "value", "name": "mm", "nameTextStyle": {"color": LIGHT["axis"]},
+                  "axisLabel": {"color": LIGHT["axis"]},
+                  "splitLine": {"lineStyle": {"opacity": 0.3}}},
     }  # fmt: skip
 
 

@@ -29,33 +29,6 @@ WORDS = {
     "solve.robust": "Find where the scanner stands", "verify.holdout": "Check on poses held out",
 }  # fmt: skip
 """What people say for the steps that most recipes have; others show their summary."""
-CONFIGURATIONS = {
-    "eye-on-base": "beside the arm", "eye-in-hand": "on the arm's flange",
-    "eye-on-arm": "on another link of the arm", "two-arms": "on a second arm",
-}  # fmt: skip
-OPTION = """
-<q-item v-bind="props.itemProps">
-  <q-item-section avatar><img :src="'shapes/{kind}/' + props.opt.label.split(' · ')[0] + '.svg'"
-    width="72" height="54" loading="lazy" alt=""></q-item-section>
-  <q-item-section>{{{{ props.opt.label }}}}</q-item-section>
-</q-item>"""
-"""One line of a list of arms or scanners, with its picture."""
-
-
-PRINCIPLES = get_args(ScannerModel.model_fields["principle"].annotation)
-
-SCANNER: Boxes = {
-    "near": ("Nearest that it measures, such as 300 mm", ui.input),
-    "far": ("Farthest, such as 900 mm; archives need no more", ui.input),
-    "principle": ("Principle", lambda label: ui.select(list(PRINCIPLES), label=label)),
-    "pixels": ("Columns and rows, such as 1032, 772", ui.input),
-    "field": ("Field of view, such as 60 deg, 45 deg", ui.input),
-    "noise": ("Noise of a pixel in the middle, such as 0.1 mm", ui.input),
-    "error": ("Smooth distortion, such as 0.1 mm", ui.input),
-}
-
-_EVENTS: dict[type, str] = {ui.input: "change", ui.select: "update:model-value"}
-"""What says that a person has chosen, or has left the box."""
 
 
 def add(project: Project) -> None:
@@ -78,8 +51,8 @@ class Form:
         with ui.column().classes("col-12 col-md-5 gap-2"):
             self._header()
             with ui.expansion("Not in the lists?").classes("w-full"):
-                Import(project, self, "robot", ARM)
-                Import(project, self, "scanner", SCANNER)
+                for section, boxes in IMPORTED.items():
+                    Import(project, self, section, boxes)
             with ui.expansion("Does it run under ROS 2?").classes("w-full"):
                 WhatRuns(project, self)
             self._advanced()
@@ -141,10 +114,23 @@ class Form:
         examples.on_value_change(self._start_from).classes("w-full")
         for section, label in (("robot", "Arm"), ("scanner", "Scanner")):
             choice = self._choice(label, (section, "model"), _models(f"{section}s"))
-            choice.add_slot("option", OPTION.format(kind=f"{section}s"))
+            # One line of the list, with its picture.
+            choice.add_slot(
+                "option",
+                f"""<q-item v-bind="props.itemProps">
+                  <q-item-section avatar>
+                    <img :src="'shapes/{section}s/' + props.opt.label.split(' · ')[0] + '.svg'"
+                      width="72" height="54" loading="lazy" alt=""></q-item-section>
+                  <q-item-section>{{{{ props.opt.label }}}}</q-item-section>
+                </q-item>""",
+            )
         plates = {each: each for each in _standards()}
         self._choice("Flange (the arm's own if empty)", ("feature", "standard"), plates)
-        self._choice("The scanner stands", ("configuration", "name"), CONFIGURATIONS)
+        stands = {
+            "eye-on-base": "beside the arm", "eye-in-hand": "on the arm's flange",
+            "eye-on-arm": "on another link of the arm", "two-arms": "on a second arm",
+        }  # fmt: skip
+        self._choice("The scanner stands", ("configuration", "name"), stands)
         self._agree()
 
     def _start_from(self, event: Any) -> None:
@@ -217,7 +203,8 @@ class Form:
             text = "; ".join(m.text for m in wrong if _within(m, index, name, field))
             value = given.get(field) if isinstance(given, dict) else None
             box = _field(field, schema[field], value, info.is_required())
-            box.on(_EVENTS[type(box)], self._setter(["steps", index, name, field], box))
+            event = "change" if isinstance(box, ui.input) else "update:model-value"
+            box.on(event, self._setter(["steps", index, name, field], box))
             box.classes("w-full").props("dense stack-label").tooltip(info.description or "")
             if text:
                 box.props["error"], box.props["error-message"] = True, text
@@ -333,7 +320,10 @@ class WhatRuns:
             return
         self._chosen = {}
         with self._again():
-            for option, title in OF_WHAT_RUNS.items():
+            for option, title in (
+                ("robot", "The arm's description"), ("scans", "The scans"),
+                ("trigger", "What takes a scan"), ("trajectory", "What moves the arm"),
+            ):  # fmt: skip
                 lines = {each.name: each.line for each in found if each.answers == option}
                 self._choice(option, title, lines)
             for each in found:
@@ -353,7 +343,8 @@ class WhatRuns:
 
     def _choice(self, option: str, title: str, lines: dict[str, str]) -> None:
         """Show what may answer an option of the command; the only one is chosen."""
-        none = {NONE: f"{NONE} of these"} if option in ("trajectory", "trigger") else {}
+        # Others move the arm, or the camera runs by itself.
+        none = {"none": "none of these"} if option in ("trajectory", "trigger") else {}
         ui.label(title if lines else f"{title}: none runs")
         if lines:
             chosen = next(iter(lines)) if len(lines) == 1 else None
@@ -392,22 +383,30 @@ class WhatRuns:
         self._form.reload()
 
 
-OF_WHAT_RUNS = {
-    "robot": "The arm's description", "scans": "The scans", "trigger": "What takes a scan",
-    "trajectory": "What moves the arm",
-}  # fmt: skip
-"""Options of ``flangeye init --ros2`` that what runs may answer, as people call them."""
+def _principles(label: str) -> ui.select:
+    known = get_args(ScannerModel.model_fields["principle"].annotation)
+    return ui.select(list(known), label=label)
 
-NONE = "none"
-"""Answers that others move the arm, or that the camera runs by itself."""
 
 Boxes = Mapping[str, tuple[str, Callable[[str], Any]]]
 """By option of a command: what its box is called, and what it is."""
-ARM: Boxes = {
-    "urdf": ("Its URDF file, in this folder", ui.input),
-    "joint": ("Or its joints, a line each: d: 89.159 mm, alpha: 90 deg", ui.textarea),
-    "standard": ("Plate", lambda label: ui.select(_standards(), label=label)),
+IMPORTED: Mapping[str, Boxes] = {
+    "robot": {
+        "urdf": ("Its URDF file, in this folder", ui.input),
+        "joint": ("Or its joints, a line each: d: 89.159 mm, alpha: 90 deg", ui.textarea),
+        "standard": ("Plate", lambda label: ui.select(_standards(), label=label)),
+    },
+    "scanner": {
+        "near": ("Nearest that it measures, such as 300 mm", ui.input),
+        "far": ("Farthest, such as 900 mm; archives need no more", ui.input),
+        "principle": ("Principle", _principles),
+        "pixels": ("Columns and rows, such as 1032, 772", ui.input),
+        "field": ("Field of view, such as 60 deg, 45 deg", ui.input),
+        "noise": ("Noise of a pixel in the middle, such as 0.1 mm", ui.input),
+        "error": ("Smooth distortion, such as 0.1 mm", ui.input),
+    },
 }
+"""The boxes of what is in no list, by section of the recipe."""
 
 
 def _within(mistake: Mistake, index: int, name: str, field: str) -> bool:

@@ -10,9 +10,6 @@ import numpy as np
 from flangeye.models.workspace import ENOUGH, Coverage
 from flangeye.report.look import LIGHT
 
-USED, ASIDE, FAINT = LIGHT["verified"], LIGHT["refused"], LIGHT["axis"]
-LAYERS = ("low", "middle", "high")
-
 
 def residual_chart(
     sizes: Mapping[str, float], aside: Mapping[str, str], limit: float | None = None
@@ -20,27 +17,27 @@ def residual_chart(
     """Return a bar for the error of each pose [m] and the limit; those set aside are marked."""
     names = sorted({*sizes, *aside})
     bars = [round(1e3 * sizes[n], 4) if n in sizes else None for n in names]
-    series: dict[str, Any] = {"type": "bar", "name": "mm", "data": bars, "color": USED}
+    series: dict[str, Any] = {"type": "bar", "name": "mm", "data": bars, "color": LIGHT["verified"]}
     if limit is not None:
-        line = {"yAxis": 1e3 * limit, "lineStyle": {"color": ASIDE}}
-        label = {"formatter": "limit", "color": FAINT, "position": "insideEndTop"}
+        line = {"yAxis": 1e3 * limit, "lineStyle": {"color": LIGHT["refused"]}}
+        label = {"formatter": "limit", "color": LIGHT["axis"], "position": "insideEndTop"}
         series["markLine"] = {"symbol": "none", "data": [line], "label": label}
     crosses = [[n, 0] for n in sorted(aside)]
     return {
         "animation": False,
         "grid": {"left": 45, "right": 10, "top": 25, "bottom": 25},
         "tooltip": {"trigger": "axis"},
-        "xAxis": {"type": "category", "data": names, "axisLabel": {"color": FAINT}},
+        "xAxis": {"type": "category", "data": names, "axisLabel": {"color": LIGHT["axis"]}},
         "yAxis": {
-            "type": "value", "name": "mm", "nameTextStyle": {"color": FAINT},
-            "axisLabel": {"color": FAINT, "showMaxLabel": not limit},
+            "type": "value", "name": "mm", "nameTextStyle": {"color": LIGHT["axis"]},
+            "axisLabel": {"color": LIGHT["axis"], "showMaxLabel": not limit},
             "splitLine": {"lineStyle": {"opacity": 0.3}},
             **({"max": float(f"{1.1e3 * max(limit, *sizes.values()):.2g}")} if limit else {}),
         },
         "series": [
             series,
             {
-                "type": "scatter", "name": "set aside", "data": crosses, "color": ASIDE,
+                "type": "scatter", "name": "set aside", "data": crosses, "color": LIGHT["refused"],
                 "symbol": "diamond", "symbolSize": 12,
             },
         ],
@@ -49,10 +46,13 @@ def residual_chart(
 
 def place_chart(places: Mapping[str, list[float]], aside: Set[str]) -> dict[str, Any]:
     """Return the flange's places from above: used ones green, those set aside red."""
-    axis = {"type": "value", "scale": True, "axisLabel": {"color": FAINT}}
+    axis = {"type": "value", "scale": True, "axisLabel": {"color": LIGHT["axis"]}}
     axis["splitLine"] = {"lineStyle": {"opacity": 0.3}}
     series = []
-    for name, colour, wanted in (("used", USED, False), ("set aside", ASIDE, True)):
+    for name, colour, wanted in (
+        ("used", LIGHT["verified"], False),
+        ("set aside", LIGHT["refused"], True),
+    ):
         at = [[1e3 * p[0], 1e3 * p[1]] for k, p in places.items() if (k in aside) is wanted]
         series.append({"type": "scatter", "name": name, "data": at, "color": colour})
     grid = {"left": 50, "right": 10, "top": 10, "bottom": 30}
@@ -61,7 +61,7 @@ def place_chart(places: Mapping[str, list[float]], aside: Set[str]) -> dict[str,
 
 def coverage_drawing(found: Coverage) -> str:
     """Return an SVG: the cells of the work, layer by layer from above, and the turns."""
-    layers = "".join(_layer(found, i) for i in range(len(LAYERS)))
+    layers = "".join(_layer(found, i) for i in range(3))
     turns = "".join(_turn(found, i) for i in range(3))
     return (
         f'<svg viewBox="0 0 360 118" width="100%" role="img" fill="currentColor" font-size="9" '
@@ -75,13 +75,16 @@ def _layer(found: Coverage, z: int) -> str:
     for (x, y), count in np.ndenumerate(found.places[:, :, z]):
         at = f'x="{left + 24 * x}" y="{50 - 24 * y + 2}" width="22" height="22" rx="3"'
         cells.append(
-            f'<rect {at} fill="{USED}" fill-opacity="{min(0.25 + 0.2 * count, 1.0):.2f}"/>'
+            f'<rect {at} fill="{LIGHT["verified"]}" '
+            f'fill-opacity="{min(0.25 + 0.2 * count, 1.0):.2f}"/>'
             f'<text x="{left + 24 * x + 11}" y="{50 - 24 * y + 16}" text-anchor="middle">{count}'
             "</text>"
             if count
-            else f'<rect {at} fill="none" stroke="{FAINT}" stroke-dasharray="2 2"/>'
+            else f'<rect {at} fill="none" stroke="{LIGHT["axis"]}" stroke-dasharray="2 2"/>'
         )
-    label = f'<text x="{left + 35}" y="90" text-anchor="middle">{LAYERS[z]}</text>'
+    label = (
+        f'<text x="{left + 35}" y="90" text-anchor="middle">{("low", "middle", "high")[z]}</text>'
+    )
     return "".join(cells) + label
 
 
@@ -91,11 +94,13 @@ def _turn(found: Coverage, axis: int) -> str:
     parts = [f'<text x="{middle - 52}" y="{y + 4}">{"xyz"[axis]}</text>']
     for sign, size in zip((-1, 1), found.turns[axis], strict=True):
         length = min(float(np.degrees(size)), 30.0) * 40 / 30
-        colour = USED if size >= ENOUGH else ASIDE
+        colour = LIGHT["verified"] if size >= ENOUGH else LIGHT["refused"]
         x = middle - length if sign < 0 else middle
         parts.append(
             f'<rect x="{x:.1f}" y="{y - 5}" width="{length:.1f}" height="10" fill="{colour}"/>'
         )
-    parts.append(f'<line x1="{middle}" x2="{middle}" y1="{y - 8}" y2="{y + 8}" stroke="{FAINT}"/>')
+    parts.append(
+        f'<line x1="{middle}" x2="{middle}" y1="{y - 8}" y2="{y + 8}" stroke="{LIGHT["axis"]}"/>'
+    )
     label = f'<text x="{middle}" y="90" text-anchor="middle">turned about, ±30°</text>'
     return "".join(parts) + (label if axis == 2 else "")

@@ -20,7 +20,7 @@ from flangeye.errors import FlangeyeError
 from flangeye.models.robots import RobotModel
 from flangeye.report.cell import found_body
 from flangeye.report.facts import Facts, set_aside_of
-from flangeye.report.look import SERIES
+from flangeye.report.look import LIGHT, SERIES
 from flangeye.report.still import scene_of
 from flangeye.report.summary import banner_of, transform_text
 from flangeye.report.units import rounded_mm
@@ -31,7 +31,7 @@ from flangeye.units import parse_quantity
 from flangeye_ui.charts import coverage_drawing, residual_chart
 from flangeye_ui.layout import ActionBar, code, command_line, mistake, page, svg, warning
 from flangeye_ui.project import Project
-from flangeye_ui.scene import CELL, RIM, TAKEN, ScanView, Scene3D, outline_of, views_of
+from flangeye_ui.scene import CELL, ScanView, Scene3D, outline_of, views_of
 
 STEP = "verify.touch"
 ASKED = {
@@ -126,9 +126,9 @@ LIGHTS = {
     "verified": ("good", "✓", "Can be used"),
     "unverified": ("fair", "!", "Check it before use"),
     "incomplete": ("fair", "…", "Not finished"),
+    "refused": ("poor", "✕", "Do not use"),
 }
-"""By verdict: tone, sign and words of the light; anything else is red."""
-RED = ("poor", "✕", "Do not use")
+"""By verdict: tone, sign and words of the light."""
 Show = Callable[[Project, Path, Facts, ActionBar], None]
 
 
@@ -192,7 +192,7 @@ def _show(project: Project, run: Path, facts: Facts, bar: ActionBar) -> None:
         Better(project, run, facts)
     with ui.expansion("Ask the doctor what is wrong").classes("w-full") as box:
         Doctor(project, run, box)
-    bar.say(f"{run.name}: {LIGHTS.get(banner_of(facts).kind, RED)[2].lower()}.")
+    bar.say(f"{run.name}: {LIGHTS[banner_of(facts).kind][2].lower()}.")
     if facts.result.transforms and not facts.result.refused:
         bar.lead("Use", "Next: use it")
     else:
@@ -202,7 +202,7 @@ def _show(project: Project, run: Path, facts: Facts, bar: ActionBar) -> None:
 def _light(facts: Facts) -> None:
     """Show one light and one number: what it means, its 95 %, and the limit."""
     found = banner_of(facts)
-    tone, sign, words = LIGHTS.get(found.kind, RED)
+    tone, sign, words = LIGHTS[found.kind]
     with ui.element("div").classes(f"card w-full {tone}"):
         with ui.row().classes("items-center gap-5 no-wrap"):
             ui.label(sign).classes("light").props('aria-hidden="true"')
@@ -324,12 +324,14 @@ def _in_3d(project: Project, box: ui.expansion, facts: Facts) -> None:
         scene = Scene3D(420, views_of(np.array(places)) if places else CELL)
         _cell(project, scene, facts)
         for entry in facts.log.of_kind("fit"):
-            scene.cloud(outline_of(entry.value) @ pose[:3, :3].T + pose[:3, 3], RIM, 0.004)
+            scene.cloud(
+                outline_of(entry.value) @ pose[:3, :3].T + pose[:3, 3], SERIES["circle"], 0.004
+            )
         body, fits = found_body(facts), "Fitted rims"
         if body is not None:
             fits = f"{body.name}, as it was found in {body.capture},"
             for edge in body.edges @ pose[:3, :3].T + pose[:3, 3]:
-                scene.lines(edge, RIM)
+                scene.lines(edge, SERIES["circle"])
         times = _residuals(scene, facts)
         ui.label(
             f"{fits} red, in the base; residuals as arrows, {times:.0f} times their length: "
@@ -358,7 +360,7 @@ def _residuals(scene: Scene3D, facts: Facts) -> float:
     decade = float(10.0 ** np.floor(np.log10(most)))
     times = decade * max(step for step in (1, 2, 5) if step * decade <= most)
     for place, residual, used in arrows:
-        scene.arrow(place, times * residual, TAKEN if used else SERIES["unused"])
+        scene.arrow(place, times * residual, LIGHT["verified"] if used else SERIES["unused"])
     return times
 
 

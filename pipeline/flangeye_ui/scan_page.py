@@ -11,6 +11,7 @@ import numpy as np
 from nicegui import Client, ui
 
 from flangeye.errors import StageError
+from flangeye.report.look import LIGHT, SERIES
 from flangeye_ui.charts import coverage_drawing, place_chart, residual_chart
 from flangeye_ui.layout import (
     ActionBar,
@@ -23,14 +24,7 @@ from flangeye_ui.layout import (
 )
 from flangeye_ui.process import RunProcess
 from flangeye_ui.project import Project
-from flangeye_ui.scene import EARLIER, FLANGE, RIM, SCAN, SCANNED, Scene3D, drawing_of, outline_of
-
-BEFORE = {
-    True: "The arm moves its flange from pose to pose before the scanner. Keep people out of its "
-    "workspace. Starting asks for a code that the terminal shows.",
-    False: "No arm moves. Each scan is shown when it arrives, with what became of it.",
-}
-"""What is about to happen, by whether an arm moves."""
+from flangeye_ui.scene import SCANNED, Scene3D, drawing_of, outline_of
 
 
 def add(project: Project) -> None:
@@ -59,7 +53,13 @@ class RunPanel:
         self._before = ui.row().classes("w-full gap-4 items-center")
         with self._before:
             svg(drawing_of(project)).classes("picture col-12 col-md-6")
-            ui.label(BEFORE[self._live]).classes("col-12 col-md what")
+            before = (
+                "The arm moves its flange from pose to pose before the scanner. Keep people out of "
+                "its workspace. Starting asks for a code that the terminal shows."
+                if self._live
+                else "No arm moves. Each scan is shown when it arrives, with what became of it."
+            )
+            ui.label(before).classes("col-12 col-md what")
         self._during = ui.column().classes("w-full gap-3")
         with self._during:
             self._views()
@@ -238,12 +238,12 @@ class RunPanel:
 
     def _draw(self, run: RunProcess) -> None:
         self._scene.wipe()
-        self._scene.cloud(run.cloud, SCAN, 0.006)
-        self._scene.cloud(run.flange, FLANGE, 0.004)
+        self._scene.cloud(run.cloud, LIGHT["ink"], 0.006)
+        self._scene.cloud(run.flange, SERIES["used"], 0.004)
         rims = [outline_of(entry.value) for entry in run.log.of_kind("fit")]
         if rims:
-            self._scene.cloud(rims[-1], RIM, 0.006)
-            self._scene.cloud(np.vstack([np.zeros((0, 3)), *rims[:-1]]), EARLIER, 0.003)
+            self._scene.cloud(rims[-1], SERIES["circle"], 0.006)
+            self._scene.cloud(np.vstack([np.zeros((0, 3)), *rims[:-1]]), SERIES["held_out"], 0.003)
         if run is not self._shown_run:
             self._shown_run = run
             self._shots.clear()

@@ -30,8 +30,6 @@ from flangeye.report.units import millimetres
 from flangeye.types import CircleFeature, Feature, Floats
 from flangeye_ui.project import Project
 
-ROUND = 24
-"""Faces round a capsule."""
 PUBLISHED = {
     "ur3": "ur_description/urdf/ur3_robot.urdf", "ur5": "ur_description/urdf/ur5_robot.urdf",
     "ur10": "ur_description/urdf/ur10_robot.urdf",
@@ -126,12 +124,10 @@ def _capsule(radius: float, ends: Floats) -> Any:
     height = float(np.linalg.norm(along))
     axis = along / height if height else np.array([0.0, 0.0, 1.0])
     place = rigid(basis_of_plane(axis).T, ends.mean(axis=0))
-    body = trimesh.creation.capsule(height=height, radius=radius, count=[ROUND, ROUND])
+    body = trimesh.creation.capsule(height=height, radius=radius, count=[24, 24])
     return body.apply_transform(place)
 
 
-FLOOR, SQUARES = 4, 16
-"""Edge of the floor [m], and squares along it."""
 AXES = 0.25
 """Length of the base's axes [m]."""
 Point = tuple[float, float, float]
@@ -150,12 +146,6 @@ SCANNED: dict[str, View] = {
     "From the side": ((0.7, -0.1, 0.8), (0.0, 0.0, 0.8), (0.0, -1.0, 0.0)),
 }
 """Views of a scan in its camera, whose y points down."""
-SCAN, FLANGE, RIM, EARLIER = "#1f242e", "#0533bf", "#d91a1a", "#809980"
-"""Colours of clouds; the rims of earlier scans are pale."""
-TAKEN, LEFT_OUT = "#2e9e5b", "#d64545"
-"""Colours of poses and of what is left at them."""
-SHAFT, TIP = 0.002, 0.006
-"""Radii of an arrow [m]."""
 
 
 class Scene3D(ui.scene):
@@ -175,7 +165,7 @@ class Scene3D(ui.scene):
         self._floor = views is not SCANNED
         super().__init__(
             width=640, height=height, fps=20 if self._floor else 10, on_click=self._pointed,
-            grid=(FLOOR, SQUARES) if self._floor else False, background_color=LIGHT["panel"],
+            grid=(4, 16) if self._floor else False, background_color=LIGHT["panel"],
             click_events=["click", "mousemove"] if hovered else ["click"],
         )  # fmt: skip
         self.classes("w-full scene").style(f"height: {height}px")
@@ -190,7 +180,7 @@ class Scene3D(ui.scene):
         self.look(next(iter(views)))
 
     def _views(self) -> None:
-        scale = f"floor: squares of {1e3 * FLOOR / SQUARES:.0f} mm; " if self._floor else ""
+        scale = "floor: squares of 250 mm; " if self._floor else ""  # 16 along 4 m
         with ui.row().classes("items-center gap-1 w-full"):
             for name in self._of:
                 button = ui.button(name, on_click=lambda name=name: self.look(name))
@@ -252,8 +242,8 @@ class Scene3D(ui.scene):
             return
         turn, length = np.column_stack([across, tip, -other]).tolist(), float(np.linalg.norm(along))
         with self:
-            shaft = self.cylinder(SHAFT, SHAFT, length).move(*(place + along / 2).tolist())
-            cone = self.cylinder(0.0, TIP, 3 * TIP).move(*(place + along).tolist())
+            shaft = self.cylinder(0.002, 0.002, length).move(*(place + along / 2).tolist())
+            cone = self.cylinder(0.0, 0.006, 0.018).move(*(place + along).tolist())
         for part in (shaft, cone):
             part.rotate_R(turn).material(colour)
 
@@ -261,7 +251,7 @@ class Scene3D(ui.scene):
         """Draw a pose of the flange: green if used, red if left out."""
         with self:
             ball = self.sphere(0.014).move(*place).with_name(name)
-            ball.material(TAKEN if taken else LEFT_OUT)
+            ball.material(LIGHT["verified"] if taken else LIGHT["refused"])
 
     def say(self, text: str, place: Sequence[float]) -> None:
         """Write a text into the picture, in place of the last one."""
@@ -370,10 +360,10 @@ class ScanView:
                 self._cloud(entry.value)
         for entry in self.log.of_kind("fit"):
             if entry.capture == capture:
-                self._scene.cloud(outline_of(entry.value), RIM, 0.001)
+                self._scene.cloud(outline_of(entry.value), SERIES["circle"], 0.001)
 
     def _cloud(self, flange: t.FlangeCloud) -> None:
-        self._scene.cloud(flange.cloud.points().astype(np.float64), FLANGE)
+        self._scene.cloud(flange.cloud.points().astype(np.float64), SERIES["used"])
         at = np.asarray(flange.centre)
         (x, y, z), (to_x, to_y, to_z) = (at - 0.15 * at / np.linalg.norm(at)).tolist(), at.tolist()
         self._scene.move_camera(x, y, z, to_x, to_y, to_z, 0.0, -1.0, 0.0, 0.0)

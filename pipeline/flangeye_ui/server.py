@@ -43,7 +43,6 @@ from flangeye_ui.project import MoveCodes, Project
 PAGES = (
     cell_page, poses_page, scan_page, result_page, use_page, watch_page, archive_page, scene,
 )  # fmt: skip
-OPENS = "<!doctype html><meta http-equiv=refresh content='0;url={}'><title>flangeye</title>"
 DENIED = "wrong, used or missing token: open the address that 'flangeye ui' printed last"
 
 POLICY = (
@@ -62,9 +61,6 @@ HEADERS = {
     "x-frame-options": "DENY",
 }
 """Of every answer that has none of its own."""
-
-ENTER = "<!doctype html><meta http-equiv=refresh content='0;url={path}/'><title>flangeye</title>"
-"""The page navigates by itself: after a redirect a strict cookie would not be sent."""
 
 SOCKET = "/_nicegui_ws/"
 
@@ -120,9 +116,15 @@ def way_in(folder: Path, address: str) -> Iterator[Path]:
     that only its user can read, in the folder, where a confined browser may read it too.
     """
     with tempfile.NamedTemporaryFile("w", dir=folder, prefix="open_", suffix=".html") as file:
-        file.write(OPENS.format(escape(address)))
+        file.write(forwarding(address))
         file.flush()
         yield Path(file.name).resolve()
+
+
+def forwarding(address: str) -> str:
+    """Return a page that opens an address."""
+    to = f"0;url={escape(address)}"
+    return f"<!doctype html><meta http-equiv=refresh content='{to}'><title>flangeye</title>"
 
 
 def show(file: Path) -> None:
@@ -232,7 +234,8 @@ class Gate:
         cookie = self._keys.exchange(token)
         if cookie is None:
             return PlainTextResponse(f"{DENIED}\n", 403)
-        page = ENTER.format(path=self._keys.path)
+        # The page navigates by itself: after a redirect a strict cookie would not be sent.
+        page = forwarding(f"{self._keys.path}/")
         return HTMLResponse(page, headers={"set-cookie": cookie, "cache-control": "no-store"})
 
     def is_ours(self, host: str) -> bool:

@@ -24,8 +24,6 @@ from flangeye_ui.layout import ActionBar, code, command_line, mistake, page
 from flangeye_ui.project import Project
 from flangeye_ui.result_page import chosen_run
 
-LIST = 'bordered separator role="group" aria-label="Systems"'
-
 ASKED = {
     "temperature": "Temperature of the air, °C", "spread": "Coldest to warmest in use, K",
     "place": "Where it was done", "operator": "Who did it",
@@ -75,7 +73,8 @@ class Systems:
                 box.classes("w-full").props("outlined dense clearable autofocus")
                 box.on("keydown.enter", self._first)
                 self._none = ui.label("No system has these words.").props('role="status"')
-                with ui.list().props(LIST).classes("w-full systems"):
+                listed = ui.list().props('bordered separator role="group" aria-label="Systems"')
+                with listed.classes("w-full systems"):
                     self._items = {name: self._item(name) for name in files}
             self._preview = ui.column().classes("col-12 col-md gap-2")
         self._copy = bar.offer("Copy", self._to_clipboard, second=True)

@@ -11,43 +11,40 @@ from flangeye import hookimpl
 if TYPE_CHECKING:
     from flangeye.models.graph import Emulator, EmulatorOptions
 
-STAGES = {
-    "acquire.simulated": "flangeye_emulators.acquire.simulated:acquire_simulated",
-    "acquire.simulated_cell": "flangeye_emulators.acquire.simulated_cell:acquire_simulated_cell",
-    "acquire.simulated_cell_scans": "flangeye_emulators.acquire.simulated_cell:"
-    "acquire_simulated_cell_scans",
-    "acquire.simulated_marker": "flangeye_emulators.acquire.simulated_session:"
-    "acquire_simulated_marker",
-    "acquire.simulated_session": "flangeye_emulators.acquire.simulated_session:"
-    "acquire_simulated_session",
-    "acquire.simulated_images": "flangeye_emulators.acquire.simulated_images:"
-    "acquire_simulated_images",
-    "acquire.simulated_profiles": "flangeye_emulators.acquire.simulated_profiles:"
-    "acquire_simulated_profiles",
-    "scan.simulated": "flangeye_emulators.scan:scan_simulated",
-}
-
-PARTS = {
-    "scanner.emulator": "flangeye_emulators.scanner:scanner_loopback",
-    "scanner.mounted": "flangeye_emulators.scanner:scanner_mounted",
-    "robot.emulator": "flangeye_emulators.robot:robot_loopback",
-    "robot.simulated": "flangeye_emulators.robot:robot_simulated",
-    "arc.simulated": "flangeye_emulators.arc:arc_simulated",
-    "profiler.simulated": "flangeye_emulators.finger.profiler:profiler_simulated",
-    "sensor.simulated_finger": "flangeye_emulators.finger.sensor:sensor_simulated_finger",
-}
-
 
 @hookimpl
 def flangeye_stages() -> Mapping[str, str]:
     """Offer the simulated stages."""
-    return STAGES
+    return {
+        "acquire.simulated": "flangeye_emulators.acquire.simulated:acquire_simulated",
+        "acquire.simulated_cell": "flangeye_emulators.acquire.simulated_cell:"
+        "acquire_simulated_cell",
+        "acquire.simulated_cell_scans": "flangeye_emulators.acquire.simulated_cell:"
+        "acquire_simulated_cell_scans",
+        "acquire.simulated_marker": "flangeye_emulators.acquire.simulated_session:"
+        "acquire_simulated_marker",
+        "acquire.simulated_session": "flangeye_emulators.acquire.simulated_session:"
+        "acquire_simulated_session",
+        "acquire.simulated_images": "flangeye_emulators.acquire.simulated_images:"
+        "acquire_simulated_images",
+        "acquire.simulated_profiles": "flangeye_emulators.acquire.simulated_profiles:"
+        "acquire_simulated_profiles",
+        "scan.simulated": "flangeye_emulators.scan:scan_simulated",
+    }
 
 
 @hookimpl
 def flangeye_parts() -> Mapping[str, str]:
     """Offer the simulated parts."""
-    return PARTS
+    return {
+        "scanner.emulator": "flangeye_emulators.scanner:scanner_loopback",
+        "scanner.mounted": "flangeye_emulators.scanner:scanner_mounted",
+        "robot.emulator": "flangeye_emulators.robot:robot_loopback",
+        "robot.simulated": "flangeye_emulators.robot:robot_simulated",
+        "arc.simulated": "flangeye_emulators.arc:arc_simulated",
+        "profiler.simulated": "flangeye_emulators.finger.profiler:profiler_simulated",
+        "sensor.simulated_finger": "flangeye_emulators.finger.sensor:sensor_simulated_finger",
+    }
 
 
 def _serve_ur(options: "EmulatorOptions") -> None:

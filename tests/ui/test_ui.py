@@ -31,10 +31,10 @@ from flangeye.errors import StageError
 from flangeye.maths.pose_corrections import inverted
 from flangeye.plugin.registry import Registry, load_registry
 from flangeye.recipe.find import find_recipe
+from flangeye.report.look import LIGHT, SERIES
 from flangeye_ui import scan_page, server
 from flangeye_ui.poses_page import plan_in
 from flangeye_ui.project import MoveCodes, Project, _mistake
-from flangeye_ui.scene import RIM, TAKEN
 from flangeye_ui.server import require_free
 from tests.doctor.sessions import clean
 from tests.doctor.test_cures import write
@@ -672,8 +672,10 @@ def test_residuals_are_arrows_in_3d(browser: Any, served: Served, finished: Path
     page.locator(".scene").last.evaluate("box => box.scrollIntoView({block: 'center'})")
     page.wait_for_timeout(2000)
     shot(page, "residuals")
-    assert coloured(page, TAKEN) > 300  # nothing else in the picture is green but the y axis
-    assert coloured(page, RIM) > 300
+    assert (
+        coloured(page, LIGHT["verified"]) > 300
+    )  # nothing else in the picture is green but the y axis
+    assert coloured(page, SERIES["circle"]) > 300
     assert page.problems == []
 
 

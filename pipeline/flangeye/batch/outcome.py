@@ -5,16 +5,15 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from flangeye.errors import FlangeyeError
 from flangeye.files.paths import Storage
 from flangeye.result.contract import Result
 
 Status = Literal["verified", "unverified", "refused", "failed", "crashed"]
-STATUSES: tuple[Status, ...] = ("verified", "unverified", "refused", "failed", "crashed")
-ACCEPTED = ("verified", "unverified")
-FINISHED = ("verified", "unverified", "refused")
+STATUSES: tuple[Status, ...] = get_args(Status)
+ACCEPTED, FINISHED = STATUSES[:2], STATUSES[:3]
 
 MARKER = "session.json"
 """Written last into a session's folder: it is whole, and need not be run again."""

@@ -27,7 +27,7 @@ from flangeye.estimation.estimate import Estimate, estimate
 from flangeye.estimation.flange_roll import roll_note
 from flangeye.estimation.graph import Places, Problem
 from flangeye.estimation.mixed import told_of_places
-from flangeye.estimation.observability import LEAST, meaningless, unobservable
+from flangeye.estimation.observability import meaningless, unobservable
 from flangeye.estimation.session import Asked, Session, session_of
 from flangeye.estimation.threads import on_one_thread
 from flangeye.estimation.work import Work, work_of
@@ -220,7 +220,8 @@ def _weak(session: Session, options: Options) -> Floats:
     found = session.found
     model, sizes = found.posterior.model, found.posterior.mode.sizes.copy()
     own = model.factors[:2, 0]
-    sizes[own] = np.maximum(sizes[own], LEAST)
+    # Noise of the best camera and arm [rad, m]: exact inputs must not seem observable
+    sizes[own] = np.maximum(sizes[own], (1e-4, 2e-5))
     known = [k for k, effect in enumerate(found.effects) if effect.kind == COMMON]
     # Size of an effect that is left out [rad, m]
     sizes[known] = 1e-9

@@ -23,8 +23,6 @@ FINEST_NOISE = 1e-5
 """No scanner and arm together do better than 10 um; keeps exact inputs from seeming observable."""
 STILL = np.radians(0.5), 1e-3
 """An arm that turns and moves by less than this stands still [rad, m]."""
-LEAST = 1e-4, 2e-5
-"""Noise of the best camera and arm [rad, m]: exact inputs must not seem observable."""
 
 IN_LINE = 0.1
 """Points lie on a line when they are no further from it than this share of its length."""

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache, wraps
-from typing import ParamSpec, TypeVar
+from typing import Any, TypeVar, cast
 
 from threadpoolctl import ThreadpoolController
 
-P = ParamSpec("P")
-R = TypeVar("R")
+F = TypeVar("F", bound=Callable[..., Any])
 
 
 @cache
@@ -17,12 +16,12 @@ def _controller() -> ThreadpoolController:
     return ThreadpoolController()
 
 
-def on_one_thread(function: Callable[P, R]) -> Callable[P, R]:
+def on_one_thread(function: F) -> F:
     """Return a function that calls BLAS on one thread."""
 
     @wraps(function)
-    def limited(*args: P.args, **kwargs: P.kwargs) -> R:
+    def limited(*args: Any, **kwargs: Any) -> Any:
         with _controller().limit(limits=1):
             return function(*args, **kwargs)
 
-    return limited
+    return cast(F, limited)

@@ -18,8 +18,6 @@ from flangeye.maths.geometry import basis_of_plane, quaternion_from_rotation, ri
 from flangeye.maths.seam_geometry import seam_frames, tube_rings
 from flangeye.types import CircleFeature, Floats, Image, PointCloud, Seam, Transform
 
-ERROR, WARNING, INFO = 4, 3, 2
-
 
 def point_cloud(cloud: PointCloud, xyz: NDArray[np.float32], time_ns: int) -> Any:
     """Return ``xyz`` (N, 3) float32, unchanged, as a foxglove.PointCloud in the cloud's frame."""
@@ -147,11 +145,11 @@ def circle_lines(circle: CircleFeature, segments: int = 72) -> list[NDArray[np.f
     return [*rings, np.stack([circle.centre, circle.centre + 0.03 * n])]
 
 
-def log(message: str, level: int, time_ns: int) -> Any:
-    """Return a foxglove.Log line."""
+def log(message: str, level: str, time_ns: int) -> Any:
+    """Return a foxglove.Log line; the level is one of its enumeration, such as ``INFO``."""
     from foxglove_schemas_protobuf.Log_pb2 import Log
 
-    line = Log(level=level, message=message, name="flangeye")  # type: ignore[arg-type]
+    line = Log(level=Log.Level.Value(level), message=message, name="flangeye")
     line.timestamp.FromNanoseconds(time_ns)
     return line
 

@@ -125,7 +125,7 @@ class Recorder:
         """Log where the captures come from."""
         self._json("/source", "Source", {"total": total, **_plain(source)})
         for note in source.notes:
-            self._log(note, foxglove.INFO)
+            self._log(note, "INFO")
 
     @hookimpl
     def flangeye_captured(self, step: str, capture: t.Capture, seconds: float) -> None:
@@ -185,7 +185,7 @@ class Recorder:
     def flangeye_capture_rejected(self, rejection: t.Rejection) -> None:
         """Log a capture that was set aside."""
         self._json("/rejection", "Rejection", _plain(rejection))
-        self._log(f"{rejection.id} set aside by {rejection}", foxglove.WARNING)
+        self._log(f"{rejection.id} set aside by {rejection}", "WARNING")
 
     @hookimpl
     def flangeye_capture_finished(self, capture: str) -> None:
@@ -206,7 +206,7 @@ class Recorder:
         """Log that the run ended early, and why; a viewer that follows it stops waiting."""
         with suppress(LogWriteError):  # a full disk has been told already
             if not self._file.closed:
-                self._log(reason, foxglove.ERROR)
+                self._log(reason, "ERROR")
                 self._json("/ended", "Ended", {"reason": reason})
 
     def close(self) -> None:
@@ -233,7 +233,7 @@ class Recorder:
             self._proto("/scene", foxglove.seam_scene(value, now))
             self._proto("/seam", foxglove.seam_poses(value, now))
         if isinstance(value, t.Verification):
-            level = foxglove.INFO if value.passed else foxglove.WARNING
+            level = "INFO" if value.passed else "WARNING"
             self._log(value.reason, level)
 
     def _in_base(self, calibration: t.HandEye, now: int) -> None:
@@ -247,7 +247,7 @@ class Recorder:
                 flange = moved.apply_cloud(cloud)
                 self._proto("/base/flanges", foxglove.point_cloud(flange, flange.xyz, now))
 
-    def _log(self, line: str, level: int) -> None:
+    def _log(self, line: str, level: str) -> None:
         self._proto("/log", foxglove.log(line, level, time.time_ns()))
 
     def _json(self, topic: str, schema: str, payload: dict[str, Any]) -> None:

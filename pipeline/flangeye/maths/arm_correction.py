@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import cache
 from itertools import product
 from math import factorial, prod
 
@@ -22,7 +23,6 @@ from flangeye.types import (
     VerificationView,
 )
 
-POWERS = tuple(p for p in product(range(3), repeat=3) if sum(p) <= 2)
 RADII = 1.5
 """The length over which a field changes, in radii of the workspace: arms differ little from each
 other in it, for what bends their space are joints outside of it."""
@@ -32,7 +32,7 @@ def field_over(places: Floats) -> SmoothField:
     """Return a field without weights for poses at (N, 3) places in ``base`` [m]."""
     about = places.mean(axis=0)
     radius = float(np.linalg.norm(places - about, axis=1).max())
-    k = 3 * len(POWERS)
+    k = 3 * len(powers(2))
     bare = SmoothField(about, RADII * max(radius, 1e-3), np.zeros((6, k)), np.zeros(k))
     motions, moved = _motions(bare, places).reshape(-1, 6), effects(bare, places)
     nearest = np.linalg.pinv(motions, rcond=1e-9) @ moved.reshape(-1, k)
@@ -41,16 +41,22 @@ def field_over(places: Floats) -> SmoothField:
 
 def effects(field: SmoothField, places: Floats) -> Floats:
     """Return (..., 3, K): how each weight moves a flange at (..., 3) places [m], in ``base``."""
-    of_place = features((places - field.about) / field.length, POWERS)
+    of_place = features((places - field.about) / field.length, powers(2))
     along = of_place[..., None, :, None] * np.eye(3)[:, None, :]
     along = along.reshape(*places.shape[:-1], 3, -1)
     return np.asarray(along - _motions(field, places) @ field.rigid)
 
 
-def features(scaled: Floats, powers: Sequence[tuple[int, ...]]) -> Floats:
+@cache
+def powers(degree: int) -> tuple[tuple[int, ...], ...]:
+    """Return the exponents (K, 3) of all products of three numbers up to a degree."""
+    return tuple(p for p in product(range(degree + 1), repeat=3) if sum(p) <= degree)
+
+
+def features(scaled: Floats, exponents: Sequence[tuple[int, ...]]) -> Floats:
     """Return (..., K) values of the kernel's features at (..., 3) places in units of its length."""
     bell = np.exp(-0.5 * (scaled**2).sum(axis=-1))
-    norms, each = np.sqrt([prod(map(factorial, p)) for p in powers]), np.array(powers)
+    norms, each = np.sqrt([prod(map(factorial, p)) for p in exponents]), np.array(exponents)
     raised = scaled[..., None] ** np.arange(each.max() + 1)  # which few powers share
     of_place = raised[..., np.arange(scaled.shape[-1]), each].prod(axis=-1)
     return np.asarray(of_place / norms * bell[..., None])

@@ -21,7 +21,6 @@ from flangeye.recipe.header import TargetSection
 from flangeye.recipe.own_models import carried_files
 from flangeye.report.facts import Facts
 from flangeye.report.look import SERIES
-from flangeye.report.plot import AXES as COLOURS
 from flangeye.report.plot import (
     DIVERGING,
     Trace,
@@ -130,8 +129,8 @@ def _targets(poses: list[Floats]) -> list[Trace]:
     # Of those of a marker, drawn at every pose [m]
     axes = [[np.stack([m[:3, 3], m[:3, 3] + 0.06 * m[:3, i]]) for m in poses] for i in range(3)]
     named = [
-        lines(parts, colour, 2, name="its axes", showlegend=i == 0)
-        for i, (parts, colour) in enumerate(zip(axes, COLOURS, strict=True))
+        lines(parts, SERIES[axis], 2, name="its axes", showlegend=i == 0)
+        for i, (parts, axis) in enumerate(zip(axes, "xyz", strict=True))
     ]
     return named if poses else []
 

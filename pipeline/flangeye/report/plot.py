@@ -19,8 +19,6 @@ from flangeye.types import Floats
 Trace = dict[str, Any]
 Figure = dict[str, Any]
 
-AXES = (SERIES["x"], SERIES["y"], SERIES["z"])
-
 DIVERGING = [
     [0.0, "#2166ac"],
     [0.35, "#75a9d1"],
@@ -71,8 +69,8 @@ def frame(matrix: Floats, name: str, length: float) -> list[Trace]:
     """Return the three axes of a frame at pose ``matrix`` (4, 4), with its name."""
     origin = matrix[:3, 3]
     axes = [
-        lines([np.stack([origin, origin + length * matrix[:3, i]])], AXES[i], 6, showlegend=False)
-        for i in range(3)
+        lines([np.stack([origin, origin + length * along])], SERIES[axis], 6, showlegend=False)
+        for axis, along in zip("xyz", matrix[:3, :3].T, strict=True)
     ]
     behind = origin - 0.25 * length * matrix[:3, 2]  # where no axis is
     label = scatter3d(

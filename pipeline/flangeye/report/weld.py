@@ -27,7 +27,10 @@ from flangeye.report.plot import (
 from flangeye.report.units import millimetres
 from flangeye.types import Floats, WeldReport, WorkpieceScan
 
-BANDS = {"seeking": "#8a8f98", "bridging": "#d98a00", "ending": "#3a7ebf", "stopped": "#d5451b"}
+BANDS = {
+    "seeking": SERIES["held_out"], "bridging": SERIES["unused"], "ending": SERIES["used"],
+    "stopped": SERIES["circle"],
+}  # fmt: skip
 """Colours of the controller's phases; following, the rule, has none."""
 
 

@@ -26,7 +26,7 @@ from flangeye_emulators.acquire.planned_session import (
     source_of,
 )
 from flangeye_emulators.world.board_image import PAPER_MARGIN, BoardCamera, Cover, render_board
-from flangeye_emulators.world.mesh import MATT, box
+from flangeye_emulators.world.mesh import MATERIALS, box
 from flangeye_emulators.world.raycast import Pixels, RaycastScene, SolidBody
 from flangeye_emulators.world.scanner import StructuredLight, TimeOfFlight, scanner_of
 from flangeye_emulators.world.session import CameraView, seen_from
@@ -46,7 +46,7 @@ def sheet_of(board: Board) -> SolidBody:
     half = np.array(board.size) / 2 + PAPER_MARGIN * board.square
     # Of the sheet that carries the print [m]
     low, high = [*-half, -4e-3], [*half, 0.0]
-    return SolidBody(box(low, high), MATT)
+    return SolidBody(box(low, high), MATERIALS["matt"])
 
 
 def uncovered(cloud: PointCloud, board: Board, camera_T_target: Floats, cover: Cover) -> PointCloud:

@@ -39,7 +39,7 @@ from flangeye_emulators.acquire.planned_session import (
     source_of,
 )
 from flangeye_emulators.world.cell import SimulatedCell
-from flangeye_emulators.world.mesh import FINISHES, flange_mesh
+from flangeye_emulators.world.mesh import MATERIALS, flange_mesh
 from flangeye_emulators.world.raycast import SolidBody
 from flangeye_emulators.world.scanner import ScannerQuality, before_camera, scanner_of
 from flangeye_emulators.world.session import (
@@ -133,7 +133,7 @@ class _Set:
             return [body.moved(places.y) for body in other]
         if self.session.configuration.target == FLANGE and actual.joints is not None:
             return self._arm(self.robot, actual.joints[i], actual.flange[i])
-        finish = FINISHES[self.flange.details.finish]
+        finish = MATERIALS[self.flange.details.finish]
         return [SolidBody(flange_mesh(self.flange), finish).moved(actual.target[i] @ places.z)]
 
     def _arm(self, robot: RobotModel, joints: Floats, flange: Floats) -> list[SolidBody]:

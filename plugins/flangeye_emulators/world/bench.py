@@ -21,7 +21,7 @@ from flangeye.models.workpiece import Workpiece, WorkpiecePath
 from flangeye.plugin.stage import Params
 from flangeye.types import BASE, FLANGE, Floats, Transform
 from flangeye.units import Angle, Length, param
-from flangeye_emulators.world.mesh import METAL, PAINTED, RUBBER, TABLE, WALL, Mesh, box, capsule
+from flangeye_emulators.world.mesh import MATERIALS, Mesh, box, capsule
 from flangeye_emulators.world.raycast import SolidBody
 
 BENCH_MARGIN = 0.25
@@ -86,7 +86,7 @@ def bench_with(
     low, high = part.vertices.min(axis=0), part.vertices.max(axis=0)
     top = float(low[2])
     bench = box([*(low[:2] - BENCH_MARGIN), top - 0.04], [*(high[:2] + BENCH_MARGIN), top])
-    bodies = [SolidBody(bench, TABLE), SolidBody(part, METAL)]
+    bodies = [SolidBody(bench, MATERIALS["table"]), SolidBody(part, MATERIALS["metal"])]
     seams = [
         s.points @ base_T_part[:3, :3].T + base_T_part[:3, 3] for s in workpiece.seams.values()
     ]
@@ -114,10 +114,10 @@ def _thing(place: Floats, floor: float, rng: np.random.Generator) -> SolidBody:
     pose = rigid(rotation_from_rpy(0.0, 0.0, rng.uniform(0, np.pi)), np.array([*place, floor]))
     if rng.random() < 0.6:
         block = box([-size[0], -size[1], 0.0], [size[0], size[1], 2 * size[2]])
-        return SolidBody(block.moved(pose), PAINTED)
+        return SolidBody(block.moved(pose), MATERIALS["painted"])
     radius = float(size[0]) / 2
     ends = np.array([[-size[1] - 0.02, 0, radius], [size[1] + 0.02, 0, radius]])
-    return SolidBody(capsule(ends[0], ends[1], radius).moved(pose), RUBBER)
+    return SolidBody(capsule(ends[0], ends[1], radius).moved(pose), MATERIALS["rubber"])
 
 
 def _sheet(workpiece: Workpiece, base_T_part: Floats, covered: float) -> SolidBody:
@@ -126,7 +126,7 @@ def _sheet(workpiece: Workpiece, base_T_part: Floats, covered: float) -> SolidBo
     edge = high[0] - covered * (high[0] - low[0])
     above = high[2] + 0.03
     sheet = box([edge, low[1] - 0.02, above], [high[0] + 0.02, high[1] + 0.02, above + 0.002])
-    return SolidBody(sheet.moved(base_T_part), WALL)
+    return SolidBody(sheet.moved(base_T_part), MATERIALS["matt"])
 
 
 class StandingArm(Protocol):

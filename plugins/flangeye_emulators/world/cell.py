@@ -15,14 +15,7 @@ from flangeye.motion.clearance import ArmVolume
 from flangeye.types import Floats
 from flangeye_emulators.world.mesh import (
     COARSE,
-    FINISHES,
-    MATT,
-    METAL,
-    PAINTED,
-    POLISHED,
-    RUBBER,
-    TABLE,
-    WALL,
+    MATERIALS,
     Mesh,
     box,
     capsule,
@@ -32,7 +25,7 @@ from flangeye_emulators.world.mesh import (
     merged,
     region,
     wrist_mesh,
-)  # fmt: skip
+)
 from flangeye_emulators.world.raycast import SolidBody
 
 
@@ -79,8 +72,8 @@ class SimulatedCell:
         x, y = self.centre[:2]
         far = x + self.size[0] / 2 + 0.13
         return [
-            SolidBody(box([-0.4, y - 0.9, -0.04], [far + 0.3, y + 0.9, 0.0]), TABLE),
-            SolidBody(box([far, y - 0.9, 0.0], [far + 0.02, y + 0.9, 0.7]), WALL),
+            SolidBody(box([-0.4, y - 0.9, -0.04], [far + 0.3, y + 0.9, 0.0]), MATERIALS["table"]),
+            SolidBody(box([far, y - 0.9, 0.0], [far + 0.02, y + 0.9, 0.7]), MATERIALS["matt"]),
             *self._stand(),
         ]
 
@@ -100,21 +93,21 @@ class SimulatedCell:
             own = self.body.by_link.items()
             links = [Mesh(one.vertices, one.triangles).moved(frames[k]) for k, one in own]
         return [
-            *([SolidBody(merged(links), PAINTED)] if links else []),
+            *([SolidBody(merged(links), MATERIALS["painted"])] if links else []),
             *(body.moved(base_T_flange) for body in self._at_flange()),
         ]
 
     def _at_flange(self) -> list[SolidBody]:
         """Return what moves with the flange, in ``flange``."""
-        finish = FINISHES[self.flange.details.finish]
+        finish = MATERIALS[self.flange.details.finish]
         plate = SolidBody(flange_mesh(self.flange), finish)
-        wrist = SolidBody(wrist_mesh(self.flange), PAINTED)
+        wrist = SolidBody(wrist_mesh(self.flange), MATERIALS["painted"])
         if self.body is not None and not isinstance(self.body, ArmBody):
             tool = Mesh(self.body.vertices, self.body.triangles)
-            return [plate, wrist, SolidBody(tool, METAL)]
+            return [plate, wrist, SolidBody(tool, MATERIALS["metal"])]
         if self.sphere is None:
             return [plate, wrist]
-        ball = SolidBody(sphere_mesh(self.sphere), MATT)
+        ball = SolidBody(sphere_mesh(self.sphere), MATERIALS["matt"])
         return [plate, wrist, ball, SolidBody(stub_mesh(self.sphere), finish)]
 
     def board(self, base_T_flange: Floats) -> SolidBody:
@@ -124,7 +117,7 @@ class SimulatedCell:
             away += self.sphere.centre_in_flange[2] + self.sphere.radius
         if self.body is not None and not isinstance(self.body, ArmBody):
             away += float(self.body.vertices[:, 2].max())
-        sheet = SolidBody(box([-half, -half, away], [half, half, away + 0.003]), WALL)
+        sheet = SolidBody(box([-half, -half, away], [half, half, away + 0.003]), MATERIALS["matt"])
         return sheet.moved(base_T_flange)
 
     def _stand(self) -> list[SolidBody]:
@@ -134,10 +127,10 @@ class SimulatedCell:
         pose = np.eye(4)
         pose[:3, :3] = rotation_from_rpy(0.12, -0.1, 0.0)
         pose[:3, 3] = [foot[0], foot[1], top]
-        ring = SolidBody(_ring(self.flange), POLISHED).moved(pose)
+        ring = SolidBody(_ring(self.flange), MATERIALS["polished"]).moved(pose)
         low = np.array([foot[0], foot[1], 0.0])
         post = capsule(low, np.array([foot[0], foot[1], top - 0.03]), 0.015)
-        return [ring, SolidBody(post, RUBBER)]
+        return [ring, SolidBody(post, MATERIALS["rubber"])]
 
 
 def _ring(flange: Flange) -> Mesh:

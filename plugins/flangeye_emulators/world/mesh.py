@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from flangeye.errors import StageError
 from flangeye.maths.geometry import basis_of_plane
-from flangeye.models.robots import Finish, Recess
+from flangeye.models.robots import Recess
 from flangeye.models.targets import Flange
 from flangeye.types import Floats
 
@@ -254,17 +254,13 @@ class Material:
     grain: float = 1.0
 
 
-PAINTED = Material(albedo=0.6)
-METAL = Material(albedo=0.35, gloss=0.6, grain=1.2)
-ANODISED = Material(albedo=0.08, gloss=0.3, grain=1.5)
-POLISHED = Material(albedo=0.25, gloss=0.9, grain=1.3)
-MATT = Material(albedo=0.8)
-RUBBER = Material(albedo=0.03, grain=1.5)
-WALL = Material(albedo=0.8)
-TABLE = Material(albedo=0.3)
-
-FINISHES: Mapping[Finish, Material] = {
-    "painted": PAINTED,
-    "metal": METAL,
-    "anodised": ANODISED,
+MATERIALS: Mapping[str, Material] = {
+    "painted": Material(albedo=0.6),
+    "metal": Material(albedo=0.35, gloss=0.6, grain=1.2),
+    "anodised": Material(albedo=0.08, gloss=0.3, grain=1.5),
+    "polished": Material(albedo=0.25, gloss=0.9, grain=1.3),
+    "matt": Material(albedo=0.8),
+    "rubber": Material(albedo=0.03, grain=1.5),
+    "table": Material(albedo=0.3),
 }
+"""By name; a flange's finish is one of the first three."""

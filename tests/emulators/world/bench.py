@@ -8,7 +8,7 @@ from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.models.loading import load_model
 from flangeye.models.scanners import ScannerModel
 from flangeye.models.targets import Flange, plate_of
-from flangeye_emulators.world.mesh import METAL, WALL, box, flange_mesh, wrist_mesh
+from flangeye_emulators.world.mesh import MATERIALS, box, flange_mesh, wrist_mesh
 from flangeye_emulators.world.raycast import RaycastScene, SolidBody
 
 SCANNER = load_model("scanners", "phoxi-m")
@@ -29,7 +29,7 @@ def facing(tilt: float = 0.0, depth: float = 0.7, aside: float = 0.0) -> np.ndar
     return rigid(rotation_from_rpy(np.pi + tilt, 0.0, 0.0), np.array([aside, 0.0, depth]))
 
 
-def plate(depth: float, material=WALL, half: float = 0.5) -> SolidBody:
+def plate(depth: float, material=MATERIALS["matt"], half: float = 0.5) -> SolidBody:
     """Return a flat plate across the view."""
     return SolidBody(box([-half, -half, depth], [half, half, depth + 0.01]), material)
 
@@ -38,8 +38,8 @@ def flange_scene(camera_T_flange: np.ndarray, robot: str = "ur5") -> RaycastScen
     """Return a flange on its wrist, 0.3 m before a table."""
     shape = flange(robot)
     carried = [
-        SolidBody(flange_mesh(shape), METAL),
-        SolidBody(wrist_mesh(shape), METAL),
+        SolidBody(flange_mesh(shape), MATERIALS["metal"]),
+        SolidBody(wrist_mesh(shape), MATERIALS["metal"]),
     ]
     behind = float(camera_T_flange[2, 3]) + 0.3
     return RaycastScene([body.moved(camera_T_flange) for body in carried] + [plate(behind)])

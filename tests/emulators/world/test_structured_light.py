@@ -7,7 +7,7 @@ import pytest
 
 from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye_emulators.world import scanner
-from flangeye_emulators.world.mesh import ANODISED, METAL, PAINTED, WALL, box
+from flangeye_emulators.world.mesh import MATERIALS, box
 from flangeye_emulators.world.raycast import RaycastScene, SolidBody, pixels_of
 from flangeye_emulators.world.scanner import (
     Distortion,
@@ -35,7 +35,7 @@ def scan(scanner, scene, resolution=1.0, noise=1.0, seed=0):
     return StructuredLight(scanner, resolution, noise, rng(7)).scan(scene, rng(seed))
 
 
-def tilted_plate(tilt, material=WALL):
+def tilted_plate(tilt, material=MATERIALS["matt"]):
     """A large plate through (0, 0, 0.788 m), turned about the image's y."""
     turn = rigid(rotation_from_rpy(0, tilt, 0), np.array([0, 0, (SCANNER.near + SCANNER.far) / 2]))
     return RaycastScene([SolidBody(box([-0.6, -0.6, 0], [0.6, 0.6, 0.01]), material).moved(turn)])
@@ -69,7 +69,7 @@ def test_a_scan_is_organised_and_missing_points_are_nan() -> None:
 
 
 def test_the_projector_throws_shadows_away_from_itself() -> None:
-    block = SolidBody(box([-0.05, -0.05, 0.7], [0.05, 0.05, 0.72]), WALL)
+    block = SolidBody(box([-0.05, -0.05, 0.7], [0.05, 0.05, 0.72]), MATERIALS["matt"])
     points = scan(quiet(projection=None), RaycastScene([block, plate(0.9)]), 0.2, noise=0.0)
     pixels = pixels_of(SCANNER, 0.2)
     row = points[points.shape[0] // 2, :, 2]
@@ -116,7 +116,9 @@ def test_noise_grows_with_the_square_of_the_depth() -> None:
     assert deviation[1] / deviation[0] == pytest.approx(4.0, rel=0.04)
 
 
-@pytest.mark.parametrize(("material", "grain"), [(METAL, 1.2), (ANODISED, 1.5)])
+@pytest.mark.parametrize(
+    ("material", "grain"), [(MATERIALS["metal"], 1.2), (MATERIALS["anodised"], 1.5)]
+)
 def test_metal_is_noisier(material: Any, grain: float) -> None:
     scanner = zoomed(quiet(calibration_error=0.0))
     points = scan(scanner, RaycastScene([plate(0.788, material)]))[120:180, 160:240, 2]
@@ -163,7 +165,7 @@ def test_metal_is_lost_where_it_mirrors_the_projector() -> None:
     # The bisector of the directions to camera and projector leans half of 24 degrees to x.
     bisecting = np.arctan2(SCANNER.baseline, 0.788 - 0.071) / 2
     lost = {}
-    for name, material in {"metal": METAL, "wall": WALL}.items():
+    for name, material in {"metal": MATERIALS["metal"], "wall": MATERIALS["matt"]}.items():
         for turn in (-bisecting, bisecting):
             points = scan(zoomed(), tilted_plate(turn, material))
             lost[name, turn] = np.isnan(points[100:200, 150:250, 2]).mean()
@@ -175,12 +177,12 @@ def test_metal_is_lost_where_it_mirrors_the_projector() -> None:
 def test_dark_surfaces_are_lost_when_seen_at_an_angle() -> None:
     lost = {
         (material.albedo, tilt): np.isnan(scan(zoomed(), tilted_plate(tilt, material))).mean()
-        for material in (ANODISED, PAINTED)
+        for material in (MATERIALS["anodised"], MATERIALS["painted"])
         for tilt in (0.1, 1.0)
     }
-    assert lost[ANODISED.albedo, 0.1] < 0.02
-    assert lost[ANODISED.albedo, 1.0] > 0.9
-    assert lost[PAINTED.albedo, 1.0] < 0.02
+    assert lost[MATERIALS["anodised"].albedo, 0.1] < 0.02
+    assert lost[MATERIALS["anodised"].albedo, 1.0] > 0.9
+    assert lost[MATERIALS["painted"].albedo, 1.0] < 0.02
 
 
 def test_edges_lose_points_and_few_fly() -> None:

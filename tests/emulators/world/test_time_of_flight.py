@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from flangeye.models.loading import load_model
-from flangeye_emulators.world.mesh import ANODISED, METAL, WALL, box
+from flangeye_emulators.world.mesh import MATERIALS, box
 from flangeye_emulators.world.raycast import RaycastScene, SolidBody, pixels_of
 from flangeye_emulators.world.scanner import TimeOfFlight
 from tests.emulators.world.bench import plate
@@ -38,7 +38,7 @@ def test_noise_has_a_floor_and_grows_with_the_square_of_the_distance(depth: floa
     points = middle(scan([plate(depth, half=2.0)]))[30:40, 30:50]
     half_range = (KINECT.near + KINECT.far) / 2
     wanted = KINECT.temporal_noise * (0.3 + 0.7 * (depth / half_range) ** 2)
-    wanted /= np.sqrt(WALL.albedo)
+    wanted /= np.sqrt(MATERIALS["matt"].albedo)
     digits = 1e-3 / np.sqrt(12)
     assert np.nanstd(points[..., 2]) == pytest.approx(np.hypot(wanted, digits), rel=0.15)
 
@@ -46,13 +46,13 @@ def test_noise_has_a_floor_and_grows_with_the_square_of_the_distance(depth: floa
 def test_metal_is_much_noisier() -> None:
     wall, metal = (
         np.nanstd(middle(scan([plate(0.8, material, half=1.0)]))[20:, 20:][..., 2])
-        for material in (WALL, ANODISED)
+        for material in (MATERIALS["matt"], MATERIALS["anodised"])
     )
     assert metal > 3 * wall
 
 
 def test_steps_in_metal_are_measured_too_far() -> None:
-    block = SolidBody(box([-0.1, -0.1, 0.75], [0.1, 0.1, 0.8]), METAL)
+    block = SolidBody(box([-0.1, -0.1, 0.75], [0.1, 0.1, 0.8]), MATERIALS["metal"])
     points = scan([block, plate(1.0, half=1.0)], resolution=1.0, temporal_noise=0.0)
     rows, columns = points.shape[:2]
     across = points[rows // 2, :, 2] - 0.75
@@ -63,7 +63,7 @@ def test_steps_in_metal_are_measured_too_far() -> None:
 
 
 def test_pixels_at_an_edge_see_both_sides() -> None:
-    block = SolidBody(box([-0.1, -0.1, 0.75], [0.1, 0.1, 0.8]), WALL)
+    block = SolidBody(box([-0.1, -0.1, 0.75], [0.1, 0.1, 0.8]), MATERIALS["matt"])
     points = scan([block, plate(1.0, half=1.0)], resolution=1.0)
     depth = points[..., 2]
     between = (depth > 0.77) & (depth < 0.98)

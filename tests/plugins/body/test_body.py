@@ -30,7 +30,7 @@ from flangeye.types import (
     Rejected,
     Transform,
 )
-from flangeye_emulators.world.mesh import MATT, PAINTED, TABLE, Mesh, box
+from flangeye_emulators.world.mesh import MATERIALS, Mesh, box
 from flangeye_emulators.world.raycast import RaycastScene, SolidBody
 from flangeye_emulators.world.scanner import scanner_of
 from flangeye_plugins.body.looks import prepared
@@ -52,9 +52,9 @@ def scan(body: TargetBody, pose=POSE, seed: int = 0) -> Capture:
     """A simulated scan of a body before a table, with a box beside it."""
     mesh = Mesh(body.vertices, body.triangles)
     bodies = [
-        SolidBody(mesh.moved(pose), MATT),
-        SolidBody(box([-1, -1, 1.0], [1, 1, 1.02]), TABLE),
-        SolidBody(box([-0.3, -0.2, 0.8], [-0.2, -0.05, 0.9]), PAINTED),
+        SolidBody(mesh.moved(pose), MATERIALS["matt"]),
+        SolidBody(box([-1, -1, 1.0], [1, 1, 1.02]), MATERIALS["table"]),
+        SolidBody(box([-0.3, -0.2, 0.8], [-0.2, -0.05, 0.9]), MATERIALS["painted"]),
     ]
     xyz = eye().scan(RaycastScene(bodies), np.random.default_rng(seed))
     return Capture("0000", PointCloud(CAMERA, xyz), {FLANGE: Transform(BASE, FLANGE, pose)})
@@ -110,7 +110,9 @@ def test_what_is_stated_covers_what_scanner_and_make_do() -> None:
         q = np.linalg.qr(rng.standard_normal((3, 3)))[0]
         pose = rigid((q := q * np.sign(np.linalg.det(q))), POSE[:3, 3] - q @ made.centre)
         xyz = scanner_of(SCANNER, 0.3, 1.0, rng).scan(
-            RaycastScene([SolidBody(Mesh(made.vertices, made.triangles).moved(pose), MATT)]),
+            RaycastScene(
+                [SolidBody(Mesh(made.vertices, made.triangles).moved(pose), MATERIALS["matt"])]
+            ),
             rng,
         )
         capture = Capture("0000", PointCloud(CAMERA, xyz), {})

@@ -11,8 +11,6 @@ from flangeye.types import Floats, Mask
 SIZE = 1e-3
 """Typical share by which a printed marker is larger or smaller than was said: a tenth of a
 millimetre of 100 mm, what a ruler shows."""
-TIMES = 2.0
-"""By how many times that may be more or less, one sigma."""
 
 
 def camera_effects(problem: Problem, size_unknown: bool = False) -> list[Effect]:
@@ -28,10 +26,10 @@ def camera_effects(problem: Problem, size_unknown: bool = False) -> list[Effect]
     whole = {int(k) for k in s.pairs[s.ranks == 6]}
     pairs = [ends for k, ends in enumerate(problem.ends) if k in whole]
     for target in dict.fromkeys(target for _, target in pairs):
-        effects.append(Effect(f"size of {target}", _size(target), size, TIMES, kind="size"))
+        effects.append(Effect(f"size of {target}", _size(target), size, kind="size"))
     for camera in dict.fromkeys(camera for camera, _ in pairs):
         name = f"focal length of {camera}"
-        effects.append(Effect(name, _focal(camera), SIZE, TIMES, kind="focal"))
+        effects.append(Effect(name, _focal(camera), SIZE, kind="focal"))
     return effects
 
 

@@ -30,7 +30,7 @@ class Effect:
     name: str
     block: Block
     size: float
-    factor: float
+    factor: float = 2.0
     cause: str = ""
     of_arm: bool = False
     kind: str = ""

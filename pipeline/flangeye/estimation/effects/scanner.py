@@ -10,19 +10,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
 
 import numpy as np
 
 from flangeye.estimation.effects.effect import Effect
 from flangeye.estimation.graph import Linear, Problem, Sightings
-from flangeye.maths.arm_correction import features
+from flangeye.maths.arm_correction import features, powers
 from flangeye.maths.geometry import hat, stack_rows
 from flangeye.models.scanners import ScannerModel
 from flangeye.types import Floats
 
-POWERS = tuple(p for p in product(range(4), repeat=3) if sum(p) <= 3)
-"""A calibrated scanner bends its volume once or twice, and has no ripples."""
 GRID = np.stack(np.meshgrid(*[np.linspace(-1, 1, 7)] * 3), axis=-1).reshape(-1, 3)
 """The view, evenly."""
 TIMES = 1.1
@@ -154,7 +151,8 @@ class DistortionField:
         ways = np.concatenate(
             [rays[..., None], np.broadcast_to(across, (len(points), 3, 2))], axis=2
         )
-        columns = features(view, POWERS)[:, None, :, None] * ways[:, :, None, :]
+        # A calibrated scanner bends its volume once or twice, and has no ripples.
+        columns = features(view, powers(3))[:, None, :, None] * ways[:, :, None, :]
         return np.asarray(columns.reshape(len(points), 3, -1))
 
     def _motions(self, points: Floats) -> Floats:

@@ -11,9 +11,6 @@ from flangeye.estimation.effects.effect import Block, Effect
 from flangeye.estimation.graph import Linear, Problem
 from flangeye.types import Floats
 
-TIMES = 2.0
-"""By how many times both may be larger or smaller, one sigma."""
-
 
 def target_effects(problem: Problem) -> list[Effect]:
     """Return the errors of circles and faces that are the same at all poses.
@@ -27,11 +24,11 @@ def target_effects(problem: Problem) -> list[Effect]:
     if (ranks == 5).any():
         # Of a plate's face against the flange's axis [rad]: flatness of 0.02 mm over the
         # rim and what the last joint's bearing adds
-        effects.append(Effect("tilt of the face", _tilt(circles), 0.5e-3, TIMES, kind="tilt"))
+        effects.append(Effect("tilt of the face", _tilt(circles), 0.5e-3, kind="tilt"))
     if (ranks > 0).any():
         effects.append(
             # Of the seen circle's centre from the controller's flange origin [m]
-            Effect("offset of the circle", _offset(circles), 0.03e-3, TIMES, kind="offset")
+            Effect("offset of the circle", _offset(circles), 0.03e-3, kind="offset")
         )
     return effects
 
