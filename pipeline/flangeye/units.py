@@ -13,32 +13,26 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field, PlainSerializer, WithJsonSchema
 
-_DEGREE = Decimal(math.pi) / 180
-_UNITS: dict[str, dict[str, Decimal]] = {
-    "length": {"mm": Decimal("1e-3"), "m": Decimal(1), "um": Decimal("1e-6")},
-    "angle": {"deg": _DEGREE, "rad": Decimal(1), "mrad": Decimal("1e-3")},
-    "joint position": {"deg": _DEGREE, "rad": Decimal(1), "mm": Decimal("1e-3"), "m": Decimal(1)},
-    "duration": {"ms": Decimal("1e-3"), "s": Decimal(1), "min": Decimal(60)},
-    "speed": {"mm/s": Decimal("1e-3"), "m/s": Decimal(1)},
-    "acceleration": {"mm/s^2": Decimal("1e-3"), "m/s^2": Decimal(1)},
-    "angular speed": {"deg/s": _DEGREE, "rad/s": Decimal(1)},
-    "force": {"N": Decimal(1), "mN": Decimal("1e-3")},
-    "stiffness": {"N/mm": Decimal("1e3"), "N/m": Decimal(1)},
+_DEGREE, _MILLI = Decimal(math.pi) / 180, Decimal("1e-3")
+_UNITS: dict[str, tuple[str, dict[str, Decimal]]] = {
+    "length": ("31.5 mm", {"mm": _MILLI, "m": Decimal(1), "um": Decimal("1e-6")}),
+    "angle": ("17 deg", {"deg": _DEGREE, "rad": Decimal(1), "mrad": _MILLI}),
+    "joint position": (
+        "170 deg",
+        {"deg": _DEGREE, "rad": Decimal(1), "mm": _MILLI, "m": Decimal(1)},
+    ),
+    "duration": ("500 ms", {"ms": _MILLI, "s": Decimal(1), "min": Decimal(60)}),
+    "speed": ("50 mm/s", {"mm/s": _MILLI, "m/s": Decimal(1)}),
+    "acceleration": ("200 mm/s^2", {"mm/s^2": _MILLI, "m/s^2": Decimal(1)}),
+    "angular speed": ("30 deg/s", {"deg/s": _DEGREE, "rad/s": Decimal(1)}),
+    "force": ("3 N", {"N": Decimal(1), "mN": _MILLI}),
+    "stiffness": ("2 N/mm", {"N/mm": Decimal("1e3"), "N/m": Decimal(1)}),
 }
-_EXAMPLES = {
-    "length": "31.5 mm",
-    "angle": "17 deg",
-    "joint position": "170 deg",
-    "duration": "500 ms",
-    "speed": "50 mm/s",
-    "acceleration": "200 mm/s^2",
-    "angular speed": "30 deg/s",
-    "force": "3 N",
-    "stiffness": "2 N/mm",
-}
+"""By kind: an example, and each unit in SI units."""
 # Each part can be matched in one way only: otherwise ten thousand digits take for ever.
-_NUMBER = r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
-_QUANTITY = re.compile(rf"\s*({_NUMBER})\s*(?:([^\d\s.]\S*)\s*)?")
+_QUANTITY = re.compile(
+    r"\s*([-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)\s*(?:([^\d\s.]\S*)\s*)?"
+)
 
 
 def parse_quantity(value: object, kind: str) -> float:
@@ -47,9 +41,9 @@ def parse_quantity(value: object, kind: str) -> float:
     Raises:
         ValueError: There is no unit, or it measures something else; says what is allowed.
     """
-    units = _UNITS[kind]
+    example, units = _UNITS[kind]
     a_kind = f"an {kind}" if kind[0] in "aeiou" else f"a {kind}"
-    allowed = f"{', '.join(units)}, for example '{_EXAMPLES[kind]}'"
+    allowed = f"{', '.join(units)}, for example '{example}'"
     if isinstance(value, bool) or not isinstance(value, (str, int, float)):
         raise ValueError(f"{a_kind} is a number with a unit ({allowed})")
     match = _QUANTITY.fullmatch(str(value))
@@ -59,7 +53,7 @@ def parse_quantity(value: object, kind: str) -> float:
     if unit is None:
         raise ValueError(f"'{value}' has no unit: {a_kind} needs one ({allowed})")
     if unit not in units:
-        other = next((k for k, table in _UNITS.items() if unit in table), None)
+        other = next((k for k, (_, known) in _UNITS.items() if unit in known), None)
         what = f"is no {kind}, it has a unit of {other}" if other else "has an unknown unit"
         raise ValueError(f"'{value}' {what}: {a_kind} needs {allowed}")
     try:
@@ -74,14 +68,17 @@ def parse_quantity(value: object, kind: str) -> float:
 def format_quantity(si: float, kind: str) -> str:
     """Return ``si`` as text that :func:`parse_quantity` reads back to the same float."""
     si = float(si)  # NumPy's floats have another repr
-    for unit, factor in _UNITS[kind].items():
+    _, units = _UNITS[kind]
+    for unit, factor in units.items():
         text = f"{float(f'{Decimal(repr(si)) / factor:.12g}'):.12g} {unit}"
         if parse_quantity(text, kind) == si:
             return text
-    return f"{si!r} {next(u for u, f in _UNITS[kind].items() if f == 1)}"
+    return f"{si!r} {next(u for u, f in units.items() if f == 1)}"
 
 
 def _quantity(kind: str) -> tuple[BeforeValidator, PlainSerializer, WithJsonSchema]:
+    example, units = _UNITS[kind]
+
     def parse(value: object) -> float:
         # Defaults may be given in SI by code; only text from YAML must carry its unit.
         return value.si if isinstance(value, SI) else parse_quantity(value, kind)
@@ -93,8 +90,8 @@ def _quantity(kind: str) -> tuple[BeforeValidator, PlainSerializer, WithJsonSche
             {
                 "type": "string",
                 "x-flangeye-quantity": kind,
-                "examples": [_EXAMPLES[kind]],
-                "description": f"A {kind} with its unit: {', '.join(_UNITS[kind])}.",
+                "examples": [example],
+                "description": f"A {kind} with its unit: {', '.join(units)}.",
             }
         ),
     )

@@ -10,7 +10,6 @@ import numpy as np
 
 from flangeye_paper.tables import (
     AXES,
-    KINECT,
     PRINTED,
     TABLE_1,
     Row,
@@ -42,7 +41,7 @@ def table1(batches: Path, out: Path) -> None:
         *_stored_rows("Aubo i5 PhoXi S", batches / "table1_aubo"),
         *(_icp_row("Aubo i5 PhoXi S", s, "") for s in read_sessions(batches / "table1_aubo")),
         *(_icp_row("Aubo i5 PhoXi S", s, ", converged") for s in path if _iterations(s) == 500),
-        _printed_row("UR10e Azure Kinect", KINECT),
+        _printed_row("UR10e Azure Kinect", TABLE_1["UR10e Azure Kinect"]),
         *(_kinect_row(s) for s in read_sessions(batches / "table1_kinect")),
     ]
     write_csv(out / "table1.csv", rows)

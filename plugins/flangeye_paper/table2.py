@@ -25,7 +25,6 @@ from flangeye_paper.tables import (
 )
 
 TARGETS = {"flange": "#1d4ed8", "sphere": "#d97706"}
-COUNTS = "steps.0.poses.grid.counts"
 
 
 class Trials(NamedTuple):
@@ -59,9 +58,8 @@ def table2(batches: Path, out: Path) -> None:
     for target in TARGETS:
         wide = read_sessions(batches / f"table2_{target}")
         for counts, pairs in (("[2, 2, 1]", 4), ("[4, 2, 2]", 16)):
-            trials.append(
-                _trials(target, pairs, False, [s for s in wide if s.row[COUNTS] == counts])
-            )
+            chosen = [s for s in wide if s.row["steps.0.poses.grid.counts"] == counts]
+            trials.append(_trials(target, pairs, False, chosen))
         narrow = read_sessions(batches / f"table2-narrow_{target}")
         trials.append(_trials(target, 16, True, narrow))
     printed = [

@@ -154,9 +154,6 @@ def _mm(displacement: Floats) -> str:
     return f"{np.linalg.norm(displacement) * 1e3:.3f}"
 
 
-NAMES = ("zero", "a", "d", "alpha")
-
-
 class ArmParams(Params):
     """Parameters of ``refine.arm``."""
 
@@ -234,7 +231,8 @@ def _listed(told: ArmParameters) -> list[str]:
     single: list[str] = []
     combined_only: list[str] = []
     for (joint, which), singly in np.ndenumerate(told.identified):
-        name, unit = f"joint {joint + 1} {NAMES[which]}", ("mrad", "mm", "mm", "mrad")[which]
+        what, unit = (("zero", "mrad"), ("a", "mm"), ("d", "mm"), ("alpha", "mrad"))[which]
+        name = f"joint {joint + 1} {what}"
         value, deviation = (x[joint, which] * 1e3 for x in (told.values, told.deviations))
         (single if singly else combined_only).append(
             f"{name} {value:+.2f} ± {deviation:.2f} {unit}" if singly else name

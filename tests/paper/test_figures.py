@@ -164,7 +164,7 @@ def test_table2_measures_at_the_camera_and_at_the_work(
         "truth": {"base_T_camera": truth.tolist(), "rms_over_workspace": 2e-3},
     }
     for target in table2.TARGETS:
-        rows = [{table2.COUNTS: counts} for counts in ("[2, 2, 1]", "[4, 2, 2]")]
+        rows = [{"steps.0.poses.grid.counts": counts} for counts in ("[2, 2, 1]", "[4, 2, 2]")]
         batch(f"table2_{target}", *((row, "x", {}) for row in rows), extra=extra)
         root = batch(f"table2-narrow_{target}", ({}, "x", {}), extra=extra)
     table2.table2(root, tmp_path)

@@ -23,8 +23,6 @@ Grey = NDArray[np.uint8]
 FEWEST_CHARUCO = 6
 """Corners of a ChArUco board below which too little of it is seen."""
 
-FAMILIES = tuple(name for name in DICTIONARIES if not name.endswith(("_50", "_100", "_1000")))
-"""One of each kind: the first markers of 4X4_250 are those of 4X4_50, and few prints need more."""
 WIDTH = 640
 """Of an image in which other families are looked for [px]: each tries every square in it."""
 
@@ -202,7 +200,10 @@ def _family_in(grey: Grey) -> tuple[str, list[int]] | None:
 
     by = min(1.0, WIDTH / grey.shape[1])
     small = cv2.resize(grey, None, fx=by, fy=by, interpolation=cv2.INTER_AREA)
-    for name in FAMILIES:
+    # One of each kind: the first markers of 4X4_250 are those of 4X4_50, and few prints need more.
+    for name in DICTIONARIES:
+        if name.endswith(("_50", "_100", "_1000")):
+            continue
         family = cv2.aruco.ArucoDetector(dictionary_of(name))
         if ids := _ids(family.detectMarkers(small)[1]):
             return name, sorted(ids)

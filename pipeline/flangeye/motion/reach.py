@@ -236,13 +236,6 @@ def _within(points: Floats, field: tuple[float, float]) -> bool:
     return bool((np.abs(points[:, :2]) <= half * points[:, 2:]).all())
 
 
-POINT_WITHIN = 0.02
-"""Poses near a point are this near to it, along each axis [m]."""
-
-NEAR_TILT = 0.2
-"""Their largest roll, pitch and yaw [rad]."""
-
-
 @dataclass(frozen=True, eq=False)
 class Site:
     """Arm, scanner and obstacles that a plan is made for.
@@ -304,7 +297,7 @@ def poses_near(
     count: int,
     site: Site,
     rng: np.random.Generator,
-    spread: tuple[Any, float] = (POINT_WITHIN, NEAR_TILT),
+    spread: tuple[Any, float] = (0.02, 0.2),
 ) -> list[PlannedPose]:
     """Return up to so many reachable poses drawn around a point (3,).
 

@@ -22,8 +22,6 @@ from flangeye.recipe.load import Recipe, parse_recipe
 from flangeye.result import SIMULATED
 from flangeye.result.contract import AnswerResult, Result, TransformResult
 
-EXPORTS = "exports"
-"""Where in the folder the files for other programs are."""
 RUNS = Path("runs")
 """Where folders go that nobody named."""
 CHECKS = "checks"
@@ -94,7 +92,7 @@ class RunFolder:
         if result.transforms and not result.refused:
             self._write("calibration.yaml", calibration_yaml(result))
         for name, text in result.exports.items():
-            self._write(f"{EXPORTS}/{name}", text)
+            self._write(f"exports/{name}", text)
 
     def discard(self) -> None:
         """Delete log and folder: the run ended before a result worth keeping."""

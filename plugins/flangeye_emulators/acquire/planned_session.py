@@ -51,7 +51,7 @@ from flangeye_emulators.world.session import (
 )
 
 VERSION = 1
-"""Raised whenever the same parameters would give other captures."""
+"""Raised whenever the same parameters would give other captures or sessions."""
 REPORTED = float(np.radians(0.0115)), 0.05e-3
 """Standard deviation of a reported pose about and along each axis [rad, m]: half of what the data
 sheet of a UR5 gives for repeatability, 0.1 mm."""

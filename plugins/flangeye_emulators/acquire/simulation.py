@@ -41,7 +41,7 @@ from flangeye.types import (
     by_frame,
 )  # fmt: skip
 from flangeye.units import in_mm, param
-from flangeye_emulators.acquire.planned_session import UNSEEN, noise_free
+from flangeye_emulators.acquire.planned_session import UNSEEN, VERSION, noise_free
 from flangeye_emulators.world.arm import ArmErrors, ImperfectArm
 from flangeye_emulators.world.cell import SimulatedCell
 from flangeye_emulators.world.raycast import Image, SolidBody
@@ -73,10 +73,6 @@ class SimulatedParams(ScannerQuality):
     outliers: float = Field(
         0.0, ge=0, le=1, description="Share of the captures in which the flange is covered."
     )
-
-
-VERSION = 1
-"""Raised whenever the same parameters would give other captures."""
 
 
 class Setting(NamedTuple):

@@ -168,7 +168,6 @@ MARK = b"SOF\x01"
 _LENGTH = struct.Struct(">I")
 _HEADER = len(MARK) + _LENGTH.size
 ROBOT = "rob1"
-VERSION = "0.24.1"
 
 
 def serve(options: EmulatorOptions) -> None:
@@ -287,7 +286,7 @@ METHODS: dict[str, Method] = {
     "getRobotNames": _tell(lambda box: [ROBOT]),
     "getAxisNames": _tell(lambda box: []),
     "SystemInfo.getInterfaceVersionCode": _tell(lambda box: 24001),
-    "SystemInfo.getControlSoftwareFullVersion": _tell(lambda box: f"{VERSION} (loopback)"),
+    "SystemInfo.getControlSoftwareFullVersion": _tell(lambda box: "0.24.1 (loopback)"),
     "RobotConfig.getCycletime": _tell(lambda box: box.cycle),
     "RobotConfig.getDof": _tell(lambda box: len(box.arm.speeds)),
     "RobotConfig.getTcpOffset": _tell(lambda box: _pose(box.arm.chain.flange_T_tcp)),

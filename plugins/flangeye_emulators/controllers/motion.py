@@ -62,10 +62,6 @@ class PoseSpace:
         return pose
 
 
-JOINTS: Space = JointSpace()
-POSES: Space = PoseSpace()
-
-
 SLOWEST = 1e-4
 """Speeds and accelerations below this are taken as this: a move must end."""
 
@@ -128,12 +124,12 @@ class Travel:
 
 def joint_move(start: Floats, end: Floats, speed: float, acceleration: float) -> Travel:
     """Return a move straight in joint angles (n,); the leading joint keeps speed [rad/s]."""
-    return Travel(JOINTS, start, end, speed, acceleration)
+    return Travel(JointSpace(), start, end, speed, acceleration)
 
 
 def linear_move(start: Floats, end: Floats, speed: float, acceleration: float) -> Travel:
     """Return a move straight in space from pose to pose (4, 4); speed in [m/s]."""
-    return Travel(POSES, start, end, speed, acceleration)
+    return Travel(PoseSpace(), start, end, speed, acceleration)
 
 
 class Speed:

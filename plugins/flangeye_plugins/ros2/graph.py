@@ -156,9 +156,6 @@ class Frames:
 NONE = "none"
 """The answer that there is no controller, or no trigger."""
 
-TRIGGERS = re.compile(r"capture|trigger|acquire|scan|grab|snap|frame", re.IGNORECASE)
-"""What services are called that take a scan, and not those that switch an arm on."""
-
 
 class Ros2Graph(Device):
     """The running ROS 2 graph; see :class:`flangeye.models.graph.Graph`."""
@@ -275,9 +272,10 @@ class Ros2Graph(Device):
     # --- what runs
 
     def _triggers(self) -> list[str]:
-        """Return the services that may take a scan, by their type and their name."""
+        """Return the services that may take a scan, by type and name; none that switches an arm."""
+        words = r"capture|trigger|acquire|scan|grab|snap|frame"
         services = self._bridge.services().items()
-        return [s for s, kind in services if kind == TRIGGER and TRIGGERS.search(s)]
+        return [s for s, kind in services if kind == TRIGGER and re.search(words, s, re.IGNORECASE)]
 
     def _description(self, topics: Sequence[Topic], ask: Ask) -> str:
         """Return the URDF that a node publishes, or of a file."""

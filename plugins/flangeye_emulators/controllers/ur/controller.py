@@ -15,14 +15,8 @@ from flangeye.types import Floats
 from flangeye_emulators.controllers.arm import ControlUnit, MotionFault, SimulatedArm
 from flangeye_emulators.controllers.poses import pose_vector
 
-HALF, THIRD = np.pi, 2 * np.pi / 3
-
-SPEEDS: dict[str, tuple[float, ...]] = {
-    "ur3": (HALF,) * 3 + (2 * np.pi,) * 3,
-    "ur5": (HALF,) * 6,
-    "ur10": (THIRD,) * 2 + (HALF,) * 4,
-}
-"""Largest joint speeds [rad/s] by size of arm: data sheets (UR3e 180 and 360 deg/s, UR5e 180 deg/s,
+SPEEDS = {"ur3": (180,) * 3 + (360,) * 3, "ur5": (180,) * 6, "ur10": (120,) * 2 + (180,) * 4}
+"""Largest joint speeds [deg/s] by size of arm: data sheets (UR3e 180 and 360 deg/s, UR5e 180 deg/s,
 UR10e 120 and 180 deg/s; the CB3 arms alike)."""
 
 
@@ -237,7 +231,7 @@ def control_box_of(robot: RobotModel) -> ControlBox:
 
 def joint_speeds_of(robot: RobotModel) -> NDArray[np.float64]:
     """Return the (6,) largest joint speeds [rad/s]; those of a UR5 for an arm with another name."""
-    return np.array(SPEEDS.get(robot.model.rstrip("e"), SPEEDS["ur5"]))
+    return np.radians(SPEEDS.get(robot.model.rstrip("e"), SPEEDS["ur5"]))
 
 
 class RobotMode(IntEnum):

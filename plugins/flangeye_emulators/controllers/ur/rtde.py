@@ -100,29 +100,21 @@ def _integer_output(index: int) -> Output:
     return Output("INT32", lambda box: (box.registers.output_int[index],))
 
 
-_JOINTS = Output("VECTOR6D", lambda box: box.arm.stance.joints.tolist())
-_SPEEDS = Output("VECTOR6D", lambda box: box.arm.speeds.tolist())
-_POSE = Output("VECTOR6D", lambda box: box.tcp_pose().tolist())
-_TWIST = Output("VECTOR6D", lambda box: box.arm.twist.tolist())
 _STILL = Output("VECTOR6D", _nothing(6))
 
 OUTPUTS: dict[str, Output] = {
     "timestamp": Output("DOUBLE", lambda box: (box.time,)),
-    "target_q": _JOINTS,
-    "target_qd": _SPEEDS,
     "target_qdd": _STILL,
     "target_current": _STILL,
     "target_moment": _STILL,
-    "actual_q": _JOINTS,
-    "actual_qd": _SPEEDS,
+    "actual_q": Output("VECTOR6D", lambda box: box.arm.stance.joints.tolist()),
+    "actual_qd": Output("VECTOR6D", lambda box: box.arm.speeds.tolist()),
     "actual_current": _STILL,
     "actual_current_as_torque": _STILL,
     "joint_control_output": _STILL,
-    "actual_TCP_pose": _POSE,
-    "actual_TCP_speed": _TWIST,
+    "actual_TCP_pose": Output("VECTOR6D", lambda box: box.tcp_pose().tolist()),
+    "actual_TCP_speed": Output("VECTOR6D", lambda box: box.arm.twist.tolist()),
     "actual_TCP_force": Output("VECTOR6D", lambda box: box.arm.felt.tolist()),
-    "target_TCP_pose": _POSE,
-    "target_TCP_speed": _TWIST,
     "ft_raw_wrench": Output("VECTOR6D", _raw_wrench),
     "actual_digital_input_bits": Output(
         "UINT64", lambda box: (box.digital_outputs & 0xFF,) if box.wired else (0,)
@@ -157,6 +149,9 @@ OUTPUTS: dict[str, Output] = {
     **{f"output_double_register_{i}": _double_output(i) for i in range(Registers.COUNT)},
 }
 """What a client may read."""
+# The arm goes exactly where it was told to.
+for _name in ("q", "qd", "TCP_pose", "TCP_speed"):
+    OUTPUTS[f"target_{_name}"] = OUTPUTS[f"actual_{_name}"]
 
 
 def write_inputs(box: URController, values: dict[str, float]) -> None:
@@ -174,11 +169,8 @@ def write_inputs(box: URController, values: dict[str, float]) -> None:
 
 
 PORT = 30004
-VERSION = 2
-IN_USE = "IN_USE"
 
 _HEADER = struct.Struct(">HB")
-_FREQUENCY = struct.Struct(">d")
 
 
 class RtdePort:
@@ -258,15 +250,15 @@ class RtdeSession(Connection):
 
     def _negotiate(self, body: bytes) -> None:
         (version,) = struct.unpack(">H", body[:2].rjust(2, b"\0"))
-        self._answer("V", bytes([version == VERSION]))
+        self._answer("V", bytes([version == 2]))
 
     def _tell_version(self, body: bytes) -> None:
         del body
         self._answer("v", struct.pack(">4I", *self._port.box.box.version))
 
     def _set_outputs(self, body: bytes) -> None:
-        (frequency,) = _FREQUENCY.unpack_from(body.ljust(_FREQUENCY.size, b"\0"))
-        recipe = OutputRecipe(_names(body[_FREQUENCY.size :]))
+        (frequency,) = struct.unpack(">d", body[:8].ljust(8, b"\0"))
+        recipe = OutputRecipe(_names(body[8:]))
         rate = self._port.box.box.rate
         self._every = max(1, round(rate / frequency)) if 0 < frequency <= rate else 1
         self._output = recipe if recipe.valid else None
@@ -276,7 +268,7 @@ class RtdeSession(Connection):
         recipe = InputRecipe(_names(body))
         taken = self._port.claim(recipe.names, self) if recipe.valid else []
         types = [
-            IN_USE if name in taken else type_
+            "IN_USE" if name in taken else type_
             for name, type_ in zip(recipe.names, recipe.types, strict=True)
         ]
         number = 0
