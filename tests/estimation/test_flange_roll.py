@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye.estimation.flange_roll import roll_note, roll_of
+from flangeye.estimation.sightings import roll_note, roll_of
 from flangeye.maths.geometry import basis_of_plane, rotation_exp
 from flangeye.types import Floats
 

@@ -23,7 +23,7 @@ from flangeye.doctor.diagnosis import (
     require_enough,
 )
 from flangeye.errors import FlangeyeError
-from flangeye.estimation.rough import rough
+from flangeye.estimation.plan import rough
 from flangeye.estimation.sightings import problem_of
 from flangeye.maths.geometry import invert, rigid
 from flangeye.models.cell import Cell, Link

@@ -24,11 +24,11 @@ from flangeye.estimation.certified import answer_of, certificate_notes, moved_no
 from flangeye.estimation.corrections import CORRECTED, corrections_of, put_right
 from flangeye.estimation.effects.arm import COMMON
 from flangeye.estimation.estimate import Estimate, estimate
-from flangeye.estimation.flange_roll import roll_note
 from flangeye.estimation.graph import Places, Problem
 from flangeye.estimation.mixed import told_of_places
 from flangeye.estimation.observability import meaningless, unobservable
 from flangeye.estimation.session import Asked, Session, session_of
+from flangeye.estimation.sightings import roll_note
 from flangeye.estimation.threads import on_one_thread
 from flangeye.estimation.work import Work, work_of
 from flangeye.maths.geometry import adjoint_shift

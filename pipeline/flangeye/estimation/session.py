@@ -9,9 +9,8 @@ import numpy as np
 
 from flangeye.errors import CalibrationRefused, StageError
 from flangeye.estimation.effects.arm import arm_effects, known
-from flangeye.estimation.effects.camera import camera_effects
+from flangeye.estimation.effects.camera import camera_effects, drift_effects
 from flangeye.estimation.effects.clock import clock_effects, delayed
-from flangeye.estimation.effects.drift import drift_effects
 from flangeye.estimation.effects.effect import Effect
 from flangeye.estimation.effects.scanner import scanner_effects
 from flangeye.estimation.effects.target import target_effects, wrong_offset

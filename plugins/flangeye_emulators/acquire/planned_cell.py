@@ -14,8 +14,7 @@ import numpy as np
 from pydantic import Field
 
 from flangeye.errors import StageError
-from flangeye.estimation.plan import best_next, foreseen, foreseen_poses, so_far
-from flangeye.estimation.rough import Rough
+from flangeye.estimation.plan import Rough, best_next, foreseen, foreseen_poses, so_far
 from flangeye.maths.frame_graph import Frame, chain, composed
 from flangeye.maths.geometry import invert
 from flangeye.models.cell import Axis, Cell

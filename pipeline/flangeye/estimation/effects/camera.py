@@ -1,4 +1,4 @@
-"""Errors that all features of one camera share: of its intrinsics, and of a marker's size."""
+"""Errors that all features of one camera share: its intrinsics, a marker's size, its drift."""
 
 from __future__ import annotations
 
@@ -72,3 +72,38 @@ def _smoothed(problem: Problem, linear: Linear, whose: Mask) -> Floats:
     size = float((predicted[whose] ** 2).sum())
     ratio = float((measured * predicted)[whose].sum()) / size if size > 0 else 1.0
     return np.asarray(ratio * predicted)
+
+
+def drift_effects(problem: Problem) -> list[Effect]:
+    """Return how each camera drifts: shifts and turns, piecewise linear in time.
+
+    What it sees may be what moved.
+    """
+    # Five sightings between two knots at least
+    knots = min(len(problem.seen) // 5, 12)
+    if knots < 2:
+        return []
+    cameras = list(dict.fromkeys(camera for camera, _ in problem.ends))
+    # Over a session [m] and [rad]: a stand that warms by a kelvin
+    kinds = ("shift", 20e-6, slice(3, 6)), ("turn", 20e-6, slice(0, 3))
+    return [
+        # By how many times it may be more or less, one sigma
+        Effect(f"drift of {camera}", _drift(camera, knots, rows), size, 4.0,
+               f"drift of {camera}", kind="drift", lasting=False)
+        for camera in cameras for _, size, rows in kinds
+    ]  # fmt: skip
+
+
+def _drift(camera: str, knots: int, rows: slice) -> Block:
+    def block(problem: Problem, linear: Linear) -> Floats:
+        s, count = problem.seen, len(problem.seen)
+        out = np.zeros((count, 6, 3 * knots))
+        at = np.linspace(0, knots - 1, count)[np.argsort(np.argsort(s.times))]
+        hats = np.maximum(1 - np.abs(at[:, None] - np.arange(knots)), 0.0)
+        hats = hats - hats.mean(axis=0)
+        whose = np.array([problem.ends[k][0] == camera for k in s.pairs])
+        moved = hats[:, :, None, None] * np.eye(3)  # (N, knots, 3, 3)
+        out[:, rows] = np.swapaxes(moved, 1, 2).reshape(count, 3, -1) * whose[:, None, None]
+        return out
+
+    return block
