@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.io import savemat
 
 from flangeye.errors import StageError
 from flangeye.files.cameras import camera_in, cameras_in
@@ -129,6 +130,39 @@ def test_several_cameras_in_a_file_are_said(tmp_path: Path) -> None:
     camera = camera_in(tmp_path / "a.yaml")
     assert camera is not None
     assert camera.note().endswith("5 coefficients; the first of 2 in it")
+
+
+@pytest.mark.parametrize(
+    ("first", "lens", "second"),
+    [("M1", "D1", "M2"), ("cameraMatrix1", "distCoeffs1", "cameraMatrix2"),
+     ("K_left", "D_left", "K_right")],
+)  # fmt: skip
+def test_a_stereo_pairs_first_camera_is_taken(
+    tmp_path: Path, first: str, lens: str, second: str
+) -> None:
+    path = tmp_path / "stereo.yml"
+    file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    for name, value in ((second, 2 * K), (first, K), (lens, np.array([LENS])), ("R", np.eye(3))):
+        file.write(name, value)
+    file.release()
+    camera = camera_in(path)
+    assert camera is not None
+    assert np.allclose(camera.matrix, K)
+    assert np.allclose(camera.distortion, LENS)
+    assert camera.note().endswith("5 coefficients; the first of 2 in it")
+
+
+@pytest.mark.parametrize("named", ["K", "IntrinsicMatrix", "FocalLength"])
+def test_matlabs_camera_counts_pixels_from_one(tmp_path: Path, named: str) -> None:
+    own = K.copy()
+    own[:2, 2] += 1.0
+    values = {"IntrinsicMatrix": own.T, "K": own, "FocalLength": own[[0, 1], [0, 1]]}
+    stated = {named: values[named], "ImageSize": [720.0, 1280.0], "RadialDistortion": LENS[:2]}
+    stated |= {"PrincipalPoint": own[:2, 2]} if named == "FocalLength" else {}
+    savemat(tmp_path / "cam.mat", {"params": {**stated, "TangentialDistortion": LENS[2:4]}})
+    (camera,) = cameras_in(tmp_path)
+    assert np.allclose(camera.matrix, K)
+    assert np.allclose(camera.distortion, [*LENS[:4], 0.0])
 
 
 def test_a_lens_of_another_model_is_refused(tmp_path: Path) -> None:

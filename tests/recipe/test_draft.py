@@ -524,6 +524,11 @@ def two_tables_of_nobody(folder):
         table(folder, "x,y,z,qx,qy,qz,qw", quaternion, name)
 
 
+def pointers(folder: Path) -> None:
+    for name in ("poses.csv", "scan_0.ply"):
+        (folder / name).write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\n")
+
+
 def two_poses_of_nobody(folder):
     names = ("x", "y", "z", "qx", "qy", "qz", "qw")
     heading = ",".join(f"{group}_{name}" for group in "ab" for name in names)
@@ -576,7 +581,10 @@ def two_poses_of_nobody(folder):
         (two_poses_of_nobody, [], "not known: which poses are the arm's (log.csv:a, log.csv:b); "
          "add --table log.csv:a"),
         (lambda folder: (folder / "notes.md").write_text("x"), [],
-         "rec: holds no scans and no table of poses; rec: no reader knows this layout"),
+         "rec: no scans and no table of poses in notes.md; write the poses as .csv, a row each, or "
+         "name the reader that knows them: --reader NAME ('flangeye stages reader' lists them)"),
+        (pointers, [], "rec: 2 of 2 files are Git LFS pointers, not the files themselves, such as "
+         "poses.csv; fetch them: git lfs pull"),
         (lambda folder: None, [],
          "rec: is empty; put the clouds or images and their poses there"),
         (lambda folder: folder.rmdir(), [],

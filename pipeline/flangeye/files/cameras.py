@@ -21,15 +21,15 @@ from flangeye.files.tables.documents import KINDS, document_of
 from flangeye.types import Floats
 
 MATRICES = (
-    "camera_matrix", "cameramatrix", "intrinsic_matrix", "intrinsics", "intrinsic", "mtx", "matrix",
-    "k", "m1",
+    "cameramatrix", "intrinsicmatrix", "intrinsics", "intrinsic", "mtx", "matrix", "k", "m",
 )  # fmt: skip
-"""Names of the camera's matrix, in small letters."""
+"""Names of the camera's matrix, as all names here in small letters without what joins words."""
 DISTORTIONS = (
-    "distortion_coefficients", "distortion_coeffs", "dist_coeffs", "distcoeffs", "distortion",
-    "dist", "coeffs", "d", "d1",
+    "distortioncoefficients", "distortioncoeffs", "distcoeffs", "distortion", "dist", "coeffs", "d",
 )  # fmt: skip
 """Names of the distortion; other names that begin with ``dist`` follow them."""
+_FIRST, _SECOND = ("", "1", "left", "l"), ("2", "right", "r")
+"""What stands behind the names of a stereo calibration's cameras."""
 ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """OpenCV's coefficients."""
 LABELLED = (".txt", ".csv", ".ini", ".cfg", ".toml")
@@ -103,6 +103,7 @@ def camera_in(path: Path) -> CameraFile | None:
     values, matrix = found[0]
     _require_opencv(path, values)
     others = sum(not np.array_equal(other, matrix) for _, other in found)
+    others += _named(values, _SECOND) is not None
     lens = _distortion(values)
     if not lens.size:  # it may stand in a mapping of its own, one for each camera
         apart = [each for mapping in _mappings(data) if (each := _distortion(mapping)).size]
@@ -158,28 +159,46 @@ def _with_lens_beside(camera: CameraFile) -> CameraFile:
 def _mappings(data: Any) -> Iterator[dict[str, Any]]:
     """Yield the mappings in a document, the outer first, names in small letters."""
     if isinstance(data, Mapping):
-        yield {str(name).lower(): value for name, value in data.items()}
+        yield _plain(data)
     values = data.values() if isinstance(data, Mapping) else data if isinstance(data, list) else ()
     for value in values:
         yield from _mappings(value)
 
 
+def _plain(values: Mapping[Any, Any]) -> dict[str, Any]:
+    """Return values by their names in small letters: ``camera_matrix``, ``CameraMatrix``."""
+    return {re.sub(r"[_ -]", "", str(name).lower()): value for name, value in values.items()}
+
+
 def _matrix(values: Mapping[str, Any]) -> Floats | None:
+    matrix = _one_by_one(values)
+    matrix = _named(values, _FIRST) if matrix is None else matrix
+    if matrix is not None and "radialdistortion" in values:  # MATLAB's first pixel is at 1, 1
+        matrix = matrix - [[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]]
+    return matrix
+
+
+def _one_by_one(values: Mapping[str, Any]) -> Floats | None:
     # One by one, the second as RealSense names them, the third as nerfstudio does
     for names in (
         ("fx", "fy", "cx", "cy"),
         ("fx", "fy", "ppx", "ppy"),
-        ("fl_x", "fl_y", "cx", "cy"),
+        ("flx", "fly", "cx", "cy"),
     ):
         if all(_is_number(values.get(name)) for name in names):
             return _pinhole(*(float(values[name]) for name in names))
-    if (focal := _numbers(values.get("focal_length"))).size == 2:
-        middle = _numbers(values.get("principal_point"))
+    if (focal := _numbers(values.get("focallength"))).size == 2:
+        middle = _numbers(values.get("principalpoint"))
         return _pinhole(*focal, *middle) if middle.size == 2 else None
-    for name in MATRICES:
+    return None
+
+
+def _named(values: Mapping[str, Any], behind: Iterable[str]) -> Floats | None:
+    """Return the matrix under a name of its own, with one of these endings."""
+    for name in (f"{name}{which}" for name in MATRICES for which in behind):
         value = values.get(name)
         if isinstance(value, Mapping):
-            value = _matrix({str(key).lower(): each for key, each in value.items()})
+            value = _matrix(_plain(value))
         numbers = _numbers(value)
         if numbers.size == 9:
             matrix = numbers.reshape(3, 3)
@@ -191,15 +210,20 @@ def _matrix(values: Mapping[str, Any]) -> Floats | None:
 
 
 def _distortion(values: Mapping[str, Any]) -> Floats:
-    others = [name for name in values if name.startswith("dist") and name != "distortion_model"]
-    for name in (*DISTORTIONS, *others):
+    if "radialdistortion" in values:  # MATLAB's
+        k1, k2, k3 = np.resize([*_numbers(values["radialdistortion"]), 0.0, 0.0, 0.0], 3)
+        p1, p2 = np.resize([*_numbers(values.get("tangentialdistortion")), 0.0, 0.0], 2)
+        return np.array([k1, k2, p1, p2, k3])
+    others = [name for name in values if name.startswith("dist") and name != "distortionmodel"]
+    named = [f"{name}{which}" for name in DISTORTIONS for which in _FIRST]
+    for name in (*named, *others):
         value = values.get(name)
         if isinstance(value, Mapping):
-            known = {str(key).lower(): each for key, each in value.items()}
+            known = _plain(value)
             value = known.get("data", _in_order(known))
         if (numbers := _numbers(value)).size:
             return numbers
-    if "k1" in values:
+    if _is_number(values.get("k1")):
         return _numbers(_in_order(values))
     return np.zeros(0)
 
@@ -211,7 +235,7 @@ def _in_order(values: Mapping[str, Any]) -> list[Any]:
 
 
 def _require_opencv(path: Path, values: Mapping[str, Any]) -> None:
-    named = [str(values.get(name, "")).lower() for name in ("distortion_model", "model")]
+    named = [str(values.get(name, "")).lower() for name in ("distortionmodel", "model")]
     # In the name of a model whose coefficients are not OpenCV's
     words = ("equidistant", "fisheye", "kannala", "fov", "inverse", "omni", "ds", "eucm")
     other = next((name for name in named if any(word in name for word in words)), None)

@@ -9,11 +9,12 @@ from __future__ import annotations
 import io
 import resource
 import sys
+from collections.abc import Iterator
 from typing import Any
 
 
 def main() -> None:
-    """Parse, and write the arrays of numbers."""
+    """Parse, and write the arrays of numbers, those in structures too."""
     memory = 4 << 30  # libraries reserve much that they never use [bytes]
     resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -21,7 +22,7 @@ def main() -> None:
     from scipy.io import loadmat
 
     values = loadmat(io.BytesIO(sys.stdin.buffer.read())).items()
-    numbers = ((n, v) for n, v in values if isinstance(v, np.ndarray) and v.dtype.kind in "iuf")
+    numbers = (each for name, value in values for each in _numbers(name, value))
     # The prefix keeps arrays apart from arguments of savez
     arrays: dict[str, Any] = {"of_" + name: array for name, array in numbers}
     largest = 1 << 28  # [bytes]
@@ -30,6 +31,16 @@ def main() -> None:
     out = io.BytesIO()
     np.savez(out, **arrays)
     sys.stdout.buffer.write(out.getvalue())
+
+
+def _numbers(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """Yield an array of numbers with its name; of a structure each, behind a dot."""
+    kind = getattr(getattr(value, "dtype", None), "kind", "")
+    if kind in ("i", "u", "f"):
+        yield name, value
+    elif kind == "V" and value.dtype.names and value.size == 1:
+        for field in value.dtype.names:
+            yield from _numbers(f"{name}.{field}", value[field].item())
 
 
 if __name__ == "__main__":

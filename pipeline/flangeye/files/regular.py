@@ -6,6 +6,7 @@ import os
 import stat
 import tempfile
 from contextlib import suppress
+from io import BufferedReader
 from pathlib import Path
 from typing import BinaryIO
 
@@ -13,6 +14,8 @@ from flangeye.errors import FlangeyeError, StageError
 
 MAX_TEXT = 64_000_000
 """Longest table, list of poses or JSON file [bytes]: a million poses."""
+_POINTER = b"version https://git-lfs.github.com/spec/"
+"""How the stand-in of a file begins that Git Large File Storage keeps elsewhere."""
 
 
 def open_regular(path: Path, error: type[FlangeyeError] = StageError) -> BinaryIO:
@@ -23,9 +26,33 @@ def open_regular(path: Path, error: type[FlangeyeError] = StageError) -> BinaryI
         error: What to raise.
 
     Raises:
-        FlangeyeError: Of the given sort: it does not exist, cannot be read, or is a folder, a
-            device, a FIFO or a socket.
+        FlangeyeError: Of the given sort: it does not exist, cannot be read, is a folder, a device,
+            a FIFO or a socket, or stands in for a file that Git LFS keeps elsewhere.
     """
+    file = _opened(path, error)
+    if _stands_in(file):
+        file.close()
+        raise error(f"{path}: is a Git LFS pointer, not the file itself; fetch it: git lfs pull")
+    return file
+
+
+def is_pointer(path: Path) -> bool:
+    """Return whether a file stands in for one that Git LFS keeps elsewhere."""
+    try:
+        with _opened(path, StageError) as file:
+            return _stands_in(file)
+    except StageError:
+        return False
+
+
+def _stands_in(file: BufferedReader) -> bool:
+    try:
+        return file.peek(len(_POINTER)).startswith(_POINTER)
+    except OSError:  # said by who reads it
+        return False
+
+
+def _opened(path: Path, error: type[FlangeyeError]) -> BufferedReader:
     try:
         # Not every system has all of them
         flags = os.O_RDONLY | sum(
@@ -55,8 +82,6 @@ def read_regular(
             raw = file.read(limit + 1)
         except OSError as failure:
             raise error(f"{path}: cannot be read: {_reason(failure)}") from None
-    if raw.startswith(b"version https://git-lfs.github.com/spec/"):
-        raise error(f"{path}: is a Git LFS pointer, not the file itself; fetch it: git lfs pull")
     if len(raw) > limit:
         raise error(f"{path}: is larger than {limit} bytes, the most that is read of such a file")
     return raw

@@ -40,9 +40,6 @@ def read_head(path: Path) -> bytes:
         head = file.read(65536)
     if not head:
         refuse(path, "is empty (0 bytes)")
-    # The stand-in of a file that Git Large File Storage keeps elsewhere begins so
-    if head.startswith(b"version https://git-lfs.github.com/spec/"):
-        refuse(path, "is a Git LFS pointer, not the file itself; fetch it: git lfs pull")
     return head
 
 

@@ -142,8 +142,14 @@ def _matlab(file: Path) -> TableDocument:
     if done.returncode:
         raise ValueError(done.stderr.decode("utf-8", "replace"))
     found = np.load(io.BytesIO(done.stdout), allow_pickle=False)
-    arrays = {n.removeprefix("of_"): array for n, array in found.items()}
-    return TableDocument(arrays, lambda at: f"{file}: row {at + 1}")
+    data: dict[str, Any] = {}
+    for name, array in found.items():
+        *structures, last = name.removeprefix("of_").split(".")
+        place = data
+        for each in structures:
+            place = place.setdefault(each, {})
+        place[last] = array
+    return TableDocument(data, lambda at: f"{file}: row {at + 1}")
 
 
 KINDS: Mapping[str, Callable[[Path], TableDocument]] = {

@@ -181,7 +181,14 @@ def _missing(survey: FolderSurvey, reason: StageError) -> str:
     closed = survey.of((".parquet", ".feather", ".pkl", ".pickle", ".xlsx", ".xls", ".ods"))
     if closed:
         return f"{survey.folder}: {closed[0].name} is a table that is not read; save it as .csv"
-    return f"{survey.folder}: holds no scans and no table of poses; {reason}"
+    some = 6  # names that a line shows
+    named = [str(path.relative_to(survey.folder)) for path in survey.files]
+    more = f" and {len(named) - some} more" if len(named) > some else ""
+    return (
+        f"{survey.folder}: no scans and no table of poses in {', '.join(named[:some])}{more}; "
+        "write the poses as .csv, a row each, or name the reader that knows them: --reader NAME "
+        "('flangeye stages reader' lists them)"
+    )
 
 
 def _convertible(survey: FolderSurvey, count: int) -> RecipeError | None:

@@ -12,6 +12,7 @@ from pathlib import Path
 from flangeye.errors import FlangeyeError, RecipeError, StageError
 from flangeye.files.cameras import cameras_in
 from flangeye.files.clouds import CONVERSIONS
+from flangeye.files.regular import is_pointer
 from flangeye.files.scans import CLOUDS, IMAGES, VENDOR, natural, texts_of_points
 from flangeye.files.tables import KINDS, Table, number_of, read_table, tables_in
 from flangeye.recipe.draft.headings import list_name, list_sizes
@@ -165,6 +166,11 @@ def look(folder: Path) -> FolderSurvey:
     files = sorted(found, key=lambda path: natural(str(path)))
     if not any(folder.iterdir()):
         raise RecipeError(f"{folder}: is empty; put the clouds or images and their poses there")
+    if pointers := [path for path in files if is_pointer(path)]:
+        raise RecipeError(
+            f"{folder}: {len(pointers)} of {len(files)} files are Git LFS pointers, not the files "
+            f"themselves, such as {pointers[0].name}; fetch them: git lfs pull"
+        )
     with suppress(StageError):
         cameras = {camera.path for camera in cameras_in(folder)}
     points = texts_of_points(files)
