@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from nicegui import ui
 
 from flangeye.report.look import LIGHT, LOGO, css
+from flangeye.result import SIMULATED
 
 if TYPE_CHECKING:
     from flangeye_ui.project import Project
@@ -26,7 +27,6 @@ BESIDE = {
     "Watch": ("/watch", "See whether stored calibrations still hold."),
     "Archive": ("/archive", "Compare the sessions of this folder and look into their scans."),
 }
-SIMULATED = "SIMULATED: no real arm or scanner; the figures are the simulation's."
 
 
 class ActionBar:

@@ -40,20 +40,14 @@ from flangeye_ui import (
 )
 from flangeye_ui.project import MoveCodes, Project
 
-PAGES = (
-    cell_page, poses_page, scan_page, result_page, use_page, watch_page, archive_page, scene,
-)  # fmt: skip
 DENIED = "wrong, used or missing token: open the address that 'flangeye ui' printed last"
 
-POLICY = (
-    "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; "
-    "style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; frame-ancestors 'none'; "
-    "base-uri 'none'; form-action 'none'; object-src 'none'"
-)
-"""Of the page itself: Vue compiles its templates in the browser, which asks for the unsafe ones."""
-
 HEADERS = {
-    "content-security-policy": POLICY,
+    # Vue compiles its templates in the browser, which asks for the unsafe ones.
+    "content-security-policy": "default-src 'self'; "
+    "script-src 'self' 'unsafe-inline' 'unsafe-eval'; style-src 'self' 'unsafe-inline'; "
+    "img-src 'self' data: blob:; frame-ancestors 'none'; base-uri 'none'; form-action 'none'; "
+    "object-src 'none'",
     "x-content-type-options": "nosniff",
     "referrer-policy": "no-referrer",
     "cross-origin-opener-policy": "same-origin",
@@ -61,8 +55,6 @@ HEADERS = {
     "x-frame-options": "DENY",
 }
 """Of every answer that has none of its own."""
-
-SOCKET = "/_nicegui_ws/"
 
 
 def serve(folder: Path, registry: Registry, host: str, port: int, browser: bool) -> None:
@@ -84,7 +76,9 @@ def serve(folder: Path, registry: Registry, host: str, port: int, browser: bool)
     at = f"http://{f'[{host}]' if ':' in host else host}:{port}/?token="
     keys = Keys(lambda token: say(f"for another browser, once: {at}{token}"))
     project = Project(folder.resolve(), registry, MoveCodes(say))
-    for each in PAGES:
+    for each in (
+        cell_page, poses_page, scan_page, result_page, use_page, watch_page, archive_page, scene,
+    ):  # fmt: skip
         each.add(project)
     foreign.add(project.folder)
     app.add_middleware(Gate, keys=keys, host=host, port=port)
@@ -226,7 +220,7 @@ class Gate:
         inside = scope["path"].startswith(f"{self._keys.path}/")
         if not inside or not self._keys.known(headers):
             return PlainTextResponse(f"{DENIED}\n", 403)
-        if scope["type"] == "http" and scope["path"].startswith(self._keys.path + SOCKET):
+        if scope["type"] == "http" and scope["path"].startswith(f"{self._keys.path}/_nicegui_ws/"):
             return PlainTextResponse("web sockets only\n", 403)  # they alone always name an origin
         return None
 

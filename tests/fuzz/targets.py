@@ -589,10 +589,10 @@ def _read_live(kind):
         from flangeye_plugins.scanner.opened import cloud_of
 
         uses = {
-            messages.CLOUD: lambda told: cloud_of(messages.cloud_of(told), 1.0),
-            messages.IMAGE: lambda told: (messages.values_of(told), messages.pixels_of(told)),
-            messages.COMPRESSED: messages.pixels_of, messages.INFO: messages.intrinsics_of,
-            messages.JOINT_STATE: messages.positions_of,
+            messages.Type.CLOUD: lambda told: cloud_of(messages.cloud_of(told), 1.0),
+            messages.Type.IMAGE: lambda told: (messages.values_of(told), messages.pixels_of(told)),
+            messages.Type.COMPRESSED: messages.pixels_of, messages.Type.INFO: messages.intrinsics_of,
+            messages.Type.JOINT_STATE: messages.positions_of,
         }  # fmt: skip
         data = path.read_bytes()
         messages.stamp_of(data), messages.frame_of(data)

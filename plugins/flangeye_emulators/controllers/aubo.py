@@ -162,11 +162,8 @@ class AuboController(ControlUnit):
         return {"robot_mode": self.robot_mode, "safety": self.safety}
 
 
-MARK = b"SOF\x01"
-
-
-_LENGTH = struct.Struct(">I")
-_HEADER = len(MARK) + _LENGTH.size
+MARK, _HEADER = b"SOF\x01", struct.Struct(">4sI")
+"""What begins a frame: the mark, and the length of what follows."""
 ROBOT = "rob1"
 
 
@@ -195,22 +192,22 @@ class RpcSession(Connection):
     def received(self, data: bytes) -> None:
         """Answer each whole frame."""
         self._buffer += data
-        while len(self._buffer) >= _HEADER:
-            (length,) = _LENGTH.unpack_from(self._buffer, len(MARK))
+        while len(self._buffer) >= _HEADER.size:
+            mark, length = _HEADER.unpack_from(self._buffer)
             # Bytes of a body after which a client is cut off
-            if not self._buffer.startswith(MARK) or length > 1 << 20:
+            if mark != MARK or length > 1 << 20:
                 self.abort()
                 return
-            if len(self._buffer) < _HEADER + length:
+            end = _HEADER.size + length
+            if len(self._buffer) < end:
                 return
-            body = self._buffer[_HEADER : _HEADER + length]
-            self._buffer = self._buffer[_HEADER + length :]
+            body, self._buffer = self._buffer[_HEADER.size : end], self._buffer[end:]
             self.send(frame(answer(self._box, body)))
 
 
 def frame(body: bytes) -> bytes:
     """Return a body with its mark and length."""
-    return MARK + _LENGTH.pack(len(body)) + body
+    return _HEADER.pack(MARK, len(body)) + body
 
 
 def answer(box: AuboController, body: bytes) -> bytes:

@@ -36,18 +36,6 @@ def _words(text: str) -> frozenset[str]:
 
 
 _PYTHON = _words(" ".join(keyword.kwlist))
-_URSCRIPT = _PYTHON | _words("end halt local then thread")
-_RAPID = _words(
-    "alias and backward case connect const default div do else elseif endfor endfunc endif "
-    "endmodule endproc endrecord endtest endtrap endwhile error exit false for from func goto if "
-    "inout local mod module nostepin not noview or pers proc raise readonly record retry return "
-    "step sysmodule test then to trap true trynext undo var viewonly while with xor"
-)
-_VAL3 = _words(
-    "and begin bool call case default dio do else elseif end endfor endif endswitch endwhile false "
-    "for frame if joint mdesc not num or point program return sio start stop string switch then to "
-    "tool trsf true until wait while xor"
-)
 
 
 @dataclass(frozen=True)
@@ -98,7 +86,7 @@ CONTROLLERS = {
         "a URScript file; the pose of a feature, relative to {sort}",
         CONVENTIONS["ur"].in_units("m", "rad"),
         ("the base", "the flange: pose_trans(get_actual_tcp_pose(), …)"),
-        reserved=_URSCRIPT,
+        reserved=_PYTHON | _words("end halt local then thread"),
     ),
     "kuka": ControllerFormat(
         "Write a KUKA base, or a tool where the arm carries the camera.",
@@ -120,7 +108,13 @@ CONTROLLERS = {
         "load the module; robhold is TRUE where the arm carries the camera",
         "abb",
         ("FALSE", "TRUE"),
-        reserved=_RAPID,
+        reserved=_words(
+            "alias and backward case connect const default div do else elseif endfor endfunc "
+            "endif endmodule endproc endrecord endtest endtrap endwhile error exit false for from "
+            "func goto if inout local mod module nostepin not noview or pers proc raise readonly "
+            "record retry return step sysmodule test then to trap true trynext undo var viewonly "
+            "while with xor"
+        ),
     ),
     "fanuc": ControllerFormat(
         "Write the numbers of a Fanuc user frame, or of a tool frame where the arm carries it.",
@@ -152,7 +146,11 @@ CONTROLLERS = {
         "a line of VAL 3; declare it a {sort}",
         "staubli",
         ("frame, its father world", "tool, its father flange"),
-        reserved=_VAL3,
+        reserved=_words(
+            "and begin bool call case default dio do else elseif end endfor endif endswitch "
+            "endwhile false for frame if joint mdesc not num or point program return sio start "
+            "stop string switch then to tool trsf true until wait while xor"
+        ),
     ),
     "doosan": ControllerFormat(
         "Write the pose as a DRL variable, as user coordinates and tools take it.",

@@ -20,7 +20,7 @@ from flangeye.errors import StageError
 from flangeye.files.paths import find_named, settings_file
 from flangeye.files.processes import Pipe, PipeEndedError, busy, python_command
 from flangeye.models.graph import Topic
-from flangeye_plugins.ros2.messages import CLOCK, CLOCK_TYPE, stamp_of, types
+from flangeye_plugins.ros2.messages import Type, stamp_of, types
 
 PROGRAM = "ros2"
 """The entry of this machine's settings that names the Python which has rclpy."""
@@ -95,7 +95,7 @@ class Bridge(Device):
             self.middleware = str(self._answer({}, 30.0))
             self._began = time.monotonic()
             if sim_time:
-                self.follow(CLOCK, CLOCK_TYPE)
+                self.follow("/clock", Type.CLOCK)
         except DeviceError:
             self.close()
             raise
@@ -199,14 +199,14 @@ class Bridge(Device):
             )
         if not self._sim_time:
             return stamp - message.ahead_ns
-        tick = self.newest(CLOCK)
+        tick = self.newest("/clock")
         return (
             message.received_ns if tick is None else tick.received_ns + stamp - stamp_of(tick.data)
         )
 
     def stamp_ns(self, local_ns: int) -> int:
         """Return the message stamp that belongs to a time of ``time.monotonic_ns``."""
-        tick = self.newest(CLOCK) if self._sim_time else None
+        tick = self.newest("/clock") if self._sim_time else None
         if tick is None:
             return local_ns + time.time_ns() - time.monotonic_ns()
         return stamp_of(tick.data) + local_ns - tick.received_ns

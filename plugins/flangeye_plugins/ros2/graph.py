@@ -27,14 +27,8 @@ from flangeye.models.urdf import MAX_BYTES, NAMED, UrdfArm, arm_of, flange_links
 from flangeye.types import CAMERA, CalibratedPose, Floats
 from flangeye_plugins.ros2.client import MATCHING, Bridge, GraphMessage
 from flangeye_plugins.ros2.messages import (
-    CLOCK,
-    CLOUD,
-    IMAGE,
-    JOINT_STATE,
     PER_METRE,
-    TEXT,
-    TRAJECTORY,
-    TRIGGER,
+    Type,
     decoded,
     encoded,
     frame_of,
@@ -42,7 +36,7 @@ from flangeye_plugins.ros2.messages import (
     positions_of,
 )
 
-TF, STATIC, TF_TYPE = "/tf", "/tf_static", "tf2_msgs/msg/TFMessage"
+TF, STATIC = "/tf", "/tf_static"
 
 
 class StampedFrame(NamedTuple):
@@ -70,9 +64,9 @@ class Frames:
         self._asker, self._bridge = bridge.asker, bridge
         bridge.wait_until_known()  # those that stand may be found after those that move
         if moving:
-            bridge.follow(TF, TF_TYPE, take=self._moving)
+            bridge.follow(TF, Type.TF, take=self._moving)
         if STATIC in bridge.topics():
-            bridge.follow(STATIC, TF_TYPE, take=self._standing)
+            bridge.follow(STATIC, Type.TF, take=self._standing)
 
     def root(self, name: str) -> str:
         """Return the frame at the top of a frame's tree."""
@@ -141,7 +135,7 @@ class Frames:
         self._take(message, None)
 
     def _take(self, message: GraphMessage, received_ns: int | None) -> None:
-        for each in decoded(message.data, TF_TYPE).transforms:
+        for each in decoded(message.data, Type.TF).transforms:
             turn, move = each.transform.rotation, each.transform.translation
             xyzw, place = [turn.x, turn.y, turn.z, turn.w], [move.x, move.y, move.z]
             # A quaternion whose norm is off by more is none, and tf2 leaves such a transform out as
@@ -206,7 +200,10 @@ class Ros2Graph(Device):
             RecipeError: The URDF does not tell which link is the base.
         """
         topics = self.topics()
-        if not any(t.publishers and t.type in (TEXT, JOINT_STATE, CLOUD, IMAGE) for t in topics):
+        if not any(
+            t.publishers and t.type in (Type.TEXT, Type.JOINT_STATE, Type.CLOUD, Type.IMAGE)
+            for t in topics
+        ):
             raise DeviceError(
                 f"ROS 2: no arm and no camera runs {self._bridge.place}: start their drivers, or "
                 "set both variables here as in their terminals"
@@ -219,7 +216,7 @@ class Ros2Graph(Device):
         scans = scans_of(heard, ask)
         driver = arm_driver(topics, found.joints, states, ask)
         camera = scanner_driver(scans, self._triggers(), ask)
-        if any(topic.name == CLOCK and topic.publishers for topic in topics):
+        if any(topic.name == "/clock" and topic.publishers for topic in topics):
             for params in (camera, *driver.values()):
                 params["sim_time"] = True
         base, frame = found.base, scans.frame or CAMERA
@@ -247,7 +244,7 @@ class Ros2Graph(Device):
                 ``tf2_msgs``.
         """
         tree = self._tree()
-        self._bridge.offer(STATIC, TF_TYPE, latched=True)
+        self._bridge.offer(STATIC, Type.TF, latched=True)
         told, transforms = [], []
         for each in (pose.transform, *pose.others):
             parent, child = (frames.get(n, n) for n in (each.parent, each.child))
@@ -260,7 +257,7 @@ class Ros2Graph(Device):
             matrix = each.matrix @ invert(tree.pose(root, child))
             transforms.append(self._stamped(parent, root, matrix))
             told.append(f"{parent} to {root}" + (f", which carries {child}" * (root != child)))
-        self._bridge.publish(STATIC, encoded(message(TF_TYPE, transforms=transforms)))
+        self._bridge.publish(STATIC, encoded(message(Type.TF, transforms=transforms)))
         return told
 
     def stay(self) -> None:
@@ -275,7 +272,9 @@ class Ros2Graph(Device):
         """Return the services that may take a scan, by type and name; none that switches an arm."""
         words = r"capture|trigger|acquire|scan|grab|snap|frame"
         services = self._bridge.services().items()
-        return [s for s, kind in services if kind == TRIGGER and re.search(words, s, re.IGNORECASE)]
+        return [
+            s for s, kind in services if kind == Type.TRIGGER and re.search(words, s, re.IGNORECASE)
+        ]
 
     def _description(self, topics: Sequence[Topic], ask: Ask) -> str:
         """Return the URDF that a node publishes, or of a file."""
@@ -284,24 +283,28 @@ class Ros2Graph(Device):
         chosen = ask("robot", question, known[0] if len(known) == 1 else None, "arm.urdf")
         if chosen not in known:
             return read_text(Path(chosen), MAX_BYTES, DeviceError)
-        self._bridge.follow(chosen, TEXT)
+        self._bridge.follow(chosen, Type.TEXT)
         latched = self._bridge.wait(chosen, 0, self.counted)
         if latched is None:
             raise DeviceError(
                 f"{chosen}: nothing came within {self.counted:g} s; --robot takes a file"
             )
-        return str(decoded(latched.data, TEXT).data)
+        return str(decoded(latched.data, Type.TEXT).data)
 
     def _listen(self, topics: Sequence[Topic]) -> list[Heard]:
         """Count the messages of all arms and cameras at once."""
-        some = [t for t in topics if t.publishers and t.type in (JOINT_STATE, CLOUD, IMAGE)]
+        some = [
+            t
+            for t in topics
+            if t.publishers and t.type in (Type.JOINT_STATE, Type.CLOUD, Type.IMAGE)
+        ]
         joints: dict[str, dict[str, float]] = {topic.name: {} for topic in some}
 
         def take(name: str, message: GraphMessage) -> None:
-            joints[name].update(decoded(message.data, JOINT_STATE, positions_of))
+            joints[name].update(decoded(message.data, Type.JOINT_STATE, positions_of))
 
         for topic in some:
-            moves = topic.type == JOINT_STATE
+            moves = topic.type == Type.JOINT_STATE
             hears = partial(take, topic.name) if moves else None
             self._bridge.follow(topic.name, topic.type, always=moves, take=hears)
             self._bridge.want(topic.name)
@@ -368,11 +371,11 @@ class Heard(NamedTuple):
     @property
     def has_scans(self) -> bool:
         """Whether it has clouds or depths: by an image's encoding, or its name where none came."""
-        if self.topic.type != IMAGE:
-            return self.topic.type == CLOUD
+        if self.topic.type != Type.IMAGE:
+            return self.topic.type == Type.CLOUD
         if self.newest is None:
             return "depth" in self.topic.name
-        return decoded(self.newest.data, IMAGE).encoding in PER_METRE
+        return decoded(self.newest.data, Type.IMAGE).encoding in PER_METRE
 
     @property
     def line(self) -> str:
@@ -385,13 +388,13 @@ class Heard(NamedTuple):
 
 def descriptions_in(topics: Iterable[Topic]) -> list[str]:
     """Return the topics that have an arm's URDF."""
-    texts = (t.name for t in topics if t.type == TEXT and t.publishers)
+    texts = (t.name for t in topics if t.type == Type.TEXT and t.publishers)
     return [name for name in texts if name.endswith("robot_description")]
 
 
 def controllers_in(topics: Iterable[Topic]) -> list[str]:
     """Return the topics on which a controller takes joint trajectories."""
-    return [t.name for t in topics if t.type == TRAJECTORY and t.subscribers]
+    return [t.name for t in topics if t.type == Type.TRAJECTORY and t.subscribers]
 
 
 def described_arm(text: str, path: Path, ask: Ask) -> tuple[UrdfArm, dict[str, Any]]:
@@ -431,7 +434,7 @@ def states_of(heard: Sequence[Heard], joints: Sequence[str]) -> tuple[str, Float
     Raises:
         DeviceError: None has; says which joints each has.
     """
-    states = [each for each in heard if each.topic.type == JOINT_STATE and each.newest]
+    states = [each for each in heard if each.topic.type == Type.JOINT_STATE and each.newest]
     for each in sorted(states, key=lambda each: not each.topic.name.endswith("joint_states")):
         if set(joints) <= set(each.joints):
             return each.topic.name, np.array([each.joints[joint] for joint in joints])
@@ -465,7 +468,7 @@ def scans_of(heard: Sequence[Heard], ask: Ask) -> Heard:
         DeviceError: There is none, or not the one that was asked for.
     """
     every = {each.topic.name: each for each in heard if each.has_scans}
-    found = [n for n, each in every.items() if each.topic.type == CLOUD] or [*every]
+    found = [n for n, each in every.items() if each.topic.type == Type.CLOUD] or [*every]
     chosen = ask("scans", f"which topic has the scans ({', '.join(found)})", _only(found, None))
     if chosen not in every:
         raise DeviceError(
@@ -483,7 +486,9 @@ def scanner_driver(scans: Heard, triggers: Iterable[str], ask: Ask) -> dict[str,
         triggers: Services that may take one.
         ask: For which does.
     """
-    params: dict[str, Any] = {"cloud" if scans.topic.type == CLOUD else "depth": scans.topic.name}
+    params: dict[str, Any] = {
+        "cloud" if scans.topic.type == Type.CLOUD else "depth": scans.topic.name
+    }
     if scans.newest is None:
         namespace = f"/{scans.topic.name.split('/')[1]}/"
         likely = [t for t in triggers if t.startswith(namespace)] or [*triggers]

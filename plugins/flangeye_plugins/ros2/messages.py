@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
+from enum import StrEnum
 from functools import cache
 from typing import Any
 
@@ -15,12 +16,22 @@ from flangeye.files.images import decode_image
 from flangeye.files.words import reason_of
 from flangeye.types import Floats, Singles
 
-JOINT_STATE, TRAJECTORY = "sensor_msgs/msg/JointState", "trajectory_msgs/msg/JointTrajectory"
-CLOUD, IMAGE, COMPRESSED, INFO = (
-    f"sensor_msgs/msg/{name}" for name in ("PointCloud2", "Image", "CompressedImage", "CameraInfo")
-)
-TEXT, EMPTY, TRIGGER = "std_msgs/msg/String", "std_msgs/msg/Empty", "std_srvs/srv/Trigger"
-CLOCK, CLOCK_TYPE = "/clock", "rosgraph_msgs/msg/Clock"
+
+class Type(StrEnum):
+    """The types of messages and services that are spoken."""
+
+    JOINT_STATE = "sensor_msgs/msg/JointState"
+    TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
+    CLOUD = "sensor_msgs/msg/PointCloud2"
+    IMAGE = "sensor_msgs/msg/Image"
+    COMPRESSED = "sensor_msgs/msg/CompressedImage"
+    INFO = "sensor_msgs/msg/CameraInfo"
+    TF = "tf2_msgs/msg/TFMessage"
+    CLOCK = "rosgraph_msgs/msg/Clock"
+    TEXT = "std_msgs/msg/String"
+    EMPTY = "std_msgs/msg/Empty"
+    TRIGGER = "std_srvs/srv/Trigger"
+
 
 SHORTEST = 12
 """A message with a time has four bytes of encapsulation, seconds and nanoseconds."""

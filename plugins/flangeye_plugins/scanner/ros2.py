@@ -18,13 +18,8 @@ from flangeye.plugin.stage import Params, part
 from flangeye.types import Floats, Image
 from flangeye_plugins.ros2.client import Bridge, GraphMessage
 from flangeye_plugins.ros2.messages import (
-    CLOUD,
-    COMPRESSED,
-    EMPTY,
-    IMAGE,
-    INFO,
     PER_METRE,
-    TRIGGER,
+    Type,
     cloud_of,
     decoded,
     frame_of,
@@ -121,7 +116,8 @@ class Ros2Scanner(OpenScanner):
         self._bridge, self._params = bridge, params
         self._kinds: dict[str, str] = {}
         for topic, kinds in (
-            (params.cloud, [CLOUD]), (params.depth, [IMAGE]), (params.image, [IMAGE, COMPRESSED]),
+            (params.cloud, [Type.CLOUD]), (params.depth, [Type.IMAGE]),
+            (params.image, [Type.IMAGE, Type.COMPRESSED]),
         ):  # fmt: skip
             if topic:
                 runs = bridge.awaited(partial(_running, bridge, topic))
@@ -129,7 +125,7 @@ class Ros2Scanner(OpenScanner):
                 bridge.follow(topic, self._kinds[topic], always=False)
         self._looks = bool(params.depth or params.image)
         if self._looks:
-            bridge.follow(params.info, INFO)
+            bridge.follow(params.info, Type.INFO)
             if not params.trigger:  # else it may come with the first scan
                 self._camera(time.monotonic() + params.timeout)
         self._calls = bool(params.trigger) and self._find_trigger(str(params.trigger))
@@ -195,14 +191,14 @@ class Ros2Scanner(OpenScanner):
                 "names another topic"
             )
         rectified = "rect" in str(self._params.depth or self._params.image).rpartition("/")[2]
-        info = decoded(message.data, INFO)
+        info = decoded(message.data, Type.INFO)
         pinholes = ("", "plumb_bob", "rational_polynomial")  # whose coefficients are OpenCV's
         if info.distortion_model not in pinholes:
             raise DeviceError(
                 f"{NAME}: {topic} has the distortion model {info.distortion_model}; known: "
                 f"{', '.join(pinholes[1:])}: rectify the images (image_proc) and name those"
             )
-        matrix, lens = decoded(message.data, INFO, partial(intrinsics_of, rectified=rectified))
+        matrix, lens = decoded(message.data, Type.INFO, partial(intrinsics_of, rectified=rectified))
         # Numbers of coefficients that OpenCV takes
         if not (matrix[0, 0] > 0 and matrix[1, 1] > 0 and len(lens) in (0, 4, 5, 8, 12, 14)):
             raise DeviceError(
@@ -221,17 +217,17 @@ class Ros2Scanner(OpenScanner):
         found = self._bridge.awaited(
             lambda: self._bridge.services().get(trigger) or _running(self._bridge, trigger)
         )
-        if found == TRIGGER:
+        if found == Type.TRIGGER:
             self._bridge.find(trigger)
             return True
-        if not isinstance(found, Topic) or found.type != EMPTY:
+        if not isinstance(found, Topic) or found.type != Type.EMPTY:
             services = self._bridge.services().items()
-            known = sorted(name for name, kind in services if kind == TRIGGER)
+            known = sorted(name for name, kind in services if kind == Type.TRIGGER)
             raise DeviceError(
-                f"{NAME}: {trigger} is neither a service nor a topic of {EMPTY} that runs; "
-                f"services of type {TRIGGER}: {', '.join(known) or 'none'}"
+                f"{NAME}: {trigger} is neither a service nor a topic of {Type.EMPTY} that runs; "
+                f"services of type {Type.TRIGGER}: {', '.join(known) or 'none'}"
             )
-        self._bridge.offer(trigger, EMPTY)
+        self._bridge.offer(trigger, Type.EMPTY)
         self._bridge.awaited(lambda: self._bridge.listeners(trigger))
         return False
 
@@ -290,10 +286,10 @@ class Ros2Scanner(OpenScanner):
     def _points(self, taken: dict[str, GraphMessage], camera: Camera | None) -> Floats:
         """Return the scan's points (H, W, 3) or (N, 3) [m]; none where there is an image alone."""
         if cloud := self._params.cloud:
-            return decoded(taken[cloud].data, CLOUD, cloud_of)  # type: ignore[no-any-return]
+            return decoded(taken[cloud].data, Type.CLOUD, cloud_of)  # type: ignore[no-any-return]
         if not (depth := self._params.depth) or not camera:
             return np.zeros((0, 3))
-        depths = decoded(taken[depth].data, IMAGE, partial(_metres, depth))
+        depths = decoded(taken[depth].data, Type.IMAGE, partial(_metres, depth))
         self._require_size(depth, depths, camera)
         view = DepthView(camera.matrix.tolist(), camera.distortion.tolist())
         return view.points(depths)  # type: ignore[return-value]

@@ -17,7 +17,7 @@ from flangeye_plugins.robot.ros2.driver import (
     robot_ros2_freedrive,
 )
 from flangeye_plugins.ros2.client import Bridge
-from flangeye_plugins.ros2.messages import INFO, JOINT_STATE, decoded, positions_of
+from flangeye_plugins.ros2.messages import Type, decoded, positions_of
 from flangeye_plugins.scanner.ros2 import Ros2ScannerParams as Topics
 from flangeye_plugins.scanner.ros2 import scanner_ros2
 from tests.plugins.fixed import fixed
@@ -136,10 +136,10 @@ def test_a_publisher_that_comes_later_and_does_not_resend_is_heard(env):
     heard = set()
 
     def hear(message):
-        heard.update(decoded(message.data, JOINT_STATE, positions_of))
+        heard.update(decoded(message.data, Type.JOINT_STATE, positions_of))
 
     with peers(Controller(env, prefix="left_")), Bridge("a test") as bridge:
-        bridge.follow("/joint_states", JOINT_STATE, take=hear)
+        bridge.follow("/joint_states", Type.JOINT_STATE, take=hear)
         with peers(Controller(env, best_effort=True)):
             until = time.monotonic() + 10
             while not {"left_joint_1", "joint_1"} <= heard:
@@ -195,13 +195,13 @@ def test_a_camera_whose_bridge_is_killed_or_held_names_its_topic_in_one_line(env
 
 def test_an_answer_that_comes_too_late_is_not_that_to_the_next_question(env):
     with peers(Camera(env, "depth")), Bridge("a test") as bridge:
-        bridge.follow("/camera/camera_info", INFO)
+        bridge.follow("/camera/camera_info", Type.INFO)
         process = bridge._pipe._process.pid
         os.kill(process, signal.SIGSTOP)
         with pytest.raises(DeviceError, match="a test: the bridge to ROS 2 did not answer"):
             bridge.services()
         os.kill(process, signal.SIGCONT)
-        assert bridge.topics()["/camera/camera_info"].type == INFO
+        assert bridge.topics()["/camera/camera_info"].type == Type.INFO
 
 
 def test_a_camera_info_may_come_with_the_first_scan_and_has_to_fit_it(env):

@@ -17,7 +17,7 @@ from flangeye.units import in_mm
 from flangeye_plugins.robot.ros2 import pieces
 from flangeye_plugins.robot.ros2.listener import Listener, ListenParams
 from flangeye_plugins.ros2.client import Bridge
-from flangeye_plugins.ros2.messages import TRAJECTORY, encoded, message
+from flangeye_plugins.ros2.messages import Type, encoded, message
 
 RENEWAL = 0.025
 """Between two pieces of a motion [s]."""
@@ -101,7 +101,7 @@ class Ros2Arm(Listener):
         self._from, self._moved, self._renewed = np.zeros(len(params.joints)), 0.0, 0.0
         self._ended = 0.0
         super().__init__(asker, model, params, bridge)
-        bridge.offer(self._topic, TRAJECTORY)
+        bridge.offer(self._topic, Type.TRAJECTORY)
         self._require_listener()
 
     def move_joints(self, joints: Floats, speed: float, acceleration: float) -> None:
@@ -196,7 +196,7 @@ class Ros2Arm(Listener):
     def _require_listener(self) -> None:
         if not self._bridge.awaited(lambda: self._bridge.listeners(self._topic)):
             topics = self._bridge.topics().values()
-            others = [t.name for t in topics if t.type == TRAJECTORY and t.subscribers]
+            others = [t.name for t in topics if t.type == Type.TRAJECTORY and t.subscribers]
             raise DeviceError(
                 f"{self.name}: no controller listens to {self._topic}; topics of this type "
                 f"that one listens to: {', '.join(others) or 'none'}: is the controller active?"
@@ -207,8 +207,8 @@ class Ros2Arm(Listener):
         began = self._bridge.stamp_ns(time.monotonic_ns()) - round(1e9 * BEGINNING)
         stamp = message(time_type, sec=began // 10**9, nanosec=began % 10**9)
         trajectory = message(
-            TRAJECTORY, header=message(header, stamp=stamp, frame_id=""), joint_names=self._names,
-            points=[_point(p) for p in points],
+            Type.TRAJECTORY, header=message(header, stamp=stamp, frame_id=""),
+            joint_names=self._names, points=[_point(p) for p in points],
         )  # fmt: skip
         self._bridge.publish(self._topic, encoded(trajectory))
 

@@ -19,7 +19,7 @@ from flangeye.types import BASE, FLANGE, Floats, Transform
 from flangeye_plugins.robot.tool_check import require_model
 from flangeye_plugins.ros2.client import Bridge, GraphMessage
 from flangeye_plugins.ros2.graph import Frames
-from flangeye_plugins.ros2.messages import JOINT_STATE, decoded, positions_of
+from flangeye_plugins.ros2.messages import Type, decoded, positions_of
 
 
 class TfParams(Params):
@@ -90,7 +90,7 @@ class Listener(Device):
             raise DeviceError(
                 f"{asker}: joints names {len(params.joints)}, but a {model.model} has {self.arm.n}"
             )
-        bridge.follow(params.joint_states, JOINT_STATE, take=self._arrived.append)
+        bridge.follow(params.joint_states, Type.JOINT_STATE, take=self._arrived.append)
         self._frames = Frames(bridge) if params.tf else None
         if self._frames and params.tf:
             self._frames.wait_for(params.tf.base, params.tf.flange)
@@ -179,7 +179,7 @@ class Listener(Device):
         One message may have some of the joints, and another, soon after it, the others.
         """
         try:
-            told = decoded(message.data, JOINT_STATE, positions_of)
+            told = decoded(message.data, Type.JOINT_STATE, positions_of)
         except StageError as error:
             raise DeviceError(f"{self.name}: {error}") from None
         self._heard.update(told)
