@@ -14,6 +14,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from flangeye.devices import Device, DeviceError
+from flangeye.errors import StageError
 from flangeye.files.regular import read_text
 from flangeye.maths.geometry import (
     invert,
@@ -23,12 +24,14 @@ from flangeye.maths.geometry import (
 )
 from flangeye.maths.kinematics import Arm
 from flangeye.models.graph import Ask, Running, RunningCell, Topic
+from flangeye.models.scanners import ScannerData, detect_unit, median_distance
 from flangeye.models.urdf import MAX_BYTES, NAMED, UrdfArm, arm_of, flange_links, parse_urdf
-from flangeye.types import CAMERA, CalibratedPose, Floats
+from flangeye.types import CAMERA, CalibratedPose, Floats, PointCloud
 from flangeye_plugins.ros2.client import MATCHING, Bridge, GraphMessage
 from flangeye_plugins.ros2.messages import (
     PER_METRE,
     Type,
+    cloud_of,
     decoded,
     encoded,
     frame_of,
@@ -230,6 +233,7 @@ class Ros2Graph(Device):
             seen=[
                 f"{found.robot.model}: {base} to {found.flange}, {len(found.joints)} joints",
                 *(each.line for each in heard),
+                *unit_of(scans),
             ],
         )
 
@@ -476,6 +480,26 @@ def scans_of(heard: Sequence[Heard], ask: Ask) -> Heard:
             f"{', '.join(every) or 'none'} (images for markers: write scanner.ros2, image, by hand)"
         )
     return every[chosen]
+
+
+def unit_of(scans: Heard) -> list[str]:
+    """Return a warning where the newest cloud of a topic is not in metres, as ROS 2 has it."""
+    if scans.topic.type != Type.CLOUD or scans.newest is None:
+        return []
+    xyz = decoded(scans.newest.data, Type.CLOUD, cloud_of)
+    there = xyz[(xyz != 0).any(axis=-1)]  # many drivers write zeros for missing points
+    far = median_distance(PointCloud(CAMERA, there))
+    try:
+        unit = detect_unit(Path(scans.topic.name), far, ScannerData(model="a work cell's scanner"))
+    except StageError as error:
+        return [f"warning: {error}"]
+    if unit == "m":
+        return []
+    return [
+        f"warning: {scans.topic.name}: its points are {far:.4g} away (median), which are "
+        "millimetres; ROS 2 has metres (REP 103), and a run would refuse the scans: set the "
+        "camera's driver to metres, then flangeye init --ros2 again"
+    ]
 
 
 def scanner_driver(scans: Heard, triggers: Iterable[str], ask: Ask) -> dict[str, Any]:

@@ -4,7 +4,17 @@ import numpy as np
 import pytest
 
 from flangeye import StageError
-from flangeye_plugins.ros2.messages import cloud_of, message, positions_of, values_of
+from flangeye.models.graph import Topic
+from flangeye_plugins.ros2.client import GraphMessage
+from flangeye_plugins.ros2.graph import Heard, unit_of
+from flangeye_plugins.ros2.messages import (
+    Type,
+    cloud_of,
+    encoded,
+    message,
+    positions_of,
+    values_of,
+)
 
 HEADER = message(
     "std_msgs/msg/Header",
@@ -44,6 +54,21 @@ def test_a_cloud_of_one_row_or_column_is_not_organised(shape):
 def test_a_cloud_whose_size_and_bytes_differ_is_refused():
     with pytest.raises(StageError, match=r"it has 79 bytes, and 2 rows of 36 bytes \(step 36\)"):
         cloud_of(cloud(spare=7))
+
+
+@pytest.mark.parametrize(
+    ("scale", "said"),
+    [(0.1, None), (100.0, "points are 707.1 away (median), which are millimetres; ROS 2 has metres"),
+     (1e5, "/eye/points: median distance 7.07e+05 fits neither m nor mm")],
+)  # fmt: skip
+def test_init_warns_of_a_cloud_that_is_not_in_metres(scale, said):
+    given = cloud()
+    points = np.vstack([scale * XYZ.reshape(-1, 3)[:3], np.zeros((3, 3))]).astype("<f4")
+    given.data = points.view(np.uint8).ravel()
+    newest = GraphMessage(1, 0, 0, encoded(given))
+    warnings = unit_of(Heard(Topic("/eye/points", Type.CLOUD, ("eye",), 0), 10.0, newest, {}))
+    assert len(warnings) == (said is not None)
+    assert all(line.startswith("warning: /eye/points: ") and said in line for line in warnings)
 
 
 @pytest.mark.parametrize(("order", "step"), [("<", 10), (">", 6), ("<", 0)])
