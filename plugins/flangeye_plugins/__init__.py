@@ -111,6 +111,7 @@ PARTS = {
     "check.order": "flangeye_plugins.check.order:order",
     "check.clock": "flangeye_plugins.check.order:clock",
     "check.flips": "flangeye_plugins.check.outliers:flips",
+    "check.scatter": "flangeye_plugins.check.outliers:scatter",
     "check.outlier": "flangeye_plugins.check.outliers:outlier",
     "check.moved": "flangeye_plugins.check.order:moved",
     "check.tool": "flangeye_plugins.check.order:tool",

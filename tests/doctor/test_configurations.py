@@ -157,6 +157,6 @@ def test_what_cannot_show_is_said_with_the_reason() -> None:
         "check.convention": "the camera's link is where the joint angles say",
         "check.exchanged": "the camera's link is where the joint angles say",
         "check.flips": "no marker's whole pose was measured",
-        "check.size": "no marker's whole pose was measured",
+        "check.scatter": "no marker's whole pose was measured",
         "check.tool": "a constant offset of what carries the camera is part of the answer",
     }

@@ -216,6 +216,10 @@ def test_centres_of_an_unknown_place_are_solved_by_what_a_refusal_names(tmp_path
 @pytest.mark.parametrize(
     ("fault", "kind"),
     [("both inverted", "hand"),
+     pytest.param("marker inverted", "hand", marks=pytest.mark.slow),
+     pytest.param("wrong mounting", "hand", marks=pytest.mark.slow),
+     pytest.param("marker's angles off by 6 deg", "hand", marks=pytest.mark.slow),
+     pytest.param("marker's size + 0.3 %", "marker", marks=pytest.mark.slow),
      pytest.param("robot's degrees as radians", "marker", marks=pytest.mark.slow),
      pytest.param("marker's y negated", "marker", marks=pytest.mark.slow),
      pytest.param("marker's rpy as vector", "hand", marks=pytest.mark.slow)],
@@ -224,7 +228,9 @@ def test_a_fault_in_tables_is_named_and_its_line_cures(fault: str, kind: str) ->
     cells = [cell.strip() for cell in injected.row(fault, kind, 1).split("|")[1:-1]]
     status, finding, cured = cells[2], cells[5], cells[6]
     assert status != "verified"
-    assert finding in ("pose convention", "pose direction", "mirrored axis")
+    assert finding in (
+        "pose convention", "pose direction", "mirrored axis", "marker rotations", "target size",
+    )  # fmt: skip
     assert cured.startswith("verified") and float(cured.split()[1]) < 1.0
 
 

@@ -96,7 +96,7 @@ def test_both_in_the_same_wrong_unit() -> None:
     session = session_of("centres")
     both = replace(session, poses=scaled(session.poses, 1e3), centres=session.centres * 1e3)
     finding = only(both)
-    assert finding.what.endswith("both are in mm")
+    assert finding.what.endswith("m away, and in mm")
     assert "robot: {scale: 0.001}, target: {scale: 0.001}" in finding.fix
 
 
@@ -382,6 +382,58 @@ def test_targets_that_were_seen_turned_over(carried: str, axis: tuple[Any, ...])
     finding = only(replace(session, rotations=rotations))
     assert finding.name == "target flips"
     assert finding.samples == ("002", "005", "009")
+
+
+def test_the_poses_of_a_tool_that_is_turned() -> None:
+    session = session_of("flange")
+    for offset in ([0.02, 0.0, 0.15], [0.0, 0.0, 0.0]):
+        tool = rigid(rotation_exp(np.array([0.3, 0.2, 0.5])), np.array(offset))
+        finding = only(session.with_poses(session.poses @ tool))
+        assert finding.name == "tool offset"
+        assert "turned by 20 deg from the flange's axis" in finding.what
+        assert finding.fix == "configuration: {name: eye-on-base, place: unknown}"
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_mirrored_scans(axis: int) -> None:
+    session, sign = session_of("flange"), np.where(np.arange(3) == axis, -1.0, 1.0)
+    finding = only(replace(session, centres=session.centres * sign, normals=session.normals * sign))
+    assert finding.name == "mirrored axis"
+    # Mirrored along x or y: to turn the camera by half a turn is the same
+    assert ("-1.0]" in finding.fix) == (axis == 2)
+    assert finding.lines[0]["acquire.archive"]["stretch"].count(-1.0) == 1
+
+
+@pytest.mark.parametrize("carried", ["target", "camera"])
+def test_an_arm_with_an_axis_negated(carried: str) -> None:
+    session = session_of("marker", carried)
+    finding = only(session.with_poses(scaled(session.poses, np.array([1.0, -1.0, 1.0]))))
+    assert "the y of the robot's positions is negated" in finding.what
+    assert "robot: {mirrored: y}" in finding.fix
+
+
+def test_a_scanner_whose_distances_are_too_long() -> None:
+    session = session_of("flange")
+    finding = only(replace(session, centres=session.centres * 1.01))
+    assert finding.name == "scale"
+    (stretch,) = {*finding.lines[0]["acquire.archive"]["stretch"]}
+    assert stretch == pytest.approx(1 / 1.01, abs=3e-4)
+
+
+@pytest.mark.parametrize("carried", ["target", "camera"])
+def test_markers_whose_rotations_scatter_though_their_positions_fit(carried: str) -> None:
+    session = session_of("marker", carried)
+    off = rotation_exp(np.random.default_rng(0).normal(0, 0.06, (len(session), 3)))
+    finding = only(replace(session, rotations=off @ session.rotations))
+    assert finding.name == "marker rotations"
+    assert "scatter by 5" in finding.what or "scatter by 6" in finding.what
+
+
+def test_an_arm_beyond_all_reach_is_in_another_unit_whatever_else_is_wrong() -> None:
+    session = session_of("marker")
+    wrong = session.with_poses(inverted(scaled(session.poses, 1e3)))
+    found = examine(wrong, CHECKS).findings
+    assert [finding.name for finding in found] == ["unit", "pose direction"]
 
 
 @pytest.mark.parametrize("factor", [1.03, 0.9])

@@ -19,6 +19,7 @@ from flangeye.maths.pose_corrections import inverted, scaled, shifted, without_t
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.find import recipe_names
 from flangeye.recipe.load import load_recipe
+from flangeye.types import PointCloud
 from flangeye_plugins.check import CHECKS
 from tests.doctor.sessions import clean
 
@@ -132,12 +133,30 @@ def test_clouds_in_inches(tmp_path: Path) -> None:
         write_cloud(cloud, read_cloud(cloud), "in")
     (finding,) = examine(open_session(archive, REGISTRY, given), CHECKS).findings
     assert finding.name == "unit"
-    assert finding.what.endswith("0 of 8 scans show a target with unit: auto, 8 do with unit: in")
+    assert finding.what.endswith("0 of 8 scans show a target as read, 8 do with {unit: in}")
     (step,) = yaml.safe_load(finding.fix)
     corrected_session = load_recipe(
         path, REGISTRY, [f"steps.0.unit={step['acquire.archive']['unit']}"]
     )
     assert examine(open_session(archive, REGISTRY, corrected_session), CHECKS).findings == ()
+
+
+@pytest.mark.parametrize("sign", [(-1.0, 1.0, 1.0), (1.0, 1.0, -1.0)])
+def test_mirrored_clouds(tmp_path: Path, sign: tuple[float, ...]) -> None:
+    """Before the scanner, and behind it, where no step finds anything; the line cures."""
+    path = recipe_names()["ur5_phoxi-m_sample"]
+    archive = tmp_path / "mirrored"
+    given = load_recipe(path, REGISTRY)
+    shutil.copytree(given.steps[0].params.path, archive)
+    for cloud in archive.glob("*.pcd"):
+        points = read_cloud(cloud)
+        write_cloud(cloud, PointCloud(points.frame, points.xyz * np.array(sign)), "m")
+    (finding,) = examine(open_session(archive, REGISTRY, given), CHECKS).findings
+    assert finding.name == "mirrored axis"
+    stretch = finding.lines[0]["acquire.archive"]["stretch"]
+    assert stretch == list(sign)
+    mended = load_recipe(path, REGISTRY, [f"steps.0.stretch={stretch}"])
+    assert examine(open_session(archive, REGISTRY, mended), CHECKS).findings == ()
 
 
 def test_a_log_of_ours_needs_no_recipe(
@@ -217,7 +236,7 @@ def test_nothing_found_is_exit_code_zero(
 ) -> None:
     code, out, _ = run(monkeypatch, capsys, folder(session_of()))
     assert code == 0
-    assert out.splitlines()[0] == "20 of 20 samples have a target in them; 16 checks"
+    assert out.splitlines()[0] == "20 of 20 samples have a target in them; 17 checks"
     assert out.splitlines()[-1] == "nothing found"
 
 

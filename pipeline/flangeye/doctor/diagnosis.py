@@ -182,13 +182,24 @@ class RecordedSession:
         read = self.read_with(arms=arms, **correction)
         return replace(read, poses=poses, seconds=seconds, motions=None)
 
+    def stretched(self, factors: Floats) -> RecordedSession:
+        """Return the session with what was seen (3,) times as far along each axis, as read so."""
+        normals = self.normals * np.sign(factors)
+        seen = replace(self, centres=self.centres * factors, normals=normals)
+        if self.acquire == "acquire.archive":
+            earlier = np.array(self.changes.get("stretch", (1.0, 1.0, 1.0)))
+            return seen.with_changes(stretch=[float(f"{k:.6g}") for k in earlier * factors])
+        mirrored = {"mirrored": "xyz"[int(np.argmin(factors))]} if factors.min() < 0 else {}
+        scale = float(f"{np.abs(factors[0]):.6g}")
+        return seen.read_with(target=mirrored or {"scale": scale})
+
     def with_poses(self, poses: Floats) -> RecordedSession:
         """Return the session with other poses (N, 4, 4)."""
         return replace(self, poses=poses, motions=None)
 
     def step(self) -> str:
         """Return the acquire step that reads this session, as a line of the recipe."""
-        return f"- {self.acquire}: {_flow({'reader': self.reader, **self.changes})}"
+        return f"- {self.acquire}: {as_yaml({'reader': self.reader, **self.changes})}"
 
 
 class Misfit(NamedTuple):
@@ -273,13 +284,13 @@ OR_ELSE = "  # or, if it is not: "
 """Between two lines of which a person has to choose one."""
 
 
-def _flow(value: Any) -> str:
+def as_yaml(value: Any) -> str:
     """Return a value as YAML on one line, unquoted where that is read back the same."""
     if isinstance(value, Mapping):
-        inside = ", ".join(f"{key}: {_flow(each)}" for key, each in value.items())
+        inside = ", ".join(f"{key}: {as_yaml(each)}" for key, each in value.items())
         return f"{{{inside}}}"
     if isinstance(value, (list, tuple)):
-        return f"[{', '.join(map(_flow, value))}]"
+        return f"[{', '.join(map(as_yaml, value))}]"
     text = str(value).lower() if isinstance(value, bool) else str(value)
     plain = (
         not isinstance(value, str)

@@ -25,6 +25,7 @@ from flangeye.doctor.diagnosis import (
     ReadAgain,
     Reader,
     RecordedSession,
+    as_yaml,
 )
 from flangeye.errors import StageError
 from flangeye.files.recording import Archive, NotThisLayout, Recording, check_ids
@@ -247,11 +248,11 @@ def _of_recipe(path: Path, registry: Registry, recipe: Recipe) -> RecordedSessio
         )
     archive: Archive = reader(path)
     check_ids(archive)
-    found, remarks, unit = found_in(archive, first, recipe, registry)
+    found, remarks, other = found_in(archive, first, recipe, registry)
     kept = _kept(archive, first)
     session = _of_recordings(kept, found, recipe)
-    if unit is not None:
-        return _in_other_unit(session, *unit)
+    if other is not None:
+        return _read_otherwise(session, *other)
     again = partial(_read_again, path, (reader, recipe), found)
     return replace(session, again=again, remarks=remarks)
 
@@ -287,10 +288,13 @@ def _bound_with(reader: BoundPart, arm: Mapping[str, Any], target: Mapping[str, 
     return replace(reader, params=reader.params and reader.params.model_copy(update=changed))
 
 
-def _in_other_unit(session: RecordedSession, unit: str, why: str) -> RecordedSession:
-    """Return the session with its clouds in another unit, and a remark on that."""
-    corrected_session = session.with_changes(unit=unit)
-    return replace(corrected_session, remarks=(Finding("unit", why, corrected_session.step()),))
+def _read_otherwise(
+    session: RecordedSession, change: Mapping[str, Any], why: str
+) -> RecordedSession:
+    """Return the session with its clouds read in another way, and a remark on that."""
+    corrected_session = session.with_changes(**change)
+    name = "unit" if "unit" in change else "mirrored axis"
+    return replace(corrected_session, remarks=(Finding(name, why, corrected_session.step()),))
 
 
 def _kept(archive: Archive, first: Step) -> Archive:
@@ -420,12 +424,12 @@ class _Seen(NamedTuple):
 
 def found_in(
     archive: Archive, first: Step, recipe: Recipe, registry: Registry
-) -> tuple[dict[str, t.Feature], tuple[Finding, ...], tuple[str, str] | None]:
-    """Return the features that the recipe finds in the scans; try other units if it finds none.
+) -> tuple[dict[str, t.Feature], tuple[Finding, ...], tuple[Mapping[str, Any], str] | None]:
+    """Return the features that the recipe finds in the scans; read them otherwise if none is found.
 
     Returns:
-        The features by id; what the captures set aside tell; the unit they were found in and why
-        not in that of the recipe, if so.
+        The features by id; what the captures set aside tell; the parameters they were found with
+        and why not with those of the recipe, if so.
     """
     stated = None if first.params is None else getattr(first.params, "unit", None)
     seen = _seen_by(archive, first, recipe, registry)
@@ -433,16 +437,17 @@ def found_in(
     if any(remark.fix for remark in remarks):
         return seen.features, remarks, None
     if len(seen.features) < FEWEST_SAMPLES and first.params is not None and stated is not None:
-        # What else clouds may be in, by what the recipe says
-        for unit in (unit for unit in ("auto", "m", "mm", "in") if unit != stated):
-            params = first.params.model_copy(update={"unit": unit})
+        # What else clouds may be in, or lie behind the scanner as they were written
+        tried: list[dict[str, Any]] = [
+            {"unit": unit} for unit in ("auto", "m", "mm", "in") if unit != stated
+        ]
+        for change in [*tried, {"stretch": (1.0, 1.0, -1.0)}]:
+            params = first.params.model_copy(update=change)
             others = _seen_by(archive, replace(first, params=params), recipe, registry).features
             if len(others) >= FEWEST_SAMPLES:
                 count = f"{len(seen.features)} of {len(archive.recordings)} scans"
-                why = (
-                    f"{count} show a target with unit: {stated}, {len(others)} do with unit: {unit}"
-                )
-                return others, (), (unit, f"{seen.refused}; {why}" if seen.refused else why)
+                why = f"{count} show a target as read, {len(others)} do with {as_yaml(change)}"
+                return others, (), (change, f"{seen.refused}; {why}" if seen.refused else why)
     if seen.refused is not None:
         raise seen.refused
     return seen.features, remarks, None

@@ -62,6 +62,11 @@ class ArchiveParams(OpeningParams):
         description="Unit of the clouds. auto: what the layout says, else metres or millimetres, "
         "whichever fits the scanner's range; either is reported.",
     )
+    stretch: tuple[float, float, float] = Field(
+        (1.0, 1.0, 1.0),
+        description="Factors of the clouds' coordinates along x, y and z: -1 where an axis is "
+        "mirrored, 0.99 where distances are 1 % too long.",
+    )
     viewpoint: bool = Field(
         False, description="Whether points stand in the frame in which a PCD's VIEWPOINT has the "
         "scanner; they are turned into the scanner's."
@@ -187,6 +192,8 @@ def _captures(
     """Read one cloud at a time, and the image beside it."""
     for recording, path in _clouds(usable):
         cloud = read_cloud(path, unit, from_viewpoint=params.viewpoint)
+        if params.stretch != (1.0, 1.0, 1.0):
+            cloud = PointCloud(cloud.frame, cloud.xyz * np.array(params.stretch, np.float32))
         check_unit(path, median_distance(cloud), unit, scanner)
         yield Capture(
             recording.id,

@@ -1,7 +1,7 @@
 """``check.*``: mistakes in recordings that ``flangeye doctor`` names. Add one: a new module."""
 
 from flangeye_plugins.check.order import clock, identity, moved, order, repeated, tool
-from flangeye_plugins.check.outliers import flips, motion, outlier
+from flangeye_plugins.check.outliers import flips, motion, outlier, scatter
 from flangeye_plugins.check.pose_conventions import convention, direction, exchanged, mirrored
 from flangeye_plugins.check.units import rounding, size, units
 
@@ -16,6 +16,7 @@ CHECKS = (
     order,
     clock,
     flips,
+    scatter,
     outlier,
     moved,
     tool,

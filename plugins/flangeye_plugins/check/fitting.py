@@ -20,6 +20,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from math import erfc
 from typing import NamedTuple
 
 import numpy as np
@@ -517,6 +518,15 @@ def likelier(first: RecordedSession, second: RecordedSession) -> float:
         found = [_estimated(each.where(kept)) for each in (first, second)]
     costs = [np.inf if each is None else each.posterior.cost for each in found]
     return 0.0 if costs == [np.inf, np.inf] else 0.5 * (costs[1] - costs[0])
+
+
+def size_by_chance(session: RecordedSession) -> float:
+    """Return the probability that errors of the arm show so wrong a marker's size by chance."""
+    one_arm = session.seconds is None and session.links is None
+    if not one_arm or np.isfinite(session.places).any() or not (found := _estimated(session)):
+        return 1.0
+    ((_, mean, covariance),) = found.numbers("size")
+    return float(erfc(abs(mean[0]) / np.sqrt(2 * covariance[0, 0])))
 
 
 def _estimated(session: RecordedSession) -> Estimate | None:

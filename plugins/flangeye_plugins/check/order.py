@@ -10,7 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flangeye import part
-from flangeye.doctor.diagnosis import Arms, Finding, Findings, NotApplicable, RecordedSession
+from flangeye.doctor.diagnosis import (
+    CERTAIN,
+    Arms,
+    Finding,
+    Findings,
+    NotApplicable,
+    RecordedSession,
+)
 from flangeye.maths.pose_corrections import delaying, shifted, without_tool
 from flangeye.maths.streams import later, pose_at
 from flangeye.types import Floats, Indices, Mask
@@ -324,10 +331,12 @@ def _moved_finding(session: RecordedSession, evidence: Significance, start: int)
 
 @part("check.tool")
 def tool(session: RecordedSession) -> Findings:
-    """The poses are those of a tool (TCP): a constant offset in the flange frame."""
+    """The poses are those of a tool (TCP): a constant offset and turn in the flange frame."""
     _require_known_place(session)
-    null = fit_of(session)
-    found = fit(equations_of(session).with_free_place())
+    centres = replace(session, normals=np.full_like(session.normals, np.nan))
+    turn = _turned(session, fit(equations_of(centres).with_free_place()))
+    read = centres if turn else session
+    null, found = fit_of(read), fit(equations_of(read).with_free_place())
     offset = session.place[:3, :3] @ (found.unknowns.place[0, 0] - session.places[0])
     length = float(np.linalg.norm(offset))
     evidence = best_of(null, found, 3)
@@ -335,20 +344,52 @@ def tool(session: RecordedSession) -> Findings:
     ratio = float(found.likelihood[0] - null.likelihood[0])
     # A seen circle further from where the arm has it is a mistake [m]
     p = exceedance(ratio, float(null.count[0]), 3, freedom, length / 1e-3)
-    if p == 1 or not _known(found, offset):
+    known = p < 1 and _known(found, offset)
+    if not known and (not turn or session.seconds is not None):
         return
     listed = [f"{value * 1e3:.2f} mm" for value in offset + 0.0]
+    told = [f"{length * 1e3:.1f} mm from where the arm carries it"] if known else []
+    told += [f"turned by {np.degrees(turn):.0f} deg from the flange's axis"] if turn else []
     what = (
-        f"the seen target is {length * 1e3:.1f} mm from where the arm carries it, constantly: "
-        "the poses are probably those of a tool set in the controller, or it is mounted there, "
-        "which configuration: {place: unknown} says"
+        f"the seen target is {' and '.join(told)}, constantly: the poses are probably those of a "
+        "tool set in the controller, or it is mounted there, which configuration: {place: "
+        "unknown} says"
     )
+    evidence = evidence._replace(probability=p)
+    if turn and session.seconds is None:
+        # The same turn in all samples is no chance, and no misread rotation
+        evidence = evidence._replace(probability=0.0, gain=CERTAIN)
+        free = replace(centres, places=np.full_like(session.places, np.nan))
+        fix = "configuration: {name: eye-on-base, place: unknown}"
+        yield evidence.finding("tool offset", what, free, fix)
+        return
     corrected_session = session.corrected(
         lambda poses: without_tool(poses, -offset),
         "both" if session.seconds is None else "second",
         offset=listed,
     )
-    yield evidence._replace(probability=p).finding("tool offset", what, corrected_session)
+    yield evidence.finding("tool offset", what, corrected_session)
+
+
+def _turned(session: RecordedSession, centres: VariantFits) -> float:
+    """Return by how much all normals alike are off the target's axis [rad]; 0 where they are not.
+
+    Args:
+        session: The samples.
+        centres: The calibration by their centres.
+    """
+    seen = np.isfinite(session.normals[:, 0])
+    if not seen.any() or session.links is not None:
+        return 0.0
+    turns = equations_of(session).carried(centres.unknowns.other)[0, seen, :3, :3]
+    there = session.normals[seen] @ centres.unknowns.rotation[0].T
+    own = (turns.swapaxes(-1, -2) @ there[..., None])[..., 0]
+    axis = own.mean(axis=0) / np.linalg.norm(own.mean(axis=0))
+    scatter = float(np.sqrt(np.median(np.sum((own - axis) ** 2, axis=1))))
+    # Where z points inwards, it is the frame's convention and no turn
+    turn = float(np.arccos(np.clip(abs(axis[2]), 0.0, 1.0)))
+    # A face is cut squarer than that; and known to a tenth of it
+    return turn if turn > max(np.radians(2.0), 10 * scatter) else 0.0
 
 
 def _require_known_place(session: RecordedSession) -> None:

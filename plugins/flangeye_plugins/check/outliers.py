@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +17,7 @@ from flangeye_plugins.check.fitting import (
     VariantFits,
     best_of,
     exceedance,
+    explained,
     fit,
     fit_of,
     log_of,
@@ -98,6 +100,44 @@ def flips(session: RecordedSession) -> Findings:
     kept = session.without(which >= 0)
     fix = f"{kept.step()}  # or a target without that symmetry"
     yield evidence.finding("target flips", what, kept, fix, names)
+
+
+@part("check.scatter")
+def scatter(session: RecordedSession) -> Findings:
+    """Markers' rotations scatter although their positions fit."""
+    session.require_samples()
+    if not np.isfinite(session.rotations).any():
+        raise NotApplicable("no marker's whole pose was measured")
+    misfit = fit_of(session).misfit()
+    # More than verify.holdout lets pass [rad]
+    if misfit.angle is None or misfit.angle < np.radians(2.0) or not explained(session):
+        return
+    what = (
+        f"the markers' rotations scatter by {np.degrees(misfit.angle):.1f} deg about one "
+        f"calibration, which their positions fit to {misfit.position * 1e3:.2g} mm: detect the "
+        "marker again, larger or sharper in the image, or use its positions alone"
+    )
+    alone = _positions_alone(session)
+    fix = alone.step() if alone else "acquire.centres reads positions"
+    yield Finding("marker rotations", what, fix, corrected_session=alone)
+
+
+def _positions_alone(session: RecordedSession) -> RecordedSession | None:
+    """Return the session as acquire.centres reads a table's markers; None where none was read."""
+    table = {} if isinstance(session.reader, str) else session.reader.get("table", {})
+    target = table.get("target")
+    if not isinstance(target, Mapping) or "columns" not in target:
+        return None
+    about = {key: value for key, value in target.items() if key != "angle"}
+    point = {**about, "rotation": "point", "columns": target["columns"][:3]}
+    return replace(
+        session,
+        rotations=np.full_like(session.rotations, np.nan),
+        acquire="acquire.centres",
+        reader={"table": {**table, "target": point}},
+        changes={k: v for k, v in session.changes.items() if k in ("path", "leave_out")},
+        again=None,
+    )
 
 
 def _flipped(

@@ -18,7 +18,7 @@ from flangeye.doctor.diagnosis import (
     NotApplicable,
     RecordedSession,
 )
-from flangeye.maths.pose_corrections import inverted, reread, transposed
+from flangeye.maths.pose_corrections import inverted, reread, scaled, transposed
 from flangeye.maths.pose_formats import CONVENTIONS, EULER_ORDERS, PLAIN, written
 from flangeye.models.configuration import looks_exchanged
 from flangeye_plugins.check.equations import equations_of
@@ -243,19 +243,26 @@ def exchanged(session: RecordedSession) -> Findings:
 
 @part("check.mirrored")
 def mirrored(session: RecordedSession) -> Findings:
-    """One axis of what was seen has the wrong sign."""
+    """One axis of what was seen, or of the arm's positions, has the wrong sign."""
     session.require_samples()
-    tried = [replace(session, centres=session.centres * sign) for sign in 1 - 2 * np.eye(3)]
-    evidence = best_of(fit_of(session), fit(equations_of(*tried)))
-    found, axis = tried[evidence.which], "xyz"[evidence.which]
-    if evidence.probability == 1 or not helps(session, found):
-        return
-    what = f"the {axis} of the target's positions is negated: they fit with its sign changed"
-    if session.acquire == "acquire.archive":
-        fix = f"write the scans with their {axis} the other way round: they are mirrored"
-        yield evidence.finding("mirrored axis", what, found, fix)
-    else:
-        yield evidence.finding("mirrored axis", what, found.read_with(target={"mirrored": axis}))
+    # Where each axis would do, one that leaves targets before the camera
+    axes = sorted(range(3), key=lambda at: (at == 2) == (np.nanmedian(session.centres[:, 2]) > 0))
+    tried = [
+        ("target", "xyz"[axis], session.stretched(np.where(np.arange(3) == axis, -1.0, 1.0)))
+        for axis in axes
+    ]
+    if session.uses_poses and session.seconds is None:
+        tried += [("robot", axis, _with_negated(session, axis)) for axis in "xyz"]
+    evidence = best_of(fit_of(session), fit(equations_of(*(each for _, _, each in tried))))
+    whose, axis, found = tried[evidence.which]
+    if evidence.probability < 1 and helps(session, found):
+        what = f"the {axis} of the {whose}'s positions is negated: they fit with its sign changed"
+        yield evidence.finding("mirrored axis", what, found)
+
+
+def _with_negated(session: RecordedSession, axis: str) -> RecordedSession:
+    sign = np.array([-1.0 if each == axis else 1.0 for each in "xyz"])
+    return session.corrected(lambda poses: scaled(poses, sign), robot={"mirrored": axis})
 
 
 def _distances(session: RecordedSession) -> tuple[float, float]:

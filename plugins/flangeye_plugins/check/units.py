@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from flangeye import part
 from flangeye.doctor.diagnosis import (
-    CERTAIN,
     Arms,
     Finding,
     Findings,
@@ -21,6 +20,7 @@ from flangeye.maths.pose_corrections import scaled
 from flangeye.types import Floats
 from flangeye_plugins.check.equations import equations_of
 from flangeye_plugins.check.fitting import (
+    HELPS,
     Significance,
     VariantFits,
     best_of,
@@ -30,6 +30,7 @@ from flangeye_plugins.check.fitting import (
     fit_of,
     helps,
     named,
+    size_by_chance,
 )
 
 UNITS: Mapping[str, float] = {
@@ -63,12 +64,13 @@ def units(session: RecordedSession) -> Findings:
     session.require_samples()
     tried = list(_alternatives(session))
     evidence = best_of(fit_of(session), fit(equations_of(*(each.session for each in tried))))
+    found = None
     if evidence.probability < 1 and tried[evidence.which].said:
         found = _finding(session, tried[evidence.which], evidence)
-        if found.corrected_session is not None and helps(session, found.corrected_session):
-            yield found
-    elif session.uses_poses and (both := _both(session)) is not None:
-        yield both
+    if found and found.corrected_session and helps(session, found.corrected_session):
+        yield found
+    elif (far := _too_far(session)) is not None:
+        yield far
 
 
 def _alternatives(session: RecordedSession) -> Iterator[OtherUnit]:
@@ -157,29 +159,29 @@ def _of_target(session: RecordedSession, factor: float, unit: str) -> RecordedSe
     return corrected_session.read_with(target={"scale": _number(factor)})
 
 
-def _both(session: RecordedSession) -> Finding | None:
-    """Arm and target agree with each other, and both are in the same wrong unit."""
-    distance, target = _distance_of_arm(session), _distance_of_target(session)
-    ranges = _outside(distance, ARMS), _outside(target, session.reach)
-    if min(ranges) < np.log(3):  # one of them at least is as it should be
+def _too_far(session: RecordedSession) -> Finding | None:
+    """Name the unit of places that are ten times further than arms reach, or scanners see.
+
+    That needs no calibration that fits: there may be other mistakes.
+    """
+    arm, target = _distance_of_arm(session), _distance_of_target(session)
+    lengths = {"robot": (arm, ARMS), "target": (target, session.reach)}
+    if not session.uses_poses or session.seconds is not None:
+        del lengths["robot"]
+    told: dict[str, Any] = {}
+    said, factors = [], {"robot": 1.0, "target": 1.0}
+    for whose, (distance, allowed) in lengths.items():
+        unit = min(UNITS, key=lambda u, d=distance, a=allowed: _outside(d * UNITS[u], a))  # type: ignore[misc]
+        if distance > 10 * allowed[1] and _outside(distance * UNITS[unit], allowed) == 0:
+            factors[whose] = UNITS[unit]
+            told[whose] = {"scale": _number(UNITS[unit])}
+            said.append(f"the {whose}'s are {distance:.4g} m away, and in {unit}")
+    if not told:
         return None
-    unit = min(UNITS, key=lambda u: _outside(distance * UNITS[u], ARMS))
-    factor = UNITS[unit]
-    if _outside(distance * factor, ARMS) > 0:
-        return None
-    # Share of the arm's distance by which arm and target differ where they agree
-    if fit_of(session).misfit().position > 0.05 * distance:
-        return None
-    told = {"scale": _number(factor)}
-    corrected_session = replace(session, centres=session.centres * factor).corrected(
-        lambda poses: scaled(poses, factor), robot=told, target=told
-    )
-    what = (
-        f"robot and target agree, but the flange is {distance:.4g} m from the base and the target "
-        f"{target:.4g} m from the camera: both are in {unit}"
-    )
-    before, after = fit_of(session).misfit(), fit_of(corrected_session).misfit()
-    return Significance(0, before, after, 0.0, CERTAIN).finding("unit", what, corrected_session)
+    corrected = replace(session, centres=session.centres * factors["target"])
+    corrected = corrected.corrected(lambda poses: scaled(poses, factors["robot"]), **told)
+    what = f"positions were read in m: {'; '.join(said)}"
+    return Finding("unit", what, corrected.step(), corrected_session=corrected)
 
 
 def _distance_of_arm(session: RecordedSession) -> float:
@@ -210,10 +212,12 @@ wrong focal length does (Zhang 2000, equation 2), its depth alone."""
 def size(session: RecordedSession) -> Findings:
     """The target's distances are off by one factor: its size is wrong, or the focal length."""
     session.require_samples()
-    if not np.isfinite(session.rotations).any():
-        raise NotApplicable("no marker's whole pose was measured")
+    marker = bool(np.isfinite(session.rotations).any())
+    if not marker and not np.isfinite(session.places).all():
+        raise NotApplicable("neither a marker's pose was measured, nor where the target stands")
     null = fit_of(session)
     factors = {kind: _factor(session, null, along) for kind, along in ALONG.items()}
+    factors = factors if marker else {"size": factors["size"]}
     tried = [_stretched(session, kind, k) for kind, k in factors.items() if 0.2 < k < 5]
     if not tried:
         return
@@ -221,20 +225,29 @@ def size(session: RecordedSession) -> Findings:
     found = fit_of(corrected_session)
     evidence = best_of(null, found, 1)
     ratio, count = float(found.likelihood[0] - null.likelihood[0]), float(null.count[0])
-    # A printer is no better, and nobody measures a marker with less care
-    effect = abs(np.log(factor)) / 5e-3
+    # A printer is no better, and nobody measures a marker with less care; scanners are
+    effect = abs(np.log(factor)) / (5e-3 if marker else 2e-3)
     p = exceedance(ratio, count, 1, count - found.parameters - 1, effect)
-    if p < 1 and explained(corrected_session):
-        evidence = evidence._replace(probability=min(1.0, len(tried) * p))
-        calibrate = (
-            "calibrate the camera: add board: {kind: …, columns: …, rows: …, square: …} to "
-            "acquire.images, which finds it by its views of the board"
-        )
-        focal = f"the camera's focal length is {factor:.4f} times as long as its calibration says"
-        if kind == "focal":
-            what = focal
-            yield evidence.finding("focal length", what, corrected_session, calibrate)
+    if p == 1 and abs(factor - 1) * _distance_of_target(session) > session.limit:
+        p = size_by_chance(session)
+    if p == 1 or not explained(corrected_session):
+        return
+    evidence = evidence._replace(probability=min(1.0, len(tried) * p))
+    calibrate = (
+        "calibrate the camera: add board: {kind: …, columns: …, rows: …, square: …} to "
+        "acquire.images, which finds it by its views of the board"
+    )
+    focal = f"the camera's focal length is {factor:.4f} times as long as its calibration says"
+    if kind == "focal":
+        yield evidence.finding("focal length", focal, corrected_session, calibrate)
+    elif not marker:
+        # Poses between which an arm's motion was interpolated are a little too near each other
+        if evidence.after.position > HELPS**2 * evidence.before.position:
             return
+        what = f"what the scanner measures fits the arm's motion if it is {factor:.4f} times as far"
+        fix = session.stretched(factor * np.ones(3)).step()
+        yield evidence.finding("scale", what, corrected_session, fix)
+    else:
         what = f"the marker is {factor:.4f} times as large as the recipe says"
         fix = f"measure it after printing: its lengths in the fit step times {factor:.4f}"
         if session.acquire == "acquire.samples":
@@ -266,6 +279,9 @@ def _factor(session: RecordedSession, null: VariantFits, along: Floats) -> float
     mounts = equations.carried(null.unknowns.other)[0][seen]
     eye = np.broadcast_to(np.eye(3), (len(grown), 3, 3))
     parts, right = [grown[..., None], eye, -mounts[:, :3, :3]], mounts[:, :3, 3] - kept
+    if equations.knows_place:
+        right = right + (mounts[:, :3, :3] @ equations.places[0, seen, :, None])[..., 0]
+        del parts[2]
     if equations.bases is not None:
         # The second arm's base moves too: what it is now comes off, and is found again.
         bases = equations.bases[0, seen, :3, :3]
