@@ -28,13 +28,11 @@ from flangeye.estimation.sightings import branches_of, problem_of
 from flangeye.estimation.start import agreeing, begin, distances, size_of
 from flangeye.maths.arm_correction import reached_from
 from flangeye.maths.geometry import rigid
-from flangeye.maths.statistics import chi2_quantile
+from flangeye.maths.statistics import MISFIT, chi2_quantile
 from flangeye.models.cell import Cell
 from flangeye.models.scanners import ScannerModel
 from flangeye.types import Floats, Indices, Mask, Note, Observation, PoseFeature
 
-MISTAKE_CERTAIN = 1 - 1e-6
-"""Probability with which a mistake that is named is not noise's doing."""
 CONFIGURED = (
     "that the recipe's configuration is the cell's (place: unknown, where nobody has measured "
     "where the target is mounted)"
@@ -430,7 +428,7 @@ def _require_size(session: Session) -> None:
         )
     share, sigma, kind = max(told, key=lambda each: abs(each[0]) / each[1])
     if abs(share) <= session.asked.size_limit or (share / sigma) ** 2 < chi2_quantile(
-        MISTAKE_CERTAIN, 1
+        1 - MISFIT, 1
     ):
         return
     factor = f"{1 + share:.4f} +- {sigma:.4f} times as"
@@ -468,7 +466,7 @@ def _size_far_off(session: Session) -> float | None:
     other = estimate(problem, places, effects, agree).posterior.cost
     # The same numbers in another unit of length: three coordinates of each are so much larger.
     better = found.posterior.cost - other + 6 * len(observations) * np.log(factor)
-    return factor if better > chi2_quantile(MISTAKE_CERTAIN, 1) else None
+    return factor if better > chi2_quantile(1 - MISFIT, 1) else None
 
 
 def _with_offset(session: Session) -> Session:
@@ -483,7 +481,7 @@ def _with_offset(session: Session) -> Session:
         return session
     again = estimate(found.problem, found.places, wrong, found.inliers)
     _, mean, covariance = again.numbers("offset")[0]
-    if mean @ np.linalg.solve(covariance, mean) < chi2_quantile(MISTAKE_CERTAIN, 3):
+    if mean @ np.linalg.solve(covariance, mean) < chi2_quantile(1 - MISFIT, 3):
         return session
     listed = ", ".join(f"{value * 1e3:.3f}" for value in mean)
     what = f"the seen circle is ({listed}) mm from the origin of the flange frame, in it"

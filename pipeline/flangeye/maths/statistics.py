@@ -16,6 +16,8 @@ T = TypeVar("T", bound=np.floating)
 
 SIGMA_OF_MAD = 1.4826
 """Standard deviation of a normal variable over its median absolute deviation."""
+MISFIT = 1e-6
+"""Chance that a chi-square test takes noise for a misfit, or for a mistake that is then named."""
 
 
 def median(values: NDArray[T]) -> NDArray[T]:

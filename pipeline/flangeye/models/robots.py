@@ -16,8 +16,6 @@ from flangeye.models.model import Model
 from flangeye.types import Floats, Note
 from flangeye.units import Angle, AngularSpeed, JointPosition, Length, param
 
-NOWHERE = ("0 mm", "0 mm", "0 mm")
-UNTURNED = ("0 deg", "0 deg", "0 deg")
 UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 """Joints of Universal Robots from base to flange, as its ROS driver names them."""
 
@@ -63,10 +61,11 @@ class Joint(Model):
     d: Length = param("0 mm")
     theta: Angle = param("0 deg", description="Offset added to the joint's angle.")
     xyz: tuple[Length, Length, Length] = param(
-        NOWHERE, description="Convention urdf: its frame's origin in the frame of the link before."
+        ("0 mm",) * 3,
+        description="Convention urdf: its frame's origin in the frame of the link before.",
     )
     rpy: tuple[Angle, Angle, Angle] = param(
-        UNTURNED, description="Convention urdf: roll, pitch, yaw of its frame in that frame."
+        ("0 deg",) * 3, description="Convention urdf: roll, pitch, yaw of its frame in that frame."
     )
     axis: tuple[float, float, float] = Field(
         (0.0, 0.0, 1.0), description="Convention urdf: what it turns about, in its own frame."
@@ -86,8 +85,8 @@ class Joint(Model):
 class Placement(Model):
     """Where a frame is in another."""
 
-    xyz: tuple[Length, Length, Length] = param(NOWHERE)
-    rpy: tuple[Angle, Angle, Angle] = param(UNTURNED, description="Roll, pitch, yaw.")
+    xyz: tuple[Length, Length, Length] = param(("0 mm",) * 3)
+    rpy: tuple[Angle, Angle, Angle] = param(("0 deg",) * 3, description="Roll, pitch, yaw.")
 
 
 class Volume(Model):

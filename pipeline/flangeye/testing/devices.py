@@ -28,6 +28,7 @@ from flangeye.devices import (
 from flangeye.files.paths import bundled
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
+from flangeye.motion.supervision import STANDING
 from flangeye.testing.base import (
     Conformance,
     require,
@@ -48,9 +49,6 @@ TESTED_TURN = 0.1
 
 RESTS = 0.5
 """Longest time from the last look at a moving arm until it rests [s]."""
-
-STANDING = 1e-3
-"""Of joints, less is standing [rad/s]."""
 
 LATE = 1.0
 """What a busy machine may add to any time that is measured [s]."""

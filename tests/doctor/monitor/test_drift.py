@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from flangeye.estimation.watch.drift import (
-    MISFIT,
     CheckSightings,
     DriftTest,
     Information,
@@ -31,7 +30,7 @@ from flangeye.estimation.watch.drift import (
     verdict,
 )
 from flangeye.maths.geometry import rigid, rotation_exp
-from flangeye.maths.statistics import chi2_quantile, f_quantile
+from flangeye.maths.statistics import MISFIT, chi2_quantile, f_quantile
 from flangeye.types import Floats
 from tools import drift_year
 from tools.checked_year import CORNERS, Happening, Year, watch

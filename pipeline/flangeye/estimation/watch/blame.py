@@ -10,9 +10,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from flangeye.estimation.watch.drift import MISFIT, CheckSightings, Information, allowance
+from flangeye.estimation.watch.drift import CheckSightings, Information, allowance
 from flangeye.maths.geometry import adjoint_shift, stack_rows
-from flangeye.maths.statistics import chi2_quantile
+from flangeye.maths.statistics import MISFIT, chi2_quantile
 from flangeye.types import Floats
 
 LARGEST = 1e-3

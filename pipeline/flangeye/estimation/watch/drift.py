@@ -32,13 +32,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flangeye.maths.geometry import hat
-from flangeye.maths.statistics import chi2_quantile, f_quantile
+from flangeye.maths.statistics import MISFIT, chi2_quantile, f_quantile
 from flangeye.types import Floats
 
 NO_NORMAL = 1.0
 """Variance [rad^2] of a tilt that was not measured: it tells nothing."""
-MISFIT = 1e-6
-"""How unlikely one sighting is that is a misfit, while nothing moved."""
 
 
 State = Literal["OK", "DEGRADED", "MOVED"]

@@ -178,14 +178,7 @@ class AuboRobot(Device):
         motion = self._client.motion
         self._begin(in_joints=True)
         self._rest = _in_joints(np.asarray(joints))
-        self._ride = Ride(
-            speed, acceleration,
-            lambda speeds: self._client.command(
-                "speed", lambda: motion.speedJoint(speeds.tolist(), acceleration, GRACE)
-            ),
-            self._brake,
-            lambda: self._arrive(lambda: motion.moveJoint(target, acceleration, speed, 0.0, 0.0)),
-        )  # fmt: skip
+        self._ride_to(target, motion.speedJoint, motion.moveJoint, speed, acceleration)
 
     def move_linear(self, base_T_flange: Transform, speed: float, acceleration: float) -> None:
         """Start a straight move of the flange; a moving arm is stopped first."""
@@ -194,13 +187,19 @@ class AuboRobot(Device):
         motion = self._client.motion
         self._begin(in_joints=False)
         self._rest = self._in_space(base_T_goal)
+        self._ride_to(target, motion.speedLine, motion.moveLine, speed, acceleration)
+
+    def _ride_to(
+        self, target: list[float], go: Any, end: Any, speed: float, acceleration: float
+    ) -> None:
+        """Ride by the controller's speed command and end by its move, in one space."""
         self._ride = Ride(
             speed, acceleration,
-            lambda twist: self._client.command(
-                "speed", lambda: motion.speedLine(twist.tolist(), acceleration, GRACE)
+            lambda speeds: self._client.command(
+                "speed", lambda: go(speeds.tolist(), acceleration, GRACE)
             ),
             self._brake,
-            lambda: self._arrive(lambda: motion.moveLine(target, acceleration, speed, 0.0, 0.0)),
+            lambda: self._arrive(lambda: end(target, acceleration, speed, 0.0, 0.0)),
         )  # fmt: skip
 
     def move_velocity(self, twist: Floats, acceleration: float) -> None:
