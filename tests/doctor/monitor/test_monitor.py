@@ -51,24 +51,28 @@ def monitor(cell: Path, history: Path, *archives: str, options: tuple[str, ...] 
     )
 
 
-def test_ok_then_moved_since_when_and_which_part(cell: Path, tmp_path: Path) -> None:
+def test_ok_then_moved_since_when_and_which_part_and_it_stays_moved(
+    cell: Path, tmp_path: Path
+) -> None:
     history = tmp_path / "h.jsonl"
-    fine = monitor(cell, history, *(f"ok-{i:02}" for i in range(16)))
+    fine = monitor(cell, history, *(f"ok-{i:02}" for i in range(15)))
     assert fine.exit_code == 0, fine.output
-    assert [json.loads(line)["state"] for line in fine.stdout.splitlines()] == ["OK"] * 16
+    assert [json.loads(line)["state"] for line in fine.stdout.splitlines()] == ["OK"] * 15
     moved = monitor(cell, history, "moved-0", "moved-1", "moved-2")
     assert moved.exit_code == 2
     last = json.loads(moved.stdout.splitlines()[-1])
-    assert (last["check"], last["state"], last["since_check"]) == (18, "MOVED", 16)
+    assert (last["check"], last["state"], last["since_check"]) == (17, "MOVED", 15)
     assert last["since"].startswith("2001") and last["sightings"] == 3
     assert last["shift_mm"] == pytest.approx(0.6, abs=0.15)
     assert last["part"] is not None and last["probability"] > 0.3
     page = history.with_suffix(".html").read_text()
     assert (
         "<h1>MOVED</h1>" in page
-        and "since check 16" in page
+        and "since check 15" in page
         and "https://" not in page.split("<script", 1)[0]
     )
+    again = monitor(cell, history, "ok-15")
+    assert again.exit_code == 2 and json.loads(again.stdout)["since_check"] == 15
 
 
 def test_the_chart_of_one_check_has_one_time(cell: Path, tmp_path: Path) -> None:
@@ -77,13 +81,6 @@ def test_the_chart_of_one_check_has_one_time(cell: Path, tmp_path: Path) -> None
     (at,) = figure(history, DriftTest()).layout.xaxis.tickvals
     assert (at.year, at.microsecond) == (2001, 0)
     assert "h.jsonl: 1. A step" in (tmp_path / "h.html").read_text()
-
-
-def test_what_has_moved_stays_moved(cell: Path, tmp_path: Path) -> None:
-    history = tmp_path / "h.jsonl"
-    monitor(cell, history, *(f"ok-{i:02}" for i in range(12)), "moved-0", "moved-1", "moved-2")
-    again = monitor(cell, history, "ok-12")
-    assert again.exit_code == 2 and json.loads(again.stdout)["since_check"] == 12
 
 
 def test_a_slow_drift_is_degraded(cell: Path, tmp_path: Path) -> None:
@@ -366,33 +363,42 @@ def test_live_needs_a_calibration_that_was_live(cell: Path) -> None:
         from_arm(stored_calibration(cell / "calibration"), load_registry(), 3, move=False)
 
 
-def calibrated_from_six(scans: Path, out: Path, *more: str) -> None:
-    """Calibrate from the sample's first six scans."""
-    if not scans.exists():
-        part_of_sample(scans, range(6))
-    words = ["run", "ur5_phoxi-m_sample", "--archive", str(scans), "--out", str(out), *more]
-    done = CliRunner().invoke(commands(), words)
+def calibrated(folder: Path, name: str, *more: str) -> None:
+    """Calibrate from a folder's scans."""
+    words = ["run", "ur5_phoxi-m_sample", "--archive", str(folder / "scans")]
+    done = CliRunner().invoke(commands(), [*words, "--out", str(folder / name), *more])
     assert done.exit_code == 0, done.output
 
 
-def test_the_calibrations_own_scans_are_no_check_even_fitted_anew(tmp_path: Path) -> None:
-    scans = tmp_path / "scans"
-    calibrated_from_six(scans, tmp_path / "calibration")
-    calibrated_from_six(scans, tmp_path / "anew", "--set", "fit.rim.inlier=0.2 mm")
+@pytest.fixture(scope="module")
+def six(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with the sample's first six scans and a calibration from them."""
+    folder = tmp_path_factory.mktemp("six")
+    part_of_sample(folder / "scans", range(6))
+    calibrated(folder, "calibration")
+    return folder
+
+
+def test_the_calibrations_own_scans_are_no_check_even_fitted_anew(
+    six: Path, tmp_path: Path
+) -> None:
+    calibrated(six, "anew", "--set", "fit.rim.inlier=0.2 mm")
     for again in ("calibration", "anew", "scans"):
-        refused = monitor(tmp_path, tmp_path / "h.jsonl", again)
+        refused = monitor(six, tmp_path / "h.jsonl", again)
         assert str(refused.exception).endswith(
             f"{again}: 6 of its scans are the calibration's own, which check nothing; scan again"
         )
 
 
-def test_recordings_may_be_laid_out_otherwise_than_the_calibrations(tmp_path: Path) -> None:
+def test_recordings_may_be_laid_out_otherwise_than_the_calibrations(
+    six: Path, tmp_path: Path
+) -> None:
     later = part_of_sample(tmp_path / "later", range(6, 8))
-    calibrated_from_six(tmp_path / "earlier", tmp_path / "run")
     poses = [r.base_T_flange for r in folder(later, FolderParams()).recordings]
     (later / "poses.csv").unlink()
     np.save(later / "arm.npy", poses)
-    words = ["monitor", str(tmp_path / "run" / "calibration.yaml"), "--archive", str(later)]
+    words = ["monitor", str(six / "calibration" / "calibration.yaml"), "--archive", str(later)]
+    words += ["--history", str(tmp_path / "h.jsonl")]
     reader = "acquire.archive.reader={table: {file: arm.npy, rotation: matrix, length: m}}"
     found = CliRunner().invoke(commands(), [*words, "--set", reader])
     assert found.exit_code == 0, found.output
