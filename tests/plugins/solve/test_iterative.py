@@ -182,7 +182,7 @@ def test_a_larger_pool_is_a_better_answer() -> None:
     def rms(pool: int) -> float:
         errors = [
             worst_at_work(run(simulate(40, seed=seed), parameters(pool=pool, required="0 mm")))
-            for seed in range(20)
+            for seed in range(10)
         ]
         return float(np.sqrt(np.mean(np.square(errors))))
 

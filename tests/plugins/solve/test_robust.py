@@ -158,7 +158,7 @@ def test_exact_centres_give_the_exact_pose(seed: int, n: int) -> None:
 
 
 @given(seed=st.integers(0, 10**6))
-@settings(max_examples=8)
+@settings(max_examples=4)
 def test_moving_the_base_moves_the_answer_and_nothing_else(seed: int) -> None:
     observations = simulate(15, seed, wrong=2, normal=1e-3)
     rng = np.random.default_rng(seed)
