@@ -57,11 +57,13 @@ def _details(finding: Finding) -> list[str]:
 
 
 def evidence_of(finding: Finding) -> str:
-    """Return by how much a correction reduces the errors; empty if it was not computed."""
+    """Return what a correction makes of errors and likelihood; empty if it was not computed."""
     if finding.before is None or finding.after is None:
         return ""
     error = f"error {_error(finding.before)} before, {_error(finding.after)} after"
-    return f"{error}; by chance {_chance(finding.probability)}"
+    times = finding.gain / np.log(10.0)
+    likelier = f"; 10^{times:.0f} times likelier" if 1 <= times < np.inf else ""
+    return f"{error}{likelier}; by chance {_chance(finding.probability)}"
 
 
 def fix_lines(finding: Finding, indent: str) -> list[str]:
