@@ -264,7 +264,7 @@ def compare(
     seen = float(np.mean(shares))
     disc = disc._replace(centre=disc.plane.lift(centre), seen=seen, ratio=ratio)
     flaws = (
-        _of_other_size(disc, other, flange) or _missing_ring(disc, shares, flange, limits),
+        _unlikely(disc, other, flange) or _missing_ring(disc, shares, flange, limits),
         _missing_plate(disc, nearby, flange),
         _too_steep(disc, limits),
     )
@@ -286,12 +286,14 @@ def _missing_ring(
     return None
 
 
-def _of_other_size(disc: Disc, other: float | None, flange: Flange) -> str | None:
-    if other is None or disc.ratio > 0:
+def _unlikely(disc: Disc, other: float | None, flange: Flange) -> str | None:
+    if disc.ratio > 0:
         return None
+    wanted = f"{2e3 * flange.rim:.1f} mm"
+    has = "no edge like" if other is None else f"a rim of {2e3 * other:.1f} mm rather than"
     return (
-        f"a disc {disc.across * 1e3:.0f} mm across has a rim of {2e3 * other:.1f} mm rather than "
-        f"{2e3 * flange.rim:.1f} mm (log likelihood ratio {disc.ratio:.0f})"
+        f"a disc {disc.across * 1e3:.0f} mm across has {has} a rim of {wanted} "
+        f"(log likelihood ratio {disc.ratio:.0f})"
     )
 
 

@@ -117,9 +117,21 @@ def test_a_disc_of_another_size_is_told_by_its_likelihood() -> None:
     assert ratio < -50
     found = compared(ring(BORE, 0.8 * UR5.rim), coverage=0.01)
     assert found.rank == 1 and found.flaw is not None
-    assert "has a rim of 48.6 mm rather than 61.0 mm (log likelihood ratio -" in found.flaw
+    assert "has a rim of 48.6 mm rather than a rim of 61.0 mm (log likelihood" in found.flaw
     half = rim_ratio(ring(BORE, UR5.rim, arc=0.7 * np.pi)[:, :2], start, PITCH, UR5.rim)
     assert half[0] > 5
+
+
+def test_an_edge_of_no_circle_is_no_rim_however_much_of_it_is_near_one() -> None:
+    """Three of ten sectors on the rim, as the coverage asks, the others anywhere inside it."""
+    rng = np.random.default_rng(20)
+    flat = ring(BORE, UR5.rim)
+    angle = np.arctan2(flat[:, 1], flat[:, 0]) % (2 * np.pi)
+    ends = UR5.rim * np.where(rng.random(48) < 0.7, rng.uniform(0.45, 0.9, 48), 1.0)
+    cut = flat[np.linalg.norm(flat[:, :2], axis=1) < ends[(angle * 48 / (2 * np.pi)).astype(int)]]
+    found = compared(cut, coverage=0.01)
+    assert found.ratio <= 0
+    assert found.flaw is not None and "a rim of 61.0 mm (log likelihood ratio" in found.flaw
 
 
 def test_what_fits_has_no_flaw_and_got_farthest() -> None:
