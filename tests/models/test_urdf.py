@@ -241,6 +241,9 @@ def test_a_rail_and_a_base_of_ones_own(kuka: Path) -> None:
     ("change", "words"),
     [
         (lambda t: t[:-5], "not valid XML"),
+        (lambda t: f'<!DOCTYPE r [<!ENTITY a "aa">]>{t}', "declares a document type or entities"),
+        (lambda t: t.replace("0 0 0.400", "0 0 9e307"), "an <origin> reaches 9e.307 m; a URDF's"),
+        (lambda t: t.replace('axis xyz="0 0 -1"', 'axis xyz="0 0 -1e-320"'), "needs a direction"),
         (lambda t: t.replace("robot", "sdf"), "is no URDF: its outermost element is <sdf>"),
         (lambda t: t.replace(">", ' xmlns:xacro="http://wiki.ros.org/xacro"><xacro:macro/>', 1), "expand it: xacro"),
         (lambda t: t.replace("tool0", "a").replace("flange", "b").replace("</robot>",

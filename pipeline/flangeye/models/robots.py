@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -77,7 +78,8 @@ class Joint(Model):
     @field_validator("axis")
     @classmethod
     def _has_a_direction(cls, axis: tuple[float, float, float]) -> tuple[float, float, float]:
-        if not any(axis):
+        # Squares of far smaller or larger numbers are 0 or infinite
+        if not 1e-6 < math.hypot(*axis) < 1e6:
             raise ValueError("an axis needs a direction, for example [0, 0, 1]")
         return axis
 

@@ -23,7 +23,7 @@ from flangeye.maths.geometry import (
     rpy_from_rotation,
 )
 from flangeye.models.robots import FlangeDetails, Joint, Placement, RobotModel, Volume
-from flangeye.models.urdf_meshes import capsule_of, mesh_of, numbers_of
+from flangeye.models.urdf_meshes import capsule_of, mesh_of, numbers_of, require_metres
 from flangeye.types import Floats, Note, Warn
 from flangeye.units import SI
 
@@ -147,6 +147,8 @@ def read_urdf(path: Path) -> Urdf:
 
 def parse_urdf(text: str, path: Path) -> Urdf:
     """Return the URDF in a text; raises as :func:`read_urdf`, of ``path``."""
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise RecipeError(f"{path}: declares a document type or entities, which are not read")
     try:
         root = ET.fromstring(text)
     except ET.ParseError as error:
@@ -423,6 +425,7 @@ def origin_of(path: Path, element: ET.Element) -> Floats:
     origin = element.find("origin")
     rpy = numbers_of(path, origin, "rpy", "0 0 0")
     xyz = numbers_of(path, origin, "xyz", "0 0 0")
+    require_metres(path, "an <origin>", xyz)
     return rigid(rotation_from_rpy(*rpy), np.array(xyz))
 
 

@@ -38,17 +38,23 @@ def capsule_of(body: ET.Element, urdf: Path, packages: Mapping[str, Path]) -> Ca
     if body.tag == "sphere":
         return Capsule(np.zeros(3), np.zeros(3), _number(body, "radius", urdf))
     points = _points(body, urdf, packages)
-    reach = float(np.abs(points).max())
-    # Of numbers that overflow LAPACK's decomposition never ends; no body of an arm is so large [m]
-    if not reach < 1e3:
-        raise RecipeError(
-            f"{urdf}: a <{body.tag}> reaches {reach:.3g} m; a URDF's lengths are in m"
-        )
+    require_metres(urdf, f"a <{body.tag}>", points)
     capsule = fit_capsule(points)
     outside = float(capsule.distance(points).max())
     if outside > 1e-6:
         raise RecipeError(f"{urdf}: a mesh sticks {outside * 1e3:.3f} mm out of its capsule")
     return capsule
+
+
+def require_metres(urdf: Path, what: str, xyz: Any) -> None:
+    """Refuse coordinates so large that products of them overflow, and LAPACK never ends.
+
+    Raises:
+        RecipeError: No part of an arm is so large.
+    """
+    reach = float(np.abs(xyz).max())
+    if not reach < 1e3:
+        raise RecipeError(f"{urdf}: {what} reaches {reach:.3g} m; a URDF's lengths are in m")
 
 
 def mesh_of(body: ET.Element, urdf: Path, packages: Mapping[str, Path]) -> Any:

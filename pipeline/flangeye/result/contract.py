@@ -47,6 +47,7 @@ class TransformResult(_Part):
                 raise ValueError(f"'{name}' is not {count}x{count}")
         if any(len(direction) != 6 for direction in self.unobservable or []):
             raise ValueError("a direction of 'unobservable' has not 6 components")
+        _require_covariance(self.covariance)
         Transform.named("base_T_camera", self.matrix)  # which refuses what is not rigid
         return self
 
@@ -60,6 +61,16 @@ class TransformResult(_Part):
             None if free and free[i] > 0.01 else math.sqrt(max(row[i], 0.0))
             for i, row in enumerate(self.covariance)
         ]
+
+
+def _require_covariance(rows: Matrix) -> None:
+    """Refuse variances below zero, and correlations beyond one."""
+    variances = [row[i] for i, row in enumerate(rows)]
+    bounds = [[(1 + 1e-6) * a * b for b in variances] for a in variances]
+    pairs = ((x * x, bound) for row, of in zip(rows, bounds, strict=True)
+             for x, bound in zip(row, of, strict=True))  # fmt: skip
+    if any(variance < 0 for variance in variances) or any(square > most for square, most in pairs):
+        raise ValueError("'covariance' has a variance below 0, or a correlation beyond 1")
 
 
 class ObservationResult(_Part):
@@ -91,6 +102,7 @@ class ObservationResult(_Part):
             raise ValueError("a point of it has not 3 coordinates")
         if self.covariance is not None and len(self.covariance) != 3:
             raise ValueError("'covariance' is not 3x3")
+        _require_covariance(self.covariance or [])
         return self
 
 

@@ -92,7 +92,9 @@ class Transform:
         freeze(self, matrix=(4, 4))
         rotation = self.matrix[:3, :3]
         # Not np.allclose: poses come 500 times a second, and it takes 30 us.
-        orthonormal = np.abs(rotation @ rotation.T - np.eye(3)).max() < 2e-5
+        # Entries of a rotation are within 1; the product of far larger ones overflows.
+        small = np.abs(rotation).max() < 2.0
+        orthonormal = small and np.abs(rotation @ rotation.T - np.eye(3)).max() < 2e-5
         if not orthonormal or np.linalg.det(rotation) < 0 or tuple(self.matrix[3]) != (0, 0, 0, 1):
             raise ValueError(f"{self.name} is not a rigid transform")
 

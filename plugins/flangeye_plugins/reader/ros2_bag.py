@@ -128,12 +128,13 @@ class Bag:
 def ros2_bag(path: Path, params: BagParams, kinematics: RobotModel | None = None) -> Archive:
     """Read a ROS 2 bag, MCAP or .db3, without ROS: standstills with their clouds or images."""
     bag = _first_look(path)
-    arm, arm_told, joints = _arm(bag, params, kinematics)
-    seen, seen_told = _seen(bag, params)
     try:
+        arm, arm_told, joints = _arm(bag, params, kinematics)
+        seen, seen_told = _seen(bag, params)
         pairs, paired = pair(arm, seen.times, seen.signals(arm), params.join)
     except StageError as error:
-        raise StageError(f"{path}: {error}") from None
+        named = str(path) in str(error)
+        raise StageError(str(error) if named else f"{path}: {error}") from None
     recordings = seen.recordings(pairs, joints)
     notes = [f"ROS 2 bag: {arm_told}; {seen_told}", *paired, *seen.notes]
     return Archive(f"ROS 2 bag, {path.name}", path, recordings, bag.files, "m", notes)
@@ -151,7 +152,7 @@ def _first_look(path: Path) -> Bag:
         if kind == TF:
             raw.read(partial(bag.frames.take, static=raw.topic.endswith("tf_static")))
         elif kind == POSE:
-            _append(bag.poses, raw, raw.read(partial(_pose_stamped, raw.topic)))
+            _append(bag.poses, raw, raw.read(_pose_stamped))
         elif kind == JOINTS:
             _append(bag.joints, raw, raw.read(_joint_angles))
         elif kind == INFO:
@@ -169,8 +170,8 @@ def _append(into: dict[str, tuple[list[float], list[Any]]], raw: Raw, value: Any
     values.append(value)
 
 
-def _pose_stamped(topic: str, message: Any) -> Floats:
-    return pose_of(topic, message.pose.position, message.pose.orientation)
+def _pose_stamped(message: Any) -> Floats:
+    return pose_of("its pose", message.pose.position, message.pose.orientation)
 
 
 def _joint_angles(message: Any) -> dict[str, float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import AbstractContextManager, closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from functools import cache, partial
 from pathlib import Path
@@ -53,8 +53,8 @@ class Raw:
         """
         try:
             return use(self.decode())
-        except StageError:
-            raise
+        except StageError as error:
+            raise StageError(f"{self.file}: a message of {self.topic}: {error}") from None
         except Exception as error:  # a damaged schema makes messages without their fields
             reason = reason_of(error)
             raise StageError(
@@ -146,8 +146,18 @@ def _mcap_messages(file: Path, topics: Collection[str]) -> Iterator[Raw]:
                 yield Raw(file, channel.topic, time_ns * 1e-9, data, decode)
 
 
-def _opened(file: Path) -> AbstractContextManager[sqlite3.Connection]:
-    return closing(sqlite3.connect(f"file:{file}?mode=ro", uri=True))
+@contextmanager
+def _opened(file: Path) -> Iterator[sqlite3.Connection]:
+    """Give a bag's database; views, whose queries need not end, are no tables of a bag.
+
+    Raises:
+        StageError: It is a database of something else.
+    """
+    with closing(sqlite3.connect(f"file:{file}?mode=ro", uri=True)) as database:
+        tables = database.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
+        if not {("topics",), ("messages",)} <= set(tables):
+            raise StageError(f"{file}: is no ROS 2 bag: it has no tables topics and messages")
+        yield database
 
 
 def _db3_topics(file: Path) -> dict[str, str]:

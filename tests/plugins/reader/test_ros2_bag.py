@@ -186,6 +186,26 @@ def test_a_damaged_cloud_is_set_aside_with_its_pose(tmp_path: Path) -> None:
         read(file)
 
 
+def test_a_bags_numbers_name_file_and_topic_and_its_tables_are_tables(tmp_path: Path) -> None:
+    times, moving, _ = stops(POSES)
+    told = [("/tool", t, pose_stamped(t, pose)) for t, pose in zip(times, moving, strict=True)]
+    for _, _, message in told:
+        for axis in "xyzw":
+            setattr(message.pose.orientation, axis, 0.0)
+    file = next(write_bag(tmp_path / "bag", "db3", told).glob("*.db3"))
+    with pytest.raises(StageError) as wrong:
+        read(file)
+    assert str(wrong.value).startswith(f"{file}: a message of /tool: its pose: the quaternion's no")
+    with closing(sqlite3.connect(file)) as database, database:  # a query that never ends
+        database.execute("ALTER TABLE messages RENAME TO kept")
+        database.execute(
+            "CREATE VIEW messages AS WITH RECURSIVE r(n) AS (SELECT 1 UNION ALL SELECT n + 1 "
+            "FROM r) SELECT n AS id, 1 AS topic_id, n AS timestamp, x'00' AS data FROM r"
+        )
+    with pytest.raises(StageError, match=r"is no ROS 2 bag: it has no tables topics and messages"):
+        read(file)
+
+
 def test_a_damaged_image_is_set_aside_where_the_clocks_are_compared(tmp_path: Path) -> None:
     """Of a standstill's other images one is taken."""
     told, _ = robot_in_tf(POSES)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -161,7 +162,9 @@ def _model(robot: Mapping[str, Any]) -> RobotModel | None:
 def _missing(survey: FolderSurvey, reason: StageError) -> str:
     """Say what is missing, and the line that would bring it."""
     if not isinstance(reason, NotThisLayout):
-        return f"{reason}; flangeye init takes such lines as --reader '{{…}}' and --robot NAME"
+        lines = re.search(r"\b(?:reader|robot): ", str(reason)) is not None
+        how = "; flangeye init takes such lines as --reader '{…}' and --robot NAME"
+        return f"{reason}{how if lines else ''}"
     # Files of arrays that hold nothing else
     for path in survey.of((".mat", ".npz")):
         try:
