@@ -94,6 +94,11 @@ def rotation_first(f, j, a, s):
         (f / f"{name}.txt").write_text(text(vector(poses)[:, [3, 4, 5, 0, 1, 2]]))
 
 
+def metres_and_degrees(f, j, a, s):
+    (f / "tcp.txt").write_text("% controller V8\n" + text(euler(a, "ZYX", 1.0), " "))
+    (f / "pattern.csv").write_text(text(vector(s), " "))
+
+
 def blank_lines(f, j, a, s):
     for name, poses in (("robot", a), ("marker", s)):
         lines = text(quaternion(poses), "  ").replace("\n", "\n\n")
@@ -286,6 +291,7 @@ LAYOUTS: dict[str, Callable[..., None]] = {
     "a running index, rotation vector before the position": index_column,
     "rows of one table in no order, with the `id` of the other's": index_in_no_order,
     "rotation vector before the position, in metres, without a heading": rotation_first,
+    "position in metres and angles in degrees, without a heading": metres_and_degrees,
     "an index with gaps, where some images were left out": index_with_gaps,
     "a remark behind `//`, and a blank line after each row": blank_lines,
     "`cam2target.csv`: the camera in the target": cam2target,

@@ -170,7 +170,8 @@ def _of_six(table: Table, part: list[int], numbers: Floats, told: str) -> PoseCo
     if "joint" in table.name.lower():
         return PoseColumns(table, tuple(part), JOINTS, guess=told)
     first, second = (float(np.nanmax(np.abs(numbers[:, at]))) for at in ([0, 1, 2], [3, 4, 5]))
-    turned_first = second > FARTHEST and first < TURN
+    largest = 360.0  # of an angle in degrees, beside a position in metres
+    turned_first = second > largest and first < TURN
     columns: list[Column] = [*part[3:], *part[:3]] if turned_first else [*part]
     if turned_first:
         told = "; ".join(filter(None, (told, f"the rotation in columns {part[0]} to {part[2]}")))
