@@ -72,10 +72,12 @@ def weld_drawing(facts: Facts) -> WeldDrawing | None:
 
 
 class _View:
-    """The paths in the plane: x along the plan as a whole, y to the left."""
+    """The paths in the plane: x towards what is farthest from the plan's start, y to the left."""
 
     def __init__(self, weld: WeldReport) -> None:
-        along = weld.planned[-1] - weld.planned[0]
+        # A seam that goes once around ends where it begins.
+        ways = weld.planned - weld.planned[0]
+        along = ways[np.linalg.norm(ways, axis=1).argmax()]
         x = along - (along @ weld.opening) * weld.opening
         x /= np.linalg.norm(x)
         self._axes = np.stack([x, np.cross(weld.opening, x)], axis=1)

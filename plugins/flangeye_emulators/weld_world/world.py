@@ -92,7 +92,8 @@ class WeldWorld:
         self._heat = SeamDistortion(truth.heat, self.groove.root.length)
         self._rolled_out = rolled_out
         self.tip, self.torch = np.zeros(3), np.zeros(3)
-        self.torch_s, self.off = float(nominal.torch[0]), 0.0
+        self._behind = float(nominal.torch[0])
+        self.torch_s, self.off = self._behind, 0.0
 
     def held(self, pose: ToolPose, level_R_tool: Floats) -> tuple[Floats, Floats]:
         """Return the finger's axes (3, 3) in the plane's and where its tip would rest (3,)."""
@@ -109,7 +110,10 @@ class WeldWorld:
         pose = self._arm.true_pose(reported)
         self.torch = self._rolled_out(pose.position, self._tool.torch(pose, stands))
         root = self.groove.root
-        self.torch_s = root.foot(self.torch[:2], self.torch_s)
+        # The plane of a round seam may lie on itself: the torch is where it follows the tip.
+        behind = self.contact.s + self._behind
+        near = self.torch_s if abs(self.torch_s - behind) < abs(self._behind) else behind
+        self.torch_s = root.foot(self.torch[:2], near)
         place = root.at(self.torch_s)
         moved = self._heat.at(self.torch_s, self.torch_s)
         self.off = float((self.torch[:2] - place.point) @ place.normal) - moved
