@@ -1,4 +1,4 @@
-"""The sample workpieces: V-grooves, straight, curved and round, a T-joint, and their files.
+"""The sample workpieces: V-grooves, straight, curved and round, a T-joint, a pipe on a plate.
 
 ``python -m tools.workpieces data/workpieces`` makes the files again.
 """
@@ -158,14 +158,22 @@ def write_files(folder: Path) -> None:
 def samples() -> Mapping[str, tuple[Mesh, str]]:
     """Return each sample's surface and YAML file, by name."""
     plates = {plate.name: (plate.mesh(), _description(plate)) for plate in PLATES}
-    return {**plates, "fillet": (t_joint(), _fillet()), "v-ring": (round_cover(), _ring())}
+    return {
+        **plates,
+        "fillet": (t_joint(), _fillet()),
+        "v-ring": (round_cover(), _ring()),
+        "pipe-on-plate": (pipe_on_plate(), _pipe()),
+    }
 
 
 def t_joint() -> Mesh:
     """Return the two plates of a T-joint."""
-    base, upright = (box(*corners) for corners in T_JOINT)
-    vertices = np.concatenate([base.vertices, upright.vertices])
-    triangles = np.concatenate([base.triangles, upright.triangles + len(base.vertices)])
+    return _together(*(box(*corners) for corners in T_JOINT))
+
+
+def _together(first: Mesh, second: Mesh) -> Mesh:
+    vertices = np.concatenate([first.vertices, second.vertices])
+    triangles = np.concatenate([first.triangles, second.triangles + len(first.vertices)])
     return Mesh(vertices, triangles.astype(np.int32))
 
 
@@ -200,10 +208,46 @@ def round_cover() -> Mesh:
 
 
 def _ring() -> str:
+    return _yaml("Cover with a round V-groove", "v-ring", _groove(_circle(HEIGHT - DEPTH)))
+
+
+def _circle(height: float) -> Floats:
     angle = np.linspace(0.0, 2 * np.pi, AROUND + 1)
-    flat = np.zeros(len(angle))
-    points = np.column_stack([RING * np.cos(angle), RING * np.sin(angle), flat + HEIGHT - DEPTH])
-    return _yaml("Cover with a round V-groove", "v-ring", _groove(points))
+    flat = np.full(len(angle), height)
+    return np.column_stack([RING * np.cos(angle), RING * np.sin(angle), flat])
+
+
+PIPE = (0.005, 0.03)
+"""Wall and height of a pipe of radius ``RING`` [m]."""
+FOOT = ((-0.1, -0.09, 0.0), (0.1, 0.09, 0.01))
+"""Corners of the plate that it stands on [m]."""
+
+
+def pipe_on_plate() -> Mesh:
+    """Return a pipe that stands on a plate."""
+    wall, height = PIPE
+    pipe = trimesh.creation.annulus(RING - wall, RING, height, sections=AROUND)
+    pipe.apply_translation([0.0, 0.0, FOOT[1][2] + height / 2])
+    return _together(
+        box(*FOOT), Mesh(np.asarray(pipe.vertices), np.asarray(pipe.faces, dtype=np.int32))
+    )
+
+
+def _pipe() -> str:
+    points = _circle(FOOT[1][2])
+    outwards = points / RING + [0.0, 0.0, 1.0 - FOOT[1][2] / RING]
+    seam = {
+        "name": "fillet",
+        "points": _in_mm(points),
+        "opening": [[round(float(v), 6) for v in way] for way in outwards],
+        "half_angle": "45 deg",
+        "half_width": f"{1e3 * PIPE[1] * np.sin(np.pi / 4):.6g} mm",
+    }
+    return _yaml("Pipe of 120 mm on a plate of 10 mm", "pipe-on-plate", seam)
+
+
+def _in_mm(points: Floats) -> list[list[float]]:
+    return [[round(float(1e3 * v), 6) for v in point] for point in points]
 
 
 def write_stl(path: Path, mesh: Mesh) -> None:
@@ -225,7 +269,7 @@ def _description(plate: Plate) -> str:
 def _groove(points: Floats) -> dict[str, Any]:
     return {
         "name": "groove",
-        "points": [[round(float(1e3 * v), 6) for v in point] for point in points],
+        "points": _in_mm(points),
         "opening": [0, 0, 1],
         "half_angle": f"{np.degrees(HALF_ANGLE):.6g} deg",
         "half_width": f"{1e3 * DEPTH * np.tan(HALF_ANGLE):.6g} mm",

@@ -80,6 +80,11 @@ class CadSeam:
     half_angle: float | None
     half_width: float | None
 
+    @property
+    def closed(self) -> bool:
+        """Whether it ends where it begins."""
+        return bool(np.allclose(self.points[0], self.points[-1], rtol=0.0, atol=1e-6))
+
 
 @dataclass(frozen=True, eq=False)
 class Workpiece:

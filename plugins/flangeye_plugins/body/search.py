@@ -87,14 +87,13 @@ def judged(shape: Shape, view: CoarseImage, pose: Floats, tolerance: float) -> B
     compared = _compared(shape, view, pose, tolerance)
     if compared is None:
         return BodyVerdict(*[0] * 7)
-    rays, scan, depth, normals, hit, due, agree, against, _ = compared
+    rays, scan, depth, normals, hit, due, agree, against, *_ = compared
     beside = ndimage.binary_dilation(hit, iterations=OUTLINE) & ~ndimage.binary_dilation(hit)
     row, column = ndimage.distance_transform_edt(~hit, return_distances=False, return_indices=True)
     ended = depth[row, column][..., None] * rays[row, column]
     on = np.abs(np.einsum("ijk,ijk->ij", normals[row, column], scan - ended)) < 2 * tolerance
     measured = beside & np.isfinite(scan[..., 2])
-    # How far behind the outline that is, as a share of the size
-    ended_there = beside & (scan[..., 2] > depth[row, column] + 0.05 * shape.size)
+    ended_there = beside & (scan[..., 2] > depth[row, column] + 2 * tolerance)
     counts = (due, agree, against, beside & on, measured, ended_there, beside)
     return BodyVerdict(*(int(count.sum()) for count in counts))
 
@@ -110,6 +109,7 @@ class _Compared(NamedTuple):
     due: Mask
     agree: Mask
     against: Mask
+    through: Mask
     facets: Indices
 
 
@@ -132,9 +132,10 @@ def _compared(shape: Shape, view: CoarseImage, pose: Floats, tolerance: float) -
     agree = due & (np.abs(off) < tolerance)
     # What is nearer to the scanner hides the body
     before = (off > 2 * tolerance) & (scan[..., 2] > depth - 0.1 * shape.size)
+    behind = off < -2 * tolerance
     # A single ray may be a mixed one, at an edge of the body.
-    against = ndimage.binary_opening(due & ((off < -2 * tolerance) | before))
-    return _Compared(rays, scan, depth, normals, hit, due, agree, against, facets)
+    against, through = (ndimage.binary_opening(due & seen) for seen in (behind | before, behind))
+    return _Compared(rays, scan, depth, normals, hit, due, agree, against, through, facets)
 
 
 def opposed(shape: Shape, view: CoarseImage, pose: Floats) -> Mask | None:
@@ -312,6 +313,34 @@ class BodySearch:
         poses = poses[distinct(poses, np.array(scores), self.looks)[:8]]
         return self._distinct([one for one in map(self._laid, poses) if one])
 
+    def seen(self, found: FoundPose) -> float:
+        """Return how much of the body was seen, of what it shows from its broadest side."""
+        depth = found.pose[2, :3] @ self.looks.centre + found.pose[2, 3]
+        return float(found.verdict.agree * (self._fine.angle * depth) ** 2 / self.looks.broadest)
+
+    def refuted(self, pose: Floats, near: Callable[[Floats], Mask]) -> float:
+        """Return the share of what was looked at of some of the body that was seen through.
+
+        What lies before it hides it, and says nothing.
+
+        Args:
+            pose: ``camera_T_body``.
+            near: Which of points (N, 3) on the body are asked for.
+        """
+        seen = _compared(self.looks, self._fine, pose, self._tolerance)
+        if seen is None:
+            return 0.0
+        known = np.flatnonzero(seen.agree | seen.through)
+        met = (seen.depth[..., None] * seen.rays).reshape(-1, 3)[known]
+        known = known[near((met - pose[:3, 3]) @ pose[:3, :3])]
+        return float(seen.through.reshape(-1)[known].sum() / max(len(known), 1))
+
+    @cached_property
+    def _tolerance(self) -> float:
+        """How far off a cell of the view may be after the body is laid on the scan [m]."""
+        # As a share of the size, or in deviations
+        return max(0.003 * self.looks.size, 3.5 * self._fine.noise)
+
     @cached_property
     def _fine(self) -> CoarseImage:
         return view_of(self.points, self.looks.size / FINE_ACROSS)
@@ -324,10 +353,7 @@ class BodySearch:
         fit = fitted(around(self.points, self.looks, pose), self.looks, pose, 2000)
         if fit is None:
             return None
-        # How far off a cell of the view may be after the body is laid on the scan, as a share of
-        # the size.
-        tolerance = max(0.003 * self.looks.size, 3.5 * self._fine.noise)
-        verdict = judged(self.looks, self._fine, fit.pose, tolerance)
+        verdict = judged(self.looks, self._fine, fit.pose, self._tolerance)
         return FoundPose(fit.pose, verdict, fit.weakest(self.looks.freedoms))
 
     def _twins(self, best: FoundPose) -> Floats:

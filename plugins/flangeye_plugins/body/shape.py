@@ -105,6 +105,13 @@ class Shape:
 
         return np.asarray(ConvexHull(self.vertices, qhull_options="QJ").vertices)
 
+    @cached_property
+    def broadest(self) -> float:
+        """Area of its convex hull as seen from where that is largest [m^2]."""
+        hull = self._mesh.convex_hull
+        areas = np.abs(spread_directions(128) @ hull.face_normals.T) @ hull.area_faces / 2
+        return float(areas.max())
+
     def meet(self, origin: Floats, directions: Floats) -> Met:
         """Return where rays from points (3,) or (N, 3) along (N, 3) meet the body first."""
         import open3d as o3d

@@ -31,7 +31,7 @@ from flangeye_plugins.seam.planned import (
     for_the_controller,
     refuse_outside,
 )
-from flangeye_plugins.seam.points import facing_camera
+from flangeye_plugins.seam.points import normals_of
 from flangeye_plugins.seam.rough import Course, JointPlace, Spline, course, rough_path
 from flangeye_plugins.seam.stitched import PlacedScan, seen_in_base
 from flangeye_plugins.seam.sweep import WIDE, Swept, fitted, swept_from
@@ -192,7 +192,7 @@ def _found(seen: PlacedScan, rough: Course, params: JointParams) -> Found:
     most_fitted = 400_000
     pitch, points = _solid(points[at[:: -(-len(at) // most_fitted)]])
     at, local = rough.local(points, box)
-    normals = facing_camera(points).normals
+    normals = normals_of(points)
     # Beside a rough line's corners the sections are askew: the joint is sought again along the
     # smooth line through where it was found, which has none.
     line = rough.through(_placed(rough, local, normals[at], params))

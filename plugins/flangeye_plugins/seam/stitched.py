@@ -31,7 +31,7 @@ from flangeye.types import (
     WorkpieceScan,
 )
 from flangeye_plugins.seam.planned import scanner_covariance
-from flangeye_plugins.seam.points import facing_camera, thinned
+from flangeye_plugins.seam.points import normals_of, thinned
 
 
 class OfPose(Protocol):
@@ -199,7 +199,7 @@ def _apart(clouds: Sequence[Floats]) -> float | None:
 
     found = []
     for first, second in pairwise(clouds):
-        surface = facing_camera(first)
+        normals = normals_of(first)
         # Points so near to each other may show the same face [m]
         away, at = cKDTree(first).query(second, distance_upper_bound=10e-3)
         both = np.isfinite(away)
@@ -207,6 +207,6 @@ def _apart(clouds: Sequence[Floats]) -> float | None:
         fewest_shared = 200
         if both.sum() >= fewest_shared:
             at = at[both]
-            across = np.einsum("ni,ni->n", second[both] - first[at], surface.normals[at])
+            across = np.einsum("ni,ni->n", second[both] - first[at], normals[at])
             found.append(float(np.median(np.abs(across))))
     return max(found, default=None)

@@ -39,7 +39,8 @@ def scanned(workpiece="v-straight", seed=0, resolution=RESOLUTION, distortion=1.
 
     params = SimulatedScanParams.model_validate({"workpiece": str(workpiece), **given})
     scan = scan_simulated(look, seed, params)
-    return replace(scan, truth={}), scan.truth["groove"]
+    (seam,) = scan.truth.values()
+    return replace(scan, truth={}), seam
 
 
 def write_plate(folder, y, name="plate", ribbed=False, unit="mm"):

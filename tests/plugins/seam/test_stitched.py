@@ -10,7 +10,7 @@ import pytest
 from flangeye import CalibrationRefused
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.maths.seam_geometry import errors_from, tube_radii
-from flangeye.types import Seam, Seed, VerifiedHandEye
+from flangeye.types import Seam, VerifiedHandEye
 from flangeye_plugins.seam.cad import CadParams, seam_cad
 from flangeye_plugins.seam.joint import JointParams, seam_joint
 from flangeye_plugins.seam.stitched import seen_in_base
@@ -89,7 +89,4 @@ def test_a_scan_of_another_scanner_is_refused() -> None:
 
 def test_a_cad_is_registered_to_one_place_alone() -> None:
     with pytest.raises(CalibrationRefused, match="put together from 2 places"):
-        seam_cad(
-            on_flange(), scan_of_the_plate(), Seed(0), CadParams(workpiece="v-straight"), None,
-            PHOXI,
-        )  # fmt: skip
+        seam_cad(on_flange(), scan_of_the_plate(), CadParams(workpiece="v-straight"), None, PHOXI)
