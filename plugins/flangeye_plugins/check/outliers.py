@@ -17,7 +17,6 @@ from flangeye_plugins.check.fitting import (
     VariantFits,
     best_of,
     exceedance,
-    explained,
     fit,
     fit_of,
     log_of,
@@ -110,7 +109,7 @@ def scatter(session: RecordedSession) -> Findings:
         raise NotApplicable("no marker's whole pose was measured")
     misfit = fit_of(session).misfit()
     # More than verify.holdout lets pass [rad]
-    if misfit.angle is None or misfit.angle < np.radians(2.0) or not explained(session):
+    if misfit.angle is None or misfit.angle < np.radians(2.0) or misfit.position > session.limit:
         return
     what = (
         f"the markers' rotations scatter by {np.degrees(misfit.angle):.1f} deg about one "
@@ -119,7 +118,8 @@ def scatter(session: RecordedSession) -> Findings:
     )
     alone = _positions_alone(session)
     fix = alone.step() if alone else "acquire.centres reads positions"
-    yield Finding("marker rotations", what, fix, corrected_session=alone)
+    # Whatever explains the rotations comes first
+    yield Finding("marker rotations", what, fix, gain=0.0, corrected_session=alone)
 
 
 def _positions_alone(session: RecordedSession) -> RecordedSession | None:
