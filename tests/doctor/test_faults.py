@@ -445,10 +445,13 @@ def test_a_marker_that_was_printed_in_another_size(factor: float) -> None:
 
 
 def test_a_size_in_images_may_be_the_focal_length_too() -> None:
-    session = replace(session_of("marker"), acquire="acquire.images")
+    board = {"kind": "charuco", "columns": 9, "rows": 6, "square": "30 mm", "marker": "22 mm"}
+    session = replace(session_of("marker"), acquire="acquire.images", board=board)
     finding = only(replace(session, centres=session.centres * 1.05))
     assert "or the camera's focal length is 0.95" in finding.what
-    assert "where the print is as the recipe says, calibrate the camera: add board" in finding.fix
+    assert "where the print is as the recipe says: - acquire.images: {" in finding.fix
+    focal = only(replace(session, centres=session.centres * [1.0, 1.0, 1.1]))
+    assert [line["acquire.images"]["board"] for line in focal.lines] == [board]
 
 
 @pytest.mark.parametrize("factor", [1.04, 0.9])

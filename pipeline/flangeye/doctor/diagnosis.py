@@ -65,6 +65,7 @@ class RecordedSession:
         reader: The archive's reader, as the recipe writes it.
         acquire: Name of the recipe's first step.
         changes: Parameters of that step that differ from the recipe's, by what was mended.
+        board: The board that the recipe's fit step looks for, as ``acquire.images`` takes it.
         limit: Smallest error that the recipe asks for [m].
         marks_open: Whether the recipe's solver marks translations that the motion cannot show.
         remarks: Mistakes that opening the archive has shown already, mended here.
@@ -90,6 +91,7 @@ class RecordedSession:
     reader: Reader = "auto"
     acquire: str = "acquire.archive"
     changes: Mapping[str, Any] = field(default_factory=dict)
+    board: Mapping[str, Any] = field(default_factory=dict)
     limit: float = USUAL_LIMIT
     marks_open: bool = False
     remarks: tuple[Finding, ...] = ()

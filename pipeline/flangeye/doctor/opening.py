@@ -378,7 +378,19 @@ def _as_recipe(
         reader=reader,
         acquire=first.stage.name,
         changes={**_given(first.params, {"reader", "path"}), **_path_in(recipe)},
+        board=_board_of(recipe),
     )
+
+
+def _board_of(recipe: Recipe) -> dict[str, Any]:
+    """Return the board that a recipe's fit step looks for, with what was stated of it."""
+    asked = {"columns", "rows", "square", "marker", "dictionary"}
+    for step in recipe.steps:
+        kind = step.stage.name.removeprefix("fit.")
+        if kind in ("charuco", "checkerboard", "circles"):
+            stated = _given(step.params)
+            return {"kind": kind, **{name: stated[name] for name in stated if name in asked}}
+    return {}
 
 
 def _path_in(recipe: Recipe) -> dict[str, Any]:

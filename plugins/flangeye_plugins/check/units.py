@@ -233,10 +233,7 @@ def size(session: RecordedSession) -> Findings:
     if p == 1 or not explained(corrected_session):
         return
     evidence = evidence._replace(probability=min(1.0, len(tried) * p))
-    calibrate = (
-        "calibrate the camera: add board: {kind: …, columns: …, rows: …, square: …} to "
-        "acquire.images, which finds it by its views of the board"
-    )
+    calibrate = _calibrate_camera(session)
     focal = f"the camera's focal length is {factor:.4f} times as long as its calibration says"
     if kind == "focal":
         yield evidence.finding("focal length", focal, corrected_session, calibrate)
@@ -254,7 +251,7 @@ def size(session: RecordedSession) -> Findings:
             fix = session.read_with(target={"scale": float(f"{factor:.4f}")}).step()
         elif session.acquire == "acquire.images":  # where the target stays near the camera's axis
             what = f"{what}, or {focal}"
-            fix = f"{fix}; where the print is as the recipe says, {calibrate}"
+            fix = f"{fix}; where the print is as the recipe says: {calibrate}"
         yield evidence.finding("target size", what, corrected_session, fix)
 
 
@@ -318,3 +315,10 @@ def _step(places: Floats) -> float | None:
         if len(places) and np.abs(multiples - np.round(multiples)).max() < 1e-3:
             return step
     return None
+
+
+def _calibrate_camera(session: RecordedSession) -> str:
+    """Return the line that finds the camera by its views of the board, where it sees one."""
+    if session.acquire == "acquire.images" and session.board:
+        return session.with_changes(board=dict(session.board)).step()
+    return "calibrate the camera by views of a board"
