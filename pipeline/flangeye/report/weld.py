@@ -346,10 +346,34 @@ def _facts(seam: t.Seam, facts: Facts) -> list[tuple[str, str]]:
         rows.append(("Half angle of the groove", f"{np.degrees(seam.half_angle):.1f}°"))
     if seam.half_width is not None:
         rows.append(("Half width of the groove", f"{millimetres(seam.half_width)} mm"))
-    rows += [(name, f"{value:.4g}") for name, value in seam.figures.items()]
+    rows += [_figure(name, value) for name, value in seam.figures.items()]
     told = facts.result.seam
     if told and told.truth:
         error = f"{millimetres(told.truth.rms)} mm rms, {millimetres(told.truth.max)} mm at most"
         rows.append(("True error, of the simulation", error))
         rows.append(("Points whose tube holds the true seam", f"{told.truth.inside:.0%}"))
     return rows
+
+
+FIGURES = {
+    "seen": ("Seen of the part, of its broadest side", "%"),
+    "refuted": ("Of the part looked through", "%"),
+    "second": ("Next best pose agrees, of the best", "%"),
+    "explained": ("Explained by the joint", "%"),
+    "coverage": ("Seen of its length", "%"),
+    "residual": ("Scan off the surface", "mm"),
+    "registration": ("Line in the scan, one sigma", "mm"),
+    "start": ("Start along the seam, one sigma", "mm"),
+    "end": ("End along the seam, one sigma", "mm"),
+    "apart": ("Neighbouring clouds apart", "mm"),
+    "points": ("Points on the surface", ""),
+    "edges": ("Points on its edges", ""),
+}
+"""What the seam steps' figures are, and the unit they are told in."""
+
+
+def _figure(name: str, value: float) -> tuple[str, str]:
+    """Return a figure in words, and its value with its unit; another step's by its own name."""
+    words, unit = FIGURES.get(name, (name, ""))
+    told = {"mm": f"{millimetres(value)} mm", "%": f"{value:.0%}"}
+    return words, told.get(unit, f"{value:.4g}")

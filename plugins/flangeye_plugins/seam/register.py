@@ -71,7 +71,7 @@ def register(
         CalibrationRefused: The fit is poor or ambiguous.
     """
     check_unit(points, workpiece)
-    scan = points.astype(np.float32)
+    scan = points[points[:, 2] > 0.0].astype(np.float32)
     looks = Looks(workpiece.vertices, workpiece.triangles)
     search = BodySearch(scan, looks)
     found = [one for one in search.everywhere() if one.verdict.score > 0]
