@@ -596,7 +596,8 @@ def _read_live(kind):
         }  # fmt: skip
         data = path.read_bytes()
         messages.stamp_of(data), messages.frame_of(data)
-        messages.decoded(data, getattr(messages, kind), uses[getattr(messages, kind)])
+        asked = messages.Type[kind]
+        messages.decoded(data, asked, uses[asked])
 
     return read
 
