@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 import pytest
 
+from flangeye.errors import RecipeError
 from flangeye.files.paths import bundled
 from flangeye.maths.kinematics import Arm
 from flangeye.models.cell import Cell
@@ -110,3 +111,13 @@ def test_the_recipes_folder_comes_before_the_shells(
     monkeypatch.chdir(shell)
     assert load_model("robots", "ur5.yaml", folder).model == "ur5"
     assert load_model("robots", "ur5.yaml", shell.parent).model == "ur10e"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"), [("", "holds nothing"), ("a\n", "is a text"), ("[1]\n", "is a list")]
+)
+def test_a_model_that_is_no_mapping_says_what_it_is(tmp_path: Path, text: str, said: str) -> None:
+    (tmp_path / "mine.yaml").write_text(text)
+    (tmp_path / "cell.yaml").write_text(HEADER + "robot: mine.yaml\nscanner: phoxi-m\n" + STEPS)
+    with pytest.raises(RecipeError, match=f"mine.yaml:1: {said}; it must be a mapping with"):
+        load_recipe(tmp_path / "cell.yaml", load_registry())

@@ -27,6 +27,11 @@ def sentence(details: Any, model: type[Any], given: Any) -> str:
         return _unknown_key(str(details["loc"][-1]), _fields_at(model, details["loc"][:-1]))
     if details["type"] == "missing":
         return "is missing"
+    if details["type"] in ("model_type", "dataclass_type", "model_attributes_type"):
+        fields = ", ".join(_fields_at(model, details["loc"]))
+        is_now = {type(None): "holds nothing", list: "is a list", str: "is a text"}
+        what = is_now.get(type(given), f"is {given}")
+        return f"{what}; it must be a mapping with the keys {fields}"
     message = str(details["msg"]).removeprefix("Value error, ")
     message = message.replace("Input should be", "must be")
     if details["type"].startswith(("greater", "less")) and isinstance(given, str):
