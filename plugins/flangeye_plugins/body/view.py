@@ -67,17 +67,15 @@ class CoarseImage:
         total, count, open_side = np.zeros_like(self.xyz), np.zeros(self.xyz.shape[:2]), None
         normals = self.normals
         for shift in _ring(2):
-            other = _shifted(self.xyz, shift)
-            same = np.abs(other[..., 2] - self.depth) < _gate(
-                self.depth, self.angle, max(map(abs, shift))
-            )
+            way = _shifted(self.xyz, shift) - self.xyz
+            same = np.abs(way[..., 2]) < _gate(self.depth, self.angle, max(map(abs, shift)))
             # A table right behind a plate's edge is not the plate: it lies off its plane.
-            off = np.abs(np.einsum("ijk,ijk->ij", other - self.xyz, normals))
-            same &= off < np.linalg.norm(other - self.xyz, axis=-1) / 2 + 3 * self.noise
-            total += np.where(same[..., None], other - self.xyz, 0.0)
+            off = np.abs(np.einsum("ijk,ijk->ij", way, normals))
+            same &= off < np.linalg.norm(way, axis=-1) / 2 + 3 * self.noise
+            total += np.where(same[..., None], way, 0.0)
             count += same
             if max(map(abs, shift)) == 1:
-                beyond = ~same & ~(other[..., 2] < self.depth)
+                beyond = ~same & ~(way[..., 2] < 0.0)
                 open_side = beyond if open_side is None else open_side | beyond
         across = -total / np.maximum(count, 1)[..., None]
         across -= np.einsum("ijk,ijk->ij", across, normals)[..., None] * normals

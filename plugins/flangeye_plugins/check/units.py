@@ -171,8 +171,9 @@ def _too_far(session: RecordedSession) -> Finding | None:
     told: dict[str, Any] = {}
     said, factors = [], {"robot": 1.0, "target": 1.0}
     for whose, (distance, allowed) in lengths.items():
-        unit = min(UNITS, key=lambda u, d=distance, a=allowed: _outside(d * UNITS[u], a))  # type: ignore[misc]
-        if distance > 10 * allowed[1] and _outside(distance * UNITS[unit], allowed) == 0:
+        off = {unit: _outside(distance * factor, allowed) for unit, factor in UNITS.items()}
+        unit = min(off, key=off.__getitem__)
+        if distance > 10 * allowed[1] and off[unit] == 0:
             factors[whose] = UNITS[unit]
             told[whose] = {"scale": _number(UNITS[unit])}
             said.append(f"the {whose}'s are {distance:.4g} m away, and in {unit}")

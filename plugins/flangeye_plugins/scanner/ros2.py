@@ -286,7 +286,8 @@ class Ros2Scanner(OpenScanner):
     def _points(self, taken: dict[str, GraphMessage], camera: Camera | None) -> Floats:
         """Return the scan's points (H, W, 3) or (N, 3) [m]; none where there is an image alone."""
         if cloud := self._params.cloud:
-            return decoded(taken[cloud].data, Type.CLOUD, cloud_of)  # type: ignore[no-any-return]
+            seen: Floats = decoded(taken[cloud].data, Type.CLOUD, cloud_of)
+            return seen
         if not (depth := self._params.depth) or not camera:
             return np.zeros((0, 3))
         depths = decoded(taken[depth].data, Type.IMAGE, partial(_metres, depth))
