@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -32,6 +32,7 @@ from flangeye.files.recording import Archive, NotThisLayout, Recording, check_id
 from flangeye.files.yaml_lines import parse_yaml
 from flangeye.log.read import RunLog, is_log, log_of, read_run
 from flangeye.maths.geometry import rigid
+from flangeye.models.boards import Kind
 from flangeye.models.cell import Cell, cell_of
 from flangeye.models.configuration import DEFAULT, LINK, Configuration
 from flangeye.models.robots import RobotModel
@@ -387,7 +388,7 @@ def _board_of(recipe: Recipe) -> dict[str, Any]:
     asked = {"columns", "rows", "square", "marker", "dictionary"}
     for step in recipe.steps:
         kind = step.stage.name.removeprefix("fit.")
-        if kind in ("charuco", "checkerboard", "circles"):
+        if kind in get_args(Kind):
             stated = _given(step.params)
             return {"kind": kind, **{name: stated[name] for name in stated if name in asked}}
     return {}

@@ -141,8 +141,9 @@ def _figures(found: Registered) -> dict[str, float]:
 
 
 def _limits(params: CadParams) -> RegistrationLimits:
-    # Parts that were there were seen by 0.38 and more, wrong ones by 0.16 at most; a twentieth of
-    # what was seen may be missing, and the best pose is three percent better than the second.
+    # More of a part that is there is seen, though a third of it is covered, and less of the edges
+    # that other parts have alike; a twentieth of what was seen may be missing, and the best pose is
+    # three percent better than the second.
     return RegistrationLimits(0.25, 0.05, params.max_residual, 0.03)
 
 
