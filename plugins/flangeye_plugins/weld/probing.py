@@ -168,7 +168,7 @@ class Probing:
     def _fit(self, felt: Floats, cycles: Floats) -> tuple[Learned, str]:
         """Return what explains the sweep, and whether the tip climbs."""
         noise = max(_scatter(felt[:, 1]), self._noise[0])
-        late = np.arange(-0.06, 0.121, 0.01)  # timestamps, by up to 120 ms, or early by up to 60
+        late = np.arange(-0.12, 0.121, 0.01)  # timestamps, or early, by up to 120 ms
         reversals = 1e-3 * np.array([0.02, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.6, 1.0])
         stamps, widths = (grid.ravel() for grid in np.meshgrid(late, reversals, indexing="ij"))
         at, slant = (
@@ -176,11 +176,12 @@ class Probing:
         )
         rms, solutions = _explained(at, slant, widths, felt[:, 1])
         belief = self._belief
-        unlikely = len(felt) * (rms / noise) ** 2
+        # What no candidate explains is no smaller an error for being no noise.
+        unlikely = len(felt) * (rms / max(noise, float(rms.min()))) ** 2
         unlikely += ((stamps - belief.stamp) / belief.stamp_sigma) ** 2
         unlikely += ((solutions[:, 2] + belief.play) / belief.play_sigma) ** 2
         best = int(np.argmin(unlikely))
-        _, across, play, ahead = solutions[best].tolist()
+        _, across, play, _, ahead = solutions[best].tolist()
         slid = felt[:, 3] - felt[:, 3].mean()
         middle = at[best] - at[best].mean()
         moved = float(middle @ middle) + 1e-12
@@ -221,13 +222,13 @@ class Probing:
         """Return by how much less is shown in the hard half; its, the gain's and ahead's sigma."""
         away = at - np.median(at + felt[:, 1])
         hard = np.sign(away) * np.maximum(np.abs(away) - self._reach / 2.0, 0.0)
-        reversal = (_dragged(at[None], np.array([width]))[0] - at) / width
-        rows = np.column_stack([np.ones_like(at), -at, reversal, hard, -slant])
+        *through, ahead = _rows(at[None], slant[None], np.array([width]))[0].T
+        rows = np.column_stack([*through, hard, ahead])
         inverse = np.linalg.pinv(rows.T @ rows)
-        less = float((inverse @ rows.T @ felt[:, 1])[3])
-        _, gain, _, hardly, ahead = (noise * np.sqrt(np.diag(inverse))).tolist()
+        less = float((inverse @ rows.T @ felt[:, 1])[4])
+        _, gain, _, _, hardly, leads = (noise * np.sqrt(np.diag(inverse))).tolist()
         pivoted = self._two_walls and float(np.ptp(slant)) > PIVOTS
-        return (less, hardly), gain, ahead if pivoted else 1e3
+        return (less, hardly), gain, leads if pivoted else 1e3
 
     def _climbs(self, felt: Floats, at: Floats, gain: float, bend: tuple[float, float]) -> str:
         """Say that the tip rises where it is pressed hard, or shows less there; else nothing."""
@@ -259,7 +260,7 @@ def _scatter(values: Floats) -> float:
 
 
 def _explained(at: Floats, slant: Floats, widths: Floats, felt: Floats) -> tuple[Floats, Floats]:
-    """Return rms (C,) and offset, gain, play and ahead (C, 4) that explain what was felt (N,).
+    """Return rms (C,) and the five unknowns of :func:`_rows` (C, 5) that explain touches (N,).
 
     Args:
         at: (C, N) where the end point was, for each candidate's timestamps [m].
@@ -267,8 +268,7 @@ def _explained(at: Floats, slant: Floats, widths: Floats, felt: Floats) -> tuple
         widths: (C,) of each candidate's reversal [m].
         felt: (N,) displacements across [m].
     """
-    reversal = (_dragged(at, widths) - at) / widths[:, None]
-    rows = np.stack([np.ones_like(at), -at, reversal, -slant], axis=2)
+    rows = _rows(at, slant, widths)
     gram = np.swapaxes(rows, 1, 2) @ rows
     solutions = np.einsum("cij,cnj,n->ci", np.linalg.pinv(gram, hermitian=True), rows, felt)
     left = felt - np.einsum("cni,ci->cn", rows, solutions)
@@ -286,9 +286,24 @@ def _spread(unlikely: Floats, stamps: Floats, plays: Floats, best: int) -> tuple
     return math.sqrt(play + (20e-6) ** 2 / 12.0), math.sqrt(stamp + 10e-3**2 / 12.0)
 
 
-def _dragged(at: Floats, half: Floats) -> Floats:
-    """Return what motions (C, N) drag along with dead bands of ``half`` (C,) to both sides."""
-    dragged = at.copy()
+def _rows(at: Floats, slant: Floats, widths: Floats) -> Floats:
+    """Return the design (C, N, 5): offset, gain, play, where in its play it began, and ahead.
+
+    Where the finger stood in its play at first is told by where it would have been had it begun at
+    the one end and at the other, until both have come to the same.
+    """
+    left, right = (_dragged(at, widths, end) for end in (-1.0, 1.0))
+    reversal, began = (left + right) / 2.0 - at, (right - left) / 2.0
+    scale = widths[:, None]
+    return np.stack([np.ones_like(at), -at, reversal / scale, began / scale, -slant], axis=2)
+
+
+def _dragged(at: Floats, half: Floats, end: float) -> Floats:
+    """Return what motions (C, N) drag along with dead bands of ``half`` (C,) to both sides.
+
+    It begins at an end of its band: 1 for the left one, -1 for the right.
+    """
+    dragged = at + end * half[:, None]
     for i in range(1, at.shape[1]):
         dragged[:, i] = np.clip(dragged[:, i - 1], at[:, i] - half, at[:, i] + half)
     return dragged

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from flangeye_plugins.weld.belief import Belief, Learned
-from flangeye_plugins.weld.probing import SWEEP_MARGIN, Probing, _dragged, _explained, _scatter
+from flangeye_plugins.weld.probing import SWEEP_MARGIN, Probing, _scatter
 from flangeye_plugins.weld.settings import Following
 
 SETTINGS = Following()
@@ -245,7 +245,7 @@ def test_what_finger_clock_and_arm_are_off_by_is_found(side: float, two_walls: b
     found = learned(
         gain=0.08, width=0.04e-3, stamp=0.03, askew=0.2, dead=0.08, side=side, two_walls=two_walls
     )
-    assert found.gain == pytest.approx(0.08, abs=2e-3)
+    assert found.gain == pytest.approx(0.08, abs=3e-3)
     assert found.width == pytest.approx(-0.04e-3, abs=4e-6)
     assert (found.dead_time, found.lag) == (pytest.approx(0.08), 0.0)
     assert found.stamp == pytest.approx(0.03) and found.askew == pytest.approx(0.2, abs=2e-3)
@@ -288,25 +288,29 @@ def test_measurements_scatter_as_their_second_differences_do() -> None:
     assert _scatter(values) == pytest.approx(3e-5, rel=0.05)
 
 
-def test_a_dead_band_drags_what_is_in_it_along() -> None:
-    way = np.array([[0.0, 1.0, 3.0, 2.5, 1.0, -2.0, -1.5]])
-    assert _dragged(way, np.array([1.0]))[0] == pytest.approx([0, 0, 2, 2, 2, -1, -1])
-    both = _dragged(np.vstack([way, way]), np.array([1.0, 0.0]))
-    assert both[1] == pytest.approx(way[0]) and both[0] == pytest.approx([0, 0, 2, 2, 2, -1, -1])
-
-
-def test_offset_gain_and_play_are_those_of_least_squares() -> None:
-    rng = np.random.default_rng(1)
-    slant = rng.normal(0, 0.1, (3, 80))
-    at, widths = np.cumsum(rng.normal(0, 1e-4, (3, 80)), axis=1), np.array([1e-4, 2e-4, 5e-5])
-    felt = rng.normal(0, 1e-4, 80)
-    rms, solutions = _explained(at, slant, widths, felt)
-    for row, lean, width, left, solved in zip(at, slant, widths, rms, solutions, strict=True):
-        reversal = (_dragged(row[None], np.array([width]))[0] - row) / width
-        rows = np.column_stack([np.ones(80), -row, reversal, -lean])
-        best = np.linalg.lstsq(rows, felt, rcond=None)[0]
-        assert solved == pytest.approx(best)
-        assert left == pytest.approx(np.sqrt(np.mean((felt - rows @ best) ** 2)))
+@pytest.mark.parametrize("began", [-1.0, -0.3, 0.6, 1.0])
+@pytest.mark.parametrize(("half", "late", "gain"), [(0.3e-3, 0.0, 0.1), (0.15e-3, 50e-3, -0.1)])
+def test_where_in_its_play_a_finger_began_changes_nothing(
+    began: float, half: float, late: float, gain: float
+) -> None:
+    """Its own generator: an arm that lags, a dead band, images with late stamps, known truth."""
+    found, rng = going(), np.random.default_rng(5)
+    where, speed, shown, cycle = 1.2e-3, 0.0, -1.2e-3 + began * half, 0
+    while not found.over:
+        told, _ = found.velocity(PERIOD)
+        found.note(cycle * PERIOD, told, where)
+        shown = float(np.clip(shown, -where - half, -where + half))
+        if cycle % IMAGES == 0:
+            seen = (1.0 + gain) * shown + 10e-6 * rng.standard_normal()
+            found.feel(cycle * PERIOD + late, seen, 0.0, 0.0)
+        speed += (told - speed) * PERIOD / 0.2
+        where, cycle = where + speed * PERIOD, cycle + 1
+    learned = found.learned()
+    assert isinstance(learned, Learned)
+    assert learned.width == pytest.approx((1.0 + gain) * half, abs=0.02e-3)
+    assert learned.stamp == pytest.approx(late, abs=5e-3)
+    assert learned.gain == pytest.approx(gain, abs=0.02)
+    assert learned.unexplained < 0.02e-3
 
 
 @pytest.mark.parametrize("images", [0, 1, 2, 3])
@@ -331,8 +335,8 @@ def test_a_finger_that_is_not_probed_is_taken_as_its_file_says_to_a_twentieth() 
 @pytest.mark.parametrize("over", [0.02e-3, 0.1e-3, 0.2e-3, 0.4e-3, 1e-3])
 def test_play_and_hysteresis_are_found_that_are_gone_through_over_so_much(over: float) -> None:
     found = learned(width=0.04e-3, over=over, noise=1e-6)
-    assert found.width == pytest.approx(-0.04e-3, rel=0.02) and found.unexplained < 5e-6
-    assert found.gain == pytest.approx(0.0, abs=1e-3)
+    assert found.width == pytest.approx(-0.04e-3, rel=0.03) and found.unexplained < 5e-6
+    assert found.gain == pytest.approx(0.0, abs=3e-3)
 
 
 @pytest.mark.parametrize("stamp", [-0.06, 0.12])
