@@ -48,7 +48,7 @@ def test_a_weld_that_stopped_by_itself_is_gone_on_with_too(tmp_path: Path) -> No
     small = "steps.0.resolution=0.3"
     stopped = flangeye(tmp_path, SEAM, "--set", small, "--set", hidden, "--out", "stopped")
     assert stopped.returncode == 1
-    assert "the weld was stopped: no tag was seen for 500 ms" in stopped.stdout
+    assert "Weld stopped   no tag was seen for 500 ms" in stopped.stdout
     again = flangeye(tmp_path, "--resume", "stopped", "--out", "again")
     assert again.returncode == 0, again.stderr + again.stdout
     weld = json.loads((tmp_path / "again" / "result.json").read_text())["weld"]
