@@ -1,6 +1,6 @@
 """How often a body is found without a guess, how often wrongly, and how far off, by simulation.
 
-    python -m tools.study_bodies SCANS [BODY…] [--first SEED]
+    python -m tools.study_bodies SCANS [BODY…] [--first SEED] [--alone]
 
 Simulated scans of a PhoXi M at 0.35 of its resolution: the body on a UR5e's flange, turned at random,
 before a table with six other things; in three of ten another body is there, or the mesh is mirrored, of
@@ -19,12 +19,25 @@ from typing import Any, NamedTuple
 import numpy as np
 import trimesh
 
-from flangeye.maths.geometry import rigid, rotation_from_rpy, rotation_log
+from flangeye.estimation.alike import told_apart
+from flangeye.maths.geometry import rigid, rotation_exp, rotation_from_rpy, rotation_log
 from flangeye.models.bodies import TargetBody, load_body
-from flangeye.models.configuration import Configuration
+from flangeye.models.cell import cell_of
+from flangeye.models.configuration import ORIGIN, Configuration
 from flangeye.models.loading import load_model
 from flangeye.models.targets import plate_of
-from flangeye.types import CAMERA, Capture, Earlier, PointCloud, PoseFeature, Rejected
+from flangeye.types import (
+    BASE,
+    CAMERA,
+    FLANGE,
+    Capture,
+    Earlier,
+    Observation,
+    PointCloud,
+    PoseFeature,
+    Rejected,
+    Transform,
+)
 from flangeye_emulators.world.mesh import (
     MATERIALS,
     Mesh,
@@ -51,6 +64,9 @@ VISIBLE = 0.3
 SCANNER = load_model("scanners", "phoxi-m", Path())
 MODEL_ERROR, ALIKE = 0.1e-3, 1 / 4
 """How far bodies are off their CAD along each axis [m], and over what share of their size alike."""
+
+SESSION = 8
+"""Scans of one session: where several poses explain a scan, those of its session decide."""
 
 
 def eye(rng):
@@ -118,15 +134,15 @@ def scene(rng, body):
 
 
 class Trial(NamedTuple):
-    """One scan: the pose found or why not, its error where the body is there, and CPU time [s]."""
+    """One scan: the poses found or why none, the true one, and CPU time [s]."""
 
     there: bool
     visible: bool
-    feature: PoseFeature | None
+    found: list[PoseFeature]
     why: str
-    off: np.ndarray
+    pose: np.ndarray
     seconds: float
-    peer_off: np.ndarray
+    peer_off: np.ndarray | None
     peer_seconds: float
 
 
@@ -143,7 +159,7 @@ def wrong(body, turn):
     return TargetBody(body.name, points, body.triangles)
 
 
-def trial(name, seed):
+def trial(name, seed, alone=True):
     """Search one scan for a body; in three of ten another is in its place, or its mesh is wrong."""
     rng = np.random.default_rng(seed)
     body, there = load_body(name, None, Path()), seed % 10 >= 3
@@ -161,15 +177,35 @@ def trial(name, seed):
     visible = there and judged(shape, view, pose, tolerance).shown > VISIBLE
     start = time.process_time()
     found = segment_body(capture, body, Configuration(), Earlier([]), SegmentBodyParams())
+    fits = [found]
     if not isinstance(found, Rejected):
-        found = fit_body(found, body, FitBodyParams(), SCANNER)
+        fits = [fit_body(each, body, FitBodyParams(), SCANNER) for each in found.alone]
     taken = time.process_time() - start
-    lost = isinstance(found, Rejected)
-    off = error(np.eye(4) if lost else found.camera_T_target.matrix, pose)
+    features = [each for each in fits if isinstance(each, PoseFeature)]
+    why = "" if features else fits[0].reason
     start = time.process_time()
-    peer_off = error(peer(points, body), pose)
-    return Trial(there, visible, None if lost else found, found.reason if lost else "", off, taken,
-                 peer_off, time.process_time() - start)  # fmt: skip
+    peer_off = None if alone else error(peer(points, body), pose)
+    return Trial(there, visible, features, why, pose, taken, peer_off, time.process_time() - start)
+
+
+def session(trials, rng):
+    """The one pose found in each of some scans, or None: where several are, the arm's motion tells."""
+    arm = [
+        rigid(rotation_exp(rng.normal(0, 3e-4, 3)), rng.normal(0, 2e-4, 3)) @ one.pose
+        for one in trials
+    ]
+    held = [
+        [
+            Observation(str(k), feature, {FLANGE: Transform(BASE, FLANGE, arm[k])})
+            for feature in one.found
+        ]
+        for k, one in enumerate(trials)
+    ]
+    sure = [poses[0] for poses in held if len(poses) == 1]
+    open_ = [poses for poses in held if len(poses) > 1]
+    told = told_apart(cell_of(Configuration(stands=ORIGIN), None), sure, open_, True)
+    by = {one.id: one.feature for one in [*sure, *told] if one}
+    return [by.get(str(k)) for k in range(len(trials))]
 
 
 def peer(points, body):
@@ -220,35 +256,62 @@ def right(off, size):
 
 
 def summary(name, trials):
-    """How many were found, refused and wrong, and stated over true errors."""
-    size = load_body(name, None, Path()).size
-    seen = [one for one in trials if one.visible]
-    found = [one for one in trials if one.feature is not None]
-    good = [one for one in found if one.there and right(one.off, size)]
-    chi = [one.off @ np.linalg.solve(one.feature.covariance, one.off) / 6 for one in good]
-    off = [1e3 * float(np.linalg.norm(one.off[3:])) for one in good]
-    peers = [one for one in trials if one.there and right(one.peer_off, size)]
-    peer_off = [1e3 * float(np.linalg.norm(one.peer_off[3:])) for one in peers]
-    return (
-        f"{name}, {len(trials)} scans, {len(seen)} with {VISIBLE:.0%} of its view seen, "
+    """How many were found, refused and wrong, and stated over true errors; what went wrong before."""
+    size, rng = load_body(name, None, Path()).size, np.random.default_rng(len(trials))
+    parts = [trials[k : k + SESSION] for k in range(0, len(trials), SESSION)]
+    told = [one for part in parts for one in session(part, rng)]
+    seen = [k for k, one in enumerate(trials) if one.visible]
+    offs = {
+        k: error(one.camera_T_target.matrix, trials[k].pose) for k, one in enumerate(told) if one
+    }
+    good = [k for k in offs if trials[k].there and right(offs[k], size)]
+    alone = [k for k in good if len(trials[k].found) == 1]
+    chi = [offs[k] @ np.linalg.solve(told[k].covariance, offs[k]) / 6 for k in good]
+    lost = [k for k in range(len(trials)) if k not in good and (k in seen or k in offs)]
+    lines = [f"  scan {k}: {_what(trials[k], k in offs)}\n" for k in lost]
+    text = (
+        f"{''.join(lines)}{name}, {len(trials)} scans, {len(seen)} with {VISIBLE:.0%} of its view seen, "
         f"{sum(not one.there for one in trials)} without it\n"
-        f"  flangeye  right {len(good)}, of these visible {sum(one.visible for one in good)}, "
-        f"wrong {len(found) - len(good)}, off {_median(off)} mm, normalised error "
-        f"squared {np.mean(chi) if chi else np.nan:.2f} of 1, "
-        f"{np.mean([one.seconds for one in trials]):.2f} s CPU\n"
-        f"  FPFH+ICP  right {len(peers)}, of these visible {sum(one.visible for one in peers)}, "
+        f"  flangeye  right {len(good)}, of these visible {sum(k in good for k in seen)}, by their "
+        f"scan alone {sum(k in alone for k in seen)}, "
+        f"wrong {len(offs) - len(good)}, off {_median([1e3 * _length(offs[k][3:]) for k in good])} mm, "
+        f"normalised error squared {np.mean(chi) if chi else np.nan:.2f} of 1, "
+        f"{np.mean([one.seconds for one in trials]):.2f} s CPU"
+    )
+    if trials[0].peer_off is None:
+        return text
+    peers = [one for one in trials if one.there and right(one.peer_off, size)]
+    peer_off = [1e3 * _length(one.peer_off[3:]) for one in peers]
+    return text + (
+        f"\n  FPFH+ICP  right {len(peers)}, of these visible {sum(one.visible for one in peers)}, "
         f"wrong {len(trials) - len(peers)}, off {_median(peer_off)} mm, "
         f"{np.mean([one.peer_seconds for one in trials]):.2f} s CPU"
     )
+
+
+def _what(one, taken):
+    """What was wrong with a scan: which pose was taken, or why none, and how far off the nearest is."""
+    offs = [error(each.camera_T_target.matrix, one.pose) for each in one.found]
+    why = "WRONG" if taken else one.why or f"{len(offs)} poses"
+    why = why if one.there else f"{why}, without it"
+    if not offs:
+        return why
+    off = min(offs, key=_length)
+    return f"{why}, {1e3 * _length(off[3:]):.1f} mm, {np.degrees(_length(off[:3])):.1f} deg off"
+
+
+def _length(vector):
+    return float(np.linalg.norm(vector))
 
 
 def _median(values):
     return f"{np.median(values):.2f}" if values else "-"
 
 
-def main(scans, names, first):
+def main(scans, names, first, alone):
     for name in names:
-        print(summary(name, [trial(name, first + k) for k in range(scans)]), flush=True)
+        trials = [trial(name, first + k, alone) for k in range(scans)]
+        print(summary(name, trials), flush=True)
 
 
 if __name__ == "__main__":
@@ -256,5 +319,6 @@ if __name__ == "__main__":
     words.add_argument("scans", type=int)
     words.add_argument("bodies", nargs="*", default=BODIES)
     words.add_argument("--first", type=int, default=0)
+    words.add_argument("--alone", action="store_true", help="without Open3D beside it")
     asked = words.parse_args()
-    main(asked.scans, asked.bodies, asked.first)
+    main(asked.scans, asked.bodies, asked.first, asked.alone)

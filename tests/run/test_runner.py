@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from flangeye import types as t
-from flangeye.errors import CalibrationRefused, StageError
+from flangeye.errors import CalibrationRefused, NothingSeen, StageError
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import parse_recipe
 from flangeye.run.restart import restart_hint
@@ -80,6 +80,54 @@ def test_a_bad_capture_is_data(execute: Callable[..., Any]) -> None:
     assert [r.id for r in log.rejections] == ["000", "001"]
     assert [e.capture for e in log.of_kind("segment")] == ["002", "003", "004", "005"]
     assert result.status == "verified"
+
+
+def pose_seen(capture):
+    """The true pose of the target in a capture of the toy."""
+    return (toy.BASE_T_CAMERA.inverse() @ capture.poses[t.FLANGE]).matrix
+
+
+def both_seen(segment, sure=()):
+    """A segment function of the toy: two half turns explain each scan, all but some."""
+
+    def function(capture):
+        pose, turned = pose_seen(capture), pose_seen(capture) @ np.diag([-1.0, -1.0, 1.0, 1.0])
+        alone = replace(segment(capture), camera_T_target=pose)
+        return alone if capture.id in sure else replace(alone, camera_T_target=turned, others=pose)
+
+    return function
+
+
+def as_segmented(cloud, params):
+    return t.PoseFeature(t.Transform(t.CAMERA, t.TARGET, cloud.camera_T_target), 1e-8 * np.eye(6))
+
+
+@pytest.mark.parametrize("sure", [(), ("003",)])
+def test_of_poses_that_explain_a_scan_alike_the_arms_motion_decides(
+    execute: Callable[..., Any], sure: tuple[str, ...]
+) -> None:
+    with (
+        replaced(toy.segment, both_seen(toy.segment.function, sure)),
+        replaced(toy.fit, as_segmented),
+    ):
+        result, log = execute(TOY_RECIPE)
+    assert {o.id for o in result.observations} == {f"{k:03d}" for k in range(6)}
+    for observation in log.observations():
+        seen = observation.feature.camera_T_target.matrix
+        assert np.allclose(seen, pose_seen(observation), atol=1e-6)
+    assert sorted(log.finished) == sorted(log.poses)
+
+
+def test_where_the_arms_motion_does_not_tell_the_captures_are_set_aside(
+    execute: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(toy, "rigid", lambda *_: np.eye(4))
+    with (
+        replaced(toy.segment, both_seen(toy.segment.function)),
+        replaced(toy.fit, as_segmented),
+        pytest.raises(NothingSeen, match="2 poses of the target .* turn the target by 20 deg"),
+    ):
+        execute(TOY_RECIPE)
 
 
 def test_verification_captures_are_kept_from_the_solver(execute: Callable[..., Any]) -> None:

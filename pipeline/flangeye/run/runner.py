@@ -54,6 +54,7 @@ class Runner:
         self._outcome = Outcome(t.Source(fingerprint=""))
         self._start = FromNothing()
         self._refined: list[Step] = []
+        self._held: list[list[t.Observation]] = []
         self._captures: t.Captures | None = None
         self._working: Generator[t.Capture | t.Rejection] | None = None
         self._done: Callable[[], dict[str, Done]] = dict
@@ -180,6 +181,7 @@ class Runner:
             with self._watch.timing(label):
                 capture = next(captures, None)
             if capture is None:
+                yield from self._told(stream, last=True)
                 self._require_seen()
                 return
             seconds = self._watch.seconds[label] - before
@@ -192,10 +194,38 @@ class Runner:
                 self._reject(t.Rejection(capture.id, acquire.stage.name, fault))
                 continue
             self._hooks.flangeye_captured(step=label, capture=capture, seconds=seconds)
-            observation = stream.outcomes[capture.id] = self._through(capture)
-            self._hooks.flangeye_capture_finished(capture=capture.id)
-            if observation is not None:
-                yield observation
+            poses = self._through(capture)
+            if len(poses) > 1:  # the arm's motion decides, once there is more of it
+                self._held.append(poses)
+            else:
+                stream.outcomes[capture.id] = poses[0] if poses else None
+                self._hooks.flangeye_capture_finished(capture=capture.id)
+                yield from poses
+            yield from self._told(stream)
+
+    def _told(self, stream: t.Captures, last: bool = False) -> Iterator[t.Observation]:
+        """Yield the captures held back of which the arm's motion has told the pose by now.
+
+        Those of which it does not are set aside after the last capture.
+        """
+        from flangeye.estimation.alike import not_told, told_apart
+
+        if not self._held:
+            return
+        found = told_apart(cell_in(self._values), self._outcome.seen, self._held, last)
+        pairs = list(zip(self._held, found, strict=True))
+        self._held = [poses for poses, one in pairs if one is None and not last]
+        for poses, one in pairs:
+            if one is not None:
+                self._finished(self._steps("fit")[0], one.id, one.feature)
+            elif last:
+                why, segment = not_told(poses), self._steps("segment")[0].stage.name
+                aside = t.Rejection(poses[0].id, segment, why.reason, why.figures, why.fix)
+                self._reject(aside)
+            if one is not None or last:
+                stream.outcomes[poses[0].id] = one
+                self._hooks.flangeye_capture_finished(capture=poses[0].id)
+        yield from (one for one in found if one is not None)
 
     def _require_seen(self) -> None:
         """Refuse captures of which none shows the target, by the reason that most of them share.
@@ -239,26 +269,49 @@ class Runner:
             given[t.FlangeCloud] = done.value
         return found
 
-    def _through(self, capture: t.Capture) -> t.Observation | None:
-        """Take one capture through segment and fit; None when set aside or kept for verifying."""
+    def _through(self, capture: t.Capture) -> list[t.Observation]:
+        """Take one capture through segment and fit, and return it with each pose it may show.
+
+        It is none where it was set aside, or is kept for verifying.
+        """
         given: dict[Any, Any] = {t.Capture: capture}
+        flange = None
         if self._steps("segment"):
             flange = self._segment(capture)
             if flange is None:
-                return None
+                return []
             if capture.role == "verification":
                 view = t.VerificationView(capture.id, flange, capture.base_T_flange)
                 self._values[t.Views].append(view)
             given[t.FlangeCloud] = flange
         if capture.role == "verification":
-            return None
-        feature = self._per_capture("fit", capture.id, given)
-        if feature is None:
-            return None
-        return t.Observation(
-            capture.id, feature, capture.poses, capture.joints, capture.camera, capture.target,
-            capture.motion, capture.arm_joints,
-        )  # fmt: skip
+            return []
+        features = self._each_fitted(capture.id, flange, given)
+        return [
+            t.Observation(
+                capture.id, feature, capture.poses, capture.joints, capture.camera, capture.target,
+                capture.motion, capture.arm_joints,
+            )
+            for feature in features
+        ]  # fmt: skip
+
+    def _each_fitted(
+        self, capture: str, flange: t.FlangeCloud | None, given: dict[Any, Any]
+    ) -> list[Any]:
+        """Return what is fitted to each pose that explains a scan; several are not logged yet."""
+        if flange is not None and len(flange.others):
+            step = self._steps("fit")[0]
+            with self._watch.timing(step.label):
+                every = [
+                    (one, _guarded(step, self._arguments(step, {**given, t.FlangeCloud: one})))
+                    for one in flange.alone
+                ]
+            fitted = [each for each in every if not isinstance(each[1], t.Rejected)]
+            if len(fitted) > 1:
+                return [feature for _, feature in fitted]
+            given[t.FlangeCloud] = (fitted or every)[0][0]
+        feature = self._per_capture("fit", capture, given)
+        return [] if feature is None else [feature]
 
     def _segment(self, capture: t.Capture) -> t.FlangeCloud | None:
         if flange := self._start.segmented(capture.id):

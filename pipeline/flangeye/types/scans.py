@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -87,6 +87,7 @@ class FlangeCloud:
         centre: (3,) rough centre of the disc in ``camera`` [m]; a start for fitting.
         normal: (3,) rough unit normal in ``camera``, towards the scanner.
         camera_T_target: (4, 4) rough pose of a body; None of a circle or a sphere.
+        others: (K, 4, 4) other poses that explain the scan as well.
         ratio: Logarithm of how much likelier its edge is the flange's rim than another disc's;
             None where that was not asked.
     """
@@ -96,11 +97,20 @@ class FlangeCloud:
     normal: Array
     camera_T_target: Array | None = None
     ratio: float | None = None
+    others: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
 
     def __post_init__(self) -> None:
-        freeze(self, centre=(3,), normal=(3,))
+        others = np.reshape(self.others, (-1, 4, 4))  # JSON does not tell (0, 4, 4) from (0,)
+        object.__setattr__(self, "others", others)
+        freeze(self, centre=(3,), normal=(3,), others=others.shape)
         if self.camera_T_target is not None:
             freeze(self, camera_T_target=(4, 4))
+
+    @property
+    def alone(self) -> list[FlangeCloud]:
+        """It with each pose that explains the scan alone."""
+        poses = (self.camera_T_target, *self.others)
+        return [replace(self, camera_T_target=each, others=self.others[:0]) for each in poses]
 
 
 @dataclass(frozen=True, eq=False)

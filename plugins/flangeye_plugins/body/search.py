@@ -66,6 +66,15 @@ class BodyVerdict(NamedTuple):
         return self.agree / max(self.agree + self.against, 1)
 
     @property
+    def share(self) -> float:
+        """Rank of a pose before it is refined: its score as a share of the rays that are due.
+
+        What is near to the scanner is met by many rays, and is not the likelier for it.
+        """
+        # With fewer rays a share says little
+        return self.score / max(self.due, 150)
+
+    @property
     def score(self) -> float:
         """Rank of a pose: rays that agree, less weighted rays that contradict."""
         held = self.agree if self.bounded else 0
@@ -197,8 +206,13 @@ def guesses(view: CoarseImage, looks: Looks, most: int) -> Floats:
     # shares of the body's size
     on = scan.take(_some(scan, 800, looks.size * (1 / 22), rng))
     poses = _passed(on, _some(looks.ends, 400, looks.size * (1 / 18), rng), view, looks)
-    # Forty points choose the best
-    return poses[_best_of(looks.scores(poses, view, 40, ROUGH), most)].astype(np.float64)
+    # Moved before forty points choose the best: over a long body an edge's own direction is too
+    # rough. So many points move a pose at once, and so far off the scan may be
+    at_once, few, reach = 2_000, 16, 0.1 * looks.size
+    chunks = range(0, len(poses), at_once)
+    moved = [looks.settled(poses[k : k + at_once], view, few, reach) for k in chunks]
+    poses = np.concatenate([poses[:0], *moved])
+    return poses[_best_of(looks.scores(poses, view, 40, 0.05), most)].astype(np.float64)
 
 
 def _best_of(scores: Floats, most: int) -> Indices:
@@ -289,13 +303,13 @@ class BodySearch:
         """Return distinct candidate poses of the body, best first."""
         # Coarse cells have less noise
         view = view_of(self.points, self.looks.size / 60)
-        poses = guesses(view, self.looks, 1500)
+        poses = guesses(view, self.looks, 1000)
         # Points of the body that settle them, how far from the body the scan is taken for
         # it, move by move, and how far off it may be where it is judged, as shares of the
         # size, and how many are kept
         for count, reaches, tolerance, left in (
-            (40, (0.08, 0.06, 0.05), 0.03, 300),
-            (160, (0.04, 0.03, 0.02), 0.02, 80),
+            (40, (0.06, 0.05), 0.03, 200),
+            (160, (0.04, 0.03, 0.02), 0.02, 40),
         ):
             for reach in reaches:
                 poses = self.looks.settled(poses, view, count, reach * self.looks.size)
@@ -308,7 +322,7 @@ class BodySearch:
         """Return the best of (K, 4, 4) poses, refined on the scan's own points, best first."""
         if not len(poses):
             return []
-        scores = [judged(self.looks, self._fine, pose, self._rough).score for pose in poses]
+        scores = [judged(self.looks, self._fine, pose, self._rough).share for pose in poses]
         # Laid on the scan's own points
         poses = poses[distinct(poses, np.array(scores), self.looks)[:8]]
         return self._distinct([one for one in map(self._laid, poses) if one])
@@ -369,11 +383,14 @@ class BodySearch:
         return [found[k] for k in distinct(poses, scores, self.looks)]
 
 
-def around(points: Singles, shape: Shape, pose: Floats) -> Singles:
-    """Return the points of (N, 3) around a body at a pose."""
-    offset = points - (pose[:3, :3] @ shape.centre + pose[:3, 3]).astype(np.float32)
-    # As a share of the size: half reaches the body's ends
-    return np.asarray(points[np.einsum("ni,ni->n", offset, offset) < (0.55 * shape.size) ** 2])
+def around(points: Singles, shape: Shape, *poses: Floats) -> Singles:
+    """Return the points of (N, 3) around a body at any of some poses."""
+    near = np.zeros(len(points), bool)
+    for pose in poses:
+        offset = points - (pose[:3, :3] @ shape.centre + pose[:3, 3]).astype(np.float32)
+        # As a share of the size: half reaches the body's ends
+        near |= np.einsum("ni,ni->n", offset, offset) < (0.55 * shape.size) ** 2
+    return np.asarray(points[near])
 
 
 def distinct(poses: Floats, scores: Floats, looks: Looks) -> Indices:

@@ -67,6 +67,11 @@ def fit_body(
 
     if cloud.camera_T_target is None:
         return Rejected("nothing says where the body is; segment.body comes before fit.body")
+    if len(cloud.others):
+        return Rejected(
+            f"{1 + len(cloud.others)} poses of {body.name} explain the scan, and of a single one "
+            "nothing tells which is right; FlangeCloud.alone gives each of them"
+        )
     body = body.at(capture.joints if capture else None)
     fit = fitted(cloud.cloud.xyz, prepared(body), cloud.camera_T_target)
     if fit is None:

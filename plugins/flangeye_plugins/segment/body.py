@@ -10,7 +10,7 @@ import numpy as np
 
 from flangeye import Params, stage
 from flangeye.errors import StageError
-from flangeye.maths.geometry import invert, rotation_log
+from flangeye.maths.geometry import invert
 from flangeye.models.bodies import LARGEST, SMALLEST, TargetBody
 from flangeye.models.configuration import Configuration
 from flangeye.types import (
@@ -64,9 +64,9 @@ def segment_body(
 
     Edges of the body are laid on edges of the scan; the poses that the scan does not contradict are
     refined, and then checked ray by ray against everything the scanner saw: the body's surface,
-    points behind it, and surface where the body has ended. Refused: no pose that passes, and two
-    that do. Where the arm's motion since earlier sightings predicts the pose and that passes, it is
-    taken without a search.
+    points behind it, and surface where the body has ended. Where none passes the scan is refused;
+    where several do, the arm's motion between captures decides. Where the arm's motion since
+    earlier sightings predicts a pose that passes, it is taken without a search.
 
     Raises:
         StageError: The cloud is in millimetres, or otherwise a thousand times off; or the body is
@@ -97,14 +97,16 @@ def segment_body(
     if not found:
         every = search.everywhere()
         found = list(filter(passes, every))
-        if why := _why_not(every, found, body):
+        if not found:
             # Of the first captures only: a body that was seen before is as its mesh says.
-            doubtful = not found and not earlier.observations
+            doubtful = not earlier.observations
+            why = _why_none(every, body)
             return (doubtful and _misdrawn(points, body, every, passes)) or why
-    pose = found[0].pose
+    pose, *others = (one.pose for one in found)
     centre = pose[:3, :3] @ looks.centre + pose[:3, 3]
-    cloud = PointCloud(capture.cloud.frame, around(points, looks, pose))
-    return FlangeCloud(cloud, centre, -centre / np.linalg.norm(centre), pose)
+    cloud = PointCloud(capture.cloud.frame, around(points, looks, pose, *others))
+    towards = -centre / np.linalg.norm(centre)
+    return FlangeCloud(cloud, centre, towards, pose, others=np.array(others))
 
 
 def _between(points: Singles, near: float, far: float) -> Singles:
@@ -200,23 +202,14 @@ def _passes(
     )
 
 
-def _why_not(every: list[FoundPose], passing: list[FoundPose], body: TargetBody) -> Rejected | None:
-    """Return why no pose is taken; None where one is."""
+def _why_none(every: list[FoundPose], body: TargetBody) -> Rejected:
+    """Return why no pose is taken."""
     if not every:
         return Rejected(f"nothing of the size of {body.name} is there")
     best = every[0].verdict
-    if not passing:
-        return Rejected(
-            f"no pose of {body.name} ({body.size * 1e3:.0f} mm across) explains the scan: is it in "
-            "view, and are the mesh's unit and handedness right?",
-            f"the best shows {best.shown:.0%} of it in {best.agree} rays, {best.trusted:.1%} of "
-            f"what is seen there fits, and it holds to {every[0].weakest * body.size * 1e3:.1f} mm",
-        )
-    if len(passing) > 1:
-        turn = rotation_log((passing[0].pose.T @ passing[1].pose)[None, :3, :3])[0]
-        return Rejected(
-            f"two poses of {body.name} explain the scan",
-            f"{np.degrees(np.linalg.norm(turn)):.0f} deg apart, by {passing[0].verdict.agree} and "
-            f"{passing[1].verdict.agree} rays",
-        )
-    return None
+    return Rejected(
+        f"no pose of {body.name} ({body.size * 1e3:.0f} mm across) explains the scan: is it in "
+        "view, and are the mesh's unit and handedness right?",
+        f"the best shows {best.shown:.0%} of it in {best.agree} rays, {best.trusted:.1%} of "
+        f"what is seen there fits, and it holds to {every[0].weakest * body.size * 1e3:.1f} mm",
+    )

@@ -1,0 +1,132 @@
+"""Which of several poses that explain a scan alike is the target's: the arm's motion tells.
+
+What holds for one capture holds for all: ``X C = W P``, with the camera ``X`` and the target ``P``
+in what carries them, the pose ``C`` in the scan, and ``W`` between the carriers, as controllers
+report it. Where ``P`` is known each pose in a scan gives a camera; where it is not, the target
+turned by the same angle between two captures in scans and by the controllers. True poses agree so
+with those of every other capture, and false ones only while the arm turns about the axis, and moves
+along it, that true and false poses differ by.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from flangeye.maths.geometry import hat, invert, rotation_log
+from flangeye.models.cell import Cell
+from flangeye.types import Floats, Indices, Observation, PoseFeature, Rejected, Transform
+
+Poses = Sequence[Observation]
+"""One capture, once for each pose that explains its scan; the features are ``PoseFeature``."""
+
+
+def told_apart(
+    cell: Cell, sure: Poses, held: Sequence[Poses], last: bool
+) -> list[Observation | None]:
+    """Return of each capture the pose that the others bear out; None where they do not tell.
+
+    Args:
+        cell: Who carries whom.
+        sure: Captures that one pose explains.
+        held: The others.
+        last: Whether no capture is left to come. Then, where the target's place is to be found and
+            no capture is sure, the first capture's best pose is called the target's.
+    """
+    told = _told(cell, sure, held)
+    if last and not sure and not any(told) and cell.frames[held[0][0].target].place is None:
+        return [held[0][0], *_told(cell, held[0][:1], held[1:])]
+    return told
+
+
+def not_told(poses: Poses) -> Rejected:
+    """Return why a capture is set aside that several poses explain: how they differ, what to do."""
+    one, other, *_ = (feature.camera_T_target.matrix for feature in _features(poses))
+    turn = rotation_log((invert(one) @ other)[:3, :3])
+    angle = float(np.linalg.norm(turn))
+    x, y, z = turn / max(angle, 1e-9)
+    return Rejected(
+        f"{len(poses)} poses of the target explain the scan, and the arm's motion does not tell "
+        "which is right",
+        f"they are {np.degrees(angle):.0f} deg apart about ({x:.2f}, {y:.2f}, {z:.2f}) of the "
+        "target",
+        "between captures turn the target by 20 deg and more about other axes than the one that "
+        "the poses differ by, and move it across that; or scan what is one-sided of it",
+    )
+
+
+def _told(cell: Cell, sure: Poses, held: Sequence[Poses]) -> list[Observation | None]:
+    each = [*held, *([o] for o in sure if isinstance(o.feature, PoseFeature))]
+    every = [pose for poses in each for pose in poses]
+    ends = {end for pose in every for end in (pose.camera, pose.target)}
+    if len(each) < 2 or not {*cell.unknown_frames} <= ends:
+        return [None] * len(held)
+    starts = np.cumsum([0, *map(len, each)])[:-1]
+    own = np.repeat(np.arange(len(each)), [len(poses) for poses in each])
+    # (poses, captures): from each pose to that of another capture which is nearest to it
+    nearest = np.fmin.reduceat(_apart(cell, every), starts, axis=1)
+    nearest[np.arange(len(own)), own] = np.nan
+    costs = _costs(nearest, starts)
+    return [_likeliest(poses, costs[own == k]) for k, poses in enumerate(held)]
+
+
+def _apart(cell: Cell, every: Poses) -> Floats:
+    """Return (M, M) squared distances between poses, in variances; NaN between other ends."""
+    unknown = cell.unknown_frames
+    at_once = [Transform(cell.frames[n].parent, n, np.eye(4)) for n in unknown]
+    ends = cell.ends(dict(zip(cell.unknowns, at_once, strict=True)), every)
+    carried = invert(ends.camera) @ ends.target
+    features = _features(every)
+    seen = np.array([one.camera_T_target.matrix for one in features])
+    spread = np.array([one.covariance for one in features])
+    placed = not {o.target for o in every} & {*unknown}
+    measure = _off_place if placed else _off_angle
+    same = [[(a.camera, a.target) == (b.camera, b.target) for b in every] for a in every]
+    out = [measure(k, carried, seen, spread) for k in range(len(every))]
+    return np.where(same, out, np.nan)
+
+
+def _features(poses: Poses) -> list[PoseFeature]:
+    return [pose.feature for pose in poses if isinstance(pose.feature, PoseFeature)]
+
+
+def _off_place(k: int, carried: Floats, seen: Floats, spread: Floats) -> Floats:
+    """Return (M,): a target from where the cameras of the others would see it."""
+    there = seen @ invert(carried) @ carried[k]
+    turn = rotation_log(there[:, :3, :3] @ seen[k, :3, :3].T)
+    off = np.concatenate([turn, there[:, :3, 3] - seen[k, :3, 3]], axis=1)
+    moved = np.tile(np.eye(6), (len(seen), 1, 1))
+    moved[:, 3:, :3] = hat(seen[:, :3, 3] - seen[k, :3, 3])
+    spread = spread[k] + moved @ spread @ moved.transpose(0, 2, 1)
+    return np.asarray(np.einsum("mi,mi->m", off, np.linalg.solve(spread, off[..., None])[..., 0]))
+
+
+def _off_angle(k: int, carried: Floats, seen: Floats, spread: Floats) -> Floats:
+    """Return (M,): by how much less or more the target turned in scans than controllers say."""
+    told, found = (
+        np.linalg.norm(rotation_log((invert(all_[k]) @ all_)[:, :3, :3]), axis=1)
+        for all_ in (carried, seen)
+    )
+    turns = np.trace(spread[:, :3, :3], axis1=1, axis2=2) / 3
+    return np.asarray((told - found) ** 2 / (turns[k] + turns))
+
+
+def _costs(nearest: Floats, starts: Indices) -> Floats:
+    """Return (M,) how unlikely poses are, as logarithms, by distances (M, N) to N captures.
+
+    Distances have long tails, for any one of the arm's poses may be wrong, and the scale that the
+    session shows, for arms err by more than scans.
+    """
+    known = np.isfinite(nearest).any(axis=1)
+    typical = np.full(len(nearest), np.inf)
+    typical[known] = np.nanmedian(nearest[known], axis=1)
+    scale = max(1.0, float(np.median(np.minimum.reduceat(typical, starts))))
+    return np.asarray(np.nansum(np.log1p(nearest / scale), axis=1))
+
+
+def _likeliest(poses: Poses, costs: Floats) -> Observation | None:
+    first, second = np.argsort(costs, kind="stable")[:2]
+    # Times by which a pose must be likelier than any other
+    odds = 1000.0
+    return poses[first] if costs[second] - costs[first] > np.log(odds) else None

@@ -1,0 +1,105 @@
+"""estimation.alike: poses that explain a scan alike, told apart by how the arm moved."""
+
+import numpy as np
+import pytest
+
+from flangeye.estimation.alike import not_told, told_apart
+from flangeye.maths.geometry import invert, rigid, rotation_exp
+from flangeye.models.cell import cell_of
+from flangeye.models.configuration import ORIGIN, Configuration
+from flangeye.types import BASE, CAMERA, FLANGE, TARGET, Observation, PoseFeature, Transform
+
+HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
+CAMERA_PLACE = rigid(rotation_exp([2.0, 0.5, -1.0]), np.array([0.6, 0.1, 0.9]))
+DEVIATIONS = np.r_[np.full(3, 3e-4), np.full(3, 1e-4)]
+
+
+def turned(rng, axes=(1.0, 1.0, 1.0)):
+    return rigid(rotation_exp(rng.normal(0, 0.4, 3) * axes), rng.normal(0, 0.1, 3) * axes)
+
+
+def session(arm, seed=0, place=None, sure=0):
+    """Captures of each of which the first pose, and then the second, is the true one in turn."""
+    rng, out = np.random.default_rng(seed), []
+    for k, pose in enumerate(arm):
+        true = invert(CAMERA_PLACE) @ pose @ (np.eye(4) if place is None else place)
+        both = [true] if k < sure else [true, true @ HALF_TURN][:: 1 - 2 * (k % 2)]
+        noise = rng.normal(0, 1, 6) * DEVIATIONS
+        reported = pose @ rigid(rotation_exp(rng.normal(0, 5e-4, 3)), rng.normal(0, 5e-4, 3))
+        out.append([
+            Observation(
+                str(k),
+                PoseFeature(
+                    Transform(CAMERA, TARGET, rigid(
+                        rotation_exp(noise[:3]) @ each[:3, :3], each[:3, 3] + noise[3:]
+                    )),
+                    np.diag(DEVIATIONS**2),
+                ),
+                {FLANGE: Transform(BASE, FLANGE, reported)},
+            )
+            for each in both
+        ])  # fmt: skip
+    return out
+
+
+def told(captures, stands=ORIGIN, last=True):
+    """Which pose is told of each capture that has several."""
+    cell = cell_of(Configuration(stands=stands), None)
+    sure = [poses[0] for poses in captures if len(poses) == 1]
+    held = [poses for poses in captures if len(poses) > 1]
+    found = told_apart(cell, sure, held, last)
+    return [one and poses.index(one) for poses, one in zip(held, found, strict=True)]
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("count", [2, 3, 8])
+def test_captures_tell_each_other_apart_where_none_is_sure(count: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    arm = [turned(rng) for _ in range(count)]
+    assert told(session(arm, seed)) == [k % 2 for k in range(count)]
+
+
+def test_one_sure_capture_tells_all_others() -> None:
+    rng = np.random.default_rng(1)
+    arm = [turned(rng) for _ in range(4)]
+    assert told(session(arm, sure=1)) == [1, 0, 1]
+    assert told(session(arm, sure=1), last=False) == [1, 0, 1]
+
+
+def test_a_capture_whose_arm_pose_is_wrong_does_not_mislead() -> None:
+    rng = np.random.default_rng(2)
+    arm = [turned(rng) for _ in range(6)]
+    captures = session(arm)
+    captures[2] = session([turned(rng) for _ in range(6)])[2]
+    moved = {FLANGE: Transform(BASE, FLANGE, arm[2])}
+    captures[2] = [Observation(o.id, o.feature, moved) for o in captures[2]]
+    right = told(captures)
+    assert [right[k] for k in (0, 1, 3, 4, 5)] == [0, 1, 1, 0, 1]
+
+
+def test_an_arm_that_moves_about_their_axis_alone_does_not_tell_and_the_motion_is_named() -> None:
+    rng = np.random.default_rng(3)
+    arm = [turned(rng, (0, 0, 1)) for _ in range(6)]
+    captures = session(arm)
+    assert told(captures) == [None] * 6
+    why = not_told(captures[0])
+    assert "2 poses of the target explain the scan" in why.reason
+    assert "180 deg apart about (" in why.figures
+    assert "1.00) of the target" in why.figures
+    assert "other axes" in why.fix
+
+
+def test_nothing_is_told_of_one_capture() -> None:
+    assert told(session([np.eye(4)])) == [None]
+
+
+def test_where_the_place_is_to_be_found_all_captures_mean_the_same_pose() -> None:
+    """Whether it is the true one or the other is the same to the camera."""
+    rng = np.random.default_rng(4)
+    arm = [turned(rng) for _ in range(6)]
+    place = rigid(rotation_exp([0.3, -0.2, 1.0]), np.array([0.05, 0.0, 0.1]))
+    captures = session(arm, place=place)
+    assert told(captures, None, last=False) == [None] * 6
+    assert told(captures, None) == [k % 2 for k in range(6)]
+    assert told([poses[::-1] for poses in captures], None) == [k % 2 for k in range(6)]
+    assert told(session(arm, place=place, sure=1), None) == [1, 0, 1, 0, 1]
