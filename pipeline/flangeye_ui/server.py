@@ -9,8 +9,8 @@ its own in its place. Nothing behind the gate sees cookies.
 
 from __future__ import annotations
 
-import contextlib
 import ipaddress
+import os
 import secrets
 import socket
 import tempfile
@@ -85,16 +85,17 @@ def serve(folder: Path, registry: Registry, host: str, port: int, browser: bool)
     app.on_shutdown(lambda: project.run.stop("the page's server ended") if project.run else None)
     say(f"open {at}{keys.token}")
     app.config.socket_io_js_transports = ["websocket"]
-    with way_in(folder, at + keys.token) as file:
-        if browser:
-            app.on_startup(lambda: threading.Thread(target=show, args=(file,), daemon=True).start())
-        # For how long a page may be away [s]. NiceGUI takes a page for dead that leaves a ping
-        # unanswered for 0.4 of it: longer than ``scan_page.SILENCE``, which alone decides whether a
-        # page lives.
-        ui.run(
-            host=host, port=port, reload=False, show=False, show_welcome_message=False,
-            title="flangeye", dark=None, reconnect_timeout=15.0,
-        )  # fmt: skip
+    file = way_in(folder, at + keys.token)
+    app.on_shutdown(lambda: file.unlink(missing_ok=True))  # also where the server is terminated
+    if browser:
+        app.on_startup(lambda: threading.Thread(target=show, args=(file,), daemon=True).start())
+    # For how long a page may be away [s]. NiceGUI takes a page for dead that leaves a ping
+    # unanswered for 0.4 of it: longer than ``scan_page.SILENCE``, which alone decides whether a
+    # page lives.
+    ui.run(
+        host=host, port=port, reload=False, show=False, show_welcome_message=False,
+        title="flangeye", dark=None, reconnect_timeout=15.0,
+    )  # fmt: skip
 
 
 def say(line: str) -> None:
@@ -102,17 +103,16 @@ def say(line: str) -> None:
     print(line, flush=True)  # noqa: T201
 
 
-@contextlib.contextmanager
-def way_in(folder: Path, address: str) -> Iterator[Path]:
-    """Keep a file that leads to an address which other users of the machine must not see.
+def way_in(folder: Path, address: str) -> Path:
+    """Write a file that leads to an address which other users of the machine must not see.
 
     What a program is started with can be read by everybody, so a browser is started with a file
     that only its user can read, in the folder, where a confined browser may read it too.
     """
-    with tempfile.NamedTemporaryFile("w", dir=folder, prefix="open_", suffix=".html") as file:
+    handle, name = tempfile.mkstemp(".html", "open_", folder)
+    with os.fdopen(handle, "w") as file:
         file.write(forwarding(address))
-        file.flush()
-        yield Path(file.name).resolve()
+    return Path(name).resolve()
 
 
 def forwarding(address: str) -> str:

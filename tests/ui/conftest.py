@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import signal
 import socket
 import subprocess
 import sys
@@ -89,12 +88,14 @@ def wait_for(port: int) -> None:
 
 
 def ended(served: Served) -> None:
-    served.process.send_signal(signal.SIGINT)
+    served.process.terminate()  # nothing is left behind then either
     try:
         served.process.wait(10)
     except subprocess.TimeoutExpired:
         served.process.kill()
         served.process.wait(10)
+    else:
+        assert not list(served.folder.glob("open_*.html"))
 
 
 @pytest.fixture(scope="module")
