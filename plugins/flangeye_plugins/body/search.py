@@ -396,13 +396,18 @@ def around(points: Singles, shape: Shape, *poses: Floats) -> Singles:
 def distinct(poses: Floats, scores: Floats, looks: Looks) -> Indices:
     """Return the indices of poses that differ from each other, best first."""
     order = np.argsort(-scores, kind="stable")
-    centres = poses[order, :3, :3] @ looks.centre + poses[order, :3, 3]
-    # One pose, where they differ by less in place, as a share of the size, and in turn
-    near = np.linalg.norm(centres[:, None] - centres, axis=2) < 0.06 * looks.size
-    trace = np.einsum("aij,bij->ab", poses[order, :3, :3], poses[order, :3, :3])
-    near &= trace > 1 + 2 * np.cos(float(np.radians(12.0)))
+    near = alike(poses[order], poses[order], looks)
     free = np.ones(len(order), bool)
     for k in range(len(order)):
         if free[k]:
             free[k + 1 :] &= ~near[k, k + 1 :]
     return order[free]
+
+
+def alike(some: Floats, others: Floats, looks: Looks) -> Mask:
+    """Return (A, B) which of (A, 4, 4) and (B, 4, 4) are one pose, not yet laid on the scan."""
+    here, there = (poses[:, :3, :3] @ looks.centre + poses[:, :3, 3] for poses in (some, others))
+    # They differ by less in place, as a share of the size, and in turn
+    near = np.linalg.norm(here[:, None] - there, axis=2) < 0.06 * looks.size
+    trace = np.einsum("aij,bij->ab", some[:, :3, :3], others[:, :3, :3])
+    return np.asarray(near & (trace > 1 + 2 * np.cos(float(np.radians(12.0)))))

@@ -74,7 +74,7 @@ def segment_body(
     """
     from flangeye_plugins.body.dense import FEWEST
     from flangeye_plugins.body.looks import prepared
-    from flangeye_plugins.body.search import BodySearch, around
+    from flangeye_plugins.body.search import BodySearch, alike, around
     from flangeye_plugins.segment.scale import check_scale
 
     body = body.at(capture.joints)
@@ -93,8 +93,10 @@ def segment_body(
         )
     search = BodySearch(points, looks)
     passes = partial(_passes, coverage=params.min_coverage, trust=params.min_trust)
-    found = list(filter(passes, search.near(_predicted(capture, configuration, earlier))))[:1]
-    if not found:
+    predicted = _predicted(capture, configuration, earlier)
+    found = list(filter(passes, search.near(predicted)))[:1]
+    # What slid away from where the arm has carried the body may be another thing
+    if not (found and alike(found[0].pose[None], predicted, looks).any()):
         every = search.everywhere()
         found = list(filter(passes, every))
         if not found:

@@ -152,6 +152,9 @@ def test_two_poses_that_explain_a_scan_alike_are_kept_until_the_arms_motion_tell
     refused = fit_body(both, GRIPPER, FitBodyParams())
     assert "2 poses of gripper explain the scan" in refused.reason
     assert is_at(BEHIND, found(capture, earlier=sighting(POSE)))
+    # A pose that the arm's motion does not predict is not taken for a predicted one
+    aside = BEHIND @ HALF_TURN @ rigid(rotation_from_rpy(0.0, 0.0, 0.3), np.zeros(3))
+    assert len(found(capture, earlier=sighting(aside, BEHIND)).alone) == 2
 
 
 def test_an_earlier_sighting_that_was_wrong_does_no_harm() -> None:
