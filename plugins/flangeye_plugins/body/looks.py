@@ -187,7 +187,7 @@ class Looks(Shape):
 @lru_cache(maxsize=8)  # a session's body, and how its mesh may be drawn wrongly
 def prepared(body: TargetBody) -> Looks:
     """Return a body's looks; computed once for each shape."""
-    return Looks(body.vertices, body.triangles)
+    return Looks(body.vertices, body.triangles, mounted=True)
 
 
 def _apart(points: Floats, seen: Mask) -> Indices:

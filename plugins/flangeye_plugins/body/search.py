@@ -94,12 +94,14 @@ def judged(shape: Shape, view: CoarseImage, pose: Floats, tolerance: float) -> B
     from scipy import ndimage
 
     compared = _compared(shape, view, pose, tolerance)
-    if compared is None:
+    if compared is None or not compared.hit.any():
         return BodyVerdict(*[0] * 7)
     rays, scan, depth, normals, hit, due, agree, against, *_ = compared
     beside = ndimage.binary_dilation(hit, iterations=OUTLINE) & ~ndimage.binary_dilation(hit)
     row, column = ndimage.distance_transform_edt(~hit, return_distances=False, return_indices=True)
     ended = depth[row, column][..., None] * rays[row, column]
+    foot = shape.at_foot(((ended - pose[:3, 3]) @ pose[:3, :3]).reshape(-1, 3))
+    beside &= ~foot.reshape(beside.shape)
     on = np.abs(np.einsum("ijk,ijk->ij", normals[row, column], scan - ended)) < 2 * tolerance
     measured = beside & np.isfinite(scan[..., 2])
     ended_there = beside & (scan[..., 2] > depth[row, column] + 2 * tolerance)

@@ -72,6 +72,7 @@ class Shape:
     Attributes:
         vertices: (V, 3) [m].
         triangles: (T, 3) indices of vertices.
+        mounted: Whether it is drawn in the frame of what carries it, with z away from that.
     """
 
     # Spacings of the samples that pairs are made of along the body's size.
@@ -86,6 +87,7 @@ class Shape:
 
     vertices: Floats
     triangles: NDArray[np.int32]
+    mounted: bool = False
 
     @cached_property
     def size(self) -> float:
@@ -202,7 +204,16 @@ class Shape:
         ends, nearest = ends.take(np.isfinite(gap)), nearest[np.isfinite(gap)]
         side = np.einsum("ni,ni->n", ends.normals, outwards[nearest])
         ends = ends._replace(normals=ends.normals * np.sign(side)[:, None])
-        return ends.take(np.abs(side) > self.crease)
+        # What a body is fastened to may go on where it ends
+        stands = (ends.directions[:, 2] < -self.crease) & self.at_foot(ends.points)
+        return ends.take((np.abs(side) > self.crease) & ~stands)
+
+    def at_foot(self, points: Floats) -> Mask:
+        """Return (N,) which points of a mounted body are at the face that it is fastened by."""
+        low, high = self.vertices[:, 2].min(), self.vertices[:, 2].max()
+        # Two cells of the view that poses are judged in, of a flat body less, as shares of its size
+        near = min(0.02 * self.size, 0.1 * (high - low))
+        return np.asarray((points[:, 2] < near) & (self.mounted and abs(low) < near))
 
     @cached_property
     def outside(self) -> tuple[Floats, Floats]:

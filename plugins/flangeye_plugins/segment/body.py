@@ -152,7 +152,7 @@ def _misdrawn(
     for pose in (one.pose for one in every):
         gone = opposed(shape, view, pose)
         if gone is not None:
-            rest = Looks(vertices, facets[~gone].astype(np.int32))
+            rest = Looks(vertices, facets[~gone].astype(np.int32), mounted=True)
             near = filter(holds, BodySearch(points, rest).near(pose[None]))
             held += [(one.verdict.score, vertices[facets[gone]]) for one in near]
     if not held:

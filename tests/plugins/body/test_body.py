@@ -333,3 +333,9 @@ def test_a_fit_that_rests_on_other_edges_is_refused() -> None:
     told = trial("ring-plate", 23)
     assert not told.found
     assert "it rests on other edges than its own" in told.why
+
+
+def test_where_the_carrier_goes_on_beyond_a_bodys_foot_is_no_end_of_it() -> None:
+    """The flange is flush with the torch's bracket: its edges are not those of the bracket."""
+    told = trial("torch", 84004)
+    assert [np.linalg.norm(off(one, told.pose)[3:]) < 0.5e-3 for one in told.found] == [True]
