@@ -8,11 +8,11 @@ when it takes what the camera sees to within 1 mm rms of where the true one does
 
 from __future__ import annotations
 
+import io
 import json
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -21,6 +21,9 @@ import typer
 import yaml
 from scipy.spatial.transform import Rotation
 
+from flangeye.cli import commands
+from flangeye.cli.console import end_in_words
+from flangeye.maths.geometry import rigid
 from tests.estimation import foreign
 
 POSES, ARM, RIGHT = 24, 0.1e-3, 1e-3
@@ -103,6 +106,55 @@ def _mirrored(poses: np.ndarray) -> None:
     poses[:, 1, 3] *= -1
 
 
+def _left_handed(poses: np.ndarray) -> np.ndarray:
+    """Write poses in a frame whose y points the other way."""
+    flip = np.diag([1.0, -1.0, 1.0, 1.0])
+    return np.asarray(flip @ poses @ flip)
+
+
+def _exchanged_axes(poses: np.ndarray) -> np.ndarray:
+    poses = poses.copy()
+    poses[:, [0, 1], 3] = poses[:, [1, 0], 3]
+    return poses
+
+
+def _other_axes(turn: np.ndarray) -> Fault:
+    """Return the fault that the camera's frame has other axes than x right, y down, z forward."""
+    return seen(lambda poses: rigid(turn, np.zeros(3)) @ poses)
+
+
+def _deeper(poses: np.ndarray) -> None:
+    poses[:, 2, 3] *= 1.02
+
+
+def _half_in_mm(arm: np.ndarray, marker: np.ndarray) -> Rows:
+    changed = arm.copy()
+    changed[len(arm) // 2 :, :3, 3] *= 1000
+    return plain(changed, marker)
+
+
+def _shuffled(poses: np.ndarray) -> np.ndarray:
+    return poses[np.random.default_rng(3).permutation(len(poses))]
+
+
+def _quarter_turns(poses: np.ndarray) -> None:
+    turn = Rotation.from_rotvec([0, 0, np.pi / 2]).as_matrix()
+    poses[1::4, :3, :3] = poses[1::4, :3, :3] @ turn
+
+
+def _wrong_sign(arm: np.ndarray, marker: np.ndarray) -> Rows:
+    rows = plain(arm, marker)._replace(arm=written(arm, "xyz"), rotations=("xyz rad", "xyzw"))
+    rows.arm[:, 5] *= -1
+    return rows
+
+
+def _in_the_tool(arm: np.ndarray, marker: np.ndarray) -> Rows:
+    """Give positions of the base in the flange beside rotations of the flange in the base."""
+    mixed = arm.copy()
+    mixed[:, :3, 3] = np.linalg.inv(arm)[:, :3, 3]
+    return plain(mixed, marker)
+
+
 def _frozen(arm: np.ndarray, marker: np.ndarray) -> Rows:
     stale = arm.copy()
     stale[10:14] = stale[10]
@@ -139,7 +191,41 @@ FAULTS: dict[str, Fault] = {
     "marker in mm": _times(1000.0),
     "marker's y negated": seen(_mirrored),
     "robot transposed": lambda a, m: plain(_transposed(a), m),
+    "marker transposed": lambda a, m: plain(a, _transposed(m)),
+    "both transposed": lambda a, m: plain(_transposed(a), _transposed(m)),
+    "tables exchanged": lambda a, m: plain(m, a),
+    "exchanged and inverted": lambda a, m: plain(np.linalg.inv(m), np.linalg.inv(a)),
+    "robot exchanged, wrong mounting": lambda a, m: _wrong_mounting(m, a),
+    "robot inverted, wrong mounting": lambda a, m: _wrong_mounting(np.linalg.inv(a), m),
+    "marker inverted, wrong mounting": lambda a, m: _wrong_mounting(a, np.linalg.inv(m)),
+    "both inverted, wrong mounting": lambda a, m: _wrong_mounting(
+        np.linalg.inv(a), np.linalg.inv(m)
+    ),
+    "camera's axes as OpenGL has them": _other_axes(np.diag([1.0, -1.0, -1.0])),
+    "camera's axes as ROS bodies have them": _other_axes(
+        np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    ),
+    "robot left-handed": lambda a, m: plain(_left_handed(a), m),
+    "marker left-handed": seen(_left_handed),
+    "robot's x and y exchanged": lambda a, m: plain(_exchanged_axes(a), m),
+    "marker's x and y exchanged": seen(_exchanged_axes),
+    "robot's position in the tool": _in_the_tool,
+    "robot's third angle negated": _wrong_sign,
+    "robot in mm": lambda a, m: plain(_scaled(a, 1000.0), m),
+    "both in mm": lambda a, m: plain(_scaled(a, 1000.0), _scaled(m, 1000.0)),
+    "both in inches": lambda a, m: plain(_scaled(a, 1 / 0.0254), _scaled(m, 1 / 0.0254)),
+    "robot in mm from half way": _half_in_mm,
+    "marker's depth + 2 %": seen(_deeper),
+    "rows shuffled": seen(_shuffled),
+    "rows reversed": seen(lambda m: m[::-1]),
+    "quarter turns of the marker": seen(_quarter_turns),
 }
+
+
+def _scaled(poses: np.ndarray, by: float) -> np.ndarray:
+    out = poses.copy()
+    out[:, :3, 3] *= by
+    return out
 
 
 def _transposed(poses: np.ndarray) -> np.ndarray:
@@ -194,6 +280,13 @@ def _error(found: np.ndarray, s: foreign.Session) -> float:
     return float(np.sqrt(((first - second) ** 2).sum(axis=1).mean()))
 
 
+class Said(NamedTuple):
+    """What a command wrote."""
+
+    stdout: str
+    stderr: str
+
+
 def doctored(recipe: Path) -> tuple[str, Path | None]:
     """Return what the doctor names first, and the recipe with its last line pasted."""
     done = _flangeye("doctor", recipe, "--json")
@@ -203,19 +296,26 @@ def doctored(recipe: Path) -> tuple[str, Path | None]:
     if not findings:
         return "nothing", None
     name = "; ".join(finding["name"] for finding in findings)
-    line = findings[-1]["fix"].partition("  # or, if")[0]
-    kind = next((k for k in ("- acquire", "configuration:") if line.startswith(k)), None)
-    if kind is None:
+    fixes = [finding["fix"].partition("  # or, if")[0] for finding in findings]
+    kinds = ("- acquire", "configuration:")
+    pasted = {kind: fix for fix in fixes for kind in kinds if fix.startswith(kind)}
+    if not pasted:
         return name, None
     file = recipe.with_name("pasted.yaml")
-    lines = [line if old.startswith(kind) else old for old in recipe.read_text().splitlines()]
+    lines = [
+        next((pasted[kind] for kind in pasted if old.startswith(kind)), old)
+        for old in recipe.read_text().splitlines()
+    ]
     file.write_text("\n".join(lines))
     return name, file
 
 
-def _flangeye(*words: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "flangeye.cli", *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+def _flangeye(*words: object) -> Said:
+    """Run a command in this process: a hundred of them import the same modules."""
+    said, why = io.StringIO(), io.StringIO()
+    with redirect_stdout(said), redirect_stderr(why), suppress(SystemExit):
+        end_in_words(lambda: commands()(list(map(str, words))))
+    return Said(said.getvalue(), why.getvalue())
 
 
 def table(faults: Annotated[list[str] | None, typer.Argument()] = None, seed: int = 0) -> None:

@@ -105,6 +105,7 @@ PARTS = {
     "check.repeated": "flangeye_plugins.check.order:repeated",
     "check.units": "flangeye_plugins.check.units:units",
     "check.direction": "flangeye_plugins.check.pose_conventions:direction",
+    "check.axes": "flangeye_plugins.check.pose_conventions:axes",
     "check.mirrored": "flangeye_plugins.check.pose_conventions:mirrored",
     "check.exchanged": "flangeye_plugins.check.pose_conventions:exchanged",
     "check.convention": "flangeye_plugins.check.pose_conventions:convention",

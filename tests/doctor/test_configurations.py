@@ -156,6 +156,7 @@ def test_what_cannot_show_is_said_with_the_reason() -> None:
         "check.direction": "the camera's link is where the joint angles say",
         "check.convention": "the camera's link is where the joint angles say",
         "check.exchanged": "the camera's link is where the joint angles say",
+        "check.axes": "the markers were found in images or clouds, whose frame is known",
         "check.flips": "no marker's whole pose was measured",
         "check.scatter": "no marker's whole pose was measured",
         "check.tool": "a constant offset of what carries the camera is part of the answer",

@@ -216,7 +216,9 @@ def test_centres_of_an_unknown_place_are_solved_by_what_a_refusal_names(tmp_path
 @pytest.mark.parametrize(
     ("fault", "kind"),
     [("both inverted", "hand"),
+     ("tables exchanged", "marker"),
      pytest.param("marker inverted", "hand", marks=pytest.mark.slow),
+     pytest.param("camera's axes as OpenGL has them", "hand", marks=pytest.mark.slow),
      pytest.param("wrong mounting", "hand", marks=pytest.mark.slow),
      pytest.param("marker's angles off by 6 deg", "hand", marks=pytest.mark.slow),
      pytest.param("marker's size + 0.3 %", "marker", marks=pytest.mark.slow),
@@ -229,9 +231,18 @@ def test_a_fault_in_tables_is_named_and_its_line_cures(fault: str, kind: str) ->
     status, finding, cured = cells[2], cells[5], cells[6]
     assert status != "verified"
     assert finding in (
-        "pose convention", "pose direction", "mirrored axis", "marker rotations", "target size",
+        "pose convention", "pose direction", "mounting", "mirrored axis", "marker rotations", "target size", "camera axes",
     )  # fmt: skip
     assert cured.startswith("verified") and float(cured.split()[1]) < 1.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", ["robot inverted", "marker inverted", "robot exchanged"])
+def test_two_mistakes_at_once_are_named_and_their_lines_cure(fault: str) -> None:
+    cells = [c.strip() for c in injected.row(f"{fault}, wrong mounting", "marker", 1).split("|")]
+    assert cells[3] != "verified"
+    assert cells[6] == "mounting; pose direction"
+    assert cells[7].startswith("verified") and float(cells[7].split()[1]) < 1.0
 
 
 @pytest.mark.slow

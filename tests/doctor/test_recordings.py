@@ -236,7 +236,7 @@ def test_nothing_found_is_exit_code_zero(
 ) -> None:
     code, out, _ = run(monkeypatch, capsys, folder(session_of()))
     assert code == 0
-    assert out.splitlines()[0] == "20 of 20 samples have a target in them; 17 checks"
+    assert out.splitlines()[0] == "20 of 20 samples have a target in them; 18 checks"
     assert out.splitlines()[-1] == "nothing found"
 
 

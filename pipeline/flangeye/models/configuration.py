@@ -130,19 +130,6 @@ class Ends:
     target: Floats
 
 
-def looks_exchanged(carried: float, standing: float) -> bool:
-    """Whether camera and target seem to be swapped.
-
-    With both the arm's and the markers' poses inverted, one fits as the other does. Arms carry
-    what they carry near the flange, and what stands before them is further from their base.
-
-    Args:
-        carried: Distance from the flange of what the arm carries [m].
-        standing: Distance from the arm's base of what stands [m].
-    """
-    return carried > 2 * standing
-
-
 def mapped_and_expected(ends: Ends, observations: Sequence[Observation]) -> tuple[Floats, Floats]:
     """Return the targets as measured and as expected: (N, 3) each, in ``base``."""
     seen = np.array([o.feature.centre for o in observations]).reshape(-1, 3)

@@ -2,7 +2,7 @@
 
 from flangeye_plugins.check.order import clock, identity, moved, order, repeated, tool
 from flangeye_plugins.check.outliers import flips, motion, outlier, scatter
-from flangeye_plugins.check.pose_conventions import convention, direction, exchanged, mirrored
+from flangeye_plugins.check.pose_conventions import axes, convention, direction, exchanged, mirrored
 from flangeye_plugins.check.units import rounding, size, units
 
 CHECKS = (
@@ -12,6 +12,7 @@ CHECKS = (
     direction,
     convention,
     exchanged,
+    axes,
     mirrored,
     order,
     clock,

@@ -25,26 +25,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flangeye import StageError
 from flangeye.doctor.diagnosis import Arms, Finding, Misfit, RecordedSession
-from flangeye.errors import CalibrationRefused
-from flangeye.estimation.estimate import Estimate
-from flangeye.estimation.session import session_of
-from flangeye.maths.geometry import hat, rigid, rotation_exp
-from flangeye.models.cell import cell_of
-from flangeye.models.configuration import Configuration
-from flangeye.types import (
-    BASE,
-    CAMERA,
-    FLANGE,
-    TARGET,
-    Floats,
-    Indices,
-    Mask,
-    Observation,
-    PoseFeature,
-    Transform,
-)
+from flangeye.estimation.readings import Pairs, estimated
+from flangeye.maths.geometry import hat, rotation_exp
+from flangeye.types import Floats, Indices, Mask
 from flangeye_plugins.check.equations import Equations, VariantUnknowns, equations_of, start_of
 
 TAILS = 4.0
@@ -499,55 +483,21 @@ def _spread(session: RecordedSession) -> float:
     return max(float(np.linalg.norm(side.std(axis=0))) for side in sides)
 
 
-def likelier(first: RecordedSession, second: RecordedSession) -> float:
-    """Return the logarithm of the ratio of two sessions' restricted likelihoods.
-
-    By the model that a run calibrates with. It knows how a marker's noise and the arm's errors
-    differ, where two readings fit equally well: a marker's position is measured better than its
-    rotation times its distance.
-
-    Args:
-        first: Whole poses of a marker, with one arm; neither its place nor the camera's is known.
-        second: Another reading of the same samples.
-    """
-    found = [_estimated(each) for each in (first, second)]
-    used = [each.inliers for each in found if each is not None]
-    if len(used) == 2 and not (agree := used[0] & used[1]).all():
-        seen = np.flatnonzero(np.isfinite(first.rotations[:, 0, 0]))
-        kept = np.isin(np.arange(len(first)), seen[agree])
-        found = [_estimated(each.where(kept)) for each in (first, second)]
-    costs = [np.inf if each is None else each.posterior.cost for each in found]
-    return 0.0 if costs == [np.inf, np.inf] else 0.5 * (costs[1] - costs[0])
-
-
 def size_by_chance(session: RecordedSession) -> float:
     """Return the probability that errors of the arm show so wrong a marker's size by chance."""
     one_arm = session.seconds is None and session.links is None
-    if not one_arm or np.isfinite(session.places).any() or not (found := _estimated(session)):
+    if not one_arm or np.isfinite(session.places).any():
+        return 1.0
+    if (found := estimated(pairs_of(session), session.robot)) is None:
         return 1.0
     ((_, mean, covariance),) = found.numbers("size")
     return float(erfc(abs(mean[0]) / np.sqrt(2 * covariance[0, 0])))
 
 
-def _estimated(session: RecordedSession) -> Estimate | None:
-    """Return the model's estimate from a session's markers; None where it refuses them."""
-    # As good as acquire.samples takes markers for: how good they are is estimated [rad, m]
-    noise = np.diag(np.square([np.radians(0.2)] * 3 + [0.5e-3] * 3))
-    observations = [
-        Observation(
-            name,
-            PoseFeature(Transform(CAMERA, TARGET, rigid(turn, centre)), noise),
-            {FLANGE: Transform(BASE, FLANGE, pose)},
-            None,
-        )
-        for name, pose, turn, centre in zip(
-            session.ids, session.poses, session.rotations, session.centres, strict=True
-        )
-        if np.isfinite(turn).all()
-    ]
-    ends = (BASE, FLANGE) if session.carried == "target" else (FLANGE, BASE)
-    try:
-        configuration = Configuration(camera=ends[0], target=ends[1])
-        return session_of(observations, cell_of(configuration, session.robot), None).found
-    except (CalibrationRefused, StageError):
-        return None
+def pairs_of(session: RecordedSession) -> Pairs:
+    """Return the poses of one arm and of what was seen: whole ones, or of centres turned by NaN."""
+    turned = np.isfinite(session.rotations).all(axis=(1, 2))
+    shown = turned if turned.any() else session.seen
+    markers = np.tile(np.eye(4), (int(shown.sum()), 1, 1))
+    markers[:, :3, :3], markers[:, :3, 3] = session.rotations[shown], session.centres[shown]
+    return Pairs(session.poses[shown], markers, session.carried == "camera")

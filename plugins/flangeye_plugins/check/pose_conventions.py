@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -18,9 +18,9 @@ from flangeye.doctor.diagnosis import (
     NotApplicable,
     RecordedSession,
 )
+from flangeye.estimation.readings import Reading, meant, optical, other_axes
 from flangeye.maths.pose_corrections import inverted, reread, scaled, transposed
 from flangeye.maths.pose_formats import CONVENTIONS, EULER_ORDERS, PLAIN, written
-from flangeye.models.configuration import looks_exchanged
 from flangeye_plugins.check.equations import equations_of
 from flangeye_plugins.check.fitting import (
     best_of,
@@ -28,8 +28,8 @@ from flangeye_plugins.check.fitting import (
     fit,
     fit_of,
     helps,
-    likelier,
     named,
+    pairs_of,
 )
 
 QUATERNIONS = ("xyzw", "wxyz")
@@ -47,7 +47,7 @@ _WAYS: Mapping[str, tuple[Change, str]] = {
 }
 
 
-class Reading(NamedTuple):
+class Rereading(NamedTuple):
     """A session with its rotations read in another convention: whose, from and to."""
 
     session: RecordedSession
@@ -68,7 +68,7 @@ def convention(session: RecordedSession) -> Findings:
         yield evidence.finding("pose convention", what, found.session)
 
 
-def _written_otherwise(session: RecordedSession) -> Iterator[Reading]:
+def _written_otherwise(session: RecordedSession) -> Iterator[Rereading]:
     """Give the recordings read again, their numbers as written taken in another convention."""
     if session.again is None:
         return
@@ -86,7 +86,7 @@ def _written_otherwise(session: RecordedSession) -> Iterator[Reading]:
             with suppress(StageError):  # the numbers are no poses in it
                 read = session.again(changes if of_arm else {}, changes if of_target else {})
                 if read.ids == session.ids:
-                    yield Reading(read, name, _spelt(said), _spelt(other))
+                    yield Rereading(read, name, _spelt(said), _spelt(other))
 
 
 Convention = tuple[str, str | None]
@@ -119,17 +119,17 @@ def _spelt(convention: Convention) -> str:
     )
 
 
-def _of_arms(session: RecordedSession) -> Iterator[Reading]:
+def _of_arms(session: RecordedSession) -> Iterator[Rereading]:
     for arms in session.arms:
         whose = "the" if session.seconds is None else named(arms, session)
         for read_as, written_as in _readings(_stated(session)):
             reread_session = session.corrected(
                 _rereading(read_as, written_as), arms, robot={"rotation": [read_as, written_as]}
             )
-            yield Reading(reread_session, f"{whose} rotations", _name(read_as), _name(written_as))
+            yield Rereading(reread_session, f"{whose} rotations", _name(read_as), _name(written_as))
 
 
-def _of_markers(session: RecordedSession) -> Iterator[Reading]:
+def _of_markers(session: RecordedSession) -> Iterator[Rereading]:
     """Give other readings of ready-made markers' rotations, alone and with the arms'."""
     if not _has_ready_made_markers(session):
         return
@@ -138,11 +138,11 @@ def _of_markers(session: RecordedSession) -> Iterator[Reading]:
         change = _rereading(read_as, written_as)
         told = {"rotation": [read_as, written_as]}
         alone = _with_markers(session, change).read_with(target=told)
-        yield Reading(alone, "the markers' rotations", _name(read_as), _name(written_as))
+        yield Rereading(alone, "the markers' rotations", _name(read_as), _name(written_as))
         if stated == _stated(session):
             both = _with_markers(session, change).corrected(change, "both", robot=told, target=told)
             whose = "the rotations of robot and markers"
-            yield Reading(both, whose, _name(read_as), _name(written_as))
+            yield Rereading(both, whose, _name(read_as), _name(written_as))
 
 
 def _has_ready_made_markers(session: RecordedSession) -> bool:
@@ -212,10 +212,12 @@ def direction(session: RecordedSession) -> Findings:
     corrected_session, whose, way = tried[evidence.which]
     if evidence.probability == 1 or not helps(session, corrected_session):
         return
-    what, fix = f"{whose} {_WAYS[way][1]}", corrected_session.step()
+    name, what = "pose direction", f"{whose} {_WAYS[way][1]}"
+    fix = corrected_session.step()
     if way == "inverted" and _may_be_mounted_otherwise(session):
-        what, fix, corrected_session = _of_exchanged(session, corrected_session)
-    yield evidence.finding("pose direction", what, corrected_session, fix)
+        readings = [_after_inverting(each) for each in _meant(corrected_session)]
+        name, what, fix, corrected_session = _choices(session, readings)
+    yield evidence.finding(name, what, corrected_session, fix)
 
 
 @part("check.exchanged")
@@ -224,21 +226,36 @@ def exchanged(session: RecordedSession) -> Findings:
     session.require_poses()
     if not np.isfinite(session.rotations).any() or not _may_be_mounted_otherwise(session):
         raise NotApplicable("camera and target cannot stand for each other")
-    carried, standing = _distances(session)
-    other = _with_markers(session, inverted).corrected(
-        inverted, robot={"inverted": True}, target={"inverted": True}
-    )
-    if not looks_exchanged(carried, standing) or not explained(session) or _unseen(other):
+    if not explained(session) or Reading() in (readings := _meant(session)):
         return
+    carried, standing = _distances(session)
     carried_by = {"target": ("marker", "camera"), "camera": ("camera", "marker")}
+    name, told, fix, corrected_session = _choices(session, readings)
     what = (
         f"as they are read, the arm carries the {carried_by[session.carried][0]} "
         f"{carried:.2f} m from its flange, and the {carried_by[session.carried][1]} stands "
-        f"{standing:.2f} m from its base: the poses of robot and markers are both inverted, "
-        "which fits as well"
+        f"{standing:.2f} m from its base: rather {told}, which fits as well"
     )
     misfit = fit_of(session).misfit()
-    yield Finding("pose direction", what, other.step(), (), misfit, misfit, corrected_session=other)
+    # Whatever explains errors comes first
+    yield Finding(name, what, fix, (), misfit, misfit, 0.0, 0.0, corrected_session)
+
+
+@part("check.axes")
+def axes(session: RecordedSession) -> Findings:
+    """The camera's frame has other axes than x right, y down, z forward."""
+    session.require_samples()
+    if not _has_ready_made_markers(session):
+        raise NotApplicable("the markers were found in images or clouds, whose frame is known")
+    if (found := other_axes(session.centres[session.seen])) is None or not explained(session):
+        return
+    turn = optical(found)
+    read = session.read_with(target={"axes": found})
+    mended = replace(read, centres=session.centres @ turn.T, rotations=turn @ session.rotations)
+    who = {"opengl": "OpenGL has them, z backward", "ros": "bodies have them in ROS, x forward"}
+    what = f"the camera's axes are as {who[found]}: the targets lie along that"
+    # What explains errors comes first
+    yield Finding("camera axes", what, mended.step(), gain=0.0, corrected_session=mended)
 
 
 @part("check.mirrored")
@@ -274,11 +291,6 @@ def _distances(session: RecordedSession) -> tuple[float, float]:
     return float(np.linalg.norm(near)), float(np.linalg.norm(far))
 
 
-def _unseen(session: RecordedSession) -> bool:
-    """Whether a target lies beside or behind the camera."""
-    return _off_axis(session) > np.pi / 2
-
-
 def _turned_round(session: RecordedSession) -> Iterator[tuple[RecordedSession, str, str]]:
     for arms in session.arms:
         whose = "the" if session.seconds is None else named(arms, session)
@@ -303,43 +315,46 @@ def _may_be_mounted_otherwise(session: RecordedSession) -> bool:
     return session.links is None and session.seconds is None and unknown
 
 
-def _of_exchanged(
-    session: RecordedSession, turned: RecordedSession
-) -> tuple[str, str, RecordedSession]:
-    """Return what may be wrong, the lines to choose from, and the session by the first of them.
-
-    The samples fit each of three: with the arm's poses inverted camera and target are as far from
-    flange and base as they are from base and flange with another mounting, or inverted markers.
-    Distances tell the first from the others, and the likelihood the last.
-    """
-    # Where the camera then is, and how to say so
-    held, name = {
-        "target": ("in the hand", "eye-in-hand"),
-        "camera": ("beside the robot", "eye-on-base"),
-    }[session.carried]
-    mounted = f"the camera is {held}", f"configuration: {{name: {name}, place: unknown}}", turned
-    arm = "the poses are flange_T_base", turned.step(), turned
-    choices = [mounted, arm]
-    if looks_exchanged(*_distances(turned)):
-        choices = [mounted]
-    elif looks_exchanged(*reversed(_distances(turned))):
-        choices = [arm]
-    if np.isfinite(session.rotations).any() and mounted in choices:
-        other = _with_markers(session, inverted).read_with(target={"inverted": True})
-        marker = "the target's poses are target_T_camera", other.step(), other
-        carried: Literal["camera", "target"] = "camera" if name == "eye-in-hand" else "target"
-        sure = likelier(other, replace(session, carried=carried))
-        # Ten thousand times likelier: the data tell. The priors alone make it one or two thousand
-        if abs(sure) < np.log(1e4):
-            choices.append(marker)
-        elif sure > 0:
-            choices = [marker]
-    what = ", or ".join(each for each, _, _ in choices)
-    fits = ": the samples fit each" if len(choices) > 1 else ""
-    return what + fits, OR_ELSE.join(line for _, line, _ in choices), choices[0][2]
+def _meant(session: RecordedSession) -> list[Reading]:
+    return meant(pairs_of(session), *_distances(session), session.robot)
 
 
-def _off_axis(session: RecordedSession) -> float:
-    """Return the largest angle between what was seen and the camera's axis [rad]."""
-    x, y, z = session.centres.T
-    return float(np.nanmax(np.arctan2(np.hypot(x, y), z)))
+def _after_inverting(reading: Reading) -> Reading:
+    """Return a reading of poses of which the arm's were inverted, as one of those as recorded."""
+    if reading.exchanged:
+        return reading._replace(marker_inverted=not reading.marker_inverted)
+    return reading._replace(robot_inverted=not reading.robot_inverted)
+
+
+def _choices(
+    session: RecordedSession, readings: Sequence[Reading]
+) -> tuple[str, str, str, RecordedSession]:
+    """Return the mistake in a word and in words, the lines to choose from, and what is meant."""
+    in_hand = session.carried == "camera"
+    what = ", or ".join(dict.fromkeys(each.told(in_hand) for each in readings))
+    made = [_read_so(session, each) for each in readings]
+    fits = ": the samples fit each" if len(made) > 1 else ""
+    name = "mounting" if readings[0].remounted else "pose direction"
+    return name, what + fits, OR_ELSE.join(dict.fromkeys(line for line, _ in made)), made[0][1]
+
+
+def _read_so(session: RecordedSession, reading: Reading) -> tuple[str, RecordedSession]:
+    """Return a line of the recipe, and the session by it: of two, that of the mounting first."""
+    if reading.remounted:
+        name = "eye-on-base" if session.carried == "camera" else "eye-in-hand"
+        held: Literal["camera", "target"] = "target" if name == "eye-on-base" else "camera"
+        line = f"configuration: {{name: {name}, place: unknown}}"
+        return line, replace(session, carried=held)
+    shown = session.where(np.asarray(np.isfinite(session.rotations).all(axis=(1, 2))))
+    session = shown if reading.exchanged or reading.marker_inverted else session
+    told: dict[str, Any] = {"exchanged": True} if reading.exchanged else {}
+    told |= {"robot": {"inverted": True}} if reading.robot_inverted else {}
+    told |= {"target": {"inverted": True}} if reading.marker_inverted else {}
+    read = replace(session.read_with(**told), motions=None)
+    if session is not shown:
+        mended = replace(read, poses=inverted(session.poses))
+    else:
+        pairs = reading.of(pairs_of(session))
+        turns, centres = pairs.marker[:, :3, :3], pairs.marker[:, :3, 3]
+        mended = replace(read, poses=pairs.robot, rotations=turns, centres=centres)
+    return mended.step(), mended

@@ -17,9 +17,11 @@ from pydantic import Field, field_validator
 
 from flangeye import BoundPart, Choose, Params, StageError, part
 from flangeye.doctor.diagnosis import Arms
+from flangeye.estimation.readings import Axes, optical
 from flangeye.files.recording import Archive, Recording
 from flangeye.maths.pose_corrections import (
     delayed,
+    each_turned,
     inverted,
     reread,
     scaled,
@@ -36,6 +38,9 @@ from flangeye.units import Duration, Length, param
 class PoseMistake(Params):
     """Mistakes of poses, undone in the order of this list."""
 
+    axes: Axes | None = Field(
+        None, description="Axes of the camera's frame, where z is not forward: opengl or ros."
+    )
     rotation: tuple[str, str] | None = Field(
         None, description="Conventions of the rotations: the one in which that reader read them, "
         f"then the one in which they were written; {', '.join(PLAIN[:3])}, or axes.",
@@ -64,6 +69,8 @@ class PoseMistake(Params):
 
     def undone(self, poses: Floats) -> Floats:
         """Return poses (N, 4, 4) as they should be."""
+        if self.axes:
+            poses = each_turned(optical(self.axes), poses)
         if self.rotation:
             poses = reread(poses, *self.rotation)
         if self.transposed:
@@ -89,6 +96,9 @@ class CorrectedParams(Params):
         default_factory=PoseMistake,
         description="What was wrong with ready-made markers and centres.",
     )
+    exchanged: bool = Field(
+        False, description="The robot's poses were read for the markers', and these for those."
+    )
     offset: tuple[Length, Length, Length] = param(
         ("0 mm", "0 mm", "0 mm"),
         description="What was seen, from the point whose poses were recorded, in its frame.",
@@ -113,6 +123,8 @@ def corrected(path: Path, params: CorrectedParams) -> Archive:
 
 def _alone(recording: Recording, params: CorrectedParams) -> Recording:
     """Undo what concerns each pose by itself."""
+    if params.exchanged:
+        recording = _exchanged(recording)
     spared = {"first": FLANGE2, "second": FLANGE}.get(params.arms)
     poses = {
         frame: pose if frame == spared else _corrected(pose[None], params)[0]
@@ -136,6 +148,20 @@ def _alone(recording: Recording, params: CorrectedParams) -> Recording:
         centre_in_camera=None if centre is None else centre * params.target.factors,
         camera_T_target=target,
     )
+
+
+def _exchanged(recording: Recording) -> Recording:
+    """Exchange the robot's pose and the marker's.
+
+    Raises:
+        StageError: One of the two is missing.
+    """
+    marker = recording.camera_T_target
+    if marker is None or FLANGE not in recording.poses:
+        raise StageError(f"{recording.id}: exchanged: there is no marker's pose beside the robot's")
+    poses = {**recording.poses, FLANGE: marker}
+    seen = recording.poses[FLANGE]
+    return replace(recording, poses=poses, camera_T_target=seen, motion=None, joints=None)
 
 
 def _corrected(poses: Floats, params: CorrectedParams) -> Floats:

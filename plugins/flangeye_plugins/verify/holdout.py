@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from flangeye import CalibrationRefused, Params, StageError, stage
+from flangeye.estimation.readings import Pairs, Reading, meant, other_axes
 from flangeye.maths.geometry import angle_between, invert, rotation_log
 from flangeye.models.cell import Cell, cell_of
 from flangeye.models.configuration import (
@@ -17,7 +18,6 @@ from flangeye.models.configuration import (
     DEFAULT,
     EVERY,
     Configuration,
-    looks_exchanged,
     mapped_and_expected,
 )
 from flangeye.models.robots import RobotModel, SecondRobot
@@ -42,6 +42,9 @@ class HoldoutParams(Params):
 
     folds: int = Field(5, ge=2, description="Number of folds; each is held out once.")
     max_rms: Length = param("1 mm", gt=0, description="Largest held-out error that passes, rms.")
+    optical: bool = Field(
+        True, description="Whether markers are seen in a camera's own frame, z forward."
+    )
     # Largest held-out angle between measured and expected faces that passes, rms. Positions alone
     # can fit while every angle was read wrongly [rad]
     max_tilt: ClassVar[float] = float(np.radians(2))
@@ -109,7 +112,7 @@ def verify_holdout(  # noqa: PLR0913  what it asks the runner for
         corrected = _figures(hold_out(poses, deals, answers, standing), counted)
         figures |= {f"corrected_{name}": corrected[name] for name in ("rms", "median", "p95")}
     passed, reason = _judge(figures, params)
-    if passed and (why := _exchanged(calibration, standing)):
+    if passed and (why := _misread(calibration, standing, params.optical)):
         passed, reason = False, why
     errors = {o.id: float(norm) for o, norm in zip(poses, norms, strict=True)}
     return Verification(passed, reason, figures, errors)
@@ -207,24 +210,35 @@ def _figures(held: HeldOut, counted: Mask) -> dict[str, float]:
     return {**figures, "tilt_rms": rms(tilts)} if len(tilts) else figures
 
 
-def _exchanged(calibration: HandEye, cell: Cell) -> str | None:
-    """Return why camera and marker of one arm seem to stand for each other; None if they do not."""
-    markers = any(isinstance(pair.observation.feature, PoseFeature) for pair in calibration.pairs)
-    if not markers or len(cell.unknown_frames) != 2 or len(cell.movers) != 1 or cell.links:
+def _misread(calibration: HandEye, cell: Cell, optical: bool) -> str | None:
+    """Return how one arm's and a marker's poses were rather meant; None if as they were read."""
+    seen = [o for pair in calibration.pairs if pair.used for o in [pair.observation]]
+    whole = all(isinstance(o.feature, PoseFeature) for o in seen)
+    if not whole or len(cell.unknown_frames) != 2 or len(cell.movers) != 1 or cell.links:
         return None
     found = {x.transform.parent: x.transform for x in calibration.transforms.values()}
     if len(found) != 2 or FLANGE not in found:
         return None
-    carried = float(np.linalg.norm(found.pop(FLANGE).translation))
-    ((_, other),) = found.items()
-    standing = float(np.linalg.norm(other.translation))
-    if not looks_exchanged(carried, standing):
-        return None
-    return (
-        f"the arm would carry the one {carried:.2f} m from its flange, the other would stand "
-        f"{standing:.2f} m from its base: the poses of robot and markers are probably both "
-        "inverted, which fits as well; if they are right, state the target's place "
-        "(configuration: {place: …})"
+    carried = found.pop(FLANGE)
+    ((_, standing),) = found.items()
+    markers = np.array([o.feature.camera_T_target.matrix for o in seen])  # type: ignore[union-attr]
+    pairs = Pairs(
+        np.array([o.poses[FLANGE].matrix for o in seen]), markers, carried.child == cell.cameras[0]
+    )
+    near, far = (float(np.linalg.norm(each.translation)) for each in (carried, standing))
+    readings = meant(pairs, near, far, next(iter(cell.arms.values()), None))
+    if Reading() not in readings:
+        return (
+            f"the arm would carry the one {near:.2f} m from its flange, the other would "
+            f"stand {far:.2f} m from its base: probably "
+            f"{readings[0].told(pairs.in_hand)}, which fits as well; if they are right, state the "
+            "target's place (configuration: {place: …})"
+        )
+    axes = other_axes(markers[:, :3, 3]) if optical else None
+    side = {"opengl": "behind", "ros": "beside"}
+    return axes and (
+        f"all targets are {side[axes]} the camera: its frame has not z forward; if that is meant, "
+        "say verify.holdout: {optical: false}"
     )
 
 

@@ -1,0 +1,205 @@
+r"""Which of several readings of an arm's and a marker's poses is meant, where all fit alike.
+
+With the arm's poses :math:`P`, what it carries at :math:`C` from its flange and what stands at
+:math:`S` in its base, every sample says :math:`P C = S M`, :math:`M` being what was seen, the
+standing frame to the carried one. The same numbers say as well
+
+.. math:: P^{-1} S = C M^{-1}, \quad M C^{-1} = S^{-1} P, \quad M^{-1} S^{-1} = C^{-1} P^{-1}:
+
+both inverted, exchanged, and both; and in each the camera may stand or be carried. The residuals
+of the eight differ little. What tells them apart is where things then are, and which errors are
+left: a marker's position is measured better than its turn times its distance, and an arm errs by
+its joints.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+
+from flangeye.errors import CalibrationRefused, StageError
+from flangeye.estimation.estimate import Estimate
+from flangeye.estimation.session import session_of
+from flangeye.maths.geometry import invert
+from flangeye.models.cell import cell_of
+from flangeye.models.configuration import Configuration
+from flangeye.models.robots import RobotModel
+from flangeye.types import (
+    BASE,
+    CAMERA,
+    FLANGE,
+    TARGET,
+    Floats,
+    Mask,
+    Observation,
+    PoseFeature,
+    Transform,
+)
+
+Axes = Literal["opengl", "ros"]
+"""A camera's frame with y up and z backward, or with x forward, y left and z up (REP 103)."""
+
+
+def optical(axes: Axes) -> Floats:
+    """Return (3, 3) that turns a camera's frame into x right, y down, z forward."""
+    if axes == "opengl":
+        return np.diag([1.0, -1.0, -1.0])
+    return np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+
+
+class Pairs(NamedTuple):
+    """N poses (N, 4, 4) of an arm and of a marker in the camera, and whether it carries that."""
+
+    robot: Floats
+    marker: Floats
+    in_hand: bool
+
+
+class Reading(NamedTuple):
+    """What has to be changed of poses as they were read, in this order."""
+
+    exchanged: bool = False
+    robot_inverted: bool = False
+    marker_inverted: bool = False
+    remounted: bool = False
+
+    def of(self, pairs: Pairs) -> Pairs:
+        """Return the poses so read."""
+        robot, marker, in_hand = pairs
+        if self.exchanged:
+            robot, marker = marker, robot
+        robot = invert(robot) if self.robot_inverted else robot
+        marker = invert(marker) if self.marker_inverted else marker
+        return Pairs(robot, marker, in_hand != self.remounted)
+
+    def told(self, in_hand: bool) -> str:
+        """Return what is wrong, in words; the camera is now carried, or not."""
+        both = self.robot_inverted and self.marker_inverted
+        words = [
+            "the tables of robot and markers are exchanged" if self.exchanged else "",
+            "the poses of robot and markers are both inverted" if both else "",
+            "the poses are flange_T_base" if self.robot_inverted and not both else "",
+            "the target's poses are target_T_camera" if self.marker_inverted and not both else "",
+            f"the camera is {'beside the robot' if in_hand else 'in the hand'}"
+            if self.remounted
+            else "",
+        ]
+        return " and ".join(filter(None, words))
+
+
+def meant(pairs: Pairs, carried: float, standing: float, robot: RobotModel | None) -> list[Reading]:
+    """Return the readings that may be meant, likeliest first; several where the data do not tell.
+
+    Args:
+        pairs: As they were read; one calibration fits them. Centres are turned by NaN, and are
+            neither inverted nor exchanged.
+        carried: Distance from the flange of what the arm then carries [m].
+        standing: Distance from the base of what then stands [m].
+        robot: The arm's model, where one is known.
+    """
+    # Median distance [m] and spread of its logarithm, from the flange of what an arm carries, and
+    # from its base of what stands: as tools and cells are, with room for either to be odd
+    held, away = (0.12, 0.8), (0.9, 0.5)
+    # Log odds by which places tell two readings apart, and by which errors do: the priors of their
+    # sizes alone make one or two thousand
+    told, likelier = np.log(20.0), np.log(1e4)
+    whole = bool(np.isfinite(pairs.marker).all())
+    plausible = {
+        reading: _log_normal(standing if inverse else carried, *held)
+        + _log_normal(carried if inverse else standing, *away)
+        + _seen(reading.of(pairs).marker[:, :3, 3])
+        for inverse, exchanged, remounted in product((False, True), repeat=3)
+        for reading in [_reading(pairs.in_hand, inverse, exchanged, remounted)]
+        if whole or not (reading.exchanged or reading.marker_inverted)
+    }
+    top = max(plausible.values())
+    near = [reading for reading, each in plausible.items() if each > top - told]
+    if len(near) == 1 or not whole:
+        return sorted(near, key=lambda reading: -plausible[reading])
+    odds = {
+        r: plausible[r] - cost for r, cost in zip(near, _costs(near, pairs, robot), strict=True)
+    }
+    likely = [reading for reading in near if odds[reading] > max(odds.values()) - likelier]
+    return sorted(likely, key=lambda reading: -odds[reading])
+
+
+def _reading(in_hand: bool, inverse: bool, exchanged: bool, remounted: bool) -> Reading:
+    """Return what makes of the loop as read one of the eight."""
+    if exchanged:
+        return Reading(True, inverse != in_hand, inverse != (in_hand != remounted), remounted)
+    return Reading(False, inverse, inverse != remounted, remounted)
+
+
+def _log_normal(distance: float, median: float, spread: float) -> float:
+    return -0.5 * float(np.log(max(distance, 1e-3) / median) / spread) ** 2
+
+
+def _seen(places: Floats) -> float:
+    """Return the log odds of what a camera sees at places (N, 3), in the axes that fit best.
+
+    A picture reaches 20 to 35 degrees from its axis; beyond 60 all angles are as unlikely.
+    """
+    off = [
+        _off_axis(places),
+        _off_axis(places @ optical("opengl").T),
+        _off_axis(places @ optical("ros").T),
+    ]
+    odds = -0.5 * (np.array(off) / np.radians(20)) ** 2 - np.array([0.0, 1.0, 1.5])
+    return float(max(odds.max(), -5.0))
+
+
+def _off_axis(places: Floats) -> float:
+    """Return the rms angle of places (N, 3) off the axis z [rad]."""
+    angles = np.arctan2(np.hypot(places[:, 0], places[:, 1]), places[:, 2])
+    return float(np.sqrt(np.nanmean(angles**2)))
+
+
+def other_axes(places: Floats) -> Axes | None:
+    """Return in which axes places (N, 3) lie before a camera, where they do not as they are."""
+    off = {name: _off_axis(places @ optical(name).T) for name in get_args(Axes)}
+    name: Axes = min(off, key=off.__getitem__)
+    before = np.radians(40)  # as far from its axis as a wide camera sees
+    return name if off[name] < before < _off_axis(places) else None
+
+
+def _costs(readings: list[Reading], pairs: Pairs, robot: RobotModel | None) -> Floats:
+    """Return minus the logarithms of restricted likelihoods, on the samples that agree in all.
+
+    Sixty samples tell two readings apart as well as thousands do.
+    """
+    some = np.unique(np.linspace(0, len(pairs.robot) - 1, 60).round().astype(int))
+    kept = np.isin(np.arange(len(pairs.robot)), some)
+    found = [_estimated(each.of(pairs), kept, robot) for each in readings]
+    agree = np.all([each.inliers for each in found if each], axis=0)
+    if any(found) and not agree.all():
+        kept[np.flatnonzero(kept)[~agree]] = False
+        found = [_estimated(each.of(pairs), kept, robot) for each in readings]
+    costs = [0.5 * each.posterior.cost if each else np.inf for each in found]
+    return np.zeros(len(costs)) if np.isinf(costs).all() else np.array(costs)
+
+
+def _estimated(pairs: Pairs, kept: Mask, robot: RobotModel | None) -> Estimate | None:
+    some = Pairs(pairs.robot[kept], pairs.marker[kept], pairs.in_hand)
+    return estimated(some, robot)
+
+
+def estimated(pairs: Pairs, robot: RobotModel | None) -> Estimate | None:
+    """Return the model's estimate from poses; None where it refuses them."""
+    # As good as acquire.samples takes markers for: how good they are is estimated [rad, m]
+    noise = np.diag(np.square([np.radians(0.2)] * 3 + [0.5e-3] * 3))
+    observations = [
+        Observation(
+            f"{i}",
+            PoseFeature(Transform(CAMERA, TARGET, marker), noise),
+            {FLANGE: Transform(BASE, FLANGE, flange)},
+        )
+        for i, (flange, marker) in enumerate(zip(pairs.robot, pairs.marker, strict=True))
+    ]
+    camera, target = (FLANGE, BASE) if pairs.in_hand else (BASE, FLANGE)
+    cell = cell_of(Configuration(camera=camera, target=target), robot)
+    try:
+        return session_of(observations, cell, None).found
+    except (CalibrationRefused, StageError):
+        return None

@@ -1,0 +1,69 @@
+"""Which of the readings of a marker session that fit alike is meant: on known places."""
+
+from typing import get_args
+
+import numpy as np
+import pytest
+
+from flangeye.estimation.readings import Axes, Pairs, Reading, meant, optical, other_axes
+from flangeye.maths.geometry import invert
+from flangeye.types import Floats
+from tests.estimation import foreign
+from tests.estimation.sessions import robot
+
+MODEL = robot("ur5e")[0]
+
+
+def sound(kind: str, size: float = 0.1e-3) -> tuple[Pairs, Floats, Floats]:
+    """Return a session's poses, and what the arm carries and what stands."""
+    s = foreign.session(kind, foreign.UR5E, size, 16, 3)
+    ends = (s.camera, s.target) if s.in_hand else (s.target, s.camera)
+    return Pairs(s.reported, s.seen, s.in_hand), *ends
+
+
+def distances(ends: tuple[Floats, Floats]) -> tuple[float, float]:
+    near, far = (float(np.linalg.norm(each[:3, 3])) for each in ends)
+    return near, far
+
+
+@pytest.mark.parametrize("kind", ["marker", "hand"])
+def test_a_sound_session_is_meant_as_it_is(kind: str) -> None:
+    pairs, *ends = sound(kind)
+    assert meant(pairs, *distances((ends[0], ends[1])), MODEL) == [Reading()]
+    assert other_axes(pairs.marker[:, :3, 3]) is None
+
+
+@pytest.mark.parametrize("kind", ["marker", "hand"])
+@pytest.mark.parametrize(
+    ("mistake", "inverse"),
+    [
+        (Reading(robot_inverted=True, marker_inverted=True), True),
+        (Reading(marker_inverted=True, remounted=True), False),
+        (Reading(robot_inverted=True, remounted=True), True),
+    ],
+)
+def test_what_fits_alike_is_told_by_places_and_errors(
+    kind: str, mistake: Reading, inverse: bool
+) -> None:
+    pairs, carried, standing = sound(kind)
+    ends = (standing, carried) if inverse else (carried, standing)
+    assert meant(mistake.of(pairs), *distances(ends), MODEL) == [mistake]
+
+
+@pytest.mark.parametrize("kind", ["marker", "hand"])
+def test_exchanged_tables_are_exchanged_back(kind: str) -> None:
+    pairs, carried, standing = sound(kind)
+    if pairs.in_hand:  # P C = S M with M the inverse of what is seen
+        given = Pairs(invert(pairs.marker), invert(pairs.robot), True)
+        back = Reading(exchanged=True, robot_inverted=True, marker_inverted=True)
+    else:
+        given, back = Pairs(pairs.marker, pairs.robot, False), Reading(exchanged=True)
+    found = meant(given, *distances((carried, standing)), MODEL)
+    assert back in found and Reading() not in found
+    assert np.allclose(back.of(given).robot, pairs.robot)
+
+
+@pytest.mark.parametrize("name", get_args(Axes))
+def test_a_frame_with_other_axes_is_named(name: Axes) -> None:
+    places = sound("marker")[0].marker[:, :3, 3]
+    assert other_axes(places @ optical(name)) == name
