@@ -249,6 +249,9 @@ def axes(session: RecordedSession) -> Findings:
         raise NotApplicable("the markers were found in images or clouds, whose frame is known")
     if (found := other_axes(session.centres[session.seen])) is None or not explained(session):
         return
+    # What is seen elsewhere because the poses mean something else is no matter of axes
+    if _may_be_mounted_otherwise(session) and Reading() not in _meant(session):
+        return
     turn = optical(found)
     read = session.read_with(target={"axes": found})
     mended = replace(read, centres=session.centres @ turn.T, rotations=turn @ session.rotations)
