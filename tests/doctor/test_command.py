@@ -24,8 +24,9 @@ def save_with_inverted_targets(folder: Path) -> None:
     arm = np.array(
         [rigid(r, p) for r, p in zip(turns, rng.uniform(0.2, 0.6, (20, 3)), strict=True)]
     )
-    flange_t_camera = rigid(rotation_exp([0.1, 0.2, 1.5]), [0.05, 0.02, 0.1])
-    base_t_target = rigid(rotation_exp([2.8, 0.0, 0.3]), [0.4, 0.4, -0.6])
+    # It looks down at a target that faces it: else its axes would be called those of OpenGL
+    flange_t_camera = rigid(rotation_exp([3.1, 0.2, 0.1]), [0.05, 0.02, 0.1])
+    base_t_target = rigid(rotation_exp([0.2, 0.0, 0.3]), [0.4, 0.4, -0.6])
     seen = np.linalg.inv(arm @ flange_t_camera) @ base_t_target
     np.savez(folder / "poses.npz", robot=arm, target=np.linalg.inv(seen))
 
