@@ -7,6 +7,7 @@ few points of the body rule most of them out.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -66,13 +67,14 @@ class BodyVerdict(NamedTuple):
         return self.agree / max(self.agree + self.against, 1)
 
     @property
-    def share(self) -> float:
-        """Rank of a pose before it is refined: its score as a share of the rays that are due.
+    def rank(self) -> float:
+        """Rank of a pose before it is refined: its score over the scatter of so many rays.
 
-        What is near to the scanner is met by many rays, and is not the likelier for it.
+        The score alone favours what is near to the scanner and met by many rays, its share of them
+        what shows little of the body.
         """
-        # With fewer rays a share says little
-        return self.score / max(self.due, 150)
+        # With fewer rays a score says little
+        return self.score / math.sqrt(max(self.due, 150))
 
     @property
     def score(self) -> float:
@@ -282,11 +284,13 @@ class FoundPose(NamedTuple):
         pose: (4, 4) ``camera_T_body``.
         verdict: What speaks for it and against.
         weakest: Standard deviation of what the scan shows least of it, in sizes or radians.
+        seen: How much of the body was seen, of what it shows from its broadest side.
     """
 
     pose: Floats
     verdict: BodyVerdict
     weakest: float
+    seen: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -324,15 +328,10 @@ class BodySearch:
         """Return the best of (K, 4, 4) poses, refined on the scan's own points, best first."""
         if not len(poses):
             return []
-        scores = [judged(self.looks, self._fine, pose, self._rough).share for pose in poses]
+        scores = [judged(self.looks, self._fine, pose, self._rough).rank for pose in poses]
         # Laid on the scan's own points
         poses = poses[distinct(poses, np.array(scores), self.looks)[:8]]
         return self._distinct([one for one in map(self._laid, poses) if one])
-
-    def seen(self, found: FoundPose) -> float:
-        """Return how much of the body was seen, of what it shows from its broadest side."""
-        depth = found.pose[2, :3] @ self.looks.centre + found.pose[2, 3]
-        return float(found.verdict.agree * (self._fine.angle * depth) ** 2 / self.looks.broadest)
 
     def refuted(self, pose: Floats, near: Callable[[Floats], Mask]) -> float:
         """Return the share of what was looked at of some of the body that was seen through.
@@ -370,7 +369,9 @@ class BodySearch:
         if fit is None:
             return None
         verdict = judged(self.looks, self._fine, fit.pose, self._tolerance)
-        return FoundPose(fit.pose, verdict, fit.weakest(self.looks.freedoms))
+        depth = fit.pose[2, :3] @ self.looks.centre + fit.pose[2, 3]
+        seen = float(verdict.agree * (self._fine.angle * depth) ** 2 / self.looks.broadest)
+        return FoundPose(fit.pose, verdict, fit.weakest(self.looks.freedoms), seen)
 
     def _twins(self, best: FoundPose) -> Floats:
         """Return quarter turns of a pose that explain the scan nearly as well."""

@@ -78,7 +78,7 @@ def register(
     fit = _laid(scan, looks, found[0].pose) if found else None
     if fit is None:
         raise CalibrationRefused(f"{STAGE}: the part is nowhere in the scan; {_look(workpiece)}")
-    best, seen = found[0].verdict.score, search.seen(found[0])
+    best, seen = found[0].verdict.score, found[0].seen
     if seen < limits.seen:
         raise CalibrationRefused(
             f"{STAGE}: poor fit: of what the part shows from its broadest side {seen:.0%} was "

@@ -191,13 +191,16 @@ def _passes(
     found: FoundPose, coverage: float, trust: float, goes_on: float = 0.5, weakest: float = FIRM
 ) -> bool:
     verdict = found.verdict
-    # Rays, a hundredth of the body's size apart, that show it: fewer fit by chance
+    # Fewer rays, a hundredth of the body's size apart, and a smaller share of its broadest side fit
+    # other things by chance, as the end of a torch does; an edge-on plate shows more
+    fewest, least = 150, 0.07
     # Largest share of the rays beside the body in which its surface goes on: where something is
     # fastened to it
     return (
         verdict.shown >= coverage
         and verdict.trusted >= trust
-        and verdict.agree >= 150
+        and verdict.agree >= fewest
+        and found.seen >= least
         and verdict.bounded
         and verdict.goes_on <= goes_on * verdict.beside
         and found.weakest <= weakest
