@@ -133,7 +133,13 @@ def _reading(in_hand: bool, inverse: bool, exchanged: bool, remounted: bool) -> 
 
 
 def _log_normal(distance: float, median: float, spread: float) -> float:
-    return -0.5 * float(np.log(max(distance, 1e-3) / median) / spread) ** 2
+    """Return the log odds of a distance [m]; an odd one is as likely as any other."""
+    return _floored(-0.5 * (np.log(max(distance, 1e-3) / median) / spread) ** 2)
+
+
+def _floored(odds: float) -> float:
+    """Return log odds, of what is odd as if one place in 150 were so."""
+    return float(max(odds, -5.0))
 
 
 def _seen(places: Floats) -> float:
@@ -147,7 +153,7 @@ def _seen(places: Floats) -> float:
         _off_axis(places @ optical("ros").T),
     ]
     odds = -0.5 * (np.array(off) / np.radians(20)) ** 2 - np.array([0.0, 1.0, 1.5])
-    return float(max(odds.max(), -5.0))
+    return _floored(odds.max())
 
 
 def _off_axis(places: Floats) -> float:
