@@ -213,15 +213,20 @@ def _figures(held: HeldOut, counted: Mask) -> dict[str, float]:
 def _misread(calibration: HandEye, cell: Cell, optical: bool) -> str | None:
     """Return how one arm's and a marker's poses were rather meant; None if as they were read."""
     seen = [o for pair in calibration.pairs if pair.used for o in [pair.observation]]
-    whole = all(isinstance(o.feature, PoseFeature) for o in seen)
-    if not whole or len(cell.unknown_frames) != 2 or len(cell.movers) != 1 or cell.links:
+    shown = [o.feature.camera_T_target for o in seen if isinstance(o.feature, PoseFeature)]
+    if (
+        len(shown) < len(seen)
+        or len(cell.unknown_frames) != 2
+        or len(cell.movers) != 1
+        or cell.links
+    ):
         return None
     found = {x.transform.parent: x.transform for x in calibration.transforms.values()}
     if len(found) != 2 or FLANGE not in found:
         return None
     carried = found.pop(FLANGE)
     ((_, standing),) = found.items()
-    markers = np.array([o.feature.camera_T_target.matrix for o in seen])  # type: ignore[union-attr]
+    markers = np.array([each.matrix for each in shown])
     pairs = Pairs(
         np.array([o.poses[FLANGE].matrix for o in seen]), markers, carried.child == cell.cameras[0]
     )
