@@ -26,13 +26,6 @@ def inverted(poses: Floats) -> Floats:
     return np.asarray(np.linalg.inv(poses))
 
 
-def each_turned(turn: Floats, poses: Floats) -> Floats:
-    """Return the poses in a frame that is turned: (3, 3) times places and rotations."""
-    out = np.array(poses)
-    out[..., :3, :] = turn @ poses[..., :3, :]
-    return out
-
-
 def transposed(poses: Floats) -> Floats:
     """Return the poses with their rotations transposed: matrices stored column by column."""
     out = np.array(poses)

@@ -19,9 +19,9 @@ from flangeye import BoundPart, Choose, Params, StageError, part
 from flangeye.doctor.diagnosis import Arms
 from flangeye.estimation.readings import Axes, optical
 from flangeye.files.recording import Archive, Recording
+from flangeye.maths.geometry import rigid
 from flangeye.maths.pose_corrections import (
     delayed,
-    each_turned,
     inverted,
     reread,
     scaled,
@@ -70,7 +70,7 @@ class PoseMistake(Params):
     def undone(self, poses: Floats) -> Floats:
         """Return poses (N, 4, 4) as they should be."""
         if self.axes:
-            poses = each_turned(optical(self.axes), poses)
+            poses = rigid(optical(self.axes), np.zeros(3)) @ poses
         if self.rotation:
             poses = reread(poses, *self.rotation)
         if self.transposed:
