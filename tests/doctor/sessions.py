@@ -19,9 +19,10 @@ def clean(rng, n=20, kind="flange", carried="target", noise=0.1e-3, turn=0.3, bo
     """Return a session without a mistake."""
     poses = np.array([_pose(rng, turn, box) for _ in range(n)])
     known = kind in ("flange", "centres")
-    target = (
-        np.eye(4) if known else rigid(rotation_exp(rng.normal(0, 0.5, 3)), rng.normal(0, 0.06, 3))
-    )
+    # A marker that stands is before the camera, which looks up, and not inside the arm's base
+    about = [0.55, -0.1, 0.9] if carried == "camera" else [0.0, 0.0, 0.0]
+    target = rigid(rotation_exp(rng.normal(0, 0.5, 3)), rng.normal(about, 0.06))
+    target = np.eye(4) if known else target
     camera = _camera(rng, carried)
     carriers, mounts, arms = _carriers(rng, carried, poses, lambda: _pose(rng, turn, box))
     seen = np.linalg.inv(carriers @ camera) @ mounts @ target

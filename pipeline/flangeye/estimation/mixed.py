@@ -364,21 +364,25 @@ def mode_of(model: LinearModel, start: Floats | None = None) -> Mode:
         step = -vectors @ (vectors.T @ slope / values)
         # Of the likelihood's logarithm; what the step leaves is about the square of that
         if -slope @ step < 1e-3:
+            z = z + step
             break
-        z, here = _better(model, z, here, step * min(1.0, 3.0 / np.linalg.norm(step)))
+        better = _better(model, z, here, step * min(1.0, 3.0 / np.linalg.norm(step)))
+        if better is None:  # what is left is less than rounding, where places are hardly told
+            break
+        z, here = better
     # The symmetric root: eigenvectors have no sign of their own, and draws are to be the same for
     # sessions that differ by rounding
-    return Mode(z + step, np.asarray(vectors / np.sqrt(values) @ vectors.T))
+    return Mode(z, np.asarray(vectors / np.sqrt(values) @ vectors.T))
 
 
-def _better(model: LinearModel, z: Floats, here: Fit, step: Floats) -> tuple[Floats, Fit]:
-    """Return sizes that are likelier along a step, with their fit; the shortest one, if none is."""
+def _better(model: LinearModel, z: Floats, here: Fit, step: Floats) -> tuple[Floats, Fit] | None:
+    """Return sizes that are likelier along a step, with their fit; None where none is found."""
     for part in 0.5 ** np.arange(10):
         at = z + part * step
         there = fit(model, model.sizes.at(at), with_slopes=True)
         if there.cost + at @ at < here.cost + z @ z:
-            break
-    return at, there
+            return at, there
+    return None
 
 
 def posterior(model: LinearModel, mode: Mode, at_mode: Fit) -> Posterior:

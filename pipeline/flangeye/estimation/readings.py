@@ -107,8 +107,8 @@ def meant(pairs: Pairs, carried: float, standing: float, robot: RobotModel | Non
     told, likelier = np.log(20.0), np.log(1e4)
     whole = bool(np.isfinite(pairs.marker).all())
     plausible = {
-        reading: _log_normal(standing if inverse else carried, *held)
-        + _log_normal(carried if inverse else standing, *away)
+        reading: _odds(standing if inverse else carried, *held)
+        + _odds(carried if inverse else standing, *away)
         + _seen(reading.of(pairs).marker[:, :3, 3])
         for inverse, exchanged, remounted in product((False, True), repeat=3)
         for reading in [_reading(pairs.in_hand, inverse, exchanged, remounted)]
@@ -132,14 +132,10 @@ def _reading(in_hand: bool, inverse: bool, exchanged: bool, remounted: bool) -> 
     return Reading(False, inverse, inverse != remounted, remounted)
 
 
-def _log_normal(distance: float, median: float, spread: float) -> float:
-    """Return the log odds of a distance [m]; an odd one is as likely as any other."""
-    return _floored(-0.5 * (np.log(max(distance, 1e-3) / median) / spread) ** 2)
-
-
-def _floored(odds: float) -> float:
-    """Return log odds, of what is odd as if one place in 150 were so."""
-    return float(max(odds, -5.0))
+def _odds(distance: float, median: float, spread: float) -> float:
+    """Return the log odds of a distance [m], by Student's t of its logarithm: any may be odd."""
+    off = np.log(max(distance, 1e-3) / median) / spread
+    return float(-2.0 * np.log1p(off**2 / 3.0))
 
 
 def _seen(places: Floats) -> float:
@@ -153,7 +149,7 @@ def _seen(places: Floats) -> float:
         _off_axis(places @ optical("ros").T),
     ]
     odds = -0.5 * (np.array(off) / np.radians(20)) ** 2 - np.array([0.0, 1.0, 1.5])
-    return _floored(odds.max())
+    return float(max(odds.max(), -5.0))
 
 
 def _off_axis(places: Floats) -> float:
