@@ -27,7 +27,8 @@ def test_the_default_solver_is_near_the_bound() -> None:
     made = hand_eye.sessions("n=15, 17 deg", 400)
     found = np.array(hand_eye.rms([hand_eye.most_likely(m) for m in made], made))
     bound = np.array(hand_eye.bound(made))
-    assert (found <= 1.1 * bound).all()
+    # The bound knows that the focal length is exact; to allow for its error costs a sixth in place
+    assert (found <= [1.1, 1.25] * bound).all()
     assert (found >= 0.9 * bound).all()  # else the bound is not one
 
 

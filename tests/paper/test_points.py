@@ -140,7 +140,8 @@ def test_robust_against_the_bound_itself(paper: Callable[..., Any], noise: str) 
     overrides = ["steps.2.count=400", f"steps.0.noise={noise}"]
     clean, _ = paper("fig9_robust", STEP, *overrides)
     gross, _ = paper("fig9_robust", STEP, *overrides, "steps.0.outliers=0.15")
-    assert clean["workspace_rms"] <= 1.05 * clean["bound_workspace_rms"]
+    # The bound knows that nothing errs but noise; to allow for an arm's and a drift costs a tenth
+    assert clean["workspace_rms"] <= 1.15 * clean["bound_workspace_rms"]
     assert gross["workspace_rms"] <= 1.10 * gross["inliers_alone_rms"]
 
 
