@@ -202,8 +202,8 @@ def rare(seed, name):
     ],
 )
 def test_what_once_was_a_silent_failure_is_in_its_stated_bound(seed: int) -> None:
-    """They are the worst of twenty thousand worlds, so far out that three sigma do not cover them."""
-    assert judged(seed, sigmas=4.0).over_bound <= 1.0
+    """They are the worst of twenty thousand: the largest of so many normal numbers is 4 to 4.5."""
+    assert judged(seed, sigmas=4.5).over_bound <= 1.0
 
 
 def test_worlds_are_drawn_again_as_they_were() -> None:
