@@ -1,4 +1,4 @@
-"""The control loop, in simulated or real time, with its limits on the tip."""
+"""The way to the seam, and the control loop along it with its limits on the tip."""
 
 from __future__ import annotations
 
@@ -12,15 +12,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from flangeye.devices import DeviceError, RobotState
+from flangeye.errors import StageError
 from flangeye.models.finger import Finger
 from flangeye.motion.arc import OFF
 from flangeye.motion.executor import Executor
 from flangeye.motion.seam_following import Command, Controller, ToolPose, Touch
+from flangeye.types import Floats
 from flangeye_plugins.weld.finger_camera import FingerCameraReader
 from flangeye_plugins.weld.follower import Follower
 from flangeye_plugins.weld.frame import Tool
 from flangeye_plugins.weld.path import Path
-from flangeye_plugins.weld.settings import Following
+from flangeye_plugins.weld.reachability import SeamReach
+from flangeye_plugins.weld.search import UNTOUCHED
+from flangeye_plugins.weld.settings import Following, Mode
 from flangeye_plugins.weld.touch.tip_displacement import TipDisplacement
 from flangeye_plugins.weld.weld_log import Cycle, WeldLog
 
@@ -86,6 +90,49 @@ class WeldCell:
     bounds: Bounds
     steered: Follower | None = None
     gas_after: float | None = None
+
+
+def approach(cell: WeldCell, passage: SeamReach, weld_log: WeldLog, mode: Mode) -> None:
+    """Bring the tip above the planned start, the tool along the seam.
+
+    Raises:
+        StageError: The finger is not seen, is deformed though nothing should touch it, or there is
+            no free way.
+        DeviceError: The arm was stopped on the way: the reason.
+    """
+    here = cell.drive.tick()
+    route = passage.to_start(np.asarray(here.joints))
+    if mode != "vision":
+        _watch(cell, weld_log)
+    cell.drive.follow(route)
+    for sight in cell.eyes.seen():  # what was seen on the way is no news to the controller
+        weld_log.before(sight)
+
+
+def _watch(cell: WeldCell, weld_log: WeldLog) -> None:
+    """Look at the finger for a while; nothing moves."""
+    began = cell.drive.tick().time_ns
+    felt: list[Floats] = []
+    seen = 0
+    # The finger is watched for at most two seconds before the arm moves.
+    while cell.drive.tick().time_ns - began < 2e9 and len(felt) < 10:
+        for sight in cell.eyes.seen():
+            seen += 1
+            weld_log.before(sight)
+            if sight.feeling is not None:
+                felt.append(np.asarray(sight.feeling.displacement))
+    if not felt:
+        what = "no tag is in view" if seen else "the camera gives no images"
+        raise StageError(
+            f"weld.tactile: {what}; is the finger's light on, the lens clean, and is the tag the "
+            "one its file names?"
+        )
+    off = float(np.linalg.norm(np.median(felt, axis=0)))
+    if off > UNTOUCHED:
+        raise StageError(
+            f"weld.tactile: the tip is displaced by {off * 1e3:.1f} mm though nothing should touch "
+            "it; free it, or calibrate the finger again: flangeye tactile calibrate"
+        )
 
 
 def follow(cell: WeldCell, controller: Controller, weld_log: WeldLog, longest: float) -> str:

@@ -16,7 +16,7 @@ from flangeye_plugins.weld.task import WeldTask
 
 
 class Sway(NamedTuple):
-    """The weave at one time, to the left of the seam.
+    """The weave at one time, to the left of the seam; none where it is all zero.
 
     Attributes:
         aside: [m].
@@ -24,16 +24,13 @@ class Sway(NamedTuple):
         rush: Its second derivative [m/s^2].
     """
 
-    aside: float
-    rate: float
-    rush: float
+    aside: float = 0.0
+    rate: float = 0.0
+    rush: float = 0.0
 
     def led(self, lag: float) -> Sway:
         """Return the swing that an arm follows with a time constant [s], to be on this one."""
         return Sway(self.aside + lag * self.rate, self.rate + lag * self.rush, self.rush)
-
-
-STRAIGHT = Sway(0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -51,7 +48,7 @@ class Weave:
     def at(self, elapsed: float) -> Sway:
         """Return the swing so long after it began [s]; none before it has."""
         if elapsed < 0.0 or not self.width:
-            return STRAIGHT
+            return Sway()
         turn = 2.0 * math.pi * self.frequency
         sine, cosine = math.sin(turn * elapsed), math.cos(turn * elapsed)
         half = self.width / 2.0

@@ -28,12 +28,11 @@ from flangeye.types import (
     WeldReport,
 )
 from flangeye_plugins.weld import checks
-from flangeye_plugins.weld.approach import approach
 from flangeye_plugins.weld.belief import Belief, belief_of
 from flangeye_plugins.weld.bound import check_bound
 from flangeye_plugins.weld.camera_process import CameraProcess
 from flangeye_plugins.weld.corners import leg_of
-from flangeye_plugins.weld.execution import Bounds, WeldCell, follow
+from flangeye_plugins.weld.execution import Bounds, WeldCell, approach, follow
 from flangeye_plugins.weld.finger_camera import CameraJob, FingerCameraReader, SteppedReader
 from flangeye_plugins.weld.follower import Follower
 from flangeye_plugins.weld.frame import LeaningTool, Tool, WorkSurface, body_of

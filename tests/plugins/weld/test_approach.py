@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from flangeye.errors import StageError
-from flangeye_plugins.weld.approach import _watch, approach
+from flangeye_plugins.weld.execution import _watch, approach
 
 
 def watched(displacements: list[Any], seen: int = 1, period: float = 0.05) -> tuple[int, int]:
