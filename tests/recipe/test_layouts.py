@@ -150,6 +150,23 @@ def json_per_image(f, j, a, s):
         (f / f"{k}.json").write_text(json.dumps({"robot": arm.tolist(), "marker": seen.tolist()}))
 
 
+def sections(f, j, a, s):
+    for name, poses in (("robot.ini", a), ("marker.toml", s)):
+        rows = [f"[{k}]\npose = [{', '.join(f'{x:.9g}' for x in row)}]\n"
+                for k, row in enumerate(vector(poses), 1)]  # fmt: skip
+        (f / name).write_text("# by hand\n" + "\n".join(rows))
+
+
+def sections_of_names(f, j, a, s):
+    pose = ("x", "y", "z", "qx", "qy", "qz", "qw")
+    keys = [f"{who}_{each}" for who in ("tcp", "board") for each in pose]
+    rows = np.column_stack([quaternion(a), quaternion(s)])
+    (f / "session.ini").write_text("".join(
+        f"[{k}]\n" + "".join(f"{key} = {x:.9g}\n" for key, x in zip(keys, row, strict=True))
+        for k, row in enumerate(rows)
+    ))  # fmt: skip
+
+
 def lists_with_units(f, j, a, s):
     (f / "session.json").write_text(json.dumps([
         {name: {"quaternion_wxyz": row[[6, 3, 4, 5]].tolist(),
@@ -300,6 +317,8 @@ LAYOUTS: dict[str, Callable[..., None]] = {
     "OpenCV's storage, `pose1: […]` in two files": opencv_lists,
     "OpenCV's storage, lists `Rotation_Vec` and `Translation_Vec`": opencv_vectors,
     "a JSON for each image, without leading zeros": json_per_image,
+    "sections `[1]`, `[2]`, … with `pose = […]` (`.ini`, `.toml`)": sections,
+    "sections with `tcp_x = …`, `board_qw = …`": sections_of_names,
     "JSON of lists `quaternion_wxyz`, `translation_mm`": lists_with_units,
     "`.npz` with `R_gripper2base`, `t_gripper2base`, …": npz_opencv,
     "`R_gripper2base.txt` and `t_gripper2base.txt`, …": separate_files,

@@ -1,4 +1,4 @@
-"""Files that hold named values: JSON, YAML, OpenCV's storage, NumPy and MATLAB, as plain data."""
+"""Named values as plain data: JSON, YAML, TOML, OpenCV's storage, NumPy and MATLAB."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import io
 import json
 import re
 import subprocess
+import tomllib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -43,7 +44,7 @@ def document_of(file: Path) -> TableDocument | None:
         return None
     try:
         document = read(file)
-        return document._replace(data=_plain(document.data))
+        return document and document._replace(data=_plain(document.data))
     except StageError:
         raise
     except Exception as error:  # damaged bytes can break these parsers in any way
@@ -65,6 +66,14 @@ def _loaded(where: str, text: str) -> Any:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
         raise StageError(f"{where}: is no JSON: {reason_of(error)}") from None
+
+
+def _toml(file: Path) -> TableDocument | None:
+    """Return the sections of a file, ``[12]`` above ``pose = [...]``; None where it has others."""
+    try:
+        return TableDocument(tomllib.loads(read_text(file)), lambda at: f"{file}: record {at + 1}")
+    except tomllib.TOMLDecodeError:
+        return None
 
 
 def _yaml(file: Path) -> TableDocument:
@@ -152,10 +161,10 @@ def _matlab(file: Path) -> TableDocument:
     return TableDocument(data, lambda at: f"{file}: row {at + 1}")
 
 
-KINDS: Mapping[str, Callable[[Path], TableDocument]] = {
+KINDS: Mapping[str, Callable[[Path], TableDocument | None]] = {
     ".json": _json, ".jsonl": _json_lines, ".ndjson": _json_lines,
     ".yaml": _yaml, ".yml": _yaml, ".samples": _yaml, ".xml": _xml,
-    ".npz": _numpy, ".npy": _numpy, ".mat": _matlab,
+    ".toml": _toml, ".ini": _toml, ".npz": _numpy, ".npy": _numpy, ".mat": _matlab,
 }  # fmt: skip
 """Documents by their ending; everything else is text."""
 
