@@ -12,7 +12,7 @@ import numpy as np
 from flangeye import FlangeyeError
 from flangeye.log.read import read_run
 from flangeye.maths.geometry import arc_lengths
-from flangeye.maths.seam_geometry import torch_deviation
+from flangeye.maths.seam_geometry import WeldPlane, torch_deviation
 from flangeye.types import Floats, WeldReport, WorkpieceScan
 from flangeye_paper.tables import Row, SessionRow, dress, legend, read_sessions, sheet, write_csv
 
@@ -81,24 +81,8 @@ class SeenWeld:
 
     def _seen(self, points: Floats) -> tuple[Floats, Floats]:
         """Return arc lengths (K,) of points (K, 3) and how far they are to the left (K,) [m]."""
-        # The true seam is extended straight by this much, for what happens before and after it [m].
-        beyond = 0.2
-        line = np.vstack([
-            self.truth[0] - beyond * _unit(self.truth[1] - self.truth[0]),
-            self.truth,
-            self.truth[-1] + beyond * _unit(self.truth[-1] - self.truth[-2]),
-        ])  # fmt: skip
-        start, step = line[:-1], np.diff(line, axis=0)
-        lengths = np.linalg.norm(step, axis=1)
-        ahead = step / lengths[:, None]
-        left = np.cross(self.report.opening, ahead)
-        away = points[:, None] - start
-        along = np.clip(np.einsum("kni,ni->kn", away, ahead), 0.0, lengths)
-        distance = np.linalg.norm(_flat(away - along[..., None] * ahead, self.report), axis=2)
-        nearest = distance.argmin(axis=1)
-        rows = np.arange(len(points))
-        arc = np.concatenate([[0.0], np.cumsum(lengths)])[nearest] + along[rows, nearest] - beyond
-        return arc, np.einsum("ki,ki->k", away[rows, nearest], left[nearest])
+        plane = WeldPlane(self.truth, self.report.opening)
+        return plane.beside(self.truth, points)
 
 
 def seen(session: SessionRow) -> SeenWeld:
@@ -113,15 +97,6 @@ def seen(session: SessionRow) -> SeenWeld:
         raise FlangeyeError(f"{session.folder}: did not weld")
     (truth,) = scan.truth.values()
     return SeenWeld(weld, np.asarray(truth))
-
-
-def _flat(vectors: Floats, report: WeldReport) -> Floats:
-    """Return vectors (..., 3) without what lies along the opening."""
-    return np.asarray(vectors - (vectors @ report.opening)[..., None] * report.opening)
-
-
-def _unit(vector: Floats) -> Floats:
-    return np.asarray(vector / np.linalg.norm(vector))
 
 
 Welds = Mapping[str, Sequence[SeenWeld]]
@@ -199,13 +174,11 @@ def _draw(welds: Mapping[str, Welds]) -> Any:
 
 def _paths(panel: Any, workpiece: str, weld: SeenWeld) -> None:
     report, truth = weld.report, weld.truth
-    start, x = truth[0], truth[-1] - truth[0]
-    x = x / np.linalg.norm(x)
-    axes = np.stack([x, np.cross(report.opening, x)], axis=1) * 1e3
-    panel.plot(*((truth - start) @ axes).T, color="black", linewidth=2.5, label="true seam")
-    panel.plot(*((report.planned - start) @ axes).T, color="#64748b", ls=":", label="planned")
+    flat = WeldPlane(truth, report.opening).flat
+    panel.plot(*flat(truth).T * 1e3, color="black", linewidth=2.5, label="true seam")
+    panel.plot(*flat(report.planned).T * 1e3, color="#64748b", ls=":", label="planned")
     for name, colour in (("robot", "#d97706"), ("tip", "#1d4ed8"), ("torch", "#be123c")):
-        at = (getattr(report, name) - start) @ axes
+        at = flat(getattr(report, name)) * 1e3
         panel.plot(*at.T, color=colour, linewidth=1.0, label=name)
     dress(panel, f"paths, {workpiece} groove", "along [mm]", "across [mm]")
 

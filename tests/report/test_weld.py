@@ -13,9 +13,10 @@ import pytest
 from flangeye import types as t
 from flangeye.log.read import read_run
 from flangeye.log.record import Recorder
+from flangeye.maths.seam_geometry import off_line
 from flangeye.report.facts import Facts
 from flangeye.report.page import render
-from flangeye.report.weld import off_line, weld_drawing
+from flangeye.report.weld import weld_drawing
 from flangeye.result.contract import Result
 
 TIME = np.linspace(0.0, 40.0, 401)

@@ -64,6 +64,49 @@ def torch_deviation(points: Floats, line: Floats, openings: Floats) -> Floats:
     return np.asarray(distance[rows, nearest][~before & ~beyond])
 
 
+class WeldPlane:
+    """The plane of the work: x from a line's start towards what is farthest on it, y to the left.
+
+    A seam that goes once around ends where it begins.
+    """
+
+    def __init__(self, line: Floats, opening: Floats) -> None:
+        """Lay the plane through the start of a line (N, 3) [m], across an opening (3,)."""
+        ways = line - line[0]
+        along = ways[np.linalg.norm(ways, axis=1).argmax()]
+        x = along - (along @ opening) * opening
+        x /= np.linalg.norm(x)
+        self._axes = np.stack([x, np.cross(opening, x)], axis=1)
+        self._origin = line[0]
+
+    def flat(self, points: Floats) -> Floats:
+        """Return points (N, 3) in the plane, (N, 2) [m]."""
+        return np.asarray((points - self._origin) @ self._axes)
+
+    def beside(self, line: Floats, points: Floats) -> tuple[Floats, Floats]:
+        """Return the points' arc lengths along a line (M, 3), and offsets to its left [m]."""
+        return off_line(self.flat(line), self.flat(points))
+
+
+def off_line(line: Floats, points: Floats) -> tuple[Floats, Floats]:
+    """Return arc lengths of points (N, 2) along a line (M, 2), and offsets to its left [m].
+
+    The line goes on straight beyond its ends.
+    """
+    start, step = line[:-1], np.diff(line, axis=0)
+    length = np.linalg.norm(step, axis=1)
+    unit = step / length[:, None]
+    away = points[:, None] - start
+    along = np.einsum("nmi,mi->nm", away, unit)
+    inside = np.clip(along, 0.0, length)
+    nearest = np.linalg.norm(away - inside[:, :, None] * unit, axis=2).argmin(axis=1)
+    rows = np.arange(len(points))
+    from_start, u = away[rows, nearest], unit[nearest]
+    across = u[:, 0] * from_start[:, 1] - u[:, 1] * from_start[:, 0]
+    before = np.concatenate([[0.0], np.cumsum(length)])[nearest]
+    return before + along[rows, nearest], across
+
+
 def seam_frames(seam: Seam) -> Floats:
     """Return (N, 3, 3) ``base_R_seam``: x along the seam, z into the groove, y to the side."""
     x = seam.tangents

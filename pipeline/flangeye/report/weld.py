@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flangeye import types as t
-from flangeye.maths.seam_geometry import distances_to_line, tube_radii, tube_rings
+from flangeye.maths.geometry import arc_lengths
+from flangeye.maths.seam_geometry import WeldPlane, distances_to_line, tube_radii, tube_rings
 from flangeye.report.facts import Facts
 from flangeye.report.look import SERIES
 from flangeye.report.plot import (
@@ -64,53 +65,11 @@ def weld_drawing(facts: Facts) -> WeldDrawing | None:
     weld = facts.log.last(WeldReport)
     if weld is None or not len(weld.time):
         return None
-    seen = _View(weld)
+    plane = WeldPlane(weld.planned, weld.opening)
     return WeldDrawing(
-        weld, _summary(facts, weld), _paths(seen), _offsets(seen), _deviation(seen, _truth(facts)),
-        _contact(weld), _speeds(weld), tuple(_loop(weld)),
+        weld, _summary(facts, weld), _paths(weld, plane), _offsets(weld, plane),
+        _deviation(weld, plane, _truth(facts)), _contact(weld), _speeds(weld), tuple(_loop(weld)),
     )  # fmt: skip
-
-
-class _View:
-    """The paths in the plane: x towards what is farthest from the plan's start, y to the left."""
-
-    def __init__(self, weld: WeldReport) -> None:
-        # A seam that goes once around ends where it begins.
-        ways = weld.planned - weld.planned[0]
-        along = ways[np.linalg.norm(ways, axis=1).argmax()]
-        x = along - (along @ weld.opening) * weld.opening
-        x /= np.linalg.norm(x)
-        self._axes = np.stack([x, np.cross(weld.opening, x)], axis=1)
-        self._origin = weld.planned[0]
-        self.weld = weld
-        self.planned = self.flat(weld.planned)
-
-    def flat(self, points: Floats) -> Floats:
-        """Return points (N, 3) in the plane, (N, 2) [m]."""
-        return np.asarray((points - self._origin) @ self._axes)
-
-    def off_plan(self, points: Floats) -> tuple[Floats, Floats]:
-        """Return the points' arc lengths along the plan, and offsets to its left [m]."""
-        return off_line(self.planned, self.flat(points))
-
-
-def off_line(line: Floats, points: Floats) -> tuple[Floats, Floats]:
-    """Return arc lengths of points (N, 2) along a line (M, 2), and offsets to its left [m].
-
-    The line goes on straight beyond its ends.
-    """
-    start, step = line[:-1], np.diff(line, axis=0)
-    length = np.linalg.norm(step, axis=1)
-    unit = step / length[:, None]
-    away = points[:, None] - start
-    along = np.einsum("nmi,mi->nm", away, unit)
-    inside = np.clip(along, 0.0, length)
-    nearest = np.linalg.norm(away - inside[:, :, None] * unit, axis=2).argmin(axis=1)
-    rows = np.arange(len(points))
-    from_start, u = away[rows, nearest], unit[nearest]
-    across = u[:, 0] * from_start[:, 1] - u[:, 1] * from_start[:, 0]
-    before = np.concatenate([[0.0], np.cumsum(length)])[nearest]
-    return before + along[rows, nearest], across
 
 
 def _truth(facts: Facts) -> Floats | None:
@@ -133,8 +92,7 @@ def _summary(facts: Facts, weld: WeldReport) -> str:
     return text if weld.completed else f"{text} It was stopped: {weld.reason}."
 
 
-def _paths(view: _View) -> Figure:
-    weld = view.weld
+def _paths(weld: WeldReport, plane: WeldPlane) -> Figure:
     named: tuple[tuple[str, Floats, str, dict[str, Any]], ...] = (
         ("planned", weld.planned, SERIES["held_out"], {"dash": "dot"}),
         ("felt (refined)", weld.refined, SERIES["truth"], {}),
@@ -144,15 +102,14 @@ def _paths(view: _View) -> Figure:
     )
     traces = []
     for name, places, colour, rest in named:
-        at = view.flat(places) * 1e3
+        at = plane.flat(places) * 1e3
         traces.append(curve(at[:, 0], at[:, 1], name, colour, **rest))
     layout = layout2d("along the seam [mm]", "across [mm]")
     layout["yaxis"]["scaleanchor"] = "x"
     return {"data": traces, "layout": layout}
 
 
-def _offsets(view: _View) -> Figure:
-    weld = view.weld
+def _offsets(weld: WeldReport, plane: WeldPlane) -> Figure:
     traces = []
     for name, places, colour in (
         ("felt (refined)", weld.refined, SERIES["truth"]),
@@ -160,15 +117,16 @@ def _offsets(view: _View) -> Figure:
         ("torch", weld.torch, SERIES["circle"]),
         ("robot", weld.robot, SERIES["unused"]),
     ):
-        along, across = view.off_plan(places) if len(places) else (np.zeros(0), np.zeros(0))
+        along, across = (
+            plane.beside(weld.planned, places) if len(places) else (np.zeros(0), np.zeros(0))
+        )
         traces.append(curve(along * 1e3, across * 1e3, name, colour))
     layout = layout2d("along the plan [mm]", "left of the plan [mm]")
     return {"data": traces, "layout": layout}
 
 
-def _deviation(view: _View, truth: Floats | None) -> Figure:
+def _deviation(weld: WeldReport, plane: WeldPlane, truth: Floats | None) -> Figure:
     """Plot the estimated torch position with its 95 % band, and the true one where it is known."""
-    weld = view.weld
     true_torch = weld.true_torch if len(weld.true_torch) else weld.torch
     traces = []
     for name, line, torch, colour in (
@@ -176,10 +134,10 @@ def _deviation(view: _View, truth: Floats | None) -> Figure:
         ("true, from the true seam", truth, true_torch, SERIES["truth"]),
     ):
         if line is not None and len(line) > 1:
-            along, across, _ = _beside(view, line, torch)
+            along, across, _ = _beside(plane, line, torch)
             traces.append(curve(along * 1e3, across * 1e3, name, colour))
     if len(weld.refined) > 1 and len(weld.band) == len(weld.torch):
-        along, _, beside = _beside(view, weld.refined, weld.torch)
+        along, _, beside = _beside(plane, weld.refined, weld.torch)
         for sign, name in ((1.0, "95 % band"), (-1.0, "95 % band, right")):
             # A band that is wider is drawn so wide: it says that nothing is known [m]
             edge = sign * np.minimum(weld.band[beside], 5e-3) * 1e3
@@ -187,12 +145,12 @@ def _deviation(view: _View, truth: Floats | None) -> Figure:
     return {"data": traces, "layout": layout2d("along the seam [mm]", "torch to the left [mm]")}
 
 
-def _beside(view: _View, line: Floats, torch: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+def _beside(
+    plane: WeldPlane, line: Floats, torch: Floats
+) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     """Return where a torch (N, 3) is along a seam and to its left [m], and the (N,) beside it."""
-    seam = view.flat(line)
-    length = float(np.linalg.norm(np.diff(seam, axis=0), axis=1).sum())
-    along, across = off_line(seam, view.flat(torch))
-    beside = (along >= 0.0) & (along <= length)
+    along, across = plane.beside(line, torch)
+    beside = (along >= 0.0) & (along <= arc_lengths(plane.flat(line))[-1])
     return along[beside], across[beside], beside
 
 
@@ -355,25 +313,21 @@ def _facts(seam: t.Seam, facts: Facts) -> list[tuple[str, str]]:
     return rows
 
 
-FIGURES = {
-    "seen": ("Seen of the part, of its broadest side", "%"),
-    "refuted": ("Of the part looked through", "%"),
-    "second": ("Next best pose agrees, of the best", "%"),
-    "explained": ("Explained by the joint", "%"),
-    "coverage": ("Seen of its length", "%"),
-    "residual": ("Scan off the surface", "mm"),
-    "registration": ("Line in the scan, one sigma", "mm"),
-    "start": ("Start along the seam, one sigma", "mm"),
-    "end": ("End along the seam, one sigma", "mm"),
-    "apart": ("Neighbouring clouds apart", "mm"),
-    "points": ("Points on the surface", ""),
-    "edges": ("Points on its edges", ""),
-}
-"""What the seam steps' figures are, and the unit they are told in."""
-
-
 def _figure(name: str, value: float) -> tuple[str, str]:
     """Return a figure in words, and its value with its unit; another step's by its own name."""
-    words, unit = FIGURES.get(name, (name, ""))
+    words, unit = {
+        "seen": ("Seen of the part, of its broadest side", "%"),
+        "refuted": ("Of the part looked through", "%"),
+        "second": ("Next best pose agrees, of the best", "%"),
+        "explained": ("Explained by the joint", "%"),
+        "coverage": ("Seen of its length", "%"),
+        "residual": ("Scan off the surface", "mm"),
+        "registration": ("Line in the scan, one sigma", "mm"),
+        "start": ("Start along the seam, one sigma", "mm"),
+        "end": ("End along the seam, one sigma", "mm"),
+        "apart": ("Neighbouring clouds apart", "mm"),
+        "points": ("Points on the surface", ""),
+        "edges": ("Points on its edges", ""),
+    }.get(name, (name, ""))
     told = {"mm": f"{millimetres(value)} mm", "%": f"{value:.0%}"}
     return words, told.get(unit, f"{value:.4g}")
