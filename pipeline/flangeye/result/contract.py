@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from flangeye.types import Transform
 
-Vector = list[float]
-Point = Annotated[list[float], Field(min_length=3, max_length=3)]
-Matrix = list[list[float]]
+
+def _listed(value: Any) -> Any:
+    """Return the numbers of an array, for parts that are read off the types of a run."""
+    return value.tolist() if hasattr(value, "tolist") else value
+
+
+Vector = Annotated[list[float], BeforeValidator(_listed)]
+Point = Annotated[Vector, Field(min_length=3, max_length=3)]
+Matrix = Annotated[list[list[float]], BeforeValidator(_listed)]
 
 
 class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", defer_build=True)
+    model_config = ConfigDict(extra="forbid", defer_build=True, from_attributes=True)
 
 
 class TransformResult(_Part):

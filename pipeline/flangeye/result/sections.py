@@ -18,7 +18,6 @@ from flangeye.result.contract import (
     AnswersResult,
     CorrectionResult,
     ExpectedErrorResult,
-    FieldResult,
     HoldoutResult,
     ObservationResult,
     Result,
@@ -54,28 +53,7 @@ def _transform(estimate: t.TransformEstimate) -> TransformResult:
 
 def correction_result(correction: t.ArmCorrection | None) -> CorrectionResult | None:
     """Return a correction as ``result.json`` and ``calibration.yaml`` carry it."""
-    return None if correction is None else _correction(correction)
-
-
-def _correction(correction: t.ArmCorrection) -> CorrectionResult:
-    field = correction.field
-    return CorrectionResult(
-        tool_offset=correction.tool_offset.tolist(),
-        joint_offsets=_listed(correction.joint_offsets),
-        joints=_listed(correction.joints),
-        lengths=_listed(correction.lengths),
-        field=field
-        and FieldResult(
-            about=field.about.tolist(),
-            length=field.length,
-            rigid=field.rigid.tolist(),
-            weights=field.weights.tolist(),
-        ),
-    )
-
-
-def _listed(values: t.Array | None) -> Any:
-    return None if values is None else np.asarray(values).tolist()
+    return None if correction is None else CorrectionResult.model_validate(correction)
 
 
 def warnings_result(notes: Iterable[t.Note]) -> list[WarningResult]:
@@ -132,7 +110,7 @@ def expected_error(result: Result) -> tuple[float, float] | None:
 def expected_error_result(calibration: t.HandEye | None) -> ExpectedErrorResult | None:
     """Return the section ``expected_error``."""
     found = calibration and calibration.expected
-    return ExpectedErrorResult(rms=found.rms, p95=found.p95) if found else None
+    return ExpectedErrorResult.model_validate(found) if found else None
 
 
 def true_result(calibration: t.HandEye | None) -> dict[str, TransformResult]:
@@ -164,7 +142,7 @@ def _answer(calibration: t.HandEye, of_all: float | None) -> AnswerResult:
     return AnswerResult(
         transforms=transforms_result(calibration),
         correction=correction_result(calibration.correction),
-        arms={name: _correction(found) for name, found in calibration.arms.items()},
+        arms={n: CorrectionResult.model_validate(arm) for n, arm in calibration.arms.items()},
         expected_rms=calibration.expected and calibration.expected.rms,
         holdout_rms=of_all,
     )
@@ -202,7 +180,7 @@ def _observation(pair: t.Pair) -> ObservationResult:
 
 def workspace_result(box: t.Box) -> WorkspaceResult:
     """Return the section ``workspace``."""
-    return WorkspaceResult(centre=box.centre.tolist(), size=box.size.tolist())
+    return WorkspaceResult.model_validate(box)
 
 
 def truth_result(
@@ -279,12 +257,7 @@ def holdout_result(verifications: Mapping[str, t.Verification]) -> HoldoutResult
 
 def verifications_result(found: Mapping[str, t.Verification]) -> dict[str, VerificationResult]:
     """Return the section ``verifications``."""
-    return {
-        step: VerificationResult(
-            passed=v.passed, reason=v.reason, figures=dict(v.figures), errors=dict(v.errors)
-        )
-        for step, v in found.items()
-    }
+    return {step: VerificationResult.model_validate(v) for step, v in found.items()}
 
 
 def seam_result(seam: t.Seam | None, scan: t.WorkpieceScan | None) -> SeamResult | None:
