@@ -19,7 +19,7 @@ from flangeye.maths.geometry import rigid
 from flangeye.models.bodies import load_body
 from flangeye.report import write_report
 from flangeye.report.cell import cell_drawing, cloud_panels, found_body
-from flangeye.report.facts import facts_of
+from flangeye.report.facts import Facts, facts_of
 from flangeye.report.page import render
 from flangeye.report.plot import box_edges, figure3d, joined, packed, plain, round_up, scatter3d
 from flangeye.report.residuals import errors_of, residual_figure
@@ -188,12 +188,12 @@ def test_a_body_is_drawn_where_it_was_found_first() -> None:
     flange = {t.FLANGE: t.Transform(t.BASE, t.FLANGE, np.eye(4))}
     seen = [t.Observation(name, feature, flange) for name in ("03", "04")]
     log: Any = SimpleNamespace(observations=lambda: seen, models={})
-    facts: Any = SimpleNamespace(log=log, recipe="target: {body: gripper, at: flange}")
-    found = found_body(facts)
+    result: Any = None
+    found = found_body(Facts(log, result, "target: {body: gripper, at: flange}"))
     assert found is not None
     assert (found.name, found.capture) == ("gripper", "03")
     extent = np.ptp(found.edges.reshape(-1, 3), axis=0)
     assert extent == pytest.approx(np.ptp(body.vertices, axis=0), rel=0.02)
     assert found.edges.reshape(-1, 3).mean(axis=0) == pytest.approx(pose[:3, 3], abs=body.size)
-    facts.recipe = "target: {body: of-another-version, at: flange}"
-    assert found_body(facts) is None
+    other = Facts(log, result, "target: {body: of-another-version, at: flange}")
+    assert found_body(other) is None

@@ -8,20 +8,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import quote
 
 from flangeye import report as run_report
 from flangeye.batch.dataset import Row
 from flangeye.batch.progress import Tally
 from flangeye.files.paths import VERSION, Storage
-from flangeye.report.look import css
+from flangeye.report.look import templates
 from flangeye.report.page import packed_plotly
 from flangeye.report.units import degrees, duration, millimetres
-
-if TYPE_CHECKING:
-    from jinja2 import Environment
-
 
 _HEADINGS: Mapping[str, str] = {
     "session": "Session",
@@ -80,7 +76,8 @@ def render(tally: Tally) -> str:
     shown = [_with_short_archive(row, tally) for row in tally.shown()]
     sample = [_with_short_archive(row, tally) for row in tally.sample]
     drawings = drawings_of(sample, tally.varied)
-    return _environment().get_template("summary.html.j2").render(
+    own, shared = Path(__file__).parent, Path(run_report.__file__).parent
+    return templates(own, shared).get_template("summary.html.j2").render(
         title=tally.recipe,
         counts=[(s, n) for s, n in tally.counts.items() if n],
         total=tally.total,
@@ -138,22 +135,6 @@ def _text(name: str, value: Any) -> str:
     if name == "true_rotation_rad":
         return degrees(value)
     return f"{value:.2f}" if name == "seconds" else str(value)
-
-
-def _environment() -> Environment:
-    """Return templates that escape everything; the look is that of a run's report."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-    environment = Environment(
-        loader=FileSystemLoader([Path(__file__).parent, Path(run_report.__file__).parent]),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.globals["look"] = css
-    environment.policies["json.dumps_kwargs"] = {"allow_nan": False}
-    return environment
 
 
 Drawing = dict[str, Any]

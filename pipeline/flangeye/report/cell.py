@@ -11,7 +11,6 @@ import numpy as np
 
 from flangeye import types as t
 from flangeye.errors import FlangeyeError
-from flangeye.files.yaml_lines import parse_yaml
 from flangeye.log.foxglove import circle_lines
 from flangeye.maths.geometry import basis_of_plane
 from flangeye.maths.statistics import rms
@@ -160,7 +159,7 @@ def found_body(facts: Facts) -> FoundBody | None:
     None too where it cannot be read here, as one of another version: the rest of the page stands.
     """
     poses, found = _marker_poses(facts), {o.id: o for o in facts.log.observations()}
-    data = parse_yaml(facts.recipe, "recipe").data if facts.recipe else {}
+    data = facts.header
     if not (data.get("target") or {}).get("body") or not poses:
         return None
     capture, pose = next(iter(poses.items()))

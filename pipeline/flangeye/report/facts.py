@@ -9,16 +9,21 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
 
 from flangeye import types as t
+from flangeye.errors import FlangeyeError
 from flangeye.files.yaml_lines import parse_yaml
 from flangeye.log.read import RunLog
+from flangeye.models.loading import load_model
 from flangeye.models.workspace import work_of
+from flangeye.recipe.own_models import carried_files
 from flangeye.report.units import duration
 from flangeye.result import contract as r
 from flangeye.result import logged_result, sections, sha256
@@ -45,6 +50,22 @@ class Facts:
     def estimate(self) -> tuple[str, r.TransformResult] | None:
         """Name and value of the transform that was estimated, if the solver came so far."""
         return next(iter(self.result.transforms.items()), None)
+
+    @cached_property
+    def header(self) -> dict[str, Any]:
+        """The recipe as data; empty without one."""
+        return (parse_yaml(self.recipe, "recipe").data or {}) if self.recipe else {}
+
+    def model(self, kind: Literal["robots", "scanners"]) -> Any:
+        """Return the recipe's arm or scanner, where its file is here: it may be another machine's.
+
+        Args:
+            kind: Of the models, as their folder is called.
+        """
+        name = (self.header.get(kind.removesuffix("s")) or {}).get("model")
+        with suppress(FlangeyeError), carried_files(self.log.models) as folder:
+            return load_model(kind, name, folder) if name else None
+        return None
 
     @property
     def of_cell(self) -> bool:

@@ -5,6 +5,12 @@ Text colours have a contrast of at least 4.5 on their background (WCAG 2.1, AA),
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
 LIGHT = {
     "paper": "#ffffff", "panel": "#f6f7f9", "ink": "#1c2230", "muted": "#5b6474", "rule": "#dfe3e9",
     "link": "#1f5fa8", "bar": "#3a7ebf", "axis": "#7b8494", "grid": "#dfe3e9",
@@ -49,3 +55,20 @@ def css() -> str:
 
 def _variables(colours: dict[str, str]) -> str:
     return " ".join(f"--{name}: {value};" for name, value in colours.items())
+
+
+def templates(*folders: Path) -> Environment:
+    """Return templates that escape everything, for ids, reasons and titles come from anywhere."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    environment = Environment(
+        loader=FileSystemLoader(folders),
+        autoescape=True,
+        optimized=False,  # a page is rendered once
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.policies["json.dumps_kwargs"] = {"allow_nan": False}
+    environment.globals["look"] = css
+    return environment

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from flangeye.log.read import JournalEntry, RunLog, read_notes
 from flangeye.maths.statistics import rms
 from flangeye.report.cell import cell_drawing, cloud_panels
 from flangeye.report.facts import Facts, facts_of, idle_of, provenance_of, set_aside_of, timings_of
-from flangeye.report.look import LOGO, SERIES, css
+from flangeye.report.look import LOGO, SERIES, templates
 from flangeye.report.plot import Figure, layout2d, plain, round_up
 from flangeye.report.residuals import errors_of, residual_figure
 from flangeye.report.space import graph_drawing, workspace_drawing
@@ -36,9 +36,6 @@ from flangeye.report.summary import (
 from flangeye.report.units import degrees, figure, millimetres, percent
 from flangeye.report.weld import seam_view, weld_drawing
 from flangeye.types import Floats
-
-if TYPE_CHECKING:
-    from jinja2 import Environment
 
 
 def write_report(log: RunLog, path: Path, library: Path | None = None) -> None:
@@ -63,7 +60,10 @@ def render(log: RunLog, library: str | None = None) -> str:
     """Return the page as text; see :func:`write_report`."""
     content = _content(facts_of(log))
     content |= {"library": library, "plotly_js": "" if library else packed_plotly()}
-    return _environment().get_template("report.html.j2").render(content)
+    environment = templates(Path(__file__).parent)
+    environment.filters |= {"mm": millimetres, "deg": degrees, "percent": percent}
+    environment.filters |= {"figure": figure, "words": lambda name: name.replace("_", " ")}
+    return environment.get_template("report.html.j2").render(content)
 
 
 def plotly_js() -> bytes:
@@ -127,25 +127,6 @@ def _content(facts: Facts) -> dict[str, Any]:
         "provenance": provenance_of(facts),
         "version": VERSION,
     }
-
-
-def _environment() -> Environment:
-    """Return templates that escape everything, for ids, reasons and titles come from anywhere."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        optimized=False,  # a page is rendered once
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.policies["json.dumps_kwargs"] = {"allow_nan": False}
-    environment.globals["look"] = css
-    environment.filters |= {"mm": millimetres, "deg": degrees, "percent": percent}
-    environment.filters |= {"figure": figure, "words": lambda name: name.replace("_", " ")}
-    return environment
 
 
 @dataclass(frozen=True)

@@ -10,14 +10,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from flangeye.errors import FlangeyeError
-from flangeye.files.yaml_lines import parse_yaml
 from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.maths.kinematics import Arm
-from flangeye.models.loading import load_model
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
-from flangeye.recipe.own_models import carried_files
 from flangeye.report.facts import Facts
 from flangeye.report.look import SERIES
 from flangeye.types import Floats
@@ -73,17 +69,8 @@ def scene_of(facts: Facts) -> StillScene | None:
 
     None where the scanner does not stand in the base, or its models are not known here.
     """
-    header = parse_yaml(facts.recipe, "recipe").data if facts.recipe else {}
-    robot, scanner = ((header.get(part) or {}).get("model") for part in ("robot", "scanner"))
-    if facts.base_T_camera is None or not robot or not scanner:
-        return None
-    try:
-        with carried_files(facts.log.models) as folder:
-            arm, camera = (
-                load_model("robots", robot, folder),
-                load_model("scanners", scanner, folder),
-            )
-    except FlangeyeError:  # the files of the run's machine need not be on this one
+    arm, camera = facts.model("robots"), facts.model("scanners")
+    if facts.base_T_camera is None or arm is None or camera is None:
         return None
     used = [o for o in facts.measured if o.used]
     joints = next((facts.log.poses[o.id]["joints"] for o in used if o.id in facts.log.poses), None)

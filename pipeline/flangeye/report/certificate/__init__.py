@@ -5,19 +5,15 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from flangeye.errors import FlangeyeError, StageError
+from flangeye.errors import StageError
 from flangeye.files.paths import VERSION
 from flangeye.files.regular import write_whole
-from flangeye.files.yaml_lines import parse_yaml
 from flangeye.log.read import read_run
-from flangeye.models.loading import load_model
 from flangeye.models.scanners import ScannerModel
-from flangeye.recipe.own_models import carried_files
 from flangeye.report.certificate.budget import (
     Budget,
     Conditions,
@@ -28,7 +24,7 @@ from flangeye.report.certificate.budget import (
     use_budget_of,
 )
 from flangeye.report.facts import Facts, facts_of, provenance_of
-from flangeye.report.look import css
+from flangeye.report.look import templates
 from flangeye.report.summary import transform_text
 from flangeye.report.units import degrees, millimetres
 from flangeye.result import result_of_camera, status_of
@@ -89,16 +85,7 @@ def sandbox() -> list[str]:
 
 def render(facts: Facts, conditions: Conditions) -> str:
     """Return the page as text."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.globals["look"] = css
+    environment = templates(Path(__file__).parent)
     environment.filters |= {"mm": millimetres, "standard": standard_text, "part": part_text}
     return environment.get_template("certificate.html.j2").render(_content(facts, conditions))
 
@@ -121,8 +108,7 @@ def part_text(metres: float) -> str:
 
 def _content(facts: Facts, conditions: Conditions) -> dict[str, Any]:
     result = facts.result
-    header = parse_yaml(facts.recipe, "recipe").data if facts.recipe else {}
-    scanner = _scanner(header, facts.log.models)
+    scanner = facts.model("scanners")
     return {
         "result": result,
         "status": status_of(result),
@@ -130,7 +116,7 @@ def _content(facts: Facts, conditions: Conditions) -> dict[str, Any]:
         "shares": shares_of(result),
         "use": use_budget_of(result, scanner, conditions),
         "transform": transform_text(*next(iter(result.transforms.items()))),
-        "objects": _objects(header, scanner),
+        "objects": _objects(facts.header, scanner),
         "conditions": conditions,
         "expected": expected_error(result),
         "used": sum(o.used for o in result.observations),
@@ -162,15 +148,6 @@ def _serial(section: dict[str, Any]) -> str:
     driver = section.get("driver")
     settings = next(iter(driver.values()), None) if isinstance(driver, dict) else None
     return str(settings.get("serial", "")) if isinstance(settings, dict) else ""
-
-
-def _scanner(header: dict[str, Any], models: Mapping[str, bytes]) -> ScannerModel | None:
-    model = (header.get("scanner") or {}).get("model")
-    try:
-        with carried_files(models) as folder:
-            return load_model("scanners", model, folder) if model else None
-    except FlangeyeError:  # the file of the run's machine need not be on this one
-        return None
 
 
 __all__ = [
