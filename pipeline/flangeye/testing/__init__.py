@@ -8,7 +8,7 @@ fault raises AssertionError with one line that says what was expected.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -254,34 +254,6 @@ class ExportConformance(Conformance):
         require(not missing, f"the file does not say '{missing[0] if missing else ''}'")
 
 
-KITS = {
-    "acquire": AcquireConformance,
-    "segment": SegmentConformance,
-    "fit": FitConformance,
-    "solve": SolveConformance,
-    "refine": RefineConformance,
-    "verify": VerifyConformance,
-    "export": ExportConformance,
-    "scan": ScanConformance,
-    "seam": SeamConformance,
-    "weld": WeldConformance,
-    "reader": ReaderConformance,
-    "plan": PlanConformance,
-    "view": ViewConformance,
-    "cost": CostConformance,
-    "error": ErrorConformance,
-    "robot": RobotConformance,
-    "scanner": ScannerConformance,
-    "controller": ControllerConformance,
-    "sensor": SensorConformance,
-    "profiler": ProfilerConformance,
-    "arc": ArcConformance,
-    "replay": ReplayConformance,
-    "guide": GuideConformance,
-    "check": CheckConformance,
-}
-"""Kind of stage or part -> its class."""
-
 # Spelt out: a type checker takes nothing else for public.
 __all__ = [
     "KITS",
@@ -311,3 +283,10 @@ __all__ = [
     "ViewConformance",
     "WeldConformance",
 ]
+
+KITS: Mapping[str, type[Conformance]] = {
+    kit.kind: kit
+    for kit in map(globals().get, __all__)
+    if isinstance(kit, type) and issubclass(kit, Conformance) and kit.kind
+}
+"""Kind of stage or part -> its class."""
