@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -25,8 +23,8 @@ from flangeye.units import Angle, param
 from flangeye_emulators.acquire.planned_session import (
     UNSEEN,
     UPRIGHT,
-    VERSION,
     ArmsParams,
+    fingerprint_of,
     noise_free,
 )
 from flangeye_emulators.world.arm import ImperfectArm
@@ -367,6 +365,5 @@ def _true(cell: Cell, params: CellSessionParams) -> tuple[Transform, tuple[Trans
 
 def _source(cell: Cell, seed: int, params: CellSessionParams) -> Source:
     made_of = [cell.describe(), params.model_dump(mode="json")]
-    text = json.dumps([VERSION, seed, made_of], sort_keys=True)
     note = f"simulated: a cell, {params.sightings} sightings"
-    return Source(hashlib.sha256(text.encode()).hexdigest(), (note,), simulated=True)
+    return Source(fingerprint_of(seed, made_of), (note,), simulated=True)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -228,7 +229,11 @@ def source_of(
     """Return where a session's captures come from: made of the models and parameters alone."""
     configuration = session.configuration
     made_of = [robot.model, configuration.describe(), *(m.model_dump(mode="json") for m in models)]
-    text = json.dumps([VERSION, seed, made_of], sort_keys=True)
     note = f"simulated: {configuration.name}, {len(session.reported.camera)} poses"
-    fingerprint = hashlib.sha256(text.encode()).hexdigest()
-    return Source(fingerprint, (note,), truth=session.truth, simulated=True)
+    return Source(fingerprint_of(seed, made_of), (note,), truth=session.truth, simulated=True)
+
+
+def fingerprint_of(seed: int, made_of: Sequence[Any]) -> str:
+    """Return the hash of a simulation, by its seed and plain data of all that it is made of."""
+    text = json.dumps([VERSION, seed, made_of], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()

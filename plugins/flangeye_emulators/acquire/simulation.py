@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -11,7 +9,7 @@ from functools import partial
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, Field
+from pydantic import Field
 
 from flangeye.devices import MotionAllowed
 from flangeye.errors import NothingMoved, StageError
@@ -41,7 +39,12 @@ from flangeye.types import (
     by_frame,
 )  # fmt: skip
 from flangeye.units import in_mm, param
-from flangeye_emulators.acquire.planned_session import UNSEEN, VERSION, noise_free
+from flangeye_emulators.acquire.planned_session import (
+    UNSEEN,
+    VERSION,
+    fingerprint_of,
+    noise_free,
+)
 from flangeye_emulators.world.arm import ArmErrors, ImperfectArm
 from flangeye_emulators.world.cell import SimulatedCell
 from flangeye_emulators.world.raycast import Image, SolidBody
@@ -106,7 +109,9 @@ def simulate(
     unseen = [] if params.arm.is_default else _unseen(stops.plan, site, _rng(checking.spawn(1)[0]))
     cell = SimulatedCell(robot, plate, stops.plan.centre, stops.plan.size, sphere, body)
     session = _session(cell, scanner, stops, unseen, params, errors)
-    source = session.source(_fingerprint(seed, robot, scanner, flange, params, sphere, body=body))
+    models = [robot, scanner, flange, params, *([sphere] if sphere else [])]
+    made_of: list[Any] = [model.model_dump(mode="json") for model in models]
+    source = session.source(fingerprint_of(seed, made_of + ([body.digest] if body else [])))
     whys = [pose.why for pose in stops.all]
     # A plan that says why is heard before each scan, so nothing is scanned ahead of it.
     ahead = not any(whys)
@@ -192,13 +197,6 @@ def _unseen(plan: Plan, site: Site, rng: np.random.Generator) -> list[Floats]:
     # Largest roll, pitch and yaw of poses that show what a calibration is worth [rad]
     spread = plan.size / 2, 0.3
     return [pose.joints for pose in poses_near(plan.centre, UNSEEN, site, rng, spread)]
-
-
-def _fingerprint(seed: int, *models: BaseModel | None, body: TargetBody | None) -> str:
-    given: list[Any] = [model.model_dump(mode="json") for model in models if model is not None]
-    given += [body.digest] if body else []
-    text = json.dumps([VERSION, seed, given], sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,6 @@ from flangeye.maths.streams import (
     STILL_ANGLE,
     STILL_DISTANCE,
     interpolated,
-    mean_pose,
     passed,
     turning,
     with_joints,
@@ -303,7 +302,7 @@ def _by_time(
     if len(still) < len(pairs):
         notes.append(f"left out {len(pairs) - len(still)} poses, at which something else moved")
     found = [
-        _recording(seen, f"{i:04}", _mean([values[k] for k in p.events]), _moment(first, moved, p))
+        _recording(seen, f"{i:04}", p.mean(values), _moment(first, moved, p))
         for i, p in enumerate(still)
     ]
     return found, [f"{seen.text.file.name}: {note}" for note in notes]
@@ -361,11 +360,6 @@ def _stands(each: Moved, found: MatchedPose, events: Floats) -> bool:
     turned = np.arccos(np.clip((np.trace(before[:3, :3].T @ after[:3, :3]) - 1) / 2, -1, 1))
     moved = np.linalg.norm(after[:3, 3] - before[:3, 3])
     return bool(moved < STILL_DISTANCE and turned < STILL_ANGLE)
-
-
-def _mean(values: Sequence[Floats | Path | None]) -> Floats:
-    seen = np.array(values)
-    return mean_pose(seen) if seen.ndim == 3 else np.asarray(seen.mean(axis=0))
 
 
 def _recording(

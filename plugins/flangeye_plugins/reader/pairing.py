@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from pydantic import Field
@@ -54,6 +55,11 @@ class MatchedPose:
     pose: Floats
     events: tuple[int, ...]
     motion: Motion | None = None
+
+    def mean(self, measured: Sequence[Any]) -> Floats:
+        """Return the mean of its measurements, of all points (3,) or poses (4, 4)."""
+        seen = np.array([measured[i] for i in self.events])
+        return mean_pose(seen) if seen.ndim == 3 else np.asarray(seen.mean(axis=0))
 
 
 def pair(

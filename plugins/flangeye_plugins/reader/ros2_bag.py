@@ -40,13 +40,9 @@ from flangeye_plugins.reader.ros2_messages import (
     scratch,
     topics_of,
 )
-from flangeye_plugins.ros2.messages import cloud_of, intrinsics_of, pixels_of
+from flangeye_plugins.ros2.messages import Type, cloud_of, intrinsics_of, pixels_of
 
 T = TypeVar("T")
-CLOUD, POSE = "sensor_msgs/msg/PointCloud2", "geometry_msgs/msg/PoseStamped"
-IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-INFO, JOINTS = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/JointState"
-TF = "tf2_msgs/msg/TFMessage"
 ARM = "robot: NAME ('flangeye robots' lists them) or robot: {urdf: arm.urdf} in the recipe"
 """How a recipe names its arm."""
 
@@ -144,18 +140,20 @@ def _first_look(path: Path) -> Bag:
     """Read all but the clouds and images, and of those the times."""
     files = bag_files(path)
     bag = Bag(path, files, topics_of(files))
-    wanted = bag.of_type(CLOUD, POSE, *IMAGES, INFO, JOINTS, TF)
+    wanted = bag.of_type(
+        Type.CLOUD, Type.POSE, Type.IMAGE, Type.COMPRESSED, Type.INFO, Type.JOINT_STATE, Type.TF
+    )
     heard = set()
     for raw in messages(files, wanted):
         kind = bag.topics[raw.topic]
         heard.add(raw.topic)
-        if kind == TF:
+        if kind == Type.TF:
             raw.read(partial(bag.frames.take, static=raw.topic.endswith("tf_static")))
-        elif kind == POSE:
+        elif kind == Type.POSE:
             _append(bag.poses, raw, raw.read(_pose_stamped))
-        elif kind == JOINTS:
+        elif kind == Type.JOINT_STATE:
             _append(bag.joints, raw, raw.read(_joint_angles))
-        elif kind == INFO:
+        elif kind == Type.INFO:
             bag.cameras[raw.topic] = raw.read(intrinsics_of)
             bag.seen_from[raw.topic] = raw.frame
         else:
@@ -191,10 +189,10 @@ def _arm(
         StageError: Nothing in the bag tells where the flange is, or several things do.
     """
     joints = _joints(bag, params)
-    if params.robot in bag.of_type(JOINTS):
+    if params.robot in bag.of_type(Type.JOINT_STATE):
         return *_by_kinematics(bag, joints, robot), joints
     if params.robot is not None:
-        topic = bag.only("robot", params.robot, POSE)
+        topic = bag.only("robot", params.robot, Type.POSE)
         return in_order(*bag.poses[str(topic)]), f"the flange's poses from {topic}", joints
     # Names under which ROS's drivers publish the two frames, the better one first
     base = _frame(bag, params.base, ("base", "base_link", "world"))
@@ -398,7 +396,7 @@ class Scans:
 
     def _files(self, topic: str, wanted: Sequence[int]) -> dict[int, Path]:
         """Write some messages of a topic as files; return them by the message's number."""
-        save = save_cloud if self.bag.topics[topic] == CLOUD else save_image
+        save = save_cloud if self.bag.topics[topic] == Type.CLOUD else save_image
         name = scratch(self.bag.path) / topic.strip("/").replace("/", "_")
         return self._sound(topic, wanted, lambda i, told: save(Path(f"{name}-{i:05}"), told))
 
@@ -414,8 +412,8 @@ def _seen(bag: Bag, params: BagParams) -> tuple[Target | Scans, str]:
     """Return what the camera saw, and how it was found."""
     if params.target is not None:
         return _target(bag, params), f"the target from {params.target}"
-    clouds = bag.only("clouds", params.clouds, CLOUD)
-    images = bag.only("images", params.images, *IMAGES)
+    clouds = bag.only("clouds", params.clouds, Type.CLOUD)
+    images = bag.only("images", params.images, Type.IMAGE, Type.COMPRESSED)
     if clouds is None and images is None:
         raise StageError(
             f"{bag.path}: holds neither clouds nor images; name the target where somebody has "
@@ -433,7 +431,7 @@ def _info(bag: Bag, params: BagParams, images: str) -> str | None:
     same = [topic for topic in bag.cameras if frame and bag.seen_from[topic] == frame]
     found = [beside] if beside in bag.cameras else same
     given = params.camera_info or (found[0] if len(found) == 1 else None)
-    return bag.only("camera_info", given, INFO)
+    return bag.only("camera_info", given, Type.INFO)
 
 
 def _target(bag: Bag, params: BagParams) -> Target:

@@ -28,7 +28,7 @@ from flangeye.files.scans import Poses, recording_of, scans_of
 from flangeye.files.tables import Column, Table, files_at, number_of, rows_together
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.pose_corrections import inverted
-from flangeye.maths.streams import interpolated, mean_pose, passed, turning
+from flangeye.maths.streams import interpolated, passed, turning
 from flangeye.models.robots import RobotModel
 from flangeye.types import FLANGE, FLANGE2, Floats, Motion
 from flangeye.units import param
@@ -290,7 +290,7 @@ def _joined(
         raise StageError(f"{target.table.file}: {error}") from None
     recordings = [
         replace(
-            _recording(f"{i:04}", p.pose, _mean(values, p), _second_at(second, p), p.time),
+            _recording(f"{i:04}", p.pose, p.mean(values), _second_at(second, p), p.time),
             motion=_motion(arm, second, p),
         )
         for i, p in enumerate(pairs)
@@ -320,11 +320,6 @@ def _motion(
     if found.motion is None or stream is None:
         return found.motion
     return passed(*arm, found.time, {FLANGE2: stream})
-
-
-def _mean(values: Sequence[Floats], found: MatchedPose) -> Floats:
-    seen = np.array([values[i] for i in found.events])
-    return mean_pose(seen) if seen.ndim == 3 else np.asarray(seen.mean(axis=0))
 
 
 def _second_at(second: Readings | None, found: MatchedPose) -> Floats | None:

@@ -27,6 +27,7 @@ class Type(StrEnum):
     COMPRESSED = "sensor_msgs/msg/CompressedImage"
     INFO = "sensor_msgs/msg/CameraInfo"
     TF = "tf2_msgs/msg/TFMessage"
+    POSE = "geometry_msgs/msg/PoseStamped"
     CLOCK = "rosgraph_msgs/msg/Clock"
     TEXT = "std_msgs/msg/String"
     EMPTY = "std_msgs/msg/Empty"
@@ -35,8 +36,6 @@ class Type(StrEnum):
 
 SHORTEST = 12
 """A message with a time has four bytes of encapsulation, seconds and nanoseconds."""
-NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-"""``sensor_msgs/PointField``: datatype -> NumPy's."""
 PIXELS = {"mono8": ("u1", 1), "8UC1": ("u1", 1), "mono16": ("u2", 1), "16UC1": ("u2", 1),
           "32FC1": ("f4", 1), "rgb8": ("u1", 3), "bgr8": ("u1", 3), "8UC3": ("u1", 3),
           "rgba8": ("u1", 4), "bgra8": ("u1", 4)}  # fmt: skip
@@ -129,10 +128,12 @@ def cloud_of(message: Any) -> Singles:
     if not {"x", "y", "z"} <= set(fields):
         raise StageError(f"a PointCloud2 without x, y, z: it has {', '.join(fields) or 'nothing'}")
     order = ">" if message.is_bigendian else "<"
+    # Datatypes of sensor_msgs/PointField
+    numbers = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
     kind = np.dtype(
         {
             "names": list("xyz"),
-            "formats": [order + NUMBERS[fields[axis].datatype] for axis in "xyz"],
+            "formats": [order + numbers[fields[axis].datatype] for axis in "xyz"],
             "offsets": [fields[axis].offset for axis in "xyz"],
             "itemsize": message.point_step,
         }
