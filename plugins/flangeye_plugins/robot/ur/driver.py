@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -36,31 +36,30 @@ REMOTE = "it is in local control: choose Remote Control at the top right of the 
 
 POWER = "the arm has no power or its brakes are on: switch it on at the pendant"
 
-SAFETY: dict[int, tuple[Mode, str]] = {
-    3: ("protective stop", "protective stop: find the cause, then release it at the pendant"),
-    4: ("not ready", "the arm is outside its safety limits: move it back in recovery mode"),
-    5: ("protective stop", "safeguard stop: somebody is in the cell"),
-    6: ("emergency stop", "emergency stop of the system: release it"),
-    7: ("emergency stop", "emergency stop: release the button"),
-    8: ("not ready", "safety violation: restart the safety system at the pendant"),
-    9: ("not ready", "safety fault: restart the controller"),
-    11: ("protective stop", "safeguard stop in automatic mode"),
-    12: ("protective stop", "the three-position switch is not held"),
-}
-"""RTDE ``safety_mode`` (RTDE guide): what it means for motion, and for people."""
+SAFETY: Mapping[tuple[int, str], tuple[Mode, str]] = {
+    (3, "PROTECTIVE_STOP"): (
+        "protective stop", "protective stop: find the cause, then release it at the pendant"
+    ),
+    (4, "RECOVERY"): (
+        "not ready", "the arm is outside its safety limits: move it back in recovery mode"
+    ),
+    (5, "SAFEGUARD_STOP"): ("protective stop", "safeguard stop: somebody is in the cell"),
+    (6, "SYSTEM_EMERGENCY_STOP"): ("emergency stop", "emergency stop of the system: release it"),
+    (7, "ROBOT_EMERGENCY_STOP"): ("emergency stop", "emergency stop: release the button"),
+    (8, "VIOLATION"): ("not ready", "safety violation: restart the safety system at the pendant"),
+    (9, "FAULT"): ("not ready", "safety fault: restart the controller"),
+    (11, "AUTOMATIC_MODE_SAFEGUARD_STOP"): ("protective stop", "safeguard stop in automatic mode"),
+    (12, "SYSTEM_THREE_POSITION_ENABLING_STOP"): (
+        "protective stop", "the three-position switch is not held"
+    ),
+}  # fmt: skip
+"""RTDE ``safety_mode`` (RTDE guide) and the dashboard's word for it: what it means for motion, and
+for people."""
 
-SAFETY_NAMES = {
-    "PROTECTIVE_STOP": 3,
-    "RECOVERY": 4,
-    "SAFEGUARD_STOP": 5,
-    "SYSTEM_EMERGENCY_STOP": 6,
-    "ROBOT_EMERGENCY_STOP": 7,
-    "VIOLATION": 8,
-    "FAULT": 9,
-    "AUTOMATIC_MODE_SAFEGUARD_STOP": 11,
-    "SYSTEM_THREE_POSITION_ENABLING_STOP": 12,
-}
-"""The dashboard's words for them."""
+
+def safety_of(told: int | str) -> tuple[Mode, str] | None:
+    """Return what a safety mode means, by its number or the dashboard's word; None if unknown."""
+    return next((meaning for names, meaning in SAFETY.items() if told in names), None)
 
 
 class DashboardFacts(NamedTuple):
@@ -116,8 +115,8 @@ def _timed(ask: Callable[[str], str], question: str) -> tuple[str, float]:
 
 
 def _trouble(safety: str, power: str, remote: str, trip: float) -> str:
-    if safety in SAFETY_NAMES:
-        return SAFETY[SAFETY_NAMES[safety]][1]
+    if known := safety_of(safety):
+        return known[1]
     if power != "RUNNING":
         return POWER
     if read_remote(remote) == 0:
@@ -161,7 +160,7 @@ def condition_of(sample: CycleSample, commanded: bool) -> Condition:
     # NORMAL and REDUCED (RTDE guide)
     if sample.safety_mode not in (1, 2):
         unknown: tuple[Mode, str] = ("not ready", f"safety mode {sample.safety_mode}")
-        return Condition(*SAFETY.get(sample.safety_mode, unknown))
+        return Condition(*safety_of(sample.safety_mode) or unknown)
     if sample.robot_mode != RUNNING:
         return Condition("not ready", POWER)
     if sample.remote == 0:
