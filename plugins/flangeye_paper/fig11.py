@@ -119,9 +119,10 @@ def _draw(runs: Mapping[tuple[str, str], Runs]) -> Any:
     for column, robot in enumerate(ROBOTS):
         for row, axes, unit in ((0, AXES[:3], "mm"), (1, AXES[3:], "deg")):
             panel = page.panels[3 * row + column]
-            _bands(panel, _rows(robot, "stored", runs[robot, "stored"]), axes)
+            _spread(panel, _rows(robot, "stored", runs[robot, "stored"]), axes, filled=True)
             if (robot, "run again") in runs:
-                _edges(panel, _rows(robot, "run again", runs[robot, "run again"]), axes)
+                again = _rows(robot, "run again", runs[robot, "run again"])
+                _spread(panel, again, axes, filled=False)
             what = "stored (bands) and run again (lines)" if column == 0 else "stored"
             dress(panel, f"{ROBOTS[robot]}, {what}", "poses", f"mean ± deviation [{unit}]")
             panel.set_xlim(5, 45)
@@ -131,21 +132,15 @@ def _draw(runs: Mapping[tuple[str, str], Runs]) -> Any:
     return page
 
 
-def _bands(panel: Any, rows: Sequence[Row], axes: Sequence[str]) -> None:
+def _spread(panel: Any, rows: Sequence[Row], axes: Sequence[str], filled: bool) -> None:
+    """Draw mean and deviation of each axis as a band, or its two edges alone."""
     for axis in axes:
         poses, mean, deviation = map(
             np.array, columns(rows, "poses", f"{axis}_mean", f"{axis}_std")
         )
-        panel.plot(poses, mean, color=AXIS_COLOURS[axis], linewidth=1.0, label=axis)
-        panel.fill_between(
-            poses, mean - deviation, mean + deviation, color=AXIS_COLOURS[axis], alpha=0.2, lw=0
-        )
-
-
-def _edges(panel: Any, rows: Sequence[Row], axes: Sequence[str]) -> None:
-    for axis in axes:
-        poses, mean, deviation = map(
-            np.array, columns(rows, "poses", f"{axis}_mean", f"{axis}_std")
-        )
-        for edge in (mean - deviation, mean + deviation):
-            panel.plot(poses, edge, "--", color=AXIS_COLOURS[axis], linewidth=0.9)
+        low, high, colour = mean - deviation, mean + deviation, AXIS_COLOURS[axis]
+        if filled:
+            panel.plot(poses, mean, color=colour, linewidth=1.0, label=axis)
+            panel.fill_between(poses, low, high, color=colour, alpha=0.2, lw=0)
+        else:
+            panel.plot(poses, low, "--", poses, high, "--", color=colour, linewidth=0.9)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from flangeye.maths.statistics import rms
 from flangeye_paper.tables import (
     AXES,
     BOUND,
@@ -77,9 +78,9 @@ def _summary(rows: Sequence[Row], method: str) -> dict[str, Any]:
         **{f"{axis} {_unit(axis)}": _growth(clean, f"{axis}_std") for axis in AXES},
         "x at work mm/mm": _growth(clean, "centre_x_std"),
         "workspace rms mm/mm": _growth(clean, "workspace_rms"),
-        "times the bound": _rms(over),
+        "times the bound": rms(over),
         "15 % outliers, 1 mm: workspace rms mm": at_one[0] if at_one else None,
-        "times the inliers alone": _rms(alone),
+        "times the inliers alone": rms(alone),
     }
 
 
@@ -101,11 +102,7 @@ def _unit(axis: str) -> str:
 
 
 def _growth(rows: Sequence[Row], column: str) -> float:
-    return _rms([r[column] / r["noise_mm"] for r in rows])
-
-
-def _rms(values: Sequence[float]) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
+    return rms([r[column] / r["noise_mm"] for r in rows])
 
 
 def _draw(rows: Sequence[Row]) -> Any:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flangeye import FlangeyeError
+from flangeye.maths.statistics import rms
 from flangeye_paper.published import stored_results
 from flangeye_paper.tables import (
     METHODS,
@@ -103,7 +104,7 @@ def _kept(session: SessionRow) -> set[str]:
 
 def _row(recording: CentreSet, label: str, splits: list[SessionRow], kept: set[str]) -> Row:
     errors = [_errors(session) for session in splits]
-    common = [_rms(v for k, v in e.items() if k in kept) for e in errors]
+    common = [rms([v for k, v in e.items() if k in kept]) for e in errors]
     return {
         "recording": recording.name,
         "method": label,
@@ -111,7 +112,7 @@ def _row(recording: CentreSet, label: str, splits: list[SessionRow], kept: set[s
         "rms mm": float(np.median(common)),
         "range over splits mm": f"{min(common):.3f} to {max(common):.3f}",
         "poses": len(kept),
-        "all poses: rms mm": float(np.median([_rms(e.values()) for e in errors])),
+        "all poses: rms mm": float(np.median([rms(list(e.values())) for e in errors])),
         "median mm": float(np.median([np.median(list(e.values())) for e in errors])),
         "of poses": len(errors[0]),
     }
@@ -146,10 +147,6 @@ def _stored_row(recording: CentreSet, archive: Path, session: SessionRow, kept: 
         "median mm": float(np.median(errors)),
         "of poses": len(poses),
     }
-
-
-def _rms(values: Iterable[float]) -> float:
-    return float(np.sqrt(np.mean(np.square(list(values)))))
 
 
 def _draw(rows: list[Row]) -> Any:

@@ -10,7 +10,7 @@ H T follows what ICP gives for any other matrix, as far as it converges.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -59,13 +59,6 @@ class CadFile:
     name: str
     axes: tuple[float, float, float]
     offset: float
-
-
-_CAD: Mapping[str, CadFile] = {
-    "aubo": CadFile("flange_aubo_cropped.pcd", (-1, 1, -1), -0.006),
-    # Their script of the Kinect takes the Aubo's flange for the UR10e's: ISO 9409-1-50-4-M6 both.
-    "kinect": CadFile("flange_aubo_a.pcd", (-1, 1, -1), -6.0),
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +117,12 @@ def _reordered(centres: Observations, order: NDArray[np.intp]) -> Iterator[Obser
 
 
 def _views(archive: Archive) -> Iterator[PublishedView]:
-    cad = _CAD.get(archive.layout.removeprefix("ancorasir "))
+    cad = {
+        "aubo": CadFile("flange_aubo_cropped.pcd", (-1, 1, -1), -0.006),
+        # Their script of the Kinect takes the Aubo's flange for the UR10e's: ISO 9409-1-50-4-M6
+        # both.
+        "kinect": CadFile("flange_aubo_a.pcd", (-1, 1, -1), -6.0),
+    }.get(archive.layout.removeprefix("ancorasir "))
     for recording in archive.recordings:
         if cad and recording.cloud and recording.role == "verification":
             shape = read_cloud(_truth_folder(archive.root) / cad.name).points().astype(np.float64)

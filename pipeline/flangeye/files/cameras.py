@@ -24,12 +24,8 @@ MATRICES = (
     "cameramatrix", "intrinsicmatrix", "intrinsics", "intrinsic", "mtx", "matrix", "k", "m",
 )  # fmt: skip
 """Names of the camera's matrix, as all names here in small letters without what joins words."""
-DISTORTIONS = (
-    "distortioncoefficients", "distortioncoeffs", "distcoeffs", "distortion", "dist", "coeffs", "d",
-)  # fmt: skip
-"""Names of the distortion; other names that begin with ``dist`` follow them."""
-_FIRST, _SECOND = ("", "1", "left", "l"), ("2", "right", "r")
-"""What stands behind the names of a stereo calibration's cameras."""
+_FIRST = ("", "1", "left", "l")
+"""What stands behind the names of the camera, or of a stereo calibration's first."""
 ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """OpenCV's coefficients."""
 LABELLED = (".txt", ".csv", ".ini", ".cfg", ".toml")
@@ -103,7 +99,7 @@ def camera_in(path: Path) -> CameraFile | None:
     values, matrix = found[0]
     _require_opencv(path, values)
     others = sum(not np.array_equal(other, matrix) for _, other in found)
-    others += _named(values, _SECOND) is not None
+    others += _named(values, ("2", "right", "r")) is not None
     lens = _distortion(values)
     if not lens.size:  # it may stand in a mapping of its own, one for each camera
         apart = [each for mapping in _mappings(data) if (each := _distortion(mapping)).size]
@@ -215,7 +211,11 @@ def _distortion(values: Mapping[str, Any]) -> Floats:
         p1, p2 = np.resize([*_numbers(values.get("tangentialdistortion")), 0.0, 0.0], 2)
         return np.array([k1, k2, p1, p2, k3])
     others = [name for name in values if name.startswith("dist") and name != "distortionmodel"]
-    named = [f"{name}{which}" for name in DISTORTIONS for which in _FIRST]
+    usual = (
+        "distortioncoefficients", "distortioncoeffs", "distcoeffs", "distortion", "dist", "coeffs",
+        "d",
+    )  # fmt: skip
+    named = [f"{name}{which}" for name in usual for which in _FIRST]
     for name in (*named, *others):
         value = values.get(name)
         if isinstance(value, Mapping):

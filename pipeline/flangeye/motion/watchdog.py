@@ -31,8 +31,8 @@ from flangeye.motion.limits import MotionLimits
 from flangeye.motion.route import Leg
 from flangeye.motion.supervision import RememberedState, SafetyFault, Supervisor
 
-GUARDING, LEADING = 2, 1
-"""Priorities among those who come first; the process of a maker's client has one of its own."""
+LEADING = 1
+"""Priority of the thread that leads the arm; its guard's is higher."""
 
 
 def take_precedence(priority: int) -> None:
@@ -61,8 +61,8 @@ STOPS = {signal.SIGINT: "Ctrl-C", signal.SIGTSTP: "Ctrl-Z"}
 AT_REST = 1.0
 """Longest silence of program or guard while the arm stands [s]."""
 
-SLOW, HUNG = 2.0 * GRACE, 10.0 * GRACE
-"""A program that leads the arm and is late: the arm is stopped, and is led no more [s]."""
+HUNG = 10.0 * GRACE
+"""A program that leads the arm and is so late leads it no more [s]."""
 
 
 class Charge(NamedTuple):
@@ -103,7 +103,7 @@ def watchdog_process(wire: Connection, charge: Charge, alarm: Connection) -> Non
     for ending in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(ending, lambda *_: sys.exit())  # as an exception, which stops the arm
     keyboard = _terminal(charge.keyboard)
-    take_precedence(GUARDING)
+    take_precedence(LEADING + 1)
     guard(wire, charge._replace(alarm=alarm.fileno(), keyboard=keyboard))
 
 
@@ -207,7 +207,7 @@ class Watchdog:
         silent = 1e-9 * (self._supervisor.samples[-1].time_ns - self._led_ns)
         if silent > HUNG:
             self._bar(f"the program that moves the arm sent no command for {HUNG:.0f} s")
-        elif silent > SLOW and not self._paused:
+        elif silent > 2.0 * GRACE and not self._paused:
             self._paused = True  # the driver brakes by itself, and before: not on that alone
             try:
                 self._robot.stop()

@@ -57,11 +57,6 @@ class SpringSurface:
         return np.asarray(max(push, 0.0) * self.normal)
 
 
-BRAKES = 10.0
-"""Deceleration of the joints in a stop nobody planned [rad/s^2]. The maker measures 0.16 to 0.53 s
-from 3.2 rad/s (UR5 manual, stop category 0): 6 to 20 rad/s^2."""
-
-
 class MotionFault(Exception):
     """Why the arm had to stop by itself; it is braking already."""
 
@@ -203,7 +198,9 @@ class SimulatedArm:
             )
 
     def _brake(self) -> None:
-        self._motion, self._braking = stop(self.speeds, BRAKES, False), True
+        # The maker measures 0.16 to 0.53 s from 3.2 rad/s (UR5 manual, stop category 0): a
+        # deceleration of 6 to 20 rad/s^2
+        self._motion, self._braking = stop(self.speeds, 10.0, False), True
 
     def _feel(self) -> None:
         position = self.stance.base_T_tcp[:3, 3]

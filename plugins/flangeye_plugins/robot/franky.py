@@ -31,19 +31,6 @@ from flangeye_plugins.robot.tool_check import (
     wrench_at_flange,
 )
 
-TRIAL = """
-import os, sys, franky
-realtime = franky.RealtimeConfig.Enforce if sys.argv[2] == "True" else franky.RealtimeConfig.Ignore
-try:
-    franky.Robot(sys.argv[1], realtime_config=realtime)
-except Exception as error:
-    print(" ".join(str(error).split()), flush=True)
-os._exit(0)
-"""
-"""Connects once, in a process that can be killed: where a host is silent, the library never
-returns."""
-
-
 MODES: dict[str, tuple[Mode, str]] = {
     "Idle": ("ready", ""),
     "Move": ("moving", ""),
@@ -70,7 +57,17 @@ def require_answer(name: str, host: str, realtime: bool) -> None:
     Raises:
         DeviceError: It does not work, or takes too long.
     """
-    command = python_command("-c", TRIAL, host, str(realtime))
+    # In a process that can be killed: where a host is silent, the library never returns
+    program = """
+import os, sys, franky
+realtime = franky.RealtimeConfig.Enforce if sys.argv[2] == "True" else franky.RealtimeConfig.Ignore
+try:
+    franky.Robot(sys.argv[1], realtime_config=realtime)
+except Exception as error:
+    print(" ".join(str(error).split()), flush=True)
+os._exit(0)
+"""
+    command = python_command("-c", program, host, str(realtime))
     patience = 2.5  # the library itself waits for ever [s]
     try:
         tried = subprocess.run(

@@ -20,7 +20,7 @@ from flangeye.models.robots import joints_in_order
 POSITION = ("x", "y", "z")
 JOINTS = ("joints",)
 """In place of a rotation: joint angles."""
-_LENGTHS, _ANGLES, _TIMES = ("m", "mm"), ("rad", "deg"), ("s", "ms", "us", "ns")
+_LENGTHS, _ANGLES = ("m", "mm"), ("rad", "deg")
 _PLACES = (
     "position",
     "pos",
@@ -315,7 +315,7 @@ def _words(name: str) -> list[str]:
 
 def _time(words: Sequence[str]) -> tuple[bool, str | None]:
     words = [word.lower() for word in words]
-    unit = words[-1] if words[-1] in _TIMES and len(words) > 1 else None
+    unit = words[-1] if words[-1] in ("s", "ms", "us", "ns") and len(words) > 1 else None
     called = [word for word in words if word != unit]
     return called[-1] in ("time", "timestamp", "stamp", "secs", "sec", "t"), unit
 

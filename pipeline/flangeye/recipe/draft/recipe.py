@@ -36,14 +36,6 @@ PRINTED = ("charuco", "checkerboard", "circles", "aruco")
 NONE = "none"
 
 
-CONVERTED = {
-    ".bag": "is a ROS 1 bag; convert it: pip install rosbags && "
-    "rosbags-convert --src {file} --dst {stem}",
-    **CONVERSIONS,
-}
-"""Recordings that other programs turn into what is read, and how."""
-
-
 @dataclass(frozen=True)
 class Draft:
     """A drafted recipe, and the notes about it.
@@ -196,7 +188,11 @@ def _missing(survey: FolderSurvey, reason: StageError) -> str:
 
 def _convertible(survey: FolderSurvey, count: int) -> RecipeError | None:
     """Return the error that recordings have to be converted; None where there are not as many."""
-    for suffix, way in CONVERTED.items():
+    bag = (
+        "is a ROS 1 bag; convert it: pip install rosbags && rosbags-convert --src {file} "
+        "--dst {stem}"
+    )
+    for suffix, way in {".bag": bag, **CONVERSIONS}.items():
         others = survey.of((suffix,))
         if len(others) >= count:
             named = way.format(file=others[0], stem=others[0].with_suffix(""))
