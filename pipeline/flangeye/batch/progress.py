@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,20 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flangeye.batch.dataset import Kind, Row
-from flangeye.batch.outcome import ACCEPTED, STATUSES, Status
+from flangeye.batch.outcome import ACCEPTED, STATUSES, SessionOutcome, Status
 from flangeye.files.elsewhere import is_url
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-
-
-from collections import Counter
-from typing import TYPE_CHECKING
-
-from flangeye.batch.outcome import SessionOutcome
 from flangeye.files.words import printable
 
 if TYPE_CHECKING:
+    import pyarrow as pa
     from rich.console import Console
 
     from flangeye.batch.work import ChunkTold

@@ -4,31 +4,26 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
 
 from platformdirs import user_config_path
 from pydantic import AfterValidator, BeforeValidator, PlainSerializer, ValidationInfo
 
 from flangeye.devices import DeviceError
+from flangeye.errors import StageError
+from flangeye.files.elsewhere import is_url, reaching, system_of
 from flangeye.files.words import nearest
 
 if TYPE_CHECKING:
     VERSION: str
     """Version of the installed project."""
-
-
-import shutil
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
-from tempfile import TemporaryDirectory
-from typing import Protocol
-
-from flangeye.errors import StageError
-from flangeye.files.elsewhere import is_url, reaching, system_of
 
 WHOLE = PlainSerializer(lambda path: str(path.absolute()), return_type=str, when_used="json")
 """How a path is written into a resolved recipe: it is the same from any folder."""
