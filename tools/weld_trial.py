@@ -29,7 +29,7 @@ class Row(NamedTuple):
         bound: The controller's bound of the torch's error.
         band: The same for 95 % of the seam.
         aim: How far to the left of the seam the torch is to be.
-        lit: 1 where the torch could weld: after it first was within ``max_error``.
+        arc_on: 1 where the torch could weld: after it first was within ``max_error``.
     """
 
     time: float
@@ -42,7 +42,7 @@ class Row(NamedTuple):
     bound: float
     band: float
     aim: float
-    lit: float
+    arc_on: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +69,7 @@ class Trial:
     def beside(self) -> Floats:
         """(K,) whether the torch was between the ends of the seam, and could weld."""
         s, welds = self.column("torch_s"), np.array(self.phases) != "returning"
-        return np.asarray((self.column("lit") > 0.0) & welds & (s > 0.0) & (s < self.length))
+        return np.asarray((self.column("arc_on") > 0.0) & welds & (s > 0.0) & (s < self.length))
 
     @property
     def errors(self) -> Floats:
@@ -84,7 +84,7 @@ class Trial:
         """
         s = np.clip(self.column("torch_s"), 0.0, self.length)
         off = np.abs(self.column("torch") - self.column("aim"))
-        fine = (self.column("lit") > 0.0) & (off <= self.column("bound"))
+        fine = (self.column("arc_on") > 0.0) & (off <= self.column("bound"))
         ticks = np.linspace(0.0, self.length, 2001)
         welded = np.zeros(len(ticks), dtype=bool)
         for before, here, ok in zip(s[:-1], s[1:], fine[:-1] & fine[1:], strict=True):
@@ -154,5 +154,5 @@ def _row(world: WeldWorld, pose: ToolPose, controller: Controller, command: Comm
     return Row(
         pose.time, world.torch_s, world.off, tip, robot, command.turn, controller.tip,
         controller.bound, controller.band, getattr(controller, "aim", 0.0),
-        getattr(controller, "lit", 0.0) is not None,
+        getattr(controller, "arc_from", 0.0) is not None,
     )  # fmt: skip

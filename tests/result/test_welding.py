@@ -12,7 +12,7 @@ SEAM = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]])
 SCAN = WorkpieceScan(PointCloud(CAMERA, np.zeros((1, 3))), "test", truth={"groove": SEAM})
 
 
-def report(lit_from: float) -> WeldReport:
+def report(arc_from: float) -> WeldReport:
     """A torch that comes from 1 mm aside and is on the seam from 30 mm on."""
     along = np.linspace(0.0, 0.1, 101)
     torch = np.column_stack([along, np.where(along < 0.03, 1e-3, 0.0), 0 * along])
@@ -20,7 +20,7 @@ def report(lit_from: float) -> WeldReport:
     return WeldReport(
         "tactile", True, "", SEAM, SEAM, np.tile([0.0, 0.0, 1.0], (2, 1)), along, torch, torch, torch,
         none, none, none, none, along, ("following",) * len(along),
-        figures={"lit_from": lit_from}, true_torch=torch,
+        figures={"arc_from": arc_from}, true_torch=torch,
     )  # fmt: skip
 
 

@@ -317,7 +317,7 @@ def _weld_truth(weld: t.WeldReport, true_seams: list[t.Array]) -> WeldTruthResul
     """
     torch = weld.true_torch if len(weld.true_torch) else weld.torch
     welds = ~np.isin(weld.phases, ("seeking", "probing", "entering", "returning", "passing"))
-    torch = torch[welds & (weld.along >= weld.figures.get("lit_from", 0.0) - 1e-9)]
+    torch = torch[welds & (weld.along >= weld.figures.get("arc_from", 0.0) - 1e-9)]
     lines = [np.asarray(seam) for seam in true_seams]
     found = [torch_deviation(torch, line, weld.openings_beside(line)) for line in lines]
     errors = min((e for e in found if len(e)), key=lambda e: float(e.max()), default=None)

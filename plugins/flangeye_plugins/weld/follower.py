@@ -85,7 +85,7 @@ class Follower:
 
     def kept(self) -> ResumePoint | None:
         """Return the state from which to resume; None before the torch was on the seam."""
-        if self.lit is None:
+        if self.arc_from is None:
             return None
         return ResumePoint(self.seam.refined.samples(), self.torch, self.sensing.learned)
 
@@ -137,9 +137,9 @@ class Follower:
         return self.lead.aim
 
     @property
-    def lit(self) -> float | None:
+    def arc_from(self) -> float | None:
         """Where the torch first was within ``max_error``, and so may weld, by arc length [m]."""
-        return self.welding.lit
+        return self.welding.arc_from
 
     @property
     def arc(self) -> float:
@@ -268,9 +268,9 @@ class Follower:
 
     def _finish(self) -> None:
         """End the weld, if there was one."""
-        if self.lit is not None and not self.welding.striking.filled(self.now or 0.0):
+        if self.arc_from is not None and not self.welding.striking.filled(self.now or 0.0):
             return
-        if self.task.touch and self.lit is None:
+        if self.task.touch and self.arc_from is None:
             self._stop(f"not begun: {self.welding.too_uncertain(self.bound)}")
         else:
             self.phase = "done"
@@ -279,7 +279,7 @@ class Follower:
         """Return why going on would be blind, or nothing."""
         settings, plan, sensing = self.task.settings, self.task.plan, self.sensing
         # Before the arc burns the arm may stand for longer.
-        patience = settings.blind if self.lit is not None else 4.0 * settings.blind
+        patience = settings.blind if self.arc_from is not None else 4.0 * settings.blind
         unseen = pose.time - sensing.seen
         if self.task.touch and self.phase != "ending" and unseen > patience:
             return f"no tag was seen for {patience * 1e3:.0f} ms"

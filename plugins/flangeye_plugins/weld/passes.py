@@ -31,7 +31,7 @@ from flangeye_plugins.weld.follower import Follower
 from flangeye_plugins.weld.path import PATH_SPACING, Path, Place
 from flangeye_plugins.weld.response import Response
 from flangeye_plugins.weld.settings import PassParams
-from flangeye_plugins.weld.steering import Striking, Sway, Weave
+from flangeye_plugins.weld.steering import Striking, Weave, WeaveOffset
 from flangeye_plugins.weld.task import ResumePoint
 from flangeye_plugins.weld.tip import within
 
@@ -101,9 +101,9 @@ class Passes:
             self._go_on(before)
 
     def _go_on(self, before: ResumePoint) -> None:
-        """Begin in a later pass, where the torch is to be lit again."""
+        """Begin in a later pass, where the arc is to burn again."""
         root = self.root
-        root.sensing.learned, root.welding.lit = before.learned, root.task.start.torch
+        root.sensing.learned, root.welding.arc_from = before.learned, root.task.start.torch
         root.seam.refined.noise = before.learned.noise
         self.number = before.number - 1
         self._learned()
@@ -134,9 +134,9 @@ class Passes:
         self.sigma, self.bound, self.band, self.aim = root.sigma, root.bound, root.band, root.aim
 
     @property
-    def lit(self) -> float | None:
+    def arc_from(self) -> float | None:
         """Where the torch first was within ``max_error`` in the root pass, by arc length [m]."""
-        return self.root.lit
+        return self.root.arc_from
 
     @property
     def arc(self) -> float:
@@ -235,7 +235,7 @@ class Passes:
         up += settings.speed * self._path.climb(self.torch)
         return Command(np.array([*planar, up]), turn)
 
-    def _swayed(self, now: float) -> Sway:
+    def _swayed(self, now: float) -> WeaveOffset:
         dead, elapsed = self._response.dead_time, now - (self._began or now)
         self.aim = self._pass.across + self._weave.at(elapsed - dead).aside
         return self._weave.at(elapsed).led(self._response.lag)

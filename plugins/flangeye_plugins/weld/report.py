@@ -70,7 +70,7 @@ def _advice(controller: Controller) -> tuple[Note, ...]:
     """Recommend a look behind the torch where what nothing ahead of it measures is most of it."""
     root = follower_of(controller)
     # Where it is more than half, a look is worth its price.
-    if root is None or root.lit is None:
+    if root is None or root.arc_from is None:
         return ()
     fixed = root.welding.share_fixed
     if root.welding.bias.looked or fixed < 0.5:
@@ -86,11 +86,11 @@ def _extent(controller: Controller, plan: Path) -> str:
     root = follower_of(controller)
     if root is None:
         return f"its torch had come to {controller.torch * 1e3:.0f} mm"
-    if root.lit is None:
+    if root.arc_from is None:
         return "nothing was welded"
-    end = min(root.torch, plan.length)
+    begin, end = max(root.arc_from, 0.0), min(root.torch, plan.length)
     return (
-        f"{root.welding.share:.0%} of the seam was welded, from {max(root.lit, 0.0) * 1e3:.0f} to "
+        f"{root.welding.share:.0%} of the seam was welded, from {begin * 1e3:.0f} to "
         f"{end * 1e3:.0f} of {plan.length * 1e3:.0f} mm"
     )
 
@@ -117,7 +117,7 @@ def learned_figures(controller: Controller) -> Mapping[str, float]:
         "timestamps_late": found.stamp,
         "arm_dead_time": found.dead_time,
         "arm_lag": found.lag,
-        "lit_from": -1.0 if root.lit is None else root.lit,
+        "arc_from": -1.0 if root.arc_from is None else root.arc_from,
         "share_welded": root.welding.share,
     }
 

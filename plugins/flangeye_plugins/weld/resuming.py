@@ -31,7 +31,7 @@ from flangeye_plugins.weld.task import ResumePoint, Start, WeldTask
 from flangeye_plugins.weld.weld_log import LoggedLooks
 
 RUN_IN = 2 * SETTLING
-"""Way in which the torch takes back what the sweep has led it aside by, before it is lit [m]."""
+"""Way in which the torch takes back what the sweep has led it aside by, before the arc [m]."""
 
 
 def controller_of(
@@ -187,32 +187,32 @@ def _require_same(log: FilePath, points: Floats, before: Floats) -> None:
 def set_back(params: WeldTactileParams, plan: Path, distance: float, kept: ResumePoint) -> Start:
     """Return where a resumed weld begins, so that the torch overlaps.
 
-    It is lit where the overlap begins, and set down a run-in before that; in a later pass, which
-    touches nothing, it comes down right there.
+    The arc begins where the overlap does, the tip is set down a run-in before that; in a later
+    pass, which touches nothing, it comes down right there.
 
     Raises:
         StageError: The tip would be beyond where it can press.
     """
     if kept.number:
-        lit = max(kept.torch - params.overlap, 0.0)
-        return _standing(plan, distance, lit, _away(plan, lit, distance))
+        arc_from = max(kept.torch - params.overlap, 0.0)
+        return _standing(plan, distance, arc_from, _away(plan, arc_from, distance))
     release = params.speed * params.deflection / params.release
     # At the latest 5 mm before the tip lets go of the wall.
     last = plan.length - params.ending - release - 5e-3
-    lit = kept.torch - params.overlap
+    arc_from = kept.torch - params.overlap
     if last < params.set_down:
         raise StageError("weld.tactile: the rest of the seam is too short for the tip to press on")
-    tip = min(_away(plan, max(lit - RUN_IN, params.set_down - distance), distance), last)
-    return _standing(plan, distance, max(lit, 0.0), tip)
+    tip = min(_away(plan, max(arc_from - RUN_IN, params.set_down - distance), distance), last)
+    return _standing(plan, distance, max(arc_from, 0.0), tip)
 
 
-def _standing(plan: Path, distance: float, lit: float, tip: float) -> Start:
-    """Return where tip and torch stand on the plan, to weld from ``lit`` on."""
+def _standing(plan: Path, distance: float, arc_from: float, tip: float) -> Start:
+    """Return where tip and torch stand on the plan, to weld from ``arc_from`` on."""
     place = plan.at(tip)
     torch = plan.at(_away(plan, tip, -distance)).point
     heading = np.arctan2(*(place.point - torch)[::-1]) - np.arctan2(*place.tangent[::-1])
     angle = float((heading + np.pi) % (2 * np.pi) - np.pi)
-    return Start(tip, lit, angle)
+    return Start(tip, arc_from, angle)
 
 
 def _away(plan: Path, s: float, distance: float) -> float:

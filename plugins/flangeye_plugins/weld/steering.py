@@ -15,7 +15,7 @@ from flangeye_plugins.weld.response import Response
 from flangeye_plugins.weld.task import WeldTask
 
 
-class Sway(NamedTuple):
+class WeaveOffset(NamedTuple):
     """The weave at one time, to the left of the seam; none where it is all zero.
 
     Attributes:
@@ -28,9 +28,9 @@ class Sway(NamedTuple):
     rate: float = 0.0
     rush: float = 0.0
 
-    def led(self, lag: float) -> Sway:
+    def led(self, lag: float) -> WeaveOffset:
         """Return the swing that an arm follows with a time constant [s], to be on this one."""
-        return Sway(self.aside + lag * self.rate, self.rate + lag * self.rush, self.rush)
+        return WeaveOffset(self.aside + lag * self.rate, self.rate + lag * self.rush, self.rush)
 
 
 @dataclass(frozen=True)
@@ -45,14 +45,14 @@ class Weave:
     width: float
     frequency: float
 
-    def at(self, elapsed: float) -> Sway:
+    def at(self, elapsed: float) -> WeaveOffset:
         """Return the swing so long after it began [s]; none before it has."""
         if elapsed < 0.0 or not self.width:
-            return Sway()
+            return WeaveOffset()
         turn = 2.0 * math.pi * self.frequency
         sine, cosine = math.sin(turn * elapsed), math.cos(turn * elapsed)
         half = self.width / 2.0
-        return Sway(half * sine, half * turn * cosine, -half * turn**2 * sine)
+        return WeaveOffset(half * sine, half * turn * cosine, -half * turn**2 * sine)
 
     @property
     def fastest(self) -> float:
@@ -192,7 +192,7 @@ class TorchLead:
         self._from = max(task.start.torch, 0.0)
         self._swings: float | None = None
 
-    def swing(self, now: float, coming: float, arm: Response) -> Sway:
+    def swing(self, now: float, coming: float, arm: Response) -> WeaveOffset:
         """Return the weave to command, ahead by the arm's delay; set ``aim`` to the one due now.
 
         Args:
@@ -207,7 +207,7 @@ class TorchLead:
         return self.weave.at(elapsed + arm.dead_time).led(arm.lag)
 
     def turn(
-        self, velocity: Floats, coming: ToolPose, normal: Floats, off: float, sway: Sway
+        self, velocity: Floats, coming: ToolPose, normal: Floats, off: float, sway: WeaveOffset
     ) -> float:
         """Return the angular velocity that keeps the torch on its target [rad/s].
 

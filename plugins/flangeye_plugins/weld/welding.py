@@ -24,7 +24,7 @@ class Welding:
         sigma: Standard deviation of the torch's place across the seam [m].
         bound: What the torch's distance from the seam does not exceed [m].
         band: The same for 95 % of the seam [m].
-        lit: Where the torch first was within ``max_error``, and so may weld, by arc length [m].
+        arc_from: Where the arc begins, the torch being within ``max_error``; None before [m].
         bias: What a look behind the torch says of errors that nothing else measures.
         striking: The arc.
     """
@@ -46,7 +46,7 @@ class Welding:
         self.bias = Bias(prior, settings.distortion, belief.distance)
         self.striking = Striking(belief.arc)
         self.sigma = self.bound = self.band = 0.0
-        self.lit: float | None = None
+        self.arc_from: float | None = None
         self._trail = Trail()
         self._swept: float | None = None
 
@@ -129,9 +129,9 @@ class Welding:
     @property
     def share(self) -> float:
         """Share of the planned seam that was welded with the torch within ``max_error``."""
-        if self.lit is None:
+        if self.arc_from is None:
             return 0.0
-        welded = min(self._progress.torch, self.ends) - self.lit
+        welded = min(self._progress.torch, self.ends) - self.arc_from
         return max(welded, 0.0) / (self.ends - self.begins)
 
     @property
@@ -149,7 +149,7 @@ class Welding:
     @property
     def complete(self) -> bool:
         """Whether as much was welded as was planned."""
-        return self.lit is not None and self.share >= 1.0 - SHORT
+        return self.arc_from is not None and self.share >= 1.0 - SHORT
 
     def too_uncertain(self, bound: float, where: str = "") -> str:
         """Return the reason for refusing or stopping a weld with too wide a bound [m]."""
@@ -174,15 +174,15 @@ class Welding:
             self.striking.gas(now)
         if not self.begins <= torch <= self.ends:
             return ""
-        if self.lit is not None:
+        if self.arc_from is not None:
             self._trail.pass_by(now, torch, raw, variance - self._unseen())
         worst, bound = torch, self.bound
-        if self.lit is None and bound <= task.settings.max_error:
+        if self.arc_from is None and bound <= task.settings.max_error:
             worst, bound = self._ahead(variance)
         if bound > task.settings.max_error:
             return self._too_far(worst, bound)
-        if self.lit is None:
-            self.lit = torch
+        if self.arc_from is None:
+            self.arc_from = torch
             self.striking.strike(now)
         return ""
 
@@ -205,7 +205,7 @@ class Welding:
             bound: The torch's bound there [m].
         """
         task, torch = self._task, self._progress.torch
-        if self.lit is not None:
+        if self.arc_from is not None:
             return self.too_uncertain(bound)
         if task.before is not None:
             late = torch > task.before.torch

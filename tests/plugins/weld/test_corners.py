@@ -134,7 +134,7 @@ def test_tip_and_torch_go_round_a_corner_of_a_groove(turn: float) -> None:
 
     def noted(pose, touches):
         command = step(pose, touches)
-        bounds.append(controller.bound if controller.lit is not None else np.inf)
+        bounds.append(controller.bound if controller.arc_from is not None else np.inf)
         return command
 
     controller.step = noted
@@ -211,8 +211,8 @@ def test_the_torch_comes_to_the_corner_and_goes_on_from_it(bent: FilePath, leg: 
     along = (end - start) / np.linalg.norm(end - start)
     torch = report.true_torch - start
     s, across = torch @ along, torch @ np.cross([0.0, 0, 1], along)
-    lit = report.figures["lit_from"]
-    beside = (s > max(lit, 0.0)) & (s < np.linalg.norm(end - start))
+    arc_from = report.figures["arc_from"]
+    beside = (s > max(arc_from, 0.0)) & (s < np.linalg.norm(end - start))
     assert s[beside].min() < 0.012  # the first leg's weld begins, and the second's, at its start
     # Along the seam nothing is felt: where a leg ends is as the plan has it.
     planned = (seam.points_in_base[leg] - start) @ along

@@ -17,7 +17,7 @@ from flangeye_plugins.weld.follower import Follower
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.sensing import Located, SeamReading
 from flangeye_plugins.weld.settings import Following
-from flangeye_plugins.weld.steering import Sway
+from flangeye_plugins.weld.steering import WeaveOffset
 from flangeye_plugins.weld.task import ResumePoint, Start, WeldTask
 from tests.plugins.weld.bench import straight
 
@@ -50,7 +50,7 @@ def make(
 
 
 HOLDS = {
-    "tip": "progress", "torch": "progress", "coming": "progress", "lit": "welding",
+    "tip": "progress", "torch": "progress", "coming": "progress", "arc_from": "welding",
     "bound": "welding", "seen": "sensing", "heard": "sensing", "_lost": "pressing",
 }  # fmt: skip
 """What of the follower holds a part of its state."""
@@ -137,24 +137,24 @@ def test_what_the_torch_is_stated_to_be_off_by_is_its_error_and_its_sigmas(
     assert vision.welding.bound == 0.0
 
 
-def doubtful(torch: float, lit: float | None, off: float = 3e-3, **given: Any) -> Any:
+def doubtful(torch: float, arc_from: float | None, off: float = 3e-3, **given: Any) -> Any:
     """A follower whose torch is off by so much, after its estimate."""
     found = make(**given)
     felt_along(found, 0.0)
-    found.progress.torch, found.welding.lit = torch, lit
+    found.progress.torch, found.welding.arc_from = torch, arc_from
     found._estimate(pose(torch + DISTANCE, off))
     return found
 
 
 def test_the_torch_is_lit_where_it_is_known_and_then_has_to_stay_so() -> None:
-    assert doubtful(0.01, None, off=0.0).lit == 0.01
-    assert doubtful(0.02, 0.01, off=0.0).lit == 0.01
-    assert doubtful(-0.01, None, off=0.0).lit is None  # it is not on the seam yet
-    assert doubtful(0.01, None, off=0.0, start=Start(5e-3, 15e-3)).lit is None
-    assert doubtful(0.016, None, off=0.0, start=Start(5e-3, 15e-3)).lit == 0.016
-    assert doubtful(0.01, None, off=0.0, phase="probing").lit is None
+    assert doubtful(0.01, None, off=0.0).arc_from == 0.01
+    assert doubtful(0.02, 0.01, off=0.0).arc_from == 0.01
+    assert doubtful(-0.01, None, off=0.0).arc_from is None  # it is not on the seam yet
+    assert doubtful(0.01, None, off=0.0, start=Start(5e-3, 15e-3)).arc_from is None
+    assert doubtful(0.016, None, off=0.0, start=Start(5e-3, 15e-3)).arc_from == 0.016
+    assert doubtful(0.01, None, off=0.0, phase="probing").arc_from is None
     stopped = doubtful(0.02, 0.01)
-    assert stopped.phase == "stopped" and stopped.lit == 0.01
+    assert stopped.phase == "stopped" and stopped.arc_from == 0.01
     assert stopped.reason.startswith("the torch is known to 3.")
     assert stopped.reason.endswith(" mm only, max_error is 1 mm")
 
@@ -163,7 +163,7 @@ def test_a_weld_that_cannot_begin_within_the_first_hundredth_of_the_seam_is_refu
     long = straight(0.3)
     assert doubtful(0.0029, None, plan=long).phase == "following"
     told = doubtful(0.0031, None, plan=long)
-    assert told.phase == "stopped" and told.lit is None and told.welding.share == 0.0
+    assert told.phase == "stopped" and told.arc_from is None and told.welding.share == 0.0
     assert told.reason.startswith("not begun: the torch is known to 3.")
     assert doubtful(0.0178, None, plan=long, start=Start(5e-3, 15e-3)).phase == "following"
     assert doubtful(0.0179, None, plan=long, start=Start(5e-3, 15e-3)).phase == "stopped"
@@ -179,7 +179,7 @@ def test_a_weld_is_not_begun_where_the_seam_ahead_is_not_known() -> None:
         found.seam.refined._doubts[found.seam.refined._index(0.03)] = doubt
         found.progress.torch = torch
         found._estimate(pose(torch + DISTANCE, 0.0))
-        assert found.phase == phase and (found.welding.lit is None) == (doubt > 0.0)
+        assert found.phase == phase and (found.welding.arc_from is None) == (doubt > 0.0)
     assert found.reason.startswith("not begun: the torch is known to 3.")
     assert " mm only at 2" in found.reason and " mm of the seam, max_error" in found.reason
 
@@ -693,15 +693,15 @@ def test_the_seam_ends_where_the_tip_falls_off_it(compressed: float, at: float, 
 
 
 def test_a_weld_has_ended_where_the_torch_is_at_the_end_of_the_seam() -> None:
-    assert judged(make("ending"), torch=LENGTH - 1e-6, lit=0.0) == "ending"
-    assert judged(make("ending"), torch=LENGTH, lit=0.0) == "done"
+    assert judged(make("ending"), torch=LENGTH - 1e-6, arc_from=0.0) == "ending"
+    assert judged(make("ending"), torch=LENGTH, arc_from=0.0) == "done"
     never = make("ending")
-    assert judged(never, torch=LENGTH, lit=None, bound=1.5e-3) == "stopped"
+    assert judged(never, torch=LENGTH, arc_from=None, bound=1.5e-3) == "stopped"
     assert never.reason == ("not begun: the torch is known to 1.50 mm only, max_error is 1 mm")
     assert judged(make("ending", touch=False), torch=LENGTH) == "done"
     stopped = make("stopped")
     stopped.reason = "why"
-    assert judged(stopped, torch=LENGTH, lit=0.0) == "stopped" and stopped.reason == "why"
+    assert judged(stopped, torch=LENGTH, arc_from=0.0) == "stopped" and stopped.reason == "why"
 
 
 def refused(found: Any, at: Any = None, **state: Any) -> str:
@@ -709,8 +709,10 @@ def refused(found: Any, at: Any = None, **state: Any) -> str:
 
 
 def test_an_arm_that_would_go_on_blindly_is_stopped() -> None:
-    assert refused(make(), seen=0.501, lit=0.0) == refused(make(), seen=0.5, lit=0.0) == ""
-    assert refused(make(), seen=0.499, lit=0.0) == "no tag was seen for 500 ms"
+    assert (
+        refused(make(), seen=0.501, arc_from=0.0) == refused(make(), seen=0.5, arc_from=0.0) == ""
+    )
+    assert refused(make(), seen=0.499, arc_from=0.0) == "no tag was seen for 500 ms"
     assert refused(make(), seen=-0.99) == ""  # no arc burns: the arm stands and waits
     assert refused(make(), seen=-1.01) == "no tag was seen for 2000 ms"
     assert refused(make("ending"), seen=0.0) == ""
@@ -879,7 +881,7 @@ def test_what_is_kept_of_a_weld_is_what_it_felt_and_where_its_torch_is() -> None
     felt_along(found, 1e-3)
     found.progress.torch = 0.03
     assert found.kept() is None  # the torch was not on the seam
-    found.welding.lit = 0.0
+    found.welding.arc_from = 0.0
     kept = found.kept()
     assert kept.torch == 0.03 and kept.number == 0 and kept.traced.shape == (0, 3)
     assert kept.samples == pytest.approx(found.seam.refined.samples())
@@ -897,7 +899,7 @@ def test_a_follower_that_has_not_begun_states_nothing_and_presses_nothing() -> N
         found.pressing.wanted,
         found.lead.aim,
     ) == (0.0,) * 5
-    assert found.welding.lit is None and found.reason == "" and found.kept() is None
+    assert found.welding.arc_from is None and found.reason == "" and found.kept() is None
     assert (found.sensing.latency, found.now) == (0.0, None)
 
 
@@ -978,7 +980,7 @@ def test_looks_that_contradict_all_that_is_stated_stop_the_weld() -> None:
 def test_a_torch_is_led_and_judged_by_where_it_is_seen_to_be() -> None:
     found = make(offset_across="0.1 mm")
     felt_along(found, 0.0)
-    found.welding.bias.value, found.progress.torch, found.welding.lit = 0.25e-3, 0.05, 0.0
+    found.welding.bias.value, found.progress.torch, found.welding.arc_from = 0.25e-3, 0.05, 0.0
     found._estimate(pose(0.05 + DISTANCE, 0.1e-3 - 0.25e-3, time=6.0))
     assert found.welding.bound == pytest.approx(3 * found.welding.sigma, abs=1e-6)
     (row,) = found.welding._trail._rows
@@ -993,12 +995,12 @@ def test_a_torch_is_led_and_judged_by_where_it_is_seen_to_be() -> None:
 
 
 def test_where_the_torch_passes_is_remembered_once_it_is_lit() -> None:
-    for lit, count in ((None, 0), (0.0, 1)):
+    for arc_from, count in ((None, 0), (0.0, 1)):
         found = make()
         felt_along(found, 0.0)
-        found.progress.torch, found.welding.lit = 0.05, lit
+        found.progress.torch, found.welding.arc_from = 0.05, arc_from
         found._estimate(pose(0.05 + DISTANCE, 0.0, time=6.0))
-        assert len(found.welding._trail._rows) == count and found.welding.lit is not None
+        assert len(found.welding._trail._rows) == count and found.welding.arc_from is not None
 
 
 @pytest.mark.parametrize("aside", [0.3e-3, -0.3e-3])
@@ -1011,7 +1013,7 @@ def test_a_torch_that_is_where_its_swing_is_stays_there_and_turns_as_it_goes(asi
             0.01,
             0.0,
         )
-        found.lead.swing = lambda *given, rate=rate: Sway(aside, rate, 0.0)
+        found.lead.swing = lambda *given, rate=rate: WeaveOffset(aside, rate, 0.0)
         turn = found.step(pose(0.05, 0.0, angle=-aside / DISTANCE, time=0.01), []).turn
         on_line = make(touch=False)
         put(on_line, tip=0.05, torch=0.01, coming=0.01).now = 0.0

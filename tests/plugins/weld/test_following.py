@@ -55,7 +55,7 @@ def test_both_ends_of_the_seam_are_felt_and_it_is_welded_between_them(
     assert phases == ["seeking", "probing", "following", "entering", "ending", "done"]
     assert abs(done.deviation()).max() < 0.3e-3
     assert done.torch_s.max() == pytest.approx(0.12, abs=2.5e-3)
-    assert done.controller.lit + shift == pytest.approx(0.0, abs=1.5e-3)
+    assert done.controller.arc_from + shift == pytest.approx(0.0, abs=1.5e-3)
 
 
 @pytest.mark.parametrize("degrees", [90, -90])

@@ -39,7 +39,7 @@ class Root:
         self.mode, self.side, self.phase, self.reason = "tactile", 1.0, "following", ""
         self.tip, self.torch, self.wanted, self.aim = DISTANCE, 0.0, 2e-3, 0.0
         self.sigma, self.bound, self.band = SIGMA, 0.0, 0.0
-        self.welding = SimpleNamespace(lit=0.0)
+        self.welding = SimpleNamespace(arc_from=0.0)
         self.sensing = SimpleNamespace(learned=Learned(dead_time=0.08, lag=0.05))
         self.ends = False
 
@@ -48,8 +48,8 @@ class Root:
         return STILL
 
     @property
-    def lit(self) -> Any:
-        return self.welding.lit
+    def arc_from(self) -> Any:
+        return self.welding.arc_from
 
     def kept(self) -> Any:
         return ResumePoint(np.zeros((1, 5)), self.torch, self.sensing.learned)
@@ -287,7 +287,7 @@ def test_a_later_pass_is_gone_on_with_where_it_was() -> None:
     again = passes({}, {"across": "1 mm"}, before=kept, start=Start(0.06, 25e-3))
     assert again.number == 1 and again.phase == "returning"
     assert again.torch == again._start == pytest.approx(25e-3)
-    assert again.root.sensing.learned == kept.learned and again.lit == 25e-3
+    assert again.root.sensing.learned == kept.learned and again.arc_from == 25e-3
     assert again._response.dead_time == 0.08
     assert again.root.seam.refined.noise == kept.learned.noise
     begun = passes({})

@@ -137,10 +137,10 @@ def test_what_the_sweep_found_is_among_the_figures() -> None:
     controller.sensing.learned = Learned(0.1, 0.02, -0.03e-3, 0.1e-3, 0.04, 0.05, 0.06)
     assert learned_figures(controller) == {
         "finger_gain_error": 0.1, "finger_play": 0.06e-3, "timestamps_late": 0.04,
-        "arm_dead_time": 0.05, "arm_lag": 0.06, "lit_from": -1.0, "share_welded": 0.0,
+        "arm_dead_time": 0.05, "arm_lag": 0.06, "arc_from": -1.0, "share_welded": 0.0,
     }  # fmt: skip
-    controller.welding.lit = 0.02
-    assert learned_figures(controller)["lit_from"] == 0.02
+    controller.welding.arc_from = 0.02
+    assert learned_figures(controller)["arc_from"] == 0.02
     other: Any = SimpleNamespace()
     assert learned_figures(other) == {}
 
@@ -165,7 +165,7 @@ def test_a_look_behind_is_recommended_where_the_files_are_most_of_what_is_unknow
     controller.welding.bias.prior = torch_sigma**2
     controller.welding.sigma = 0.35e-3
     assert _advice(controller) == ()  # nothing was welded
-    controller.welding.lit = 0.0
+    controller.welding.arc_from = 0.0
     advice = _advice(controller)
     assert bool(advice) == told
     if told:

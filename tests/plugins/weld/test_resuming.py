@@ -127,7 +127,7 @@ def test_far_along_the_seam_the_torch_is_lit_where_the_overlap_begins() -> None:
     follower = Follower(task)
     World(line, line, follower, PARAMS, start=start.tip).run()
     assert (follower.phase, follower.reason) == ("done", "")
-    assert follower.welding.lit == pytest.approx(0.14, abs=0.2e-3)
+    assert follower.welding.arc_from == pytest.approx(0.14, abs=0.2e-3)
 
 
 def kept_at(torch: float, number: int = 0) -> ResumePoint:

@@ -31,9 +31,9 @@ def test_a_run_killed_in_its_weld_goes_on_where_it_was(tmp_path: Path) -> None:
     weld = json.loads((tmp_path / "again" / "result.json").read_text())["weld"]
     assert weld["completed"]
     assert weld["truth"]["rms"] < 0.15e-3
-    assert weld["figures"]["lit_from"] > 0.03  # m: it did not begin at the seam's start
+    assert weld["figures"]["arc_from"] > 0.03  # m: it did not begin at the seam's start
     start = next(n for n in read_notes(tmp_path / "again" / "run.mcap") if n.name == "start")
-    assert start.value["kept"]["torch"] - weld["figures"]["lit_from"] == pytest.approx(
+    assert start.value["kept"]["torch"] - weld["figures"]["arc_from"] == pytest.approx(
         0.03, abs=0.5e-3
     )
     told = flangeye(tmp_path, "--resume", "again")

@@ -210,7 +210,7 @@ def test_the_torch_is_scored_where_it_truly_is_and_not_where_it_is_believed() ->
     true = torch_deviation(report.true_torch, true_line("v-straight"), report.opening)
     assert np.median(believed) < 0.05e-3
     assert np.median(true) == pytest.approx(0.6e-3, rel=0.05)
-    assert report.figures["lit_from"] >= 0.0
+    assert report.figures["arc_from"] >= 0.0
 
 
 # --- what stops it on the way ---------------------------------------------------------------------

@@ -11,7 +11,7 @@ from flangeye_plugins.weld.checks import check_weave
 from flangeye_plugins.weld.passes import Passes, follower_of
 from flangeye_plugins.weld.resuming import controller_from
 from flangeye_plugins.weld.settings import Following
-from flangeye_plugins.weld.steering import Sway, Weave
+from flangeye_plugins.weld.steering import Weave, WeaveOffset
 from tools.weld_bench import curved, misplanned, try_condition
 from tools.weld_conditions import CONDITIONS, Condition
 
@@ -24,7 +24,7 @@ def rms(values):
 
 def test_a_swing_is_a_sine_with_its_derivatives() -> None:
     weave, step = Weave(4e-3, 0.7), 1e-5
-    assert weave.at(-1.0) == Sway() == Weave(0.0, 1.0).at(2.0)
+    assert weave.at(-1.0) == WeaveOffset() == Weave(0.0, 1.0).at(2.0)
     for t in (0.1, 0.6, 1.3):
         here, before, after = (weave.at(t + dt) for dt in (0.0, -step, step))
         assert here.rate == pytest.approx((after.aside - before.aside) / (2 * step), abs=1e-8)
