@@ -8,15 +8,15 @@ import numpy as np
 from pydantic import Field
 
 from flangeye.errors import StageError
-from flangeye.maths.geometry import basis_of_plane, rigid, rotation_from_rpy
+from flangeye.maths.geometry import basis_of_plane, rigid
 from flangeye.maths.kinematics import Arm
 from flangeye.models.scanners import ScannerModel, middle_of_view
-from flangeye.plugin.stage import Params, part
+from flangeye.plugin.stage import Params, PlaceParams, part
 from flangeye.types import Floats
 from flangeye.units import Angle, Length, param
 
 
-class GuessParams(Params):
+class GuessParams(PlaceParams):
     """Parameters of ``view.guess``."""
 
     position: tuple[Length, Length, Length] = Field(
@@ -34,7 +34,7 @@ def view_guess(arm: Arm, scanner: ScannerModel, params: GuessParams) -> Floats:
     Returns:
         (4, 4) base_T_camera.
     """
-    return rigid(rotation_from_rpy(*params.rpy), np.asarray(params.position))
+    return params.matrix
 
 
 class ShownParams(Params):

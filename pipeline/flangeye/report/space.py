@@ -12,8 +12,6 @@ import numpy as np
 
 from flangeye import types as t
 from flangeye.errors import FlangeyeError
-from flangeye.files.yaml_lines import parse_yaml
-from flangeye.log.read import RunLog
 from flangeye.maths.geometry import covariance_at, each_applied
 from flangeye.models.cell import Cell
 from flangeye.models.configuration import Ends
@@ -161,7 +159,7 @@ def _true_errors(facts: Facts, grid: Floats, extent: float) -> tuple[Trace, floa
 
 def graph_drawing(facts: Facts) -> PlotlyFigure | None:
     """Return a drawing of camera poses and sighted targets; None if a pose is missing."""
-    cell, seen = _cell_of(facts.log, facts.recipe), facts.log.observations()
+    cell, seen = _cell_of(facts), facts.log.observations()
     found = {name: Transform.named(name, x.matrix) for name, x in facts.result.transforms.items()}
     if cell is None or not seen or not {*cell.unknowns} <= {*found}:
         return None
@@ -179,14 +177,13 @@ def graph_drawing(facts: Facts) -> PlotlyFigure | None:
     return PlotlyFigure(figure3d(traces), words, summary)
 
 
-def _cell_of(log: RunLog, recipe: str) -> Cell | None:
+def _cell_of(facts: Facts) -> Cell | None:
     """Return the cell of a run's recipe, with the models of its own that the log carries.
 
     None where it cannot be read here, as one of another version: the rest of the page stands.
     """
-    with suppress(FlangeyeError, ValueError), carried_files(log.models) as folder:
-        data = parse_yaml(recipe, "recipe").data or {}
-        section = CellSection.model_validate(data.get("cell"))
+    with suppress(FlangeyeError, ValueError), carried_files(facts.log.models) as folder:
+        section = CellSection.model_validate(facts.header.get("cell"))
         header = Header.model_construct(title="", steps=[], cell=section)
         return cell_of(header, partial(load_model, "robots", near=folder), lambda *_: None)
     return None
