@@ -98,11 +98,11 @@ class WorkSurface:
     """The surface along a seam, and the plane into which it is rolled out.
 
     The plane's x leads along the seam as a whole, its z out of the work. A seam whose ends meet
-    goes once around: the plane goes on beyond both, by half a turn.
+    goes once around: the plane goes on beyond both, by a turn.
 
     Attributes:
         points: (N, 3) of the seam in the plane, all of height zero [m]; of one that goes once
-            around with half a turn more at each end.
+            around with a turn more at each end.
         path: The seam in the plane.
     """
 
@@ -251,7 +251,9 @@ def _interpolated(at: Floats, along: Floats, rows: Floats) -> Floats:
 
 
 def _gone_around(points: Floats, openings: Floats) -> tuple[Floats, Floats, float]:
-    """Return a seam and its openings with half a turn more at each end, if it goes once around.
+    """Return a seam and its openings with a turn more at each end, if it goes once around.
+
+    A weld begins anywhere on it, and goes on over its start.
 
     Returns:
         The points and openings (M, 3), and how far they go on at each end [m].
@@ -260,13 +262,9 @@ def _gone_around(points: Floats, openings: Floats) -> tuple[Floats, Floats, floa
         return points, openings, 0.0
     rows = np.hstack([points, openings])
     rows[-1] = rows[0]
-    along = arc_lengths(rows[:, :3])
-    half = float(along[-1]) / 2
-    count = len(rows)
-    back = _interpolated(np.linspace(half, along[-1], count), along, rows)
-    forth = _interpolated(np.linspace(0.0, half, count), along, rows)
-    rows = np.vstack([back[:-1], rows, forth[1:]])
-    return rows[:, :3], rows[:, 3:], half
+    turn = float(arc_lengths(rows[:, :3])[-1])
+    rows = np.vstack([rows[:-1], rows[:-1], rows])
+    return rows[:, :3], rows[:, 3:], turn
 
 
 def rolled_out(points: Floats, openings: Floats) -> Floats:
