@@ -26,10 +26,11 @@ def camera_effects(problem: Problem, size_unknown: bool = False) -> list[Effect]
     whole = {int(k) for k in s.pairs[s.ranks == 6]}
     pairs = [ends for k, ends in enumerate(problem.ends) if k in whole]
     for target in dict.fromkeys(target for _, target in pairs):
-        effects.append(Effect(f"size of {target}", _size(target), size, kind="size"))
+        name = f"size of {target}"
+        effects.append(Effect(name, _size(target), size, kind="size", of_camera=not size_unknown))
     for camera in dict.fromkeys(camera for camera, _ in pairs):
         name = f"focal length of {camera}"
-        effects.append(Effect(name, _focal(camera), SIZE, kind="focal"))
+        effects.append(Effect(name, _focal(camera), SIZE, kind="focal", of_camera=True))
     return effects
 
 

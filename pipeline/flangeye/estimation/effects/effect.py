@@ -25,6 +25,7 @@ class Effect:
         of_arm: Whether it displaces an arm against what its controller reports.
         lasting: Whether it is at new poses as it was at those of the session.
         kind: Which part of a correction its numbers are (``zeros``, ``lengths``, ``field``...).
+        of_camera: Whether a camera is to be where what it reports is right in spite of it.
     """
 
     name: str
@@ -35,3 +36,4 @@ class Effect:
     of_arm: bool = False
     kind: str = ""
     lasting: bool = True
+    of_camera: bool = False
