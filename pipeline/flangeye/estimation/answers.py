@@ -14,9 +14,10 @@ What is common to all poses cancels, so that it is known far better than the tru
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 
@@ -116,7 +117,7 @@ class _Commands:
         for name in self.found.problem.unknown:
             carried = any(c.frame in chain(self.work.frames, name) for c in self.work.carriers)
             out.append((self._carried if carried else self._fixed)(name, world))
-            # A camera is where what it reports is right: it will err as it did
+            # Its lasting errors move what it reports at the work as they did in the session
             if any(name == camera for camera, _ in self.work.ends):
                 out[-1] = out[-1] + self._explained(self._linear.blocks[name], self._of_camera)
         return np.concatenate(out, axis=1)
@@ -128,20 +129,20 @@ class _Commands:
     @cached_property
     def _of_arm(self) -> Floats:
         """(W, 6, K) how the arms' errors move what is seen."""
-        return self._columns(self._linear, [e.of_arm for e in self.found.effects])
+        return self._columns(self._linear, "of_arm")
 
     @cached_property
     def _of_camera(self) -> Floats:
         """(W, 6, K) how a camera's errors move what is seen."""
-        return self._columns(self._linear, [e.of_camera for e in self.found.effects])
+        return self._columns(self._linear, "of_camera")
 
-    def _columns(self, linear: Linear, counted: Sequence[bool]) -> Floats:
+    def _columns(self, linear: Linear, whose: Literal["of_arm", "of_camera"]) -> Floats:
         still = np.zeros((len(self.work.seen), 6, 0))
         columns = [
-            effect.block(self.work, linear) if counts else np.zeros((len(still), 6, count))
-            for effect, count, counts in zip(
-                self.found.effects, self.found.counts, counted, strict=True
-            )
+            effect.block(self.work, linear)
+            if getattr(effect, whose)
+            else np.zeros((len(still), 6, count))
+            for effect, count in zip(self.found.effects, self.found.counts, strict=True)
         ]
         return np.concatenate([still, *columns], axis=2)
 
@@ -151,8 +152,7 @@ class _Commands:
         still, out = np.zeros((len(self.work.seen), 6, 6)), {}
         for carrier in self.work.carriers:
             blocks = {c.frame: still + np.eye(6) * (c is carrier) for c in self.work.carriers}
-            arms = [effect.of_arm for effect in self.found.effects]
-            twists = self._columns(Linear(np.zeros(0), np.zeros(0), blocks), arms)
+            twists = self._columns(Linear(np.zeros(0), np.zeros(0), blocks), "of_arm")
             places = np.asarray(self.work.frames[carrier.frame].place)[self.work.seen.times, :3, 3]
             motions = still + np.eye(6)
             motions[:, 3:, :3] = -hat(places)

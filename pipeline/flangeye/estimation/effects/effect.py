@@ -25,7 +25,7 @@ class Effect:
         of_arm: Whether it displaces an arm against what its controller reports.
         lasting: Whether it is at new poses as it was at those of the session.
         kind: Which part of a correction its numbers are (``zeros``, ``lengths``, ``field``...).
-        of_camera: Whether a camera is to be where what it reports is right in spite of it.
+        of_camera: Whether the answer as reported takes its rigid part into the camera's place.
     """
 
     name: str
