@@ -134,14 +134,19 @@ def test_robust_with_outliers_is_as_good_as_the_inliers_alone(paper: Callable[..
     assert plain["workspace_rms"] > 10 * ours["workspace_rms"]
 
 
+ALLOWS_FOR_MORE = pytest.mark.xfail(
+    strict=True,
+    reason="1.10 times: an arm's error and a drift are allowed for, of which it has none",
+)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("noise", ["0.2 mm", "2 mm", "10 mm"])
+@pytest.mark.parametrize("noise", [pytest.param("0.2 mm", marks=ALLOWS_FOR_MORE), "2 mm", "10 mm"])
 def test_robust_against_the_bound_itself(paper: Callable[..., Any], noise: str) -> None:
     overrides = ["steps.2.count=400", f"steps.0.noise={noise}"]
     clean, _ = paper("fig9_robust", STEP, *overrides)
     gross, _ = paper("fig9_robust", STEP, *overrides, "steps.0.outliers=0.15")
-    # The bound knows that nothing errs but noise; to allow for an arm's and a drift costs a tenth
-    assert clean["workspace_rms"] <= 1.15 * clean["bound_workspace_rms"]
+    assert clean["workspace_rms"] <= 1.05 * clean["bound_workspace_rms"]
     assert gross["workspace_rms"] <= 1.10 * gross["inliers_alone_rms"]
 
 

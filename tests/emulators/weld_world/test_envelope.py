@@ -172,9 +172,12 @@ def test_nothing_of_the_world_is_reachable_from_the_controller(
     assert not [name for name in modules if name.startswith("flangeye_emulators")]
 
 
-def rare(seed, name):
+BEYOND = pytest.mark.xfail(strict=True, reason="1.04 times four sigma")
+
+
+def rare(seed, name, *marks):
     """A world that fails for much the same reason as one that every run of the tests tries."""
-    return pytest.param(seed, id=name, marks=pytest.mark.slow)
+    return pytest.param(seed, id=name, marks=(pytest.mark.slow, *marks))
 
 
 @pytest.mark.parametrize(
@@ -185,7 +188,7 @@ def rare(seed, name):
         rare(100076, "hardly felt before the wall ends, plan bowed by 4 mm"),
         pytest.param(300162, id="wall at 64 deg, heights too noisy to see the tip climb it"),
         pytest.param(100178, id="waves at speed: the torch is not yet where it was sent"),
-        rare(910577, "tip climbs steadily, plan 11 mm off"),
+        rare(910577, "tip climbs steadily, plan 11 mm off", BEYOND),
         rare(930731, "a wave taken for a plan turned by 16 deg"),
         rare(940028, "the same of a plan that was reported done"),
         rare(950967, "tip let go of in a gap, nothing felt before"),
@@ -202,8 +205,8 @@ def rare(seed, name):
     ],
 )
 def test_what_once_was_a_silent_failure_is_in_its_stated_bound(seed: int) -> None:
-    """They are the worst of twenty thousand: the largest of so many normal numbers is 4 to 4.5."""
-    assert judged(seed, sigmas=4.5).over_bound <= 1.0
+    """They are the worst of twenty thousand worlds, so far out that three sigma do not cover them."""
+    assert judged(seed, sigmas=4.0).over_bound <= 1.0
 
 
 def test_worlds_are_drawn_again_as_they_were() -> None:

@@ -320,15 +320,24 @@ def test_the_stated_region_holds_the_truth(kind: dict[str, Any]) -> None:
     assert inside >= 0.95 - 0.12  # three standard deviations of 30 runs
 
 
+TOO_WIDE = pytest.mark.xfail(
+    strict=True, reason="97.3 to 99.7 %: no arm is taken for so good a one"
+)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("n", [8, 20])
-@pytest.mark.parametrize("kind", [{}, {"depth": 0.1}, {"normal": 1e-3}])
-def test_the_stated_region_holds_the_truth_as_often_as_it_says(
-    n: int, kind: dict[str, Any]
+@pytest.mark.parametrize(
+    ("kind", "n"),
+    [
+        ({}, 8), pytest.param({}, 20, marks=TOO_WIDE), ({"normal": 1e-3}, 8), ({"normal": 1e-3}, 20),
+        *(pytest.param({"depth": 0.1}, n, marks=TOO_WIDE) for n in (8, 20)),
+    ],
+)  # fmt: skip
+def test_the_stated_region_holds_the_truth_in_93_to_97_percent(
+    kind: dict[str, Any], n: int
 ) -> None:
     inside = np.mean([holds(solve(simulate(n, seed, **kind))) for seed in range(1000)])
-    # No arm is as good as this one, which errs by nothing: with noise of 0.03 mm it shows
-    assert 0.93 <= inside <= (1.0 if "depth" in kind else 0.98)
+    assert 0.93 <= inside <= 0.97
 
 
 @pytest.mark.slow
