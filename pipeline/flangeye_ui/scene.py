@@ -242,8 +242,8 @@ class Scene3D(ui.scene):
             return
         turn, length = np.column_stack([across, tip, -other]).tolist(), float(np.linalg.norm(along))
         with self:
-            shaft = self.cylinder(0.002, 0.002, length).move(*(place + along / 2).tolist())
-            cone = self.cylinder(0.0, 0.006, 0.018).move(*(place + along).tolist())
+            shaft = self.cylinder(0.003, 0.003, length).move(*(place + along / 2).tolist())
+            cone = self.cylinder(0.0, 0.009, 0.027).move(*(place + along).tolist())
         for part in (shaft, cone):
             part.rotate_R(turn).material(colour)
 
