@@ -11,6 +11,7 @@ from flangeye.estimation.estimate import Estimate
 from flangeye.estimation.graph import Carrier
 from flangeye.maths.arm_correction import effects as field_effects
 from flangeye.maths.arm_correction import field_over
+from flangeye.maths.geometry import hat
 from flangeye.types import ArmCorrection, Floats
 
 CORRECTED = frozenset({"zeros", "lengths", "twists", "field"})
@@ -78,12 +79,15 @@ def _as_field(found: Estimate, carrier: Carrier) -> Floats:
     At the session's poses, by least squares; what is rigid of it stays in the camera's pose.
     """
     places = _places(found, carrier)
-    moves = field_effects(field_over(places), places).reshape(3 * len(places), -1)
-    rest = np.zeros((len(places), 3))
+    field, rest = field_over(places), np.zeros((len(places), 3))
     if carrier.joints is not None and carrier.kinematics is not None:
         mean = found.posterior.mean[found.posterior.model.p :]
         for kind, columns in displacements(carrier).items():
             rows = _rows(found, carrier, kind)
             if kind not in CORRECTED and rows is not None:
                 rest += columns[:, 3:] @ mean[rows]
-    return np.asarray(np.linalg.lstsq(moves, rest.ravel(), rcond=1e-6)[0])
+    still = np.tile(np.eye(3), (len(places), 1, 1))
+    motions = np.concatenate([-hat(places - field.about), still], axis=2).reshape(-1, 6)
+    bent = rest.ravel() - motions @ np.linalg.lstsq(motions, rest.ravel(), rcond=1e-9)[0]
+    moves = field_effects(field, places).reshape(len(bent), -1)
+    return np.asarray(np.linalg.lstsq(moves, bent, rcond=1e-6)[0])

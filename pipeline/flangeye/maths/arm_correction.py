@@ -11,7 +11,6 @@ from math import factorial, prod
 
 import numpy as np
 
-from flangeye.maths.geometry import hat
 from flangeye.maths.kinematics import Arm
 from flangeye.types import (
     FLANGE,
@@ -33,18 +32,14 @@ def field_over(places: Floats) -> SmoothField:
     about = places.mean(axis=0)
     radius = float(np.linalg.norm(places - about, axis=1).max())
     k = 3 * len(powers(2))
-    bare = SmoothField(about, RADII * max(radius, 1e-3), np.zeros((6, k)), np.zeros(k))
-    motions, moved = _motions(bare, places).reshape(-1, 6), effects(bare, places)
-    nearest = np.linalg.pinv(motions, rcond=1e-9) @ moved.reshape(-1, k)
-    return replace(bare, rigid=nearest)
+    return SmoothField(about, RADII * max(radius, 1e-3), np.zeros(k))
 
 
 def effects(field: SmoothField, places: Floats) -> Floats:
     """Return (..., 3, K): how each weight moves a flange at (..., 3) places [m], in ``base``."""
     of_place = features((places - field.about) / field.length, powers(2))
     along = of_place[..., None, :, None] * np.eye(3)[:, None, :]
-    along = along.reshape(*places.shape[:-1], 3, -1)
-    return np.asarray(along - _motions(field, places) @ field.rigid)
+    return np.asarray(along.reshape(*places.shape[:-1], 3, -1))
 
 
 @cache
@@ -65,13 +60,6 @@ def features(scaled: Floats, exponents: Sequence[tuple[int, ...]]) -> Floats:
 def displacement(field: SmoothField, places: Floats) -> Floats:
     """Return (..., 3) by how much a flange reported at (..., 3) places is elsewhere [m]."""
     return np.asarray(effects(field, places) @ field.weights)
-
-
-def _motions(field: SmoothField, places: Floats) -> Floats:
-    """Return (..., 3, 6): how a rotation and a translation about the middle move places."""
-    turned = -hat(places - field.about)
-    still = np.broadcast_to(np.eye(3), turned.shape)
-    return np.concatenate([turned, still], axis=-1)
 
 
 def corrected_flange(

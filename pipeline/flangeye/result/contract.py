@@ -229,7 +229,6 @@ class FieldResult(_Part):
 
     about: Point = Field(description="Middle of the calibration's poses, in the base [m].")
     length: float = Field(description="Correlation length of the field [m].")
-    rigid: Matrix = Field(description="6xK, the rigid motion that each feature is less.")
     weights: Vector = Field(description="Weights of the K features [m].")
 
 

@@ -41,25 +41,21 @@ class SmoothField:
     """A smooth displacement of the flange over the workspace: the arm's remaining errors.
 
     A Gaussian process of low order: the features of the squared-exponential kernel up to the
-    second power of the place, less the rigid motion that comes nearest to each over the
-    calibration's poses, for that one belongs to the camera's pose. Evaluated by
-    :mod:`flangeye.maths.arm_correction`.
+    second power of the place. Evaluated by :mod:`flangeye.maths.arm_correction`.
 
     Attributes:
         about: (3,) middle of the calibration's poses, in ``base`` [m].
         length: Correlation length of the field [m].
-        rigid: (6, K) rotation and translation about the middle that each feature is less.
         weights: (K,) of the features [m].
     """
 
     about: Array
     length: float
-    rigid: Array
     weights: Array
 
     def __post_init__(self) -> None:
         k = len(self.weights)
-        freeze(self, about=(3,), rigid=(6, k), weights=(k,))
+        freeze(self, about=(3,), weights=(k,))
 
 
 @dataclass(frozen=True, eq=False)
