@@ -28,10 +28,12 @@ sizes of the body. A turn that may be any has 1.8, and no estimator is linear th
 
 
 class _Equations(NamedTuple):
-    """Linearised residuals. Columns: turn [rad], shift in sizes, loss at edges by facing, rounding.
+    """Linearised residuals.
+
+    Columns: turn [rad], shift in sizes, loss at edges by facing, rounding, and the body's scale.
 
     Attributes:
-        jacobian: (N, 13).
+        jacobian: (N, 14).
         residual: (N,) [m].
         place: (N, 3) on the body [m].
         facing: (N, 3) which way the face looks there, on the body.
@@ -54,14 +56,17 @@ class BodyFit:
         edges: How many points of edges do.
         size: Of the body [m].
         centre: (3,) of the body in ``camera`` [m].
-        bread: (13, 13) inverse of the information, with the prior's.
-        meat: (13, 13) covariance of the scores by the scan's noise, and the prior's information.
+        bread: (14, 14) change of what is estimated by the scores: of the pose and what a scanner
+            does to it at the scale of the mesh, and in the last row that of the scale.
+        meat: (14, 14) covariance of the scores by the scan's noise, and the prior's information.
         lost: (6,) width that the scan seems to lose at ends of faces, by the way they look: -x, +x,
             -y, ... of the body [m]; negative where its edge is inside.
         odd: How unlike a scanner's that and the rounding are: squared, over their prior's
             covariance, with seven degrees of freedom.
         patches: (P, 3) places on the body that err together, in ``camera`` [m].
-        pulls: (P, 13, 3) derivative of the scores by how far each of them is off [1/m].
+        pulls: (P, 14, 3) derivative of the scores by how far each of them is off [1/m].
+        oversize: By which share the scan shows the body larger than its mesh: one step, which falls
+            short where much of the scan is far off the mesh and counts less.
     """
 
     pose: Floats
@@ -76,14 +81,17 @@ class BodyFit:
     odd: float
     patches: Floats
     pulls: Floats
+    oversize: float
 
     def weakest(self, freedoms: int) -> float:
-        """Return the standard deviation of the least certain of so many directions.
+        """Return the standard deviation of the least certain of so many directions and the scale.
 
-        In sizes of the body, or radians, of the points alone.
+        In sizes of the body, or radians, of the points alone: of the scale, how far it moves the
+        body's ends. A corner holds a pose, and any size.
         """
-        inner = (self.bread @ self.meat @ self.bread)[:6, :6]
-        return float(np.sqrt(np.linalg.eigvalsh(inner)[freedoms - 1]))
+        inner = self.bread @ self.meat @ self.bread.T
+        pose = np.linalg.eigvalsh(inner[:6, :6])[freedoms - 1]
+        return float(np.sqrt(max(pose, inner[-1, -1] / 2**2)))
 
     @property
     def freedoms(self) -> int:
@@ -102,6 +110,19 @@ class BodyFit:
             distortion: Of the scanner, (P, 3, K): how each of K independent weights of unit
                 variance moves (P, 3) points [m].
         """
+        about_centre = self._spread(model_error, distortion)[:6, :6]
+        # The turn is about the centre, and the translation is the origin's.
+        carried = np.diag(np.repeat([1.0, self.size], 3))
+        carried[3:, :3] = -hat(self.pose[:3, 3] - self.centre)
+        moved = carried @ about_centre @ carried.T
+        return np.asarray((moved + moved.T) / 2)
+
+    def unsure(self, model_error: float, distortion: Callable[[Floats], Floats]) -> float:
+        """Return the standard deviation of ``oversize``; arguments as of ``covariance``."""
+        return float(np.sqrt(self._spread(model_error, distortion)[-1, -1]))
+
+    def _spread(self, model_error: float, distortion: Callable[[Floats], Floats]) -> Floats:
+        """Return (14, 14) covariance of all that is estimated, the turn about the centre."""
         apart = np.linalg.norm(self.patches[:, None] - self.patches, axis=2)
         # A body's surface is off its CAD alike over a quarter of its size: about a face
         alike = np.exp(-0.5 * (apart / ((1 / 4) * self.size)) ** 2)
@@ -109,12 +130,7 @@ class BodyFit:
             "pai,pq,qbi->ab", self.pulls, alike, self.pulls, optimize=True
         )
         bent = np.einsum("pai,pik->ak", self.pulls, distortion(self.patches))
-        about_centre = (self.bread @ (inner + bent @ bent.T) @ self.bread)[:6, :6]
-        # The turn is about the centre, and the translation is the origin's.
-        carried = np.diag(np.repeat([1.0, self.size], 3))
-        carried[3:, :3] = -hat(self.pose[:3, 3] - self.centre)
-        moved = carried @ about_centre @ carried.T
-        return np.asarray((moved + moved.T) / 2)
+        return np.asarray(self.bread @ (inner + bent @ bent.T) @ self.bread.T)
 
 
 def fitted(points: Singles, shape: Shape, start: Floats, most: int = 12_000) -> BodyFit | None:
@@ -206,8 +222,9 @@ class _Laying:
             # By the raster: what ends are off where the body is not there yet is no noise.
             spread = np.inf if few else max(self.raster, noise)
             equations, weights = _weighted(surface, ends, noise, spread)
-            information = (equations.jacobian.T * weights) @ equations.jacobian + prior
-            gradient = (equations.jacobian.T * weights) @ equations.residual
+            jacobian = equations.jacobian[:, :-1]
+            information = (jacobian.T * weights) @ jacobian + prior
+            gradient = (jacobian.T * weights) @ equations.residual
             gradient[6:] += self.prior @ (self.usual - scanner)
             step = np.asarray(np.linalg.solve(information, gradient), np.float64)
             pose, scanner = _moved(pose, shape, step), scanner + step[6:]
@@ -219,24 +236,37 @@ class _Laying:
             reach = max(0.5 * reach, least_reach * noise)
             if not few:
                 beside = max(0.5 * beside, least_reach * spread)
-        left = equations._replace(residual=equations.residual - equations.jacobian @ step)
+        left = equations._replace(residual=equations.residual - jacobian @ step)
         return _Settled(pose, left, weights, information, len(surface.residual), noise, scanner)
 
     def fit_of(self, rest: _Settled) -> BodyFit:
         """Return it with all that its covariance needs."""
         shape, pose = self.shape, rest.pose
         centre = pose[:3, :3] @ shape.centre + pose[:3, 3]
-        bread: Floats = np.linalg.inv(rest.information).astype(np.float64)
+        bread = _bread(rest)
         cluster = _patches(rest.left, shape)
         meat = _noise(rest.left, rest.weights, cluster, rest.surface)
-        meat[:6, :6] += UNKNOWN**-2.0 * np.eye(6)
-        meat[6:, 6:] += self.prior
+        meat[[*range(6), -1], [*range(6), -1]] += UNKNOWN**-2.0
+        meat[6:-1, 6:-1] += self.prior
         patches, pulls = _pulls(rest.left, rest.weights, cluster, pose)
         edges, off = len(rest.left.residual) - rest.surface, rest.scanner - self.usual
         return BodyFit(
             pose, rest.noise, rest.surface, edges, shape.size, centre, bread, meat,
             rest.scanner[:FACINGS], float(off @ self.prior @ off), patches, pulls,
+            float(bread[-1] @ (rest.left.jacobian.T * rest.weights) @ rest.left.residual),
         )  # fmt: skip
+
+
+def _bread(rest: _Settled) -> Floats:
+    """Return (14, 14) what scores do to pose and scanner at the mesh's scale, and to the scale."""
+    jacobian = rest.left.jacobian
+    along = (jacobian.T * rest.weights) @ jacobian[:, -1]
+    bread = np.zeros(2 * jacobian.shape[1:])
+    bread[:-1, :-1] = np.linalg.inv(rest.information)
+    # What the scale does to the residuals, less what the others do alike
+    bread[-1] = np.r_[-bread[:-1, :-1] @ along[:-1], 1.0]
+    bread[-1] /= bread[-1] @ along + UNKNOWN**-2.0
+    return bread
 
 
 def _surface(
@@ -361,7 +391,8 @@ def _equations(
     rotation = pose[:3, :3]
     arms = (place - shape.centre) @ rotation.T
     normals = along @ rotation.T
-    jacobian = np.column_stack([np.cross(arms, normals), shape.size * normals, errors])
+    swells = np.einsum("ni,ni->n", arms, normals)
+    jacobian = np.column_stack([np.cross(arms, normals), shape.size * normals, errors, swells])
     return _Equations(jacobian, residual, place, along)
 
 
@@ -379,7 +410,7 @@ def _weighted(
 
 
 def _noise(equations: _Equations, weights: Floats, cluster: Indices, surface: int) -> Floats:
-    """Return the (13, 13) covariance of the scores by noise that points of a patch share.
+    """Return the (14, 14) covariance of the scores by noise that points of a patch share.
 
     How many times as much as that of independent ones is one number for surfaces and one for edges:
     a covariance by the patches' own sums would have hardly more of them than columns.
@@ -405,7 +436,7 @@ def _patches(equations: _Equations, shape: Shape) -> Indices:
 def _pulls(
     equations: _Equations, weights: Floats, cluster: Indices, pose: Floats
 ) -> tuple[Floats, Floats]:
-    """Return where patches are (P, 3), and what being off there does to the scores (P, 13, 3)."""
+    """Return where patches are (P, 3), and what being off there does to the scores (P, 14, 3)."""
     many = np.bincount(cluster)
     place = equations.place @ pose[:3, :3].T + pose[:3, 3]
     middles = np.stack([np.bincount(cluster, x) / many for x in place.T], axis=1)

@@ -35,6 +35,7 @@ class BodyVerdict(NamedTuple):
         goes_on: Rays beside it that show its surface where it has ended.
         beside: Rays beside it that show anything.
         ended: Rays beside it that show something behind it.
+        crossing: Rays beside it that show something at its own depth, where it has ended.
         outline: All rays beside it.
     """
 
@@ -44,6 +45,7 @@ class BodyVerdict(NamedTuple):
     goes_on: int
     beside: int
     ended: int
+    crossing: int
     outline: int
 
     @property
@@ -63,8 +65,12 @@ class BodyVerdict(NamedTuple):
 
     @property
     def trusted(self) -> float:
-        """Share of the scan points at its place that agree with it."""
-        return self.agree / max(self.agree + self.against, 1)
+        """Share of the rays at its place and right beside it that are as it makes them.
+
+        They meet its surface, or pass it and end behind it.
+        """
+        held = self.agree + self.ended
+        return held / max(held + self.against + self.crossing, 1)
 
     @property
     def rank(self) -> float:
@@ -97,7 +103,7 @@ def judged(shape: Shape, view: CoarseImage, pose: Floats, tolerance: float) -> B
 
     compared = _compared(shape, view, pose, tolerance)
     if compared is None or not compared.hit.any():
-        return BodyVerdict(*[0] * 7)
+        return BodyVerdict(*[0] * len(BodyVerdict._fields))
     rays, scan, depth, normals, hit, due, agree, against, *_ = compared
     beside = ndimage.binary_dilation(hit, iterations=OUTLINE) & ~ndimage.binary_dilation(hit)
     row, column = ndimage.distance_transform_edt(~hit, return_distances=False, return_indices=True)
@@ -107,7 +113,8 @@ def judged(shape: Shape, view: CoarseImage, pose: Floats, tolerance: float) -> B
     on = np.abs(np.einsum("ijk,ijk->ij", normals[row, column], scan - ended)) < 2 * tolerance
     measured = beside & np.isfinite(scan[..., 2])
     ended_there = beside & (scan[..., 2] > depth[row, column] + 2 * tolerance)
-    counts = (due, agree, against, beside & on, measured, ended_there, beside)
+    crossing = measured & ~ended_there & ~_hides(shape, scan, depth[row, column])
+    counts = (due, agree, against, beside & on, measured, ended_there, crossing, beside)
     return BodyVerdict(*(int(count.sum()) for count in counts))
 
 
@@ -143,12 +150,16 @@ def _compared(shape: Shape, view: CoarseImage, pose: Floats, tolerance: float) -
     due = hit & ~_edges(np.where(hit, depth, np.inf), view.angle)
     due &= np.einsum("ijk,ijk->ij", normals, rays) < -GRAZING * np.linalg.norm(rays, axis=-1)
     agree = due & (np.abs(off) < tolerance)
-    # What is nearer to the scanner hides the body
-    before = (off > 2 * tolerance) & (scan[..., 2] > depth - 0.1 * shape.size)
+    before = (off > 2 * tolerance) & ~_hides(shape, scan, depth)
     behind = off < -2 * tolerance
     # A single ray may be a mixed one, at an edge of the body.
     against, through = (ndimage.binary_opening(due & seen) for seen in (behind | before, behind))
     return _Compared(rays, scan, depth, normals, hit, due, agree, against, through, facets)
+
+
+def _hides(shape: Shape, scan: Floats, depth: Floats) -> Mask:
+    """Return (H, W) where the scan is so far before the body's depth that it hides the body."""
+    return ~(scan[..., 2] > depth - 0.1 * shape.size)
 
 
 def opposed(shape: Shape, view: CoarseImage, pose: Floats) -> Mask | None:
@@ -283,7 +294,8 @@ class FoundPose(NamedTuple):
     Attributes:
         pose: (4, 4) ``camera_T_body``.
         verdict: What speaks for it and against.
-        weakest: Standard deviation of what the scan shows least of it, in sizes or radians.
+        weakest: Standard deviation of what the scan shows least of it and of the body's scale, in
+            sizes or radians.
         seen: How much of the body was seen, of what it shows from its broadest side.
     """
 

@@ -91,6 +91,14 @@ def fit_body(
         )
     alone = partial(_somewhere, params.scanner_error)
     distortion = DistortionField(scanner).at if scanner else alone
+    larger, unsure = fit.oversize, fit.unsure(params.model_error, distortion)
+    if (larger / unsure) ** 2 > chi2_quantile(0.99, 1):
+        return Rejected(
+            f"the scan shows {body.name} in another size than its mesh has: the mesh is of another "
+            "scale, or it rests on another thing",
+            f"{'larger' if larger > 0 else 'smaller'} by {abs(larger):.1%} at least, known to "
+            f"{unsure:.1%}",
+        )
     covariance = fit.covariance(params.model_error, distortion)
     figures = {
         "points": float(fit.points),

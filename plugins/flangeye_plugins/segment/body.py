@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from flangeye_plugins.body.search import FoundPose
 
 FIRM = 0.004
-"""Largest standard deviation of what a scan shows least of a body, in its sizes or radians: what
-fits by chance is seldom held in all directions."""
+"""Largest standard deviation of what a scan shows least of a body's pose and scale, in its sizes or
+radians: what fits by chance is seldom held in all directions, and a corner fits any size."""
 
 
 class SegmentBodyParams(Params):
@@ -48,7 +48,8 @@ class SegmentBodyParams(Params):
         0.99,
         gt=0,
         le=1,
-        description="Of what is seen where the body should be, the smallest share that is it.",
+        description="Of what is seen where the body should be and right beside it, the smallest "
+        "share that is as the body makes it.",
     )
 
 
@@ -64,7 +65,8 @@ def segment_body(
 
     Edges of the body are laid on edges of the scan; the poses that the scan does not contradict are
     refined, and then checked ray by ray against everything the scanner saw: the body's surface,
-    points behind it, and surface where the body has ended. Where none passes the scan is refused;
+    points behind it, and anything at its depth where the body has ended; and the scan has to show
+    the body's size. Where none passes the scan is refused;
     where several do, the arm's motion between captures decides. Where the arm's motion since
     earlier sightings predicts a pose that passes, it is taken without a search.
 

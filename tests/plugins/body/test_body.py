@@ -34,9 +34,11 @@ from flangeye_emulators.world.mesh import MATERIALS, Mesh, box
 from flangeye_emulators.world.raycast import RaycastScene, SolidBody
 from flangeye_emulators.world.scanner import scanner_of
 from flangeye_plugins.body.looks import prepared
+from flangeye_plugins.body.search import BodySearch
+from flangeye_plugins.body.search import around as points_around
 from flangeye_plugins.fit.body import FitBodyParams, fit_body
 from flangeye_plugins.segment.body import SegmentBodyParams, segment_body
-from tools.study_bodies import SCANNER, as_made, trial
+from tools.study_bodies import SCANNER, as_made, scene, trial
 
 GRIPPER = load_body("gripper", None, Path())
 POSE = rigid(rotation_from_rpy(2.5, 0.6, 0.8), np.array([0.03, -0.02, 0.75]))
@@ -330,9 +332,28 @@ def test_a_mesh_of_ones_own_goes_with_the_run(tmp_path: Path) -> None:
 
 def test_a_fit_that_rests_on_other_edges_is_refused() -> None:
     """A ring plate laid 1.4 mm aside, where its surfaces fit as well."""
-    told = trial("ring-plate", 23)
-    assert not told.found
-    assert "it rests on other edges than its own" in told.why
+    rng = np.random.default_rng(23)
+    plate = load_body("ring-plate", None, Path())
+    bodies, _ = scene(rng, as_made(plate, rng))
+    points = scanner_of(SCANNER, 0.35, 1.0, rng).scan(RaycastScene(bodies), rng).reshape(-1, 3)
+    points, looks = points[np.isfinite(points[:, 2])].astype(np.float32), prepared(plate)
+    aside = BodySearch(points, looks).everywhere()[0].pose
+    near = PointCloud(CAMERA, points_around(points, looks, aside))
+    laid = FlangeCloud(near, aside[:3, 3], np.array([0, 0, -1.0]), aside)
+    told = fit_body(laid, plate, FitBodyParams(), SCANNER)
+    assert "it rests on other edges than its own" in told.reason
+    assert not trial("ring-plate", 23).found
+
+
+@pytest.mark.parametrize(("scale", "why"), [(1.01, "smaller"), (1 / 1.01, "larger")])
+def test_a_mesh_of_another_size_is_refused_by_what_the_scan_shows(scale: float, why: str) -> None:
+    other = TargetBody("gripper", GRIPPER.vertices * scale, GRIPPER.triangles)
+    refused = fit_body(around(scan(GRIPPER), POSE), other, FitBodyParams(), SCANNER)
+    assert isinstance(refused, Rejected)
+    assert "in another size than its mesh" in refused.reason
+    figure = re.match(rf"{why} by (\S+)% at least", refused.figures)
+    assert figure
+    assert 0.3 < float(figure[1]) <= 1.0
 
 
 def test_where_the_carrier_goes_on_beyond_a_bodys_foot_is_no_end_of_it() -> None:
