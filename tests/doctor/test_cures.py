@@ -217,6 +217,8 @@ def test_centres_of_an_unknown_place_are_solved_by_what_a_refusal_names(tmp_path
     ("fault", "kind"),
     [("both inverted", "hand"),
      ("tables exchanged", "marker"),
+     ("robot's x and y exchanged", "hand"),
+     pytest.param("marker's x and y exchanged", "marker", marks=pytest.mark.slow),
      pytest.param("marker inverted", "hand", marks=pytest.mark.slow),
      pytest.param("camera's axes as OpenGL has them", "hand", marks=pytest.mark.slow),
      pytest.param("wrong mounting", "hand", marks=pytest.mark.slow),
@@ -232,6 +234,7 @@ def test_a_fault_in_tables_is_named_and_its_line_cures(fault: str, kind: str) ->
     assert status != "verified"
     assert finding in (
         "pose convention", "pose direction", "mounting", "mirrored axis", "marker rotations", "target size", "camera axes",
+        "exchanged columns",
     )  # fmt: skip
     assert cured.startswith("verified") and float(cured.split()[1]) < 1.0
 

@@ -95,12 +95,18 @@ Convention = tuple[str, str | None]
 
 def _said(session: RecordedSession, of: str | None = None) -> Convention | None:
     """Return how the recipe says that rotations are written; None where it does not, or not so."""
+    stated = _params(session, of)
+    rotation = stated.get("rotation")
+    return (str(rotation), stated.get("angle")) if rotation in (*CONVENTIONS, *PLAIN) else None
+
+
+def _params(session: RecordedSession, of: str | None = None) -> Mapping[str, Any]:
+    """Return what the recipe tells the reader, or tells it of the target."""
     if isinstance(session.reader, str):
-        return None
+        return {}
     ((_, params),) = session.reader.items()
     stated = params.get(of) if params and of else params
-    rotation = stated.get("rotation") if isinstance(stated, Mapping) else None
-    return (str(rotation), stated.get("angle")) if rotation in (*CONVENTIONS, *PLAIN) else None
+    return stated if isinstance(stated, Mapping) else {}
 
 
 def _conventions(rotation: str, angle: str | None) -> Iterator[Convention]:
@@ -263,26 +269,47 @@ def axes(session: RecordedSession) -> Findings:
 
 @part("check.mirrored")
 def mirrored(session: RecordedSession) -> Findings:
-    """One axis of what was seen, or of the arm's positions, has the wrong sign."""
+    """Positions have an axis with the wrong sign, or two columns that stand for each other."""
     session.require_samples()
     # Where each axis would do, one that leaves targets before the camera
     axes = sorted(range(3), key=lambda at: (at == 2) == (np.nanmedian(session.centres[:, 2]) > 0))
     tried = [
-        ("target", "xyz"[axis], session.stretched(np.where(np.arange(3) == axis, -1.0, 1.0)))
+        (*_negated("target", "xyz"[axis]), session.stretched(np.where(np.arange(3) == axis, -1, 1)))
         for axis in axes
     ]
     if session.uses_poses and session.seconds is None:
-        tried += [("robot", axis, _with_negated(session, axis)) for axis in "xyz"]
+        tried += [(*_negated("robot", axis), _with_negated(session, axis)) for axis in "xyz"]
+    tried += _with_exchanged_columns(session)
     evidence = best_of(fit_of(session), fit(equations_of(*(each for _, _, each in tried))))
-    whose, axis, found = tried[evidence.which]
+    name, what, found = tried[evidence.which]
     if evidence.probability < 1 and helps(session, found):
-        what = f"the {axis} of the {whose}'s positions is negated: they fit with its sign changed"
-        yield evidence.finding("mirrored axis", what, found)
+        yield evidence.finding(name, what, found)
+
+
+def _negated(whose: str, axis: str) -> tuple[str, str]:
+    what = f"the {axis} of the {whose}'s positions is negated: they fit with its sign changed"
+    return "mirrored axis", what
 
 
 def _with_negated(session: RecordedSession, axis: str) -> RecordedSession:
     sign = np.array([-1.0 if each == axis else 1.0 for each in "xyz"])
     return session.corrected(lambda poses: scaled(poses, sign), robot={"mirrored": axis})
+
+
+def _with_exchanged_columns(session: RecordedSession) -> Iterator[tuple[str, str, RecordedSession]]:
+    """Give the recordings read again, two of the columns of a table's positions exchanged."""
+    for whose, of in (("robot", None), ("target", "target")):
+        columns = _params(session, of).get("columns")
+        if session.again is None or _said(session, of) is None or not isinstance(columns, list):
+            continue
+        for first, second in ((0, 1), (0, 2), (1, 2)):
+            other = list(columns)
+            other[first], other[second] = columns[second], columns[first]
+            changes = {"columns": tuple(other)}
+            read = session.again({} if of else changes, changes if of else {})
+            axes = " and ".join(("xyz"[first], "xyz"[second]))
+            what = f"{axes} of the {whose}'s positions stand in each other's columns"
+            yield "exchanged columns", what, read
 
 
 def _distances(session: RecordedSession) -> tuple[float, float]:
