@@ -134,7 +134,10 @@ def scene(rng, body):
 
 
 class Trial(NamedTuple):
-    """One scan: the poses found or why none, the true one, and CPU time [s]."""
+    """One scan: the poses found or why none, the true one, and CPU time [s].
+
+    ``there`` is whether the scan has the body, drawn as it is or mirrored: a mirrored mesh has its pose.
+    """
 
     there: bool
     visible: bool
@@ -169,12 +172,14 @@ def trial(name, seed, alone=True):
     capture = Capture(
         f"{seed:04d}", PointCloud(CAMERA, eye(rng).scan(RaycastScene(bodies), rng)), {}
     )
+    turn = seed // 10 * 2 + seed % 10 - 1
     if seed % 10 in (1, 2):
-        body = wrong(body, seed // 10 * 2 + seed % 10 - 1)
+        body = wrong(body, turn)
     points, shape = capture.cloud.points(), prepared(body)
     view = view_of(points, body.size / FINE_ACROSS)
     tolerance = max(0.003 * body.size, 3.5 * view.noise)
     visible = there and judged(shape, view, pose, tolerance).shown > VISIBLE
+    there |= seed % 10 in (1, 2) and turn % 4 == 0
     start = time.process_time()
     found = segment_body(capture, body, Configuration(), Earlier([]), SegmentBodyParams())
     fits = [found]
@@ -310,7 +315,10 @@ def _median(values):
 
 def main(scans, names, first, alone):
     for name in names:
-        trials = [trial(name, first + k, alone) for k in range(scans)]
+        trials = []
+        for k in range(scans):
+            trials.append(trial(name, first + k, alone))
+            print(f"  {name} {first + k}: {_what(trials[-1], False)}", flush=True)
         print(summary(name, trials), flush=True)
 
 
