@@ -23,7 +23,6 @@ def test_no_closed_form_is_less_accurate_than_opencvs(name: Any, case: Any) -> N
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="1.14 times in place: a focal length's error is allowed for")
 def test_the_default_solver_is_near_the_bound() -> None:
     made = hand_eye.sessions("n=15, 17 deg", 400)
     found = np.array(hand_eye.rms([hand_eye.most_likely(m) for m in made], made))

@@ -27,7 +27,7 @@ def camera_effects(problem: Problem, size_unknown: bool = False) -> list[Effect]
     pairs = [ends for k, ends in enumerate(problem.ends) if k in whole]
     for target in dict.fromkeys(target for _, target in pairs):
         name = f"size of {target}"
-        effects.append(Effect(name, _size(target), size, kind="size", of_camera=not size_unknown))
+        effects.append(Effect(name, _size(target), size, kind="size"))
     for camera in dict.fromkeys(camera for camera, _ in pairs):
         name = f"focal length of {camera}"
         effects.append(Effect(name, _focal(camera), SIZE, kind="focal", of_camera=True))
