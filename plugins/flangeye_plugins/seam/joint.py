@@ -221,8 +221,8 @@ def _solid(points: Floats) -> tuple[float, Floats]:
     tree = cKDTree(points)
     some = points[:: max(1, len(points) // 2000)]
     pitch = float(np.median(tree.query(some, k=5)[0][:, 1:].mean(axis=1)))
-    counts = tree.query_ball_point(points, 2.5 * pitch, return_length=True)
-    return pitch, points[counts > 3]
+    third = tree.query(points, k=[4])[0][:, 0]  # the first is the point itself
+    return pitch, points[third <= 2.5 * pitch]
 
 
 def _placed(rough: Course, local: Floats, normals: Floats, params: JointParams) -> list[JointPlace]:

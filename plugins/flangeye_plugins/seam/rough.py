@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from math import radians, remainder, tau
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -139,10 +140,11 @@ def _places(
 
 def _agree(joint: JointShape, which: list[int], lines: tuple[Line, ...] | list[Line]) -> bool:
     """Return whether lines have the angles between each other that the joint's half-planes have."""
-    off = [line.angle - np.radians(joint.angles[k]) for line, k in zip(lines, which, strict=True)]
-    allowed = [np.radians(2 * joint.spread[k] + 4) for k in which]
-    turned = np.angle(np.exp(1j * (np.array(off) - off[0])))
-    return bool((np.abs(turned) <= np.array(allowed) + allowed[0]).all())
+    off = [line.angle - radians(joint.angles[k]) for line, k in zip(lines, which, strict=True)]
+    allowed = [radians(2 * joint.spread[k] + 4) for k in which]
+    return all(
+        abs(remainder(o - off[0], tau)) <= a + allowed[0] for o, a in zip(off, allowed, strict=True)
+    )
 
 
 def _placed(
@@ -196,9 +198,10 @@ def explained(section: Section, q: Floats, tolerance: float) -> float | None:
     counts = np.bincount(active[good], minlength=4)
     needed = [k for k in FACES if section.joint.present[k]]
     needed += [k for k in EDGES if section.joint.present[k] and k not in section.joint.unseen]
-    if min(counts[needed]) < max(12, 0.04 * near.sum()):
+    of = int(near.sum())
+    if counts[needed].min() < max(12, 0.04 * of):
         return None
-    return float(2 * good.sum() / max(near.sum(), 1) - 1)
+    return float(2 * good.sum() / max(of, 1) - 1)
 
 
 def _apart(places: list[JointPlace]) -> list[JointPlace]:
