@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,6 +24,9 @@ from flangeye.types import (
     Transform,
 )
 from flangeye.units import Length, param
+
+if TYPE_CHECKING:
+    from flangeye_plugins.body.dense import BodyFit
 
 
 class FitBodyParams(Params):
@@ -76,29 +81,10 @@ def fit_body(
     fit = fitted(cloud.cloud.xyz, prepared(body), cloud.camera_T_target)
     if fit is None:
         return Rejected("too few points on the body")
-    if fit.noise > params.max_rms:
-        return Rejected(
-            f"the scan is {fit.noise * 1e3:.2f} mm off {body.name}'s surface (limit "
-            f"{params.max_rms * 1e3:g} mm): does it move against its mesh, as a gripper's jaws do?"
-        )
-    # Of good scans this share shows edges as its scanner does; others may rest on wrong edges
-    if fit.odd > chi2_quantile(0.99, len(fit.lost) + 1):
-        low, high = fit.lost.min() * 1e3, fit.lost.max() * 1e3
-        return Rejected(
-            f"the scan's edges are {low:+.1f} to {high:+.1f} mm off the ends of {body.name}, more "
-            "unlike from side to side than a scanner's are: it rests on other edges than its own, "
-            "or its mesh is another body's; scan from where more of its ends are seen"
-        )
     alone = partial(_somewhere, params.scanner_error)
     distortion = DistortionField(scanner).at if scanner else alone
-    larger, unsure = fit.oversize, fit.unsure(params.model_error, distortion)
-    if (larger / unsure) ** 2 > chi2_quantile(0.99, 1):
-        return Rejected(
-            f"the scan shows {body.name} in another size than its mesh has: the mesh is of another "
-            "scale, or it rests on another thing",
-            f"{'larger' if larger > 0 else 'smaller'} by {abs(larger):.1%} at least, known to "
-            f"{unsure:.1%}",
-        )
+    if refused := _unlike(fit, body.name, params, distortion):
+        return refused
     covariance = fit.covariance(params.model_error, distortion)
     figures = {
         "points": float(fit.points),
@@ -107,6 +93,34 @@ def fit_body(
         "freedoms": float(fit.freedoms),
     }
     return PoseFeature(Transform(CAMERA, TARGET, fit.pose), covariance, figures)
+
+
+def _unlike(
+    fit: BodyFit, name: str, params: FitBodyParams, distortion: Callable[[Floats], Floats]
+) -> Rejected | None:
+    """Return in what a scan is unlike the body that was laid on it; None where in nothing."""
+    if fit.noise > params.max_rms:
+        return Rejected(
+            f"the scan is {fit.noise * 1e3:.2f} mm off {name}'s surface (limit "
+            f"{params.max_rms * 1e3:g} mm): does it move against its mesh, as a gripper's jaws do?"
+        )
+    # Of good scans this share shows edges as its scanner does; others may rest on wrong edges
+    if fit.odd > chi2_quantile(0.99, len(fit.lost) + 1):
+        low, high = fit.lost.min() * 1e3, fit.lost.max() * 1e3
+        return Rejected(
+            f"the scan's edges are {low:+.1f} to {high:+.1f} mm off the ends of {name}, more "
+            "unlike from side to side than a scanner's are: it rests on other edges than its own, "
+            "or its mesh is another body's; scan from where more of its ends are seen"
+        )
+    larger, unsure = fit.oversize, fit.unsure(params.model_error, distortion)
+    if (larger / unsure) ** 2 > chi2_quantile(0.99, 1):
+        return Rejected(
+            f"the scan shows {name} in another size than its mesh has: the mesh's scale is wrong, "
+            "or what was found is another thing",
+            f"{'larger' if larger > 0 else 'smaller'} by {abs(larger):.1%} at least, known to "
+            f"{unsure:.1%}",
+        )
+    return None
 
 
 def _somewhere(error: float, points: Floats) -> Floats:
