@@ -67,8 +67,8 @@ class Supervisor:
 
     @property
     def under_way(self) -> bool:
-        """Whether the arm is expected to move."""
-        return self.leg is not None or self._led
+        """Whether the arm is expected to move, and by us."""
+        return not self._by_hand and (self.leg is not None or self._led)
 
     def judge(self, state: RobotState) -> bool:
         """Process a sample; return whether the present leg has ended and the arm has settled.

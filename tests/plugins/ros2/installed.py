@@ -1,5 +1,6 @@
 """The real rclpy, in an environment of its own: `make test` puts it beside the tests' Python."""
 
+import fcntl
 import itertools
 import os
 import shutil
@@ -70,5 +71,19 @@ _domains = itertools.count()
 
 
 def free_domain() -> int:
-    """A ROS domain that no other test, worker or test run uses now; DDS has ports for some 200."""
-    return 1 + (os.getpid() * 7 + next(_domains)) % 100  # each test has its own
+    """A ROS domain that no other test uses now; DDS has ports for some 200."""
+    return 1 + 10 * _block()[0] + next(_domains) % 10
+
+
+@cache
+def _block():
+    """Ten domains that are this process's alone as long as it lives, and the lock that says so."""
+    for number in range(10):
+        lock = (Path(tempfile.gettempdir()) / f"flangeye_tests_ros2_{number}.lock").open("w")
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            lock.close()
+        else:
+            return number, lock
+    pytest.fail("ten test runs use ROS 2 on this machine")

@@ -163,6 +163,15 @@ def test_an_arm_that_others_move_is_ready_when_it_stands_elsewhere(env):
                     assert time.monotonic() < until
                     robot.wait_cycle()
                 assert np.allclose(robot.state().joints, start + turn, atol=1e-3)
+            arm.ask(silent=0.3, truth=True)
+            time.sleep(0.15)
+            before = time.monotonic_ns()
+            assert robot.state().time_ns > before  # waited for: nothing of ours depends on it
+            arm.ask(silent=2.0, truth=True)
+            with pytest.raises(DeviceError, match=r"silent for 0\.[5-9]\d s, at most 0\.5 s"):
+                while True:
+                    robot.wait_cycle()
+                    robot.state()
 
 
 @pytest.mark.parametrize(

@@ -88,6 +88,9 @@ def robot_ros2_freedrive(model: RobotModel, params: FreedriveParams) -> Robot:
 class Ros2Arm(Listener):
     """An arm that is moved in pieces; see :class:`flangeye.devices.Robot`."""
 
+    # Silence of an arm that moves is a doubt at once [s].
+    patience: ClassVar[float] = 0.0
+
     def __init__(
         self, asker: str, model: RobotModel, params: Ros2RobotParams, bridge: Bridge
     ) -> None:
@@ -268,11 +271,13 @@ class FreedriveArm(Listener):
         now, joints = time.monotonic(), self._samples[-1].joints
         if moves:
             self._stood_since = now
+        # While nothing was heard it may have moved
+        stood = now - max(self._stood_since, 1e-9 * self._followed_since_ns)
         # An arm that was moved by hand has left its last place when a joint turned so far [rad]
         went = self._left is None or bool(np.abs(joints - self._left).max() > 0.02)
         if not self._awaited:
             return "ready"
-        if not went or now - self._stood_since < self._still:
+        if not went or stood < self._still:
             return "moving"
         self._awaited, self._left = False, joints
         return "ready"

@@ -68,6 +68,9 @@ class Listener(Device):
     # A sample older than this is no news of the arm [s].
     stale: ClassVar[float] = 0.1
 
+    # For how long news of an arm that is not commanded are waited for: nothing depends on them [s].
+    patience: ClassVar[float] = 0.5
+
     flange_T_tool: Transform | None = None
 
     def __init__(self, asker: str, model: RobotModel, params: ListenParams, bridge: Bridge) -> None:
@@ -85,7 +88,7 @@ class Listener(Device):
         self._arrived: deque[GraphMessage] = deque(maxlen=32)
         self._heard: set[str] = set()
         self._angles: dict[str, float] = {}
-        self._begun_ns = 0
+        self._begun_ns = self._followed_since_ns = 0
         if len(params.joints) != self.arm.n:
             raise DeviceError(
                 f"{asker}: joints names {len(params.joints)}, but a {model.model} has {self.arm.n}"
@@ -198,6 +201,8 @@ class Listener(Device):
         time_ns = self._bridge.local_ns(self._params.joint_states, message)
         sample = JointSample(joints, time_ns, message.received_ns)
         self._require_forwards(sample)
+        if self._samples and sample.time_ns - self._samples[-1].time_ns > 1e9 * self.stale:
+            self._followed_since_ns = sample.received_ns
         self._samples.append(sample)
         self._kept += 1
         # Over which speeds are taken [ns]: what some drivers publish as velocity is noise, or empty
@@ -215,24 +220,30 @@ class Listener(Device):
             )
 
     def _fresh(self) -> JointSample:
-        """Return the newest sample; raise DeviceError for one that is too old."""
+        """Return the newest sample, waited for; raise DeviceError where none is news of the arm."""
         if not self._samples:
             raise DeviceError(f"{self.name}: {self._missing() or self.nothing}")
-        newest = self._samples[-1]
+        until = time.monotonic() + self.patience
+        while (fault := self._fault(self._samples[-1])) and (left := until - time.monotonic()) > 0:
+            self._take(left)
+        if fault:
+            raise DeviceError(f"{self.name}: {fault}")
+        return self._samples[-1]
+
+    def _fault(self, newest: JointSample) -> str:
+        """Say why a sample is no news of the arm; empty where it is."""
         age = 1e-9 * (time.monotonic_ns() - newest.received_ns)
         if age > self.stale:
-            raise DeviceError(
-                f"{self.name}: silent for {age:.2f} s, at most {self.stale} s are allowed{busy()}"
-            )
+            allowed = max(self.stale, self.patience)
+            return f"silent for {age:.2f} s, at most {allowed} s are allowed{busy()}"
         off = 1e-9 * (newest.received_ns - newest.time_ns)
         if abs(off) > self.stale:
             when = "before" if off > 0 else "after"
-            raise DeviceError(
-                f"{self.name}: stamped {abs(off):.2f} s {when} it came, at most {self.stale} s are "
-                "allowed: set the clocks of both computers (NTP), or sim_time: true where stamps "
-                "are of /clock"
+            return (
+                f"stamped {abs(off):.2f} s {when} it came, at most {self.stale} s are allowed: set "
+                "the clocks of both computers (NTP), or sim_time: true where stamps are of /clock"
             )
-        return newest
+        return ""
 
     def _missing(self) -> str:
         """Say which joints were looked for, where messages came without them."""

@@ -208,7 +208,9 @@ def robot_ur_rtde(model: RobotModel, params: ControllerParams, reads_only: bool 
         # Which tool is set only the other side tells: a wrong one shows in where the flange is.
         offset = expected if reads_only else POSE.matrix(link.request("tool"))
         require_tool(name, "ur_rtde", offset, expected, SHOWN)
-        robot = UrRobot(name, params.host, facts.period, link, offset)
+        # An arm that is not commanded may be silent for a while: nothing depends on it [s]
+        patience = 0.5 if reads_only else UrRobot.stale
+        robot = UrRobot(name, params.host, facts.period, link, offset, patience)
         require_model(name, robot.state(), model)
     except DeviceError:
         link.close()
@@ -230,10 +232,25 @@ class UrRobot(Device):
     stale: ClassVar[float] = 0.1
 
     def __init__(
-        self, name: str, host: str, period: float, link: ControllerLink, offset: Floats
+        self,
+        name: str,
+        host: str,
+        period: float,
+        link: ControllerLink,
+        offset: Floats,
+        patience: float,
     ) -> None:
-        """Take over a connection to a controller whose tool is ``offset`` (4, 4)."""
-        self.name, self.period = name, period
+        """Take over a connection to a controller.
+
+        Args:
+            name: Name of the robot, for messages.
+            host: Address of the controller.
+            period: Length of its cycle [s].
+            link: The connection.
+            offset: (4, 4) ``flange_T_tool`` as the controller has it.
+            patience: For how long news of the arm are waited for [s].
+        """
+        self.name, self.period, self._patience = name, period, patience
         self._host, self._link = host, link
         self._seen = self._commanded = 0
         self._posed: tuple[int, Floats] = (-1, np.eye(4))
@@ -278,7 +295,7 @@ class UrRobot(Device):
 
     def wait_cycle(self) -> None:
         """Wait for a sample newer than the last one waited for."""
-        until = time.monotonic() + self.stale
+        until = time.monotonic() + self._patience
         late = False
         while (sample := self._link.sample()) is None or sample.number <= self._seen:
             if late:
@@ -312,7 +329,7 @@ class UrRobot(Device):
 
     def _fresh(self) -> CycleSample:
         """Return the newest sample; wait for one where this computer was too busy to take it."""
-        until = time.monotonic() + self.stale
+        until = time.monotonic() + self._patience
         while True:
             # The time comes first: who is not let run for a while after reading has read it fresh.
             late, now = time.monotonic() > until, time.monotonic_ns()
@@ -322,8 +339,8 @@ class UrRobot(Device):
                 return sample
             if late:
                 raise DeviceError(
-                    f"{self.name}: its last sample is {age:.2f} s old, at most {self.stale} s are "
-                    f"allowed: the controller or the network has stopped{busy()}"
+                    f"{self.name}: its last sample is {age:.2f} s old, at most {self._patience} s "
+                    f"are allowed: the controller or the network has stopped{busy()}"
                 )
             time.sleep(self.period)
 

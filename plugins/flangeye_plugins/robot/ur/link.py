@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, NoReturn
 import numpy as np
 
 from flangeye.devices import DeviceError
-from flangeye.files.processes import python_command
+from flangeye.files.processes import busy, python_command
 from flangeye.types import Floats
 from flangeye_plugins.robot.ur import worker
 
@@ -152,7 +152,7 @@ class ControllerLink:
         try:
             message = self._line.recv(65536)
         except TimeoutError:
-            self._give_up(f"did not answer '{what}' within {patience:.1f} s")
+            self._give_up(f"did not answer '{what}' within {patience:.1f} s{busy()}")
         except OSError:
             message = b""
         if not message:
