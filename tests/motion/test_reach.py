@@ -1,18 +1,25 @@
 """Which poses of the flange are asked of an arm: seen, lit, clear, and near to where it stands."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 
-from flangeye.maths.geometry import rigid, rotation_from_rpy
+from flangeye.maths.geometry import invert, rigid, rotation_from_rpy
 from flangeye.maths.kinematics import Arm
+from flangeye.models.bodies import arm_body, load_body
 from flangeye.models.loading import load_model
+from flangeye.models.robots import Volume
+from flangeye.models.urdf import robot_from_urdf
 from flangeye.motion.clearance import ArmVolume
-from flangeye.motion.reach import Margins, Reach
+from flangeye.motion.reach import Margins, Reach, Site, poses_near
+from flangeye.units import SI
 from tests.motion.stand_in import LIMITS, MODEL, turned
 
+RECIPES = Path(__file__).parents[2] / "recipes"
 ARM = Arm(MODEL)
 AHEAD = np.array([0.6, 0.0, 0.3])
 OVERHEAD = np.array([[0, -1, 0, 0.6], [-1, 0, 0, 0], [0, 0, -1, 1], [0, 0, 0, 1]], dtype=float)
@@ -257,6 +264,75 @@ def test_an_arm_in_the_line_of_sight_of_camera_or_projector_is_in_the_way() -> N
             lean = {"baseline": baseline, "convergence": convergence}
             arm = Reach(MODEL, scanner(**lean), camera, 0.05)
             assert arm._clear(SHOWN) is clear
+
+
+@pytest.mark.parametrize(("link", "clear"), [(6, True), (5, False)])
+def test_the_link_that_ends_in_the_flange_is_behind_its_face(link: int, clear: bool) -> None:
+    """A capsule about the last link of a URDF's mesh reaches beyond the flange that it ends in."""
+    of_link = invert(ARM.frames(SHOWN)[link]) @ ARM.flange(SHOWN)
+    start, end = (tuple(map(SI, (of_link @ [0.0, 0.0, z, 1.0])[:3])) for z in (-0.03, 0.03))
+    volume = Volume(link=link, start=start, end=end, radius=SI(0.04))
+    robot = MODEL.model_copy(update={"volumes": (*MODEL.known_volumes(), volume)})
+    camera = OVERHEAD.copy()
+    camera[:3, 3] = ARM.flange(SHOWN)[:3, 3] + [0.0, 0.0, 0.7]
+    assert Reach(robot, scanner(), camera, 0.05)._clear(SHOWN) is clear
+
+
+def test_an_arm_keeps_off_the_scanners_housing() -> None:
+    elbow = ARM.frames(SHOWN)[3][:3, 3]
+    for aside, clear in ((0.0, False), (0.6, True)):
+        camera = OVERHEAD.copy()
+        camera[:3, 3] = elbow + [0.0, aside, 0.0]
+        assert Reach(MODEL, scanner(), camera, 0.0)._clear(SHOWN) is clear
+
+
+TORCH = load_body("torch", None, Path())
+
+
+@pytest.mark.parametrize("body", ["gripper", "torch", "ring-plate"])
+def test_a_body_is_shown_by_most_of_what_faces_the_camera(body: str) -> None:
+    tool = load_body(body, None, Path())
+    arm = Reach(MODEL, load_model("scanners", "phoxi-m"), OVERHEAD, tool)
+    site = Site(arm.middle(), OVERHEAD[:3, 3], arm.facing, arm.joints, shown=lambda: arm.shown)
+    poses = poses_near(site.centre, 10, site, np.random.default_rng(0), (0.1, 0.3))
+    assert len(poses) == 10
+    for pose in poses:
+        mesh = trimesh.Trimesh(tool.vertices, tool.triangles).apply_transform(pose.base_T_flange)
+        towards = OVERHEAD[:3, 3] - mesh.triangles_center
+        areas = mesh.area_faces * np.einsum("ij,ij->i", mesh.face_normals, towards).clip(min=0)
+        assert areas[arm._inside(mesh.triangles_center)].sum() > 0.5 * areas.sum()
+        assert mesh.vertices[:, 2].min() > 0
+
+
+def test_a_body_out_of_the_field_or_behind_the_arm_is_refused() -> None:
+    wide = {"near": 0.1, "far": 9.0}
+    for turn, field, shown in ((0.0, 60.0, True), (0.0, 2.0, False), (np.pi, 60.0, False)):
+        camera = ARM.flange(SHOWN) @ rigid(rotation_from_rpy(np.pi + turn, 0.0, 0.0), np.zeros(3))
+        camera[:3, 3] -= 0.8 * camera[:3, 2]
+        eye = scanner(**wide, field_of_view=np.radians([field, field]))
+        arm = Reach(MODEL, eye, camera, TORCH)
+        assert arm._clear(SHOWN)
+        assert arm._allowed(SHOWN) is shown
+        assert arm._why_not(SHOWN[None]) == "with too little of the body in view"
+
+
+def test_a_tool_stays_above_the_table() -> None:
+    low = ARM.flange(SHOWN)
+    down = rigid(low[:3, :3] @ rotation_from_rpy(np.pi, 0.0, 0.0), np.array([0.5, 0.1, 0.12]))
+    for tool in (TORCH, 0.05):
+        arm = Reach(MODEL, scanner(near=0.01, far=9.0), OVERHEAD, tool)
+        above = [arm._volume.above(arm._volume.axes(ARM.frames(q)), 0.0) for q in ARM.inverse(down)]
+        assert any(above) is (tool is not TORCH)
+
+
+def test_an_arm_shows_itself_from_the_side_and_not_to_a_camera_that_sees_its_tip_alone() -> None:
+    robot = robot_from_urdf(RECIPES / "boxes-arm.urdf")
+    body, eye = arm_body(robot, {}, Path()), load_model("scanners", "azure-kinect")
+    camera = rigid(rotation_from_rpy(-1.92, 0.0, 1.75), np.array([1.3, 0.3, 0.8]))
+    joints = np.array([1.7, -1.5, 1.6, -1.7, -1.4, 0.4])
+    assert Reach(robot, eye, camera, body)._seen(joints)[1] > 0.9
+    camera[:3, 3] += 1.1 * camera[:3, 2]
+    assert Reach(robot, eye, camera, body)._seen(joints)[1] < 0.6
 
 
 def test_an_arm_that_touches_itself_is_in_its_own_way() -> None:

@@ -18,6 +18,7 @@ from flangeye.files.words import nearest
 from flangeye.maths.geometry import each_applied, invert
 from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import RobotModel
+from flangeye.models.urdf_meshes import fit_capsule
 from flangeye.models.workpiece import MESHES, STEP_SUFFIXES, read_mesh
 from flangeye.types import Floats, Indices
 
@@ -158,6 +159,17 @@ def arm_body(robot: RobotModel | None, links: Mapping[int, str], near: Path) -> 
         links=np.repeat([k for k, _, _ in parts], np.diff(before)),
         arm=Arm(robot),
     )
+
+
+def carrying(robot: RobotModel, body: TargetBody | None) -> RobotModel:
+    """Return an arm with the space of the body on its flange among the space that it fills.
+
+    Raises:
+        StageError: The space of the arm itself is not known.
+    """
+    if body is None or isinstance(body, ArmBody):
+        return robot
+    return robot.carrying(*fit_capsule(body.vertices))
 
 
 def _read(path: Path) -> tuple[Floats, NDArray[np.int32]]:

@@ -15,7 +15,7 @@ from flangeye.errors import RecipeError, StageError
 from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.models.model import Model
 from flangeye.types import Floats, Note
-from flangeye.units import Angle, AngularSpeed, JointPosition, Length, param
+from flangeye.units import SI, Angle, AngularSpeed, JointPosition, Length, param
 
 UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 """Joints of Universal Robots from base to flange, as its ROS driver names them."""
@@ -191,6 +191,19 @@ class RobotModel(Model):
                 f"the space the arm fills is needed to plan its moves: {filled.volumes_missing}"
             )
         return filled.volumes
+
+    def carrying(self, start: Floats, end: Floats, radius: float) -> RobotModel:
+        """Return the arm with a tool in the space it fills: a capsule, (3,) ends in ``flange`` [m].
+
+        Raises:
+            StageError: The space of the arm itself is not known.
+        """
+        placed = np.stack([start, end]) @ self.link_T_flange[:3, :3].T + self.link_T_flange[:3, 3]
+        first, second = (tuple(map(SI, point)) for point in placed)
+        tool = Volume(link=len(self.joints), start=first, end=second, radius=SI(radius))
+        arm = self.model_copy(update={"volumes": (*self.known_volumes(), tool)})
+        arm._bodies = None
+        return arm
 
     @property
     def link_T_flange(self) -> Floats:

@@ -1,11 +1,16 @@
-"""Clearance of an arm from the table, itself, and the scanner's view of the flange."""
+"""Clearance of an arm from the table, itself, and the scanner's view of its target."""
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
+from flangeye.maths.geometry import each_applied, invert
+from flangeye.maths.kinematics import Arm
+from flangeye.models.bodies import ArmBody, TargetBody
 from flangeye.models.robots import RobotModel
-from flangeye.types import Floats
+from flangeye.types import Floats, Indices, Mask
 
 
 class ArmVolume:
@@ -25,6 +30,7 @@ class ArmVolume:
         # Nearer links are joined where they meet
         far = np.abs(self.links[first] - self.links[second]) >= 3
         self._pairs = first[far], second[far]
+        self._before = self.links < len(robot.joints)
 
     def axes(self, frames: Floats) -> Floats:
         """Return the capsules' axes in ``base``, (V, 2, 3), given (n + 1, 4, 4) link frames."""
@@ -44,10 +50,90 @@ class ArmVolume:
         gaps = segment_distance(axes[first], axes[second])
         return bool((gaps > self.radii[first] + self.radii[second]).all())
 
+    def away(self, axes: Floats, segment: Floats, room: float) -> bool:
+        """Return whether the arm keeps ``room`` [m] from a segment (2, 3)."""
+        return bool((segment_distance(axes, segment) > self.radii + room).all())
+
+    def hides(self, axes: Floats, sight: Floats) -> Mask:
+        """Return (S,) which lines of sight (S, 2, 3) a link before the flange's own crosses."""
+        before = self._before
+        gaps = segment_distance(axes[before, None], sight[None])
+        return np.asarray((gaps < self.radii[before, None]).any(axis=0))
+
     def leaves_free(self, axes: Floats, sight: Floats, width: float) -> bool:
-        """Return whether nothing comes within ``width`` [m] of lines of sight (S, 2, 3)."""
-        gaps = segment_distance(axes[:, None], sight[None])
-        return bool((gaps > self.radii[:, None] + width).all())
+        """Return whether no link comes within ``width`` [m] of lines of sight (S, 2, 3).
+
+        The link that the flange is the end of lies behind its face and does not count.
+        """
+        before = self._before
+        gaps = segment_distance(axes[before, None], sight[None])
+        return bool((gaps > self.radii[before, None] + width).all())
+
+
+class BodyView:
+    """What of a body on an arm, or of the arm itself, is seen at its joint angles.
+
+    Attributes:
+        name: Of the body.
+        is_arm: Whether it is the arm itself.
+    """
+
+    def __init__(self, body: TargetBody, arm: Arm) -> None:
+        """Spread points over the body's surface, and prepare what may hide them."""
+        import open3d as o3d
+        import trimesh
+
+        self.name, self.is_arm, self._arm = body.name, isinstance(body, ArmBody), arm
+        parts = body.by_link if isinstance(body, ArmBody) else {arm.n + 1: body}
+        # Points on the whole surface: their share in view is known to a fiftieth
+        number = 600
+        whole = trimesh.Trimesh(body.vertices, body.triangles, process=False)
+        self._points, facets = trimesh.sample.sample_surface(whole, number, seed=0)
+        self._normals = whole.face_normals[facets]
+        of_vertex = (
+            body.links if isinstance(body, ArmBody) else np.full(len(whole.vertices), arm.n + 1)
+        )
+        self._frame: Indices = of_vertex[body.triangles[facets, 0]]
+        self._scenes = dict[int, Any]()
+        for frame, part in parts.items():
+            self._scenes[frame] = scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+            scene.add_triangles(
+                o3d.core.Tensor.from_numpy(np.ascontiguousarray(part.vertices, np.float32)),
+                o3d.core.Tensor.from_numpy(np.ascontiguousarray(part.triangles, np.uint32)),
+            )
+
+    def placed(self, joints: Floats) -> PlacedBody:
+        """Return the body where joint angles (n,) [rad] put it."""
+        frames = self._arm.frames(joints)
+        frames = np.concatenate([frames, self._arm.flange_of(frames)[None]])
+        own = frames[self._frame]
+        turned = (own[:, :3, :3] @ self._normals[:, :, None])[..., 0]
+        return PlacedBody(each_applied(own, self._points), turned, self._scenes, frames)
+
+
+class PlacedBody(NamedTuple):
+    """Points (N, 3) on a body's surface and normals (N, 3) in ``base`` [m], and its parts."""
+
+    points: Floats
+    normals: Floats
+    scenes: dict[int, Any]
+    frames: Floats
+
+    def faces(self, eye: Floats) -> Floats:
+        """Return (N,) the solid angle of each point's surface from an eye (3,); 0 where hidden."""
+        import open3d as o3d
+
+        rays = self.points - eye
+        hidden = np.zeros(len(rays), dtype=bool)
+        for number, scene in self.scenes.items():
+            inverse = invert(self.frames[number])
+            start = np.broadcast_to(each_applied(inverse[None], eye[None]), rays.shape)
+            lines = np.hstack([start, rays @ inverse[:3, :3].T]).astype(np.float32)
+            met = scene.cast_rays(o3d.core.Tensor.from_numpy(lines), nthreads=1)["t_hit"].numpy()
+            # A point's own surface is met at one, as exactly as single precision has it
+            hidden |= met < 1 - 1e-3
+        away = np.linalg.norm(rays, axis=1)
+        return np.where(hidden, 0.0, np.abs(np.einsum("ni,ni->n", self.normals, rays)) / away**3)
 
 
 def segment_distance(first: Floats, second: Floats) -> Floats:

@@ -13,11 +13,12 @@ from flangeye.devices import DeviceError, RobotDriver, RobotState
 from flangeye.errors import FlangeyeError
 from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.maths.kinematics import Arm
+from flangeye.models.bodies import TargetBody, carrying
 from flangeye.models.robots import RobotModel
-from flangeye.models.scanners import ScannerModel
-from flangeye.motion.clearance import ArmVolume
+from flangeye.models.scanners import ScannerModel, middle_of_view
+from flangeye.motion.clearance import ArmVolume, BodyView
 from flangeye.motion.limits import MotionLimits
-from flangeye.types import Floats
+from flangeye.types import Floats, Mask
 
 
 class Margins(NamedTuple):
@@ -47,10 +48,11 @@ class Refusal(NamedTuple):
 
 
 class Reach:
-    """The poses at which an arm can show its flange to a scanner.
+    """The poses at which an arm can show its flange, a body on it, or itself to a scanner.
 
     Attributes:
         arm: Its kinematics.
+        shown: (3,) axis of the flange that faces the scanner: z, or where a body is broadest.
         refusals: The poses that were asked for and are impossible.
         home: (n,) joint angles of the pose that faces the scanner best; see :meth:`facing` [rad].
     """
@@ -60,7 +62,7 @@ class Reach:
         robot: RobotModel,
         scanner: ScannerModel,
         base_T_camera: Floats,
-        radius: float,
+        target: float | TargetBody,
         margins: Margins | None = None,
     ) -> None:
         """Set up.
@@ -69,12 +71,20 @@ class Reach:
             robot: The arm.
             scanner: What looks at it.
             base_T_camera: (4, 4) where that stands.
-            radius: Radius of the disc that has to be in view [m].
+            target: Radius of the disc that has to be in view [m]; or the body, on the flange or the
+                arm itself, of which enough has to be.
             margins: What a real arm has to keep to besides.
+
+        Raises:
+            StageError: What the arm fills is not known, so nothing can be said to be clear of it.
         """
+        body = target if isinstance(target, TargetBody) else None
         self.arm = Arm(robot)
-        self._volume = ArmVolume(robot)
-        self._scanner, self._radius = scanner, radius
+        self._volume = ArmVolume(carrying(robot, body))
+        self._body = None if body is None else BodyView(body, self.arm)
+        self._radius = 0.0 if isinstance(target, TargetBody) else target
+        self.shown = np.array([0.0, 0.0, 1.0])
+        self._scanner = scanner
         self._base_T_camera = base_T_camera
         lean = scanner.convergence
         projector = scanner.baseline * np.array([np.cos(lean), 0.0, np.sin(lean)])
@@ -94,12 +104,13 @@ class Reach:
     def facing(self, centre: Floats) -> Floats | None:
         """Return the rotation (3, 3) of a flange at ``centre`` that faces along the view.
 
-        Its z is against the camera's; about z the flange turns to where the arm moves best, or,
-        where it is known where the arm stands, to the nearest posture in which it moves well. The
-        joints of that pose become the home that later poses stay near to.
+        Its z is against the camera's, or the side of it where the body is seen most; about that
+        axis the flange turns to where the arm moves best, or, where it is known where the arm
+        stands, to the nearest posture in which it moves well. The joints of that pose become the
+        home that later poses stay near to.
         """
         found = [
-            (float(self.arm.manipulability(joints)), pose[:3, :3], joints)
+            (float(self.arm.manipulability(joints)) * self._seen(joints)[0], pose[:3, :3], joints)
             for pose in self._rolls(centre)
             for joints in self._possible(pose)
         ]
@@ -114,7 +125,27 @@ class Reach:
             good = [each for each in found if each[0] >= 0.5 * best]
             chosen = min(good, key=lambda each: _turn(each[2], start))
         self.home = chosen[2]
+        if self._body:
+            self.shown = -chosen[1].T @ self._base_T_camera[:3, 2]
         return chosen[1]
+
+    def middle(self) -> Floats:
+        """Return (3,) the place on the camera's axis to work at, in ``base`` [m].
+
+        At its working distance; of a body, the nearest place to that where it is shown.
+        """
+        scanner, base_T_camera = self._scanner, self._base_T_camera
+        usual = middle_of_view(scanner, base_T_camera)
+        if self._body is None:
+            return usual
+        eye, axis = base_T_camera[:3, 3], base_T_camera[:3, 2]
+        depths = np.arange(scanner.near, scanner.far, 0.1)
+        places = eye + depths[np.argsort(np.abs(depths - axis @ (usual - eye)))][:, None] * axis
+        for place in places:
+            if self.facing(place) is not None:
+                self.refusals.clear()
+                return np.asarray(place)
+        return usual
 
     def start_from(self, joints: Floats) -> None:
         """Prefer IK solutions near (n,) joint angles, the arm's present ones [rad]."""
@@ -125,18 +156,19 @@ class Reach:
         poses = []
         # How many directions of the flange's x axis are tried for the one the arm likes best.
         rolls = 8
-        for step in range(rolls):
-            turn = rotation_from_rpy(np.pi, 0.0, 2 * np.pi * step / rolls)
-            poses.append(rigid(self._base_T_camera[:3, :3] @ turn, centre))
+        for side in _sides() if self._body else [np.eye(3)]:
+            for step in range(rolls):
+                turn = rotation_from_rpy(np.pi, 0.0, 2 * np.pi * step / rolls) @ side
+                poses.append(rigid(self._base_T_camera[:3, :3] @ turn, centre))
         return poses
 
     def joints(self, base_T_flange: Floats) -> Floats | None:
         """Return the joint angles of a pose (4, 4) that are nearest to home; None if unreachable.
 
         None means: out of view or range, out of reach or limits, touching the table or itself, or
-        with a link between scanner and flange.
+        with a link between scanner and target.
         """
-        if not self.in_view(base_T_flange):
+        if self._body is None and not self.in_view(base_T_flange):
             self._refuse(base_T_flange, "out of the scanner's view")
             return None
         reachable = self._unwound(self.arm.inverse(base_T_flange))
@@ -161,15 +193,33 @@ class Reach:
         """Return whether camera and projector see the whole disc, within the scanner's range."""
         angle = 2 * np.pi * np.arange(16) / 16
         rim = self._radius * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
-        in_base = rim @ base_T_flange[:3, :3].T + base_T_flange[:3, 3]
+        return bool(self._inside(rim @ base_T_flange[:3, :3].T + base_T_flange[:3, 3]).all())
+
+    def _inside(self, in_base: Floats) -> Mask:
+        """Return (N,) which points (N, 3) camera and projector have in their fields and range."""
         in_camera = (in_base - self._base_T_camera[:3, 3]) @ self._base_T_camera[:3, :3]
         scanner, depth = self._scanner, in_camera[:, 2]
-        if not ((depth >= scanner.near) & (depth <= scanner.far)).all():
-            return False
         turn = rotation_from_rpy(0.0, -2 * scanner.convergence, 0.0)
         from_projector = (in_base - self._eyes[1]) @ self._base_T_camera[:3, :3] @ turn
-        lit = scanner.projection is None or _within(from_projector, scanner.projection)
-        return lit and _within(in_camera, scanner.field_of_view)
+        inside = _within(in_camera, scanner.field_of_view)
+        inside &= (depth >= scanner.near) & (depth <= scanner.far)
+        if scanner.projection is not None:
+            inside &= _within(from_projector, scanner.projection)
+        return inside
+
+    def _seen(self, joints: Floats) -> tuple[float, float]:
+        """Return the solid angle of a body that is seen, and its share of what faces the camera."""
+        if self._body is None:
+            return 1.0, 1.0
+        body = self._body.placed(joints)
+        faces = body.faces(self._eyes[0])
+        seen = self._inside(body.points) & (body.faces(self._eyes[1]) > 0)
+        if not self._body.is_arm:
+            axes = self._volume.axes(self.arm.frames(joints))
+            for eye in self._eyes:
+                sight = np.stack([np.broadcast_to(eye, body.points.shape), body.points], axis=1)
+                seen &= ~self._volume.hides(axes, sight)
+        return float(faces[seen].sum()), float(faces[seen].sum() / faces.sum())
 
     def _possible(self, base_T_flange: Floats) -> list[Floats]:
         reachable = self._unwound(self.arm.inverse(base_T_flange))
@@ -179,13 +229,16 @@ class Reach:
         return possible
 
     def _allowed(self, joints: Floats) -> bool:
-        return self._clear(joints) and not self._too_near(joints)
+        if not self._clear(joints) or self._too_near(joints):
+            return False
+        # Least share of a body in view: twice what finds it, for what may stand before it
+        return self._seen(joints)[1] >= 0.6
 
     def _why_not(self, reachable: Floats) -> str:
         """Say why none of (K, n) postures is allowed."""
         clear = next((joints for joints in reachable if self._clear(joints)), None)
         if clear is not None:
-            return str(self._too_near(clear))
+            return self._too_near(clear) or "with too little of the body in view"
         return "with the arm in the way" if len(reachable) else "out of the arm's reach"
 
     def _unwound(self, joints: Floats) -> Floats:
@@ -211,16 +264,27 @@ class Reach:
         return "near a singularity" if smallest < singularity else None
 
     def _clear(self, joints: Floats) -> bool:
-        frames, volume = self.arm.frames(joints), self._volume
-        axes = volume.axes(frames)
-        target = self.arm.flange(joints)[:3, 3]
-        sight = np.stack([self._eyes, np.broadcast_to(target, self._eyes.shape)], axis=1)
+        volume = self._volume
+        axes = volume.axes(self.arm.frames(joints))
+        # Half the width of a scanner's housing about the line from camera to projector [m]
+        housing = 0.1
         # The table the arm stands on
-        return (
-            volume.above(axes, 0.0)
-            and volume.apart(axes)
-            and volume.leaves_free(axes, sight, self._radius)
-        )
+        above, apart = volume.above(axes, 0.0), volume.apart(axes)
+        if not (above and apart and volume.away(axes, self._eyes, housing)):
+            return False
+        if self._body:
+            return True
+        towards = self._eyes - self.arm.flange(joints)[:3, 3]
+        # As wide as the flange up to where that width ends at its face
+        away = np.linalg.norm(towards, axis=1, keepdims=True)
+        sight = np.stack([self._eyes, self._eyes - (1 - self._radius / away) * towards], axis=1)
+        return volume.leaves_free(axes, sight, self._radius)
+
+
+def _sides() -> list[Floats]:
+    """Return rotations (3, 3) that take each axis of the flange, either way, to its z."""
+    turns = [(0.0, 0.0), (np.pi, 0.0), *((t, 0.0) for t in (-np.pi / 2, np.pi / 2))]
+    return [rotation_from_rpy(*turn, 0.0) for turn in (*turns, (0.0, np.pi / 2), (0.0, -np.pi / 2))]
 
 
 def _turn(first: Floats, second: Floats) -> float:
@@ -228,12 +292,12 @@ def _turn(first: Floats, second: Floats) -> float:
     return float(np.abs(first - second).max().round(6))
 
 
-def _within(points: Floats, field: tuple[float, float]) -> bool:
-    """Return whether (N, 3) points before a pinhole lie in its field of view, with a margin."""
-    # Share of the field of view, to either side, that a planned flange keeps to
+def _within(points: Floats, field: tuple[float, float]) -> Mask:
+    """Return (N,) which of (N, 3) points before a pinhole lie in its field, with a margin."""
+    # Share of the field of view, to either side, that a planned target keeps to
     view_share = 0.95
     half = np.tan(np.asarray(field) / 2) * view_share
-    return bool((np.abs(points[:, :2]) <= half * points[:, 2:]).all())
+    return np.asarray((np.abs(points[:, :2]) <= half * points[:, 2:]).all(axis=1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,6 +312,7 @@ class Site:
         joints: Gives the joint angles for a flange pose (4, 4), or None where the arm cannot or
             must not go.
         lost: Gives the places, in order of their visit, of the poses that told nothing.
+        shown: Gives the axis (3,) of the flange that faces the scanner where the target does.
     """
 
     centre: Floats
@@ -255,6 +320,7 @@ class Site:
     facing: Callable[[Floats], Floats | None]
     joints: Callable[[Floats], Floats | None]
     lost: Callable[[], Collection[int]] = frozenset
+    shown: Callable[[], Floats] = lambda: np.array([0.0, 0.0, 1.0])
 
 
 class PlannedPose(NamedTuple):

@@ -16,7 +16,7 @@ from flangeye.errors import NothingMoved, StageError
 from flangeye.maths.geometry import invert
 from flangeye.models.bodies import TargetBody
 from flangeye.models.robots import RobotModel
-from flangeye.models.scanners import ScannerModel, middle_of_view
+from flangeye.models.scanners import ScannerModel
 from flangeye.models.targets import Flange, Sphere, plate_of
 from flangeye.motion.reach import Plan, PlannedPose, Reach, Site, poses_near
 from flangeye.plugin.stage import BoundPart, Choose
@@ -100,9 +100,10 @@ def simulate(
     plate = flange if flange.bore else plate_of(robot)
     planning, checking, errors, noise, later = np.random.SeedSequence([VERSION, seed]).spawn(5)
     base_T_camera = params.camera.matrix
-    reach = Reach(robot, scanner, base_T_camera, max(plate.outer, plate.details.wrist / 2))
-    site = _site(reach, scanner, base_T_camera)
-    names = f"{robot.model} can show its flange to {scanner.model}"
+    shown = body or max(plate.outer, plate.details.wrist / 2)
+    reach = Reach(robot, scanner, base_T_camera, shown)
+    site = _site(reach, base_T_camera)
+    names = f"{robot.model} can show {body.name if body else 'its flange'} to {scanner.model}"
     stops = _stops(reach, site, params, (planning, checking), names)
     if motion and motion.plan_only:
         raise _plan_alone(stops, reach, site)
@@ -132,9 +133,9 @@ def _explained(
         yield next(captures)
 
 
-def _site(reach: Reach, scanner: ScannerModel, base_T_camera: Floats) -> Site:
-    centre = middle_of_view(scanner, base_T_camera)
-    return Site(centre, base_T_camera[:3, 3], reach.facing, reach.joints)
+def _site(reach: Reach, base_T_camera: Floats) -> Site:
+    eye = base_T_camera[:3, 3]
+    return Site(reach.middle(), eye, reach.facing, reach.joints, shown=lambda: reach.shown)
 
 
 @dataclass(frozen=True, eq=False)

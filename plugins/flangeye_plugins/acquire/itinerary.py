@@ -11,8 +11,9 @@ import numpy as np
 
 from flangeye.errors import StageError
 from flangeye.maths.geometry import angle_between
+from flangeye.models.bodies import TargetBody, carrying
 from flangeye.models.robots import RobotModel
-from flangeye.models.scanners import ScannerModel, middle_of_view
+from flangeye.models.scanners import ScannerModel
 from flangeye.models.targets import Flange
 from flangeye.motion.reach import Margins, Plan, PlannedPose, Reach, Refusal, Site, poses_near
 from flangeye.motion.route import Barred, Route, Router
@@ -45,14 +46,12 @@ class Itinerary:
         total: How many stops there are at most.
     """
 
-    def __init__(
-        self, reach: Reach, base_T_camera: Floats, scanner: ScannerModel, router: Router
-    ) -> None:
+    def __init__(self, reach: Reach, base_T_camera: Floats, centre: Floats, router: Router) -> None:
         """Take the place; see :func:`itinerary_of`."""
         self.outcomes: Mapping[str, Observation | None] = {}
         self._reach, self._router = reach, router
-        centre = middle_of_view(scanner, base_T_camera)
-        self._site = Site(centre, base_T_camera[:3, 3], reach.facing, reach.joints, self._lost)
+        eye = base_T_camera[:3, 3]
+        self._site = Site(centre, eye, reach.facing, reach.joints, self._lost, lambda: reach.shown)
         self._planned: list[str] = []
         self._checks: list[PlannedPose] = []
         self._plan = Plan([], 0, centre, np.zeros(3))
@@ -162,30 +161,37 @@ class Itinerary:
 def itinerary_of(
     robot: RobotModel,
     scanner: ScannerModel,
-    flange: Flange,
+    target: Flange | TargetBody,
     base_T_camera: Floats,
     margins: Margins,
     start: Floats | None,
 ) -> Itinerary:
     """Return an itinerary without stops, for a scanner that is roughly at ``base_T_camera``.
 
-    It begins at ``start`` (n,), where the arm stands [rad], if that is known.
+    It begins at ``start`` (n,), where the arm stands [rad], if that is known. What the scanner has
+    to see is the arm's flange, or a body.
 
     Raises:
-        StageError: The arm cannot show its flange to the scanner at all.
+        StageError: The arm cannot show it to the scanner at all.
     """
-    radius = max(flange.outer, flange.details.wrist / 2)
-    reach = Reach(robot, scanner, base_T_camera, radius, margins)
+    if isinstance(target, TargetBody):
+        body, what = target, target.name
+        reach = Reach(robot, scanner, base_T_camera, target, margins)
+    else:
+        body, what = None, "its flange"
+        radius = max(target.outer, target.details.wrist / 2)
+        reach = Reach(robot, scanner, base_T_camera, radius, margins)
     if start is not None:
         reach.start_from(start)
-    centre = middle_of_view(scanner, base_T_camera)
+    centre = reach.middle()
     if reach.facing(centre) is None:
         reasons = reach.why_refused() or "no posture is possible"
         raise StageError(
-            f"acquire.live: {robot.model} cannot show its flange to {scanner.model} at "
+            f"acquire.live: {robot.model} cannot show {what} to {scanner.model} at "
             f"{in_mm(centre)} ({reasons}); correct the view, or widen robot.limits"
         )
-    return Itinerary(reach, base_T_camera, scanner, Router(robot, margins.limits, reach.home))
+    router = Router(carrying(robot, body), margins.limits, reach.home)
+    return Itinerary(reach, base_T_camera, centre, router)
 
 
 @dataclass(frozen=True)

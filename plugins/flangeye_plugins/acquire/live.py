@@ -28,6 +28,7 @@ from flangeye.devices import (
 )
 from flangeye.errors import NothingMoved, StageError
 from flangeye.maths.kinematics import Arm
+from flangeye.models.bodies import TargetBody
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
 from flangeye.models.targets import Flange
@@ -120,8 +121,9 @@ def acquire_live(  # noqa: PLR0913  what it asks the runner for
     stage_log: StageLog,
     params: LiveParams,
     resumed: Resumed | None = None,
+    body: TargetBody | None = None,
 ) -> Captures:
-    """Drive an arm through planned poses and scan its flange at each.
+    """Drive an arm through planned poses and scan its flange at each, or the body that it shows.
 
     Every pose and every way is checked before anything moves. The arm is watched by a process of
     its own and stops on any safety fault. While a scan is transferred, logged and fitted, the arm
@@ -139,7 +141,8 @@ def acquire_live(  # noqa: PLR0913  what it asks the runner for
     base_T_camera = params.view(Arm(robot), scanner)
 
     def planned(start: Floats | None) -> Itinerary:
-        itinerary = itinerary_of(robot, scanner, flange, base_T_camera, margins, start)
+        shown = body or flange
+        itinerary = itinerary_of(robot, scanner, shown, base_T_camera, margins, start)
         itinerary.plan(params.poses, params.verification, seed)
         return itinerary
 

@@ -36,7 +36,10 @@ class PlanParams(Params):
         "0.3 rad", ge=0, description="Largest roll, pitch and yaw away from facing the scanner."
     )
     facing: Angle = param(
-        "35 deg", gt=0, description="Largest angle between the flange's normal and the view."
+        "35 deg",
+        gt=0,
+        description="Largest angle between the view and the flange's normal, or where a body is "
+        "the target, the axis of the flange that it is shown along.",
     )
 
 
@@ -76,7 +79,7 @@ def _pose_at(
 ) -> PlannedPose | None:
     for _ in range(25):
         pose = tilted(place, facing, params.tilt, rng)
-        if angle_between(pose[:3, 2], site.eye - place) > params.facing:
+        if angle_between(pose[:3, :3] @ site.shown(), site.eye - place) > params.facing:
             continue
         joints = site.joints(pose)
         if joints is not None:
@@ -148,7 +151,7 @@ class Chooser:
             rigid(rotation_from_rpy(*turn) @ facing, place)
             for turn, place in zip(turns, places, strict=True)
         ])  # fmt: skip
-        off = angle_between(drawn[:, :3, 2], self._site.eye - places)
+        off = angle_between(drawn[:, :3, :3] @ self._site.shown(), self._site.eye - places)
         return np.asarray(drawn[off <= params.facing])
 
     def _expected_errors(self, candidates: Floats) -> Floats:
