@@ -8,6 +8,7 @@ beside it is the same in both, to the first order of its distance.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -120,6 +121,8 @@ class WorkSurface:
         up = uniform_filter1d(_interpolated(ticks, along, openings), width, 0, mode="nearest")
         self._rows: Floats = np.hstack([line, ahead, up])
         self._plain = self._rows.tolist()
+        planar = np.hstack([self.path.points[:, :2], self.path.tangents, self._rows])
+        self._both = planar.tolist()
 
     def line(self, s: Floats) -> tuple[Floats, Floats]:
         """Return points (K, 3) at arc lengths (K,), and axes (K, 3, 3) there, as columns.
@@ -207,17 +210,33 @@ class WorkSurface:
             points: In the plane [m]; beside a seam that goes around it may lie on itself.
             near: (K,) about where beside the seam they are, by arc length [m].
         """
-        s = near
+        pairs = zip(points.tolist(), near.tolist(), strict=True)
+        return np.array([self._unrolled(point, s) for point, s in pairs]).reshape(-1, 3)
+
+    def _unrolled(self, point: list[float], s: float) -> list[float]:
+        px, py, pz = point
         for _ in range(3):
-            there, tangents = self.path.evaluate(s)
-            s = s + np.einsum("ki,ki->k", points[:, :2] - there[:, :2], tangents)
-        there, tangents = self.path.evaluate(s)
-        off = points[:, :2] - there[:, :2]
-        along = np.einsum("ki,ki->k", off, tangents)
-        left = tangents[:, 0] * off[:, 1] - tangents[:, 1] * off[:, 0]
-        here, axes = self.line(s)
-        off = np.stack([along, left, points[:, 2]], axis=1)
-        return np.asarray(here + np.einsum("kij,kj->ki", axes, off))
+            x, y, tx, ty, *_ = self._beside(s)
+            s += (px - x) * tx + (py - y) * ty
+        x, y, tx, ty, beyond, *row = self._beside(s)
+        along, left = (px - x) * tx + (py - y) * ty, tx * (py - y) - ty * (px - x)
+        ahead = _unit(row[3:6])
+        across = _unit(_crossed(row[6:], ahead))
+        axes = zip(row[:3], ahead, across, _crossed(ahead, across), strict=True)
+        return [at + beyond * a + (a * along + up * pz + b * left) for at, a, b, up in axes]
+
+    def _beside(self, s: float) -> tuple[float, ...]:
+        """Return point and tangent in the plane, how far s is beyond an end, and the row (9,)."""
+        path = self.path
+        inside = min(max(s, path.first), path.last)
+        tick = (inside - path.first) / path.step
+        index = min(int(tick), len(self._both) - 2)
+        share, kept = tick - index, 1.0 - (tick - index)
+        here, there = self._both[index], self._both[index + 1]
+        x, y, tx, ty, *row = (kept * a + share * b for a, b in zip(here, there, strict=True))
+        norm, beyond = math.sqrt(tx * tx + ty * ty), s - inside
+        tx, ty = tx / norm, ty / norm
+        return x + beyond * tx, y + beyond * ty, tx, ty, beyond, *row
 
     def bending(self, distance: float) -> float:
         """Return how far a tool leans from the openings at its tip or torch, at most [rad].
@@ -395,6 +414,15 @@ class Tool:
 
 def _cross(first: Floats, second: Floats) -> Floats:
     """Return the cross product of two (3,), several times faster than NumPy's for any shape."""
-    a, b, c = first.tolist()
-    x, y, z = second.tolist()
-    return np.array([b * z - c * y, c * x - a * z, a * y - b * x])
+    return np.array(_crossed(first.tolist(), second.tolist()))
+
+
+def _crossed(first: Sequence[float], second: Sequence[float]) -> tuple[float, float, float]:
+    (a, b, c), (x, y, z) = first, second
+    return b * z - c * y, c * x - a * z, a * y - b * x
+
+
+def _unit(vector: Sequence[float]) -> tuple[float, float, float]:
+    x, y, z = vector
+    norm = math.sqrt(x * x + y * y + z * z)
+    return x / norm, y / norm, z / norm

@@ -64,7 +64,8 @@ class Path:
         self.tangents = slopes[:, :2] / norms
         self._climb = slopes[:, 2]
         self._curvature = self._curvatures()
-        self._rows = np.column_stack([self.points, self.tangents]).tolist()
+        self._places = np.column_stack([self.points, self.tangents])
+        self._rows = self._places.tolist()
         self._last = len(self._rows) - 2
 
     @property
@@ -106,13 +107,14 @@ class Path:
 
     def evaluate(self, s: Floats) -> tuple[Floats, Floats]:
         """Return points (K, 3) and unit tangents (K, 2) at arc lengths (K,)."""
-        inside = np.clip(s, self.first, self.last)
+        # Called several times a cycle: NumPy's clip is ten times slower than these.
+        inside = np.minimum(np.maximum(s, self.first), self.last)
         ticks = (inside - self.first) / self.step
-        index = np.minimum(ticks.astype(int), len(self.points) - 2)
+        index = np.minimum(ticks.astype(int), self._last)
         share = (ticks - index)[:, None]
-        tangent = (1 - share) * self.tangents[index] + share * self.tangents[index + 1]
+        row = (1.0 - share) * self._places[index] + share * self._places[index + 1]
+        point, tangent = row[:, :3], row[:, 3:]
         tangent /= np.sqrt(np.einsum("ki,ki->k", tangent, tangent))[:, None]
-        point = (1 - share) * self.points[index] + share * self.points[index + 1]
         point[:, :2] += (s - inside)[:, None] * tangent
         return point, tangent
 

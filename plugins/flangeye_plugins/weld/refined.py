@@ -14,6 +14,7 @@ import math
 from collections import deque
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flangeye.types import Floats
 from flangeye_plugins.weld.path import PATH_SPACING, Path
@@ -51,6 +52,15 @@ class _Field:
         return np.asarray(
             np.exp(-rd)[..., None, None] * np.moveaxis(np.array(rows), (0, 1), (2, 3))
         )
+
+    def offsets_over(self, way: Floats) -> Floats:
+        """Return the first rows (K, M, 3) of the transitions: what becomes the offset."""
+        d = way[:, None]
+        rd = self.rate * d
+        row = np.empty((3, *rd.shape))
+        row[0], row[1], row[2] = 1 + rd + rd**2 / 2, d * (1 + rd), d**2 / 2
+        row *= np.exp(-rd)
+        return row.transpose(1, 2, 0)
 
 
 class RefinedPath:
@@ -219,14 +229,24 @@ class RefinedPath:
 
     def variance(self, s: float) -> float:
         """Return the variance of the seam's offset at an arc length [m^2]: fields and doubt."""
+        return self.expected(s)[1]
+
+    def expected(self, s: float) -> tuple[float, float]:
+        """Return the seam's offset from the plan at an arc length [m], and its variance [m^2]."""
         if self.empty:
-            return float(PRIOR[0] ** 2)
-        means, variances = self._expected(np.array([s]))
-        weights = np.exp(self._likely)
-        middle = weights @ means[:, 0]
-        spread = np.maximum(self._excess, 1.0) * variances[:, 0] + (means[:, 0] - middle) ** 2
+            return 0.0, float(PRIOR[0] ** 2)
+        at = np.array([s])
+        means, variances, weights = self._expected(at)[:, 0], self._spread(at)[:, 0], self._weights
+        middle = weights @ means
+        spread = np.maximum(self._excess, 1.0) * variances + (means - middle) ** 2
         index, near = self._index(s), round(4e-3 / PATH_SPACING)
-        return float(weights @ spread + self._doubts[max(index - near, 0) : index + near + 1].max())
+        doubt = self._doubts[max(index - near, 0) : index + near + 1].max()
+        return float(middle), float(weights @ spread + doubt)
+
+    @property
+    def _weights(self) -> Floats:
+        """Return how likely each field is (M,)."""
+        return np.asarray(np.exp(self._likely))
 
     def worst(self, first: float, last: float) -> tuple[float, float]:
         """Return the least certain arc length between two, and the variance there.
@@ -259,31 +279,41 @@ class RefinedPath:
         """Return offsets (K,) at arc lengths."""
         if self.empty:
             return np.zeros(len(s))
-        return np.asarray(np.exp(self._likely) @ self._expected(s)[0])
+        return np.asarray(self._weights @ self._expected(s))
 
-    def _expected(self, s: Floats) -> tuple[Floats, Floats]:
-        """Return each field's offsets and variances (M, K) at arc lengths, behind and ahead."""
-        first = (s - self._start) / PATH_SPACING - 0.5
-        below = np.clip(first.astype(int), 0, max(self._next - 2, 0))
-        share = np.clip(first - below, 0.0, 1.0)
-        means = (1 - share) * self._means[:, below] + share * self._means[:, below + 1]
-        variances = (1 - share) * self._vars[:, below] + share * self._vars[:, below + 1]
-        ahead = np.flatnonzero(first > self._next - 1)
+    def _expected(self, s: Floats) -> Floats:
+        """Return each field's offsets (M, K) at arc lengths, behind and ahead."""
+        means, ahead = self._between(self._means, s)
         if len(ahead):
-            means[:, ahead], variances[:, ahead] = self._ahead(s[ahead])
-        return means, variances
+            rows = self._ahead(s[ahead])
+            means[:, ahead] = np.einsum("kmi,mi->mk", rows, self._state)
+        return means
 
-    def _ahead(self, s: Floats) -> tuple[Floats, Floats]:
-        """Return each field's offsets and variances (M, K) where the tip has not been."""
-        over = self._field.over(np.maximum(s - self._at, 0.0))  # (K, M, 3, 3)
-        rows = np.zeros((*over.shape[:2], 6))
-        rows[..., :3], rows[..., 3:] = self._rows(s)[:, None, :], over[:, :, 0]
-        known = np.einsum("kmi,mij,kmj->mk", rows, self._covariance, rows)
-        field = self._field.stationary
-        lost = field[:, 0, 0, None] - np.einsum(
-            "kmi,mij,kmj->mk", over[:, :, 0], field, over[:, :, 0]
-        )
-        return np.einsum("kmi,mi->mk", rows, self._state), known + np.maximum(lost, 0.0)
+    def _spread(self, s: Floats) -> Floats:
+        """Return each field's variances (M, K) at arc lengths, behind and ahead."""
+        variances, ahead = self._between(self._vars, s)
+        if len(ahead):
+            rows, field = self._ahead(s[ahead]), self._field.stationary
+            known = np.einsum("kmi,mij,kmj->mk", rows, self._covariance, rows)
+            over = rows[..., 3:]
+            lost = field[:, 0, 0, None] - np.einsum("kmi,mij,kmj->mk", over, field, over)
+            variances[:, ahead] = known + np.maximum(lost, 0.0)
+        return variances
+
+    def _between(self, kept: Floats, s: Floats) -> tuple[Floats, NDArray[np.intp]]:
+        """Return (M, K) of what is kept for places (M, N), and which s the tip has not passed."""
+        first = (s - self._start) / PATH_SPACING - 0.5
+        below = np.minimum(np.maximum(first.astype(int), 0), max(self._next - 2, 0))
+        share = np.minimum(np.maximum(first - below, 0.0), 1.0)
+        between = (1 - share) * kept[:, below] + share * kept[:, below + 1]
+        return between, (first > self._next - 1).nonzero()[0]
+
+    def _ahead(self, s: Floats) -> Floats:
+        """Return by what the state tells the offset where the tip has not been (K, M, 6)."""
+        over = self._field.offsets_over(np.maximum(s - self._at, 0.0))
+        rows = np.empty((*over.shape[:2], 6))
+        rows[..., :3], rows[..., 3:] = self._rows(s)[:, None, :], over
+        return rows
 
     def _row(self, s: float) -> Floats:
         return np.concatenate([self._rows(np.array([s]))[0], [1.0, 0.0, 0.0]])
@@ -292,8 +322,10 @@ class RefinedPath:
         """Return (K, 3): how a shift and a small turn of the plan move it along its normals."""
         points, tangents = self._plan.evaluate(s)
         levers = points[:, :2] - self._plan.points[0, :2]
-        nx, ny = -tangents[:, 1], tangents[:, 0]
-        return np.column_stack([nx, ny, ny * levers[:, 0] - nx * levers[:, 1]])
+        out = np.empty((len(s), 3))
+        out[:, 0], out[:, 1] = -tangents[:, 1], tangents[:, 0]
+        out[:, 2] = out[:, 1] * levers[:, 0] - out[:, 0] * levers[:, 1]
+        return out
 
     def _index(self, s: float) -> int:
         return min(max(int((s - self._start) / PATH_SPACING), 0), len(self._places) - 1)

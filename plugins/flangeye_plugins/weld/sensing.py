@@ -347,9 +347,10 @@ class SeamEstimate:
             side: Of the wall that is pressed.
         """
         s, seam = found.s, found.seam
-        aside = seam.offset - self.refined.offset(s)
+        offset, variance = self.refined.expected(s)
+        aside = seam.offset - offset
         # What play does is in the path already, which the touches before this one have told.
-        spread = self.refined.variance(s) + (learned.noise / (1.0 + learned.gain)) ** 2 + STEADY**2
+        spread = variance + (learned.noise / (1.0 + learned.gain)) ** 2 + STEADY**2
         expected = time, s, seam.offset, found.angle, aside, spread, seam.height
         self.contact.take(Felt(*expected, found.deflection, found.compression), side)
         self._pressed.append(found.compression)
