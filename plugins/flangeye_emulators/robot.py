@@ -76,12 +76,13 @@ class SimulatedRobot(Device):
         bench.enter(self)
         self._mover = Mover(self.arm)
         self._stopped_by = ""
+        self._reported: tuple[Floats, Transform] | None = None
 
     def state(self) -> RobotState:
         """Return the arm's state in this cycle; time counts from zero."""
         self._looked = self.cycles
         return RobotState(
-            base_T_flange=Transform(BASE, FLANGE, self.arm.stance.base_T_tcp),
+            base_T_flange=self._flange(),
             joints=self.arm.stance.joints,
             joint_speeds=self.arm.speeds,
             time_ns=round(self.cycles * self.period * 1e9),
@@ -89,6 +90,13 @@ class SimulatedRobot(Device):
             force=self.arm.felt,
             message=self._stopped_by,
         )
+
+    def _flange(self) -> Transform:
+        """Return where the flange is; it is asked for several times in a cycle."""
+        matrix = self.arm.stance.base_T_tcp
+        if self._reported is None or self._reported[0] is not matrix:
+            self._reported = matrix, Transform(BASE, FLANGE, matrix)
+        return self._reported[1]
 
     def true_flange(self) -> Floats:
         """Return the flange's true pose (4, 4). For the simulation; stages must not use it."""

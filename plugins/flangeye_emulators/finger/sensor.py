@@ -106,8 +106,8 @@ class SimulatedFinger(Device):
         age = (state.time_ns - self._started) * 1e-9
         if self._params.fails is not None and age >= self._params.fails:
             raise DeviceError(f"{self.name}: the camera is lost")
-        pose = self.tool.pose(bench.true_flange(state), now)
-        shown = self._shown(pose, bench.true_flange(state))
+        flange = bench.true_flange(state)
+        shown = self._shown(self.tool.pose(flange, now), flange)
         self._torch.append((now, *self._beside_plan()))
         if self._shutter.due(age):
             # A tag that something covers: it is as if it were far out of the image.
