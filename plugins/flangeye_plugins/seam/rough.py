@@ -121,16 +121,18 @@ def _places(
 ) -> Iterator[JointPlace]:
     """Yield where in a slab the lines fit the joint's half-planes."""
     present = [k for k in range(4) if joint.present[k]]
-    for first, second in product(lines, lines):
-        faces = {0: first, 2: second}
-        choices = [
-            [faces[k]]
-            if k in FACES
-            else lines + (_ends(faces[k - 1], k == 1) if k in joint.unseen else [])
-            for k in present
-        ]
-        if not _agree(joint, [0, 2], [first, second]):
+    beside = {
+        k: [_ends(line, k == 1) if k in joint.unseen else [] for line in lines]
+        for k in EDGES
+        if k in present
+    }
+    for i, j in product(range(len(lines)), repeat=2):
+        faces = {0: i, 2: j}
+        if not _agree(joint, [0, 2], [lines[i], lines[j]]):
             continue
+        choices = [
+            [lines[faces[k]]] if k in FACES else lines + beside[k][faces[k - 1]] for k in present
+        ]
         for chosen in product(*choices):
             if _agree(joint, present, chosen):
                 place = _placed(s, q, joint, present, chosen, tolerance)
@@ -182,7 +184,9 @@ def _placed(
 def turn(q: Floats, roll: Floats | float) -> Floats:
     """Return (N, 2) section points in axes that are rolled (N,) from theirs: z towards y."""
     c, s = np.cos(roll), np.sin(roll)
-    return np.stack([c * q[:, 0] - s * q[:, 1], s * q[:, 0] + c * q[:, 1]], axis=1)
+    out = np.empty((len(q), 2))
+    out[:, 0], out[:, 1] = c * q[:, 0] - s * q[:, 1], s * q[:, 0] + c * q[:, 1]
+    return out
 
 
 def explained(section: Section, q: Floats, tolerance: float) -> float | None:
@@ -417,6 +421,8 @@ def course(line: Floats, eyes: Floats, closed: bool, beyond: float) -> Course:
 
 def _sight(points: Floats, eyes: Floats) -> Floats:
     """Return (N, 3) from points to the nearest of the eyes [m]."""
+    if len(eyes) == 1:
+        return eyes - points
     nearest = np.linalg.norm(eyes - points[:, None], axis=2).argmin(axis=1)
     return np.asarray(eyes[nearest] - points)
 

@@ -138,7 +138,8 @@ class Section:
         """Return the (N,) signed distances of points (N, 2), and the half-planes they are from."""
         away = q @ np.nan_to_num(self.normals).T - self.heights
         away[:, ~self.joint.present] = -np.inf
-        rows = np.arange(len(q))
-        left, right = away[:, :2].argmax(axis=1), 2 + away[:, 2:].argmax(axis=1)
-        active = np.where(away[rows, left] <= away[rows, right], left, right)
-        return away[rows, active], active
+        first, second, third, fourth = away.T
+        left, right = np.maximum(first, second), np.maximum(third, fourth)
+        on_left = left <= right
+        active = np.where(on_left, second > first, 2 + (fourth > third))
+        return np.where(on_left, left, right), active

@@ -24,15 +24,16 @@ class Plate:
 
     def meet(self, origins, directions):
         """Return how far along each ray the body is entered, and the normal there."""
-        rate = directions @ self.normals.T
-        away = self.offsets - origins @ self.normals.T
+        # A row for each face: along a column of few numbers NumPy is ten times slower.
+        rate = np.ascontiguousarray((directions @ self.normals.T).T)
+        away = np.ascontiguousarray((self.offsets - np.atleast_2d(origins) @ self.normals.T).T)
         with np.errstate(divide="ignore", invalid="ignore"):
             at = away / rate
         enter = np.where(rate < 0, at, -np.inf)
         leave = np.where(rate > 0, at, np.inf)
-        outside = ((rate == 0) & (away < 0)).any(axis=1)
-        first, face = enter.max(axis=1), enter.argmax(axis=1)
-        hit = (first < leave.min(axis=1)) & (first > 1e-6) & ~outside
+        outside = ((rate == 0) & (away < 0)).any(axis=0)
+        first, face = enter.max(axis=0), enter.argmax(axis=0)
+        hit = (first < leave.min(axis=0)) & (first > 1e-6) & ~outside
         return np.where(hit, first, np.inf), self.normals[face]
 
     def moved(self, pose):

@@ -1,6 +1,7 @@
 """seam.cad: accuracy against the truth, robustness, refusals."""
 
 import re
+from dataclasses import astuple
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -16,11 +17,28 @@ from flangeye.models.workpiece import load_workpiece
 from flangeye.types import CAMERA, Box, PointCloud, WorkpieceScan
 from flangeye_emulators.scan import SimulatedScanParams
 from flangeye_plugins.seam.cad import CadParams, seam_cad
+from flangeye_plugins.seam.register import Registered, register
 from tests.plugins.seam.scenes import BASE_T_CAMERA, hand_eye, scanned, write_plate
 from tools.workpieces import PLATES, samples
 
 MM = 1e-3
 PHOXI = load_model("scanners", "phoxi-m")
+FOUND: dict[Any, Registered] = {}
+
+
+@pytest.fixture(autouse=True)
+def registered_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Register equal scans to equal parts once: half of these tests are about what comes after."""
+
+    def registered(points, workpiece, seam, limits):
+        arrays = points, workpiece.vertices, workpiece.triangles, seam.points, seam.openings
+        key = *(array.tobytes() for array in arrays), seam.half_width, astuple(limits)
+        if key not in FOUND:
+            FOUND[key] = register(points, workpiece, seam, limits)
+        return FOUND[key]
+
+    monkeypatch.setattr("flangeye_plugins.seam.cad.register", registered)
+
 
 
 @lru_cache

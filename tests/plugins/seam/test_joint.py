@@ -1,6 +1,7 @@
 """seam.joint: six joints in scans of a ray caster of its own, against the truth, and its refusals."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -47,10 +48,15 @@ def test_fifty_scans_of_a_joint(joint: str) -> None:
     assert not any(f["wrong"] for f in good)
 
 
+@cache
+def plain_plate():
+    plate = [prism([(-60 * MM, -10 * MM), (60 * MM, -10 * MM), (60 * MM, 0), (-60 * MM, 0)])]
+    return scan_of("plate", 1, plates=(plate, (-60 * MM, 60 * MM)))
+
+
 @pytest.mark.parametrize("joint", JOINTS)
 def test_a_plain_plate_is_no_joint(joint: str) -> None:
-    plate = [prism([(-60 * MM, -10 * MM), (60 * MM, -10 * MM), (60 * MM, 0), (-60 * MM, 0)])]
-    scan = scan_of("plate", 1, plates=(plate, (-60 * MM, 60 * MM)))
+    scan = plain_plate()
     with pytest.raises(
         CalibrationRefused, match=f"no {joint} joint|is known to|no gap is seen|no joint is seen"
     ):
