@@ -115,7 +115,7 @@ def test_a_ring_of_imports_ends(tmp_path):
     ("module", "room"),
     [
         ("flangeye.log.read", "flangeye.log"),
-        ("flangeye_plugins.weld.follower", "flangeye_plugins.weld"),
+        ("flangeye_plugins.weld.following.follower", "flangeye_plugins.weld"),
         ("flangeye_paper.fig9", "flangeye_paper"),
     ],
 )

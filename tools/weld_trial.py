@@ -12,7 +12,7 @@ from flangeye.types import Floats
 from flangeye_emulators.finger.profiler import LookBehind
 from flangeye_emulators.weld_world.truth import LookTruth, WeldTruth
 from flangeye_emulators.weld_world.world import ArmResponse, Nominal, Shutter, WeldWorld
-from flangeye_plugins.weld.follower import Follower
+from flangeye_plugins.weld.following.follower import Follower
 
 
 class Row(NamedTuple):

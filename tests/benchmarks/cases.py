@@ -302,11 +302,11 @@ def finger() -> tuple[Work, Work]:
 def cycle() -> tuple[Work, Work]:
     """A cycle of the weld's controller with a new touch in it, the dearest one; 2 ms are allowed."""
     from flangeye.motion.seam_following import ToolPose, Touch
-    from flangeye_plugins.weld.belief import Belief, Learned
-    from flangeye_plugins.weld.follower import Follower
+    from flangeye_plugins.weld.following.belief import Belief, Learned
+    from flangeye_plugins.weld.following.follower import Follower
+    from flangeye_plugins.weld.following.task import WeldTask
     from flangeye_plugins.weld.path import Path as Plan
     from flangeye_plugins.weld.settings import Following
-    from flangeye_plugins.weld.task import WeldTask
 
     x = np.linspace(0.0, 2.0, 2000)
     plan = Plan(np.column_stack([x, 0.02 * np.sin(x / 0.1), 0.0 * x]))

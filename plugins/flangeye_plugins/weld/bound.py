@@ -16,11 +16,11 @@ import numpy as np
 
 from flangeye.errors import StageError
 from flangeye.types import Floats
-from flangeye_plugins.weld.belief import Belief
+from flangeye_plugins.weld.following.belief import Belief
+from flangeye_plugins.weld.following.probing import PIVOTED, SOFTER
+from flangeye_plugins.weld.following.steering import Weave
 from flangeye_plugins.weld.path import Path
-from flangeye_plugins.weld.probing import PIVOTED, SOFTER
 from flangeye_plugins.weld.settings import Following
-from flangeye_plugins.weld.steering import Weave
 
 REMEDIES = {
     "fixed": ("torch_sigma, arm_sigma and distortion", "calibrate the tool, or 'look' behind it"),
@@ -107,23 +107,13 @@ def _stances(plan: Path, s: Floats, distance: float, aside: float) -> tuple[Floa
     torch is on the plan, the undeformed tip ``aside`` to the left of it [m].
     """
     here, tangents = plan.evaluate(s)
-    there, along = _other_end(plan, s, distance)
+    there, along = plan.evaluate(plan.other_end(s, distance))
     pressed = aside * np.stack([-along[:, 1], along[:, 0]], axis=1)
     now = (there - here)[:, :2] + pressed
-    then = (here - _other_end(plan, s, -distance)[0])[:, :2] + pressed
+    behind, _ = plan.evaluate(plan.other_end(s, -distance))
+    then = (here - behind)[:, :2] + pressed
     now, then = (tool / np.linalg.norm(tool, axis=1, keepdims=True) for tool in (now, then))
     sine = tangents[:, 0] * now[:, 1] - tangents[:, 1] * now[:, 0]
     turned = np.linalg.norm(now - then, axis=1)
     # Until the torch is on the seam the tool stands as it was set down, not along the plan.
     return sine, np.where(s < distance, 0.0, turned)
-
-
-def _other_end(plan: Path, s: Floats, distance: float) -> tuple[Floats, Floats]:
-    """Return where the plan is a tool's length ahead or behind (K, 3), and its tangents there."""
-    here, _ = plan.evaluate(s)
-    other = s + distance
-    for _ in range(20):
-        there, _ = plan.evaluate(other)
-        away = np.linalg.norm((there - here)[:, :2], axis=1)
-        other = other + np.sign(distance) * (abs(distance) - away)
-    return plan.evaluate(other)

@@ -11,12 +11,12 @@ from flangeye.models.finger import Finger
 from flangeye.motion.limits import MotionLimits
 from flangeye.plugin.stage import BoundPart
 from flangeye.types import Floats, Seam
-from flangeye_plugins.weld.belief import Belief
+from flangeye_plugins.weld.following.belief import Belief
+from flangeye_plugins.weld.following.steering import Steering, Weave
 from flangeye_plugins.weld.frame import LeaningTool, WorkSurface
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.reachability import flange_speed
 from flangeye_plugins.weld.settings import Following, Mode
-from flangeye_plugins.weld.steering import Steering, Weave
 from flangeye_plugins.weld.touch.tag_observation import TagDetector
 
 SEATING = 1.4
@@ -174,20 +174,10 @@ def tool_angles(plan: Path, distance: float) -> Floats:
     """Return the tool's angles to the seam at the torch [rad], with tip and torch on the plan."""
     ahead = np.arange(distance, plan.length + distance, 1e-3)
     tips, _ = plan.evaluate(ahead)
-    behind = np.array([_chord_end(plan, float(s), distance) for s in ahead])
-    torches, tangents = plan.evaluate(behind)
+    torches, tangents = plan.evaluate(plan.other_end(ahead, -distance))
     tool = (tips - torches)[:, :2]
     across = tangents[:, 0] * tool[:, 1] - tangents[:, 1] * tool[:, 0]
     return np.asarray(np.arctan2(across, np.einsum("ki,ki->k", tangents, tool)))
-
-
-def _chord_end(plan: Path, s: float, distance: float) -> float:
-    """Return where behind ``s`` the plan is first ``distance`` away from its point there."""
-    tip = plan.at(s).point
-    back = np.arange(s, s - 3 * distance, -0.5e-3)
-    away = np.linalg.norm(plan.evaluate(back)[0][:, :2] - tip, axis=1)
-    far = np.flatnonzero(away >= distance)
-    return float(back[far[0]] if len(far) else back[-1])
 
 
 def check_speeds(finger: Finger, settings: Following, limits: MotionLimits) -> None:

@@ -19,11 +19,11 @@ from flangeye.motion.executor import Executor
 from flangeye.motion.seam_following import Command, Controller, ToolPose, Touch
 from flangeye.types import Floats
 from flangeye_plugins.weld.finger_camera import FingerCameraReader
-from flangeye_plugins.weld.follower import Follower
+from flangeye_plugins.weld.following.follower import Follower
+from flangeye_plugins.weld.following.search import UNTOUCHED
 from flangeye_plugins.weld.frame import Tool
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.reachability import SeamReach
-from flangeye_plugins.weld.search import UNTOUCHED
 from flangeye_plugins.weld.settings import Following, Mode
 from flangeye_plugins.weld.touch.tip_displacement import TipDisplacement
 from flangeye_plugins.weld.weld_log import Cycle, WeldLog

@@ -16,11 +16,10 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from flangeye.maths.geometry import arc_lengths, rigid, rotation_from_rpy
-from flangeye.models.finger import Finger, FingerGeometry
+from flangeye.models.finger import FingerGeometry
 from flangeye.motion.seam_following import Command, ToolPose
 from flangeye.types import BASE, FLANGE, Floats, Transform
 from flangeye_plugins.weld.path import CHORD, Path, Place
-from flangeye_plugins.weld.settings import Following
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,12 +48,6 @@ def leaning(work: float, travel: float) -> Floats:
         travel: Its upper end leans forwards by this [rad].
     """
     return np.asarray(rotation_from_rpy(work, 0.0, 0.0) @ rotation_from_rpy(0.0, travel, 0.0))
-
-
-def body_of(finger: Finger, settings: Following) -> LeaningTool:
-    """Return the finger's tool in its orientation along the seam."""
-    work = settings.sign * settings.work_angle
-    return body_from(finger.torch_from_tip, work, settings.travel_angle)
 
 
 def body_from(torch: Floats, work: float, travel: float) -> LeaningTool:

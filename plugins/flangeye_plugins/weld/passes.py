@@ -26,14 +26,14 @@ from flangeye.motion.seam_following import (
     Touch,
 )
 from flangeye.types import Floats
-from flangeye_plugins.weld.belief import BAND
-from flangeye_plugins.weld.follower import Follower
+from flangeye_plugins.weld.following.belief import BAND
+from flangeye_plugins.weld.following.follower import Follower
+from flangeye_plugins.weld.following.response import Response
+from flangeye_plugins.weld.following.steering import Striking, Weave, WeaveOffset
+from flangeye_plugins.weld.following.task import ResumePoint
+from flangeye_plugins.weld.following.tip import within
 from flangeye_plugins.weld.path import PATH_SPACING, Path, Place
-from flangeye_plugins.weld.response import Response
 from flangeye_plugins.weld.settings import PassParams
-from flangeye_plugins.weld.steering import Striking, Weave, WeaveOffset
-from flangeye_plugins.weld.task import ResumePoint
-from flangeye_plugins.weld.tip import within
 
 GAIN = 2.0
 """How fast a pass takes back an error of place or heading [1/s]."""

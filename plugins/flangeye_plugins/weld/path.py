@@ -118,6 +118,20 @@ class Path:
         point[:, :2] += (s - inside)[:, None] * tangent
         return point, tangent
 
+    def other_end(self, s: Floats, distance: float) -> Floats:
+        """Return arc lengths (K,) of a tool's other end, with one at (K,) and both on the curve.
+
+        The tip is ahead of the torch by a distance, the torch ahead of the tip by its negative.
+        """
+        here, _ = self.evaluate(s)
+        other = s + distance
+        # Each round halves what is missing where the tool stands at 60 degrees to the curve.
+        for _ in range(20):
+            there, _ = self.evaluate(other)
+            away = np.linalg.norm((there - here)[:, :2], axis=1)
+            other = other + np.sign(distance) * (abs(distance) - away)
+        return other
+
     def climb(self, s: float) -> float:
         """Return the slope of the height along the path, zero beyond its ends."""
         return float(self._climb[self._tick(s)]) if self.first <= s <= self.last else 0.0

@@ -18,7 +18,7 @@ from flangeye.errors import StageError
 from flangeye.files.regular import write_whole
 from flangeye.models.model import Model, read_model
 from flangeye.units import Duration, Length, param
-from flangeye_plugins.weld.belief import Belief, Learned
+from flangeye_plugins.weld.following.belief import Belief, Learned
 
 
 class WeldPrior(Model):

@@ -16,10 +16,10 @@ from flangeye.motion.clearance import ArmVolume
 from flangeye.motion.limits import MotionLimits
 from flangeye.motion.route import LARGEST_TURN, TABLE, Barred, Route, Router
 from flangeye.types import Floats, Transform
+from flangeye_plugins.weld.following.task import Start
 from flangeye_plugins.weld.frame import Tool
 from flangeye_plugins.weld.path import Path, Place
 from flangeye_plugins.weld.settings import Following, WeldTactileParams
-from flangeye_plugins.weld.task import Start
 
 ROOM = np.radians(2.0)
 """The joints keep this far away from their limits along the seam [rad]."""

@@ -6,7 +6,6 @@ far as the log goes, so nothing has to be saved when a weld is stopped, not even
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path as FilePath
@@ -21,13 +20,13 @@ from flangeye.motion.seam_following import Command, Controller, FollowingTask, T
 from flangeye.plugin.registry import Lookup, load_registry
 from flangeye.plugin.stage import BoundPart
 from flangeye.types import Floats
-from flangeye_plugins.weld.belief import Belief, Learned
-from flangeye_plugins.weld.follower import Follower
+from flangeye_plugins.weld.following.belief import Belief, Learned
+from flangeye_plugins.weld.following.follower import Follower
+from flangeye_plugins.weld.following.steering import SETTLING
+from flangeye_plugins.weld.following.task import ResumePoint, Start, WeldTask
 from flangeye_plugins.weld.passes import Passes, follower_of
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following, Mode, WeldTactileParams
-from flangeye_plugins.weld.steering import SETTLING
-from flangeye_plugins.weld.task import ResumePoint, Start, WeldTask
 from flangeye_plugins.weld.weld_log import LoggedLooks
 
 RUN_IN = 2 * SETTLING
@@ -216,11 +215,5 @@ def _standing(plan: Path, distance: float, arc_from: float, tip: float) -> Start
 
 
 def _away(plan: Path, s: float, distance: float) -> float:
-    """Return where the tool's other end is with one at an arc length and both on the plan.
-
-    The tip is ahead of the torch by a distance, the torch ahead of the tip by its negative.
-    """
-    point, other = plan.at(s).point, s + distance
-    while float(np.hypot(*(plan.at(other).point - point))) < abs(distance):
-        other += math.copysign(0.5e-3, distance)
-    return other
+    """Return where the tool's other end is; see :meth:`Path.other_end`."""
+    return float(plan.other_end(np.array([s]), distance)[0])

@@ -28,14 +28,15 @@ from flangeye.types import (
     WeldReport,
 )
 from flangeye_plugins.weld import checks
-from flangeye_plugins.weld.belief import Belief, belief_of
 from flangeye_plugins.weld.bound import check_bound
 from flangeye_plugins.weld.camera_process import CameraProcess
 from flangeye_plugins.weld.corners import leg_of
 from flangeye_plugins.weld.execution import Bounds, WeldCell, approach, follow
 from flangeye_plugins.weld.finger_camera import CameraJob, FingerCameraReader, SteppedReader
-from flangeye_plugins.weld.follower import Follower
-from flangeye_plugins.weld.frame import LeaningTool, Tool, WorkSurface, body_of
+from flangeye_plugins.weld.following.belief import Belief, belief_of, body_of
+from flangeye_plugins.weld.following.follower import Follower
+from flangeye_plugins.weld.following.task import ResumePoint, Start
+from flangeye_plugins.weld.frame import LeaningTool, Tool, WorkSurface
 from flangeye_plugins.weld.passes import follower_of
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.prior import keep_posterior, with_prior
@@ -43,7 +44,6 @@ from flangeye_plugins.weld.reachability import SeamReach, Task
 from flangeye_plugins.weld.report import report_of
 from flangeye_plugins.weld.resuming import controller_of, kept_value, resume_point_of, set_back
 from flangeye_plugins.weld.settings import Following, WeldTactileParams
-from flangeye_plugins.weld.task import ResumePoint, Start
 from flangeye_plugins.weld.weld_log import WeldLog
 
 

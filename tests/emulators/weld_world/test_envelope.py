@@ -8,7 +8,7 @@ import pytest
 
 from flangeye.errors import StageError
 from flangeye_emulators.weld_world.truth import ArmTruth, ToolTruth, WeldTruth, WorkpieceTruth
-from flangeye_plugins.weld.follower import Follower
+from flangeye_plugins.weld.following.follower import Follower
 from tools import weld_trial as trials
 from tools.weld_bench import could_be_welded, try_condition
 from tools.weld_conditions import CONDITIONS, Condition
@@ -168,7 +168,7 @@ def test_nothing_of_the_world_is_reachable_from_the_controller(
     found = try_condition(Condition(), 0, SHORT, 16e-3)
     ours = [*_reachable(found.controller), *_reachable(given[-200:])]
     modules = {type(each).__module__ for each in ours}
-    assert "flangeye_plugins.weld.refined" in modules  # the walk goes somewhere
+    assert "flangeye_plugins.weld.following.refined" in modules  # the walk goes somewhere
     assert not [name for name in modules if name.startswith("flangeye_emulators")]
 
 

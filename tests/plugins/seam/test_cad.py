@@ -40,7 +40,6 @@ def registered_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("flangeye_plugins.seam.cad.register", registered)
 
 
-
 @lru_cache
 def plain(workpiece="v-straight"):
     """Return the planned seam of the plain scene, made once."""

@@ -6,11 +6,11 @@ import numpy as np
 
 from flangeye.motion.seam_following import ToolPose, Touch, turned
 from flangeye_emulators.weld_world.groove import Groove, GrooveSection, Tip, TipContact
-from flangeye_plugins.weld.belief import Belief
-from flangeye_plugins.weld.follower import Follower
+from flangeye_plugins.weld.following.belief import Belief
+from flangeye_plugins.weld.following.follower import Follower
+from flangeye_plugins.weld.following.task import WeldTask
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following
-from flangeye_plugins.weld.task import WeldTask
 
 DISTANCE = 40e-3
 SECTION = GrooveSection(np.pi / 6, 8e-3)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye_plugins.weld.belief import Belief
+from flangeye_plugins.weld.following.belief import Belief
 from flangeye_plugins.weld.frame import leaning
 from flangeye_plugins.weld.settings import Following
 

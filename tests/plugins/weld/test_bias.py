@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flangeye_plugins.weld.bias import CONTRADICTIONS, Bias, Trail
+from flangeye_plugins.weld.following.bias import CONTRADICTIONS, Bias, Trail
 
 PRIOR, HEAT, LENGTH, SIGMA = 0.3e-3**2, 0.1e-3, 40e-3, 0.05e-3
 

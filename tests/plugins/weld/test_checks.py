@@ -14,7 +14,6 @@ from flangeye.maths.seam_geometry import tube_radii
 from flangeye.models.finger import Finger
 from flangeye.plugin.stage import BoundPart
 from flangeye.types import Seam
-from flangeye_plugins.weld.belief import Belief
 from flangeye_plugins.weld.checks import (
     check_body,
     check_controller,
@@ -27,6 +26,7 @@ from flangeye_plugins.weld.checks import (
     tool_angles,
 )
 from flangeye_plugins.weld.execution import Bounds
+from flangeye_plugins.weld.following.belief import Belief
 from flangeye_plugins.weld.frame import WorkSurface
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.reachability import _nearest, flange_speed

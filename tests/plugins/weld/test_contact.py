@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from flangeye_plugins.weld.contact import Contact, Felt, Mode
+from flangeye_plugins.weld.following.contact import Contact, Felt, Mode
 
 NOISE = (20e-6, 120e-6)
 FLAT = math.tan(math.radians(40.0))

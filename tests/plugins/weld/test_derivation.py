@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye_plugins.weld.steering import Steering
+from flangeye_plugins.weld.following.steering import Steering
 
 LENGTH = 40e-3
 

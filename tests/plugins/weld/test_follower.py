@@ -12,13 +12,13 @@ import pytest
 
 from flangeye.devices import WeldProfile
 from flangeye.motion.seam_following import STILL, Command, ToolPose, Touch
-from flangeye_plugins.weld.belief import Belief, Learned
-from flangeye_plugins.weld.follower import Follower
+from flangeye_plugins.weld.following.belief import Belief, Learned
+from flangeye_plugins.weld.following.follower import Follower
+from flangeye_plugins.weld.following.sensing import Located, SeamReading
+from flangeye_plugins.weld.following.steering import WeaveOffset
+from flangeye_plugins.weld.following.task import ResumePoint, Start, WeldTask
 from flangeye_plugins.weld.path import Path
-from flangeye_plugins.weld.sensing import Located, SeamReading
 from flangeye_plugins.weld.settings import Following
-from flangeye_plugins.weld.steering import WeaveOffset
-from flangeye_plugins.weld.task import ResumePoint, Start, WeldTask
 from tests.plugins.weld.bench import straight
 
 DISTANCE, LENGTH, RADIUS = 40e-3, 0.12, 0.05

@@ -9,9 +9,9 @@ from flangeye.errors import StageError
 from flangeye.maths.geometry import rotation_from_rpy
 from flangeye.models.finger import Finger
 from flangeye_emulators.weld_world.groove import Groove, GrooveSection, Tip, TipContact
-from flangeye_plugins.weld.belief import belief_of
 from flangeye_plugins.weld.checks import check_body, check_seat
-from flangeye_plugins.weld.frame import body_from, body_of, leaning
+from flangeye_plugins.weld.following.belief import belief_of, body_of
+from flangeye_plugins.weld.frame import body_from, leaning
 from flangeye_plugins.weld.joint import WeldJoint, edges_half_angle, joint_of
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following

@@ -18,7 +18,7 @@ from flangeye_emulators.finger.profiler import SimulatedProfilerParams, profiler
 from flangeye_emulators.weld_world.truth import ClockTruth, LookTruth, ToolTruth, WeldTruth
 from flangeye_plugins.weld.camera_process import CameraProcess
 from flangeye_plugins.weld.finger_camera import CameraJob
-from flangeye_plugins.weld.follower import Follower
+from flangeye_plugins.weld.following.follower import Follower
 from flangeye_plugins.weld.resuming import resume_point_of
 from flangeye_plugins.weld.settings import WeldTactileParams
 from tests.plugins.weld.cell import planned, run

@@ -14,10 +14,10 @@ from flangeye.motion.seam_following import Command, ToolPose, turned
 from flangeye.types import Transform
 from flangeye_emulators.weld_world.groove import Groove, GrooveSection, Tip
 from flangeye_emulators.weld_world.groove import TipContact as Tip3D
+from flangeye_plugins.weld.following.refined import RefinedPath
+from flangeye_plugins.weld.following.sensing import Track
 from flangeye_plugins.weld.frame import Tool, WorkSurface
 from flangeye_plugins.weld.path import Path
-from flangeye_plugins.weld.refined import RefinedPath
-from flangeye_plugins.weld.sensing import Track
 from tests.plugins.weld.bench import curved, misplaced, straight
 
 FINGER = read_model(bundled("data") / "fingers" / "srm.yaml", Finger)

@@ -15,10 +15,10 @@ from flangeye_emulators.finger.sensor import (
     SimulatedFingerParams,
     sensor_simulated_finger,
 )
+from flangeye_plugins.weld.following.task import Start
 from flangeye_plugins.weld.frame import Tool, WorkSurface
 from flangeye_plugins.weld.reachability import JUMP, ROOM, SeamReach, Task
 from flangeye_plugins.weld.settings import WeldTactileParams
-from flangeye_plugins.weld.task import Start
 from tests.plugins.weld.cell import BOX, planned
 
 FINGER = read_model(bundled("data") / "fingers" / "srm.yaml", Finger)

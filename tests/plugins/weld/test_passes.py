@@ -11,11 +11,11 @@ import pytest
 
 from flangeye.motion.seam_following import STILL, Command, ToolPose
 from flangeye.types import Floats
-from flangeye_plugins.weld.belief import Belief, Learned
+from flangeye_plugins.weld.following.belief import Belief, Learned
+from flangeye_plugins.weld.following.task import ResumePoint, Start, WeldTask
 from flangeye_plugins.weld.passes import Passes, Traced, _nearest, _towards
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following
-from flangeye_plugins.weld.task import ResumePoint, Start, WeldTask
 from tests.plugins.weld.bench import straight
 
 DISTANCE, LENGTH, RADIUS = 40e-3, 0.1, 0.08

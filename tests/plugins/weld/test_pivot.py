@@ -19,8 +19,7 @@ from flangeye.recipe.load import load_recipe
 from flangeye.units import parse_quantity
 from flangeye_emulators.robot import SimulatedRobot, SimulatedRobotParams
 from flangeye_plugins.guide import ATTITUDES, Pivoted, guide_tool, with_body
-from flangeye_plugins.weld.belief import belief_of
-from flangeye_plugins.weld.frame import body_of
+from flangeye_plugins.weld.following.belief import belief_of, body_of
 from flangeye_plugins.weld.settings import Following
 from flangeye_plugins.weld.touch.pivot import Pivot, pivot
 from tests.plugins.weld.cell import HOME, MODEL

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye_plugins.weld.belief import Belief, Learned
-from flangeye_plugins.weld.probing import SWEEP_MARGIN, Probing, _scatter
+from flangeye_plugins.weld.following.belief import Belief, Learned
+from flangeye_plugins.weld.following.probing import SWEEP_MARGIN, Probing, _scatter
 from flangeye_plugins.weld.settings import Following
 
 SETTINGS = Following()

@@ -16,11 +16,11 @@ from flangeye.models.model import read_model
 from flangeye.motion.limits import MotionLimits
 from flangeye.motion.route import LARGEST_TURN, Barred, Route
 from flangeye_plugins.weld import reachability
+from flangeye_plugins.weld.following.task import Start
 from flangeye_plugins.weld.frame import Tool, WorkSurface
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.reachability import Barrier, SeamReach, Station, _stations, flange_speed
 from flangeye_plugins.weld.settings import Following
-from flangeye_plugins.weld.task import Start
 from tests.plugins.weld.bench import straight
 
 FINGER = read_model(bundled("data") / "fingers" / "srm.yaml", Finger)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from flangeye_plugins.weld.following.refined import LENGTHS, PRIOR, SIZES, RefinedPath, _Field
 from flangeye_plugins.weld.path import PATH_SPACING, Path
-from flangeye_plugins.weld.refined import LENGTHS, PRIOR, SIZES, RefinedPath, _Field
 from tests.plugins.weld.bench import curved, straight
 
 ALL = 100_000

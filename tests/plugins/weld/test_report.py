@@ -11,12 +11,12 @@ import pytest
 
 from flangeye.motion.seam_following import turned
 from flangeye.types import Floats, Seam
-from flangeye_plugins.weld.belief import Belief, Learned
-from flangeye_plugins.weld.follower import Follower
+from flangeye_plugins.weld.following.belief import Belief, Learned
+from flangeye_plugins.weld.following.follower import Follower
+from flangeye_plugins.weld.following.task import WeldTask
 from flangeye_plugins.weld.frame import WorkSurface, body_from
 from flangeye_plugins.weld.report import SAMPLES, _advice, learned_figures, report_of
 from flangeye_plugins.weld.settings import Following
-from flangeye_plugins.weld.task import WeldTask
 from flangeye_plugins.weld.weld_log import WeldLog
 from tests.plugins.weld.bench import straight
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flangeye.motion.seam_following import Command, ToolPose
-from flangeye_plugins.weld.response import Response, identify
+from flangeye_plugins.weld.following.response import Response, identify
 
 CYCLE = 0.01
 

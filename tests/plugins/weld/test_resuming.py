@@ -11,14 +11,14 @@ from flangeye.plugin.registry import load_registry
 from flangeye.plugin.stage import BoundPart
 from flangeye.run.replay import replay_steps
 from flangeye_emulators.finger.sensor import SimulatedFingerParams, sensor_simulated_finger
-from flangeye_plugins.weld.belief import Belief
-from flangeye_plugins.weld.follower import Follower
+from flangeye_plugins.weld.following.belief import Belief
+from flangeye_plugins.weld.following.follower import Follower
+from flangeye_plugins.weld.following.task import ResumePoint, WeldTask
 from flangeye_plugins.weld.frame import WorkSurface
 from flangeye_plugins.weld.passes import Passes
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.resuming import RUN_IN, controller_of, resume_point_of, set_back
 from flangeye_plugins.weld.settings import Following, Mode, PassParams, WeldTactileParams
-from flangeye_plugins.weld.task import ResumePoint, WeldTask
 from tests.plugins.weld.bench import DISTANCE, World, curved, straight
 from tests.plugins.weld.cell import planned, run, true_line
 from tests.plugins.weld.test_replay import logged

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from flangeye.types import Floats
-from flangeye_plugins.weld.belief import Belief
-from flangeye_plugins.weld.search import SweepSearch
+from flangeye_plugins.weld.following.belief import Belief
+from flangeye_plugins.weld.following.search import SweepSearch
 from flangeye_plugins.weld.settings import Following
 
 SETTINGS = Following()

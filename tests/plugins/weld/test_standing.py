@@ -15,10 +15,11 @@ from flangeye.motion.seam_following import ToolPose
 from flangeye.plugin.stage import BoundPart
 from flangeye.types import Image, Seam
 from flangeye_emulators.finger.sensor import SimulatedFingerParams, sensor_simulated_finger
-from flangeye_plugins.weld.belief import Belief
 from flangeye_plugins.weld.corners import corners_of, leg_of
-from flangeye_plugins.weld.follower import Follower
-from flangeye_plugins.weld.frame import body_of
+from flangeye_plugins.weld.following.belief import Belief, body_of
+from flangeye_plugins.weld.following.follower import Follower
+from flangeye_plugins.weld.following.sensing import Track
+from flangeye_plugins.weld.following.task import ResumePoint, Start
 from flangeye_plugins.weld.joint import JointKind, WeldJoint, edges_half_angle, joint_of
 from flangeye_plugins.weld.passes import Passes
 from flangeye_plugins.weld.path import Path
@@ -29,9 +30,7 @@ from flangeye_plugins.weld.resuming import (
     set_back,
     task_of,
 )
-from flangeye_plugins.weld.sensing import Track
 from flangeye_plugins.weld.settings import Following, WeldTactileParams
-from flangeye_plugins.weld.task import ResumePoint, Start
 from flangeye_plugins.weld.touch.tag_observation import RegionOfInterest, cut, shifted
 from tests.plugins.weld.bench import straight
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flangeye_plugins.weld.steering import Steering
+from flangeye_plugins.weld.following.steering import Steering
 
 STEERING = Steering(distance=0.05, gain=1.0, rate=0.5)
 

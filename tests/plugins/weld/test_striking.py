@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from flangeye.motion.arc import BURN, GAS, OFF
 from flangeye.plugin.stage import BoundPart
 from flangeye_emulators.arc import SimulatedArc, SimulatedArcParams, arc_simulated
-from flangeye_plugins.weld.steering import Striking
+from flangeye_plugins.weld.following.steering import Striking
 from flangeye_plugins.weld.weld_log import columns
 from tests.plugins.weld.cell import planned, run
 

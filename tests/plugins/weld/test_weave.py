@@ -8,10 +8,10 @@ import pytest
 
 from flangeye.errors import StageError
 from flangeye_plugins.weld.checks import check_weave
+from flangeye_plugins.weld.following.steering import Weave, WeaveOffset
 from flangeye_plugins.weld.passes import Passes, follower_of
 from flangeye_plugins.weld.resuming import controller_from
 from flangeye_plugins.weld.settings import Following
-from flangeye_plugins.weld.steering import Weave, WeaveOffset
 from tools.weld_bench import curved, misplanned, try_condition
 from tools.weld_conditions import CONDITIONS, Condition
 

@@ -6,12 +6,12 @@ import math
 
 from flangeye.devices import WeldProfile
 from flangeye.motion.seam_following import ToolPose
-from flangeye_plugins.weld.belief import BAND
-from flangeye_plugins.weld.bias import Bias, Trail
-from flangeye_plugins.weld.sensing import SeamEstimate, Sensing
-from flangeye_plugins.weld.steering import Striking, TorchLead
-from flangeye_plugins.weld.task import WeldTask
-from flangeye_plugins.weld.tip import Pressing, Progress
+from flangeye_plugins.weld.following.belief import BAND
+from flangeye_plugins.weld.following.bias import Bias, Trail
+from flangeye_plugins.weld.following.sensing import SeamEstimate, Sensing
+from flangeye_plugins.weld.following.steering import Striking, TorchLead
+from flangeye_plugins.weld.following.task import WeldTask
+from flangeye_plugins.weld.following.tip import Pressing, Progress
 
 SHORT = 0.01
 """A weld is done where no larger share of the planned seam was left out."""

@@ -13,14 +13,14 @@ import numpy as np
 
 from flangeye.motion.seam_following import Phase, ToolPose, Touch, turned
 from flangeye.types import Floats
-from flangeye_plugins.weld.belief import Learned
-from flangeye_plugins.weld.contact import LOST, Contact, Felt
-from flangeye_plugins.weld.probing import SOFTER, SWEEP_MARGIN, Probing
-from flangeye_plugins.weld.refined import RefinedPath
-from flangeye_plugins.weld.search import SweepSearch
+from flangeye_plugins.weld.following.belief import Learned
+from flangeye_plugins.weld.following.contact import LOST, Contact, Felt
+from flangeye_plugins.weld.following.probing import SOFTER, SWEEP_MARGIN, Probing
+from flangeye_plugins.weld.following.refined import RefinedPath
+from flangeye_plugins.weld.following.search import SweepSearch
+from flangeye_plugins.weld.following.task import WeldTask
+from flangeye_plugins.weld.following.tip import Pressing, Progress
 from flangeye_plugins.weld.settings import INSIDE
-from flangeye_plugins.weld.task import WeldTask
-from flangeye_plugins.weld.tip import Pressing, Progress
 
 STEADY = 0.03e-3
 """A finger that scatters less is followed from one measurement to the next [m]."""

@@ -12,15 +12,15 @@ from flangeye.devices import WeldProfile
 from flangeye.motion.arc import OFF
 from flangeye.motion.seam_following import STILL, Command, Phase, ToolPose, Touch
 from flangeye.types import Floats
-from flangeye_plugins.weld.belief import Learned
-from flangeye_plugins.weld.contact import LOST, STRAINED, STRIDE
-from flangeye_plugins.weld.response import Response
-from flangeye_plugins.weld.sensing import SeamEstimate, SeamReading, Sensing
+from flangeye_plugins.weld.following.belief import Learned
+from flangeye_plugins.weld.following.contact import LOST, STRAINED, STRIDE
+from flangeye_plugins.weld.following.response import Response
+from flangeye_plugins.weld.following.sensing import SeamEstimate, SeamReading, Sensing
+from flangeye_plugins.weld.following.steering import SLOWEST, TorchLead
+from flangeye_plugins.weld.following.task import ResumePoint, WeldTask
+from flangeye_plugins.weld.following.tip import Pressing, Progress, within
+from flangeye_plugins.weld.following.welding import Welding
 from flangeye_plugins.weld.settings import INSIDE
-from flangeye_plugins.weld.steering import SLOWEST, TorchLead
-from flangeye_plugins.weld.task import ResumePoint, WeldTask
-from flangeye_plugins.weld.tip import Pressing, Progress, within
-from flangeye_plugins.weld.welding import Welding
 
 WAITING = 0.2
 """Share of its speed that it keeps all the same: a wall that has ended is found out by going on."""

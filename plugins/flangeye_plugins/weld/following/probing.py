@@ -19,8 +19,8 @@ import math
 import numpy as np
 
 from flangeye.types import Floats
-from flangeye_plugins.weld.belief import Belief, Learned
-from flangeye_plugins.weld.response import identify
+from flangeye_plugins.weld.following.belief import Belief, Learned
+from flangeye_plugins.weld.following.response import identify
 from flangeye_plugins.weld.settings import Following
 
 SWEEP_MARGIN = 1.25

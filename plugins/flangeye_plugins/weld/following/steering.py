@@ -11,8 +11,8 @@ import numpy as np
 from flangeye.motion.arc import BURN, GAS, OFF
 from flangeye.motion.seam_following import ToolPose
 from flangeye.types import Floats
-from flangeye_plugins.weld.response import Response
-from flangeye_plugins.weld.task import WeldTask
+from flangeye_plugins.weld.following.response import Response
+from flangeye_plugins.weld.following.task import WeldTask
 
 
 class WeaveOffset(NamedTuple):

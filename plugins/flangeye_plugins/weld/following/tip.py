@@ -6,9 +6,9 @@ import math
 
 from flangeye.motion.seam_following import Phase, ToolPose
 from flangeye.types import Floats
-from flangeye_plugins.weld.belief import BAND, Learned
-from flangeye_plugins.weld.probing import SOFTER
-from flangeye_plugins.weld.task import WeldTask
+from flangeye_plugins.weld.following.belief import BAND, Learned
+from flangeye_plugins.weld.following.probing import SOFTER
+from flangeye_plugins.weld.following.task import WeldTask
 
 
 class Progress:

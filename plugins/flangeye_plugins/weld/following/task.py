@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from flangeye.types import Floats
-from flangeye_plugins.weld.belief import BAND, Belief, Learned
+from flangeye_plugins.weld.following.belief import BAND, Belief, Learned
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from flangeye.maths.statistics import SIGMA_OF_MAD
 from flangeye.types import Floats
-from flangeye_plugins.weld.belief import Belief
+from flangeye_plugins.weld.following.belief import Belief
 from flangeye_plugins.weld.settings import Following
 
 MOST = 60

@@ -9,7 +9,7 @@ import numpy as np
 
 from flangeye.models.finger import Finger
 from flangeye.types import Floats
-from flangeye_plugins.weld.frame import LeaningTool
+from flangeye_plugins.weld.frame import LeaningTool, body_from
 from flangeye_plugins.weld.joint import WeldJoint, joint_of
 from flangeye_plugins.weld.settings import Following
 
@@ -232,6 +232,12 @@ class Learned:
     def least(self) -> float:
         """Deflection by which a held tip differs from a free one, for all play and noise [m]."""
         return 3.0 * abs(self.width) + 2.0 * self.noise
+
+
+def body_of(finger: Finger, settings: Following) -> LeaningTool:
+    """Return the finger's tool in its orientation along the seam."""
+    work = settings.sign * settings.work_angle
+    return body_from(finger.torch_from_tip, work, settings.travel_angle)
 
 
 def belief_of(

@@ -1,0 +1,1 @@
+"""Following a seam by touch: belief, measurements, the felt seam, the torch and its bound."""
