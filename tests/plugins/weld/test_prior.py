@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from flangeye.errors import RecipeError, StageError
-from flangeye_plugins.weld.belief import Belief, Learned
+from flangeye_plugins.weld.following.belief import Belief, Learned
 from flangeye_plugins.weld.prior import keep_posterior, with_prior
-from tests.plugins.weld.cell import planned, run
+from tests.plugins.weld.cell import planned, run, weld_short, welded, welded_once
 from tests.plugins.weld.test_probing import swept
 
 BELIEF = Belief(40e-3, half_angle=math.radians(40.0))
@@ -78,20 +78,21 @@ def test_a_tip_that_was_bent_since_is_no_surprise_that_is_averaged_away() -> Non
 
 
 def test_a_weld_writes_the_file_and_the_next_one_starts_from_it(tmp_path) -> None:
-    path = tmp_path / "prior.yaml"
-    seam = planned("v-straight", end=0.04)
-    first, _ = run(seam, prior=path)
+    first, _, kept = welded_once()
     assert first.completed
     assert any("is in prior.yaml: the next one starts from it" in note for note in first.notes)
-    kept = path.read_text()
-    assert "Delete it to begin anew" in kept
+    assert "Delete it to begin anew" in kept.decode()
+    path = tmp_path / "prior.yaml"
+    path.write_bytes(kept)
+    seam = planned("v-straight", end=0.04)
     _, journal = run(seam, prior=path, sensor={"hidden": ("6 s", "60 s")})
     belief = dict(journal[:1])["start"]["belief"]
     assert belief["ahead_sigma"] < BELIEF.tip_sigma
 
 
-def test_a_file_that_cannot_be_written_costs_no_report(tmp_path) -> None:
+def test_equal_welds_are_equal_and_a_file_that_cannot_be_written_costs_no_report(tmp_path) -> None:
     (tmp_path / "file").write_text("")
-    report, _ = run(planned("v-straight", end=0.04), prior=tmp_path / "file" / "prior.yaml")
+    report, _ = weld_short(tmp_path / "file" / "prior.yaml")
     assert report.completed
     assert any("what the weld found is not kept" in note for note in report.notes)
+    np.testing.assert_array_equal(report.torch, welded()[0].torch)
