@@ -311,6 +311,11 @@ class FingerCamera:
         self._grain = rng.standard_normal(
             (2 * finger.camera.height, 2 * finger.camera.width), np.float32
         )
+        self._grain *= optics.noise
+        # Made once: to come by the memory takes longer than to fill it.
+        shape = finger.camera.height, finger.camera.width
+        self._grey, self._light = np.empty(shape, np.float32), np.empty(shape, np.float32)
+        self._glare = np.empty(shape)
         self._clock = 0.0
 
     def image(self, rotation: Floats, translation: Floats) -> Image:
@@ -362,17 +367,21 @@ class FingerCamera:
     def _spoilt(self, seen: NDArray[np.uint8]) -> NDArray[np.uint8]:
         import cv2
 
-        optics = self._optics
-        grey = cv2.GaussianBlur(seen, (0, 0), optics.blur).astype(np.float32)
-        grey += self._reflection(seen.shape) + optics.noise * self._noise(seen.shape)
-        return np.asarray(np.clip(np.rint(grey), 0, 255).astype(np.uint8))
+        grey, light = self._grey, self._light
+        np.copyto(grey, cv2.GaussianBlur(seen, (0, 0), self._optics.blur))
+        np.copyto(light, self._reflection(seen.shape), casting="same_kind")
+        light += self._noise(seen.shape)
+        grey += light
+        np.rint(grey, out=grey)
+        np.clip(grey, 0, 255, out=grey)
+        return grey.astype(np.uint8)
 
     def _noise(self, shape: tuple[int, ...]) -> NDArray[np.float32]:
-        """Return unit noise: a random piece of a larger field, which is quicker than drawing it."""
+        """Return noise: a random piece of a larger field, which is quicker than drawing it."""
         row, column = (int(self._rng.integers(0, size)) for size in shape)
         return np.asarray(self._grain[row : row + shape[0], column : column + shape[1]])
 
-    def _reflection(self, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    def _reflection(self, shape: tuple[int, ...]) -> Floats:
         """Return a soft bright spot that wanders over the image."""
         self._clock += 1.0
         height, width = shape
@@ -380,7 +389,9 @@ class FingerCamera:
         y = height * (0.5 + 0.45 * np.sin(0.047 * self._clock + 1.0))
         across = np.exp(-(((np.arange(width) - x) / (0.12 * width)) ** 2))
         down = np.exp(-(((np.arange(height) - y) / (0.12 * height)) ** 2))
-        return np.asarray(self._optics.glare * np.outer(down, across), dtype=np.float32)
+        np.outer(down, across, out=self._glare)
+        self._glare *= self._optics.glare
+        return self._glare
 
 
 def _half_pixel(factor: int) -> Floats:
