@@ -143,17 +143,16 @@ def follow(cell: WeldCell, controller: Controller, weld_log: WeldLog, longest: f
     began: float | None = None
     cell.drive.lead()
     try:
-        with _undisturbed():
-            clock = WeldClock()
-            while controller.phase not in ("done", "stopped"):
-                cell.drive.robot.wait_cycle()
-                clock.start()
-                state = cell.drive.read()
-                seconds = state.time_ns * 1e-9
-                began = seconds if began is None else began
-                if seconds - began > longest:
-                    return f"it did not come to its end within {longest:.0f} s"
-                _turn(cell, controller, weld_log, state, clock)
+        clock = WeldClock()
+        while controller.phase not in ("done", "stopped"):
+            cell.drive.robot.wait_cycle()
+            clock.start()
+            state = cell.drive.read()
+            seconds = state.time_ns * 1e-9
+            began = seconds if began is None else began
+            if seconds - began > longest:
+                return f"it did not come to its end within {longest:.0f} s"
+            _turn(cell, controller, weld_log, state, clock)
     except DeviceError as error:
         return str(error)
     finally:
@@ -209,7 +208,7 @@ class WeldClock:
 
 
 @contextmanager
-def _undisturbed() -> Iterator[None]:
+def undisturbed() -> Iterator[None]:
     """Let nothing of this process hold up a cycle for long.
 
     Garbage is collected before and after, not in between: that takes tens of milliseconds. A cycle

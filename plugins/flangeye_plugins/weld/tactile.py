@@ -31,7 +31,7 @@ from flangeye_plugins.weld import checks
 from flangeye_plugins.weld.bound import check_bound
 from flangeye_plugins.weld.camera_process import CameraProcess
 from flangeye_plugins.weld.corners import leg_of
-from flangeye_plugins.weld.execution import Bounds, WeldCell, approach, follow
+from flangeye_plugins.weld.execution import Bounds, WeldCell, approach, follow, undisturbed
 from flangeye_plugins.weld.finger_camera import CameraJob, FingerCameraReader, SteppedReader
 from flangeye_plugins.weld.following.belief import Belief, belief_of, body_of
 from flangeye_plugins.weld.following.follower import Follower
@@ -94,6 +94,7 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
         approach(cell, passage, weld_log, params.mode)
         if not driver.simulated:
             opened.enter_context(precedence(LEADING))
+            opened.enter_context(undisturbed())
         reason = follow(
             cell, controller, weld_log, _longest(plan.length + planned.body.distance, params)
         )

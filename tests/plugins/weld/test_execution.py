@@ -10,7 +10,7 @@ import pytest
 
 from flangeye.devices import DeviceError, WeldProfile
 from flangeye.motion.seam_following import Command, Controller, ToolPose
-from flangeye_plugins.weld.execution import WeldClock, _undisturbed, follow
+from flangeye_plugins.weld.execution import WeldClock, follow, undisturbed
 from flangeye_plugins.weld.tactile import _longest
 from flangeye_plugins.weld.weld_log import WeldLog
 
@@ -45,13 +45,13 @@ def test_a_clock_counts_what_a_cycle_computes_and_nothing_else() -> None:
 
 def test_garbage_is_not_collected_in_the_loop_and_is_again_after_it() -> None:
     assert gc.isenabled()
-    with pytest.raises(KeyboardInterrupt), _undisturbed():
+    with pytest.raises(KeyboardInterrupt), undisturbed():
         assert not gc.isenabled()
         raise KeyboardInterrupt
     assert gc.isenabled()
     gc.disable()
     try:
-        with _undisturbed():
+        with undisturbed():
             pass
         assert not gc.isenabled()
     finally:
