@@ -100,6 +100,12 @@ class PoseFeature:
         """(3, 3) of the origin [m^2]."""
         return self.covariance[3:, 3:]
 
+    @property
+    def normal_covariance(self) -> Floats:
+        """(3, 3) of the target's z, singular along it."""
+        turned = np.cross(self.normal, self.covariance[:3, :3])
+        return np.cross(self.normal, turned.T)
+
 
 Feature = CircleFeature | PoseFeature
 """What a ``fit`` stage measures of a target, in ``camera``."""

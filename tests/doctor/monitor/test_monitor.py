@@ -26,6 +26,7 @@ from flangeye.doctor.monitor.history import CheckFinding
 from flangeye.doctor.monitor.watchman import write_state
 from flangeye.errors import FlangeyeError, StageError
 from flangeye.estimation.watch.drift import DriftTest
+from flangeye.maths.geometry import rigid
 from flangeye_plugins.reader.folder import FolderParams, folder
 from tests.doctor.monitor.cell import calibrate, check, part_of_sample
 from tests.doctor.sessions import clean
@@ -405,43 +406,66 @@ def test_recordings_may_be_laid_out_otherwise_than_the_calibrations(
     assert json.loads(found.stdout)["state"] == "OK"
 
 
-def table_of(folder: Path, count: int) -> str:
-    """Write centres that another program found, as a table; return one more row of it."""
+def table_of(folder: Path, kind: str, count: int) -> np.ndarray:
+    """Write what another program measured of a target, as a table; return one more row of it."""
     folder.mkdir()
-    session = clean(np.random.default_rng(0), count, "centres", turn=0.4)
-    rows = np.hstack([session.poses.reshape(count, 16), session.centres])
-    *lines, last = [",".join(map(repr, row)) for row in rows.tolist()]
-    (folder / "poses.csv").write_text("\n".join(lines))
-    return last
+    session = clean(np.random.default_rng(0), count, kind, turn=0.4)
+    measured = [session.centres]
+    if kind == "marker":
+        seen = [rigid(r, p) for r, p in zip(session.rotations, session.centres, strict=True)]
+        measured = [np.array(seen).reshape(count, 16)]
+    rows = np.hstack([session.poses.reshape(count, 16), *measured])
+    np.savetxt(folder / "poses.csv", rows[:-1], delimiter=",")
+    return rows[-1]
 
 
-TABLE = """
+POSE = "rotation: matrix, length: m, columns"
+TABLES = {
+    "centres": """
 title: Centres
 robot: ur5e
 steps:
-  - acquire.centres:
-      path: calibrated
-      reader:
-        table:
-          rotation: matrix
-          length: m
-          pose: base_T_flange
-          columns: [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16]
-          target: {columns: [17, 18, 19], rotation: point, length: m}
+  - acquire.centres: {path: calibrated, reader: {table: {pose: base_T_flange, POSE: [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16], target: {columns: [17, 18, 19], rotation: point, length: m}}}}
   - solve.robust
-"""
+""",
+    "marker": """
+title: A marker
+robot: ur5e
+configuration: {name: eye-on-base, place: unknown}
+steps:
+  - acquire.samples: {path: calibrated, reader: {table: {pose: base_T_flange, POSE: [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16], target: {POSE: [17, 18, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28, 29, 30, 31, 32]}}}}
+  - solve.robust
+""",
+}
 
 
-def test_a_calibration_from_a_table_is_checked_with_tables_of_a_single_row(tmp_path: Path) -> None:
-    row = table_of(tmp_path / "calibrated", 21)
-    (tmp_path / "recipe.yaml").write_text(TABLE)
-    words = ["run", str(tmp_path / "recipe.yaml"), "--out", str(tmp_path / "calibration")]
+def calibrated_from_a_table(folder: Path, kind: str) -> np.ndarray:
+    """Calibrate from a table; return one more row of it."""
+    row = table_of(folder / "calibrated", kind, 21)
+    (folder / "recipe.yaml").write_text(TABLES[kind].replace("POSE", POSE))
+    words = ["run", str(folder / "recipe.yaml"), "--out", str(folder / "calibration")]
     assert CliRunner().invoke(commands(), words).exit_code == 0
+    return row
+
+
+@pytest.mark.parametrize(("kind", "x"), [("centres", 16), ("marker", 19)])
+def test_a_calibration_from_a_table_is_checked_with_tables_of_a_single_row(
+    tmp_path: Path, kind: str, x: int
+) -> None:
+    row = calibrated_from_a_table(tmp_path, kind)
     for name, aside in (("fine", 0.0), ("moved", 0.02)):
         (tmp_path / name).mkdir()
-        *pose, x, y, z = map(float, row.split(","))
-        numbers = [*pose, x + aside, y, z]
-        (tmp_path / name / "poses.csv").write_text(",".join(map(repr, numbers)) + "\n")
+        row[x] += aside
+        np.savetxt(tmp_path / name / "poses.csv", row[None], delimiter=",")
     done = monitor(tmp_path, tmp_path / "h.jsonl", "fine", "moved")
     told = [json.loads(line) for line in done.stdout.splitlines()]
     assert [(each["state"], each["sightings"]) for each in told] == [("OK", 1), ("MOVED", 1)]
+
+
+def test_a_check_of_another_target_than_the_calibrations_is_refused(
+    cell: Path, tmp_path: Path
+) -> None:
+    calibrated_from_a_table(tmp_path, "marker")
+    (tmp_path / "circles").symlink_to(cell / "ok-00")
+    done = monitor(tmp_path, tmp_path / "h.jsonl", "circles")
+    assert "shows another target than the calibration's" in str(done.exception)

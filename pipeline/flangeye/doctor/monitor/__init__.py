@@ -106,7 +106,7 @@ def _from_archive(stored: StoredCalibration) -> str:
     data = _steps(stored)
     first = data["steps"][0]
     # They read later recordings as they read the calibration's
-    reads_recordings = ("acquire.archive", "acquire.centres")
+    reads_recordings = ("acquire.archive", "acquire.centres", "acquire.samples", "acquire.images")
     name = next((name for name in reads_recordings if name in first), None)
     params = first[name] if name and isinstance(first, dict) else None
     data["steps"][0] = {name or reads_recordings[0]: {**(params or {}), "fewest": 1}}
@@ -124,13 +124,16 @@ def _steps(stored: StoredCalibration) -> dict[str, Any]:
 def _checked(
     stored: StoredCalibration, path: Path, seen: list[t.Observation], time_ns: int
 ) -> MonitorCheck:
-    circles = [o for o in seen if isinstance(o.feature, t.CircleFeature)]
-    if not circles:
+    if not seen:
         raise StageError(
-            f"{path}: the flange was found in none of its scans, so nothing is checked"
+            f"{path}: the target was found in none of its scans, so nothing is checked"
         )
-    _refuse_own(path, prints_of(circles) & prints_of(stored.used))
-    return MonitorCheck(str(path), tuple(circles), time_ns)
+    if len({type(o.feature) for o in (*seen, *stored.used)}) > 1:
+        raise StageError(
+            f"{path}: shows another target than the calibration's, which checks nothing"
+        )
+    _refuse_own(path, prints_of(seen) & prints_of(stored.used))
+    return MonitorCheck(str(path), tuple(seen), time_ns)
 
 
 def _refuse_own(path: Path, shared: Collection[Any]) -> None:

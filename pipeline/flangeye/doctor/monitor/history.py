@@ -245,5 +245,5 @@ def _require_usable(number: int, check: MonitorCheck, finding: CheckFinding) -> 
     for seen in check.seen:
         if t.FLANGE not in seen.poses:
             raise DamageError(f"sighting {seen.id}: it has no pose of the flange")
-        if (np.linalg.eigvalsh(seen.circle.covariance) <= 0).any():
+        if (np.linalg.eigvalsh(seen.feature.covariance) <= 0).any():
             raise DamageError(f"sighting {seen.id}: its covariance is not valid")

@@ -17,8 +17,10 @@ from flangeye.estimation.watch.pose_error import FREE, ArmPoseErrors, pose_error
 from flangeye.files.yaml_lines import parse_yaml
 from flangeye.log.read import RunLog, read_run
 from flangeye.maths.arm_correction import corrected_flange
+from flangeye.maths.geometry import invert, rigid
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.statistics import corners_of
+from flangeye.maths.streams import mean_pose
 from flangeye.models.loading import load_model
 from flangeye.models.workspace import workspace_of
 from flangeye.recipe.own_models import carried_files
@@ -101,7 +103,7 @@ class StoredCalibration:
         return prior_of(self.sightings(self.used, _one_check(self.used)), variances)
 
     def sightings(self, seen: Sequence[t.Observation], check: NDArray[np.intp]) -> CheckSightings:
-        """Return sightings of the flange with their deviation from this calibration.
+        """Return sightings of the target with their deviation from this calibration.
 
         Args:
             seen: The N sightings.
@@ -115,27 +117,43 @@ class StoredCalibration:
     def _bare(
         self, seen: Sequence[t.Observation], check: NDArray[np.intp]
     ) -> tuple[CheckSightings, Floats]:
-        """Return sightings with the scans' noise alone, and (N, 4, 4) expected circles."""
-        correction = self.calibration.as_reported().correction
-        expected = np.array(
-            [corrected_flange(o.base_T_flange.matrix, o.joints, correction, self.arm) for o in seen]
-        )
-        levers = np.array(
-            [e[:3, :3] @ o.centre_in_mount for e, o in zip(expected, seen, strict=True)]
-        )
-        expected[:, :3, 3] += levers
-        circles = [o.circle for o in seen]
-        normals = [np.full(3, np.nan) if c.normal is None else c.normal for c in circles]
+        """Return sightings with the scans' noise alone, and (N, 4, 4) expected targets."""
+        flanges = np.array([self._flange(o) for o in seen])
+        expected = flanges @ np.array([self._carried(o) for o in seen])
+        features = [o.feature for o in seen]
+        normals = [np.full(3, np.nan) if f.normal is None else f.normal for f in features]
         bare = sightings_of(
             self.estimate.transform.matrix, self.estimate.about,
-            np.array([c.centre for c in circles]), np.array(normals),
-            _covariances(self.estimate.transform.rotation, circles, expected), expected,
-            self._jacobians(seen, levers), check,
+            np.array([f.centre for f in features]), np.array(normals),
+            _covariances(self.estimate.transform.rotation, features, expected), expected,
+            self._jacobians(seen, expected[:, :3, 3] - flanges[:, :3, 3]), check,
         )  # fmt: skip
         return bare, expected
 
+    def _flange(self, seen: t.Observation) -> Floats:
+        """Return where the arm has its flange, or the circle that it sees there (4, 4)."""
+        correction = self.calibration.as_reported().correction
+        return corrected_flange(seen.base_T_flange.matrix, seen.joints, correction, self.arm)
+
+    def _carried(self, seen: t.Observation) -> Floats:
+        """Return where the flange carries what was seen (4, 4)."""
+        if isinstance(seen.feature, t.PoseFeature):
+            return self._mounted
+        return rigid(np.eye(3), seen.centre_in_mount)
+
+    @cached_property
+    def _mounted(self) -> Floats:
+        """Where the flange carries a target of which poses are seen (4, 4), by the calibration."""
+        base_T_camera = self.estimate.transform.matrix
+        found = [
+            invert(self._flange(o)) @ base_T_camera @ o.feature.camera_T_target.matrix
+            for o in self.used
+            if isinstance(o.feature, t.PoseFeature)
+        ]
+        return mean_pose(np.array(found))
+
     def _jacobians(self, seen: Sequence[t.Observation], levers: Floats) -> Floats | None:
-        """Return (N, 6, n) of the circles' centres, where every joint angle is known."""
+        """Return (N, 6, n) of the targets' origins, where every joint angle is known."""
         joints = [o.joints for o in seen if o.joints is not None]
         if self.arm is None or len(joints) < len(seen):
             return None
@@ -181,14 +199,14 @@ def _alike(one: Arm, other: Arm) -> bool:
     return bool(np.linalg.norm(between) < 0.03)
 
 
-def _covariances(turn: Floats, circles: Sequence[t.CircleFeature], expected: Floats) -> Floats:
+def _covariances(turn: Floats, features: Sequence[t.Feature], expected: Floats) -> Floats:
     """Return (N, 5, 5) of centres and tilts in the base, the scans' own."""
-    out = np.zeros((len(circles), 5, 5))
-    for own, circle, frame in zip(out, circles, expected, strict=True):
-        own[:3, :3] = turn @ circle.covariance @ turn.T
-        if circle.normal_covariance is not None:
+    out = np.zeros((len(features), 5, 5))
+    for own, feature, frame in zip(out, features, expected, strict=True):
+        own[:3, :3] = turn @ feature.centre_covariance @ turn.T
+        if feature.normal_covariance is not None:
             across = frame[:3, :2].T @ turn
-            own[3:, 3:] = across @ circle.normal_covariance @ across.T
+            own[3:, 3:] = across @ feature.normal_covariance @ across.T
     return out
 
 
