@@ -114,14 +114,17 @@ def board_seen(view: Grey) -> SeenBoard | None:
 def _board_of(dictionary: str, ids: list[int], grey: Grey) -> SeenBoard:
     """Return the board that markers belong to: the ChArUco board whose corners are found.
 
-    The markers of a board are numbered row by row, so their count leaves few sizes, and corners
-    between them are found with the right one only. Others are markers alone.
+    The markers of a board are numbered row by row, so corners between them are found with the right
+    number of columns only. Rows are as many as hold the markers: of those out of the image nothing
+    is known. Others are markers alone.
     """
+    import cv2
+
     count = max(ids) + 1
-    sizes = [(c, count * 2 // c + more) for c in range(3, count) for more in (0, 1)]
-    boards = [Board("charuco", c, r, 1.0, 0.75, dictionary) for c, r in sizes
-              if r >= 3 and c * r // 2 == count]  # fmt: skip
-    found = {board: len(_charuco_corners(board, grey)[1]) for board in boards}
+    sizes = [(c, next(r for r in range(count) if c * r // 2 >= count)) for c in range(3, count)]
+    boards = [Board("charuco", c, r, 1.0, 0.75, dictionary) for c, r in sizes if r >= 3]
+    markers = cv2.aruco.ArucoDetector(dictionary_of(dictionary)).detectMarkers(grey)[:2]
+    found = {board: len(_charuco_corners(board, grey, *markers)[1]) for board in boards}
     best = max(found, key=lambda board: found[board], default=None)
     if best is not None and found[best] >= FEWEST_CHARUCO:
         params = {"columns": best.columns, "rows": best.rows, "dictionary": dictionary}
@@ -150,8 +153,12 @@ def _charuco(board: Board, grey: Grey, _image: Image) -> Corners | Rejected:
     return Corners(pixels, board.inner_corners()[ids])
 
 
-def _charuco_corners(board: Board, grey: Grey) -> tuple[Floats, list[int], list[int]]:
+def _charuco_corners(
+    board: Board, grey: Grey, outlines: Any = None, numbers: Any = None
+) -> tuple[Floats, list[int], list[int]]:
     """Return the corners (n, 2) [px], which of the board's they are, and the markers' ids.
+
+    The markers are looked for, unless their outlines and numbers are given as OpenCV has them.
 
     OpenCV before 4.6 printed boards with an even number of rows with a marker at the top left,
     where now a black square is; the corners are the same.
@@ -161,7 +168,9 @@ def _charuco_corners(board: Board, grey: Grey) -> tuple[Floats, list[int], list[
     print_ = charuco_of(board)
     for legacy in (False, True)[: 1 + (board.rows % 2 == 0)]:
         print_.setLegacyPattern(legacy)
-        corners, ids, _, markers = cv2.aruco.CharucoDetector(print_).detectBoard(grey)
+        corners, ids, _, markers = cv2.aruco.CharucoDetector(print_).detectBoard(
+            grey, None, None, outlines, numbers
+        )
         if ids is not None and len(ids) >= FEWEST_CHARUCO:
             break
     pixels = np.asarray(() if corners is None else corners, dtype=np.float64).reshape(-1, 2)
