@@ -111,8 +111,8 @@ def test_what_goes_wrong_with_an_arm_is_one_line(env):
             with pytest.raises(DeviceError, match="controller rejects them"):
                 lead_on(robot, 2.0)
             robot.stop()
-            arm.tell(rejects=False, silent=0.5)
-            time.sleep(0.3)
+            arm.tell(rejects=False, silent=1.2)
+            time.sleep(0.6)  # it stands: half a second would be waited for
             with pytest.raises(DeviceError, match="silent for"):
                 robot.state()
             time.sleep(0.5)

@@ -88,9 +88,6 @@ def robot_ros2_freedrive(model: RobotModel, params: FreedriveParams) -> Robot:
 class Ros2Arm(Listener):
     """An arm that is moved in pieces; see :class:`flangeye.devices.Robot`."""
 
-    # Silence of an arm that moves is a doubt at once [s].
-    patience: ClassVar[float] = 0.0
-
     def __init__(
         self, asker: str, model: RobotModel, params: Ros2RobotParams, bridge: Bridge
     ) -> None:
@@ -106,6 +103,11 @@ class Ros2Arm(Listener):
         super().__init__(asker, model, params, bridge)
         bridge.offer(self._topic, Type.TRAJECTORY)
         self._require_listener()
+
+    @property
+    def patience(self) -> float:
+        """For how long news are waited for [s]: of an arm on its way, not at all."""
+        return 0.0 if self._mode(False) == "moving" else super().patience
 
     def move_joints(self, joints: Floats, speed: float, acceleration: float) -> None:
         """Start a move to joint angles (n,) [rad]."""

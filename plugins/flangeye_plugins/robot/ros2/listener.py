@@ -68,9 +68,6 @@ class Listener(Device):
     # A sample older than this is no news of the arm [s].
     stale: ClassVar[float] = 0.1
 
-    # For how long news of an arm that is not commanded are waited for: nothing depends on them [s].
-    patience: ClassVar[float] = 0.5
-
     flange_T_tool: Transform | None = None
 
     def __init__(self, asker: str, model: RobotModel, params: ListenParams, bridge: Bridge) -> None:
@@ -123,6 +120,11 @@ class Listener(Device):
     def close(self) -> None:
         """Disconnect from ROS 2."""
         self._bridge.close()
+
+    @property
+    def patience(self) -> float:
+        """For how long news are waited for [s]: of an arm that we do not move nothing depends."""
+        return 0.5
 
     def speeds(self) -> Floats:
         """Return the joints' speeds (n,) over the last 50 ms [rad/s]."""
@@ -234,7 +236,7 @@ class Listener(Device):
         """Say why a sample is no news of the arm; empty where it is."""
         age = 1e-9 * (time.monotonic_ns() - newest.received_ns)
         if age > self.stale:
-            allowed = max(self.stale, self.patience)
+            allowed = self.patience or self.stale
             return f"silent for {age:.2f} s, at most {allowed} s are allowed{busy()}"
         off = 1e-9 * (newest.received_ns - newest.time_ns)
         if abs(off) > self.stale:
