@@ -329,6 +329,12 @@ class WhatRuns:
             for each in found:
                 if not each.answers:
                     ui.label(each.line).classes("note")
+            printed = ui.input(
+                "Printed target, where the scans are images",
+                placeholder="charuco: {columns: 8, rows: 6, square: 30 mm, marker: 22 mm}",
+                on_change=lambda e: self._choose("target", e.value),
+            )
+            printed.classes("w-full")
             self._line = command_line(self._project.command(*self._words("running")))
             ui.button("Write the recipe", on_click=self._draft).props("outline no-caps")
             self._told = ui.column().classes("w-full gap-0")
@@ -360,8 +366,8 @@ class WhatRuns:
 
     def _words(self, name: str) -> list[str]:
         model = (self._project.data().get("scanner") or {}).get("model")
-        given = {"scanner": model, **self._chosen} if model else self._chosen
-        options = [word for option in given.items() for word in (f"--{option[0]}", option[1])]
+        given = {"scanner": model, **self._chosen}
+        options = [w for flag, answer in given.items() if answer for w in (f"--{flag}", answer)]
         return ["init", "--ros2", "--yes", *options, "--out", f"{name}.yaml"]
 
     async def _draft(self) -> None:

@@ -39,7 +39,7 @@ ANSWERS = {
     "reader": "Reader as written in a recipe; replaces the options above.",
     "flange": "With --ros2: the flange's link, where no name says it.",
     "trajectory": "With --ros2: topic of the controller that moves the arm, or none.",
-    "scans": "With --ros2: topic of clouds or depth images.",
+    "scans": "With --ros2: topic of clouds, depth images or images.",
     "trigger": "With --ros2: service that takes a scan, or none.",
     "view": "With --ros2: where the scanner roughly stands: '620, 0, 980 mm'.",
     "box": "With --ros2: the flange's box, centre; size: '450, 0, 300; 600, 600, 600 mm'.",

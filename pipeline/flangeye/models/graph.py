@@ -56,6 +56,8 @@ class RunningCell:
         scanner: The section of the camera, without its model.
         flange: base_T_flange (4, 4) now [m].
         camera: base_T_camera (4, 4) [m], where the graph has it.
+        pixels: What a camera of images alone sees now, (H, W) or (H, W, 3), empty where nothing
+            came; None for one of clouds or depths.
         files: Texts of the files that the sections name, by name.
         steps: Steps to add at the recipe's end.
         seen: What runs, a line each for people.
@@ -65,6 +67,7 @@ class RunningCell:
     scanner: Mapping[str, Any]
     flange: Floats
     camera: Floats | None = None
+    pixels: Any = None
     files: Mapping[str, str] = field(default_factory=dict)
     steps: Sequence[Any] = ()
     seen: Sequence[str] = ()

@@ -36,6 +36,7 @@ from flangeye_plugins.ros2.messages import (
     encoded,
     frame_of,
     message,
+    pixels_of,
     positions_of,
 )
 
@@ -150,6 +151,9 @@ class Frames:
             self.frames[child] = StampedFrame(parent, pose, received_ns)
 
 
+SCANS = (Type.CLOUD, Type.IMAGE, Type.COMPRESSED)
+"""The types in which cameras publish."""
+
 NONE = "none"
 """The answer that there is no controller, or no trigger."""
 
@@ -184,7 +188,7 @@ class Ros2Graph(Device):
         topics = self.topics()
         found = [Running(name, f"{name}: String", "robot") for name in descriptions_in(topics)]
         found += [
-            Running(each.topic.name, each.line, "scans" if each.has_scans else "")
+            Running(each.topic.name, each.line, "scans" if each.scans else "")
             for each in self._listen(topics)
         ]
         found += [
@@ -204,8 +208,7 @@ class Ros2Graph(Device):
         """
         topics = self.topics()
         if not any(
-            t.publishers and t.type in (Type.TEXT, Type.JOINT_STATE, Type.CLOUD, Type.IMAGE)
-            for t in topics
+            t.publishers and t.type in (Type.TEXT, Type.JOINT_STATE, *SCANS) for t in topics
         ):
             raise DeviceError(
                 f"ROS 2: no arm and no camera runs {self._bridge.place}: start their drivers, or "
@@ -228,6 +231,7 @@ class Ros2Graph(Device):
             scanner={"driver": {"ros2": camera}},
             flange=Arm(found.robot).flange(angles),
             camera=self._place(base, frame),
+            pixels=seen_by(scans) if scans.scans == "image" else None,
             files={path.name: text},
             steps=[{"export.ros2_launch": {"parent": base, "child": frame}}],
             seen=[
@@ -297,11 +301,7 @@ class Ros2Graph(Device):
 
     def _listen(self, topics: Sequence[Topic]) -> list[Heard]:
         """Count the messages of all arms and cameras at once."""
-        some = [
-            t
-            for t in topics
-            if t.publishers and t.type in (Type.JOINT_STATE, Type.CLOUD, Type.IMAGE)
-        ]
+        some = [t for t in topics if t.publishers and t.type in (Type.JOINT_STATE, *SCANS)]
         joints: dict[str, dict[str, float]] = {topic.name: {} for topic in some}
 
         def take(name: str, message: GraphMessage) -> None:
@@ -373,13 +373,20 @@ class Heard(NamedTuple):
         return frame_of(self.newest.data) if self.newest else ""
 
     @property
-    def has_scans(self) -> bool:
-        """Whether it has clouds or depths: by an image's encoding, or its name where none came."""
-        if self.topic.type != Type.IMAGE:
-            return self.topic.type == Type.CLOUD
+    def scans(self) -> str:
+        """The parameter of ``scanner.ros2`` that takes it; empty where it has no scans.
+
+        Depths are told from images by their encoding, or by their topic's name where none came.
+        """
+        kind, name = self.topic.type, self.topic.name
+        if kind not in SCANS or name.endswith("/compressedDepth"):
+            return ""
+        if kind != Type.IMAGE:
+            return "cloud" if kind == Type.CLOUD else "image"
         if self.newest is None:
-            return "depth" in self.topic.name
-        return decoded(self.newest.data, Type.IMAGE).encoding in PER_METRE
+            return "depth" if "depth" in name else "image"
+        encoding = decoded(self.newest.data, Type.IMAGE).encoding
+        return "depth" if encoding in PER_METRE else "image"
 
     @property
     def line(self) -> str:
@@ -466,18 +473,22 @@ def arm_driver(
 
 
 def scans_of(heard: Sequence[Heard], ask: Ask) -> Heard:
-    """Return the topic of the scans: clouds, or depth images.
+    """Return the topic of the scans: clouds, else depth images, else images of a printed target.
 
     Raises:
         DeviceError: There is none, or not the one that was asked for.
     """
-    every = {each.topic.name: each for each in heard if each.has_scans}
-    found = [n for n, each in every.items() if each.topic.type == Type.CLOUD] or [*every]
-    chosen = ask("scans", f"which topic has the scans ({', '.join(found)})", _only(found, None))
+    every = {each.topic.name: each for each in heard if each.scans}
+    # An image that is published compressed besides is taken as it is
+    plain = [n for n in every if n.removesuffix("/compressed") not in every.keys() - {n}]
+    kinds = ([n for n in plain if every[n].scans == kind] for kind in ("cloud", "depth", "image"))
+    found = next((names for names in kinds if names), [])
+    question = f"which topic has the scans ({', '.join(found) or 'none runs'})"
+    chosen = ask("scans", question, _only(found, None))
     if chosen not in every:
         raise DeviceError(
-            f"nobody publishes clouds or depth images on {chosen}; there are: "
-            f"{', '.join(every) or 'none'} (images for markers: write scanner.ros2, image, by hand)"
+            f"nobody publishes clouds, depth images or images on {chosen}; there are: "
+            f"{', '.join(every) or 'none'}"
         )
     return every[chosen]
 
@@ -502,6 +513,13 @@ def unit_of(scans: Heard) -> list[str]:
     ]
 
 
+def seen_by(scans: Heard) -> Any:
+    """Return the newest image of a topic, (H, W) or (H, W, 3); empty where none came."""
+    if scans.newest is None:
+        return np.zeros((0, 0), np.uint8)
+    return np.ascontiguousarray(decoded(scans.newest.data, scans.topic.type, pixels_of))
+
+
 def scanner_driver(scans: Heard, triggers: Iterable[str], ask: Ask) -> dict[str, Any]:
     """Return the parameters of ``scanner.ros2``; one that is silent has to be triggered.
 
@@ -510,9 +528,7 @@ def scanner_driver(scans: Heard, triggers: Iterable[str], ask: Ask) -> dict[str,
         triggers: Services that may take one.
         ask: For which does.
     """
-    params: dict[str, Any] = {
-        "cloud" if scans.topic.type == Type.CLOUD else "depth": scans.topic.name
-    }
+    params: dict[str, Any] = {scans.scans: scans.topic.name}
     if scans.newest is None:
         namespace = f"/{scans.topic.name.split('/')[1]}/"
         likely = [t for t in triggers if t.startswith(namespace)] or [*triggers]

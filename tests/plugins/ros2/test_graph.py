@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from flangeye.devices import DeviceError
+from flangeye.errors import RecipeError
 from flangeye.maths.geometry import quaternion_from_rotation
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
+from flangeye.recipe.draft import Questions, draft_live
 from flangeye.testing import RobotConformance, ScannerConformance
 from flangeye_plugins.robot.ros2.driver import (
     FreedriveParams,
@@ -101,11 +103,18 @@ def test_simulated_time_drives_arm_and_camera(env):
 
 
 def test_a_compressed_image_shows_a_marker_with_its_camera(env):
-    with peers(Controller(env), Camera(env, "image")):
+    with peers(Controller(env, joints=TOWARDS), Camera(env, "image")):
         with scanner_ros2.function(None, Topics(image="/camera/image_raw/compressed")) as eye:
             image = eye.expose()().image
             assert image.pixels.shape[:2] == (1024, 1280)
             assert np.allclose(np.diag(image.camera_matrix), [1400, 1400, 1])
+        questions = Questions({"plate": "ISO 9409-1-50-4-M6", "scanner": "phoxi-m"})
+        with Ros2Graph() as graph:
+            found = graph.cell(questions.ask, "cell")
+        assert found.scanner["driver"]["ros2"] == {"image": "/camera/image_raw/compressed"}
+        shown = r"the camera shows a ChArUco board of 6 x 5 squares, .*add --target 'charuco: {"
+        with pytest.raises(RecipeError, match=shown):
+            draft_live(found, questions, Path("recipe.yaml"))
         with pytest.raises(DeviceError, match="carries sensor_msgs/msg/CompressedImage, sensor_ms"):
             scanner_ros2.function(None, Topics(depth="/camera/image_raw/compressed",
                                                camera_info="/camera/camera_info"))  # fmt: skip
@@ -155,8 +164,12 @@ def test_a_flange_that_no_name_tells_is_asked_for() -> None:
     ("peer", "words", "said"),
     [
         (None, (), "ROS 2: no arm and no camera runs (ROS_DOMAIN_ID "),
-        ({"controller": None}, (), "which topic has the scans ()"),
-        ({"joints": TOWARDS}, ("--scans", "/none"), "nobody publishes clouds or depth images on /"),
+        ({"controller": None}, (), "which topic has the scans (none runs)"),
+        (
+            {"joints": TOWARDS},
+            ("--scans", "/none"),
+            "nobody publishes clouds, depth images or images on /",
+        ),
         ({"joints": TOWARDS}, ("--robot", "none.urdf"), "none.urdf"),
         ({"ends": ["plate", "eye"]}, (), "which link is the flange, z outwards (plate, eye)"),
         ({"ends": ["plate", "eye"]}, ("--flange", "tool0"), "no link 'tool0'"),

@@ -29,6 +29,11 @@ PRODUCTION = ("--set", "scanner.driver={ros2: {cloud: /cell/eye/points}}")
 OUTSIDE = np.radians([-90.0, -90.0, 90.0, -90.0, -90.0, 0.0]).tolist()
 """Where the cell's program takes the arm besides: out of the box, and the camera sees no flange."""
 DRIFT = "  - verify.drift: {reference: run/run.mcap}\n  - export"
+TRIGGERED = ("--trigger", "/camera/capture")
+PRINTED = "charuco: {columns: 6, rows: 5, square: 18 mm, marker: 13 mm, dictionary: 4X4_50}"
+SEES = {"realsense": TRIGGERED, "zivid": TRIGGERED, "image": ("--target", PRINTED)}
+ROOT = {"realsense": "camera_link", "zivid": "camera", "image": "optical_frame"}
+"""What is joined to the arm's base: the root of the camera's own frames, where it has any."""
 LINK = [0.01, 0.02, -0.03, -0.5, 0.5, -0.5, 0.5]
 
 
@@ -49,7 +54,7 @@ def require_near(matrix, truth):
     assert np.abs((matrix - truth)[:3, :3]).max() < 5e-3
 
 
-@pytest.mark.parametrize("layout", ["realsense", "zivid"])
+@pytest.mark.parametrize("layout", ["realsense", "zivid", "image"])
 def test_two_commands_lead_to_a_verified_matrix_and_a_third_to_the_graph(terminal, layout):
     installed.tf2_msgs()
     env = terminal.env
@@ -57,8 +62,7 @@ def test_two_commands_lead_to_a_verified_matrix_and_a_third_to_the_graph(termina
     arm = Controller(env, seed=1, joints=TOWARDS)
     eye = Camera(env, layout, resolution=0.4)
     with peers(arm, eye, Frames(env, own)) as (_, camera, tree):
-        out, _ = terminal.run("init", "--ros2", "--scanner", "phoxi-m", "--yes",
-                              "--trigger", "/camera/capture")  # fmt: skip
+        out, _ = terminal.run("init", "--ros2", "--scanner", "phoxi-m", "--yes", *SEES[layout])
         assert "ur5e: base_link to tool0, 6 joints" in out
         terminal.run("run", "recipe.yaml", "--move", "--out", "run", *QUICK, *FEW)
         matrix = found(terminal)
@@ -67,7 +71,7 @@ def test_two_commands_lead_to_a_verified_matrix_and_a_third_to_the_graph(termina
             check = ("monitor", "run", "--live", "--scans", "2", "--move")
             assert json.loads(terminal.run(*check, *QUICK)[0])["state"] == "OK"
         publishing = terminal.start("publish", "run")
-        parent, pose = tree.heard_of("camera_link" if own else "camera")
+        parent, pose = tree.heard_of(ROOT[layout])
         assert parent == "base_link"
         link_T_camera = tree.heard_of("optical_frame")[1] if own else np.eye(4)
         assert np.allclose(pose @ link_T_camera, matrix, atol=1e-6)

@@ -12,7 +12,14 @@ from flangeye.maths.geometry import basis_of_plane, rpy_from_rotation
 from flangeye.models.graph import RunningCell
 from flangeye.models.loading import load_model
 from flangeye.models.scanners import ScannerModel, middle_of_view
-from flangeye.recipe.draft.recipe import PLATE, Draft, draft_recipe, yaml_of
+from flangeye.recipe.draft.recipe import (
+    PLATE,
+    Draft,
+    draft_recipe,
+    printed_target,
+    steps_of,
+    yaml_of,
+)
 from flangeye.recipe.draft.survey import Questions, look
 from flangeye.types import Floats
 from flangeye.units import in_mm, parse_quantity
@@ -21,12 +28,12 @@ __all__ = ["Draft", "Questions", "draft_live", "draft_recipe", "look"]
 
 
 def draft_live(cell: RunningCell, questions: Questions, out: Path) -> Draft:
-    """Return a recipe for a running arm whose flange faces a camera beside it.
+    """Return a recipe for a running arm whose flange, or what it carries, faces a camera beside it.
 
     Args:
         cell: What runs.
-        questions: For what cannot be seen: the plate, the camera's model, where it stands, and the
-            box that the flange may move in.
+        questions: For what cannot be seen: the plate, the printed target of a camera of images, the
+            camera's model, where it stands, and the box that the flange may move in.
         out: Where the recipe will be; the files it names are beside it.
 
     Raises:
@@ -37,6 +44,13 @@ def draft_live(cell: RunningCell, questions: Questions, out: Path) -> Draft:
     scanner = load_model("scanners", name)
     if not isinstance(scanner, ScannerModel):
         raise RecipeError(f"--scanner {name}: its file lacks what planning needs: what it sees")
+    target: dict[str, Any] = {"flange": {}}
+    carried: dict[str, Any] = {}
+    if cell.pixels is not None:
+        target = printed_target(
+            [("the camera", cell.pixels)] if cell.pixels.size else [], questions
+        )
+        carried = {"configuration": {"name": "eye-on-base", "place": "unknown"}}
     robot = {**cell.robot, "limits": {"box": _box(cell.flange, questions)}}
     first = {"view": {"guess": _view(cell, scanner, questions)}}
     data = {
@@ -44,11 +58,9 @@ def draft_live(cell: RunningCell, questions: Questions, out: Path) -> Draft:
         "robot": robot,
         "scanner": {"model": name, **cell.scanner},
         "feature": {"standard": plate},
-        "steps": [
-            {"acquire.live": first},
-            "segment.flange", "fit.rim", "solve.robust", "verify.holdout", *cell.steps,
-        ],
-    }  # fmt: skip
+        **carried,
+        "steps": [{"acquire.live": first}, *steps_of(target), *cell.steps],
+    }
     return Draft(yaml_of(data), (), {out.with_name(n): text for n, text in cell.files.items()})
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -77,7 +78,7 @@ def draft_recipe(
     first: dict[str, Any] = {"path": os.path.relpath(survey.folder, out.parent)}
     first |= {} if reader == "auto" else {"reader": reader}
     first |= _camera(archive, target, questions) if stage == "acquire.images" else {}
-    data = head | {"steps": [{stage: first}, *_steps(stage, target)]}
+    data = head | {"steps": [{stage: first}, *steps_of(target)]}
     return Draft(yaml_of(data), _summary(archive, reader))
 
 
@@ -216,10 +217,7 @@ def _what(archive: Archive, questions: Questions) -> tuple[str, dict[str, Any]]:
         )
         return "acquire.archive", _target(answer)
     if any(r.image for r in records):
-        shown, example = ("", "") if questions.given.get("target") else _printed(records)
-        question = f"which printed target is seen{shown}"
-        answer = questions.ask("target", question, None, example, _target)
-        return "acquire.images", _target(answer)
+        return "acquire.images", printed_target(_some_images(records), questions)
     if any(r.camera_T_target is not None for r in records):
         return "acquire.samples", {}
     if any(r.centre_in_camera is not None for r in records):
@@ -227,27 +225,41 @@ def _what(archive: Archive, questions: Questions) -> tuple[str, dict[str, Any]]:
     raise StageError(f"{archive.root}: holds poses, but neither scans nor what the camera measured")
 
 
-def _printed(records: Sequence[Recording]) -> tuple[str, str]:
-    """Return what the first, middle and last image show of a printed target, and how to write it.
+def printed_target(images: Iterable[tuple[str, Any]], questions: Questions) -> dict[str, Any]:
+    """Return the printed target that is seen, its name with parameters.
 
-    Its lengths are those of the print, and have to be measured.
+    The question tells what the first image that shows one shows. Its lengths are those of the
+    print, and have to be measured.
+
+    Args:
+        images: Names, and pixels (H, W) or (H, W, 3).
+        questions: For the target.
+
+    Raises:
+        RecipeError: The answer is missing, or is none.
     """
-    import cv2
-
     from flangeye.models.corners import board_seen
 
-    paths = [r.image for r in records if r.image is not None]
-    for path in dict.fromkeys((paths[0], paths[len(paths) // 2], paths[-1])):
-        try:
-            pixels = decode_image(read_regular(path, MAX_FILE), cv2.IMREAD_GRAYSCALE)
-        except (ImageError, StageError):
-            continue
+    told, example = "", "'charuco: {columns: 8, rows: 6, square: 30 mm, marker: 22 mm}'"
+    for name, pixels in () if questions.given.get("target") else images:
         if seen := board_seen(pixels):
             lengths = {"charuco": "square: 30 mm, marker: 22 mm", "marker": "size: 50 mm"}
             measured = lengths.get(seen.kind, "square: 30 mm")
-            told = f" ({path.name} shows {seen.what}), with the lengths measured on the print"
-            return told, f"'{seen.fit[:-1]}, {measured}}}'"
-    return "", "'charuco: {columns: 8, rows: 6, square: 30 mm, marker: 22 mm}'"
+            told = f" ({name} shows {seen.what}), with the lengths measured on the print"
+            example = f"'{seen.fit[:-1]}, {measured}}}'"
+            break
+    question = f"which printed target is seen{told}"
+    return _target(questions.ask("target", question, None, example, _target))
+
+
+def _some_images(records: Sequence[Recording]) -> Iterator[tuple[str, Any]]:
+    """Yield name and pixels of the first, middle and last image, where they can be read."""
+    import cv2
+
+    paths = [r.image for r in records if r.image is not None]
+    for path in dict.fromkeys((paths[0], paths[len(paths) // 2], paths[-1])):
+        with suppress(ImageError, StageError):
+            yield path.name, decode_image(read_regular(path, MAX_FILE), cv2.IMREAD_GRAYSCALE)
 
 
 def _target(answer: str) -> dict[str, Any]:
@@ -339,7 +351,8 @@ def _configuration(target: Mapping[str, Any], questions: Questions) -> dict[str,
     return {} if known else {"name": "eye-on-base", "place": "unknown"}
 
 
-def _steps(stage: str, target: Mapping[str, Any]) -> list[Any]:
+def steps_of(target: Mapping[str, Any]) -> list[Any]:
+    """Return the steps from a scan of a target to the verified pose; none finds one measured."""
     found: list[Any] = []
     if "flange" in target:
         found = ["segment.flange", "fit.rim"]
