@@ -85,16 +85,20 @@ class Reach:
         self._radius = 0.0 if isinstance(target, TargetBody) else target
         self.shown = np.array([0.0, 0.0, 1.0])
         self._scanner = scanner
-        self._base_T_camera = base_T_camera
-        lean = scanner.convergence
-        projector = scanner.baseline * np.array([np.cos(lean), 0.0, np.sin(lean)])
-        self._eyes = np.stack([np.zeros(3), projector]) @ base_T_camera[:3, :3].T
-        self._eyes += base_T_camera[:3, 3]
+        self.look_from(base_T_camera)
         self._margins = margins
         self._reach = robot.length
         self.home = np.zeros(self.arm.n)
         self._start: Floats | None = None
         self.refusals: list[Refusal] = []
+
+    def look_from(self, base_T_camera: Floats) -> None:
+        """Let the scanner stand at (4, 4) ``base_T_camera``."""
+        self._base_T_camera = base_T_camera
+        lean = self._scanner.convergence
+        projector = self._scanner.baseline * np.array([np.cos(lean), 0.0, np.sin(lean)])
+        self._eyes = np.stack([np.zeros(3), projector]) @ base_T_camera[:3, :3].T
+        self._eyes += base_T_camera[:3, 3]
 
     def why_refused(self) -> str:
         """Return why poses were impossible, and how often; empty where all were possible."""

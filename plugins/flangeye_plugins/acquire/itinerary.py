@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flangeye.errors import StageError
-from flangeye.maths.geometry import angle_between
+from flangeye.maths.geometry import angle_between, kabsch, rigid
 from flangeye.models.bodies import TargetBody, carrying
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
@@ -18,7 +18,7 @@ from flangeye.models.targets import Flange
 from flangeye.motion.reach import Margins, Plan, PlannedPose, Reach, Refusal, Site, poses_near
 from flangeye.motion.route import Barred, Route, Router
 from flangeye.plugin.stage import BoundPart
-from flangeye.types import Floats, Observation, Role
+from flangeye.types import CircleFeature, Floats, Observation, Role
 from flangeye.units import in_mm
 
 
@@ -95,6 +95,14 @@ class Itinerary:
         for index, pose in enumerate(self._plan.poses, len(self._checks)):
             self._planned.append(f"{index:04d}")
             yield Stop(self._planned[-1], "calibration", pose)
+            self._look_again()
+
+    def _look_again(self) -> None:
+        """Plan on from where the scanner stands by the flanges seen so far: it was guessed."""
+        seen = [o for o in self.outcomes.values() if o and isinstance(o.feature, CircleFeature)]
+        base_T_camera = view_of(seen)
+        if base_T_camera is not None:
+            self._reach.look_from(base_T_camera)
 
     def way(self, start: Floats, stop: Stop) -> Route | Barred:
         """Return the path to a stop from joint angles (n,)."""
@@ -156,6 +164,34 @@ class Itinerary:
             for place, capture in enumerate(self._planned)
             if self.outcomes.get(capture, capture) is None
         }
+
+
+def view_of(seen: Sequence[Observation]) -> Floats | None:
+    """Return where a scanner stands, base_T_camera (4, 4), to plan by; None where it is not clear.
+
+    The least-squares motion of the circles' centres and of points before them, along the normals.
+
+    Args:
+        seen: Circles.
+    """
+    fewest, ahead = 3, 0.1  # [m]: a normal weighs as a place so far off
+    points = [
+        (
+            o.feature.centre + far * o.feature.normal,
+            o.tcp_in_base + far * o.base_T_flange.rotation[:, 2],
+        )
+        for o in seen
+        if o.feature.normal is not None
+        for far in (0.0, ahead)
+    ]
+    if len(points) < 2 * fewest:
+        return None
+    camera, base = np.moveaxis(np.array(points), 1, 0)
+    turn, shift = kabsch(camera, base)
+    # Farther off than any flange is seen [m]: something else was found, or it sits elsewhere
+    wrong = 0.02
+    off = np.linalg.norm(camera @ turn.T + shift - base, axis=1).max()
+    return rigid(turn, shift) if off < wrong else None
 
 
 def itinerary_of(
