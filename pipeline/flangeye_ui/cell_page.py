@@ -293,7 +293,7 @@ class Import:
         self._told.clear()
         with self._told:
             if said.startswith("error: "):
-                mistake(said.removeprefix("error: "))
+                mistake(said.rpartition("error: ")[2])
                 return
             ui.label(said).props('role="status"')
         self._form.choose(self._section, f"{self._words()[1]}.yaml")
@@ -380,7 +380,7 @@ class WhatRuns:
         drafted = folder / f"{name}.yaml"
         with self._told:
             if not drafted.exists():
-                mistake(said.removeprefix("error: "))
+                mistake(said.rpartition("error: ")[2])
                 return
             for line in said.splitlines()[:-1]:
                 ui.label(line).classes("note")
