@@ -213,7 +213,10 @@ class _Laying:
         least_reach = 4.0
         for _ in range(12):
             surface = _surface(self.points, shape, pose, reach, rounding, scanner[-1])
-            ends = _ends(self.edges, shape, pose, scanner[:-1], beside, self.spacing)
+            # Near its rest a body shows the same ends
+            if not rounding.any():
+                model = _visible_ends(shape, pose, self.spacing)
+            ends = _ends(self.edges, model, shape, pose, scanner[:-1], beside)
             if len(surface.residual) < FEWEST:
                 return None
             noise = _deviation(surface.residual)
@@ -313,15 +316,19 @@ def _rounding(points: Floats, shape: Shape, pose: Floats, spacing: float) -> Flo
 
 
 def _ends(
-    edges: OrientedPoints, shape: Shape, pose: Floats, lost: Floats, reach: float, spacing: float
+    edges: OrientedPoints,
+    model: OrientedPoints,
+    shape: Shape,
+    pose: Floats,
+    lost: Floats,
+    reach: float,
 ) -> _Equations:
-    """Return how far ends of the scan's surfaces are off those of the body's faces.
+    """Return how far ends of the scan's surfaces are off those of a body's faces that are seen.
 
     Across the ray, as a scanner sees them: on a face askew a point lost is a longer way.
     """
     from scipy.spatial import cKDTree
 
-    model = _visible_ends(shape, pose, spacing)
     placed = model.points @ pose[:3, :3].T + pose[:3, 3]
     outwards = model.directions @ pose[:3, :3].T
     nothing = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
