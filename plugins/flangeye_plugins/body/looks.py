@@ -139,6 +139,13 @@ class Looks(Shape):
         out[:, :3, 3] = middle - QUARTERS @ middle
         return np.asarray(pose @ out)
 
+    def reflections(self, pose: Floats) -> Floats:
+        """Return (24, 4, 4) poses, left-handed, of the body's mirror image at its quarter turns."""
+        flips = np.concatenate([np.eye(3)[None], QUARTERS]) @ np.diag([-1.0, 1.0, 1.0])
+        out = np.tile(np.eye(4), (len(flips), 1, 1))
+        out[:, :3, :3], out[:, :3, 3] = flips, self.centre - flips @ self.centre
+        return np.asarray(pose @ out)
+
     def tolerance(self, view: CoarseImage) -> float:
         """Return the largest distance from the scan that counts as agreement [m]."""
         # As a share of the size; three sigma of the scanner's noise at least

@@ -186,6 +186,13 @@ def opposed(shape: Shape, view: CoarseImage, pose: Floats) -> Mask | None:
     return gone[of_facet] if gone.any() and not gone.all() else None
 
 
+def _patch(cells: Mask) -> bool:
+    """Return whether cells (H, W) hold a patch, and not single ones as along edges."""
+    from scipy import ndimage
+
+    return bool(ndimage.binary_erosion(cells, np.ones((3, 3))).any())
+
+
 def _edges(depth: Floats, angle: float) -> Mask:
     """Return (H, W) where neighbouring rays end at different depths."""
     from scipy import ndimage
@@ -362,6 +369,35 @@ class BodySearch:
         known = known[near((met - pose[:3, 3]) @ pose[:3, :3])]
         return float(seen.through.reshape(-1)[known].sum() / max(len(known), 1))
 
+    def images(self, found: FoundPose) -> list[FoundPose]:
+        """Return left-handed poses, of the body's mirror image, that explain nearly as much."""
+        poses = self.looks.reflections(found.pose)
+        return self.near(self._as_well(poses, 0.9 * found.verdict.agree))
+
+    def unrivalled(self, found: list[FoundPose], rivals: list[FoundPose]) -> list[FoundPose]:
+        """Return the poses but those of which a rival explains all, and a coherent patch more."""
+        own, others = ([self._agreeing(one.pose) for one in each] for each in (found, rivals))
+        return [
+            one for one, cells in zip(found, own, strict=True)
+            if not any(_patch(more & ~cells) and not _patch(cells & ~more) for more in others)
+        ]  # fmt: skip
+
+    def twins_among(self, others: list[FoundPose], found: list[FoundPose]) -> list[FoundPose]:
+        """Return those of other poses that explain all that one of the found does."""
+        own, cells = ([self._agreeing(one.pose) for one in each] for each in (found, others))
+        return [
+            one for one, more in zip(others, cells, strict=True)
+            if any(not _patch(each & ~more) for each in own)
+        ]  # fmt: skip
+
+    def _agreeing(self, pose: Floats) -> Mask:
+        """Return (H, W) which cells of the scan agree with the body at a pose."""
+        out = np.zeros(self._fine.xyz.shape[:2], bool)
+        compared = _compared(self.looks, self._fine, pose, self._tolerance)
+        if compared is not None:
+            out[_window(self.looks, self._fine, pose)] = compared.agree
+        return out
+
     @cached_property
     def _tolerance(self) -> float:
         """How far off a cell of the view may be after the body is laid on the scan [m]."""
@@ -388,9 +424,12 @@ class BodySearch:
     def _twins(self, best: FoundPose) -> Floats:
         """Return quarter turns of a pose that explain the scan nearly as well."""
         # Share of the rays that a turned pose explains as well, to be laid on the scan too
-        twins, least = self.looks.twins(best.pose), 0.4 * best.verdict.agree
-        agree = [judged(self.looks, self._fine, pose, self._rough).agree for pose in twins]
-        return np.asarray(twins[np.array(agree) > least])
+        return self._as_well(self.looks.twins(best.pose), 0.4 * best.verdict.agree)
+
+    def _as_well(self, poses: Floats, least: float) -> Floats:
+        """Return those of (K, 4, 4) poses with which more rays agree than so many."""
+        agree = [judged(self.looks, self._fine, pose, self._rough).agree for pose in poses]
+        return np.asarray(poses[np.array(agree) > least])
 
     def _distinct(self, found: list[FoundPose]) -> list[FoundPose]:
         poses = np.array([one.pose for one in found]).reshape(-1, 4, 4)

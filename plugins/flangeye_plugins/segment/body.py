@@ -101,11 +101,23 @@ def segment_body(
     if not (found and alike(found[0].pose[None], predicted, looks).any()):
         every = search.everywhere()
         found = list(filter(passes, every))
+        found = search.unrivalled(found, found)
+        # Of the first captures only: a body that was seen before is as its mesh says.
+        doubtful = not earlier.observations
         if not found:
-            # Of the first captures only: a body that was seen before is as its mesh says.
-            doubtful = not earlier.observations
             why = _why_none(every, body)
             return (doubtful and _misdrawn(points, body, every, passes)) or why
+        if doubtful:
+            images = [one for pose in found for one in search.images(pose) if passes(one)]
+            found = search.unrivalled(found, images)
+        # One that fails narrowly and explains as much leaves it open which of them is right
+        near = [o for o in every if not passes(o) and o.verdict.trusted >= params.min_trust]
+        found += search.twins_among(near, found)
+        if not found:
+            what, fix, _ = _otherwise(body)[0]
+            return Rejected(
+                f"{body.name} is {what}: corrected, it explains more of the scan", fix=fix
+            )
     pose, *others = (one.pose for one in found)
     centre = pose[:3, :3] @ looks.centre + pose[:3, 3]
     cloud = PointCloud(capture.cloud.frame, around(points, looks, pose, *others))

@@ -37,7 +37,7 @@ from flangeye_plugins.body.looks import prepared
 from flangeye_plugins.body.search import BodySearch
 from flangeye_plugins.body.search import around as points_around
 from flangeye_plugins.fit.body import FitBodyParams, fit_body
-from flangeye_plugins.segment.body import SegmentBodyParams, segment_body
+from flangeye_plugins.segment.body import SegmentBodyParams, _passes, segment_body
 from tools.study_bodies import SCANNER, as_made, scene, trial
 
 GRIPPER = load_body("gripper", None, Path())
@@ -360,3 +360,46 @@ def test_where_the_carrier_goes_on_beyond_a_bodys_foot_is_no_end_of_it() -> None
     """The flange is flush with the torch's bracket: its edges are not those of the bracket."""
     told = trial("torch", 84004)
     assert [np.linalg.norm(off(one, told.pose)[3:]) < 0.5e-3 for one in told.found] == [True]
+
+
+def among_others(name, seed):
+    """A scan of a body among other things, the body, and its pose."""
+    rng = np.random.default_rng(seed)
+    body = load_body(name, None, Path())
+    bodies, pose = scene(rng, as_made(body, rng))
+    xyz = scanner_of(SCANNER, 0.35, 1.0, rng).scan(RaycastScene(bodies), rng)
+    return Capture("0000", PointCloud(CAMERA, xyz), {}), body, pose
+
+
+def test_a_mirrored_mesh_that_a_half_turn_hides_is_refused_by_what_its_image_explains_more() -> (
+    None
+):
+    """Turned over, a mirrored plate has the plate's outline; a side of it has a detail more."""
+    capture, plate, _ = among_others("ring-plate", 770009)
+    mirrored = TargetBody("ring-plate", plate.vertices * [-1, 1, 1], plate.triangles)
+    refused = found(capture, mirrored)
+    assert isinstance(refused, Rejected)
+    assert "drawn mirrored: corrected, it explains more of the scan" in refused.reason
+    assert "mirror the mesh" in refused.fix
+    assert isinstance(found(capture, plate), FlangeCloud)
+
+
+def test_of_two_poses_the_one_that_explains_a_patch_more_is_taken_alone() -> None:
+    capture, plate, pose = among_others("ring-plate", 780028)
+    points, looks = capture.cloud.points(), prepared(plate)
+    search = BodySearch(points, looks)
+    turned = [pose, *looks.twins(pose)]
+    passing = [one for one in search.near(np.array(turned)) if _passes(one, 0.3, 0.99)]
+    assert len(passing) == 2
+    kept = search.unrivalled(passing, passing)
+    assert [np.linalg.norm((one.pose - pose)[:3, 3]) < 1e-3 for one in kept] == [True]
+    assert search.unrivalled(passing, []) == passing
+
+
+def test_a_twin_that_fails_narrowly_leaves_a_pose_open() -> None:
+    """The gripper turned by half a turn passes; its true pose shows as much, and too few ends."""
+    capture, gripper, pose = among_others("gripper", 772011)
+    both = found(capture, gripper)
+    assert isinstance(both, FlangeCloud)
+    turned = [np.linalg.norm((one.camera_T_target - pose)[:3, :3]) for one in both.alone]
+    assert sorted(turn < 0.02 for turn in turned) == [False, True]
