@@ -100,8 +100,7 @@ def segment_body(
     # What slid away from where the arm has carried the body may be another thing
     if not (found and alike(found[0].pose[None], predicted, looks).any()):
         every = search.everywhere()
-        found = list(filter(passes, every))
-        found = search.unrivalled(found, found)
+        found = search.unrivalled(passing := list(filter(passes, every)), passing)
         # Of the first captures only: a body that was seen before is as its mesh says.
         doubtful = not earlier.observations
         if not found:
@@ -109,15 +108,12 @@ def segment_body(
             return (doubtful and _misdrawn(points, body, every, passes)) or why
         if doubtful:
             images = [one for pose in found for one in search.images(pose) if passes(one)]
-            found = search.unrivalled(found, images)
+            if not (found := search.unrivalled(found, images)):
+                what, fix, _ = _otherwise(body)[0]
+                return Rejected(f"{body.name} is {what}: its image explains more", fix=fix)
         # One that fails narrowly and explains as much leaves it open which of them is right
         near = [o for o in every if not passes(o) and o.verdict.trusted >= params.min_trust]
         found += search.twins_among(near, found)
-        if not found:
-            what, fix, _ = _otherwise(body)[0]
-            return Rejected(
-                f"{body.name} is {what}: corrected, it explains more of the scan", fix=fix
-            )
     pose, *others = (one.pose for one in found)
     centre = pose[:3, :3] @ looks.centre + pose[:3, 3]
     cloud = PointCloud(capture.cloud.frame, around(points, looks, pose, *others))
