@@ -48,12 +48,12 @@ from flangeye_plugins.acquire.opening import archive_path, open_archive
 
 @dataclass(frozen=True)
 class CadFile:
-    """A published CAD cloud, and where it is in the flange's frame.
+    """A published CAD cloud and its pose in the flange's frame.
 
     Attributes:
-        name: Below ``flange_ground_truth``.
-        axes: Diagonal of the rotation.
-        offset: Along z, in the file's unit.
+        name: Path in the folder ``flange_ground_truth``.
+        axes: Diagonal of the rotation matrix flange_R_CAD.
+        offset: Position of the CAD's origin along the flange's z, in the file's unit.
     """
 
     name: str

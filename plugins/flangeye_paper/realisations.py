@@ -87,7 +87,7 @@ def verify_realisations(
     """
     source = None if observations is None else observations.source
     if not isinstance(source, PointSource):
-        raise StageError("verify.realisations repeats acquire.points_as_in_paper and nothing else")
+        raise StageError("verify.realisations works only with acquire.points_as_in_paper")
     outcomes = list(_outcomes(source, solve, params.count))
     if not outcomes:
         return Verification(False, f"all {params.count} realisations were refused", {})

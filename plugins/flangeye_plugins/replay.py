@@ -68,7 +68,7 @@ class WeldReplay(LoggedWeld):
         )
 
     def see(self, sight: Mapping[str, Any]) -> None:
-        """Read an image again."""
+        """Measure the tip's displacement again in a logged image."""
         if self._pixels is None:
             raise StageError("the log of this weld holds no images")
         piece = piece_of(np.asarray(self._pixels, dtype=np.uint8), sight["corner"], self._finger)
@@ -80,14 +80,14 @@ class WeldReplay(LoggedWeld):
             self.felt[self.newest] = None if feeling is None else touch_of(feeling)
 
     def feel(self, logged: Mapping[str, Any]) -> None:
-        """Compare the measurement in the newest image."""
+        """Compare the displacement measured again in the newest image with the logged one."""
         felt = self.felt.get(self.newest)
         if felt is not None:
             off = np.abs(felt.displacement - np.array(logged["displacement"])).max()
             self._worst_feeling = max(self._worst_feeling, float(off))
 
     def decided(self, command: Command, cycles: Mapping[str, list[Any]], i: int) -> None:
-        """Compare a command."""
+        """Compare the recomputed command with the logged one of cycle ``i``."""
         decided = np.array([*command.velocity, command.turn])
         logged = np.array([*cycles["velocity"][i], cycles["turn"][i]])
         self._worst_command = max(self._worst_command, float(np.abs(decided - logged).max()))

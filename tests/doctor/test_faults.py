@@ -342,7 +342,7 @@ def test_nothing_but_identities() -> None:
     session = session_of("centres")
     finding = examine(session.with_poses(np.tile(np.eye(4), (20, 1, 1))), CHECKS).findings[0]
     assert finding.name == "identity matrices"
-    assert finding.fix == "record again: fewer than half would remain"
+    assert finding.fix == "record again: less than half the captures remain"
 
 
 def test_a_pose_that_is_stale() -> None:

@@ -173,6 +173,4 @@ def test_the_same_seed_gives_the_same_figures(paper: Callable[..., Any]) -> None
 def test_other_observations_cannot_be_repeated() -> None:
     with pytest.raises(StageError) as error:
         verify_realisations(None, None, RealisationsParams(count=2), None)
-    assert str(error.value) == (
-        "verify.realisations repeats acquire.points_as_in_paper and nothing else"
-    )
+    assert str(error.value) == ("verify.realisations works only with acquire.points_as_in_paper")

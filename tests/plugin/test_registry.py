@@ -155,7 +155,9 @@ def test_a_stage_named_by_its_place_is_imported_when_it_is_asked_for(
         PluginNotFoundError, match=r"'solve.away' cannot be imported from acme_away"
     ):
         toy_registry.stage("solve.away")
-    with pytest.raises(PluginNotFoundError, match=r"tests.toy:solve is no stage 'solve.toy2'"):
+    with pytest.raises(
+        PluginNotFoundError, match=r"tests.toy:solve does not define stage 'solve.toy2'"
+    ):
         toy_registry.stage("solve.toy2")
     assert "solve.toy" in toy_registry.everything()
     assert isinstance(toy_registry.broken["acme"], PluginNotFoundError)

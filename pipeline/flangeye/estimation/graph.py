@@ -109,10 +109,10 @@ class Problem:
     """The estimation problem: the frame graph, its carriers, and the sightings.
 
     Attributes:
-        frames: By name; the root has no entry.
-        ends: Each camera and target, by the sightings' ``pairs``.
+        frames: Frames by name, without the root frame.
+        ends: Frame names (camera, target); the sightings' ``pairs`` are indices into this.
         seen: N sightings.
-        carriers: What moves.
+        carriers: Frames that a controller moves.
     """
 
     frames: Mapping[str, Frame]

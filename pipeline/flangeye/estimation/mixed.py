@@ -91,7 +91,7 @@ class LinearModel:
         return np.asarray(self.still + np.tensordot(amounts, self.causes, axes=1))
 
     def weights(self, sizes: Floats) -> Floats:
-        """Return (N, 6, 6) of the sightings by the inverse of their noise, each by its share."""
+        """Return (N, 6, 6) weights: each sighting's inverse noise covariance times its share."""
         bare = np.linalg.inv(self.noise(sizes))
         both = self.projectors @ (bare + np.swapaxes(bare, 1, 2)) @ self.projectors
         return np.asarray(both * self.shares[:, None, None] / 2)

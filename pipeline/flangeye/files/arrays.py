@@ -70,7 +70,7 @@ def _numbers(where: str, words: list[str], width: int) -> list[float]:
     except ValueError as error:
         raise StageError(f"{where}: {error}") from None
     if len(values) != width or not all(map(math.isfinite, values)):
-        raise StageError(f"{where}: has {len(values)} numbers, not {width} that are finite")
+        raise StageError(f"{where}: has {len(values)} numbers, expected {width} finite numbers")
     return values
 
 

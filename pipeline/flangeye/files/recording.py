@@ -133,14 +133,14 @@ def check_poses(
     whole: bool = False,
     fewest: int = MIN_CAPTURES,
 ) -> None:
-    """Refuse poses that cannot all be true, or that no calibration can be made from.
+    """Refuse implausible poses, and poses that are too few or too close together to calibrate.
 
     Args:
-        root: What messages begin with.
-        recordings: Those that are to be used, verification included.
-        whole: Whether the target's whole pose was seen: then turning alone is motion too.
-        fewest: How many there have to be to calibrate with; of fewer than three nothing is
-            calibrated, and they may be at one place.
+        root: Prefix of error messages.
+        recordings: Recordings to use, verification included.
+        whole: Whether the target's full pose was measured; rotation alone is then enough motion.
+        fewest: Minimum number of calibration captures. If it is below three, nothing is calibrated,
+            and all poses may be at one place.
 
     Raises:
         StageError: A pose out of any arm's reach, one given twice, too few to calibrate with, or

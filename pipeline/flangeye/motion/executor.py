@@ -65,7 +65,7 @@ class Executor:
         """Wait for the controller's next cycle and return the arm's state.
 
         Raises:
-            DeviceError: The arm must not go on; it was told to stop.
+            DeviceError: A safety check failed; the arm has been commanded to stop.
             RunStopped: The operator stopped it.
         """
         self.robot.wait_cycle()

@@ -85,7 +85,7 @@ class Offered(MutableMapping[str, Kind]):
         for plugin in plugins:
             if isinstance(plugin, self._sort) and plugin.name == name:
                 return plugin
-        raise PluginNotFoundError(f"{place} is no {self._sort.__name__.lower()} '{name}'")
+        raise PluginNotFoundError(f"{place} does not define {self._sort.__name__.lower()} '{name}'")
 
 
 @dataclass

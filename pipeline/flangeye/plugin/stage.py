@@ -359,7 +359,7 @@ class Choose:
         ((name, raw),) = value.items()
         lookup: PartLookup | None = info.context
         if lookup is None:
-            raise ValueError(f"a {self.kind} is chosen by name only inside a recipe")
+            raise ValueError(f"outside a recipe, give the {self.kind} itself, not its name")
         try:
             chosen = lookup.part(f"{self.kind}.{name}")
         except LookupError as error:

@@ -57,15 +57,15 @@ def correction_result(correction: t.ArmCorrection | None) -> CorrectionResult | 
 
 
 def warnings_result(notes: Iterable[t.Note]) -> list[WarningResult]:
-    """Return the section ``warnings``: the notes that ask for something."""
+    """Return the section ``warnings``: the notes that need action."""
     return [WarningResult(text=str(note), fix=note.fix) for note in t.warnings_of(notes)]
 
 
 def standing_warnings(result: Result) -> list[WarningResult]:
-    """Return warnings that follow from the result itself, beside those of its steps.
+    """Return warnings about the result as a whole, in addition to those of its steps.
 
-    An estimate that is arbitrary in some direction, a calibration that nothing judged, a session
-    most of whose captures were rejected, and an expected error that poses held out contradict.
+    They cover unobservable directions, a calibration that no step verified, a session most of whose
+    captures were rejected, and a held-out error that contradicts the expected error.
     """
     found = []
     if weak := [name for name, each in result.transforms.items() if each.unobservable]:

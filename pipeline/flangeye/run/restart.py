@@ -202,7 +202,7 @@ class FromEarlierRun(FromNothing):
 
     @property
     def resumed(self) -> t.Resumed:
-        """The captures it took and that are kept, whatever became of them."""
+        """The earlier run's captures that are not taken again, used or rejected."""
         aside = {rejection.id for rejection in self.log.rejections}
         done = frozenset({*self.log.finished, *aside}) - self.retaken
         return t.Resumed(done, self.log.last_joints)
@@ -222,11 +222,11 @@ class FromEarlierRun(FromNothing):
         return stream
 
     def views(self) -> t.Views:
-        """Return the verification views of that run."""
+        """Return the earlier run's verification views, except those taken again."""
         return t.Views(view for view in self.log.views() if view.id not in self.retaken)
 
     def rejections(self) -> list[t.Rejection]:
-        """Return the captures that run set aside."""
+        """Return the earlier run's rejected captures, except those taken again."""
         return [r for r in self.log.rejections if r.id not in self.retaken]
 
     def gathered(self) -> Iterator[Gathered]:

@@ -180,7 +180,7 @@ def require_repeats(call: Callable[[], Any]) -> None:
 
 
 def require_close(got: Any, expected: Any, within: float, what: str) -> None:
-    """Raise AssertionError unless no entry of ``got`` is farther than ``within`` from expected."""
+    """Raise AssertionError if any entry of ``got`` is off ``expected`` by more than ``within``."""
     off = float(np.abs(np.asarray(got, dtype=float) - np.asarray(expected, dtype=float)).max())
     require(off <= within, f"{what} is off by {off:.3g}, at most {within:.3g} is allowed")
 

@@ -181,7 +181,7 @@ class CalibratedPose:
 
     @property
     def each(self) -> tuple[CalibratedPose, ...]:
-        """Every transform by itself."""
+        """The transform and each of the others, as calibrated poses of their own."""
         return tuple(replace(self, transform=x, others=()) for x in (self.transform, *self.others))
 
     @property

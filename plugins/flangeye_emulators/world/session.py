@@ -194,8 +194,8 @@ def home_of(arm: Arm, base_T_flange: Floats) -> Floats:
     found = arm.inverse(base_T_flange)
     if not len(found):
         raise StageError(
-            "the arm cannot reach a pose at which the camera sees the target; move camera, place "
-            "or distance"
+            "the arm cannot reach a pose at which the camera sees the target; change camera:, "
+            "place: or distance:"
         )
     return np.asarray(found[0])
 

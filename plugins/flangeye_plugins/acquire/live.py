@@ -368,7 +368,7 @@ def movement(samples: Sequence[RememberedState]) -> float:
 
 
 def movements(samples: Sequence[RememberedState]) -> Floats:
-    """Return how far such a point is in each of N samples from the first (N,) [m]."""
+    """Return (N,) how far a point 0.1 m off the flange's centre is from its first place [m]."""
     poses = np.array([sample.base_T_flange for sample in samples])
     moves = np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1)
     turns = np.linalg.norm(poses[:, :3, :3] - poses[0, :3, :3], axis=(1, 2)) / np.sqrt(2)

@@ -181,14 +181,14 @@ class Shape:
 
     @cached_property
     def surface(self) -> OrientedPoints:
-        """Points on the outside, some spacings apart for each direction of the surface."""
+        """Points of the outer surface, one per voxel and main direction of the normal."""
         points, normals = self.outside
         keep = thin(points, normals, self.size / self.spacings)
         return OrientedPoints(points[keep], normals[keep], normals[keep])
 
     @cached_property
     def ends(self) -> OrientedPoints:
-        """Some of the points where faces end, some spacings apart for each direction."""
+        """Points where faces end, one per voxel and main direction."""
         ends = self.outline
         return ends.take(thin(ends.points, ends.directions, self.size / self.spacings))
 

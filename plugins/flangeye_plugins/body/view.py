@@ -150,10 +150,10 @@ class CoarseImage:
         return float(SIGMA_OF_MAD * np.median(np.abs(off)) / np.sqrt(2)) if len(off) else 0.0
 
     def edges(self, size: float) -> OrientedPoints:
-        """Return where surfaces end, but those that are larger than a body of that size [m].
+        """Return the edges of surfaces, except of planes larger than a body of ``size`` [m].
 
-        Where a plane goes on beyond ``size`` in two of eight directions, it is no face of such a
-        body, but a table or a wall.
+        A plane that continues beyond ``size`` in at least two of eight directions is taken for a
+        table or a wall.
         """
         found, directions = self.ends
         found = found & np.isfinite(self.normals[..., 0]) & ~self._goes_on(size)

@@ -268,7 +268,7 @@ def _repeats(
 def _left_out(session: RecordedSession, wrong: NDArray[np.bool_], name: str, what: str) -> Finding:
     names = [each for each, bad in zip(session.ids, wrong, strict=True) if bad]
     if (session.seen & ~wrong).sum() < session.seen.sum() / 2:
-        return Finding(name, what, "record again: fewer than half would remain", tuple(names))
+        return Finding(name, what, "record again: less than half the captures remain", tuple(names))
     corrected_session = session.without(wrong)
     return Finding(
         name, what, corrected_session.step(), tuple(names), corrected_session=corrected_session

@@ -48,7 +48,14 @@ _WAYS: Mapping[str, tuple[Change, str]] = {
 
 
 class Rereading(NamedTuple):
-    """A session with its rotations read in another convention: whose, from and to."""
+    """A session whose rotations were read again in another convention.
+
+    Attributes:
+        session: With the rotations read again.
+        whose: Which rotations, such as "the robot's rotations".
+        read_as: Convention that the recipe states.
+        written_as: Convention in which they were read again.
+    """
 
     session: RecordedSession
     whose: str

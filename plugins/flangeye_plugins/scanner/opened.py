@@ -125,7 +125,7 @@ def require_in_range(name: str, cloud: PointCloud, model: ScannerModel | None) -
 
 
 class OpenScanner(Device):
-    """A scanner in use; drivers add ``expose``, and ``close`` if there is a device."""
+    """A connected scanner; drivers implement ``expose``, and ``close`` if a device is open."""
 
     def __init__(
         self, name: str, facts: Mapping[str, str], model: ScannerModel | None = None

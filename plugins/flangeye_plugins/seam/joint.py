@@ -162,7 +162,7 @@ def _refuse_apart(seen: PlacedScan) -> None:
 def _rough(seen: PlacedScan, params: JointParams, seam: Seam | None) -> Course:
     """Return frames along the rough line, in ``camera``."""
     if params.line is None and seam is None:
-        raise StageError(f"{STAGE}: knows no rough line; write line:, or put a seam step before it")
+        raise StageError(f"{STAGE}: no rough seam line; write line:, or put a seam step before it")
     given = np.array(params.line) if params.line else seam.points_in_base  # type: ignore[union-attr]
     steps = np.diff(given, axis=0)
     lengths = np.linalg.norm(steps, axis=1)

@@ -70,8 +70,8 @@ def answer_for(stage: str, calibration: HandEye, params: SeamParams) -> HandEye:
     corrected = calibration.as_corrected()
     if corrected is None:
         raise CalibrationRefused(
-            f"{stage}: arm: corrected, and the calibration found no error of the arm that helps; "
-            "write arm: as-reported"
+            f"{stage}: the recipe asks for arm: corrected, but the calibration found no arm "
+            "error worth correcting; write arm: as-reported"
         )
     return corrected
 

@@ -90,8 +90,8 @@ def segment_body(
     # A round body shows fewer freedoms
     if looks.freedoms < 6:
         raise StageError(
-            f"{body.name}: it looks the same however it is turned about an axis, so that a scan "
-            "does not show its pose; segment.sphere finds a ball"
+            f"{body.name}: the body is rotationally symmetric, so a scan does not determine its "
+            "pose; use another body, or segment.sphere for a ball"
         )
     search = BodySearch(points, looks)
     passes = partial(_passes, coverage=params.min_coverage, trust=params.min_trust)
@@ -225,6 +225,7 @@ def _why_none(every: list[FoundPose], body: TargetBody) -> Rejected:
     return Rejected(
         f"no pose of {body.name} ({body.size * 1e3:.0f} mm across) explains the scan: is it in "
         "view, and are the mesh's unit and handedness right?",
-        f"the best shows {best.shown:.0%} of it in {best.agree} rays, {best.trusted:.1%} of "
-        f"what is seen there fits, and it holds to {every[0].weakest * body.size * 1e3:.1f} mm",
+        f"best candidate: {best.shown:.0%} of the rays that should hit it do ({best.agree}), "
+        f"{best.trusted:.1%} of the rays at and beside it agree, standard deviation of its pose "
+        f"{every[0].weakest * body.size * 1e3:.1f} mm",
     )

@@ -32,7 +32,7 @@ REMEDIES = {
 
 
 class Predicted(NamedTuple):
-    """Variances of the torch along the plan, (K,) each [m^2].
+    """Variances of the torch's position across the seam at K places, (K,) each [m^2].
 
     Attributes:
         s: Arc lengths [m].
@@ -50,7 +50,7 @@ class Predicted(NamedTuple):
 
     @property
     def variance(self) -> Floats:
-        """(K,) all together."""
+        """(K,) sum of all parts."""
         return self.fixed + self.askew + self.tip + self.felt
 
     def largest(self, at: int) -> str:
@@ -59,7 +59,7 @@ class Predicted(NamedTuple):
 
 
 def predicted(plan: Path, belief: Belief, settings: Following) -> Predicted:
-    """Return the torch's variances along the plan."""
+    """Predict the variances of the torch's position across the seam, along the plan."""
     s = np.arange(0.0, plan.length + 1e-3, 2e-3)  # every 2 mm
     lets_go = (
         plan.length - settings.ending - settings.speed * settings.deflection / settings.release

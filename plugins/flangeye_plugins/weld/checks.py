@@ -33,13 +33,13 @@ def check_finger(finger: Finger, settings: Following) -> None:
     asked = max(settings.deflection, settings.preload)
     if asked > finger.travel:
         raise StageError(
-            f"weld.tactile: a deflection of {asked * 1e3:.3g} mm is more than finger "
-            f"{finger.model} stands, {finger.travel * 1e3:.3g} mm"
+            f"weld.tactile: a deflection of {asked * 1e3:.3g} mm exceeds the limit "
+            f"of finger {finger.model}, {finger.travel * 1e3:.3g} mm"
         )
     force = finger.force(np.array([0.0, settings.deflection, settings.preload]))
     if force is not None and force > finger.largest_force:
         raise StageError(
-            f"weld.tactile: deflection and preload press with {force:.2g} N, allowed are "
+            f"weld.tactile: deflection and preload press with {force:.2g} N, limit "
             f"{finger.largest_force:.2g} N; lower them, or raise 'largest_force' in its file"
         )
 
@@ -108,7 +108,7 @@ def check_body(body: LeaningTool, belief: Belief, settings: Following) -> None:
     if abs(above) > settings.torch_height:
         raise StageError(
             f"weld.tactile: as the tool leans its torch is {above * 1e3:+.1f} mm above the seam, "
-            f"allowed are {settings.torch_height * 1e3:.3g} mm; change 'travel_angle', or "
+            f"limit {settings.torch_height * 1e3:.3g} mm; change 'travel_angle', or "
             "set torch_up in the finger's file to where the torch's end is"
         )
 
@@ -151,15 +151,15 @@ def check_seam(seam: Seam, surface: WorkSurface, distance: float, settings: Foll
         raise StageError(
             f"weld.tactile: the seam bends out of its surface so much that over the "
             f"{distance * 1e3:.0f} mm from the torch to the tip the tool would lean by "
-            f"{np.degrees(bent):.0f} deg, allowed are 30; end the plan before the bend, or take a "
+            f"{np.degrees(bent):.0f} deg, limit 30 deg; end the plan before the bend, or take a "
             "tool whose torch is nearer to its tip"
         )
     crooked = float(np.abs(tool_angles(plan, distance)).max())
     if crooked > np.radians(60.0):  # beyond, the torch would be pushed
         raise StageError(
             f"weld.tactile: the seam is too curved for a torch {distance * 1e3:.0f} mm behind "
-            f"the tip: the tool would stand at {np.degrees(crooked):.0f} deg to it, allowed are "
-            "60; end the plan before the bend, or take a tool whose torch "
+            f"the tip: the tool would stand at {np.degrees(crooked):.0f} deg to it, limit "
+            "60 deg; end the plan before the bend, or take a tool whose torch "
             "is nearer to its tip"
         )
     fault = float(tube_radii(seam)[0])

@@ -51,7 +51,7 @@ class Bounds:
         if astray > Following.astray:
             raise DeviceError(
                 f"the tip is {astray * 1e3:.0f} mm away from the plan, "
-                f"allowed are {Following.astray * 1e3:.0f} mm"
+                f"limit {Following.astray * 1e3:.0f} mm"
             )
         for feeling in felt:
             self._check_press(feeling)
@@ -60,14 +60,13 @@ class Bounds:
         moved = float(np.linalg.norm(feeling.displacement))
         if moved > self._finger.travel:
             raise DeviceError(
-                f"the tip is displaced by {moved * 1e3:.1f} mm, finger {self._finger.model} stands "
-                f"{self._finger.travel * 1e3:.3g} mm"
+                f"the tip is displaced by {moved * 1e3:.1f} mm, limit of finger "
+                f"{self._finger.model} {self._finger.travel * 1e3:.3g} mm"
             )
         force = self._finger.force(feeling.displacement)
         if force is not None and force > self._finger.largest_force:
             raise DeviceError(
-                f"the tip presses with {force:.1f} N, "
-                f"allowed are {self._finger.largest_force:.3g} N"
+                f"the tip presses with {force:.1f} N, limit {self._finger.largest_force:.3g} N"
             )
 
 

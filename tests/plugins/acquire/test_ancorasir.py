@@ -289,7 +289,9 @@ def test_counts_that_differ(repository: Path) -> None:
 def test_spoilt_text(repository: Path) -> None:
     folder = repository / "Kinect_Result"
     (folder / "measureRobot.txt").write_text("1 2 3\n4 5\n")
-    assert refused(folder) == (f"{folder}/measureRobot.txt:2: has 2 numbers, not 3 that are finite")
+    assert refused(folder) == (
+        f"{folder}/measureRobot.txt:2: has 2 numbers, expected 3 finite numbers"
+    )
     (folder / "measureRobot.txt").write_text("1 2 x\n")
     assert refused(folder) == (
         f"{folder}/measureRobot.txt:1: could not convert string to float: 'x'"

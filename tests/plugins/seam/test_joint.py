@@ -232,7 +232,7 @@ def test_without_a_line_it_says_what_to_write() -> None:
     with pytest.raises(StageError) as error:
         seam_joint(hand_eye(), scan, JointParams(joint="vee"))
     assert str(error.value) == (
-        "seam.joint: knows no rough line; write line:, or put a seam step before it"
+        "seam.joint: no rough seam line; write line:, or put a seam step before it"
     )
 
 

@@ -57,7 +57,7 @@ def test_the_arm_as_reported_needs_nothing() -> None:
 
 
 def test_an_arm_without_a_known_error_is_not_corrected() -> None:
-    with pytest.raises(CalibrationRefused, match="no error of the arm that helps; write arm: as-r"):
+    with pytest.raises(CalibrationRefused, match="no arm error worth correcting; write arm: as-r"):
         answer_for("seam.cad", hand_eye(), CORRECTED)
 
 

@@ -160,7 +160,7 @@ def test_ctrl_c_stops_the_arm_and_the_log_is_kept() -> None:
 def test_a_tip_that_strays_from_the_plan_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Following, "astray", 2.5e-3)
     report, _ = run(planned("v-straight", shift=(0.0, 3e-3, 0.0), end=SHORT))
-    assert report.reason.startswith("the tip is 3 mm away from the plan, allowed are 2 mm; ")
+    assert report.reason.startswith("the tip is 3 mm away from the plan, limit 2 mm; ")
 
 
 # --- the tip's own bounds -------------------------------------------------------------------------
@@ -179,9 +179,9 @@ def test_what_a_weld_needs_is_within_the_bounds() -> None:
 @pytest.mark.parametrize(
     ("displacement", "lateral", "told"),
     [
-        ([0, 0, 0], 21e-3, "the tip is 21 mm away from the plan, allowed are 20 mm"),
-        ([0, 0, 5.5e-3], 0.0, "the tip presses with 11.0 N, allowed are 10 N"),
-        ([0, 6.1e-3, 0], 0.0, "the tip is displaced by 6.1 mm, finger srm stands 6 mm"),
+        ([0, 0, 0], 21e-3, "the tip is 21 mm away from the plan, limit 20 mm"),
+        ([0, 0, 5.5e-3], 0.0, "the tip presses with 11.0 N, limit 10 N"),
+        ([0, 6.1e-3, 0], 0.0, "the tip is displaced by 6.1 mm, limit of finger srm 6 mm"),
     ],
 )
 def test_beyond_the_bounds(displacement: list[Any], lateral: float, told: str) -> None:

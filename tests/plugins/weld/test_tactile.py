@@ -73,13 +73,13 @@ def refused(seam=None, name="v-straight", **more):
 
 def test_a_deflection_the_finger_does_not_stand() -> None:
     assert refused(deflection="7 mm") == (
-        "weld.tactile: a deflection of 7 mm is more than finger srm stands, 6 mm"
+        "weld.tactile: a deflection of 7 mm exceeds the limit of finger srm, 6 mm"
     )
 
 
 def test_a_force_beyond_the_limit() -> None:
     assert refused(deflection="4 mm", preload="5 mm") == (
-        "weld.tactile: deflection and preload press with 11 N, allowed are 10 N; lower them, or "
+        "weld.tactile: deflection and preload press with 11 N, limit 10 N; lower them, or "
         "raise 'largest_force' in its file"
     )
 
@@ -125,7 +125,7 @@ def test_a_seam_too_curved_for_the_tool() -> None:
         "weld.tactile: the seam is too curved for a torch 40 mm behind the tip: the tool would "
         "stand at 6"
     )
-    assert "deg to it, allowed are 60; end the plan before the bend, or take a tool" in told
+    assert "deg to it, limit 60 deg; end the plan before the bend, or take a tool" in told
 
 
 def test_a_seam_that_bends_out_of_its_surface() -> None:
@@ -135,7 +135,7 @@ def test_a_seam_that_bends_out_of_its_surface() -> None:
     hump[:, 2] += 0.03 * (np.cos(turn) - 1.0)
     hump[:, :2] = hump[:, :2].mean(axis=0) + 0.03 * np.outer(np.sin(turn), [1.0, 0.0])
     told = refused(Seam(hump, seam.openings_in_base, seam.covariance))
-    assert "the seam bends out of its surface so much" in told and "allowed are 30" in told
+    assert "the seam bends out of its surface so much" in told and "limit 30 deg" in told
 
 
 def test_a_plan_too_uncertain_to_search() -> None:

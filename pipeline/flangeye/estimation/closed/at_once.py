@@ -32,7 +32,7 @@ def daniilidis(motions: Motions) -> Floats:
     candidates = [_normalised(s * u + t * v) for s, t in _ratios(a, b, c)]
     if not candidates:
         raise CalibrationRefused(
-            "the motions have no dual quaternion in common: check that each scan belongs to its "
+            "no single transform fits all motions: check that each scan belongs to its "
             "robot pose, and turn the arm about two axes at least"
         )
     real, dual = min(candidates, key=lambda q: float(np.linalg.norm(rows @ np.concatenate(q))))

@@ -28,11 +28,11 @@ def blame(
     it), and, where the arm's kinematics are known, one joint or the arm re-mastered.
 
     Args:
-        before: What was known of the camera before, with the calibration.
-        after: The sightings since.
-        about: (3,) where motions are taken [m].
-        scanner: (3,) where the scanner stands [m]: it turns about itself.
-        daily: See :class:`DriftTest`.
+        before: Estimate of the camera motion and the arm's error weights before the change.
+        after: Sightings since the change.
+        about: (3,) reference point of the motions, in base [m].
+        scanner: (3,) the scanner's position, about which it rotates, in base [m].
+        daily: Standard deviation of the cell's day-to-day motion at the work [m].
     """
     residuals = after.residuals + after.effects @ before.mean
     designs = _designs(after, about, scanner)
@@ -50,16 +50,16 @@ def explained(
     """Return whether one move, of the scanner, the flange or the arm, explains the sightings.
 
     Args:
-        before: As in :func:`blame`.
-        after: The sightings.
-        about: As in :func:`blame`.
-        scanner: As in :func:`blame`.
-        daily: As in :func:`blame`.
+        before: Estimate of the camera motion and the arm's error weights before the change.
+        after: Sightings since the change.
+        about: (3,) reference point of the motions, in base [m].
+        scanner: (3,) the scanner's position, about which it rotates, in base [m].
+        daily: Standard deviation of the cell's day-to-day motion at the work [m].
     """
     residuals = (after.residuals + after.effects @ before.mean).ravel()
     noise = _noise(before, after, daily)
     limit = chi2_quantile(1 - MISFIT, len(residuals))
-    # What it may do at all
+    # Any motion up to 0.1 m or 0.1 rad (one sigma) is possible
     totals = (noise + 0.1**2 * d @ d.T for d, _ in _designs(after, about, scanner).values())
     return any(residuals @ np.linalg.solve(total, residuals) < limit for total in totals)
 

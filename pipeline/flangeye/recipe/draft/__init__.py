@@ -112,4 +112,4 @@ def _lengths(flag: str, text: str) -> list[str]:
             return found
     except ValueError:
         pass
-    raise RecipeError(f"--{flag} '{text.strip()}': is no three lengths, as 620 mm, 0 mm, 980 mm")
+    raise RecipeError(f"--{flag} '{text.strip()}': write three lengths, as 620 mm, 0 mm, 980 mm")

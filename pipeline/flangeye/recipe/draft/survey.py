@@ -38,10 +38,10 @@ class Questions:
     """Answers to questions: from options, evidence, or a person.
 
     Attributes:
-        given: Answers by flag, those asked for as well; None where it was not given.
-        prompt: Asks a person, or None where there is nobody.
-        assumed: What was taken by default, told at the end.
-        likely: By option, an answer that the data show, and how they do.
+        given: Answers by option, from the command line or a person; None where not given.
+        prompt: Asks a person; None if nobody can be asked.
+        assumed: Lines on the defaults that were used, to print at the end.
+        likely: By option, the answer that the data suggest, and the evidence for it.
     """
 
     given: dict[str, str | None] = field(default_factory=dict)
@@ -58,18 +58,18 @@ class Questions:
         check: Check | None = None,
         known: str = "",
     ) -> str:
-        """Return the answer to a question; a person whose answer is refused is asked again.
+        """Return the answer to a question; a person is asked again after an invalid answer.
 
         Args:
-            flag: The option that answers it.
-            question: For people.
-            default: What is likely; None where nothing is.
-            example: An answer, for the message where there is none.
-            check: Refuses an answer that is none.
-            known: The answers there are, for whoever has to choose one.
+            flag: Command-line option that answers the question.
+            question: Text shown to the person.
+            default: The likely answer; None if there is none.
+            example: Example answer, shown in the error message.
+            check: Raises an error for an invalid answer.
+            known: List of possible answers, shown with the question.
 
         Raises:
-            RecipeError: Nothing is likely, nobody can be asked; names the flag to add.
+            RecipeError: There is neither a default nor a person to ask; names the option to add.
         """
         answer = self.given.get(flag)
         if answer is None:

@@ -54,7 +54,8 @@ class WorkerRefused(Exception):
 class SampleClock:
     """Converts the controller's sample times to this computer's clock.
 
-    The earliest arrival, seen over time, has the least delay in it; delays only ever add.
+    Transport delays are never negative, so the smallest difference of arrival and sample time is
+    the best estimate of the clocks' offset.
     """
 
     def __init__(self) -> None:

@@ -61,7 +61,7 @@ class Weave:
 
     @property
     def variance(self) -> float:
-        """Variance across the seam from errors in its timing [m^2]."""
+        """Variance of the torch across the seam due to the weave's timing error [m^2]."""
         # The arm's delay is known to 10 ms: a swing is early or late by it.
         return (self.fastest * 10e-3) ** 2 / 2.0
 

@@ -104,16 +104,17 @@ class Pressing:
 
     @property
     def ends(self) -> float:
-        """Where the wanted deflection begins to ramp down, by arc length [m].
+        """Arc length at which the wanted deflection starts to ramp down [m].
 
-        It then is zero at ``ending``.
+        The deflection reaches zero ``Following.ending`` before the end of the plan, or earlier
+        where the follower asks for more.
         """
         task = self._task
         release = task.settings.speed * self.most / task.settings.release
         return task.plan.length - max(task.settings.ending, task.beyond) - release
 
     def slack_for(self, tip: float, deflection: float, play: float) -> float:
-        """Return the distance over which the tip has moved as if no wall held it [m].
+        """Return the distance the tip has moved without contact with a wall [m].
 
         The servo presses it again within a few millimetres where there is a wall. Where there is
         none the finger shows its play, whatever is asked of it.
@@ -142,11 +143,11 @@ class Pressing:
             self.side, self.wanted = -self.side, -self.wanted
 
     def since_lost(self, tip: float) -> float:
-        """Return how far the tip has gone since no wall holds it [m]."""
+        """Return how far the tip has moved since it lost contact with its wall [m]."""
         return tip - self._lost
 
     def since_turned(self, tip: float) -> float:
-        """Return how far the tip has gone since it presses this wall [m]."""
+        """Return how far the tip has moved since it was turned to this wall [m]."""
         return tip - self._turned
 
 

@@ -99,6 +99,6 @@ def _require_stayed(what: str, left: Floats) -> None:
     if off[worst] > 1e-3:
         raise StageError(
             f"pivot of the {what}: in pose {worst + 1} it was {off[worst] * 1e3:.2f} mm away "
-            f"from where it was in the others, allowed is 1 mm; did it leave "
+            f"from where it was in the others, limit 1 mm; did it leave "
             "its mark?"
         )
