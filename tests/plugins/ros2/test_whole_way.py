@@ -71,12 +71,15 @@ def test_two_commands_lead_to_a_verified_matrix_and_a_third_to_the_graph(termina
             check = ("monitor", "run", "--live", "--scans", "2", "--move")
             assert json.loads(terminal.run(*check, *QUICK)[0])["state"] == "OK"
         publishing = terminal.start("publish", "run")
-        parent, pose = tree.heard_of(ROOT[layout])
-        assert parent == "base_link"
-        link_T_camera = tree.heard_of("optical_frame")[1] if own else np.eye(4)
-        assert np.allclose(pose @ link_T_camera, matrix, atol=1e-6)
-        publishing.send_signal(signal.SIGINT)
-        said, wrong = publishing.communicate(timeout=30)
+        try:
+            parent, pose = tree.heard_of(ROOT[layout])
+            assert parent == "base_link"
+            link_T_camera = tree.heard_of("optical_frame")[1] if own else np.eye(4)
+            assert np.allclose(pose @ link_T_camera, matrix, atol=1e-6)
+            publishing.send_signal(signal.SIGINT)
+            said, wrong = publishing.communicate(timeout=30)
+        finally:
+            publishing.kill()
         assert publishing.returncode == 0, wrong
         assert "published until Ctrl-C" in said
 
