@@ -74,7 +74,6 @@ class BodyView:
     """What of a body on an arm, or of the arm itself, is seen at its joint angles.
 
     Attributes:
-        name: Of the body.
         is_arm: Whether it is the arm itself.
     """
 
@@ -83,7 +82,7 @@ class BodyView:
         import open3d as o3d
         import trimesh
 
-        self.name, self.is_arm, self._arm = body.name, isinstance(body, ArmBody), arm
+        self.is_arm, self._arm = isinstance(body, ArmBody), arm
         parts = body.by_link if isinstance(body, ArmBody) else {arm.n + 1: body}
         # Points on the whole surface: their share in view is known to a fiftieth
         number = 600

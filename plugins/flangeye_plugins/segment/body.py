@@ -29,7 +29,7 @@ from flangeye.units import Length, param
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from flangeye_plugins.body.search import FoundPose
+    from flangeye_plugins.body.search import BodySearch, FoundPose
 
 FIRM = 0.004
 """Largest standard deviation of what a scan shows least of a body's pose and scale, in its sizes or
@@ -52,6 +52,10 @@ class SegmentBodyParams(Params):
         "share that is as the body makes it.",
     )
 
+    def passed_by(self, found: FoundPose) -> bool:
+        """Return whether a pose passes."""
+        return _passes(found, self.min_coverage, self.min_trust)
+
 
 @stage("segment.body")
 def segment_body(
@@ -66,9 +70,9 @@ def segment_body(
     Edges of the body are laid on edges of the scan; the poses that the scan does not contradict are
     refined, and then checked ray by ray against everything the scanner saw: the body's surface,
     points behind it, and anything at its depth where the body has ended; and the scan has to show
-    the body's size. Where none passes the scan is refused;
-    where several do, the arm's motion between captures decides. Where the arm's motion since
-    earlier sightings predicts a pose that passes, it is taken without a search.
+    the body's size. Where none passes the scan is refused; where several do, the arm's motion
+    between captures decides. Where the arm's motion since earlier sightings predicts a pose that
+    passes, it is taken without a search.
 
     Raises:
         StageError: The cloud is in millimetres, or otherwise a thousand times off; or the body is
@@ -94,31 +98,53 @@ def segment_body(
             "pose; use another body, or segment.sphere for a ball"
         )
     search = BodySearch(points, looks)
-    passes = partial(_passes, coverage=params.min_coverage, trust=params.min_trust)
     predicted = _predicted(capture, configuration, earlier)
-    found = list(filter(passes, search.near(predicted)))[:1]
+    carried = list(filter(params.passed_by, search.near(predicted)))[:1]
     # What slid away from where the arm has carried the body may be another thing
-    if not (found and alike(found[0].pose[None], predicted, looks).any()):
-        every = search.everywhere()
-        found = search.unrivalled(passing := list(filter(passes, every)), passing)
+    if carried and alike(carried[0].pose[None], predicted, looks).any():
+        found: list[FoundPose] | Rejected = carried
+    else:
         # Of the first captures only: a body that was seen before is as its mesh says.
-        doubtful = not earlier.observations
-        if not found:
-            why = _why_none(every, body)
-            return (doubtful and _misdrawn(points, body, every, passes)) or why
-        if doubtful:
-            images = [one for pose in found for one in search.images(pose) if passes(one)]
-            if not (found := search.unrivalled(found, images)):
-                what, fix, _ = _otherwise(body)[0]
-                return Rejected(f"{body.name} is {what}: its image explains more", fix=fix)
-        # One that fails narrowly and explains as much leaves it open which of them is right
-        near = [o for o in every if not passes(o) and o.verdict.trusted >= params.min_trust]
-        found += search.twins_among(near, found)
+        found = _searched(search, body, points, params, not earlier.observations)
+    if isinstance(found, Rejected):
+        return found
     pose, *others = (one.pose for one in found)
     centre = pose[:3, :3] @ looks.centre + pose[:3, 3]
     cloud = PointCloud(capture.cloud.frame, around(points, looks, pose, *others))
     towards = -centre / np.linalg.norm(centre)
     return FlangeCloud(cloud, centre, towards, pose, others=np.array(others))
+
+
+def _searched(
+    search: BodySearch,
+    body: TargetBody,
+    points: Singles,
+    params: SegmentBodyParams,
+    doubtful: bool,
+) -> list[FoundPose] | Rejected:
+    """Return the poses that a scan leaves open, the best first, or why there is none.
+
+    Args:
+        search: In the scan.
+        body: What is looked for.
+        points: (N, 3) of the scan [m].
+        params: What a pose has to pass.
+        doubtful: Whether the mesh may be another one than the body's.
+    """
+    every, passes = search.everywhere(), params.passed_by
+    passing = list(filter(passes, every))
+    found = search.unrivalled(passing, passing)
+    if not found:
+        why = _why_none(every, body)
+        return (doubtful and _misdrawn(points, body, every, passes)) or why
+    if doubtful:
+        images = [one for pose in found for one in search.images(pose) if passes(one)]
+        if not (found := search.unrivalled(found, images)):
+            what, fix, _ = _otherwise(body)[0]
+            return Rejected(f"{body.name} is {what}: its image explains more", fix=fix)
+    # One that fails narrowly and explains as much leaves it open which of them is right
+    near = [o for o in every if not passes(o) and o.verdict.trusted >= params.min_trust]
+    return found + search.twins_among(near, found)
 
 
 def _between(points: Singles, near: float, far: float) -> Singles:
