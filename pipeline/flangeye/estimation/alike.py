@@ -35,13 +35,7 @@ def told_apart(
             no capture is sure, the first capture's best pose is called the target's.
     """
     told = _told(cell, sure, held)
-    if (
-        held
-        and last
-        and not sure
-        and not any(told)
-        and cell.frames[held[0][0].target].place is None
-    ):
+    if last and held and not (sure or any(told)) and cell.frames[held[0][0].target].place is None:
         return [held[0][0], *_told(cell, held[0][:1], held[1:])]
     return told
 
