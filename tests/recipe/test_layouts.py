@@ -302,6 +302,117 @@ def joints_of_ros(f, j, a, s):
     (f / "arm.urdf").write_text(urdf_of(load_model("robots", "ur5e")))
 
 
+def stacked_matrices(f, j, a, s):
+    storage(f, "pairs.yml", [("gripper2base", a.reshape(-1, 4)), ("target2cam", s.reshape(-1, 4))])
+
+
+def by_columns(f, j, a, s):
+    (f / "log.json").write_text(json.dumps([
+        {"O_T_EE": arm.T.ravel().tolist(), "cam_T_tag": seen.ravel().tolist()}
+        for arm, seen in zip(a, s, strict=True)
+    ]))  # fmt: skip
+
+
+def times_as_names(f, j, a, s):
+    for name, poses in (("arm", a), ("aruco", s)):
+        (f / name).mkdir()
+        for k, pose in enumerate(poses):
+            np.savetxt(f / name / f"{1690000000 + 3.125 * k:.3f}.txt", pose)
+
+
+def dates_as_names(f, j, a, s):
+    for k, (arm, seen) in enumerate(zip(vector(a), vector(s), strict=True)):
+        records = {"robot": arm.tolist(), "board": seen.tolist()}
+        (f / f"202601{28 + k // 7}_10150{k % 7}.yaml").write_text(json.dumps(records))
+
+
+def printed_arrays(f, j, a, s):
+    for name, poses in (("robot", a), ("board", s)):
+        (f / f"{name}.txt").write_text("\n".join(map(repr, poses)))
+
+
+def nested(f, j, a, s):
+    (f / "2026-01-31" / "first").mkdir(parents=True)
+    headings(f / "2026-01-31" / "first", j, a, s)
+
+
+def rostopic(f, j, a, s):
+    columns = [f"field.pose.{part}.{axis}" for part, axes in (("position", "xyz"),
+               ("orientation", "xyzw")) for axis in axes]  # fmt: skip
+    for name, poses in (("tcp_pose", a), ("aruco_pose", s)):
+        lines = [f"{1690000000 + 4 * k}000000000,{k},{row}" for k, row in
+                 enumerate(text(quaternion(poses)).splitlines())]  # fmt: skip
+        heading = ",".join(["%time", "field.header.seq", *columns])
+        (f / f"{name}.csv").write_text("\n".join([heading, *lines]) + "\n")
+
+
+def centimetres(f, j, a, s):
+    for name, poses in (("robot", a), ("marker", s)):
+        rows = quaternion(poses) * [100, 100, 100, 1, 1, 1, 1]
+        (f / f"{name}.csv").write_text("x_cm,y_cm,z_cm,qx,qy,qz,qw\n" + text(rows))
+
+
+def counted_apart(f, j, a, s):
+    names = [f"r{k}" for k in range(1, 10)] + ["t1", "t2", "t3"]
+    for name, poses in (("robot", a), ("marker", s)):
+        rows = np.hstack([poses[:, :3, :3].reshape(-1, 9), poses[:, :3, 3]])
+        (f / f"{name}.csv").write_text(",".join(names) + "\n" + text(rows))
+
+
+def bracketed_units(f, j, a, s):
+    names = [f"{n}-Position [mm]" for n in "XYZ"] + [f"Winkel {n} [°]" for n in "ABC"]
+    for name, poses in (("Roboter", a), ("Kamera", s)):
+        rows = text(euler(poses, "ZYX"), ";").replace(".", ",")
+        (f / f"{name}.csv").write_text(";".join(names) + "\n" + rows)
+
+
+def units_below(f, j, a, s):
+    for name, poses in (("robot", a), ("marker", s)):
+        rows = text(euler(poses, "xyz"), " ")
+        (f / f"{name}.txt").write_text("x y z rx ry rz\nmm mm mm deg deg deg\n" + rows)
+
+
+def empty_cells(f, j, a, s):
+    names = [f"{who}_{n}" for who in ("tcp", "tag") for n in NAMES]
+    rows = text(np.hstack([quaternion(a), quaternion(s)])).splitlines()
+    for k in (0, 5):
+        rows[k] = ",".join(rows[k].split(",")[:7]) + 7 * ","
+    (f / "log.csv").write_text("\n".join([",".join(names), *rows]) + "\n")
+
+
+def zeros(f, j, a, s):
+    names = [f"{who}_{n}" for who in ("tcp", "tag") for n in NAMES]
+    seen = quaternion(s)
+    seen[[0, 5]] = 0
+    (f / "log.csv").write_text(",".join(names) + "\n" + text(np.hstack([quaternion(a), seen])))
+
+
+def matlab_cells(f, j, a, s):
+    cells = {name: np.empty(COUNT, dtype=object) for name in ("robotPoses", "markerPoses")}
+    for cell, poses in zip(cells.values(), (a, s), strict=True):
+        cell[:] = list(poses)
+    savemat(f / "data.mat", cells)
+
+
+def fortran(f, j, a, s):
+    for name, poses in (("robot", a), ("marker", s)):
+        lines = [" ".join(f"{x:.8E}".replace("E", "D") for x in row) for row in vector(poses)]
+        (f / f"{name}.dat").write_text("\n".join(lines) + "\n")
+
+
+def centres(f, j, a, s):
+    names = [*NAMES, "sphere_x", "sphere_y", "sphere_z"]
+    rows = np.hstack([quaternion(a), s[:, :3, 3]])
+    (f / "log.csv").write_text(",".join(names) + "\n" + text(rows))
+
+
+def moveit(f, j, a, s):
+    (f / "samples.yaml").write_text("".join(
+        f"- effector_wrt_world: {arm.ravel().tolist()}\n"
+        f"  object_wrt_sensor: {seen.ravel().tolist()}\n" for arm, seen in zip(a, s, strict=True)
+    ))  # fmt: skip
+
+
 LAYOUTS: dict[str, Callable[..., None]] = {
     "two blocks of rows in one text, arm above marker": blocks,
     "the same without a line between them": halves,
@@ -339,6 +450,23 @@ LAYOUTS: dict[str, Callable[..., None]] = {
     "YAML of records: position, orientation.roll, …": yaml_nested,
     "joint angles without names, and the arm's `.urdf`": joints_alone,
     "joint angles of ROS by alphabet, and the arm's `.urdf`": joints_of_ros,
+    "OpenCV's storage, 4×4 matrices below each other": stacked_matrices,
+    "`O_T_EE` of Franka's logs, 16 numbers column by column": by_columns,
+    "a 4×4 text for each time, `arm/1690000003.125.txt`": times_as_names,
+    "a YAML for each date and time, `20260131_101502.yaml`": dates_as_names,
+    "what Python prints of arrays, `array([[…]])`": printed_arrays,
+    "a folder in a folder, alone": nested,
+    "`rostopic echo -p`, times in ns without a unit": rostopic,
+    "centimetres, `x_cm`": centimetres,
+    "headings r1 to r9 and t1 to t3": counted_apart,
+    "headings X-Position [mm], Winkel A [°], decimal commas": bracketed_units,
+    "units in a line under the heading": units_below,
+    "empty cells where the target was not seen": empty_cells,
+    "zeros where the target was not seen": zeros,
+    "MATLAB, cells of 4×4 matrices": matlab_cells,
+    "Fortran's exponents, `1.5D+02`": fortran,
+    "a sphere's centres beside the arm's poses": centres,
+    "samples of MoveIt's calibration, the camera in the hand": moveit,
 }
 """What is in the folder, and how it is written."""
 
@@ -378,3 +506,25 @@ def test_joint_angles_are_no_poses_and_ask_for_their_arm(
         "target does; joint angles? name the arm: --robot NAME ('flangeye robots' lists them), or "
         "its .urdf; or say --rotation (kuka, vector, …)"
     )
+
+
+def test_positions_of_an_unclear_unit_ask_for_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rec").mkdir()
+    _, arm, seen = session(SEED)
+    for name, poses in (("robot", arm), ("marker", seen)):
+        (tmp_path / "rec" / f"{name}.txt").write_text(text(vector(poses, 100.0), " "))
+    told = CliRunner().invoke(commands(), ["init", "rec", "--yes"])
+    reach = np.abs(100 * arm[:, :3, 3]).max()
+    assert str(told.exception) == (
+        f"not known: unit of the positions of robot.txt, which reach {reach:.0f}: far for m, near "
+        "for mm; add --length cm"
+    )
+    told = CliRunner().invoke(commands(), ["init", "rec", "--yes", "--length", "cm"])
+    assert told.exit_code == 0, f"{told.output}{told.exception}"
+    done = CliRunner().invoke(commands(), ["run", "recipe.yaml", "--out", "out"])
+    answer = json.loads((tmp_path / "out" / "result.json").read_text("utf-8"))["transforms"]
+    assert done.exit_code == 0
+    assert np.allclose(answer["flange_T_camera"]["matrix"], FLANGE_T_CAMERA, atol=2e-3)

@@ -35,9 +35,13 @@ def main() -> None:
 
 def _numbers(name: str, value: Any) -> Iterator[tuple[str, Any]]:
     """Yield an array of numbers with its name; of a structure each, behind a dot."""
+    import numpy as np
+
     kind = getattr(getattr(value, "dtype", None), "kind", "")
     if kind in ("i", "u", "f"):
         yield name, value
+    elif kind == "O" and value.size and len({np.shape(each) for each in value.flat}) == 1:
+        yield from _numbers(name, np.stack(list(value.flat)))  # a cell array of matrices
     elif kind == "V" and value.dtype.names and value.size == 1:
         for field in value.dtype.names:
             yield from _numbers(f"{name}.{field}", value[field].item())

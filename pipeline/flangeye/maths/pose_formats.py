@@ -25,7 +25,7 @@ from flangeye.maths.geometry import (
 )
 from flangeye.types import Floats
 
-LengthUnit = Literal["m", "mm"]
+LengthUnit = Literal["m", "cm", "mm"]
 AngleUnit = Literal["rad", "deg"]
 _Token = Mapping[str, str | Any]
 
@@ -42,7 +42,7 @@ EULER_ORDERS = tuple(
 intrinsic), spelt as scipy spells them."""
 
 
-_LENGTHS = {"m": 1.0, "mm": 1e-3}
+LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 _ANGLES = {"rad": 1.0, "deg": math.pi / 180}
 
 
@@ -110,7 +110,7 @@ class PoseConvention:
             )
         if not np.isfinite(values).all():
             raise ValueError(f"{self.name}: a number is not finite")
-        return rigid(self._rotation(values[3:]), values[:3] * _LENGTHS[self.length])
+        return rigid(self._rotation(values[3:]), values[:3] * LENGTHS[self.length])
 
     def numbers(self, matrix: Floats) -> Floats:
         """Return the row of numbers (6,) or (7,) of a pose (4, 4) [m].
@@ -118,7 +118,7 @@ class PoseConvention:
         A rotation vector is at most half a turn long, a quaternion has w >= 0. Where two of three
         angles turn about the same axis, the third is zero.
         """
-        position = matrix[:3, 3] / _LENGTHS[self.length]
+        position = matrix[:3, 3] / LENGTHS[self.length]
         return np.concatenate([position, self._written(matrix[:3, :3])])
 
     def read(self, text: str) -> Floats:
@@ -159,7 +159,7 @@ class PoseConvention:
 
     def text(self, matrix: Floats) -> str:
         """Return a pose (4, 4) [m] as a person reads it, to 0.01 mm and 0.001 deg."""
-        digits = {"m": 5, "mm": 2, "deg": 3, "rad": 5, "": 6}
+        digits = {"m": 5, "cm": 3, "mm": 2, "deg": 3, "rad": 5, "": 6}
         written = []
         for label, number, unit in zip(self.labels, self.numbers(matrix), self.units, strict=True):
             # Adding zero takes the sign off a zero.
@@ -212,7 +212,7 @@ class PoseConvention:
         if not unit or index >= self.count:
             return value
         own = self.units[index]
-        for table in (_LENGTHS, _ANGLES):
+        for table in (LENGTHS, _ANGLES):
             if unit in table and own in table:
                 return value * table[unit] / table[own]
         raise ValueError(
@@ -354,7 +354,8 @@ def pose_of_numbers(
     """Return the pose (4, 4) [m] of a row of numbers.
 
     Args:
-        numbers: (k,), position first, or a matrix row by row.
+        numbers: (k,), position first, or a matrix row by row; one of 16 numbers whose last column
+            is 0, 0, 0, 1 stands column by column.
         rotation: A name in :data:`CONVENTIONS`, one of :data:`PLAIN`, ``matrix`` or ``3x3``.
         length: Unit of the position.
         angle: Unit of angles, or of a rotation vector's length.
@@ -371,9 +372,18 @@ def pose_of_numbers(
         rows = np.column_stack([numbers[3:].reshape(3, 3), numbers[:3]])
     else:
         rows = numbers.reshape(-1, 4)
+        rows = rows.T if by_columns(numbers[None]) else rows
         if len(rows) == 4 and tuple(rows[3]) != (0, 0, 0, 1):
             raise ValueError("is not a rigid transform (its last row is not 0 0 0 1)")
-    return nearest_rigid(rows[:3] * np.array([1, 1, 1, _LENGTHS[length]]))
+    return nearest_rigid(rows[:3] * np.array([1, 1, 1, LENGTHS[length]]))
+
+
+def by_columns(matrices: Floats) -> bool:
+    """Return whether all matrices (N, k) of 16 numbers stand column by column, and not by rows."""
+    if matrices.shape[1] != 16:
+        return False
+    columns, rows = matrices[:, 3::4] == [0, 0, 0, 1], matrices[:, 12:] == [0, 0, 0, 1]
+    return bool(columns.all() and not rows.all())
 
 
 def nearest_rigid(matrix: Floats) -> Floats:

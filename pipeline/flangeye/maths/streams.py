@@ -169,6 +169,8 @@ def clock_offset(
         Offset [s] and correlation: 0 and 0 where nothing clear was found.
     """
     step = float(min(np.median(np.diff(first[0])), np.median(np.diff(second[0])), 0.05))
+    most = 1_000_000  # steps; times in a unit that was not stated may span centuries
+    step = max(step, float(first[0][-1] - first[0][0]) / most)
     best, shifts = 0, np.arange(-LARGEST_OFFSET, LARGEST_OFFSET + step / 2, step)
     grid = np.arange(first[0][0], first[0][-1], step)
     wanted = np.interp(grid, *first)

@@ -12,7 +12,7 @@ from pydantic import Field, field_validator, model_validator
 
 from flangeye import Params, StageError
 from flangeye.files.clouds import LengthUnit
-from flangeye.files.tables import Cell, Column, Table, read_table
+from flangeye.files.tables import Cell, Column, Table, number_of, read_table
 from flangeye.maths.pose_formats import (
     APART,
     CONVENTIONS,
@@ -21,9 +21,11 @@ from flangeye.maths.pose_formats import (
     pose_of_numbers,
     written,
 )
+from flangeye.maths.pose_formats import LengthUnit as PoseLength
 from flangeye.types import Floats
 
 POINT = "point"
+PER_UNIT = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "rad": 1.0, "deg": float(np.pi / 180)}
 
 
 class WrittenParams(Params):
@@ -34,7 +36,7 @@ class WrittenParams(Params):
         "(xyz: fixed, ZYX: turned), matrix (12 or 16 numbers, row by row), 3x3 (9 numbers behind "
         "the position), or a maker's way: " + ", ".join(CONVENTIONS) + ".",
     )
-    length: Literal["m", "mm"] = Field(description="Unit of the positions.")
+    length: PoseLength = Field(description="Unit of the positions.")
     angle: Literal["deg", "rad"] | None = Field(
         None, description="Unit of the angles, or of the rotation vector's length."
     )
@@ -68,14 +70,11 @@ class WrittenParams(Params):
         if self.rotation == POINT:
             if numbers.size != 3 or not np.isfinite(numbers).all():
                 raise StageError(f"{where}: a point has 3 finite numbers, not {numbers.size}")
-            return np.asarray(numbers * (1e-3 if self.length == "mm" else 1.0))
+            return np.asarray(numbers * PER_UNIT[self.length])
         try:
             return pose_of_numbers(numbers, self.rotation, self.length, self.angle or "rad")
         except ValueError as error:
             raise StageError(f"{where}: {error}") from None
-
-
-PER_UNIT = {"m": 1.0, "mm": 1e-3, "rad": 1.0, "deg": float(np.pi / 180)}
 
 
 class CloudUnitParams(Params):
@@ -113,7 +112,7 @@ class FlangePoseParams(ColumnsParams):
 
 
 class SeenPoseParams(ColumnsParams):
-    """A target as a camera measured it; empty cells mean not seen."""
+    """A target as a camera measured it; empty cells, and zeros in all, mean not seen."""
 
     pose: Literal["camera_T_target", "target_T_camera"] = Field(
         "camera_T_target", description="Whose pose it is. rotation: point gives its place alone."
@@ -180,14 +179,17 @@ def readings_of(own: Table, given: ColumnsParams, taken: Sequence[Column] = ()) 
     free = [i for i in range(width) if i not in other]
     columns = own.indices(given.columns) or free
     values = [
-        None if all(_is_empty(cells, c) for c in columns) else _value(own, row, columns, given)
+        None if _is_unseen(cells, columns) else _value(own, row, columns, given)
         for row, (_, cells) in enumerate(own.rows)
     ]
     return Readings(own, values, times_of(own, given.time, given.time_unit))
 
 
-def _is_empty(cells: Sequence[Cell], column: int) -> bool:
-    return column >= len(cells) or str(cells[column]).lower() in ("", "nan")
+def _is_unseen(cells: Sequence[Cell], columns: Sequence[int]) -> bool:
+    """Return whether nothing was measured: cells are empty, or all are zero, as nothing lies."""
+    filled = [cells[c] for c in columns if c < len(cells)]
+    empty = all(str(cell).strip().lower() in ("", "nan") for cell in filled)
+    return empty or (len(filled) == len(columns) and all(number_of(cell) == 0 for cell in filled))
 
 
 def _value(own: Table, row: int, columns: Sequence[int], given: ColumnsParams) -> Floats:

@@ -28,6 +28,7 @@ from flangeye.files.scans import Poses, recording_of, scans_of
 from flangeye.files.tables import Column, Table, files_at, number_of, rows_together
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.pose_corrections import inverted
+from flangeye.maths.pose_formats import LengthUnit as PoseLength
 from flangeye.maths.streams import interpolated, passed, turning
 from flangeye.models.robots import RobotModel
 from flangeye.types import FLANGE, FLANGE2, Floats, Motion
@@ -69,7 +70,7 @@ class OtherParams(ColumnsParams):
 
 
 class TargetParams(SeenPoseParams, OtherParams):
-    """The target as the camera measured it; empty cells mean not seen."""
+    """The target as the camera measured it; empty cells, and zeros in all, mean not seen."""
 
 
 class SecondParams(OtherParams):
@@ -93,7 +94,7 @@ class TableParams(FlangePoseParams, JointsParams, CloudUnitParams):
         JOINTS, description="How the rotations are written, see below; joints: there are the "
         "joint angles alone, and the recipe's robot gives the poses.",
     )  # fmt: skip
-    length: Literal["m", "mm"] = Field("m", description="Unit of the positions.")
+    length: PoseLength = Field("m", description="Unit of the positions.")
     scan: Column | None = Field(
         None,
         description="Column of the scans' file names, or of what the rows are called, as in the "

@@ -25,7 +25,7 @@ import numpy as np
 from flangeye.errors import StageError
 from flangeye.files.regular import read_any_text
 from flangeye.files.scans import natural, partners
-from flangeye.files.tables.documents import KINDS, document_of
+from flangeye.files.tables.documents import KINDS, document_of, stacked
 from flangeye.files.tables.table import (
     Cell,
     Column,
@@ -315,7 +315,7 @@ def row_of(file: Path, text: str) -> Rows | None:
 def _blocks(file: Path, lines: Sequence[str]) -> Iterator[TextBlock]:
     split = _splitter([line for line in lines if line.strip() and not _COMMENT.match(line)])
     block = TextBlock(after_blank=True, marked=split.mark != " ")
-    for n, line in enumerate(map(str.strip, lines), 1):
+    for n, line in _unbroken(lines):
         comment = bool(_COMMENT.match(line))
         plain = _COMMENT.sub("", line)
         cells = split(plain) if plain else ()
@@ -327,9 +327,26 @@ def _blocks(file: Path, lines: Sequence[str]) -> Iterator[TextBlock]:
             block = TextBlock(marked=block.marked)
         block.after_blank |= not comment
         if any(cells):
+            known = {"m", "cm", "mm", "rad", "deg", "°", "s", "ms", "us", "ns", "-", "1"}
+            units = {word.strip("[]()") for word in cells}
+            if units <= known and len(cells) == len(block.heading):  # units under names
+                cells = tuple(map("{} {}".format, block.heading, cells))
             block.heading, block.title = cells, plain.rstrip(" :")
     if block.rows:
         yield block
+
+
+def _unbroken(lines: Sequence[str]) -> Iterator[tuple[int, str]]:
+    """Yield lines with their numbers; a list of numbers that is broken over some is one line."""
+    begun, first = "", 0
+    for n, line in enumerate(map(str.strip, lines), 1):
+        begun, first = (f"{begun} {line}", first) if begun else (line, n)
+        last = begun.rpartition("[")[2] if "[" in begun else "]"
+        open_list = "]" not in last and any(map(str.isdigit, last))
+        # A pose has at most 16 numbers
+        if not open_list or n - first == 16 or n == len(lines):
+            yield first, begun
+            begun = ""
 
 
 def _with_matrices(block: TextBlock) -> TextBlock:
@@ -339,18 +356,11 @@ def _with_matrices(block: TextBlock) -> TextBlock:
         block.heading = ()
     else:
         block.title = ""
-    for lines, width in ((4, 4), (3, 4), (3, 3)):
-        if block.heading or widths != {width} or len(block.rows) % lines:
-            continue
-        numbers = np.array([[_or_nan(cell) for cell in cells] for _, cells in block.rows])
-        stack = numbers.reshape(-1, lines, width)
-        gram = stack[:, :3, :3] @ stack[:, :3, :3].swapaxes(1, 2)
-        last = lines == 3 or bool((stack[:, 3] == [0, 0, 0, 1]).all())
-        # By how much rows of a written rotation may differ from unit length, and from right angles
-        if last and np.abs(gram - np.eye(3)).max() < 2e-3:
-            rows = [block.rows[i : i + lines] for i in range(0, len(block.rows), lines)]
-            block.rows = [(r[0][0], tuple(c for _, cells in r for c in cells)) for r in rows]
-            return block
+    if not block.heading and len(widths) == 1:
+        stack = stacked(np.array([[_or_nan(cell) for cell in cells] for _, cells in block.rows]))
+        lines = stack.shape[1] if stack is not None else 1
+        rows = [block.rows[i : i + lines] for i in range(0, len(block.rows), lines)]
+        block.rows = [(r[0][0], tuple(c for _, cells in r for c in cells)) for r in rows]
     return block
 
 
@@ -394,14 +404,26 @@ class _splitter:  # noqa: N801  a function with a memory
         marks = ";\t" if blanks else ";\t,"
         shown = next(iter(lines), "")
         self.mark = next((m for m in marks if m in shown or m in "".join(lines[-1:])), " ")
+        self.ended = all(line.rstrip().endswith(self.mark) for line in lines)
 
     def __call__(self, line: str) -> tuple[str, ...]:
+        # What Python prints around an array's numbers: array([[…]], dtype=float32)
+        line = re.sub(r"^\s*[\w.]+\((?=[-\s\[(.\d])|,\s*dtype=\w+(?=\)+\s*$)", "", line).strip()
+        line = line.rstrip(", ") if line.startswith(("[", "(")) else line  # a list in a list
         if self.mark == " ":
             return tuple(line.strip("[](){}").replace(", ", " ").split())
         (cells,) = csv.reader([line], delimiter=self.mark, skipinitialspace=True)
-        cells = [cell.strip(" []{}()") for cell in cells]
-        # A mark at the line's end makes an empty last cell.
-        return tuple(cells[:-1] if cells and not cells[-1] else cells)
+        cells = [_bare(cell) for cell in cells]
+        # A mark at the end of each line makes an empty last cell.
+        return tuple(cells[:-1] if self.ended and not cells[-1] else cells)
+
+
+def _bare(cell: str) -> str:
+    """Return a cell without the brackets of a list; a name keeps those of its unit."""
+    bare = cell.strip(" []{}()")
+    return (
+        bare if number_of(bare) is not None or cell.count("[") != cell.count("]") else cell.strip()
+    )
 
 
 def _plain(line: str) -> bool:

@@ -22,7 +22,7 @@ from flangeye.files.words import reason_of
 from flangeye.files.yaml_lines import MAX_BYTES, parse_yaml
 from flangeye.types import Floats
 
-MATRICES = ((4, 4), (3, 3), (3, 4))
+MATRICES = ((4, 4), (3, 4), (3, 3))
 """Shapes of a pose, of its rotation, and of a pose without its last row."""
 
 
@@ -185,11 +185,28 @@ def _plain(value: Any) -> Any:
         channels = re.match(r"\d*", str(value.get("dt", "")))
         shape = [int(value["rows"]), int(value["cols"])]
         shape += [int(channels[0])] if channels and channels[0] else []
-        return np.array(value["data"], float).reshape(shape)
+        return _poses_first(np.array(value["data"], float).reshape(shape))
     return {str(key): _plain(each) for key, each in value.items()}
 
 
+def stacked(rows: Floats) -> Floats | None:
+    """Return (N, r, c) matrices that stand below each other in (N r, c); None where none do."""
+    for lines, width in MATRICES:
+        if rows.ndim != 2 or rows.shape[1] != width or not len(rows) or len(rows) % lines:
+            continue
+        stack = rows.reshape(-1, lines, width)
+        gram = stack[:, :3, :3] @ stack[:, :3, :3].swapaxes(1, 2)
+        last = lines == 3 or bool((stack[:, 3] == [0, 0, 0, 1]).all())
+        # By how much rows of a written rotation may differ from unit length, and from right angles
+        if last and np.abs(gram - np.eye(3)).max() < 2e-3:
+            return stack
+    return None
+
+
 def _poses_first(array: Floats) -> Floats:
+    stack = stacked(array) if array.dtype.kind in "iuf" else None
+    if stack is not None and len(stack) > 1:
+        return stack
     shape = array.shape
     if len(shape) == 3 and shape[:2] in MATRICES and shape[1:] not in MATRICES:
         return np.moveaxis(array, 2, 0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -92,13 +93,13 @@ class Table:
         """
         return [i for column in columns for i in (self._listed(column) or [self.index(column)])]
 
-    def numbers(self, columns: Sequence[int]) -> Floats:
-        """Return the numbers (N, k) of columns.
+    def numbers(self, columns: Sequence[int], empty: bool = False) -> Floats:
+        """Return the numbers (N, k) of columns; NaN where cells may be ``empty`` and are.
 
         Raises:
             StageError: A cell is none; names its line.
         """
-        return np.array([self._row(row, columns) for row in range(len(self.rows))])
+        return np.array([self._row(row, columns, empty) for row in range(len(self.rows))])
 
     def texts(self, column: int) -> list[str]:
         """Return the cells of a column."""
@@ -116,11 +117,14 @@ class Table:
         entry = re.compile(re.escape(str(column)) + r"(\.\d+)+")
         return [i for i, name in enumerate(self.heading) if entry.fullmatch(name)]
 
-    def _row(self, row: int, columns: Sequence[int]) -> list[float]:
+    def _row(self, row: int, columns: Sequence[int], empty: bool) -> list[float]:
         where, cells = self.rows[row]
         if columns and len(cells) <= max(columns):
             raise StageError(f"{where}: has {len(cells)} columns, too few")
-        found = [number_of(cells[column]) for column in columns]
+        found = [
+            math.nan if empty and cells[column] == "" else number_of(cells[column])
+            for column in columns
+        ]
         for column, number in zip(columns, found, strict=True):
             if number is None:
                 raise StageError(f"{where}: '{cells[column]}' is not a number")
@@ -128,12 +132,12 @@ class Table:
 
 
 def number_of(cell: Cell) -> float | None:
-    """Return the number in a cell, with decimal point or comma; None if it is no number."""
+    """Return the number in a cell, with decimal point or comma, or Fortran's 1.5D+02; else None."""
     if not isinstance(cell, str):
         return cell
     text = cell.replace(",", ".") if re.fullmatch(r"[-+]?\d+,\d+([eE][-+]?\d+)?", cell) else cell
     try:
-        return float(text)
+        return float(re.sub(r"(?<=[\d.])[dD](?=[-+]?\d+$)", "e", text))
     except ValueError:
         return None
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -15,10 +15,12 @@ from flangeye.maths.pose_corrections import inverted
 from flangeye.maths.pose_formats import (
     APART,
     CONVENTIONS,
+    LENGTHS,
     MATRIX,
     PLAIN,
     AngleUnit,
     LengthUnit,
+    by_columns,
 )
 from flangeye.maths.pose_formats import convention_of_maker as usual_of
 from flangeye.models.robots import RobotModel
@@ -73,6 +75,10 @@ def table_params(
         _require_as_many(tables, arm)
         arm, target = _halves(arm)
     arm, target = _seen_together(arm, target, questions, robot)
+    _ask_lengths(arm, target, questions)
+    for pose in filter(None, (arm, target)):
+        if MATRIX in pose.rotations and by_columns(_finite(_numbers(pose))):
+            questions.assumed.append(f"{pose.name}: matrices of 16 numbers, column by column")
     if arm.rotations == JOINTS:
         params = _of_joints(arm, questions, robot)
     else:
@@ -130,6 +136,11 @@ def _require_as_many(tables: Sequence[Table], arm: PoseColumns) -> None:
 
 
 def _alone(arm: PoseColumns) -> str:
+    if arm.role == "target":
+        return (
+            f"{arm.table.file}: has what the camera saw, and nothing says where the arm was; put "
+            "its poses or joint angles beside it as .csv, a row each, or add --columns NAMES"
+        )
     return (
         f"{arm.table.file}: has poses of the arm, but there are no scans beside it, and no columns "
         "of what the camera saw; add --target-columns NAMES, or put the scans there"
@@ -313,7 +324,10 @@ def _halves(arm: PoseColumns) -> tuple[PoseColumns, PoseColumns]:
 
 
 def _numbers(pose: PoseColumns) -> Floats:
-    return pose.table.numbers(pose.table.indices(pose.columns))
+    """Return the numbers of a pose, row by row; NaN in empty cells, and where all are zero."""
+    numbers = pose.table.numbers(pose.table.indices(pose.columns), empty=True)
+    numbers[~numbers.any(axis=1)] = np.nan
+    return numbers
 
 
 def _seen_together(
@@ -403,7 +417,7 @@ def _within_reach(arm: PoseColumns, robot: RobotModel | None) -> PoseColumns:
     if robot is None or not arm.may_be_joints or len(robot.joints) != len(arm.columns):
         return arm
     numbers = _numbers(arm)
-    scale = 1e-3 if _length(numbers, arm) == "mm" else 1.0
+    scale = LENGTHS[_unit(_length(numbers, arm))]
     farthest = np.nanmax(np.linalg.norm(scale * numbers[:, :3], axis=1))
     return as_joints(arm) if farthest > robot.length else arm
 
@@ -451,7 +465,7 @@ def _as_angles(pose: PoseColumns, numbers: Floats, robot: RobotModel | None) -> 
 
 
 def _unit(word: str) -> LengthUnit:
-    return "mm" if word == "mm" else "m"
+    return next((unit for unit in get_args(LengthUnit) if unit == word), "m")
 
 
 def _turn_unit(word: str) -> AngleUnit:
@@ -507,9 +521,37 @@ def _rotation(pose: PoseColumns, questions: Questions, prefix: str, maker: str |
 def _length(numbers: Floats, pose: PoseColumns) -> str:
     if pose.length is not None:
         return pose.length
-    matrix = MATRIX in pose.rotations
-    places = numbers[:, [3, 7, 11]] if matrix else numbers[:, :3]
-    return "mm" if np.nanmax(np.abs(places)) > FARTHEST else "m"
+    return "mm" if _reach(numbers, pose) > FARTHEST else "m"
+
+
+def _finite(numbers: Floats) -> Floats:
+    return numbers[np.isfinite(numbers).all(axis=1)]
+
+
+def _reach(numbers: Floats, pose: PoseColumns) -> float:
+    """Return the largest coordinate of positions."""
+    of_matrix = slice(12, 15) if by_columns(_finite(numbers)) else [3, 7, 11]
+    return float(np.nanmax(np.abs(numbers[:, of_matrix if MATRIX in pose.rotations else slice(3)])))
+
+
+def _ask_lengths(arm: PoseColumns, target: PoseColumns | None, questions: Questions) -> None:
+    """Ask for the unit of positions that are too far for metres and too near for millimetres."""
+    nearest = 150.0  # no arm stays so near its base [mm]
+    unclear = {
+        prefix: pose
+        for prefix, pose in (("", arm), ("target-", target))
+        if pose is not None and pose.is_pose and pose.length is None
+        and FARTHEST < _reach(_numbers(pose), pose) < nearest
+    }  # fmt: skip
+    if "" not in unclear:
+        return
+    reach = _reach(_numbers(arm), arm)
+    question = (
+        f"unit of the positions of {arm.name}, which reach {reach:.0f}: far for m, near for mm"
+    )
+    answer = questions.ask("length", question, None, "cm", one_of(*get_args(LengthUnit)))
+    if "target-" in unclear and questions.given.get("target-length") is None:
+        questions.given["target-length"] = answer
 
 
 def _angle(numbers: Floats, pose: PoseColumns) -> str:
@@ -551,10 +593,20 @@ def _rest(table: Table) -> dict[str, Any]:
     rest = poses_of(table)[1]
     params: dict[str, Any] = {}
     if rest.time is not None:
-        params |= {"time": rest.time} | ({"time_unit": rest.time_unit} if rest.time_unit else {})
+        unit = rest.time_unit or _time_unit(table, rest.time)
+        params |= {"time": rest.time} | ({"time_unit": unit} if unit else {})
     if rest.joints:
         angles = table.numbers(table.indices(rest.joints))
         degrees = np.nanmax(np.abs(angles)) > TURN
         unit = rest.joint_unit or ("deg" if degrees else "rad")
         params |= {"joints": list(rest.joints), "joint_unit": unit}
     return params
+
+
+def _time_unit(table: Table, column: Column) -> str | None:
+    """Return the unit of times since 1970 that no name says, by their size; None for seconds."""
+    latest = np.nanmax(np.abs(table.numbers([table.index(column)])))
+    # Seconds since 1970 are some 1e9 until the year 5000
+    return next(
+        (u for u, least in (("ns", 1e17), ("us", 1e14), ("ms", 1e11)) if latest > least), None
+    )

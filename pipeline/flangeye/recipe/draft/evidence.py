@@ -41,7 +41,7 @@ def poses_by_number(table: Table) -> tuple[list[PoseColumns], Headings]:
     rest = Headings(scan=texts[0] + 1 if len(texts) == 1 else None)
     if len({len(cells) for _, cells in table.rows}) > 1 or not columns:
         return [], rest
-    numbers = table.numbers(columns)
+    numbers = table.numbers(columns, empty=True)
     told = ""
     if _is_index(numbers) and _shape(numbers[:, 1:]):
         rest = replace(rest, index=columns[0] + 1)
@@ -316,7 +316,7 @@ def mounting_of(
 
     Args:
         arm: (N, 4, 4) base_T_flange [m].
-        seen: (N, 4, 4) poses of the target as they stand in the file [m].
+        seen: (N, 4, 4) poses of the target as they stand in the file, or (N, 3) its centres [m].
         cameras: What may carry the camera: base, flange.
         targets: What the target's poses may be, the likelier first: camera_T_target,
             target_T_camera.
@@ -324,7 +324,12 @@ def mounting_of(
     if len(arm) < FEWEST_PAIRS:
         return None
     some = np.linspace(0, len(arm) - 1, min(len(arm), MOST_PAIRS)).astype(int)
-    twins = _residuals_by_twins(arm[some], seen[some], cameras, targets)
+    twins = (
+        _residuals_by_twins(arm[some], seen[some], cameras, targets)
+        if seen.ndim == 3
+        else {camera == "flange": (_residual_of_centres(arm[some], seen[some], camera == "flange"),
+                                   camera, targets[0]) for camera in cameras}
+    )  # fmt: skip
     if not twins:
         return None
     (best, camera, way), *others = sorted(twins.values())
@@ -348,6 +353,22 @@ def _residuals_by_twins(
         if found is not None and equation not in twins:
             twins[equation] = found, camera, way
     return twins
+
+
+def _residual_of_centres(arm: Floats, seen: Floats, in_hand: bool) -> float:
+    """Return the rms distance [m] of centres (N, 3) from where an affine map takes them.
+
+    In the hand, P (X c + t) = s for all; beside the robot, X c + t = P s, linear in X, t and s.
+    """
+    many = len(arm)
+    mapped = np.einsum("ij,nk->nijk", np.eye(3), np.c_[seen, np.ones(many)]).reshape(many, 3, 12)
+    turned, standing = arm[:, :3, :3], np.tile(np.eye(3), (many, 1, 1))
+    sides = [turned @ mapped, -standing] if in_hand else [mapped, -turned]
+    rows = np.concatenate(sides, axis=2).reshape(-1, 15)
+    wanted = (arm[:, :3, 3] * (-1.0 if in_hand else 1.0)).reshape(-1)
+    found, *_ = np.linalg.lstsq(rows, wanted)
+    free = max(len(wanted) - 15, 1)
+    return float(np.sqrt(((rows @ found - wanted) ** 2).sum() / free * 3))
 
 
 def _residual(carried: Floats, seen: Floats) -> float | None:

@@ -13,14 +13,14 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from flangeye.files.tables import Column, Table, number_of
+from flangeye.files.tables import Cell, Column, Table, number_of
 from flangeye.maths.pose_formats import CONVENTIONS
 from flangeye.models.robots import joints_in_order
 
 POSITION = ("x", "y", "z")
 JOINTS = ("joints",)
 """In place of a rotation: joint angles."""
-_LENGTHS, _ANGLES = ("m", "mm"), ("rad", "deg")
+_LENGTHS, _ANGLES = ("m", "cm", "mm"), ("rad", "deg")
 _PLACES = (
     "position",
     "pos",
@@ -38,6 +38,7 @@ _PLACES = (
 _TURNS: Mapping[str, str] = {
     "orientation": "q", "ori": "q", "quaternion": "q", "quat": "q", "q": "q",
     "rotation": "r", "rotations": "r", "rot": "r", "r": "r", "euler": "r", "angles": "r",
+    "angle": "r", "winkel": "r",
     "rvec": "v", "rvecs": "v", "rotvec": "v", "rodrigues": "v", "rpy": "e",
 }  # fmt: skip
 """Names of rotations, and what the names of their columns begin with."""
@@ -224,7 +225,7 @@ def _grouped(table: Table) -> tuple[dict[str, Group], Headings]:
         joint = joint or re.fullmatch(r"(.*\.)?q", listed.lower()) if size > 4 else joint
         order = "wxyz" if "wxyz" in listed.lower() else "xyzw"
         words = _of_list(listed, order[nth]) if size in (3, 4) else _words(listed if size else name)
-        if number_of(table.rows[0][1][index]) is None:
+        if number_of(_first(table, index)) is None:
             scans = ("cloud", "scan", "file", "filename", "image", "img", "name", "path")
             if (words and words[-1].lower() in scans) or _is_file(table, index):
                 rest = replace(rest, scan=name)
@@ -258,8 +259,14 @@ def _is_index(table: Table, index: int, words: Sequence[str]) -> bool:
     return (words[-1].lower() in called if words else index == 0) and table.numbers_rows(index)
 
 
+def _first(table: Table, index: int) -> Cell:
+    """Return the first cell of a column that is not empty: a target may not be seen at first."""
+    cells = (cells[index] for _, cells in table.rows if index < len(cells))
+    return next((cell for cell in cells if cell not in ("", " ")), "")
+
+
 def _is_file(table: Table, index: int) -> bool:
-    cell = str(table.rows[0][1][index])
+    cell = str(_first(table, index))
     folder = table.files[0].parent
     return bool(cell) and len(cell) < 200 and (folder / cell).is_file()
 
@@ -386,9 +393,13 @@ def _pose(table: Table, group: Group) -> PoseColumns | None:
     entries = _matrix_entries(group)
     if len(entries) in (12, 16):
         return PoseColumns(table, entries, ("matrix",), *stated)
+    apart = {letter: cells for letter, cells in _counted(group).items() if len(cells) in (3, 9)}
+    if sorted(map(len, apart.values())) == [3, 9]:  # r1 to r9 and t1 to t3
+        turn, place = sorted(apart.values(), key=len, reverse=True)
+        return PoseColumns(table, (*place, *turn), ("3x3",), *stated)
     if not set(POSITION) <= set(group.columns):
         return None
-    place = [group.columns[axis] for axis in POSITION]
+    place = tuple(group.columns[axis] for axis in POSITION)
     if group.rotation is not None:
         return PoseColumns(table, (*place, group.rotation), ("3x3",), *stated)
     if len(entries) == 9:
@@ -396,7 +407,7 @@ def _pose(table: Table, group: Group) -> PoseColumns | None:
     fitting = [names for names in ROTATIONS if set(names) <= set(group.columns)]
     names = max(fitting, key=len, default=None)
     if names is None:
-        return PoseColumns(table, tuple(place), ("point",), *stated)
+        return PoseColumns(table, place, ("point",), *stated)
     known = (table.convention,) if table.convention else ROTATIONS[names]
     if not group.ordered and names == ("qx", "qy", "qz", "qw"):
         known = ("quaternion_xyzw", "quaternion_wxyz")
@@ -408,13 +419,25 @@ def _matrix_entries(group: Group) -> tuple[Column, ...]:
 
     They are called by row and column, ``r11``, or counted: ``m0`` to ``m15``.
     """
-    counted = {int(m[1]): column for name, column in group.columns.items()
-               if (m := re.fullmatch(r"[a-z]+(\d+)", name))}  # fmt: skip
-    if len(counted) in (12, 16) and max(counted) - min(counted) < len(counted):
-        return tuple(counted[at] for at in sorted(counted))
+    counted = [cells for cells in _counted(group).values() if len(cells) in (12, 16)]
+    if len(counted) == 1:
+        return counted[0]
     named = {m.groups(): column for name, column in group.columns.items()
              if (m := _ENTRY.fullmatch(name))}  # fmt: skip
     return tuple(named[at] for at in sorted(named))
+
+
+def _counted(group: Group) -> dict[str, tuple[Column, ...]]:
+    """Return the columns that a letter and a number call, by the letter, where none is missing."""
+    found: dict[str, dict[int, Column]] = {}
+    for name, column in group.columns.items():
+        if match := re.fullmatch(r"([a-z]+)(\d+)", name):
+            found.setdefault(match[1], {})[int(match[2])] = column
+    return {
+        letter: tuple(columns[at] for at in sorted(columns))
+        for letter, columns in found.items()
+        if max(columns) - min(columns) < len(columns)
+    }
 
 
 def frames_in(name: str) -> tuple[str, str] | None:

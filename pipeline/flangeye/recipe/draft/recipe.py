@@ -11,6 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from flangeye.errors import RecipeError, StageError
 from flangeye.files.cameras import cameras_in
 from flangeye.files.clouds import CONVERSIONS, read_cloud
@@ -28,8 +30,10 @@ from flangeye.models.urdf import robot_from_urdf
 from flangeye.plugin.registry import Registry
 from flangeye.plugin.stage import BoundPart
 from flangeye.recipe.draft.convention import table_params
+from flangeye.recipe.draft.evidence import mounting_of
 from flangeye.recipe.draft.survey import FolderSurvey, Questions, one_of
 from flangeye.recipe.load import parse_recipe
+from flangeye.types import FLANGE
 
 PLATE = "ISO 9409-1-50-4-M6"
 """What most small arms carry."""
@@ -218,10 +222,18 @@ def _what(archive: Archive, questions: Questions) -> tuple[str, dict[str, Any]]:
         return "acquire.archive", _target(answer)
     if any(r.image for r in records):
         return "acquire.images", printed_target(_some_images(records), questions)
-    if any(r.camera_T_target is not None for r in records):
-        return "acquire.samples", {}
-    if any(r.centre_in_camera is not None for r in records):
-        return "acquire.centres", {}
+    for stage, seen in (
+        ("acquire.samples", [r.camera_T_target for r in records]),
+        ("acquire.centres", [r.centre_in_camera for r in records]),
+    ):
+        both = [(r.poses[FLANGE], each) for r, each in zip(records, seen, strict=True)
+                if each is not None and FLANGE in r.poses]  # fmt: skip
+        if both:
+            arm, target = map(np.array, zip(*both, strict=True))
+            found = mounting_of(arm, target, ["base", "flange"], ["camera_T_target"])
+            if found is not None:
+                questions.likely.setdefault("camera", (found.camera, found.told))
+            return stage, {}
     raise StageError(f"{archive.root}: holds poses, but neither scans nor what the camera measured")
 
 

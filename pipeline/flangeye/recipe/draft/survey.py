@@ -162,6 +162,7 @@ def look(folder: Path) -> FolderSurvey:
     if not folder.is_dir():
         raise RecipeError(f"{folder}: is no folder; name the one that holds the recordings")
     cameras: set[Path] = set()
+    folder = _where_files_are(folder)
     found = (p for p in (*folder.glob("*"), *folder.glob("*/*")) if p.is_file())
     files = sorted(found, key=lambda path: natural(str(path)))
     if not any(folder.iterdir()):
@@ -179,6 +180,25 @@ def look(folder: Path) -> FolderSurvey:
     return FolderSurvey(folder, files, _whole(folder, tables), points, cameras)
 
 
+def _where_files_are(folder: Path) -> Path:
+    """Return a folder, or the one in it, and in that, which alone holds anything.
+
+    Raises:
+        RecipeError: Files stand only in several folders below; names one.
+    """
+    inner = [path for path in folder.iterdir() if not path.name.startswith(".")]
+    while len(inner) == 1 and inner[0].is_dir():
+        folder, inner = inner[0], list(inner[0].iterdir())
+    if not any(p.is_file() for pattern in ("*", "*/*") for p in folder.glob(pattern)):
+        deep = next((p for p in sorted(folder.glob("*/*/*")) if p.is_file()), None)
+        if deep is not None:
+            raise RecipeError(
+                f"{folder}: its files stand in folders of folders, as {deep.relative_to(folder)}; "
+                f"name the folder of one session: flangeye init {deep.parents[1]}"
+            )
+    return folder
+
+
 def places(folder: Path, files: Sequence[Path]) -> Iterator[tuple[str, list[Path]]]:
     """Yield files as a recipe names them; files named alike share one pattern."""
     groups: dict[str, list[Path]] = defaultdict(list)
@@ -188,8 +208,9 @@ def places(folder: Path, files: Sequence[Path]) -> Iterator[tuple[str, list[Path
     for file in files:
         # A file that is larger [bytes] holds scans, and is not looked into
         if file.suffix.lower() in known and file.stat().st_size <= 10_000_000:
-            alike = re.sub(r"\d+(?=\D*$)", "*", file.stem) + file.suffix
+            alike = re.sub(r"\d+", "*", file.stem) + file.suffix
             groups[str(file.relative_to(folder).with_name(alike))].append(file)
+    groups = {place: of for files in groups.values() for place, of in _series(folder, files)}
     single = [file for files in groups.values() if len(files) < FEWEST_ROWS for file in files]
     one_each = [n for n, count in Counter(f.name for f in single).items() if count >= FEWEST_ROWS]
     yield from ((place, files) for place, files in groups.items() if len(files) >= FEWEST_ROWS)
@@ -198,6 +219,32 @@ def places(folder: Path, files: Sequence[Path]) -> Iterator[tuple[str, list[Path
             yield str(file.relative_to(folder)), [file]
     for name in one_each:  # a folder for each capture
         yield f"*/{name}", [file for file in single if file.name == name]
+
+
+def _series(folder: Path, files: Sequence[Path]) -> Iterator[tuple[str, list[Path]]]:
+    """Yield files named alike but for numbers, by pattern; those of several cameras apart.
+
+    Numbers before the last part them where the last are the same in two parts, ``cam0_7`` and
+    ``cam1_7``; those of dates and times do not.
+    """
+    runs = [re.split(r"(\d+)", file.stem) for file in files]
+    parts: dict[tuple[str, ...], list[int]] = defaultdict(list)
+    for at, run in enumerate(runs):
+        parts[tuple(run[:-2])].append(at)
+    last = Counter(run[-2] for run in runs if len(run) > 1)
+    whole = max(last.values(), default=0) == 1 or max(map(len, parts.values())) < FEWEST_ROWS
+    for ats in [list(range(len(files)))] if whole else parts.values():
+        columns = zip(*(runs[at] for at in ats), strict=True)
+        stem = "".join(
+            column[0]
+            if len(set(column)) == 1 and k < len(runs[0]) - 2
+            else "*"
+            if k % 2
+            else column[0]
+            for k, column in enumerate(columns)
+        )
+        place = files[ats[0]].relative_to(folder).with_name(stem + files[0].suffix)
+        yield str(place), [files[at] for at in ats]
 
 
 def _tables(folder: Path, place: str, files: int) -> list[Table]:
