@@ -680,3 +680,31 @@ def test_a_table_may_be_in_the_encoding_of_a_spreadsheet(folder: Path, encoding:
     (folder / "log.csv").write_bytes(written.encode(encoding))
     init()
     assert np.allclose(read_poses(folder)[1][:3, 3], POSES[1][0])
+
+
+@pytest.mark.parametrize("mounted", ["base", "flange"])
+def test_images_tell_where_the_camera_is(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, mounted: str
+) -> None:
+    """A board of 8 x 6 squares, 1 m before a pinhole camera, seen at twelve turns of the arm."""
+    rng = np.random.default_rng(5)
+    matrix = np.array([[900.0, 0.0, 320.0], [0.0, 900.0, 240.0], [0.0, 0.0, 1.0]])
+    page = np.pad(print_of(Board("charuco", 8, 6, 0.03, 0.022), 60), 60, constant_values=255)
+    to_metres = np.array([[5e-4, 0, -0.15], [0, 5e-4, -0.12], [0, 0, 1]])
+    turn = Rotation.from_euler("x", 1.1).as_matrix()
+    held, stood = rigid(turn, np.array([0.05, 0.02, 0.08])), rigid(turn, np.array([0.4, 0.1, 0.2]))
+    poses = []
+    for k in range(12):
+        seen = rigid(
+            Rotation.from_rotvec(rng.uniform(-0.35, 0.35, 3)).as_matrix(),
+            np.append(rng.uniform(-0.05, 0.05, 2), 0.7),
+        )
+        flat = matrix @ np.column_stack([seen[:3, :2], seen[:3, 3]]) @ to_metres
+        image = cv2.warpPerspective(page, flat, (640, 480), borderValue=128)
+        cv2.imwrite(str(folder / f"{k}.png"), image)
+        inverse = np.linalg.inv(held @ seen) if mounted == "flange" else seen @ np.linalg.inv(held)
+        poses.append(stood @ inverse)
+    np.save(folder / "robot.npy", poses)
+    np.savez(folder / "camera.npz", mtx=matrix, dist=np.zeros(5))
+    told = init("--target", "charuco: {columns: 8, rows: 6, square: 30 mm, marker: 22 mm}")
+    assert f"where the camera is mounted (base or flange): {mounted} (fits to 0." in told

@@ -16,6 +16,7 @@ from flangeye.errors import RecipeError
 if TYPE_CHECKING:
     from flangeye.plugin.registry import Registry
     from flangeye.recipe.draft import Draft, Questions
+    from flangeye.types import Observation
 
 ANSWERS = {
     "robot": "Robot model, its .urdf or .yaml file, or none.",
@@ -112,13 +113,20 @@ def init(
 
 
 def _of_folder(folder: Path, out: Path, questions: Questions, registry: Registry) -> Draft:
-    from flangeye.recipe.draft import draft_recipe, look
+    from flangeye.recipe.draft import draft_recipe, look, mounting_seen
 
-    survey = look(folder)
+    survey, given = look(folder), dict(questions.given)
     for line in survey.lines():
         say(line)
     draft = draft_recipe(survey, out, questions, registry)
-    if "fit.rim" not in draft.text or _shows_target(draft, folder, out, registry):
+    if "acquire.images" in draft.text and given["camera"] is None and questions.prompt is None:
+        mounting = mounting_seen(_seen(draft, survey.folder, out, registry, 12) or ())
+        if mounting is None:
+            return draft
+        questions.given, questions.likely = given, {"camera": mounting}
+        questions.assumed.clear()
+        return draft_recipe(survey, out, questions, registry)
+    if "fit.rim" not in draft.text or _seen(draft, survey.folder, out, registry, 1) != []:
         return draft
     questions.given["target"] = None
     seen = "what is seen instead, 'body: gripper.stl' for a tool by its mesh"
@@ -126,8 +134,10 @@ def _of_folder(folder: Path, out: Path, questions: Questions, registry: Registry
     return draft_recipe(survey, out, questions, registry)
 
 
-def _shows_target(draft: Draft, folder: Path, out: Path, registry: Registry) -> bool:
-    """Return whether any scan shows what a drafted recipe looks for; True if it does not run."""
+def _seen(
+    draft: Draft, folder: Path, out: Path, registry: Registry, count: int
+) -> list[Observation] | None:
+    """Return the first scans that show a drafted recipe's target; None if it does not run."""
     from flangeye.errors import FlangeyeError, NothingSeen
     from flangeye.recipe.load import parse_recipe
     from flangeye.run.runner import Runner
@@ -137,11 +147,11 @@ def _shows_target(draft: Draft, folder: Path, out: Path, registry: Registry) -> 
         # Its paths start at the recipe's folder.
         recipe = parse_recipe(draft.text, out.name, registry, [f"steps.0.path={folder}"])
         with at_work("looking for the target"):
-            return bool(Runner(recipe, registry, ArchivePath(folder)).take(1))
+            return Runner(recipe, registry, ArchivePath(folder)).take(count)
     except NothingSeen:
-        return False
+        return []
     except FlangeyeError:
-        return True
+        return None
 
 
 def _of_what_runs(folder: Path, out: Path, questions: Questions, registry: Registry) -> Draft:

@@ -112,7 +112,7 @@ class FlangePoseParams(ColumnsParams):
 
 
 class SeenPoseParams(ColumnsParams):
-    """A target as a camera measured it; empty cells, and zeros in all, mean not seen."""
+    """A target as a camera measured it; empty cells, and a pose of zeros, mean not seen."""
 
     pose: Literal["camera_T_target", "target_T_camera"] = Field(
         "camera_T_target", description="Whose pose it is. rotation: point gives its place alone."
@@ -179,17 +179,20 @@ def readings_of(own: Table, given: ColumnsParams, taken: Sequence[Column] = ()) 
     free = [i for i in range(width) if i not in other]
     columns = own.indices(given.columns) or free
     values = [
-        None if _is_unseen(cells, columns) else _value(own, row, columns, given)
+        None
+        if _is_unseen(cells, columns, given.rotation != POINT)
+        else _value(own, row, columns, given)
         for row, (_, cells) in enumerate(own.rows)
     ]
     return Readings(own, values, times_of(own, given.time, given.time_unit))
 
 
-def _is_unseen(cells: Sequence[Cell], columns: Sequence[int]) -> bool:
-    """Return whether nothing was measured: cells are empty, or all are zero, as nothing lies."""
+def _is_unseen(cells: Sequence[Cell], columns: Sequence[int], whole: bool) -> bool:
+    """Return whether nothing was measured: cells are empty, or a ``whole`` pose is all zeros."""
     filled = [cells[c] for c in columns if c < len(cells)]
-    empty = all(str(cell).strip().lower() in ("", "nan") for cell in filled)
-    return empty or (len(filled) == len(columns) and all(number_of(cell) == 0 for cell in filled))
+    if all(str(cell).strip().lower() in ("", "nan") for cell in filled):
+        return True
+    return whole and len(filled) == len(columns) and all(number_of(cell) == 0 for cell in filled)
 
 
 def _value(own: Table, row: int, columns: Sequence[int], given: ColumnsParams) -> Floats:

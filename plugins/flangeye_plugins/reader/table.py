@@ -70,7 +70,7 @@ class OtherParams(ColumnsParams):
 
 
 class TargetParams(SeenPoseParams, OtherParams):
-    """The target as the camera measured it; empty cells, and zeros in all, mean not seen."""
+    """The target as the camera measured it; empty cells, and a pose of zeros, mean not seen."""
 
 
 class SecondParams(OtherParams):
@@ -227,7 +227,10 @@ def _scans(folder: Path, text: Table, params: TableParams) -> tuple[list[list[Pa
             if not PurePath(named[0]).suffix:
                 raise
     missed = found.index(None)
-    raise StageError(f"{text.where(missed)}: its scan '{named[missed]}' does not exist")
+    told = f"{text.where(missed)}: its scan '{named[missed]}' does not exist"
+    if more := found.count(None) - 1:
+        told += f", nor do {more} more of {len(found)}; put them there, or remove their rows"
+    raise StageError(told)
 
 
 def _named(folder: Path, name: str) -> Path | None:

@@ -16,6 +16,7 @@ from flangeye.recipe.draft.recipe import (
     PLATE,
     Draft,
     draft_recipe,
+    mounting_seen,
     printed_target,
     steps_of,
     yaml_of,
@@ -24,7 +25,7 @@ from flangeye.recipe.draft.survey import Questions, look
 from flangeye.types import Floats
 from flangeye.units import in_mm, parse_quantity
 
-__all__ = ["Draft", "Questions", "draft_live", "draft_recipe", "look"]
+__all__ = ["Draft", "Questions", "draft_live", "draft_recipe", "look", "mounting_seen"]
 
 
 def draft_live(cell: RunningCell, questions: Questions, out: Path) -> Draft:

@@ -324,9 +324,10 @@ def _halves(arm: PoseColumns) -> tuple[PoseColumns, PoseColumns]:
 
 
 def _numbers(pose: PoseColumns) -> Floats:
-    """Return the numbers of a pose, row by row; NaN in empty cells, and where all are zero."""
+    """Return the numbers of a pose, row by row; NaN in empty cells, and in a pose of zeros."""
     numbers = pose.table.numbers(pose.table.indices(pose.columns), empty=True)
-    numbers[~numbers.any(axis=1)] = np.nan
+    if pose.is_pose:
+        numbers[~numbers.any(axis=1)] = np.nan
     return numbers
 
 

@@ -33,7 +33,7 @@ from flangeye.recipe.draft.convention import table_params
 from flangeye.recipe.draft.evidence import mounting_of
 from flangeye.recipe.draft.survey import FolderSurvey, Questions, one_of
 from flangeye.recipe.load import parse_recipe
-from flangeye.types import FLANGE
+from flangeye.types import FLANGE, Floats, Observation, PoseFeature
 
 PLATE = "ISO 9409-1-50-4-M6"
 """What most small arms carry."""
@@ -228,13 +228,24 @@ def _what(archive: Archive, questions: Questions) -> tuple[str, dict[str, Any]]:
     ):
         both = [(r.poses[FLANGE], each) for r, each in zip(records, seen, strict=True)
                 if each is not None and FLANGE in r.poses]  # fmt: skip
+        if both and (mounting := _mounting(both)):
+            questions.likely.setdefault("camera", mounting)
         if both:
-            arm, target = map(np.array, zip(*both, strict=True))
-            found = mounting_of(arm, target, ["base", "flange"], ["camera_T_target"])
-            if found is not None:
-                questions.likely.setdefault("camera", (found.camera, found.told))
             return stage, {}
     raise StageError(f"{archive.root}: holds poses, but neither scans nor what the camera measured")
+
+
+def mounting_seen(observations: Iterable[Observation]) -> tuple[str, str] | None:
+    """Return where the camera is that saw targets, and the evidence; None if they do not tell."""
+    both = [(o.poses[FLANGE].matrix, o.feature.camera_T_target.matrix) for o in observations
+            if FLANGE in o.poses and isinstance(o.feature, PoseFeature)]  # fmt: skip
+    return _mounting(both) if both else None
+
+
+def _mounting(both: Sequence[tuple[Floats, Floats]]) -> tuple[str, str] | None:
+    arm, target = map(np.array, zip(*both, strict=True))
+    found = mounting_of(arm, target, ["base", "flange"], ["camera_T_target"])
+    return found and (found.camera, found.told)
 
 
 def printed_target(images: Iterable[tuple[str, Any]], questions: Questions) -> dict[str, Any]:
