@@ -79,10 +79,12 @@ def test_opencvs_storage(tmp_path: Path, suffix: str, names: tuple[str, str]) ->
 def test_arrays_and_nine_numbers(tmp_path: Path) -> None:
     np.savez(tmp_path / "calib.npz", mtx=K, dist=np.array([LENS]), rvecs=np.zeros((9, 3, 1)))
     np.savetxt(tmp_path / "K.txt", K)
+    np.savetxt(tmp_path / "CameraMatrix.txt", K.reshape(1, 9))
     np.save(tmp_path / "K.npy", K)
     for k in range(5):  # poses, not cameras
         np.savetxt(tmp_path / f"pose_{k}.txt", np.eye(3))
-    assert [c.path.name for c in cameras_in(tmp_path)] == ["K.npy", "K.txt", "calib.npz"]
+    names = ["CameraMatrix.txt", "K.npy", "K.txt", "calib.npz"]
+    assert [c.path.name for c in cameras_in(tmp_path)] == names
     assert all(np.allclose(c.matrix, K) for c in cameras_in(tmp_path))
 
 

@@ -580,3 +580,8 @@ def test_a_viewpoint_is_said_and_applied_on_request(tmp_path: Path) -> None:
 def test_other_kinds_are_named_with_their_conversion(tmp_path: Path, suffix: str) -> None:
     with pytest.raises(StageError, match=f"save it as .ply|as .ply: CloudCompare -O .*a{suffix}"):
         read_cloud(tmp_path / f"a{suffix}")
+
+
+def test_a_makers_own_kind_is_named_with_what_exports_it(tmp_path: Path) -> None:
+    with pytest.raises(StageError, match="a.ZDF: only Zivid's SDK reads it; export it as .ply"):
+        read_cloud(tmp_path / "a.ZDF")

@@ -501,6 +501,16 @@ def angles_of_nobody(folder):
     table(folder, "x,y,z,rx,ry,rz", vector)
 
 
+def deep(folder):
+    for name in ("a/1", "b/2"):
+        (folder / name).mkdir(parents=True)
+        (folder / name / "robot.csv").write_text("x,y,z\n")
+
+
+def alone(folder):
+    table(folder, "", quaternion, "board.csv")
+
+
 def images(folder):
     table(folder, "x,y,z,qx,qy,qz,qw", quaternion)
     for k in range(5):
@@ -574,6 +584,10 @@ def two_poses_of_nobody(folder):
         (meshes, [], "rec/scan_0.stl: is a mesh, not a scan; sample it to points as .ply: "),
         (lambda folder: (folder / "scan.e57").write_text("x"), [],
          "rec/scan.e57: is an E57 scan, which is not read; save it as .ply"),
+        (deep, [], "rec: its files stand in folders of folders, as a/1/robot.csv; name the folder "
+         "of one session: flangeye init rec/a"),
+        (alone, [], "rec/board.csv: has what the camera saw, and nothing says where the arm was; "
+         "put its poses or joint angles beside it as .csv, a row each, or add --columns NAMES"),
         (tables_of_other_lengths, [], "rec/marker.csv: has 4 rows, robot.csv has 5; give each "
          "a column time to join them by it, or remove the surplus"),
         (two_tables_of_nobody, [], "not known: which poses are the arm's (a.csv, b.csv); add "

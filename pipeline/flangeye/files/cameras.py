@@ -118,8 +118,9 @@ def _document(path: Path) -> Any:
         return _colmap(path, lines)
     rows = [line.replace(",", " ").split() for line in lines]
     rows = [row for row in rows if row and not row[0].startswith("#")]
-    if [len(row) for row in rows] == [3, 3, 3] and all(_is_number(w) for r in rows for w in r):
-        return np.array(rows, dtype=np.float64)
+    words = [word for row in rows for word in row]
+    if [len(row) for row in rows] in ([3, 3, 3], [9]) and all(map(_is_number, words)):
+        return np.array(words, dtype=np.float64).reshape(3, 3)
     return _labelled(lines)
 
 

@@ -12,6 +12,7 @@ from itertools import chain
 from pathlib import Path
 
 from flangeye.errors import StageError
+from flangeye.files.clouds import CONVERSIONS, VENDOR
 from flangeye.files.clouds.plain import open_npz, open_text
 from flangeye.files.clouds.table import read_head
 from flangeye.files.recording import Recording
@@ -120,8 +121,6 @@ CLOUDS = (".pcd", ".ply", ".npy", ".xyz", ".pts", ".asc")
 POINTS = (".csv", ".txt", ".npz")
 """Files that hold points, or poses: their content tells."""
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
-VENDOR = {".zdf": "Zivid's SDK", ".praw": "Photoneo's PhoXi Control", ".mraw": "Mech-Mind's SDK"}
-"""Files that only their maker can read, and with what to turn them into others."""
 
 
 def scans_in(folder: Path, stem: str = "*") -> list[Path]:
@@ -137,10 +136,7 @@ def scans_in(folder: Path, stem: str = "*") -> list[Path]:
     found = [p for p in files if p.suffix.lower() in (*CLOUDS, *IMAGES) or p in points]
     foreign = [p for p in files if p.suffix.lower() in VENDOR]
     if foreign and not found:
-        first = foreign[0]
-        raise StageError(
-            f"{first}: only {VENDOR[first.suffix.lower()]} reads it; export it as .ply or .pcd"
-        )
+        raise StageError(f"{foreign[0]}: {CONVERSIONS[foreign[0].suffix.lower()]}")
     return found
 
 

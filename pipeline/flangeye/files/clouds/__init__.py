@@ -71,6 +71,7 @@ __all__ = [
     "CLOUD_SUFFIXES",
     "CONVERSIONS",
     "PER_METRE",
+    "VENDOR",
     "LengthUnit",
     "check_cloud_file",
     "load_npy",
@@ -97,7 +98,10 @@ _OPENERS: Mapping[str, Callable[[Path], PointTable]] = {
 CLOUD_SUFFIXES = tuple(_OPENERS)
 """Endings of the files that can be read."""
 _SAVE = "-C_EXPORT_FMT PLY -SAVE_CLOUDS"
+VENDOR = {".zdf": "Zivid's SDK", ".praw": "Photoneo's PhoXi Control", ".mraw": "Mech-Mind's SDK"}
+"""Files that only their maker can read, and with what to turn them into others."""
 CONVERSIONS: Mapping[str, str] = {
+    **{end: f"only {by} reads it; export it as .ply or .pcd" for end, by in VENDOR.items()},
     ".e57": "is an E57 scan, which is not read; save it as .ply: CloudCompare -O {file} " + _SAVE,
     **dict.fromkeys(
         (".las", ".laz"),

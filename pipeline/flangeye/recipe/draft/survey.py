@@ -13,7 +13,7 @@ from flangeye.errors import FlangeyeError, RecipeError, StageError
 from flangeye.files.cameras import cameras_in
 from flangeye.files.clouds import CONVERSIONS
 from flangeye.files.regular import is_pointer
-from flangeye.files.scans import CLOUDS, IMAGES, VENDOR, natural, texts_of_points
+from flangeye.files.scans import CLOUDS, IMAGES, natural, texts_of_points
 from flangeye.files.tables import KINDS, Table, number_of, read_table, tables_in
 from flangeye.recipe.draft.headings import list_name, list_sizes
 
@@ -136,7 +136,7 @@ class FolderSurvey:
 
     def lines(self) -> list[str]:
         """Return the survey as lines of text."""
-        unread = (".npz", ".mat", *CONVERSIONS, *VENDOR)
+        unread = (".npz", ".mat", *CONVERSIONS)
         read = {*self.cameras, *self.points}
         told = [
             f"{what}: {', '.join(f'{n} {suffix}' for suffix, n in sorted(kinds.items()))}"
