@@ -8,12 +8,11 @@ from functools import cache
 from itertools import count
 from typing import Any, get_args
 
-import yaml
 from nicegui import ui
 
-from flangeye.errors import FlangeyeError
+from flangeye.errors import FlangeyeError, RecipeError
 from flangeye.files.paths import bundled
-from flangeye.files.yaml_lines import flow, read_yaml
+from flangeye.files.yaml_lines import flow, parse_yaml, read_yaml
 from flangeye.models.graph import Running
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import Stage
@@ -97,15 +96,15 @@ class Form:
     @ui.refreshable_method
     def steps(self) -> None:
         """Show every step that matches the search, with its mistakes at each field."""
-        data, (_, mistakes) = self._project.data(), self._project.check()
+        _, mistakes = self._project.check()
         if any(m.path.startswith("steps") for m in mistakes):
             self._box.value = True
-        for index, entry in enumerate(data.get("steps") or []):
-            self._step(index, entry, mistakes)
+        for index, (name, given) in enumerate(self._project.steps()):
+            self._step(index, name, given, mistakes)
         stages = sorted(self._project.registry.stages)
         add = ui.select(stages, label="Add a step", with_input=True, on_change=self._add)
         add.classes("w-full")
-        title = ui.input("Title of the cell", value=str(data.get("title", "")))
+        title = ui.input("Title of the cell", value=str(self._project.data().get("title", "")))
         title.on("change", lambda e: self._set(["title"], e.args)).classes("w-full")
 
     def _header(self) -> None:
@@ -134,7 +133,8 @@ class Form:
         self._agree()
 
     def _start_from(self, event: Any) -> None:
-        self._write(yaml.safe_load(find_recipe(event.value).read_text(encoding="utf-8")))
+        self._project.start_from(find_recipe(event.value))
+        self.reload()
 
     def _choice(self, label: str, path: tuple[str, str], known: dict[str, str]) -> ui.select:
         def take(event: Any) -> None:
@@ -147,12 +147,11 @@ class Form:
 
     def _agree(self) -> None:
         """Let the fields show what the recipe says, and what is wrong with it at each."""
-        data, (_, mistakes) = self._project.data(), self._project.check()
+        _, mistakes = self._project.check()
         self._agreeing = True
         for (section, key), choice in self._choices.items():
-            given = data.get(section)
-            value = given.get(key) if isinstance(given, dict) else None
-            value = value or {"configuration": "eye-on-base"}.get(section)
+            given = self._project.section(section).get(key)
+            value = str(given) if given else {"configuration": "eye-on-base"}.get(section)
             if value is not None and value not in choice.options:
                 choice.set_options({value: str(value), **dict(choice.options)})
             choice.value = value
@@ -160,9 +159,7 @@ class Form:
             choice.props["error"], choice.props["error-message"] = bool(wrong), wrong
         self._agreeing = False
 
-    def _step(self, index: int, entry: Any, mistakes: list[Mistake]) -> None:
-        name = next(iter(entry)) if isinstance(entry, dict) else str(entry)
-        given = (entry[name] if isinstance(entry, dict) else None) or {}
+    def _step(self, index: int, name: str, given: dict[str, Any], mistakes: list[Mistake]) -> None:
         stage = self._project.registry.stages.get(name)
         wrong = [m for m in mistakes if f"{m.path}.".startswith(f"steps.{index}.")]
         fields = self._fields(name, stage)
@@ -191,7 +188,7 @@ class Form:
         ]
 
     def _parameters(
-        self, index: int, name: str, stage: Stage, fields: list[str], given: Any,
+        self, index: int, name: str, stage: Stage, fields: list[str], given: dict[str, Any],
         wrong: list[Mistake],
     ) -> None:  # fmt: skip
         """Show a field for each parameter, as the recipe's schema has it, with what is wrong."""
@@ -201,8 +198,7 @@ class Form:
         for field in fields:
             info = stage.params.model_fields[field]
             text = "; ".join(m.text for m in wrong if _within(m, index, name, field))
-            value = given.get(field) if isinstance(given, dict) else None
-            box = _field(field, schema[field], value, info.is_required())
+            box = _field(field, schema[field], given.get(field), info.is_required())
             event = "change" if isinstance(box, ui.input) else "update:model-value"
             box.on(event, self._setter(["steps", index, name, field], box))
             box.classes("w-full").props("dense stack-label").tooltip(info.description or "")
@@ -219,7 +215,7 @@ class Form:
         elif len(path) == 1:
             data[path[0]] = value
         else:
-            data[path[0]] = {**(data.get(path[0]) or {}), path[1]: value}
+            data[path[0]] = {**self._project.section(path[0]), path[1]: value}
         self._write(
             {k: data[k] for k in [*[x for x in data if x != "steps"], "steps"] if k in data}
         )
@@ -255,7 +251,7 @@ class Form:
 
 @cache
 def _standards() -> list[str]:
-    table = yaml.safe_load((bundled("data") / "standards" / "iso9409-1.yaml").read_text("utf-8"))
+    table = read_yaml(bundled("data") / "standards" / "iso9409-1.yaml").data
     return [plate["designation"] for plate in table["plates"]]
 
 
@@ -365,8 +361,7 @@ class WhatRuns:
         self._line.text = self._project.command(*self._words("running"))
 
     def _words(self, name: str) -> list[str]:
-        model = (self._project.data().get("scanner") or {}).get("model")
-        given = {"scanner": model, **self._chosen}
+        given = {"scanner": self._project.section("scanner").get("model"), **self._chosen}
         options = [w for flag, answer in given.items() if answer for w in (f"--{flag}", answer)]
         return ["init", "--ros2", "--yes", *options, "--out", f"{name}.yaml"]
 
@@ -457,8 +452,8 @@ def _put_step(steps: list[Any], path: list[Any], value: Any) -> None:
 def _plain(text: str) -> Any:
     """Return what is typed as YAML would have it; text that is no YAML stays text."""
     try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError:
+        return parse_yaml(text, "field").data
+    except RecipeError:
         return text
 
 

@@ -17,7 +17,9 @@ def residual_chart(
     """Return a bar for the error of each pose [m] and the limit; those set aside are marked."""
     names = sorted({*sizes, *aside})
     bars = [round(1e3 * sizes[n], 4) if n in sizes else None for n in names]
-    series: dict[str, Any] = {"type": "bar", "name": "mm", "data": bars, "color": LIGHT["verified"]}
+    series: dict[str, Any] = {
+        "type": "bar", "name": "mm", "data": bars, "color": LIGHT["verified"], "barMaxWidth": 60,
+    }  # fmt: skip
     if limit is not None:
         line = {"yAxis": 1e3 * limit, "lineStyle": {"color": LIGHT["refused"]}}
         label = {"formatter": "limit", "color": LIGHT["axis"], "position": "insideEndTop"}

@@ -6,12 +6,15 @@ import asyncio
 import json
 from typing import Any, cast
 
+import numpy as np
 from nicegui import events, ui
 
 from flangeye.errors import FlangeyeError
+from flangeye.maths.statistics import corners_of
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
 from flangeye.recipe.load import Recipe
+from flangeye.report.still import ready, rods
 from flangeye_ui.layout import ActionBar, code, command_line, mistake, page, weigh
 from flangeye_ui.project import Project
 from flangeye_ui.scene import Scene3D, base_T_camera_of, box_of
@@ -23,9 +26,9 @@ def add(project: Project) -> None:
     @ui.page("/poses")
     def poses() -> None:
         with page(project, "Poses") as bar:
-            recipe, mistakes = project.check()
+            recipe, _ = project.check()
             if recipe is None:
-                mistake(f"The recipe has {len(mistakes)} errors; see step 1, Cell.")
+                mistake("The recipe has mistakes: see step 1, Cell.")
                 bar.lead("Cell", "Go to step 1: cell")
                 return
             PosePlanner(project, recipe, bar)
@@ -55,7 +58,7 @@ class PosePlanner:
         """Say how things stand, and show the button that leads on from there."""
         checked = self._project.planned == self._project.text
         if not self._recipe.plans:
-            self._bar.say("Its poses come from recordings: there is nothing to check.")
+            self._bar.say("The recipe plans no poses: there is nothing to check.")
         elif checked:
             self._show_poses(self._project.plan)
         else:
@@ -67,20 +70,22 @@ class PosePlanner:
 
     def _draw(self) -> None:
         robot, scanner = (self._recipe.context.get(m) for m in (RobotModel, ScannerModel))
+        seen, at = [np.zeros((1, 3))], None
         if robot is not None:
             self._scene.arm(robot)
+            seen += [ends for _, ends in rods(robot, ready(robot))]
         if (box := box_of(self._recipe)) is not None:
             self._scene.box_of(*box)
-        if scanner is None:
-            return
+            seen.append(corners_of(*box))
         try:
             at = base_T_camera_of(self._recipe)
         except FlangeyeError as error:
             mistake(str(error))
-            return
-        if at is not None:
+        if scanner is not None and at is not None:
             self._scene.sees(scanner, at).draggable()
             self._scene.on_drag_end(self._dragged)
+            seen.append(at[None, :3, 3])
+        self._scene.frame(np.vstack(seen))
 
     def _view(self) -> Any:
         return getattr(self._recipe.steps[0].params, "view", None)
@@ -96,10 +101,12 @@ class PosePlanner:
 
     def _guess(self) -> None:
         """Let the person say where the scanner stands: drag its ball, type it, or show poses."""
-        given = _first(self._project.data()) or {}
+        given = self._project.steps()[0][1]
         view: Any = given.get("view")
         guessed = self._view() is not None and isinstance(view, dict)
         if not guessed and self._simulated is None:
+            if not self._recipe.plans:
+                return
             ui.label("The scanner is not drawn: the recipe has no first guess of its pose (view).")
             return
         if guessed:
@@ -134,7 +141,7 @@ class PosePlanner:
         self._write({"view": {"shown": {"joints": rows}}})
 
     def _place(self, position: list[str]) -> None:
-        given = _first(self._project.data()) or {}
+        given = self._project.steps()[0][1]
         if self._view() is None:
             self._write({"camera": {**(given.get("camera") or {}), "position": position}})
             return
@@ -197,11 +204,3 @@ def plan_in(printed: str) -> dict[str, Any]:
         if line.startswith("{"):
             return cast("dict[str, Any]", json.loads(line))
     return {"text": printed}
-
-
-def _first(data: dict[str, Any]) -> dict[str, Any] | None:
-    steps = data.get("steps") or []
-    if not steps or not isinstance(steps[0], dict):
-        return None
-    given = next(iter(steps[0].values()))
-    return given if isinstance(given, dict) else None

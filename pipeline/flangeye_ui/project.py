@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from flangeye.errors import FlangeyeError, RecipeError, StageError
-from flangeye.files.yaml_lines import edited, parse_yaml
+from flangeye.files.yaml_lines import edited, flow, parse_yaml
 from flangeye.log.read import read_run
 from flangeye.plugin.registry import Registry
 from flangeye.plugin.stage import KINDS
@@ -78,8 +78,8 @@ class Project:
 
     @property
     def text(self) -> str:
-        """The recipe's text on disk."""
-        return self.recipe_path.read_text(encoding="utf-8")
+        """The recipe's text on disk; ``check`` tells of bytes that are none."""
+        return self.recipe_path.read_text(encoding="utf-8", errors="replace")
 
     @text.setter
     def text(self, text: str) -> None:
@@ -93,9 +93,30 @@ class Project:
             return {}
         return data if isinstance(data, dict) else {}
 
+    def section(self, name: str) -> dict[str, Any]:
+        """Return a section of the recipe as data; one word is its model, as in any recipe."""
+        given = self.data().get(name)
+        if isinstance(given, dict):
+            return given
+        return {"model": given} if isinstance(given, str) else {}
+
+    def steps(self) -> list[tuple[str, dict[str, Any]]]:
+        """Return name and given parameters of every step; of what is no step, empty ones."""
+        given = self.data().get("steps")
+        return [_step_of(entry) for entry in given] if isinstance(given, list) else []
+
     def edit(self, data: dict[str, Any]) -> None:
         """Write only what differs from the recipe on disk; comments are kept."""
         self.text = edited(self.text if self.data() else "", data)
+
+    def start_from(self, recipe: Path) -> None:
+        """Take over another recipe; the files that it names stay where they are."""
+        text = recipe.read_text(encoding="utf-8")
+        for name in set(re.findall(r"[\w./-]+", text)):
+            beside = (recipe.parent / name).resolve()
+            if "." in name and beside.exists():
+                text = text.replace(f" {name}", f" {flow(str(beside))}")
+        self.text = text
 
     def check(self) -> tuple[Recipe | None, list[Mistake]]:
         """Return the checked recipe, or everything that is wrong with it."""
@@ -107,10 +128,8 @@ class Project:
     @property
     def simulated(self) -> bool:
         """Whether scans come from a simulation, or an arm or a scanner is an emulator."""
-        data = self.data()
-        drivers = [(data.get(part) or {}).get("driver") or {} for part in ("robot", "scanner")]
-        steps = data.get("steps") or [""]
-        first = next(iter(steps[0])) if isinstance(steps[0], dict) else str(steps[0])
+        drivers = [str(self.section(part).get("driver")) for part in ("robot", "scanner")]
+        first = next((name for name, _ in self.steps()), "")
         return ".simulated" in first or any("emulator" in driver for driver in drivers)
 
     def done(self) -> set[str]:
@@ -171,12 +190,11 @@ class Project:
         Of kinds that a recipe has one of, the step that is there makes room.
         """
         data = self.data()
-        steps = list(data.get("steps") or [])
-        names = [next(iter(s)) if isinstance(s, dict) else s for s in steps]
+        steps, known = list(data.get("steps") or []), self.steps()
+        names = [step for step, _ in known]
         if name in names:
             at = names.index(name)
-            given = (steps[at][name] if isinstance(steps[at], dict) else None) or {}
-            steps[at] = {name: {**given, **params}}
+            steps[at] = {name: {**known[at][1], **params}}
         else:
             kinds, kind = list(KINDS), name.partition(".")[0]
             ranks = [kinds.index(each.partition(".")[0]) for each in names]
@@ -225,6 +243,14 @@ class Project:
         """Stop an arm that moves for a page that is not there any more."""
         if self.run and self.run.moves and page == self.owner:
             self.run.stop(why)
+
+
+def _step_of(entry: Any) -> tuple[str, dict[str, Any]]:
+    """Return name and parameters of a step as it stands in a recipe."""
+    if isinstance(entry, dict) and len(entry) == 1:
+        ((name, given),) = entry.items()
+        return str(name), given if isinstance(given, dict) else {}
+    return entry if isinstance(entry, str) else "", {}
 
 
 def _mistake(line: str) -> Mistake:

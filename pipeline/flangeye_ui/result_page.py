@@ -10,13 +10,13 @@ from typing import Any
 from urllib.parse import quote
 
 import numpy as np
-import yaml
 from nicegui import ui
 from pydantic import ValidationError
 
 from flangeye.doctor import examine, open_session
 from flangeye.doctor.diagnosis import Finding
-from flangeye.errors import FlangeyeError
+from flangeye.errors import FlangeyeError, RecipeError
+from flangeye.files.yaml_lines import parse_yaml
 from flangeye.models.robots import RobotModel
 from flangeye.report.cell import found_body
 from flangeye.report.facts import Facts, set_aside_of
@@ -31,7 +31,7 @@ from flangeye.units import parse_quantity
 from flangeye_ui.charts import coverage_drawing, residual_chart
 from flangeye_ui.layout import ActionBar, code, command_line, mistake, page, svg, warning
 from flangeye_ui.project import Project
-from flangeye_ui.scene import CELL, ScanView, Scene3D, outline_of, views_of
+from flangeye_ui.scene import ScanView, Scene3D, outline_of
 
 STEP = "verify.touch"
 ASKED = {
@@ -110,8 +110,7 @@ class TouchBox:
 
     def _write(self) -> None:
         """Put the point into the recipe's step, beside those that are there."""
-        given, steps = self._given(), self._project.data()["steps"]
-        old = next((s[STEP] for s in steps if isinstance(s, dict) and STEP in s), None) or {}
+        given, old = self._given(), dict(self._project.steps()).get(STEP, {})
         touches = [*old.get("touches", []), _touch(given)]
         self._project.write_step(STEP, {"tip": given["tip"], "touches": touches})
         self._keep.set_enabled(False)
@@ -276,8 +275,8 @@ def _warnings(project: Project, facts: Facts) -> None:
 def _line_of(project: Project, fix: str) -> dict[str, Any] | None:
     """Return a warning's cure as a line of the recipe, where it is one."""
     try:
-        found = yaml.safe_load(fix)
-    except yaml.YAMLError:
+        found = parse_yaml(fix, "fix").data
+    except RecipeError:
         return None
     line = found[0] if isinstance(found, list) and len(found) == 1 else found
     known = {*project.registry.stages, *project.data()}
@@ -321,7 +320,9 @@ def _in_3d(project: Project, box: ui.expansion, facts: Facts) -> None:
             ui.label("There is no scanner that stands in the base to draw.")
             return
         places = [each.tcp_in_base for each in facts.measured if each.tcp_in_base]
-        scene = Scene3D(420, views_of(np.array(places)) if places else CELL)
+        scene = Scene3D(420)
+        if places:
+            scene.frame(np.array(places))
         _cell(project, scene, facts)
         for entry in facts.log.of_kind("fit"):
             scene.cloud(

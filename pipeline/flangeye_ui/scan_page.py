@@ -48,7 +48,7 @@ class RunPanel:
         first = self._recipe.steps[0].stage.name if self._recipe else ""
         self._live = first == "acquire.live"
         if mistakes:
-            mistake(f"The recipe has {len(mistakes)} errors; see step 1, Cell.")
+            mistake("The recipe has mistakes: see step 1, Cell.")
         self._buttons(sound=not mistakes)
         self._before = ui.row().classes("w-full gap-4 items-center")
         with self._before:

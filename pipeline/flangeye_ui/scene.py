@@ -133,14 +133,6 @@ AXES = 0.25
 Point = tuple[float, float, float]
 View = tuple[Point, Point, Point]
 """Where the camera stands, where it looks [m], and the direction that is up."""
-CELL: dict[str, View] = {
-    name: (eye, (0.35, 0.0, 0.4), (0.0, 0.0, 1.0))
-    for name, eye in {
-        "Overview": (1.2, -1.1, 0.95), "Front": (1.9, 0.0, 0.5), "Side": (0.35, -1.6, 0.5),
-        "Top": (0.35, -0.01, 1.9),
-    }.items()
-}  # fmt: skip
-"""Views of a cell in its base."""
 SCANNED: dict[str, View] = {
     "From the scanner": ((0.0, -0.02, 0.2), (0.0, 0.0, 0.8), (0.0, -1.0, 0.0)),
     "From the side": ((0.7, -0.1, 0.8), (0.0, 0.0, 0.8), (0.0, -1.0, 0.0)),
@@ -154,15 +146,23 @@ class Scene3D(ui.scene):
     def __init__(
         self,
         height: int,
-        views: Mapping[str, View] = CELL,
+        views: Mapping[str, View] | None = None,
         hovered: Callable[[str], None] | None = None,
     ) -> None:
-        """Make one as wide as its column; ``hovered`` hears which named thing is pointed at."""
+        """Make one as wide as its column.
+
+        Args:
+            height: Its height [pixels].
+            views: To look from, by name; None for those of a cell.
+            hovered: Hears which named thing is pointed at.
+        """
         # At night what is light is dark and colours keep their hue: a scene has one background
         # only.
         ui.add_css("body.body--dark .scene canvas {filter: invert(0.88) hue-rotate(180deg)}")
-        self._hovered, self._last, self._of = hovered, "", views
-        self._floor = views is not SCANNED
+        self._hovered, self._last = hovered, ""
+        # Until it is framed, a cell is as large as an arm's reach [m]
+        self._of = views or views_of(np.array([[-0.5, -0.5, 0.0], [0.5, 0.5, 1.0]]))
+        self._floor = views is None
         super().__init__(
             width=640, height=height, fps=20 if self._floor else 10, on_click=self._pointed,
             grid=(4, 16) if self._floor else False, background_color=LIGHT["panel"],
@@ -177,7 +177,7 @@ class Scene3D(ui.scene):
                 self.text(name, f"color: {SERIES[name]}").move(*(1.12 * tip).tolist())
         self._stays = set(self.objects)
         self._views()
-        self.look(next(iter(views)))
+        self.look(next(iter(self._of)))
 
     def _views(self) -> None:
         scale = "floor: squares of 250 mm; " if self._floor else ""  # 16 along 4 m
@@ -194,6 +194,11 @@ class Scene3D(ui.scene):
     def fit(self) -> None:
         """Take the size of the column, after it was hidden."""
         self.run_method("resize")
+
+    def frame(self, places: Floats) -> None:
+        """Look at a cell from where all of the places (N, 3) fill the picture [m]."""
+        self._of = views_of(places)
+        self.look(next(iter(self._of)))
 
     def look(self, view: str) -> None:
         """Switch to one of the views."""
@@ -272,12 +277,22 @@ class Scene3D(ui.scene):
 
 
 def views_of(places: Floats) -> dict[str, View]:
-    """Return views of a cell, at first from near the places (N, 3) that matter [m]."""
-    middle = (places.min(axis=0) + places.max(axis=0)) / 2
-    away = 1.4 * max(float(np.ptp(places, axis=0).max()), AXES)
-    eye = middle + away * np.array([0.75, -0.75, 0.45])
-    (x, y, z), (to_x, to_y, to_z) = eye.tolist(), middle.tolist()
-    return {"Near": ((x, y, z), (to_x, to_y, to_z), (0.0, 0.0, 1.0)), **CELL}
+    """Return views of a cell, each from where all of the places (N, 3) are in sight [m]."""
+    low, high = places.min(axis=0), places.max(axis=0)
+    middle = (low + high) / 2
+    away = max(float(np.linalg.norm(high - low)), AXES)
+    return {
+        name: (_point(middle + away * np.array(towards)), _point(middle), (0.0, 0.0, 1.0))
+        for name, towards in {
+            "Overview": (0.65, -0.65, 0.4), "Front": (1.0, 0.0, 0.1), "Side": (0.0, -1.0, 0.1),
+            "Top": (0.0, -0.01, 1.0),
+        }.items()
+    }  # fmt: skip
+
+
+def _point(place: Floats) -> Point:
+    x, y, z = place.tolist()
+    return x, y, z
 
 
 def outline_of(feature: Feature) -> Floats:

@@ -176,7 +176,7 @@ class LoopbackScanner(OpenScanner):
         rows, columns = eye.pixels.shape
         facts = {"unit": "m", "layout": f"organised, {columns} x {rows}", "simulated": "yes"}
         super().__init__(f"simulated {model.model}, seed {params.seed}", facts)
-        base_T_camera = params.camera.matrix
+        base_T_camera = params.camera.base_T_camera
         self.truth = Truth(Transform(BASE, CAMERA, base_T_camera))
         self._control, self._params, self._faults = control, params, faults
         self._studio = CellScene(

@@ -30,11 +30,12 @@ from flangeye import cli
 from flangeye.errors import StageError
 from flangeye.maths.pose_corrections import inverted
 from flangeye.plugin.registry import Registry, load_registry
-from flangeye.recipe.find import find_recipe
+from flangeye.recipe.find import find_recipe, recipe_names
 from flangeye.report.look import LIGHT, SERIES
 from flangeye_ui import scan_page, server
 from flangeye_ui.poses_page import plan_in
 from flangeye_ui.project import MoveCodes, Project, _mistake
+from flangeye_ui.scene import base_T_camera_of
 from flangeye_ui.server import require_free
 from tests.doctor.sessions import clean
 from tests.doctor.test_cures import write
@@ -117,9 +118,14 @@ def finished(served: Served) -> Path:
     for run in sorted(served.folder.glob("runs/*")):
         if (run / "calibration.yaml").exists():
             return run
-    path = served.folder / "small.yaml"
-    path.write_text(SMALL)
-    run = served.folder / "runs" / "2026-01-01T00-00-00_small"
+    return made(served, "2026-01-01T00-00-00_small", SMALL)
+
+
+def made(served: Served, name: str, recipe: str) -> Path:
+    """Run a recipe in the server's folder, and return the run."""
+    path = served.folder / f"{name}.yaml"
+    path.write_text(recipe)
+    run = served.folder / "runs" / name
     command = [sys.executable, "-P", "-m", "flangeye.cli", "run", str(path), "--out", str(run)]
     subprocess.run(command, check=True, capture_output=True)
     return run
@@ -279,6 +285,49 @@ def test_a_recipe_that_is_wrong_opens_with_its_mistakes(browser: Any, served: Se
     page.locator(".q-field--error", has_text="resolution").wait_for(state="hidden")
 
 
+SHAPES = {
+    "one word a section": b"robot: ur5\nscanner: phoxi-m\nsteps: [acquire.simulated]",
+    "a list for a section": b"robot: [ur5]\nscanner: 5\nfeature: {standard: [1]}\nsteps: 3",
+    "steps that are none": b"robot: {model: [1]}\nsteps: [{}, 4, [a], {a: 1, b: 2}, {1: 2}]",
+    "steps by name": b"title: {a: b}\nrobot: {driver: 4}\nsteps: {acquire.simulated: {}}",
+    "no UTF-8": "title: Prüfzelle\nsteps: []".encode("latin-1"),
+    "no mapping": b"- a\n- b",
+    "no YAML": b"robot: {model: ur5\n\tx",
+}
+
+
+@pytest.mark.parametrize("text", SHAPES.values(), ids=SHAPES)
+def test_whatever_a_recipe_holds_every_page_opens(
+    browser: Any, served: Served, text: bytes
+) -> None:
+    page = opened(browser, served)
+    try:
+        (served.folder / "cell.yaml").write_bytes(text)
+        for name in ("Poses", "Cell"):
+            go(page, name)
+        assert page.problems == []
+    finally:
+        (served.folder / "cell.yaml").write_text(SMALL)
+
+
+def test_an_arm_is_chosen_where_the_recipe_has_one_word(tmp_path: Path) -> None:
+    project = Project(tmp_path, load_registry(), MoveCodes(print))
+    project.text = "robot: ur5\nsteps:\n  - acquire.simulated  # mine\n"
+    assert project.section("robot") == {"model": "ur5"}
+    assert project.steps() == [("acquire.simulated", {})]
+    assert project.simulated
+
+
+def test_every_example_can_be_started_from(tmp_path: Path) -> None:
+    project = Project(tmp_path, load_registry(), MoveCodes(print))
+    for name in recipe_names():
+        project.start_from(find_recipe(name))
+        recipe, mistakes = project.check()
+        assert recipe is not None, (name, mistakes)
+        stands = recipe.steps[0].stage.name in ("acquire.simulated", "acquire.live")
+        assert (base_T_camera_of(recipe) is not None) == stands, name
+
+
 def test_an_arm_is_imported_from_its_urdf(browser: Any, served: Served) -> None:
     (served.folder / "kr6.urdf").write_text(URDF)
     page = opened(browser, served)
@@ -327,13 +376,12 @@ def test_a_scanner_is_imported(browser: Any, served: Served) -> None:
     assert recipe["scanner"]["model"] == "eye7.yaml"
 
 
-def test_the_archive_compares_runs_batches_and_checks(
+def test_the_archive_compares_runs_and_batches(
     browser: Any, served: Served, finished: Path
 ) -> None:
     batch = served.folder / "batches" / "nights"
     batch.mkdir(parents=True, exist_ok=True)
     (batch / "sessions.csv").write_text("session,status,held_out_rms\nmonday,verified,0.0004\n")
-    (finished / "monitor.html").write_text("<h1>OK</h1>")
     page = opened(browser, served)
     go(page, "Archive")
     page.get_by_role("cell", name=finished.name).wait_for()
@@ -346,9 +394,32 @@ def test_the_archive_compares_runs_batches_and_checks(
     shot(page, "archive")
     page.get_by_role("link", name=finished.name, exact=True).click()
     page.get_by_role("heading", name="Result", exact=True).wait_for()
+    assert page.problems == []
+
+
+@pytest.mark.slow
+def test_a_calibration_is_checked_by_later_scans(
+    browser: Any, served: Served, finished: Path
+) -> None:
+    later = made(served, "later", f"seed: 5\n{SMALL}")
+    moved = "camera: {position: [603 mm, -12.5 mm, 1 m]}, poses"
+    knocked = made(served, "knocked", f"seed: 6\n{SMALL.replace('poses', moved)}")
+    page = opened(browser, served)
     go(page, "Watch")
+    page.get_by_label("Calibration", exact=True).click()
+    page.get_by_role("option", name=finished.name).click()
+    page.get_by_role("option").first.wait_for(state="hidden")
+    for new, said in (
+        (finished, "are the calibration's own, which check nothing"),
+        (later, "OK: the calibration still holds"),
+        (knocked, "MOVED: calibrate again before you use it"),
+    ):
+        page.get_by_label("New scans").fill(new.name)
+        page.get_by_role("option", name=new.name).click()
+        page.get_by_role("button", name="Check", exact=True).click()
+        page.get_by_text(said).wait_for()
     page.get_by_role("link", name=f"runs/{finished.name}/monitor.html").wait_for()
-    page.get_by_text("flangeye monitor runs/").first.wait_for()
+    shot(page, "watch")
     assert page.problems == []
 
 

@@ -79,6 +79,7 @@ def monitor(  # noqa: PLR0913  one argument an option
         CODES,
         History,
         as_json,
+        history_beside,
         only_user,
         stored_calibration,
         take,
@@ -93,7 +94,7 @@ def monitor(  # noqa: PLR0913  one argument an option
     test = _drift_test(false_alarms, limit)
     url, node = _opcua_node(opcua, opcua_security) if opcua else ("", "")
     stored = stored_calibration(calibration)
-    place = history or stored.path.parent / "monitor.jsonl"
+    place = history or history_beside(stored.path)
     kept = History.read(place, stored.key)
     registry = load_plugins()
     for check in _checks(stored, registry, archive, (scans, move), overrides or ()):

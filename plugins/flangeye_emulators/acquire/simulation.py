@@ -99,7 +99,7 @@ def simulate(
     robot, scanner, flange, sphere, body = setting
     plate = flange if flange.bore else plate_of(robot)
     planning, checking, errors, noise, later = np.random.SeedSequence([VERSION, seed]).spawn(5)
-    base_T_camera = params.camera.matrix
+    base_T_camera = params.camera.base_T_camera
     shown = body or max(plate.outer, plate.details.wrist / 2)
     reach = Reach(robot, scanner, base_T_camera, shown)
     site = _site(reach, base_T_camera)
@@ -218,7 +218,7 @@ class _Session:
 
     @property
     def base_T_camera(self) -> Floats:
-        return self.params.camera.matrix
+        return self.params.camera.base_T_camera
 
     @property
     def count(self) -> int:

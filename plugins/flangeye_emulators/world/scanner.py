@@ -569,6 +569,11 @@ class CameraPose(PlaceParams):
         ("180 deg", "0 deg", "-90 deg"), description="Roll, pitch, yaw; the default looks down."
     )
 
+    @property
+    def base_T_camera(self) -> Floats:
+        """(4, 4), translation in [m]; the page draws the scanner there."""
+        return self.matrix
+
 
 class ScannerQuality(Params):
     """Errors of a simulated scanner beyond its model."""

@@ -9,7 +9,14 @@ from typing import Any
 from flangeye import types as t
 from flangeye.devices import MotionAllowed
 from flangeye.doctor.monitor.chart import write_chart
-from flangeye.doctor.monitor.history import History, MonitorCheck, as_json, only_user, prints_of
+from flangeye.doctor.monitor.history import (
+    History,
+    MonitorCheck,
+    as_json,
+    history_beside,
+    only_user,
+    prints_of,
+)
 from flangeye.doctor.monitor.stored import StoredCalibration, stored_calibration
 from flangeye.doctor.monitor.watchman import CODES, judge, take
 from flangeye.errors import StageError
@@ -29,6 +36,7 @@ __all__ = [
     "as_json",
     "from_archive",
     "from_arm",
+    "history_beside",
     "judge",
     "only_user",
     "stored_calibration",
@@ -141,7 +149,7 @@ def _refuse_own(path: Path, shared: Collection[Any]) -> None:
     if shared:
         raise StageError(
             f"{path}: {len(shared)} of its scans are the calibration's own, which check nothing; "
-            "scan again"
+            "scan again, with another seed where the cell is simulated"
         )
 
 

@@ -163,6 +163,11 @@ class History:
         self.findings.append(finding)
 
 
+def history_beside(log: Path) -> Path:
+    """Return where the history of the calibration in a log is kept, unless another is named."""
+    return log.with_name("monitor.jsonl")
+
+
 @contextmanager
 def only_user(path: Path) -> Iterator[None]:
     """Keep other programs from adding to a history while the context lasts.
