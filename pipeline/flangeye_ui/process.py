@@ -12,13 +12,15 @@ import time
 from base64 import b64encode
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flangeye import types as t
 from flangeye.errors import FlangeyeError
 from flangeye.log import foxglove
-from flangeye.log.read import RunLog, read_run, take
+from flangeye.log.read import RunLog, logged_image, read_run, take
 from flangeye.log.records import LogMessage
 from flangeye.log.watch import RunView, follow
 from flangeye.plugin.registry import Registry
@@ -149,8 +151,10 @@ class RunProcess:
         return recipe_of_log(read_run(self.log.path), self._registry, name=self.path.name)
 
     def _show(self, message: LogMessage) -> None:
-        """Keep the newest scan and the flange in it, thin enough for a page."""
+        """Keep the newest scan and the flange in it, thin enough for a page; of images, these."""
         topic = message.channel.topic
+        if topic == "/capture/image":
+            self.shots[self._capture] = small(logged_image(message.data))
         if message.channel.schema != "foxglove.PointCloud":
             return
         thin = thinned(message.data)
@@ -158,7 +162,8 @@ class RunProcess:
             self.cloud, self.flange = thin, np.zeros((0, 3))
         elif ".segment." in topic:
             self.flange = thin
-        self.shots[self._capture] = picture_of(self.cloud, self.flange)
+        if len(self.cloud):
+            self.shots[self._capture] = picture_of(self.cloud, self.flange)
         self.arrived += 1
 
 
@@ -175,12 +180,13 @@ def thinned(data: bytes) -> Floats:
     return cloud[:: max(1, len(cloud) // points)].astype(np.float64)
 
 
+SHOT = (160, 120)
+"""Width and height of a scan's small picture [pixels]."""
+
+
 def picture_of(cloud: Floats, flange: Floats) -> str:
     """Return a scan as its camera sees it, near light and far dark, its flange blue: a data URL."""
-    import cv2
-
-    # Width and height of a scan's small picture [pixels].
-    shot = (160, 120)
+    shot = SHOT
     image = np.zeros((shot[1], shot[0], 3), dtype=np.uint8)
     if len(cloud):
         rays = cloud[:, :2] / cloud[:, 2:]
@@ -195,6 +201,21 @@ def picture_of(cloud: Floats, flange: Floats) -> str:
             values = np.broadcast_to(colour, (len(points), 3))[inside]
             for x, y in ((0, 0), (0, 1), (1, 0), (1, 1)):
                 image[at[inside, 1] + y, at[inside, 0] + x] = values
+    return _as_address(image)
+
+
+def small(image: NDArray[np.uint8]) -> str:
+    """Return an image (H, W) or (H, W, 3), red first, in a small picture's size: a data URL."""
+    import cv2
+
+    scale = min(np.array(SHOT) / image.shape[1::-1])
+    fewer = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return _as_address(fewer[..., ::-1] if fewer.ndim == 3 else fewer)
+
+
+def _as_address(image: Any) -> str:
+    import cv2
+
     return "data:image/png;base64," + b64encode(cv2.imencode(".png", image)[1].tobytes()).decode()
 
 

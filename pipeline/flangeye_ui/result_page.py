@@ -24,11 +24,13 @@ from flangeye.report.look import LIGHT, SERIES
 from flangeye.report.still import scene_of
 from flangeye.report.summary import banner_of, transform_text
 from flangeye.report.units import rounded_mm
+from flangeye.report.weld import weld_drawing
 from flangeye.result.sections import expected_error
 from flangeye.run.outlook import Outlook, outlook_of_log
 from flangeye.types import HandEye
 from flangeye.units import parse_quantity
 from flangeye_ui.charts import coverage_drawing, residual_chart
+from flangeye_ui.foreign import address_of
 from flangeye_ui.layout import ActionBar, code, command_line, mistake, page, svg, warning
 from flangeye_ui.project import Project
 from flangeye_ui.scene import ScanView, Scene3D, outline_of
@@ -175,6 +177,9 @@ def _show(project: Project, run: Path, facts: Facts, bar: ActionBar) -> None:
             _warnings(project, facts)
         with ui.column().classes("col-12 col-md gap-1"):
             _by_pose(facts)
+    if weld := weld_drawing(facts):
+        with ui.expansion("The weld", value=True).classes("w-full"):
+            ui.label(weld.summary)
     with ui.expansion("The matrix", value=True).classes("w-full"):
         _matrix(facts)
     if notes := facts.result.provenance.notes:
@@ -191,6 +196,8 @@ def _show(project: Project, run: Path, facts: Facts, bar: ActionBar) -> None:
         Better(project, run, facts)
     with ui.expansion("Ask the doctor what is wrong").classes("w-full") as box:
         Doctor(project, run, box)
+    if (report := run / "report.html").exists():
+        ui.link("The whole report", address_of(project.folder, report), new_tab=True)
     bar.say(f"{run.name}: {LIGHTS[banner_of(facts).kind][2].lower()}.")
     if facts.result.transforms and not facts.result.refused:
         bar.lead("Use", "Next: use it")
@@ -268,6 +275,9 @@ def _warnings(project: Project, facts: Facts) -> None:
             ui.button("Write it into the recipe", on_click=partial(_apply, project, line)).props(
                 "no-caps outline"
             )
+    weld = facts.result.weld
+    if weld and not weld.completed:
+        warning(f"The weld was stopped: {weld.reason}.")
     for text in warnings_of(facts):
         warning(text)
 

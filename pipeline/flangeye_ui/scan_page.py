@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -85,7 +86,7 @@ class RunPanel:
         self._progress.props('aria-label="Captures"')
         self._left = ui.label().props("aria-live=polite")
         with ui.row().classes("w-full gap-4 items-start"):
-            with ui.column().classes("col-12 col-md-6 gap-1"):
+            with ui.column().classes("col-12 col-md-6 gap-1") as self._newest:
                 self._scene = Scene3D(330, SCANNED)
                 ui.label("The newest scan: flange blue, its rim as fitted red.").classes("note")
             with ui.column().classes("col-12 col-md gap-1"):
@@ -172,8 +173,10 @@ class RunPanel:
         self._on.set_visibility(bool(ended))
         self._resume_button.set_visibility(left is not None)
         self._before.set_visibility(not shown)
-        if shown and not self._during.visible:
+        scanned = shown and run is not None and len(run.cloud) > 0
+        if scanned and not (self._newest.visible and self._during.visible):
             ui.timer(0.1, self._scene.fit, once=True)
+        self._newest.set_visibility(scanned)
         self._during.set_visibility(shown)
         if run is None or not shown:
             self._bar.say(_nothing(left, other))
@@ -184,10 +187,11 @@ class RunPanel:
     def _show(self, run: RunProcess) -> None:
         seconds, view = run.left, run.view
         self._progress.value = view.captures / view.total if view.total else 0.0
-        if run.code is not None:
+        if run.code in (0, 1):
             self._progress.value = 1.0
         rest = "" if seconds is None else f", {_time(seconds)} left at most"
-        self._left.text = f"{view.captures} of at most {view.total or '?'} scans{rest}"
+        most = f" of at most {view.total}" if view.total else ""
+        self._left.text = f"{view.captures}{most} scans{rest}"
         if not view.captures and run.code is None:
             self._left.text = "Getting ready …"
         said = [*view.rows(), *view.events, run.code, run.outlook]
@@ -198,7 +202,9 @@ class RunPanel:
         if (run.path, run.arrived) != self._shown:
             self._shown = (run.path, run.arrived)
             self._draw(run)
-        for capture, picture in {**dict.fromkeys(run.set_aside, ""), **run.shots}.items():
+        # Poses of which nothing is seen: so many are shown, of archives of thousands
+        bare = islice((*run.log.poses, *run.set_aside), 300)
+        for capture, picture in {**dict.fromkeys(bare, ""), **run.shots}.items():
             self._shot(run, capture, picture)
 
     def _tell(self) -> None:

@@ -8,6 +8,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from rich.console import Console
 
@@ -62,6 +63,18 @@ def test_a_run_is_followed_while_it_is_written(log: Any) -> None:
     assert rows["arm"].endswith("mm in the base, at the last capture")
     assert view.events[-2] == "3.solve.toy done"
     assert view.events[-1].startswith("4.verify.toy done: verify.toy: 0.")
+
+
+def test_captures_of_a_cell_count_whatever_its_arms_are_called(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "run.mcap", {"recipe.yaml": TOY_RECIPE}, False)
+    pose = t.Transform("base", "left_flange", np.eye(4))
+    cloud = t.PointCloud(t.CAMERA, np.zeros((0, 3), np.float32))
+    recorder.flangeye_captured("0.acquire.toy", t.Capture("0", cloud, {"left_flange": pose}), 0.1)
+    recorder.ended("")
+    recorder.close()
+    view = watch_run(tmp_path, None, plain(), patience=30)
+    assert (view.captures, view.arm) == (1, None)
+    assert not any(line.startswith("message") for line in view.events)
 
 
 def test_a_killed_run_is_given_up_on(log: Any, tmp_path: Path) -> None:

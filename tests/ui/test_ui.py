@@ -15,6 +15,7 @@ import sys
 import time
 import urllib.error
 import urllib.request
+from base64 import b64decode
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,7 @@ from flangeye.recipe.find import find_recipe, recipe_names
 from flangeye.report.look import LIGHT, SERIES
 from flangeye_ui import scan_page, server
 from flangeye_ui.poses_page import plan_in
+from flangeye_ui.process import small, thinned
 from flangeye_ui.project import MoveCodes, Project, _mistake
 from flangeye_ui.scene import base_T_camera_of
 from flangeye_ui.server import require_free
@@ -660,10 +662,18 @@ def test_the_plan_is_read_as_the_command_prints_it() -> None:
     assert plan_in("error: no plan") == {"text": "error: no plan"}
 
 
+def test_an_image_is_shown_small_in_its_colours() -> None:
+    red = np.zeros((300, 800, 3), dtype=np.uint8)
+    red[..., 0] = 255
+    data = small(red).partition("base64,")[2]
+    shown = cv2.imdecode(np.frombuffer(b64decode(data), np.uint8), cv2.IMREAD_COLOR)
+    assert shown.shape == (60, 160, 3)
+    assert shown[30, 80].tolist() == [0, 0, 255]  # blue first
+
+
 def test_thinning_a_large_scan_costs_less_than_making_its_message() -> None:
     from flangeye.log import foxglove
     from flangeye.types import PointCloud
-    from flangeye_ui.process import thinned
 
     xyz = np.random.default_rng(0).normal(size=(3_200_000, 3)).astype(np.float32)
     shares = []

@@ -250,7 +250,7 @@ class RunLog:
                 elif topic == "/capture/scan" and capture in self.poses:
                     parts["scan"] = unpack(message.data, self.poses[capture]["shape"])
                 elif topic == "/capture/image":
-                    parts["pixels"] = _decode_image(message.data)
+                    parts["pixels"] = logged_image(message.data)
                 elif topic == "/capture/cloud" and capture in self.poses:
                     yield self._logged_capture(capture, message.data, **parts)
             except Exception as error:  # what a foreign log holds can be wrong in any way
@@ -364,7 +364,7 @@ def read_notes(path: Path, steps: Set[str] | None = None) -> Iterator[JournalEnt
 def _note(message: LogMessage) -> JournalEntry:
     step, _, name = message.channel.topic.removeprefix("/note/").rpartition("/")
     if message.channel.schema == "foxglove.CompressedImage":
-        return JournalEntry(step, name, _decode_image(message.data))
+        return JournalEntry(step, name, logged_image(message.data))
     return JournalEntry(step, name, decode_json(message.data)["value"])
 
 
@@ -490,7 +490,8 @@ def _decode_cloud(data: bytes) -> t.PointCloud:
     return t.PointCloud(message.frame_id, foxglove.points_of(message))
 
 
-def _decode_image(data: bytes) -> Any:
+def logged_image(data: bytes) -> Any:
+    """Return the pixels of a logged image, (H, W) grey or (H, W, 3) as red, green, blue."""
     import cv2
     from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 

@@ -26,6 +26,7 @@ from flangeye.files.regular import open_regular
 from flangeye.files.words import printable
 from flangeye.log.read import decode_json
 from flangeye.log.records import Channel, LogFile, LogMessage, NotMcapError, reason_of
+from flangeye.types import FLANGE
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -132,7 +133,8 @@ class RunView:
             self._say(*content["notes"])
         elif topic == "/capture":
             self.captures += 1
-            self._place(content["poses"]["flange"], "at the last capture")
+            if flange := content["poses"].get(FLANGE):  # a cell's arms have names of their own
+                self._place(flange, "at the last capture")
         elif topic == "/rejection":
             self._say(f"set aside {content['id']}: {content['stage']}: {content['reason']}")
         elif topic.startswith("/step/"):
