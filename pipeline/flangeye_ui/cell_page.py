@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 from collections.abc import Callable, Mapping
 from functools import cache
 from itertools import count
@@ -49,6 +50,8 @@ class Form:
         self._next = bar.lead("Poses", "Next: check the poses")
         with ui.column().classes("col-12 col-md-5 gap-2"):
             self._header()
+            with ui.expansion("Have you recordings?").classes("w-full"):
+                Recordings(project, self)
             with ui.expansion("Not in the lists?").classes("w-full"):
                 for section, boxes in IMPORTED.items():
                     Import(project, self, section, boxes)
@@ -295,11 +298,95 @@ class Import:
         self._form.choose(self._section, f"{self._words()[1]}.yaml")
 
 
-class WhatRuns:
-    """Choose from what runs under ROS 2; ``flangeye init --ros2`` then writes the recipe."""
+class Drafting:
+    """A command that writes a recipe, which then becomes the cell's."""
 
     def __init__(self, project: Project, form: Form) -> None:
         self._project, self._form = project, form
+
+    def words(self, stem: str) -> list[str]:
+        """Return the command's words; the recipe's file is of this name, or a free one."""
+        raise NotImplementedError
+
+    async def draft(self, stem: str) -> tuple[str, bool]:
+        """Return what the command said, and whether there is a new recipe."""
+        folder = self._project.folder
+        names = (f"{stem}{i or ''}" for i in count())
+        name = next(n for n in names if not any(folder.glob(f"{n}.*")))
+        said = await asyncio.to_thread(self._project.run_command, self.words(name))
+        drafted = folder / f"{name}.yaml"
+        if not drafted.exists():
+            return said, False
+        self._project.text = drafted.read_text(encoding="utf-8")
+        drafted.unlink()
+        self._form.reload()
+        return said, True
+
+
+class Recordings(Drafting):
+    """Scans and poses in a folder; ``flangeye init`` looks at them and writes the recipe."""
+
+    def __init__(self, project: Project, form: Form) -> None:
+        super().__init__(project, form)
+        self._given: dict[str, str] = {}
+        self._folder = ui.input("Folder with scans and poses", placeholder="recordings/monday")
+        self._folder.classes("w-full").props("stack-label").on("keydown.enter", self._look)
+        self._folder.on_value_change(self._another)
+        self._line = command_line("")
+        self._button = ui.button("Look at them", on_click=self._look).props("outline no-caps")
+        self._told = ui.column().classes("w-full gap-1")
+        self._another()
+
+    def _another(self) -> None:
+        self._given = {}
+        self._told.clear()
+        self._line.text = self._project.command(*self.words("recorded"))
+        self._button.set_enabled(bool(self._folder.value))
+
+    def words(self, stem: str) -> list[str]:
+        """Return the command's words, with what was answered so far."""
+        answers = [w for option, answer in self._given.items() for w in (option, answer)]
+        return ["init", self._folder.value or "FOLDER", "--yes", *answers, "--out", f"{stem}.yaml"]
+
+    async def _look(self) -> None:
+        """Let the command look; show what it saw, and what it assumed in boxes to change."""
+        self._line.text = self._project.command(*self.words("recorded"))
+        self._button.disable()
+        said, drafted = await self.draft("recorded")
+        self._button.enable()
+        self._told.clear()
+        lines = said.splitlines()[: -1 if drafted else None]
+        with self._told:
+            for option, answer in self._given.items():
+                self._box(option, _words_of(option), answer)
+            for line in lines:
+                if assumed := re.fullmatch(r"assumed: (.*): (.*) \((--[\w-]+) changes it\)", line):
+                    self._box(assumed[3], assumed[1], assumed[2])
+                elif line.startswith("error: "):
+                    mistake(line.removeprefix("error: "))
+                    for option in {*re.findall(r"--[\w-]+", line)} - {*self._given}:
+                        self._box(option, _words_of(option), "")
+                else:
+                    ui.label(line).classes("note")
+
+    def _box(self, option: str, label: str, answer: str) -> None:
+        async def change(event: Any) -> None:
+            self._given = {**self._given, option: event.args}
+            self._given = {each: answer for each, answer in self._given.items() if answer}
+            await self._look()
+
+        ui.input(label, value=answer).classes("w-full").props("stack-label").on("change", change)
+
+
+def _words_of(option: str) -> str:
+    return option.removeprefix("--").replace("-", " ")
+
+
+class WhatRuns(Drafting):
+    """Choose from what runs under ROS 2; ``flangeye init --ros2`` then writes the recipe."""
+
+    def __init__(self, project: Project, form: Form) -> None:
+        super().__init__(project, form)
         self._chosen: dict[str, str] = {}
         button = ui.button("Look at what runs", on_click=self._look).props("outline no-caps")
         button.tooltip("Listens for a few seconds; publishes nothing and calls no service")
@@ -331,7 +418,7 @@ class WhatRuns:
                 on_change=lambda e: self._choose("target", e.value),
             )
             printed.classes("w-full")
-            self._line = command_line(self._project.command(*self._words("running")))
+            self._line = command_line(self._project.command(*self.words("running")))
             ui.button("Write the recipe", on_click=self._draft).props("outline no-caps")
             self._told = ui.column().classes("w-full gap-0")
 
@@ -358,30 +445,24 @@ class WhatRuns:
 
     def _choose(self, option: str, name: str) -> None:
         self._chosen[option] = name
-        self._line.text = self._project.command(*self._words("running"))
+        self._line.text = self._project.command(*self.words("running"))
 
-    def _words(self, name: str) -> list[str]:
+    def words(self, stem: str) -> list[str]:
+        """Return the command's words, with what was chosen."""
         given = {"scanner": self._project.section("scanner").get("model"), **self._chosen}
         options = [w for flag, answer in given.items() if answer for w in (f"--{flag}", answer)]
-        return ["init", "--ros2", "--yes", *options, "--out", f"{name}.yaml"]
+        return ["init", "--ros2", "--yes", *options, "--out", f"{stem}.yaml"]
 
     async def _draft(self) -> None:
         """Let the command write a recipe of a new name, and take it over."""
-        folder = self._project.folder
-        names = (f"running{i or ''}" for i in count())
-        name = next(n for n in names if not (folder / f"{n}.urdf").exists())
-        said = await asyncio.to_thread(self._project.run_command, self._words(name))
+        said, drafted = await self.draft("running")
         self._told.clear()
-        drafted = folder / f"{name}.yaml"
         with self._told:
-            if not drafted.exists():
+            if not drafted:
                 mistake(said.rpartition("error: ")[2])
                 return
             for line in said.splitlines()[:-1]:
                 ui.label(line).classes("note")
-        self._project.text = drafted.read_text(encoding="utf-8")
-        drafted.unlink()
-        self._form.reload()
 
 
 def _principles(label: str) -> ui.select:

@@ -98,8 +98,8 @@ def _header(project: Project, title: str) -> None:
                 for name in BESIDE:
                     with ui.element("li"):
                         _way(name, name == title)
-        if project.simulated:
-            ui.label(SIMULATED).classes("simulated").props('role="note"')
+        said = ui.label(SIMULATED).classes("simulated").props('role="note"')
+        said.bind_visibility_from(project, "simulated")
 
 
 def _way(name: str, here: bool, number: str = "", done: bool = False) -> None:

@@ -17,6 +17,7 @@ import urllib.error
 import urllib.request
 from base64 import b64decode
 from pathlib import Path
+from shutil import copytree
 from typing import Any
 
 import cv2
@@ -29,6 +30,7 @@ pytest.importorskip("nicegui", reason="nicegui is not installed")
 
 from flangeye import cli
 from flangeye.errors import StageError
+from flangeye.files.paths import bundled
 from flangeye.maths.pose_corrections import inverted
 from flangeye.plugin.registry import Registry, load_registry
 from flangeye.recipe.find import find_recipe, recipe_names
@@ -328,6 +330,37 @@ def test_every_example_can_be_started_from(tmp_path: Path) -> None:
         assert recipe is not None, (name, mistakes)
         stands = recipe.steps[0].stage.name in ("acquire.simulated", "acquire.live")
         assert (base_T_camera_of(recipe) is not None) == stands, name
+
+
+def test_recordings_in_a_folder_become_a_recipe(browser: Any, served: Served) -> None:
+    folder = served.folder / "recordings" / "monday"
+    copytree(bundled("data") / "samples" / "ur5_phoxi-m", folder)
+    (served.folder / "recorded.yaml").write_text("mine")
+    page = opened(browser, served)
+    page.get_by_text("Have you recordings?").click()
+    page.get_by_label("Folder with scans and poses").fill("recordings/tuesday")
+    page.get_by_role("button", name="Look at them").click()
+    page.get_by_text("recordings/tuesday: ").wait_for()
+    page.get_by_label("Folder with scans and poses").fill("recordings/monday")
+    page.get_by_role("button", name="Look at them").click()
+    page.get_by_label("which arm").fill("ur5")
+    page.get_by_label("which arm").press("Tab")
+    page.get_by_text("flangeye init recordings/monday --yes --robot ur5").wait_for()
+    written = page.get_by_label("Recipe in YAML")
+    while "robot: ur5" not in written.input_value():
+        page.wait_for_timeout(100)
+    page.get_by_text("SIMULATED").wait_for(state="hidden")
+    box = page.get_by_label("where the camera is mounted")
+    box.fill("sky")
+    box.press("Tab")
+    page.get_by_text("--camera sky: is neither base nor flange").wait_for()
+    page.get_by_text("The recipe is valid.").wait_for()
+    recipe = yaml.safe_load((served.folder / "cell.yaml").read_text())
+    assert recipe["robot"] == "ur5"
+    assert recipe["steps"][0] == {"acquire.archive": {"path": "recordings/monday"}}
+    assert (served.folder / "recorded.yaml").read_text() == "mine"
+    assert sorted(path.name for path in served.folder.glob("recorded*")) == ["recorded.yaml"]
+    assert page.problems == []
 
 
 def test_an_arm_is_imported_from_its_urdf(browser: Any, served: Served) -> None:
