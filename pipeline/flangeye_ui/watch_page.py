@@ -11,8 +11,8 @@ from nicegui import ui
 from flangeye.doctor.monitor import History, history_beside, stored_calibration
 from flangeye.doctor.monitor.chart import COLOURS, sentence
 from flangeye.errors import FlangeyeError
+from flangeye_ui.archive_page import link
 from flangeye_ui.charts import residual_chart
-from flangeye_ui.foreign import address_of
 from flangeye_ui.layout import ActionBar, command_line, mistake, page
 from flangeye_ui.project import Project
 
@@ -31,11 +31,12 @@ def add(project: Project) -> None:
     async def watch() -> None:
         with page(project, "Watch") as bar:
             stored = [run.name for run in project.runs() if (run / "calibration.yaml").exists()]
-            if not stored:
+            if stored:
+                await Watch(project, stored, bar).show()
+            else:
                 ui.label("There is no calibration in this folder to watch yet.")
                 bar.lead("Cell", "Go to step 1: cell")
-                return
-            await Watch(project, stored, bar).show()
+                _charts(project)
 
 
 class Watch:
@@ -92,6 +93,7 @@ class Watch:
         with self._cards:
             for run in watched:
                 await self._card(run)
+            _charts(self._project)
         self._bar.say(f"{len(watched)} of {len(self._stored)} calibrations have been checked.")
 
     async def _card(self, run: Path) -> None:
@@ -110,9 +112,13 @@ class Watch:
             ui.label(f"Last of {len(history.findings)} checks: {sentence(last)}")
             chart = ui.echart(_chart(history)).classes("w-full h-48").props('role="img"')
             chart.props["aria-label"] = f"Shift of the work at each check of {run.name}, mm"
-            if (whole := history.path.with_suffix(".html")).exists():
-                address = address_of(self._project.folder, whole)
-                ui.link(f"runs/{run.name}/{whole.name}", address, new_tab=True)
+
+
+def _charts(project: Project) -> None:
+    """Link the charts that ``flangeye monitor`` wrote."""
+    for run in project.runs():
+        if (run / "monitor.html").exists():
+            link(project, run / "monitor.html")
 
 
 def _history(run: Path) -> History:
