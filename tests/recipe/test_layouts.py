@@ -413,6 +413,45 @@ def moveit(f, j, a, s):
     ))  # fmt: skip
 
 
+def bars(f, j, a, s):
+    for name, poses in (("robot", a), ("marker", s)):
+        (f / f"{name}.txt").write_text("x|y|z|qx|qy|qz|qw\n" + text(quaternion(poses), "|"))
+
+
+def counted_quaternion(f, j, a, s):
+    for name, poses in (("robot", a), ("marker", s)):
+        rows = text(quaternion(poses)[:, [0, 1, 2, 6, 3, 4, 5]])
+        (f / f"{name}.csv").write_text("x,y,z,q0,q1,q2,q3\n" + rows)
+
+
+def calibration(f, j, a, s):
+    lens = {"mtx": np.array([[900.0, 0, 640], [0, 900, 480], [0, 0, 1]]), "dist": np.zeros(5)}
+    places, turns = vector(s)[:, :3, None], vector(s)[:, 3:, None]
+    np.savez(f / "camera.npz", tvecs=places, rvecs=turns, **lens)
+    np.save(f / "gripper2base.npy", a)
+
+
+def count_first(f, j, a, s):
+    for name, poses in (("robot", a), ("marker", s)):
+        (f / f"{name}.txt").write_text(f"{COUNT}\n" + text(vector(poses), " "))
+
+
+def in_turn(f, j, a, s):
+    (f / "log.txt").write_text("".join(
+        f"robot {k}\n{text(arm, ' ')}marker {k}\n{text(seen, ' ')}"
+        for k, (arm, seen) in enumerate(zip(a, s, strict=True))
+    ))  # fmt: skip
+
+
+def named_as_in_ros(f, j, a, s):
+    (f / "tf.json").write_text(json.dumps([
+        {name: {"translation": dict(zip("xyz", row[:3], strict=True)),
+                "rotation": dict(zip("xyzw", row[3:], strict=True))}
+         for name, row in (("base_to_ee", arm), ("cam_to_tag", seen))}
+        for arm, seen in zip(quaternion(a).tolist(), quaternion(s).tolist(), strict=True)
+    ]))  # fmt: skip
+
+
 LAYOUTS: dict[str, Callable[..., None]] = {
     "two blocks of rows in one text, arm above marker": blocks,
     "the same without a line between them": halves,
@@ -467,6 +506,12 @@ LAYOUTS: dict[str, Callable[..., None]] = {
     "Fortran's exponents, `1.5D+02`": fortran,
     "a sphere's centres beside the arm's poses": centres,
     "samples of MoveIt's calibration, the camera in the hand": moveit,
+    "columns between vertical bars": bars,
+    "headings q0 to q3": counted_quaternion,
+    "`.npz` of a calibration by OpenCV, with its `rvecs` and `tvecs`": calibration,
+    "the number of rows in the first line": count_first,
+    "one text, `robot 0` above a matrix, then `marker 0`, `robot 1`, …": in_turn,
+    "`base_to_ee` and `cam_to_tag`, as ROS names poses": named_as_in_ros,
 }
 """What is in the folder, and how it is written."""
 

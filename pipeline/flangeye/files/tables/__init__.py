@@ -291,7 +291,7 @@ def text_rows(file: Path, text: str) -> list[Rows]:
     blocks of one length. Matrices that stand line by line are a row each.
     """
     blocks = [_with_matrices(block) for block in _blocks(file, text.splitlines())]
-    merged = _merged(blocks)
+    merged = _in_turn(blocks) or _merged(blocks)
     names = [block.title for block in merged]
     distinct = len(set(names)) == len(names) > 1 and all(names)
     return [
@@ -319,14 +319,16 @@ def _blocks(file: Path, lines: Sequence[str]) -> Iterator[TextBlock]:
         comment = bool(_COMMENT.match(line))
         plain = _COMMENT.sub("", line)
         cells = split(plain) if plain else ()
-        if cells and not comment and any(number_of(cell) is not None for cell in cells):
+        counts = split.wide and len(cells) < 3  # rows, or what stands below: robot 7
+        numbers = any(number_of(cell) is not None for cell in cells)
+        if numbers and not comment and not counts:
             block.rows.append((f"{file}:{n}", cells))
             continue
         if block.rows:
             yield block
             block = TextBlock(marked=block.marked)
         block.after_blank |= not comment
-        if any(cells):
+        if any(cells) and any(map(str.isalnum, plain)):  # no rule of a printed table
             known = {"m", "cm", "mm", "rad", "deg", "°", "s", "ms", "us", "ns", "-", "1"}
             units = {word.strip("[]()") for word in cells}
             if units <= known and len(cells) == len(block.heading):  # units under names
@@ -389,6 +391,17 @@ def _merged(blocks: list[TextBlock]) -> list[TextBlock]:
     return sections
 
 
+def _in_turn(blocks: Sequence[TextBlock]) -> list[TextBlock]:
+    """Return a table of each title that takes turns: robot 0, marker 0, robot 1, a row each."""
+    sections: dict[str, TextBlock] = {}
+    for block in blocks:
+        title = re.sub(r"\W*\d+\W*$", "", block.title)
+        sections.setdefault(title, TextBlock(title=title)).rows += block.rows
+    alone = "" not in sections and all(len(block.rows) == 1 for block in blocks)
+    turns = len({len(block.rows) for block in sections.values()}) == 1 < len(sections)
+    return list(sections.values()) if alone and turns and len(blocks) > len(sections) else []
+
+
 def _names(block: TextBlock, blocks: Sequence[TextBlock]) -> list[str]:
     """Return the titles of rows that each have one."""
     titles = [each.title for each in blocks if each.rows[0] in block.rows]
@@ -401,14 +414,16 @@ class _splitter:  # noqa: N801  a function with a memory
     def __init__(self, lines: Sequence[str]) -> None:
         # Where blanks separate, every comma is a decimal one: "1,5 2,0 3,25".
         blanks = all(len(line.split()) > 2 and _plain(line) for line in lines[-3:])
-        marks = ";\t" if blanks else ";\t,"
+        marks = ";\t|" if blanks else ";\t|,"
         shown = next(iter(lines), "")
         self.mark = next((m for m in marks if m in shown or m in "".join(lines[-1:])), " ")
         self.ended = all(line.rstrip().endswith(self.mark) for line in lines)
+        self.wide = any(len(self(line)) > 2 for line in lines[:9])
 
     def __call__(self, line: str) -> tuple[str, ...]:
         # What Python prints around an array's numbers: array([[…]], dtype=float32)
         line = re.sub(r"^\s*[\w.]+\((?=[-\s\[(.\d])|,\s*dtype=\w+(?=\)+\s*$)", "", line).strip()
+        line = line.strip("| ") if self.mark == "|" else line
         line = line.rstrip(", ") if line.startswith(("[", "(")) else line  # a list in a list
         if self.mark == " ":
             return tuple(line.strip("[](){}").replace(", ", " ").split())

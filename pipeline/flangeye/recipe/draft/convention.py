@@ -39,6 +39,7 @@ from flangeye.recipe.draft.headings import (
     PoseColumns,
     as_joints,
     is_inverse,
+    named_parent_first,
     poses_by_name,
 )
 from flangeye.recipe.draft.survey import Questions, one_of
@@ -74,6 +75,13 @@ def table_params(
     if target is None and not scans:
         _require_as_many(tables, arm)
         arm, target = _halves(arm)
+    if target and named_parent_first(arm, target):
+        # Nobody records both inverses: base_to_tool and camera_to_target are named as ROS does
+        arm, target = replace(arm, parent_first=True), replace(target, parent_first=True)
+        questions.assumed.append(
+            f"{arm.name} and {target.name}: the second frame in the first, as ROS names poses "
+            "(--pose and --target-pose say otherwise)"
+        )
     arm, target = _seen_together(arm, target, questions, robot)
     _ask_lengths(arm, target, questions)
     for pose in filter(None, (arm, target)):

@@ -90,6 +90,7 @@ def _rotations() -> dict[tuple[str, ...], tuple[str, ...]]:
         if same == labels:
             found[labels] = (*found.get(labels, ()), name)
     return found | {
+        ("q0", "q1", "q2", "q3"): ("quaternion_wxyz", "quaternion_xyzw"),
         ("rx", "ry", "rz", "rw"): ("quaternion_xyzw",), ("vx", "vy", "vz"): ("vector",),
         ("ex", "ey", "ez"): ("xyz",), ("alpha", "beta", "gamma"): ("ZYX", "xyz", "XYZ", "ZYZ"),
     }  # fmt: skip
@@ -112,6 +113,7 @@ class PoseColumns:
         length: Unit of the position that a name states.
         angle: The same for angles.
         guess: What was concluded from the numbers alone, for people; empty if names say it.
+        parent_first: Whether base_to_tool names the tool's pose in the base, as ROS does.
     """
 
     table: Table
@@ -121,6 +123,7 @@ class PoseColumns:
     length: str | None = None
     angle: str | None = None
     guess: str = ""
+    parent_first: bool = False
 
     @property
     def name(self) -> str:
@@ -155,6 +158,8 @@ class PoseColumns:
         """Frames A and B of A_T_B, from a name; None if no name has them."""
         names = (self.called, *re.split(r"[/:]", self.table.name)[::-1])
         found = next((found for name in names if (found := frames_in(name))), None)
+        if self.parent_first and found:
+            return found[::-1]
         # ROS's tf_echo prints the pose of the frame that is named last, base_to_tool0 or base2tool0
         return found[::-1] if found and self._is_echo and _TO.search(self.table.name) else found
 
@@ -272,9 +277,9 @@ def _is_file(table: Table, index: int) -> bool:
 
 
 def _is_quaternion(table: Table, name: str) -> bool:
-    """Return whether q1 is ABB's: four of them, beside a position."""
-    called = {each.lower() for each in table.heading}
-    return name.lower() in ("q1", "q2", "q3", "q4") and "q5" not in called and "q4" in called
+    """Return whether q1 is of a quaternion, q1 to q4 as ABB has it, or q0 to q3."""
+    called = {each.lower() for each in table.heading if re.fullmatch(r"q\d", each.lower())}
+    return name.lower() in called and "".join(sorted(called)) in ("q1q2q3q4", "q0q1q2q3")
 
 
 def list_sizes(names: Sequence[str]) -> Counter[str]:
@@ -453,6 +458,12 @@ def frames_in(name: str) -> tuple[str, str] | None:
     of_arms = {"base", "flange"}, {"world", "flange"}
     of_sights = {"camera", "target"}, {"camera", "world"}
     return pair if set(pair) in (*of_arms, *of_sights) else None
+
+
+def named_parent_first(*poses: PoseColumns) -> bool:
+    """Return whether poses would all be inverse if base_to_tool meant what base2tool does."""
+    named = all(_TO.search(pose.name) for pose in poses)
+    return named and all(pose.frames and is_inverse(pose.frames) for pose in poses)
 
 
 def is_inverse(frames: tuple[str, str]) -> bool:

@@ -175,8 +175,14 @@ def look(folder: Path) -> FolderSurvey:
     with suppress(StageError):
         cameras = {camera.path for camera in cameras_in(folder)}
     points = texts_of_points(files)
-    others = [file for file in files if file not in {*cameras, *points}]
-    tables = [t for place, of in places(folder, others) for t in _tables(folder, place, len(of))]
+    others = [file for file in files if file not in points]
+    tables = [
+        table
+        for place, of in places(folder, others)
+        for table in _tables(folder, place, len(of))
+        # What calibrated the camera saw the target: OpenCV's rvecs and tvecs
+        if not cameras & set(of) or any("vec" in name.lower() for name in table.heading)
+    ]
     return FolderSurvey(folder, files, _whole(folder, tables), points, cameras)
 
 
