@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flangeye.errors import StageError
-from flangeye.maths.geometry import angle_between, kabsch, rigid
+from flangeye.estimation.closed.at_once import shah
+from flangeye.maths.geometry import angle_between, invert, kabsch, rigid
 from flangeye.models.bodies import TargetBody, carrying
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
@@ -18,7 +19,7 @@ from flangeye.models.targets import Flange
 from flangeye.motion.reach import Margins, Plan, PlannedPose, Reach, Refusal, Site, poses_near
 from flangeye.motion.route import Barred, Route, Router
 from flangeye.plugin.stage import BoundPart
-from flangeye.types import CircleFeature, Floats, Observation, Role
+from flangeye.types import Floats, Observation, PoseFeature, Role
 from flangeye.units import in_mm
 
 
@@ -98,9 +99,8 @@ class Itinerary:
             self._look_again()
 
     def _look_again(self) -> None:
-        """Plan on from where the scanner stands by the flanges seen so far: it was guessed."""
-        seen = [o for o in self.outcomes.values() if o and isinstance(o.feature, CircleFeature)]
-        base_T_camera = view_of(seen)
+        """Plan on from where the scanner stands by what was seen so far: it was guessed."""
+        base_T_camera = view_of([seen for seen in self.outcomes.values() if seen])
         if base_T_camera is not None:
             self._reach.look_from(base_T_camera)
 
@@ -169,10 +169,20 @@ class Itinerary:
 def view_of(seen: Sequence[Observation]) -> Floats | None:
     """Return where a scanner stands, base_T_camera (4, 4), to plan by; None where it is not clear.
 
-    The least-squares motion of the circles' centres and of points before them, along the normals.
-
     Args:
-        seen: Circles.
+        seen: Circles, or else poses of a target that is anywhere on the flange.
+    """
+    poses = [o for o in seen if isinstance(o.feature, PoseFeature)]
+    found = _by_poses(poses) if poses else _by_circles(seen)
+    # Farther off than any target is seen [m]: something else was found, or it sits elsewhere
+    wrong = 0.02
+    return found[0] if found and found[1] < wrong else None
+
+
+def _by_circles(seen: Sequence[Observation]) -> tuple[Floats, float] | None:
+    """Return base_T_camera, and how far a circle or its normal is from where it should be [m].
+
+    The least-squares motion of the circles' centres and of points before them, along the normals.
     """
     fewest, ahead = 3, 0.1  # [m]: a normal weighs as a place so far off
     points = [
@@ -188,10 +198,20 @@ def view_of(seen: Sequence[Observation]) -> Floats | None:
         return None
     camera, base = np.moveaxis(np.array(points), 1, 0)
     turn, shift = kabsch(camera, base)
-    # Farther off than any flange is seen [m]: something else was found, or it sits elsewhere
-    wrong = 0.02
-    off = np.linalg.norm(camera @ turn.T + shift - base, axis=1).max()
-    return rigid(turn, shift) if off < wrong else None
+    return rigid(turn, shift), np.linalg.norm(camera @ turn.T + shift - base, axis=1).max()
+
+
+def _by_poses(seen: Sequence[Observation]) -> tuple[Floats, float] | None:
+    """Return base_T_camera, and how far a target is from where it should be [m]; by Shah, 2013."""
+    fewest = 5  # of which two tell the turns, if they are about two axes
+    if len(seen) < fewest:
+        return None
+    flanges = np.array([o.base_T_flange.matrix for o in seen])
+    found = [o.feature for o in seen if isinstance(o.feature, PoseFeature)]
+    targets = np.array([feature.camera_T_target.matrix for feature in found])
+    base_T_camera, flange_T_target = shah(invert(flanges), targets)
+    apart = (base_T_camera @ targets - flanges @ flange_T_target)[:, :3, 3]
+    return base_T_camera, np.linalg.norm(apart, axis=1).max()
 
 
 def itinerary_of(

@@ -10,7 +10,17 @@ from flangeye.motion.limits import limits_of
 from flangeye.motion.reach import Margins, Reach
 from flangeye.plugin.stage import BoundPart
 from flangeye.recipe.header import LimitsSection
-from flangeye.types import BASE, FLANGE, CircleFeature, Observation, Transform, by_frame
+from flangeye.types import (
+    BASE,
+    CAMERA,
+    FLANGE,
+    TARGET,
+    CircleFeature,
+    Observation,
+    PoseFeature,
+    Transform,
+    by_frame,
+)
 from flangeye_emulators.world.scanner import CameraPose
 from flangeye_plugins.acquire.itinerary import itinerary_of, view_of
 from flangeye_plugins.plan import NextBestParams, next_best
@@ -35,8 +45,19 @@ def seen(name, base_T_flange, aside=0.0):
     return Observation(name, circle, by_frame(Transform(BASE, FLANGE, base_T_flange)))
 
 
+def marked(name, base_T_flange, aside=0.0):
+    """Return a marker on the flange as a camera measures it, to 0.2 mm and 0.2 deg."""
+    rng = np.random.default_rng(int(name))
+    flange_T_target = rigid(rotation_exp([0.1, -0.2, 1.0]), [0.03, -0.02, 0.04])
+    noise = rigid(rotation_exp(rng.normal(0, np.radians(0.2), 3)), rng.normal(0, 2e-4, 3))
+    pose = invert(BASE_T_CAMERA) @ base_T_flange @ flange_T_target @ noise
+    pose[0, 3] += aside
+    target = PoseFeature(Transform(CAMERA, TARGET, pose), np.diag([1e-5] * 3 + [4e-8] * 3))
+    return Observation(name, target, by_frame(Transform(BASE, FLANGE, base_T_flange)))
+
+
 def stops_seen(measured):
-    """Return of 20 stops of a session, planned by a wrong guess, how many the scanner sees."""
+    """Return of 20 stops of a session, planned by a wrong guess, which the scanner sees."""
     session = itinerary_of(ROBOT, SCANNER, PLATE, GUESS, MARGINS, None)
     params = NextBestParams(count=20)
     session.plan(BoundPart(next_best, params), 1, seed=3)
@@ -47,15 +68,16 @@ def stops_seen(measured):
         pose = stop.pose.base_T_flange
         inside.append(truth.in_view(pose))
         if measured:
-            session.outcomes[stop.id] = seen(stop.id, pose) if inside[-1] else None
+            session.outcomes[stop.id] = measured(stop.id, pose) if inside[-1] else None
     return inside
 
 
-def test_the_flanges_seen_tell_the_plan_where_the_scanner_stands() -> None:
-    guessed, told = stops_seen(measured=False), stops_seen(measured=True)
+@pytest.mark.parametrize(("measured", "needed"), [(seen, 3), (marked, 5)])
+def test_targets_that_were_seen_tell_the_plan_where_the_scanner_stands(measured, needed) -> None:
+    guessed, told = stops_seen(None), stops_seen(measured)
     assert sum(guessed) < 0.8 * len(guessed)
-    assert all(told[told.index(True) + 4 :])
-    assert sum(told) >= len(told) - 3
+    enough = np.flatnonzero(np.cumsum(told) == needed)[0]
+    assert all(told[enough + 1 :])
 
 
 def test_what_does_not_fit_tells_the_plan_nothing() -> None:
@@ -68,3 +90,15 @@ def test_what_does_not_fit_tells_the_plan_nothing() -> None:
     assert view_of(flanges) == pytest.approx(BASE_T_CAMERA, abs=1e-9)
     assert view_of(flanges[:2]) is None
     assert view_of([*flanges[:3], seen("3", poses[3], aside=0.1)]) is None
+
+
+def test_markers_tell_where_the_camera_stands_wherever_they_are_on_the_flange() -> None:
+    rng = np.random.default_rng(0)
+    poses = [
+        rigid(rotation_exp([np.pi, 0.0, 0.0]) @ rotation_exp(rng.normal(0, 0.2, 3)), place)
+        for place in rng.uniform([0.4, -0.2, 0.2], [0.7, 0.2, 0.5], (8, 3))
+    ]
+    markers = [marked(str(i), pose) for i, pose in enumerate(poses)]
+    assert view_of(markers) == pytest.approx(BASE_T_CAMERA, abs=0.01)
+    assert view_of(markers[:4]) is None
+    assert view_of([*markers[:7], marked("7", poses[7], aside=0.1)]) is None
