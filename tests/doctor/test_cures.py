@@ -87,6 +87,7 @@ FAULTS = {
     "transposed": ("pose direction", on_poses(transposed)),
     "shifted by one": ("shifted poses", late),
     "shifted from the middle": ("shifted poses", late_from_the_middle),
+    "backwards": ("poses backwards", on_poses(lambda p: p[::-1])),
     "flips": ("target flips", on_rows([3, 9, 15], rotations=lambda r: r @ HALF_TURN)),
     "an outlier": ("outlier", on_rows([7], centres=lambda c: c + 0.05)),
     "identities of the robot": ("identity matrices", on_rows([2, 5], poses=lambda p: 0 * p + np.eye(4))),

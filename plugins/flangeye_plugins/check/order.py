@@ -55,27 +55,35 @@ class OtherOrder(NamedTuple):
 
 @part("check.order")
 def order(session: RecordedSession) -> Findings:
-    """Scans are paired with the pose before or after their own, from the start or some scan."""
+    """Scans are paired with the pose before or after their own, or in the opposite order."""
     session.require_samples()
     every = np.arange(1, len(session) - 1)
     tried = [(arms, by, 0) for arms in session.arms for by in (1, -1, 2, -2, 3, -3)]
-    count = len(tried) + 2 * len(every)
+    count = len(tried) + 2 * len(every) + 1
     for by in (1, -1):
         near = narrowed(every, lambda some, by=by: _gains(session, by, some))  # type: ignore[misc]
         tried += [("both", by, int(start)) for start in near]
-    others = [_shifted(session, *each) for each in tried]
+    others = [*(_shifted(session, *each) for each in tried), _backwards(session)]
     evidence = _evidence(session, others, tried=count)
     if evidence is None or evidence.probability == 1:
         return
-    arms, by, start = tried[evidence.which]
+    found = others[evidence.which]
+    corrected_session = found.session.where(found.known)
+    if not helps(session.where(found.known), corrected_session):
+        return
+    if evidence.which == len(tried):
+        what = "the poses stand in the opposite order of the scans: the first belongs to the last"
+        yield evidence.finding("poses backwards", what, corrected_session)
+        return
+    what = _said(session, *tried[evidence.which])
+    yield evidence.finding("shifted poses", what, corrected_session)
+
+
+def _said(session: RecordedSession, arms: Arms, by: int, start: int) -> str:
     which = "later" if by > 0 else "earlier"
     since = f" from '{session.ids[start]}' on" if start else ""
     of = "" if session.seconds is None else f" of {_OF[arms]}"
-    what = f"each scan belongs to the pose{of} {abs(by)} {which}{since}"
-    corrected_session = others[evidence.which].session.where(others[evidence.which].known)
-    if not helps(session.where(others[evidence.which].known), corrected_session):
-        return
-    yield evidence.finding("shifted poses", what, corrected_session)
+    return f"each scan belongs to the pose{of} {abs(by)} {which}{since}"
 
 
 def _gains(session: RecordedSession, by: int, starts: Indices) -> Floats:
@@ -94,6 +102,13 @@ def _shifted(session: RecordedSession, arms: Arms, by: int, start: int) -> Other
         return shifted(poses, by, start)
 
     return _at_other_times(session, change, arms, shift=by, **where)
+
+
+def _backwards(session: RecordedSession) -> OtherOrder:
+    def change(poses: Floats) -> tuple[Floats, Mask]:
+        return poses[::-1], np.ones(len(poses), dtype=bool)
+
+    return _at_other_times(session, change, "both", backwards=True)
 
 
 def _at_other_times(

@@ -105,6 +105,9 @@ class CorrectedParams(Params):
     )
     shift: int = Field(0, description="Number of poses by which each scan's pose follows it.")
     shift_from: str | None = Field(None, description="Id of the first scan that is shifted.")
+    backwards: bool = Field(
+        False, description="The poses stand in the opposite order of the scans."
+    )
     delay: Duration = param("0 ms", description="Time from a pose to its scan.")
 
 
@@ -115,6 +118,10 @@ def corrected(path: Path, params: CorrectedParams) -> Archive:
     recordings = [_alone(recording, params) for recording in archive.recordings]
     if params.shift:
         recordings = _shift(archive, recordings, params)
+    if params.backwards:
+        count = sum(recording.role == "calibration" for recording in recordings)
+        every = np.ones(count, dtype=bool)
+        recordings = _replaced(recordings, lambda rows: rows[::-1], every, params.arms)
     if params.delay:
         recordings = _delay(archive, recordings, params)
     note = "poses corrected as the recipe says"

@@ -387,7 +387,8 @@ def test_the_calibrations_own_scans_are_no_check_even_fitted_anew(
     for again in ("calibration", "anew", "scans"):
         refused = monitor(six, tmp_path / "h.jsonl", again)
         assert str(refused.exception).endswith(
-            f"{again}: 6 of its scans are the calibration's own, which check nothing; scan again"
+            f"{again}: 6 of its scans are the calibration's own, which check nothing; scan again, "
+            "with another seed where the cell is simulated"
         )
 
 
