@@ -700,6 +700,7 @@ def test_an_image_is_shown_small_in_its_colours() -> None:
     red[..., 0] = 255
     data = small(red).partition("base64,")[2]
     shown = cv2.imdecode(np.frombuffer(b64decode(data), np.uint8), cv2.IMREAD_COLOR)
+    assert shown is not None
     assert shown.shape == (60, 160, 3)
     assert shown[30, 80].tolist() == [0, 0, 255]  # blue first
 
