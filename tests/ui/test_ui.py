@@ -542,7 +542,7 @@ def test_a_calibration_by_keyboard_alone(browser: Any, served: Served) -> None:
 def test_the_space_bar_stops_a_run_and_a_second_page_sees_it(browser: Any, served: Served) -> None:
     page = opened(browser, served)
     before = len(list(served.folder.glob("runs/*")))
-    write_recipe(page, SMALL.replace("0.25", "1.0"))
+    write_recipe(page, SMALL.replace("0.25", "1.0").replace("count: 7", "count: 40"))
     page.get_by_text("The recipe is valid.").wait_for()
     go(page, "Scan")
     page.get_by_role("button", name=START).click()
