@@ -29,10 +29,6 @@ _UNITS: dict[str, tuple[str, dict[str, Decimal]]] = {
     "stiffness": ("2 N/mm", {"N/mm": Decimal("1e3"), "N/m": Decimal(1)}),
 }
 """By kind: an example, and each unit in SI units."""
-# Each part can be matched in one way only: otherwise ten thousand digits take for ever.
-_QUANTITY = re.compile(
-    r"\s*([-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)\s*(?:([^\d\s.]\S*)\s*)?"
-)
 
 
 def parse_quantity(value: object, kind: str) -> float:
@@ -46,7 +42,9 @@ def parse_quantity(value: object, kind: str) -> float:
     allowed = f"{', '.join(units)}, for example '{example}'"
     if isinstance(value, bool) or not isinstance(value, (str, int, float)):
         raise ValueError(f"{a_kind} is a number with a unit ({allowed})")
-    match = _QUANTITY.fullmatch(str(value))
+    # Each part can be matched in one way only: otherwise ten thousand digits take for ever.
+    number_and_unit = r"\s*([-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)\s*(?:([^\d\s.]\S*)\s*)?"
+    match = re.fullmatch(number_and_unit, str(value))
     if match is None:
         raise ValueError(f"'{value}' is not {a_kind}: write a number and a unit ({allowed})")
     number, unit = match.groups()

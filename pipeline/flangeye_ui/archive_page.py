@@ -20,17 +20,6 @@ from flangeye_ui.layout import command_line, mistake, page
 from flangeye_ui.project import Project
 from flangeye_ui.scene import ScanView
 
-COLUMNS = [
-    {"name": key, "label": label, "field": key, "align": "left", "sortable": True}
-    | (dict.fromkeys(("classes", "headerClasses"), "gt-xs") if wide else {})
-    for key, label, wide in (
-        ("run", "Run", False), ("status", "Status", False), ("used", "Poses used", True),
-        ("held", "Held-out error, mm", True), ("expected", "Expected error, mm", False),
-        ("note", "Note", True),
-    )
-]  # fmt: skip
-"""The wide ones are those a phone has no room for; the run's result has them."""
-
 
 def add(project: Project) -> None:
     """Add the page."""
@@ -42,7 +31,7 @@ def add(project: Project) -> None:
             if not rows:
                 ui.label("There is no run in this folder yet.")
                 return
-            table = ui.table(columns=COLUMNS, rows=rows, row_key="run")
+            table = ui.table(columns=_columns(), rows=rows, row_key="run")
             table.classes("w-full").props("dense wrap-cells")
             # A run's name leads to its result.
             table.add_slot(
@@ -175,3 +164,16 @@ class Scrubber:
             self._scan.show(self._captures[int(index)])
         elif self._scan.log is not None:
             self._scan.say("this log has no captures")
+
+
+def _columns() -> list[dict[str, Any]]:
+    """Return the table's columns; the wide ones, which the run's result has, are not for phones."""
+    return [
+        {"name": key, "label": label, "field": key, "align": "left", "sortable": True}
+        | (dict.fromkeys(("classes", "headerClasses"), "gt-xs") if wide else {})
+        for key, label, wide in (
+            ("run", "Run", False), ("status", "Status", False), ("used", "Poses used", True),
+            ("held", "Held-out error, mm", True), ("expected", "Expected error, mm", False),
+            ("note", "Note", True),
+        )
+    ]  # fmt: skip

@@ -15,12 +15,6 @@ POLICY = (
     "base-uri 'none'"
 )
 """An origin of its own for each file: its drawings run and reach neither the page nor a network."""
-OPENED = {
-    ".html": "text/html; charset=utf-8", ".pdf": "application/pdf", ".png": "image/png",
-    ".json": "text/plain; charset=utf-8", ".csv": "text/plain; charset=utf-8",
-    ".yaml": "text/plain; charset=utf-8", ".txt": "text/plain; charset=utf-8",
-}  # fmt: skip
-"""What a browser opens; anything else is saved."""
 
 
 def address_of(folder: Path, path: Path) -> str:
@@ -41,7 +35,11 @@ def answer(folder: Path, path: str) -> Response:
     found = _found(folder, path)
     if found is None:
         return PlainTextResponse("no such file of a run\n", 404)
-    kind = OPENED.get(found.suffix.lower())
+    # What a browser opens; anything else is saved
+    kind = {
+        ".html": "text/html; charset=utf-8", ".pdf": "application/pdf", ".png": "image/png",
+        **dict.fromkeys((".json", ".csv", ".yaml", ".txt"), "text/plain; charset=utf-8"),
+    }.get(found.suffix.lower())  # fmt: skip
     return FileResponse(
         found, media_type=kind or "application/octet-stream", filename=found.name,
         content_disposition_type="inline" if kind else "attachment",

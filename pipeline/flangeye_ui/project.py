@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from shutil import copyfile
 from typing import Any
 
 from flangeye.errors import FlangeyeError, RecipeError, StageError
@@ -19,20 +20,8 @@ from flangeye.log.read import read_run
 from flangeye.plugin.registry import Registry
 from flangeye.plugin.stage import KINDS
 from flangeye.recipe.load import Recipe, load_recipe
-from flangeye.recipe.steps import SEVERAL
 from flangeye.report.facts import Facts, facts_of
 from flangeye_ui.process import RunProcess
-
-NEW = """title: My cell
-robot: {model: ur5e}
-scanner: {model: phoxi-m}
-steps:
-  - acquire.simulated
-  - segment.flange
-  - fit.rim
-  - solve.robust
-  - verify.holdout
-"""
 
 
 @dataclass(frozen=True)
@@ -69,7 +58,7 @@ class Project:
         self.owner, self.ran = "", ""
         self.planned, self.plan = "", list[dict[str, Any]]()
         if not self.recipe_path.exists():
-            self.recipe_path.write_text(NEW, encoding="utf-8")
+            copyfile(Path(__file__).with_name("new.yaml"), self.recipe_path)
 
     @property
     def recipe_path(self) -> Path:
@@ -198,9 +187,9 @@ class Project:
         else:
             kinds, kind = list(KINDS), name.partition(".")[0]
             ranks = [kinds.index(each.partition(".")[0]) for each in names]
-            before = kinds.index(kind) + (kind in SEVERAL)
+            before = kinds.index(kind) + KINDS[kind].several
             at = next((i for i, rank in enumerate(ranks) if rank >= before), len(steps))
-            replaced = kind not in SEVERAL and kinds.index(kind) in ranks
+            replaced = not KINDS[kind].several and kinds.index(kind) in ranks
             steps[at : at + replaced] = [{name: dict(params)}]
         self.edit({**data, "steps": steps})
 

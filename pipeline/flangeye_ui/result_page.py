@@ -35,7 +35,6 @@ from flangeye_ui.layout import ActionBar, code, command_line, mistake, page, svg
 from flangeye_ui.project import Project
 from flangeye_ui.scene import ScanView, Scene3D, outline_of
 
-STEP = "verify.touch"
 ASKED = {
     "seen": ("A point in the camera, from a scan", "12 mm, -40 mm, 702 mm"),
     "tip": ("The tool's tip in the flange", "0 mm, 0 mm, 152 mm"),
@@ -51,7 +50,7 @@ class TouchBox:
     def __init__(self, project: Project, run: Path, calibration: HandEye) -> None:
         self._project, self._calibration = project, calibration
         self._run = str(run.relative_to(project.folder))
-        self._stage = project.registry.stages[STEP]
+        self._stage = project.registry.stages["verify.touch"]
         ui.label(
             "Choose a corner that the scanner sees, jog a tip onto it, and compare. Three points "
             "at different places and heights say most."
@@ -112,11 +111,11 @@ class TouchBox:
 
     def _write(self) -> None:
         """Put the point into the recipe's step, beside those that are there."""
-        given, old = self._given(), dict(self._project.steps()).get(STEP, {})
+        given, old = self._given(), dict(self._project.steps()).get("verify.touch", {})
         touches = [*old.get("touches", []), _touch(given)]
-        self._project.write_step(STEP, {"tip": given["tip"], "touches": touches})
+        self._project.write_step("verify.touch", {"tip": given["tip"], "touches": touches})
         self._keep.set_enabled(False)
-        ui.notify(f"The recipe has the point: {STEP}, {len(touches)} in all.")
+        ui.notify(f"The recipe has the point: verify.touch, {len(touches)} in all.")
 
 
 def _touch(given: dict[str, list[str]]) -> dict[str, list[str]]:

@@ -24,7 +24,7 @@ from flangeye_emulators.controllers.arm import (
     joint_zeros,
     starting_joints,
 )
-from flangeye_emulators.controllers.client import AUTO, EmulatorControl, address_of
+from flangeye_emulators.controllers.client import EmulatorControl, address_of
 from flangeye_emulators.controllers.motion import joint_move, linear_move
 from flangeye_emulators.controllers.mover import Mover, Plan
 from flangeye_emulators.world import bench
@@ -202,7 +202,7 @@ def robot_loopback(
     """
     driver, host = _at_address(params)
     controller = None if _listens(host) else _start(model, params, host)
-    if controller is None and AUTO in (params.host, _host_of(params.driver)):
+    if controller is None and "auto" in (params.host, _host_of(params.driver)):
         raise DeviceError(
             f"robot.emulator: something listens at {host}, which is this run's own address: "
             "end it, then start again"
@@ -226,7 +226,7 @@ def _at_address(params: LoopbackRobotParams) -> tuple[BoundPart, str]:
 
 
 def _host_of(driver: BoundPart) -> str:
-    return str(getattr(driver.params, "host", AUTO))
+    return str(getattr(driver.params, "host", "auto"))
 
 
 def _start(model: RobotModel, params: LoopbackRobotParams, host: str) -> subprocess.Popen[str]:

@@ -20,7 +20,7 @@ from flangeye.models.targets import plate_of
 from flangeye.models.workpiece import load_workpiece
 from flangeye.plugin.stage import Params, part
 from flangeye.types import BASE, CAMERA, Array, Floats, PointCloud, Transform, Truth
-from flangeye_emulators.controllers.client import AUTO, EmulatorControl, address_of
+from flangeye_emulators.controllers.client import EmulatorControl, address_of
 from flangeye_emulators.world import bench
 from flangeye_emulators.world.bench import BenchParams, bench_with
 from flangeye_emulators.world.cell import SimulatedCell
@@ -103,7 +103,7 @@ class LoopbackScannerParams(Params):
     """Parameters of ``scanner.emulator``."""
 
     host: str = Field(
-        AUTO, description="Address of the controller; auto: that of this run's emulator."
+        "auto", description="Address of the controller; auto: that of this run's emulator."
     )
     robot: str = Field(
         "ur5e", description="Robot model of the controller: one of data/robots, or a file."

@@ -9,7 +9,6 @@ from typing import Any
 from flangeye_paper.fig9 import realised
 from flangeye_paper.tables import (
     AXES,
-    AXIS_COLOURS,
     BOUND,
     METHODS,
     PRINTED,
@@ -61,9 +60,12 @@ def _summary(rows: Sequence[Row], poses: int) -> dict[str, Any]:
 def _draw(rows: Sequence[Row]) -> Any:
     page = sheet(1, 3, 10.5, 3.4)
     oracle = [r for r in rows if r["method"] == "algorithm-1-oracle"]
-    for panel, axes, unit in ((page.panels[0], AXES[:3], "mm"), (page.panels[1], AXES[3:], "deg")):
+    for panel, axes, unit in (
+        (page.panels[0], [*AXES][:3], "mm"),
+        (page.panels[1], [*AXES][3:], "deg"),
+    ):
         for axis in axes:
-            colour = AXIS_COLOURS[axis]
+            colour = AXES[axis]
             panel.plot(*columns(oracle, "poses", f"{axis}_std"), color=colour, label=axis)
         dress(panel, f"emulated as printed, in {unit}", "poses", f"standard deviation [{unit}]")
         panel.set_ylim(bottom=0)

@@ -13,7 +13,6 @@ from flangeye.types import Floats
 from flangeye_paper.published import stored_file
 from flangeye_paper.tables import (
     AXES,
-    AXIS_COLOURS,
     Row,
     columns,
     dress,
@@ -117,7 +116,7 @@ def _summary(robot: str, source: str, runs: Runs) -> Row:
 def _draw(runs: Mapping[tuple[str, str], Runs]) -> Any:
     page = sheet(2, 3, 10.5, 6.0)
     for column, robot in enumerate(ROBOTS):
-        for row, axes, unit in ((0, AXES[:3], "mm"), (1, AXES[3:], "deg")):
+        for row, axes, unit in ((0, [*AXES][:3], "mm"), (1, [*AXES][3:], "deg")):
             panel = page.panels[3 * row + column]
             _spread(panel, _rows(robot, "stored", runs[robot, "stored"]), axes, filled=True)
             if (robot, "run again") in runs:
@@ -138,7 +137,7 @@ def _spread(panel: Any, rows: Sequence[Row], axes: Sequence[str], filled: bool) 
         poses, mean, deviation = map(
             np.array, columns(rows, "poses", f"{axis}_mean", f"{axis}_std")
         )
-        low, high, colour = mean - deviation, mean + deviation, AXIS_COLOURS[axis]
+        low, high, colour = mean - deviation, mean + deviation, AXES[axis]
         if filled:
             panel.plot(poses, mean, color=colour, linewidth=1.0, label=axis)
             panel.fill_between(poses, low, high, color=colour, alpha=0.2, lw=0)

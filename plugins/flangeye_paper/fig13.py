@@ -17,9 +17,12 @@ from flangeye.types import Floats, WeldReport, WorkpieceScan
 from flangeye_paper.tables import Row, SessionRow, dress, legend, read_sessions, sheet, write_csv
 
 WORKPIECES = ("straight", "curved")
-TOUCH, PLAN, PRINTED = "by touch", "the plan alone", "Algorithm 2 as printed"
-ACROSS = "by touch, started across the seam: from 160 mm on"
-BRIDGED = "by touch, 20 mm of wall missing: there"
+FOLLOWED = {
+    "touch": "by touch", "plan": "the plan alone", "printed": "Algorithm 2 as printed",
+    "across": "by touch, started across the seam: from 160 mm on",
+    "bridged": "by touch, 20 mm of wall missing: there",
+}  # fmt: skip
+"""Ways of following a seam."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,28 +123,28 @@ def _welds(batches: Path, workpiece: str) -> Welds:
     others = read_sessions(batches / f"fig13-others_{workpiece}")
     mode = "steps.5.mode"
     sessions = {
-        TOUCH: read_sessions(batches / f"fig13_{workpiece}"),
-        PLAN: [s for s in others if s.row[mode] == "vision"],
-        PRINTED: [s for s in others if s.row[mode] == "as_printed"],
-        ACROSS: read_sessions(batches / f"fig13-across_{workpiece}"),
-        BRIDGED: read_sessions(batches / f"fig13-gap_{workpiece}"),
+        "touch": read_sessions(batches / f"fig13_{workpiece}"),
+        "plan": [s for s in others if s.row[mode] == "vision"],
+        "printed": [s for s in others if s.row[mode] == "as_printed"],
+        "across": read_sessions(batches / f"fig13-across_{workpiece}"),
+        "bridged": read_sessions(batches / f"fig13-gap_{workpiece}"),
     }
     return {name: [seen(session) for session in listed] for name, listed in sessions.items()}
 
 
 def _rows(workpiece: str, welds: Welds) -> Iterable[Row]:
     for name, listed in welds.items():
-        yield {"workpiece": workpiece, "followed": name, **_figures(name, listed)}
+        yield {"workpiece": workpiece, "followed": FOLLOWED[name], **_figures(name, listed)}
 
 
 def _figures(name: str, welds: Sequence[SeenWeld]) -> Row:
     """Return the figures over all welds that were followed in one way."""
     # By arc length [m]: after four tool lengths; in the gap
-    part = {ACROSS: (0.16, np.inf), BRIDGED: (0.09, 0.11)}.get(name, (0.0, np.inf))
+    part = {"across": (0.16, np.inf), "bridged": (0.09, 0.11)}.get(name, (0.0, np.inf))
     # A weld that was stopped before its torch came there has none.
     found = [off for weld in welds if len(off := weld.deviation(part))]
     every = np.concatenate(found)
-    touched = name not in (PLAN, PRINTED)
+    touched = name not in ("plan", "printed")
     return {
         "welds": str(len(welds)),
         "to the end": str(sum(weld.report.completed for weld in welds)),
@@ -151,9 +154,9 @@ def _figures(name: str, welds: Sequence[SeenWeld]) -> Row:
         "turn rate deg/s": f"{np.degrees(max(np.abs(w.report.turn).max() for w in welds)):.1f}",
         "step at the end mm": _mm(max(w.end_step for w in welds)) if touched else "",
         "back on the seam after mm": (
-            f"{max(w.recovery for w in welds) * 1e3:.0f}" if name == ACROSS else ""
+            f"{max(w.recovery for w in welds) * 1e3:.0f}" if name == "across" else ""
         ),
-        "contact regained": str(sum(w.regained for w in welds)) if name == BRIDGED else "",
+        "contact regained": str(sum(w.regained for w in welds)) if name == "bridged" else "",
     }
 
 
@@ -165,7 +168,7 @@ def _draw(welds: Mapping[str, Welds]) -> Any:
     """Draw the paths in the plane, and the torch's distance from the true seam, by workpiece."""
     page = sheet(2, 2, 9.0, 5.4)
     for column, workpiece in enumerate(WORKPIECES):
-        _paths(page.panels[column], workpiece, welds[workpiece][TOUCH][0])
+        _paths(page.panels[column], workpiece, welds[workpiece]["touch"][0])
         _distance(page.panels[2 + column], welds[workpiece])
     legend(page.panels[0], loc="lower right", ncols=2)
     legend(page.panels[2], loc="upper right")
@@ -184,12 +187,12 @@ def _paths(panel: Any, workpiece: str, weld: SeenWeld) -> None:
 
 
 def _distance(panel: Any, welds: Welds) -> None:
-    for name, colour in ((TOUCH, "#be123c"), (PLAN, "#64748b"), (PRINTED, "#d97706")):
+    for name, colour in (("touch", "#be123c"), ("plan", "#64748b"), ("printed", "#d97706")):
         for i, weld in enumerate(welds[name]):
             off = weld.deviation() * 1e3
             length = np.linalg.norm(weld.truth[-1] - weld.truth[0]) * 1e3
             at = np.linspace(0, length, len(off))
-            panel.plot(at, off, color=colour, linewidth=0.8, label=None if i else name)
+            panel.plot(at, off, color=colour, linewidth=0.8, label=None if i else FOLLOWED[name])
     panel.set_yscale("log")
     panel.set_ylim(1e-3, 1e2)
     dress(panel, "torch from the true seam", "along [mm]", "distance [mm]")

@@ -41,9 +41,8 @@ BASE_T_CAMERA = np.array(
 )
 """Equation (17)."""
 
-CENTRE = np.array([0.6, -0.0125, 0.3])
-SIZE = np.array([0.3, 0.3, 0.2])
-"""The workspace in ``base`` [m]."""
+WORKSPACE = Box(np.array([0.6, -0.0125, 0.3]), np.array([0.3, 0.3, 0.2]))
+"""In ``base`` [m]."""
 
 POSES = 75
 
@@ -67,9 +66,11 @@ class Realisation:
 
 def grid() -> Floats:
     """Return the (75, 3) grid of 5 x 5 x 3 flange centres in ``base`` [m]."""
-    axes = [np.linspace(-0.5, 0.5, n) * size for n, size in zip((5, 5, 3), SIZE, strict=True)]
+    axes = [
+        np.linspace(-0.5, 0.5, n) * size for n, size in zip((5, 5, 3), WORKSPACE.size, strict=True)
+    ]
     corners = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    return np.asarray(CENTRE + corners)
+    return np.asarray(WORKSPACE.centre + corners)
 
 
 def realise(rng: np.random.Generator, noise: float, outliers: float, poses: int) -> Realisation:
@@ -180,7 +181,7 @@ def acquire_points(seed: Seed, params: PointsParams) -> Observations:
     source = PointSource(
         fingerprint=sha256(f"points_as_in_paper 1 {seed} {sorted(drawn.items())}"),
         notes=("simulated point by point as in the paper's section 3.1: no scan, no circle fit",),
-        workspace=Box(CENTRE, SIZE),
+        workspace=WORKSPACE,
         truth=Truth(Transform(BASE, CAMERA, BASE_T_CAMERA)),
         simulated=True,
         **drawn,

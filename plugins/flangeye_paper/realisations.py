@@ -13,7 +13,6 @@ from flangeye.maths.geometry import kabsch, rigid, rpy_from_rotation
 from flangeye.maths.statistics import rms
 from flangeye.models.targets import Flange
 from flangeye.types import (
-    Box,
     Floats,
     HandEye,
     Observation,
@@ -26,8 +25,7 @@ from flangeye.types import (
 )
 from flangeye_paper.points import (
     BASE_T_CAMERA,
-    CENTRE,
-    SIZE,
+    WORKSPACE,
     PointSource,
     Realisation,
     bound,
@@ -35,8 +33,6 @@ from flangeye_paper.points import (
     observations_of,
     rms_over_workspace,
 )
-
-WORKSPACE = Box(CENTRE, SIZE).grid()
 
 
 class RealisationsParams(Params):
@@ -108,14 +104,14 @@ def _outcomes(source: PointSource, solve: Solver, count: int) -> Iterator[Realis
 def outcome_of(base_T_camera: Floats, drawn: Realisation, noise: float) -> RealisationOutcome:
     """Return how far an estimate is off."""
     error, good = errors_of(base_T_camera), ~drawn.gross
-    at = BASE_T_CAMERA[:3, :3].T @ (CENTRE - BASE_T_CAMERA[:3, 3])
+    at = BASE_T_CAMERA[:3, :3].T @ (WORKSPACE.centre - BASE_T_CAMERA[:3, 3])
     alone = rigid(*kabsch(drawn.centres[good], drawn.tcps[good]))
     return RealisationOutcome(
         error=np.array([*error[:3, 3], *rpy_from_rotation(error[:3, :3])]),
         at_centre=error[:3, :3] @ at + error[:3, 3] - at,
-        rms=rms_over_workspace(base_T_camera, WORKSPACE),
-        alone=rms_over_workspace(alone, WORKSPACE),
-        bound=bound(drawn.tcps[good], noise, WORKSPACE),
+        rms=rms_over_workspace(base_T_camera, WORKSPACE.grid()),
+        alone=rms_over_workspace(alone, WORKSPACE.grid()),
+        bound=bound(drawn.tcps[good], noise, WORKSPACE.grid()),
     )
 
 
@@ -153,5 +149,5 @@ def error_oracle(
     The paper writes ``e = H^ H_true`` for the error that Algorithm 1 minimises in simulation: the
     algorithm picks its poses by looking at the answer. No real cell offers that.
     """
-    at = BASE_T_CAMERA[:3, :3].T @ (CENTRE - BASE_T_CAMERA[:3, 3])
+    at = BASE_T_CAMERA[:3, :3].T @ (WORKSPACE.centre - BASE_T_CAMERA[:3, 3])
     return PoseError(errors_of(base_T_camera.matrix), at, base_T_camera.rotation)

@@ -54,7 +54,7 @@ def _stored_rows(setup: str, batch: Path) -> list[Row]:
     found = read_sessions(batch)[0].figures(STORED)
     row = _row(setup, "implied by their stored results", _printed_units(found), found)
     spread = _printed_units({axis: found[f"{axis}_std"] for axis in AXES})
-    disagree = max(spread[axis] for axis in AXES[:3])
+    disagree = max(spread[axis] for axis in [*AXES][:3])
     return [
         _printed_row(setup, TABLE_1[setup]),
         {**row, "at flange mm": None, "note": f"the 50 disagree by {disagree:.1f} mm"},

@@ -102,7 +102,11 @@ def _text(value: Any) -> str:
     return "" if value is None else str(value)
 
 
-AXES = ("x", "y", "z", "roll", "pitch", "yaw")
+AXES: Mapping[str, str] = {
+    "x": "#d97706", "y": "#1d4ed8", "z": "#15803d",
+    "roll": "#d97706", "pitch": "#1d4ed8", "yaw": "#15803d",
+}  # fmt: skip
+"""Components of a pose and their colours."""
 
 TABLE_1: Mapping[str, tuple[float, ...]] = {
     "UR5 PhoXi M": (11.60, 2.81, 5.55, 0.49, -0.89, -0.47),
@@ -138,11 +142,6 @@ METHODS: Mapping[str, Look] = {
 }
 BOUND = Look("Cramér-Rao bound", "black")
 PRINTED = Look("the paper", "#15803d")
-
-AXIS_COLOURS = {
-    "x": "#d97706", "y": "#1d4ed8", "z": "#15803d",
-    "roll": "#d97706", "pitch": "#1d4ed8", "yaw": "#15803d",
-}  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from pydantic import Field
 from flangeye import Params, RecipePath, StageError, stage
 from flangeye.devices import KnowsSeams, MotionAllowed, RobotDriver, ScannerDriver
 from flangeye.errors import NothingMoved
-from flangeye.files.clouds import CLOUD_SUFFIXES, LengthUnit, read_cloud
+from flangeye.files.clouds import CLOUD_FILES, LengthUnit, read_cloud
 from flangeye.files.scans import natural
 from flangeye.maths.geometry import invert, rigid, rotation_from_rpy
 from flangeye.maths.kinematics import Arm
@@ -60,11 +60,11 @@ def _files(path: Path) -> list[Path]:
     if path.is_file():
         return [path]
     found = sorted(
-        (p for p in path.iterdir() if p.suffix.lower() in CLOUD_SUFFIXES),
+        (p for p in path.iterdir() if p.suffix.lower() in CLOUD_FILES),
         key=lambda p: natural(p.name),
     )
     if not found:
-        raise StageError(f"{path}: holds no cloud; known: {', '.join(CLOUD_SUFFIXES)}")
+        raise StageError(f"{path}: holds no cloud; known: {', '.join(CLOUD_FILES)}")
     return found
 
 

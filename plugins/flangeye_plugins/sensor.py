@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from flangeye.devices import Device, DeviceError, SensorFrame, StateSource, TactileSensor
 from flangeye.errors import StageError
-from flangeye.files.images import MAX_FILE, ImageError, decode_image
+from flangeye.files.images import ImageError, decode_image
 from flangeye.files.paths import RecipeFile, RecipePath
-from flangeye.files.regular import read_regular
+from flangeye.files.regular import MAX_FILE, read_regular
 from flangeye.files.scans import natural
 from flangeye.log.read import read_notes
 from flangeye.models.finger import Finger

@@ -13,8 +13,7 @@ from flangeye.maths.geometry import kabsch, rigid, rotation_exp
 from flangeye.types import BASE, CAMERA, Transform, Views
 from flangeye_paper.points import (
     BASE_T_CAMERA,
-    CENTRE,
-    SIZE,
+    WORKSPACE,
     PointsParams,
     acquire_points,
     bound,
@@ -25,7 +24,6 @@ from flangeye_paper.points import (
     rms_over_workspace,
 )
 from flangeye_paper.realisations import (
-    WORKSPACE,
     RealisationsParams,
     error_oracle,
     verify_realisations,
@@ -42,8 +40,8 @@ def realised(seed=0, noise=1e-12, outliers=0.0, poses=75):
 def test_the_grid_fills_the_workspace() -> None:
     points = grid()
     assert points.shape == (75, 3)
-    np.testing.assert_allclose(np.ptp(points, axis=0), SIZE)
-    np.testing.assert_allclose(points.mean(axis=0), CENTRE)
+    np.testing.assert_allclose(np.ptp(points, axis=0), WORKSPACE.size)
+    np.testing.assert_allclose(points.mean(axis=0), WORKSPACE.centre)
 
 
 def test_without_noise_the_points_obey_equation_7() -> None:
@@ -99,8 +97,8 @@ def test_least_squares_reaches_the_bound() -> None:
         drawn = realised(seed, MM)
         found = rigid(*kabsch(drawn.centres, drawn.tcps))
         errors.append(errors_of(found)[:3, 3])
-        rms.append(rms_over_workspace(found, WORKSPACE))
-    limits = bound(grid(), MM, WORKSPACE)
+        rms.append(rms_over_workspace(found, WORKSPACE.grid()))
+    limits = bound(grid(), MM, WORKSPACE.grid())
     assert np.std(errors, axis=0) == pytest.approx([limits[a] for a in "xyz"], rel=0.12)
     assert np.sqrt(np.mean(np.square(rms))) == pytest.approx(limits["workspace_rms"], rel=0.05)
 

@@ -126,9 +126,9 @@ def test_the_table_says_what_the_welds_did(batches: Any, tmp_path: Path) -> None
     assert touch["turn rate deg/s"] == "5.7"
     assert rows["the plan alone"]["rms mm"] == "3.000"
     assert rows["Algorithm 2 as printed"]["to the end"] == "0"
-    assert rows[fig13.ACROSS]["back on the seam after mm"] == "80"
-    assert rows[fig13.ACROSS]["largest mm"] == "0.020"
-    assert rows[fig13.BRIDGED]["contact regained"] == "1"
+    assert rows[fig13.FOLLOWED["across"]]["back on the seam after mm"] == "80"
+    assert rows[fig13.FOLLOWED["across"]]["largest mm"] == "0.020"
+    assert rows[fig13.FOLLOWED["bridged"]]["contact regained"] == "1"
     assert (tmp_path / "fig13.png").read_bytes().startswith(b"\x89PNG")
 
 

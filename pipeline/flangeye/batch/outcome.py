@@ -104,9 +104,6 @@ def finished_outcome(place: Storage, folder: str, key: str, report: bool) -> Ses
         return None  # not there, or not ours
 
 
-SEED = "seed"
-
-
 class BatchError(FlangeyeError):
     """The batch cannot start; nothing has run."""
 
@@ -149,7 +146,7 @@ class Request:
     overrides: tuple[str, ...] = ()
     grid: tuple[str, ...] = ()
     repeat: int | None = None
-    vary: str = SEED
+    vary: str = "seed"
     workers: int | None = None
     scheduler: str | None = None
     tls: Tls | None = None

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import flangeye
 from flangeye import types as t
-from flangeye.batch.outcome import SEED, BatchError, Request
+from flangeye.batch.outcome import BatchError, Request
 from flangeye.errors import RecipeError, StageError
 from flangeye.files.elsewhere import is_url, print_of
 from flangeye.files.paths import VERSION
@@ -259,7 +259,7 @@ def plan(request: Request, registry: Registry, software: Software) -> BatchPlan:
     found = []
     for varied, recipe, seeds in _recipes(request, base, path, registry):
         overrides = (*request.overrides, *_written(varied))
-        shown = {k: v for k, v in varied.items() if k != SEED}
+        shown = {k: v for k, v in varied.items() if k != "seed"}
         found.append(Variant(overrides, shown, common_key(recipe, software, prints), seeds))
     made = BatchPlan(path, found, archives, prints)
     _check_distinct(made)
@@ -335,7 +335,7 @@ def variants(request: Request) -> Iterator[dict[str, str]]:
     """
     axes = _grid(request.grid)
     if request.repeat is not None:
-        _check_repetition(request, taken=SEED in axes)
+        _check_repetition(request, taken="seed" in axes)
     for values in itertools.product(*axes.values()):
         yield dict(zip(axes, values, strict=True))
 
@@ -374,7 +374,7 @@ def _axis(text: str) -> tuple[str, list[str]]:
 
 
 def _check_repetition(request: Request, taken: bool) -> None:
-    if request.vary != SEED:
+    if request.vary != "seed":
         raise BatchError(
             f"--vary {request.vary}: only the seed can be repeated with; for other values write "
             f"--set-grid {request.vary}=a,b,c"

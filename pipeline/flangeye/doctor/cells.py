@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import combinations
+from itertools import combinations, permutations
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,7 @@ from flangeye.errors import FlangeyeError
 from flangeye.estimation.plan import rough
 from flangeye.estimation.sightings import problem_of
 from flangeye.maths.geometry import invert, rigid
+from flangeye.maths.pose_formats import LENGTHS
 from flangeye.models.cell import Cell, Link
 from flangeye.types import (
     CAMERA,
@@ -36,9 +37,6 @@ from flangeye.types import (
     PoseFeature,
     Transform,
 )
-
-UNITS = {"mm": 1e-3, "m": 1e3}
-"""Factors on lengths, by the unit they are in if the recipe says the other one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +126,7 @@ def _of_sightings(
                 mended(invert),
                 cell,
             )
-        for unit, factor in UNITS.items():
+        for unit, factor in _other_units():
             yield Suspicion(
                 "unit",
                 f"{seen} is in {unit}",
@@ -166,7 +164,7 @@ def _of_arms(
             [_moved(o, {arm: invert(o.poses[arm].matrix)}) for o in observations],
             cell,
         )
-        for unit, factor in UNITS.items():
+        for unit, factor in _other_units():
             yield Suspicion(
                 "unit",
                 f"the poses of {arm} are in {unit}",
@@ -370,3 +368,9 @@ def _exchanged(observation: Observation, one: str, two: str) -> Observation:
 
 def _scaled(pose: Floats, factor: float) -> Floats:
     return rigid(pose[:3, :3], factor * pose[:3, 3])
+
+
+def _other_units() -> Iterator[tuple[str, float]]:
+    """Give each unit of lengths, and the factor if they are in it and the recipe says another."""
+    for unit, said in permutations(("m", "mm"), 2):
+        yield unit, LENGTHS[unit] / LENGTHS[said]

@@ -8,6 +8,7 @@ corrects the session as that finding says, and looks again.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -30,11 +31,6 @@ Arms = Literal["both", "first", "second"]
 
 FEWEST_SAMPLES = 4
 """Samples below which every explanation fits."""
-
-USUAL_LIMIT = 1e-3
-"""Of verify.holdout, where no recipe asks for another [m]."""
-CERTAIN = float("inf")
-"""Gain of a finding that needs no statistics, such as a pose that is exactly the identity."""
 
 
 class NotApplicable(Exception):
@@ -66,7 +62,7 @@ class RecordedSession:
         acquire: Name of the recipe's first step.
         changes: Parameters of that step that differ from the recipe's, by what was mended.
         board: The board that the recipe's fit step looks for, as ``acquire.images`` takes it.
-        limit: Smallest error that the recipe asks for [m].
+        limit: Smallest error that the recipe asks for [m]; that of ``verify.holdout`` if for none.
         marks_open: Whether the recipe's solver marks translations that the motion cannot show.
         remarks: Mistakes that opening the archive has shown already, mended here.
         damage: What of the log could not be read or was changed, a line each.
@@ -92,7 +88,7 @@ class RecordedSession:
     acquire: str = "acquire.archive"
     changes: Mapping[str, Any] = field(default_factory=dict)
     board: Mapping[str, Any] = field(default_factory=dict)
-    limit: float = USUAL_LIMIT
+    limit: float = 1e-3
     marks_open: bool = False
     remarks: tuple[Finding, ...] = ()
     damage: tuple[str, ...] = ()
@@ -235,6 +231,7 @@ class Finding:
         probability: Probability of so large an improvement in a session without this mistake, every
             alternative that was tried counted.
         gain: Logarithm of the likelihood ratio, less what further parameters cost; ranks findings.
+            Infinite where no statistics are needed, as for a pose that is exactly the identity.
         corrected_session: The session without the mistake, to look for others; None where only
             new recordings help.
         note: Whether it is only worth knowing, and no mistake.
@@ -247,14 +244,14 @@ class Finding:
     before: Misfit | None = None
     after: Misfit | None = None
     probability: float = 0.0
-    gain: float = CERTAIN
+    gain: float = math.inf
     corrected_session: RecordedSession | None = field(default=None, repr=False)
     note: bool = False
 
     @property
     def hopeless(self) -> bool:
         """Whether the mistake surely affects most samples, so that only new recordings help."""
-        certain = self.gain == CERTAIN and bool(self.samples)
+        certain = self.gain == math.inf and bool(self.samples)
         return certain and self.corrected_session is None and not self.note
 
     @property

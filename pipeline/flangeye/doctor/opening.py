@@ -20,7 +20,6 @@ import numpy as np
 from flangeye import types as t
 from flangeye.doctor.diagnosis import (
     FEWEST_SAMPLES,
-    USUAL_LIMIT,
     Finding,
     ReadAgain,
     Reader,
@@ -407,7 +406,9 @@ def _limit(recipe: Recipe) -> float:
     asked = [
         getattr(s.params, name, None) for s in recipe.steps for name in ("max_rms", "required")
     ]
-    return min([float(limit) for limit in asked if limit is not None], default=USUAL_LIMIT)
+    return min(
+        [float(limit) for limit in asked if limit is not None], default=RecordedSession.limit
+    )
 
 
 def _written(reader: Any) -> Reader:

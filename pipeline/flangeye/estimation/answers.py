@@ -29,11 +29,6 @@ from flangeye.maths.frame_graph import chain, composed
 from flangeye.maths.geometry import hat, invert
 from flangeye.types import ExpectedError, Floats
 
-# Turns count like what they do so far from the flange [m]: enough to tell the turn about a line
-# where the work is in one, and no more, for the work is a matter of positions.
-WEIGHT = np.repeat([0.02, 1.0], 3)[:, None]
-"""Of each number of a twist in the rigid part."""
-
 
 @dataclass(frozen=True, eq=False)
 class Answer:
@@ -161,7 +156,10 @@ class _Commands:
 
     def _explained(self, by: Floats, moved: Floats) -> Floats:
         """Return (B, 6, K) the least-squares amounts, over each box, of (W, 6, 6) in (W, 6, K)."""
-        across = np.swapaxes(WEIGHT**2 * by, 1, 2)
+        # Turns count like what they do so far from the flange [m]: enough to tell the turn about a
+        # line where the work is in one, and no more, for the work is a matter of positions
+        weight = np.repeat([0.02, 1.0], 3)[:, None]
+        across = np.swapaxes(weight**2 * by, 1, 2)
         gram, right = (np.tensordot(self.boxes, across @ each, axes=1) for each in (by, moved))
         return np.asarray(np.linalg.pinv(gram, rcond=1e-12, hermitian=True) @ right)
 

@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-MAX_FILE = 1 << 28
-"""Largest image file [bytes]."""
 MAX_PIXELS = 1 << 26
 """Largest image that is decoded; the largest scanner's has a tenth."""
 

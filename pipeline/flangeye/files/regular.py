@@ -12,6 +12,8 @@ from typing import BinaryIO
 
 from flangeye.errors import FlangeyeError, StageError
 
+MAX_FILE = 1 << 28
+"""Largest image file, and what an array of an .npz file may expand to [bytes]."""
 MAX_TEXT = 64_000_000
 """Longest table, list of poses or JSON file [bytes]: a million poses."""
 _POINTER = b"version https://git-lfs.github.com/spec/"

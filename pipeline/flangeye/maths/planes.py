@@ -28,13 +28,6 @@ ENOUGH = 2000
 """Points that tell one plane from another."""
 
 
-PRODUCTS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-"""Pairs of coordinates, whose mean products are the scatter about an origin."""
-
-SCATTER = np.array([[3, 4, 5], [4, 6, 7], [5, 7, 8]])
-"""Where in a point's nine moments the entries of the scatter are."""
-
-
 class Plane(NamedTuple):
     """A plane fitted to points.
 
@@ -126,7 +119,8 @@ class _Rows(NamedTuple):
 
     Attributes:
         moments: (P, 9, K) offsets from the rough planes' points [m], and their products
-            ``PRODUCTS`` [m^2]: what a plane takes of its points is then one product of matrices.
+            xx, xy, xz, yy, yz, zz [m^2]: what a plane takes of its points is then one product of
+            matrices.
         there: (P, K) which are points.
     """
 
@@ -140,7 +134,7 @@ class _Rows(NamedTuple):
         moments = np.zeros(shape, dtype=np.result_type(np.float32, *groups))
         for row, points, plane in zip(moments, groups, rough, strict=True):
             np.subtract(points.T, plane.point[:, None], out=row[:3, : len(points)])
-        for row, (i, j) in enumerate(PRODUCTS, 3):
+        for row, (i, j) in enumerate(zip(*np.triu_indices(3), strict=True), 3):
             np.multiply(moments[:, i], moments[:, j], out=moments[:, row])
         return cls(moments, np.arange(shape[2]) < sizes[:, None])
 
@@ -184,7 +178,10 @@ class _Slabs:
         sums = (rows.moments @ chosen[..., None].astype(rows.moments.dtype))[..., 0]
         moments = sums / counts[:, None]
         means = moments[:, :3]
-        scatter = moments[:, SCATTER] - means[:, :, None] * means[:, None]
+        i, j = np.triu_indices(3)
+        scatter = np.empty((len(moments), 3, 3), dtype=moments.dtype)
+        scatter[:, i, j] = scatter[:, j, i] = moments[:, 3:]
+        scatter -= means[:, :, None] * means[:, None]
         normals = np.linalg.eigh(scatter)[1][..., 0]
         away = (normals * self.towards[which]).sum(axis=1) < 0
         self.points[which] = means

@@ -41,9 +41,10 @@ EULER_ORDERS = tuple(
 """The twelve orders about fixed axes (``xyz``, extrinsic) and about turned ones (``ZYX``,
 intrinsic), spelt as scipy spells them."""
 
-
 LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
-_ANGLES = {"rad": 1.0, "deg": math.pi / 180}
+"""Units in which positions are written, in metres."""
+ANGLES = {"rad": 1.0, "deg": math.pi / 180}
+"""Units in which angles are written, in radians."""
 
 
 @dataclass(frozen=True)
@@ -188,7 +189,7 @@ class PoseConvention:
             return rotation_from_quaternion(
                 values if self.rotation == "xyzw" else values[[1, 2, 3, 0]]
             )
-        radians = values * _ANGLES[self.angle]
+        radians = values * ANGLES[self.angle]
         return (
             rotation_exp(radians)
             if self.rotation == "vector"
@@ -204,7 +205,7 @@ class PoseConvention:
             if self.rotation == "vector"
             else _to_euler(self.rotation, rotation)
         )
-        return np.asarray(radians / _ANGLES[self.angle])
+        return np.asarray(radians / ANGLES[self.angle])
 
     def _in_own_unit(self, index: int, token: _Token) -> float:
         value = float(token["number"])
@@ -212,7 +213,7 @@ class PoseConvention:
         if not unit or index >= self.count:
             return value
         own = self.units[index]
-        for table in (LENGTHS, _ANGLES):
+        for table in (LENGTHS, ANGLES):
             if unit in table and own in table:
                 return value * table[unit] / table[own]
         raise ValueError(
@@ -261,7 +262,6 @@ def _to_euler(order: str, rotation: Floats) -> Floats:
     return np.asarray(angles - 2 * np.pi * np.ceil(angles / (2 * np.pi) - 0.5 - 1e-12))
 
 
-_XYZ = ("X", "Y", "Z")
 _N = r"([-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)"
 """A number in a program."""
 
@@ -278,51 +278,53 @@ def _named(names: str, number: str) -> str:
 CONVENTIONS: Mapping[str, PoseConvention] = {
     # PolyScope's Move tab in its default units; URScript's p[...] is the same in metres.
     "ur": PoseConvention(
-        "UR", (*_XYZ, "RX", "RY", "RZ"), "vector", "mm", "rad",
+        "UR", ("X", "Y", "Z", "RX", "RY", "RZ"), "vector", "mm", "rad",
         ("Universal Robots",), rf"\bp\[{_list_of(6)}\]", "m",
     ),
     # KUKA System Software, operating manual: A about Z, B about the turned Y, C about the turned X.
     "kuka": PoseConvention(
-        "KUKA ABC", (*_XYZ, "A", "B", "C"), "ZYX", "mm", "deg",
+        "KUKA ABC", ("X", "Y", "Z", "A", "B", "C"), "ZYX", "mm", "deg",
         ("KUKA",), _named("XYZABC", rf"\s+{_N}"),
     ),
     # FANUC operator's manual: W about X, P about Y, R about Z, the axes of the user frame.
     "fanuc": PoseConvention(
-        "Fanuc WPR", (*_XYZ, "W", "P", "R"), "xyz", "mm", "deg", ("FANUC", "Fanuc"),
+        "Fanuc WPR", ("X", "Y", "Z", "W", "P", "R"), "xyz", "mm", "deg", ("FANUC", "Fanuc"),
         _named("XYZ", rf"\s*=\s*{_N}\s*mm") + r"\s*,\s*" + _named("WPR", rf"\s*=\s*{_N}\s*deg"),
     ),
     # ABB RAPID reference, data type orient: q1 is the real part.
     "abb": PoseConvention(
-        "ABB", (*_XYZ, "Q1", "Q2", "Q3", "Q4"), "wxyz", "mm", "rad",
+        "ABB", ("X", "Y", "Z", "Q1", "Q2", "Q3", "Q4"), "wxyz", "mm", "rad",
         ("ABB",), rf"\[\s*\[{_list_of(3)}\]\s*,\s*\[{_list_of(4)}\]",
     ),
     # Yaskawa operator's manual: as Fanuc.
     "yaskawa": PoseConvention(
-        "Yaskawa", (*_XYZ, "RX", "RY", "RZ"), "xyz", "mm", "deg", ("Yaskawa",)
+        "Yaskawa", ("X", "Y", "Z", "RX", "RY", "RZ"), "xyz", "mm", "deg", ("Yaskawa",)
     ),
     # Staubli VAL 3 reference, data type trsf: Rx, Ry, Rz about turned axes.
     "staubli": PoseConvention(
-        "Staubli", (*_XYZ, "RX", "RY", "RZ"), "XYZ", "mm", "deg", ("Stäubli", "Staubli")
+        "Staubli", ("X", "Y", "Z", "RX", "RY", "RZ"), "XYZ", "mm", "deg", ("Stäubli", "Staubli")
     ),
     # Kawasaki AS reference: orientation, altitude, tool; ZYZ about turned axes.
     "kawasaki": PoseConvention(
-        "Kawasaki OAT", (*_XYZ, "O", "A", "T"), "ZYZ", "mm", "deg", ("Kawasaki",)
+        "Kawasaki OAT", ("X", "Y", "Z", "O", "A", "T"), "ZYZ", "mm", "deg", ("Kawasaki",)
     ),
     # Doosan programming manual (DRL), posx: A, B, C are Euler angles ZYZ.
     "doosan": PoseConvention(
-        "Doosan", (*_XYZ, "A", "B", "C"), "ZYZ", "mm", "deg", ("Doosan Robotics",)
+        "Doosan", ("X", "Y", "Z", "A", "B", "C"), "ZYZ", "mm", "deg", ("Doosan Robotics",)
     ),
     # MVTec HALCON, create_pose with 'gba': Rx Ry Rz about turned axes, metres.
-    "halcon": PoseConvention("HALCON", (*_XYZ, "RX", "RY", "RZ"), "XYZ", "m", "deg"),
+    "halcon": PoseConvention("HALCON", ("X", "Y", "Z", "RX", "RY", "RZ"), "XYZ", "m", "deg"),
     # ROS REP 103, and the URDF: fixed axes.
-    "rpy": PoseConvention("roll pitch yaw", (*_XYZ, "ROLL", "PITCH", "YAW"), "xyz", "m"),
+    "rpy": PoseConvention("roll pitch yaw", ("X", "Y", "Z", "ROLL", "PITCH", "YAW"), "xyz", "m"),
     # The program is what ROS's tf_echo prints.
     "quaternion_xyzw": PoseConvention(
-        "quaternion", (*_XYZ, "QX", "QY", "QZ", "QW"), "xyzw", "m",
+        "quaternion", ("X", "Y", "Z", "QX", "QY", "QZ", "QW"), "xyzw", "m",
         program=rf"Translation:\s*\[{_list_of(3)}\][-\s]*Rotation:\s*in Quaternion[^\[]*"
         rf"\[{_list_of(4)}\]", program_length="m",
     ),
-    "quaternion_wxyz": PoseConvention("quaternion", (*_XYZ, "QW", "QX", "QY", "QZ"), "wxyz", "m"),
+    "quaternion_wxyz": PoseConvention(
+        "quaternion", ("X", "Y", "Z", "QW", "QX", "QY", "QZ"), "wxyz", "m"
+    ),
 }  # fmt: skip
 """The conventions people meet, by name; others are made from :class:`PoseConvention`. Readers,
 ``flangeye init``, the doctor, drivers and exports use these rows."""

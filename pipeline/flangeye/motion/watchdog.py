@@ -59,10 +59,7 @@ STOPS = {signal.SIGINT: "Ctrl-C", signal.SIGTSTP: "Ctrl-Z"}
 """Signals as the operator knows them."""
 
 AT_REST = 1.0
-"""Longest silence of program or guard while the arm stands [s]."""
-
-HUNG = 10.0 * GRACE
-"""A program that leads the arm and is so late leads it no more [s]."""
+"""Longest silence of program or guard while the arm stands, and of a program that led it [s]."""
 
 
 class Charge(NamedTuple):
@@ -205,8 +202,8 @@ class Watchdog:
         if self._led_ns is None:
             return
         silent = 1e-9 * (self._supervisor.samples[-1].time_ns - self._led_ns)
-        if silent > HUNG:
-            self._bar(f"the program that moves the arm sent no command for {HUNG:.0f} s")
+        if silent > AT_REST:
+            self._bar(f"the program that moves the arm sent no command for {AT_REST:.0f} s")
         elif silent > 2.0 * GRACE and not self._paused:
             self._paused = True  # the driver brakes by itself, and before: not on that alone
             try:

@@ -77,12 +77,14 @@ class Contract:
         gives: Types it may return.
         opens: What later steps may ask for once such a step has run.
         meaning: One line for people.
+        several: Whether a recipe may have more than one step of the kind.
     """
 
     takes: tuple[Any, ...]
     gives: tuple[Any, ...]
     opens: tuple[Any, ...]
     meaning: str
+    several: bool = False
 
 
 KINDS: Mapping[str, Contract] = {
@@ -108,16 +110,16 @@ KINDS: Mapping[str, Contract] = {
         "the camera's pose",
     ),
     "refine": Contract(
-        (t.HandEye,), (t.HandEye,), (t.HandEye,), "a calibration changed after solving"
+        (t.HandEye,), (t.HandEye,), (t.HandEye,), "a calibration changed after solving", True
     ),
     "verify": Contract(
-        (t.HandEye,), (t.Verification,), (t.VerifiedHandEye,), "whether the pose may be used"
+        (t.HandEye,), (t.Verification,), (t.VerifiedHandEye,), "whether the pose may be used", True
     ),
     "export": Contract(
-        (t.CalibratedPose,), (t.ExportedFile,), (), "the pose in another program's format"
+        (t.CalibratedPose,), (t.ExportedFile,), (), "the pose in another program's format", True
     ),
     "scan": Contract((), (t.WorkpieceScan,), (t.WorkpieceScan,), "a scan of the workpiece"),
-    "seam": Contract((t.VerifiedHandEye,), (t.Seam,), (t.Seam,), "where to weld"),
+    "seam": Contract((t.VerifiedHandEye,), (t.Seam,), (t.Seam,), "where to weld", True),
     "weld": Contract((t.VerifiedHandEye,), (t.WeldReport,), (t.WeldReport,), "weld along the seam"),
 }
 """The kinds of steps, in the order a recipe runs them."""

@@ -91,9 +91,6 @@ SECTIONS: Mapping[Any, Offer] = {
 }
 """What stages may ask for of a recipe's header."""
 
-SEVERAL = ("refine", "verify", "seam", "export")
-"""Kinds of which a recipe may have more than one step."""
-
 
 @dataclass(frozen=True)
 class Step:
@@ -210,7 +207,7 @@ class StepOrder:
         rank = list(KINDS).index(kind)
         if kind == "export":  # done after verifying, wherever it stands behind the solver
             return
-        if kind in self._kinds and kind not in SEVERAL:
+        if kind in self._kinds and not KINDS[kind].several:
             self._complain(at, f"a recipe has one {kind} step, and this is the second")
         elif rank < self._rank:
             later = list(KINDS)[self._rank]

@@ -29,8 +29,6 @@ from flangeye.result import contract as r
 from flangeye.result import logged_result, sections, sha256
 from flangeye.units import parse_quantity
 
-INCOMPLETE: Literal["incomplete"] = "incomplete"
-
 
 @dataclass(frozen=True)
 class Facts:
@@ -121,7 +119,7 @@ def _so_far(log: RunLog, recipe: str) -> r.Result:
     verifications = {e.step: e.value for e in log.of_kind("verify")}
     return r.Result(
         title=str(header.get("title", log.path.name)),
-        status=INCOMPLETE,
+        status="incomplete",
         method=calibration.method if calibration else None,
         transforms=sections.transforms_result(calibration),
         expected_error=sections.expected_error_result(calibration),

@@ -10,7 +10,7 @@ import numpy as np
 from flangeye import types as t
 from flangeye.files.elsewhere import with_urls
 from flangeye.maths.geometry import quaternion_from_rotation, rpy_from_rotation
-from flangeye.report.facts import INCOMPLETE, Facts
+from flangeye.report.facts import Facts
 from flangeye.report.units import degrees, millimetres, rounded_mm
 from flangeye.result import contract as r
 from flangeye.result import sections
@@ -40,8 +40,8 @@ def banner_of(facts: Facts) -> Banner:
     if result.status == "refused":
         reason = result.refused or "no reason was given"
         return Banner("refused", "Refused", figures, _sentence(reason))
-    if result.status == INCOMPLETE:
-        return Banner(INCOMPLETE, "Incomplete", figures, _sentence(_how_far(facts)))
+    if result.status == "incomplete":
+        return Banner("incomplete", "Incomplete", figures, _sentence(_how_far(facts)))
     if found := sections.expected_error(result):
         figures = [f"{rounded_mm(found[0])} mm expected", *_limit(result), *figures]
     if result.status == "verified":
@@ -127,7 +127,7 @@ def next_steps_of(facts: Facts) -> list[tuple[str, str]]:
     run = shlex.quote(with_urls(str(facts.log.path.parent)))
     if facts.result.status == "refused":
         return [("Find the cause", f"flangeye doctor {run}/{facts.log.path.name}")]
-    if facts.result.status == INCOMPLETE:
+    if facts.result.status == "incomplete":
         return [
             ("Assess the poses so far", f"flangeye show {run} --outlook"),
             ("Continue a live run", f"flangeye run --resume {run} --move"),

@@ -25,7 +25,7 @@ from flangeye_emulators.acquire.planned_session import (
     plan_session,
     source_of,
 )
-from flangeye_emulators.world.board_image import PAPER_MARGIN, BoardCamera, Cover, render_board
+from flangeye_emulators.world.board_image import BoardCamera, Cover, render_board
 from flangeye_emulators.world.mesh import MATERIALS, box
 from flangeye_emulators.world.raycast import Pixels, RaycastScene, SolidBody
 from flangeye_emulators.world.scanner import StructuredLight, TimeOfFlight, scanner_of
@@ -43,7 +43,7 @@ def camera_of(pixels: Pixels, camera: BoardCamera) -> BoardCamera:
 
 def sheet_of(board: Board) -> SolidBody:
     """Return the sheet with the print on its front, in ``target``; the print's black is as matt."""
-    half = np.array(board.size) / 2 + PAPER_MARGIN * board.square
+    half = np.array(board.size) / 2 + board.square
     # Of the sheet that carries the print [m]
     low, high = [*-half, -4e-3], [*half, 0.0]
     return SolidBody(box(low, high), MATERIALS["matt"])

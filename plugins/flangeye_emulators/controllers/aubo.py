@@ -30,10 +30,6 @@ from flangeye_emulators.controllers.mover import Mover
 from flangeye_emulators.controllers.network import Connection, FaultInjector, Network
 from flangeye_emulators.controllers.server import Server, run_server
 
-POSE = CONVENTIONS["rpy"]
-"""Poses are (x, y, z, rx, ry, rz) [m, rad], turned about fixed axes."""
-
-
 OK = 0
 """Return value of commands: AUBO_OK."""
 
@@ -77,7 +73,7 @@ class AuboController(ControlUnit):
         if not self._can(pose, 6, a, v):
             return self._refusal()
         self.note("moveLine")
-        target = POSE.matrix(pose)
+        target = CONVENTIONS["rpy"].matrix(pose)
         self._mover.append(lambda: linear_move(self.arm.stance.base_T_tcp, target, v, a))
         return OK
 
@@ -164,7 +160,6 @@ class AuboController(ControlUnit):
 
 MARK, _HEADER = b"SOF\x01", struct.Struct(">4sI")
 """What begins a frame: the mark, and the length of what follows."""
-ROBOT = "rob1"
 
 
 def serve(options: EmulatorOptions) -> None:
@@ -224,7 +219,7 @@ def answer(box: AuboController, body: bytes) -> bytes:
 
 
 def _outcome(box: AuboController, request: dict[str, Any]) -> dict[str, Any]:
-    name = str(request["method"]).removeprefix(f"{ROBOT}.")
+    name = str(request["method"]).removeprefix("rob1.")
     method = METHODS.get(name)
     if method is None:
         # JSON-RPC 2.0, section 5.1
@@ -255,11 +250,11 @@ def _flange(box: AuboController) -> Floats:
 
 
 def _pose(matrix: Floats) -> list[float]:
-    return [float(number) for number in POSE.numbers(matrix)]
+    return [float(number) for number in CONVENTIONS["rpy"].numbers(matrix)]
 
 
 def _set_tool(box: AuboController, params: Mapping[str, Any]) -> int:
-    box.arm.set_tool(POSE.matrix(params["offset"]))
+    box.arm.set_tool(CONVENTIONS["rpy"].matrix(params["offset"]))
     return OK
 
 
@@ -280,7 +275,7 @@ def _speed_joint(box: AuboController, params: Mapping[str, Any]) -> int:
 
 
 METHODS: dict[str, Method] = {
-    "getRobotNames": _tell(lambda box: [ROBOT]),
+    "getRobotNames": _tell(lambda box: ["rob1"]),
     "getAxisNames": _tell(lambda box: []),
     "SystemInfo.getInterfaceVersionCode": _tell(lambda box: 24001),
     "SystemInfo.getControlSoftwareFullVersion": _tell(lambda box: "0.24.1 (loopback)"),

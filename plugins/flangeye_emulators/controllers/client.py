@@ -20,16 +20,13 @@ PORT = 29998
 """Of the control channel. It is here, for a client needs nothing of what serves it."""
 
 
-AUTO = "auto"
-"""In a recipe: the address of this run alone."""
-
 OWN = ipaddress.IPv4Network("127.64.0.0/10")
 """As many addresses of this machine as Linux has process numbers."""
 
 
 def address_of(host: str) -> str:
     """Return a host's address; for ``auto`` one that no other run on this machine has now."""
-    return str(OWN[run_number() % OWN.num_addresses]) if host == AUTO else host
+    return str(OWN[run_number() % OWN.num_addresses]) if host == "auto" else host
 
 
 class EmulatorTruth(NamedTuple):

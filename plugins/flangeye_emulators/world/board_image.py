@@ -16,8 +16,6 @@ FINE = 2
 """Rays a pixel along each axis: what it averages over."""
 GROUND = 90
 """Grey behind the paper."""
-PAPER_MARGIN = 1.0
-"""White paper around the board, in squares."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +138,7 @@ def _window(board: Board, camera_T_target: Floats, camera: BoardCamera) -> tuple
     """Return the rows and columns of the image that show the paper."""
     import cv2
 
-    corners = board.outer_corners() * (1 + 2 * PAPER_MARGIN * board.square / min(board.size))
+    corners = board.outer_corners() * (1 + 2 * board.square / min(board.size))
     corners = corners @ camera_T_target[:3, :3].T + camera_T_target[:3, 3]
     none = np.zeros(3)
     pixels = cv2.projectPoints(corners, none, none, camera.camera_matrix, camera.distortion)[0]
@@ -158,7 +156,7 @@ def scan_board(
     u, v = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
     rays = _rays(u, v, camera)
     across, down = _places(board, camera_T_target, rays)
-    margin, (wide, high) = PAPER_MARGIN * board.square, board.size
+    margin, (wide, high) = board.square, board.size
     on = (across > -margin) & (across < wide + margin) & (down > -margin) & (down < high + margin)
     depth = _depth(camera_T_target, rays)
     length = np.linalg.norm(rays, axis=-1)
@@ -168,9 +166,8 @@ def scan_board(
 
 
 def _paper(board: Board) -> tuple[NDArray[np.uint8], float]:
-    """Return the print with its margin, and how far that moves it [px]."""
-    width = round(PAPER_MARGIN * PER_SQUARE)
-    return np.pad(print_of(board, PER_SQUARE), width, constant_values=255), float(width)
+    """Return the print with its margin of a square, and how far that moves it [px]."""
+    return np.pad(print_of(board, PER_SQUARE), PER_SQUARE, constant_values=255), float(PER_SQUARE)
 
 
 def _rays(u: Floats, v: Floats, camera: BoardCamera) -> Floats:

@@ -10,8 +10,8 @@ from pydantic import Field
 
 from flangeye import Params, StageError
 from flangeye.files.elsewhere import at_hand
-from flangeye.files.images import MAX_FILE, ImageError, decode_image
-from flangeye.files.regular import read_regular
+from flangeye.files.images import ImageError, decode_image
+from flangeye.files.regular import MAX_FILE, read_regular
 from flangeye.maths.statistics import rms
 from flangeye.types import Floats, Image, PointCloud
 

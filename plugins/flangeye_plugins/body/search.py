@@ -216,10 +216,6 @@ def _window(shape: Shape, view: CoarseImage, pose: Floats) -> tuple[slice, slice
     return slice(low[0], high[0]), slice(low[1], high[1])
 
 
-ROUGH = 0.06
-"""How far off a surface may be while the turn is known to 9 degrees, as a share of the size."""
-
-
 def guesses(view: CoarseImage, looks: Looks, most: int) -> Floats:
     """Return at most so many (K, 4, 4) ``camera_T_body`` that are consistent with a scan."""
     rng = np.random.default_rng(2)
@@ -260,7 +256,8 @@ def _passed(on: OrientedPoints, at: Indices, view: CoarseImage, looks: Looks) ->
         return number[looks.ends_seen[looks.view_of(posed(number)), at[number % max(len(at), 1)]]]
 
     def scored(number: Indices, count: int) -> Floats:
-        return looks.scores(posed(number), view, count, ROUGH)
+        # How far off a surface may be while the turn is known to 9 degrees, as a share of the size
+        return looks.scores(posed(number), view, count, 0.06)
 
     number = _chunked(np.arange(len(scan) * len(body)), unhidden)
     # Points of the body by which poses are judged, and how many of them pass

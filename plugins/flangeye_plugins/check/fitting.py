@@ -289,11 +289,16 @@ def fit_of(session: RecordedSession) -> VariantFits:
     return fit(equations_of(session))
 
 
+def called(arms: Arms) -> str:
+    """Return what one of two arms, or both, are called in messages."""
+    return "both arms" if arms == "both" else f"the {arms} arm"
+
+
 def named(arms: Arms, session: RecordedSession) -> str:
     """Return whose poses are meant, in the words of messages."""
     if session.seconds is None:
         return "the robot's"
-    return {"both": "both arms'", "first": "the first arm's", "second": "the second arm's"}[arms]
+    return called(arms) + ("'" if arms == "both" else "'s")
 
 
 HELPS = 0.7

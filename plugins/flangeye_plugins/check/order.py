@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -11,7 +12,6 @@ from numpy.typing import NDArray
 
 from flangeye import part
 from flangeye.doctor.diagnosis import (
-    CERTAIN,
     Arms,
     Finding,
     Findings,
@@ -26,6 +26,7 @@ from flangeye_plugins.check.fitting import (
     Significance,
     VariantFits,
     best_of,
+    called,
     exceedance,
     fit,
     fit_of,
@@ -38,11 +39,6 @@ Change = Callable[[Floats], tuple[Floats, Mask]]
 """Gives poses (N, 4, 4), and the samples (N,) that have one."""
 Later = Callable[[float], tuple[Floats, Mask]]
 """Gives an arm's poses after a delay [s], and the samples that have one."""
-
-
-_OF: dict[Arms, str] = {
-    "both": "both arms", "first": "the first arm", "second": "the second arm",
-}  # fmt: skip
 
 
 class OtherOrder(NamedTuple):
@@ -82,7 +78,7 @@ def order(session: RecordedSession) -> Findings:
 def _said(session: RecordedSession, arms: Arms, by: int, start: int) -> str:
     which = "later" if by > 0 else "earlier"
     since = f" from '{session.ids[start]}' on" if start else ""
-    of = "" if session.seconds is None else f" of {_OF[arms]}"
+    of = "" if session.seconds is None else f" of {called(arms)}"
     return f"each scan belongs to the pose{of} {abs(by)} {which}{since}"
 
 
@@ -147,7 +143,7 @@ def clock(session: RecordedSession) -> Findings:
         return
     delay = float(near[finer.which])
     which = "after" if delay > 0 else "before"
-    whose = "the arm was" if session.seconds is None else f"{_OF[arms]} was"
+    whose = "the arm was" if session.seconds is None else f"{called(arms)} was"
     what = f"{whose} at the scans' poses {abs(delay) * 1e3:.0f} ms {which} they were recorded"
     corrected_session = others[finer.which].session.where(others[finer.which].known)
     if not helps(session.where(others[finer.which].known), corrected_session):
@@ -373,7 +369,7 @@ def tool(session: RecordedSession) -> Findings:
     evidence = evidence._replace(probability=p)
     if turn and session.seconds is None:
         # The same turn in all samples is no chance, and no misread rotation
-        evidence = evidence._replace(probability=0.0, gain=CERTAIN)
+        evidence = evidence._replace(probability=0.0, gain=math.inf)
         free = replace(centres, places=np.full_like(session.places, np.nan))
         fix = "configuration: {name: eye-on-base, place: unknown}"
         yield evidence.finding("tool offset", what, free, fix)

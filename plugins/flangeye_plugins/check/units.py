@@ -33,11 +33,10 @@ from flangeye_plugins.check.fitting import (
     size_by_chance,
 )
 
-UNITS: Mapping[str, float] = {
-    "mm": 1e-3, "cm": 1e-2, "inches": 25.4e-3, "feet": 0.3048, "um": 1e-6,
+METRES: Mapping[str, float] = {
+    "m": 1.0, "mm": 1e-3, "cm": 1e-2, "inches": 25.4e-3, "feet": 0.3048, "um": 1e-6,
 }  # fmt: skip
-"""In metres."""
-_METRES: Mapping[str, float] = {"m": 1.0, **UNITS}
+"""Units of lengths."""
 ARMS = (0.1, 4.0)
 """Median distance of a flange from its base [m], from the smallest arm to the largest."""
 
@@ -99,12 +98,12 @@ def _of_arm(session: RecordedSession, arms: Arms, factor: float) -> RecordedSess
 
 def _ratios() -> Iterator[tuple[str, str, float]]:
     """Give (as read, as meant) of a unit, and what lengths are then multiplied with."""
-    given = set[float]()
+    given = {1.0}
     for said, meant in (
-        *(("m", unit) for unit in UNITS), *((unit, "m") for unit in UNITS),
+        *(("m", unit) for unit in METRES), *((unit, "m") for unit in METRES),
         ("mm", "inches"), ("inches", "mm"),
     ):  # fmt: skip
-        factor = round(_METRES[meant] / _METRES[said], 12)
+        factor = round(METRES[meant] / METRES[said], 12)
         if factor not in given:
             yield said, meant, factor
         given.add(factor)
@@ -115,7 +114,7 @@ def _finding(session: RecordedSession, found: OtherUnit, evidence: Significance)
     if found.arms is None or (found.arms == "both" and _rather_target(session, said, meant)):
         return _of_targets_unit(session, found, evidence)
     whose = named(found.arms, session)
-    factor = _METRES[meant] / _METRES[said]
+    factor = METRES[meant] / METRES[said]
     what = f"{whose} positions were read in {said} and are in {meant} (a factor of {factor:.6g})"
     return _refitted(what, found.session, evidence)
 
@@ -125,7 +124,7 @@ def _of_targets_unit(session: RecordedSession, found: OtherUnit, evidence: Signi
     said, meant = found.said, found.meant
     if found.arms is not None:
         said, meant = meant, said
-    factor = _METRES[meant] / _METRES[said]
+    factor = METRES[meant] / METRES[said]
     what = (
         f"the target's positions were read in {said} and are in {meant} (a factor of {factor:.6g})"
     )
@@ -141,7 +140,7 @@ def _rather_target(session: RecordedSession, said: str, meant: str) -> bool:
     """Return whose lengths are wrong: of arm and target, the one that they make more plausible."""
     if session.links is not None:
         return False
-    factor = _METRES[meant] / _METRES[said]
+    factor = METRES[meant] / METRES[said]
     arm = _outside(_distance_of_arm(session) * factor, ARMS) + _outside(
         _distance_of_target(session), session.reach
     )
@@ -171,11 +170,11 @@ def _too_far(session: RecordedSession) -> Finding | None:
     told: dict[str, Any] = {}
     said, factors = [], {"robot": 1.0, "target": 1.0}
     for whose, (distance, allowed) in lengths.items():
-        off = {unit: _outside(distance * factor, allowed) for unit, factor in UNITS.items()}
+        off = {unit: _outside(distance * factor, allowed) for unit, factor in METRES.items()}
         unit = min(off, key=off.__getitem__)
         if distance > 10 * allowed[1] and off[unit] == 0:
-            factors[whose] = UNITS[unit]
-            told[whose] = {"scale": _number(UNITS[unit])}
+            factors[whose] = METRES[unit]
+            told[whose] = {"scale": _number(METRES[unit])}
             said.append(f"the {whose}'s are {distance:.4g} m away, and in {unit}")
     if not told:
         return None

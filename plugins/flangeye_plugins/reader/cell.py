@@ -17,6 +17,7 @@ from flangeye import Params, StageError, part
 from flangeye.files.recording import Archive, NotThisLayout, Recording
 from flangeye.files.tables import Column, Table, files_at
 from flangeye.maths.pose_corrections import inverted
+from flangeye.maths.pose_formats import ANGLES, LENGTHS
 from flangeye.maths.streams import (
     STILL_ANGLE,
     STILL_DISTANCE,
@@ -28,7 +29,6 @@ from flangeye.maths.streams import (
 from flangeye.types import Floats, Motion
 from flangeye.units import param
 from flangeye_plugins.reader.columns import (
-    PER_UNIT,
     POINT,
     ColumnsParams,
     FlangePoseParams,
@@ -200,7 +200,7 @@ def _arms(folder: Path, params: CellParams) -> Iterator[Moved]:
 def _axes(folder: Path, params: CellParams) -> Iterator[Moved]:
     for name, given in params.axes.items():
         text = table_with_rows(folder, given.file)
-        values = text.numbers([text.index(given.column)])[:, 0] * PER_UNIT[given.unit]
+        values = text.numbers([text.index(given.column)])[:, 0] * {**LENGTHS, **ANGLES}[given.unit]
         times = times_of(text, given.time, given.time_unit)
         yield Moved(name, text, values, _keys(text, given.number, times), times)
 

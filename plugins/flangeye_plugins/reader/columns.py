@@ -14,8 +14,10 @@ from flangeye import Params, StageError
 from flangeye.files.clouds import LengthUnit
 from flangeye.files.tables import Cell, Column, Table, number_of, read_table
 from flangeye.maths.pose_formats import (
+    ANGLES,
     APART,
     CONVENTIONS,
+    LENGTHS,
     MATRIX,
     PLAIN,
     pose_of_numbers,
@@ -25,7 +27,6 @@ from flangeye.maths.pose_formats import LengthUnit as PoseLength
 from flangeye.types import Floats
 
 POINT = "point"
-PER_UNIT = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "rad": 1.0, "deg": float(np.pi / 180)}
 
 
 class WrittenParams(Params):
@@ -70,7 +71,7 @@ class WrittenParams(Params):
         if self.rotation == POINT:
             if numbers.size != 3 or not np.isfinite(numbers).all():
                 raise StageError(f"{where}: a point has 3 finite numbers, not {numbers.size}")
-            return np.asarray(numbers * PER_UNIT[self.length])
+            return np.asarray(numbers * LENGTHS[self.length])
         try:
             return pose_of_numbers(numbers, self.rotation, self.length, self.angle or "rad")
         except ValueError as error:
@@ -140,7 +141,7 @@ class JointsParams(Params):
         """Return (N, n) joint angles [rad] of a table's rows; None where none are named."""
         if not self.joints:
             return None
-        return text.numbers(text.indices(self.joints)) * PER_UNIT[self.joint_unit]
+        return text.numbers(text.indices(self.joints)) * ANGLES[self.joint_unit]
 
 
 class Readings(NamedTuple):

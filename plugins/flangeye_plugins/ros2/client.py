@@ -22,10 +22,6 @@ from flangeye.files.processes import Pipe, PipeEndedError, busy, python_command
 from flangeye.models.graph import Topic
 from flangeye_plugins.ros2.messages import Type, stamp_of, types
 
-PROGRAM = "ros2"
-"""The entry of this machine's settings that names the Python which has rclpy."""
-
-
 MATCHING = 0.5
 """Longest time until what runs is joined to a subscription or a publisher that is new [s]."""
 
@@ -350,7 +346,7 @@ def ros_python(asker: str) -> list[str]:
     Raises:
         DeviceError: There is none: says what to do.
     """
-    if (named := find_named("programs", PROGRAM)) is not None:
+    if (named := find_named("programs", "ros2")) is not None:
         return [str(named)]
     for folder in os.environ.get("PYTHONPATH", "").split(os.pathsep):
         version = re.search(r"python(3\.\d+)", folder)
@@ -363,7 +359,7 @@ def ros_python(asker: str) -> list[str]:
         return python_command()
     raise DeviceError(
         f"{asker}: no ROS 2 in this terminal: source it (source /opt/ros/jazzy/setup.bash) and "
-        f'start again, or name the Python that has rclpy, {PROGRAM} = "/its/whole/path" under '
+        f'start again, or name the Python that has rclpy, ros2 = "/its/whole/path" under '
         f"[programs] in {settings_file()}"
     )
 

@@ -40,8 +40,6 @@ from flangeye_plugins.ros2.messages import (
     positions_of,
 )
 
-TF, STATIC = "/tf", "/tf_static"
-
 
 class StampedFrame(NamedTuple):
     """A tf frame: its parent, its pose there (4, 4), and its time; None if static."""
@@ -68,9 +66,9 @@ class Frames:
         self._asker, self._bridge = bridge.asker, bridge
         bridge.wait_until_known()  # those that stand may be found after those that move
         if moving:
-            bridge.follow(TF, Type.TF, take=self._moving)
-        if STATIC in bridge.topics():
-            bridge.follow(STATIC, Type.TF, take=self._standing)
+            bridge.follow("/tf", Type.TF, take=self._moving)
+        if "/tf_static" in bridge.topics():
+            bridge.follow("/tf_static", Type.TF, take=self._standing)
 
     def root(self, name: str) -> str:
         """Return the frame at the top of a frame's tree."""
@@ -153,9 +151,6 @@ class Frames:
 
 SCANS = (Type.CLOUD, Type.IMAGE, Type.COMPRESSED)
 """The types in which cameras publish."""
-
-NONE = "none"
-"""The answer that there is no controller, or no trigger."""
 
 
 class Ros2Graph(Device):
@@ -252,20 +247,20 @@ class Ros2Graph(Device):
                 ``tf2_msgs``.
         """
         tree = self._tree()
-        self._bridge.offer(STATIC, Type.TF, latched=True)
+        self._bridge.offer("/tf_static", Type.TF, latched=True)
         told, transforms = [], []
         for each in (pose.transform, *pose.others):
             parent, child = (frames.get(n, n) for n in (each.parent, each.child))
             root, above = tree.root(child), tree.root(parent)
             if root == above:
                 raise DeviceError(
-                    f"ROS 2: {STATIC} joins {child} to {parent} already: end what publishes that, "
-                    "or choose another frame, --child NAME"
+                    f"ROS 2: /tf_static joins {child} to {parent} already: end what publishes "
+                    "that, or choose another frame, --child NAME"
                 )
             matrix = each.matrix @ invert(tree.pose(root, child))
             transforms.append(self._stamped(parent, root, matrix))
             told.append(f"{parent} to {root}" + (f", which carries {child}" * (root != child)))
-        self._bridge.publish(STATIC, encoded(message(Type.TF, transforms=transforms)))
+        self._bridge.publish("/tf_static", encoded(message(Type.TF, transforms=transforms)))
         return told
 
     def stay(self) -> None:
@@ -333,7 +328,7 @@ class Ros2Graph(Device):
 
     def _tree(self) -> Frames:
         """Return the frames that run, as soon as those that stand have come."""
-        moving = any(t.name == TF and t.publishers for t in self.topics())
+        moving = any(t.name == "/tf" and t.publishers for t in self.topics())
         frames = Frames(self._bridge, moving)
         time.sleep(MATCHING)
         return frames
@@ -461,13 +456,13 @@ def arm_driver(
 ) -> dict[str, Any]:
     """Return the driver of an arm as a recipe names it, with its parameters."""
     listening = controllers_in(topics)
-    question = f"which controller moves the arm; {NONE}: others do, by hand or by a program"
+    question = "which controller moves the arm; none: others do, by hand or by a program"
     told = f" ({', '.join(listening)})" if len(listening) > 1 else ""
-    chosen = ask("trajectory", question + told, _only(listening, NONE))
+    chosen = ask("trajectory", question + told, _only(listening, "none"))
     params: dict[str, Any] = {"joints": list(joints)}
     if states != "/joint_states":
         params["joint_states"] = states
-    if chosen == NONE:
+    if chosen == "none":
         return {"ros2_freedrive": params}
     return {"ros2": params | {"trajectory": chosen}}
 
@@ -535,7 +530,7 @@ def scanner_driver(scans: Heard, triggers: Iterable[str], ask: Ask) -> dict[str,
         told = f" ({', '.join(likely)})" if len(likely) > 1 else ""
         question = f"{scans.topic.name} is silent: which service (std_srvs/Trigger) takes a scan"
         trigger = ask("trigger", question + told, _only(likely, None), "/camera/capture")
-        if trigger != NONE:
+        if trigger != "none":
             params["trigger"] = trigger
     return params
 

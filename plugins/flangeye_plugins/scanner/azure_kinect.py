@@ -25,7 +25,6 @@ from flangeye.plugin.stage import Params, part
 from flangeye_plugins.scanner.opened import DepthView, OpenScanner
 
 NAME = "scanner.azure_kinect"
-DEFAULT_PYTHON = "kinect"
 HOST = Path(__file__).with_name("kinect_host.py")
 
 
@@ -44,7 +43,7 @@ class AzureKinectParams(Params):
     # Longest wait for a frame [s]
     timeout: ClassVar[float] = 2.0
     python: MachineName = Field(
-        DEFAULT_PYTHON,
+        "kinect",
         description="The Python that has pyk4a, where this one cannot have it: a name under "
         "[programs] of this machine's settings; this Python where they have no 'kinect'.",
     )
@@ -87,7 +86,7 @@ def _host(params: AzureKinectParams) -> Pipe:
 
 def _python(name: str) -> list[str]:
     """Return the command of the Python that this machine names; of this one if it names none."""
-    if name == DEFAULT_PYTHON and find_named("programs", name) is None:
+    if name == "kinect" and find_named("programs", name) is None:
         return python_command()
     # An older Python knows no -P; isolated, it imports nothing from the current folder either.
     return [str(require_named("programs", name, NAME)), "-I"]

@@ -14,7 +14,7 @@ from pydantic import Field
 
 from flangeye.devices import DeviceError, Scan, Scanner
 from flangeye.errors import StageError
-from flangeye.files.clouds import CLOUD_SUFFIXES, LengthUnit, read_cloud
+from flangeye.files.clouds import CLOUD_FILES, LengthUnit, read_cloud
 from flangeye.files.paths import RecipePath
 from flangeye.models.scanners import ScannerModel, check_unit, median_distance
 from flangeye.plugin.stage import Params, part
@@ -104,7 +104,7 @@ class WatchedFolder(OpenScanner):
                 raise DeviceError(f"{self.name}: is closed")
         raise DeviceError(
             f"{self.name}: no whole new cloud within {self._params.timeout:g} s{incomplete}; "
-            f"looked for {self._params.pattern} ({', '.join(CLOUD_SUFFIXES)})"
+            f"looked for {self._params.pattern} ({', '.join(CLOUD_FILES)})"
         )
 
     def close(self) -> None:
@@ -167,7 +167,7 @@ class WatchedFolder(OpenScanner):
 
 
 def _is_cloud(path: Path) -> bool:
-    return path.suffix.lower() in CLOUD_SUFFIXES and not path.name.startswith((".", "~"))
+    return path.suffix.lower() in CLOUD_FILES and not path.name.startswith((".", "~"))
 
 
 def _counted(path: Path) -> list[str]:

@@ -18,10 +18,8 @@ from flangeye.types import Floats, Mask
 ABSENT = np.nan
 FACES, EDGES = (0, 2), (1, 3)
 """The half-planes: first face, first edge, second face, second edge."""
-OFFSETS = np.zeros((4, 3))
+OFFSETS = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -0.5], [0.0, 1.0, 0.0], [0.0, 0.0, -0.5]])
 """What the two faces' heights and the root gap add to the half-planes' heights."""
-OFFSETS[0, 0] = OFFSETS[2, 1] = 1.0
-OFFSETS[1, 2] = OFFSETS[3, 2] = -0.5
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,6 @@ from flangeye.models.targets import Flange
 from flangeye.types import Floats, Indices, Singles
 from flangeye_plugins.segment.grid import Grid, cells
 
-ENOUGH, AROUND = 600, 300
-"""Points that settle the plane of a piece and of what is around a patch; a table has a hundred
-times as many."""
-
 SEARCHED = 1.5e-3
 """How far off its patch's plane a part's plane may be, besides its scatter [m]."""
 
@@ -108,7 +104,9 @@ def flat_parts(
     parts, bent = _whole(pieces, scatter)
     searched = [(p, r) for p, r in zip(pieces, bent, strict=True) if len(r) >= fewest]
     patches = [patch for piece, rest in searched for patch in _flattest(piece, rest)]
-    samples = [patch.piece.points.take(patch.around(reach, AROUND), axis=0) for patch in patches]
+    # Points that settle what is around a patch; a table has two hundred times as many
+    few = 300
+    samples = [patch.piece.points.take(patch.around(reach, few), axis=0) for patch in patches]
     planes = _planes(samples, [patch.rough for patch in patches], scatter)
     taken = np.zeros(1 + max((int(p.at.max()) for p in pieces), default=0), dtype=bool)
     for patch, plane in zip(patches, planes, strict=True):
@@ -122,7 +120,8 @@ def flat_parts(
 
 def _whole(pieces: list[SurfacePiece], scatter: float) -> tuple[list[PlanarPiece], list[Indices]]:
     """Return the pieces that are flat as a whole, and the remainder of every piece to search."""
-    samples = [thinned(piece.points, ENOUGH) for piece in pieces]
+    # So many points settle the plane of a piece
+    samples = [thinned(piece.points, enough=600) for piece in pieces]
     rough = [fit_plane(s.astype(np.float64), -s.mean(axis=0)) for s in samples]
     parts, bent = [], []
     for piece, plane in zip(pieces, _planes(samples, rough, scatter), strict=True):

@@ -34,9 +34,6 @@ from flangeye_plugins.weld.finger_camera import (
     torch_of,
 )
 
-TORCH = "torch"
-"""What the process is asked for where the torch was."""
-
 
 class Seeing(NamedTuple):
     """The open camera and profiler of the process.
@@ -101,7 +98,7 @@ class CameraProcess:
         """Return where a simulated torch really was, or None; no image is read any more."""
         self._end_watch()
         with suppress(OSError, EOFError):
-            self._wire.send(TORCH)
+            self._wire.send("torch")
             if self._wire.poll(PATIENCE):
                 truth: tuple[Floats, Floats] | None = self._wire.recv()
                 return truth
@@ -200,7 +197,7 @@ def camera_process(wire: Connection, job: CameraJob) -> None:
 
 def _answer(question: Any, seeing: Seeing) -> Any:
     """Return the torch's pose; or, given the arm's pose, the sighting or why there is none."""
-    if question == TORCH:
+    if question == "torch":
         return torch_of(seeing.sensor)
     seeing.latest.tell(question)
     name = seeing.sensor.name

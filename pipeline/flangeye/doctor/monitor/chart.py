@@ -3,30 +3,15 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from html import escape
 from pathlib import Path
 from typing import Any
 
 from flangeye.doctor.monitor.history import CheckFinding, History
 from flangeye.estimation.watch.drift import DriftTest
 from flangeye.files.regular import write_whole
-from flangeye.report.look import LIGHT, SERIES, css
+from flangeye.report.look import LIGHT, SERIES, templates
 
 COLOURS = {"OK": LIGHT["verified"], "DEGRADED": LIGHT["unverified"], "MOVED": LIGHT["refused"]}
-PAGE = """<!doctype html><html lang="en"><head><meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta http-equiv="Content-Security-Policy" content="default-src 'none';
- script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:">
-<title>{state}: {path}</title>
-<style>
-{look}:root {{ color-scheme: light; }}
-body {{ margin: 0 auto; padding: 1.5rem; max-width: 70rem; color: {ink}; background: {paper};
-  font: 1rem/1.5 var(--sans); }}
-h1 {{ margin: 0; font-size: 1.5rem; color: {colour}; }}
-p {{ margin: .4rem 0; overflow-wrap: anywhere; }}
-</style></head><body><h1>{state}</h1><p>{sentence}</p>{figure}
-<p>Checks in {path}: {checks}. A step is reported at a false-alarm rate of at most {rate:g} a check.
-</p></body></html>"""
 
 
 def write_chart(history: History, test: DriftTest, path: Path) -> None:
@@ -36,11 +21,11 @@ def write_chart(history: History, test: DriftTest, path: Path) -> None:
         StageError: It cannot be written.
     """
     last = history.findings[-1]
-    page = PAGE.format(
-        look=css(), ink=LIGHT["ink"], paper=LIGHT["paper"],
-        state=last.state, colour=COLOURS[last.state], sentence=escape(sentence(last)),
+    page = templates(Path(__file__).parent).get_template("chart.html.j2").render(
+        ink=LIGHT["ink"], paper=LIGHT["paper"],
+        state=last.state, colour=COLOURS[last.state], sentence=sentence(last),
         figure=figure(history, test).to_html(full_html=False, include_plotlyjs="inline"),
-        checks=len(history.findings), path=escape(str(history.path)), rate=test.false_alarms,
+        checks=len(history.findings), path=history.path, rate=test.false_alarms,
     )  # fmt: skip
     write_whole(path, page)
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from flangeye import types as t
 from flangeye.errors import StageError
 from flangeye.estimation.watch.drift import CheckSightings, Prior, prior_of, sightings_of
-from flangeye.estimation.watch.pose_error import FREE, ArmPoseErrors, pose_error_of
+from flangeye.estimation.watch.pose_error import ArmPoseErrors, pose_error_of
 from flangeye.files.yaml_lines import parse_yaml
 from flangeye.log.read import RunLog, read_run
 from flangeye.maths.arm_correction import corrected_flange
@@ -99,8 +99,8 @@ class StoredCalibration:
     @cached_property
     def prior(self) -> Prior:
         """Prior of later sightings, from the calibration's own sightings."""
-        variances = np.concatenate([FREE, self.pose_error.variances])
-        return prior_of(self.sightings(self.used, _one_check(self.used)), variances)
+        sightings = self.sightings(self.used, _one_check(self.used))
+        return prior_of(sightings, self.pose_error.with_camera)
 
     def sightings(self, seen: Sequence[t.Observation], check: NDArray[np.intp]) -> CheckSightings:
         """Return sightings of the target with their deviation from this calibration.

@@ -28,10 +28,6 @@ CODES = {"OK": 0, "DEGRADED": 1, "MOVED": 2}
 """Exit codes, for a script that stops a cell."""
 
 
-OPEN = "none"
-"""Instead of a security policy: neither encrypted nor signed."""
-
-
 def take(
     stored: StoredCalibration, history: History, check: MonitorCheck, test: DriftTest
 ) -> CheckFinding:
@@ -140,7 +136,7 @@ def require_secured(url: str, security: str | None) -> None:
         raise StageError(
             f"{url}: is on another machine, where anybody between can change the state: give "
             "--opcua-security POLICY,MODE,CERTIFICATE,KEY, such as Basic256Sha256,SignAndEncrypt,"
-            f"cert.der,key.pem, or '{OPEN}' in a network of its own"
+            f"cert.der,key.pem, or 'none' in a network of its own"
         )
 
 
@@ -151,7 +147,8 @@ def write_state(url: str, node: str, finding: CheckFinding, security: str | None
         url: ``opc.tcp://host:port``.
         node: ``ns=2;s=flangeye``.
         finding: Finding of the last check.
-        security: ``POLICY,MODE,CERTIFICATE,KEY`` as asyncua has it, or OPEN.
+        security: ``POLICY,MODE,CERTIFICATE,KEY`` as asyncua has it; ``none`` neither encrypts nor
+            signs.
 
     Raises:
         StageError: asyncua is missing, the server does not answer, there is no such node, or the
@@ -174,7 +171,7 @@ async def _write(url: str, node: str, finding: CheckFinding, security: str | Non
     from asyncua.client.client import Client
 
     client = Client(url)
-    if security not in (None, OPEN):
+    if security not in (None, "none"):
         await client.set_security_string(security)
     async with client:
         variable = client.get_node(node)

@@ -32,8 +32,7 @@ KINDS = {
 """Typical size of each kind for zeros of 1 rad: encoders once a turn [rad], a joint's deflection
 for a metre of lever [rad/m], lengths [m], twists [rad]. Ratios seen in published calibrations of
 industrial arms (Nubiola & Bonev 2013; the zeros and lengths of ``refine.arm``), rounded."""
-PLACES = ("place of the base", True, (1.0, 0.5)), ("place of the flange", False, (1.2, 0.15))
-ANEW = 0.4, 0.1
+ANEW = {"base": (1.0, 0.5), "flange": (1.2, 0.15), "each": (0.4, 0.1)}
 """Likewise where the joints are not known, of turn [rad] and shift [m] that all poses have in
 common, of the base and in the flange, and that each has of its own: those of a UR5e and a Panda
 with errors of all these kinds (``tests/estimation/foreign.py``), over 240 mm and 20 to 35
@@ -60,9 +59,17 @@ def arm_effects(problem: Problem, arm: str) -> list[Effect]:
             effects.append(Effect(name, block, ratio * accuracy, EACH, arm, True, kind))
     else:
         effects += [
-            Effect(name, _in_common(arm, at_base, rows), size * accuracy, EACH, arm, True, COMMON)
-            for name, at_base, sizes in PLACES
-            for rows, size in zip((slice(3), slice(3, 6)), sizes, strict=True)
+            Effect(
+                f"place of the {at}",
+                _in_common(arm, at == "base", rows),
+                size * accuracy,
+                EACH,
+                arm,
+                True,
+                COMMON,
+            )
+            for at in ("base", "flange")
+            for rows, size in zip((slice(3), slice(3, 6)), ANEW[at], strict=True)
         ]
     field = field_over(np.asarray(problem.frames[carriers[0].frame].place)[:, :3, 3])
     block = _by_place(arm, field)
@@ -106,8 +113,9 @@ def arm_scatters(problem: Problem) -> list[Scatter]:
             out.append(Scatter(_backlash(arm), 0.1 * accuracy, QUALITY, ""))
         else:
             turns, shifts = (_anew(arm, rows) for rows in (slice(3), slice(3, 6)))
-            out.append(Scatter(turns, ANEW[0] * accuracy, EACH, arm))
-            out.append(Scatter(shifts, ANEW[1] * accuracy, EACH, arm))
+            turned, shifted = ANEW["each"]
+            out.append(Scatter(turns, turned * accuracy, EACH, arm))
+            out.append(Scatter(shifts, shifted * accuracy, EACH, arm))
     return out
 
 

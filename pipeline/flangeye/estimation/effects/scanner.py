@@ -20,8 +20,6 @@ from flangeye.maths.geometry import hat, stack_rows
 from flangeye.models.scanners import ScannerModel
 from flangeye.types import Floats
 
-GRID = np.stack(np.meshgrid(*[np.linspace(-1, 1, 7)] * 3), axis=-1).reshape(-1, 3)
-"""The view, evenly."""
 TIMES = 1.1
 """By how many times the file's calibration error may be more or less, one sigma: data sheets state
 it for every device of the type. Were it free, it would take what the arm does wrong."""
@@ -113,8 +111,9 @@ class DistortionField:
         to the calibration error [m] of the scanner's file.
         """
         middle, half = self._depths
-        depths = middle + half * GRID[:, 2:]
-        points = np.concatenate([GRID[:, :2] * self._slopes * depths, depths], axis=1)
+        grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, 7)] * 3), axis=-1).reshape(-1, 3)
+        depths = middle + half * grid[:, 2:]
+        points = np.concatenate([grid[:, :2] * self._slopes * depths, depths], axis=1)
         raw, motions = self._raw(points), self._motions(points)
         rigid = np.linalg.lstsq(stack_rows(motions), stack_rows(raw), rcond=None)[0]
         bent = raw - motions @ rigid

@@ -29,8 +29,6 @@ POWERS = tuple(
     for turn in product(range(2), repeat=3)
     if sum(place) + 2 * sum(turn) <= 2
 )
-FREE = np.ones(6)
-"""Variances of a camera's motion that nothing is known of: [rad^2] and [m^2]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +64,11 @@ class ArmPoseErrors:
     def variances(self) -> Floats:
         """(K,) of the weights."""
         return np.repeat(np.square(self.smooth), 3 * len(POWERS))
+
+    @property
+    def with_camera(self) -> Floats:
+        """(6 + K,) variances of a motion of the camera, not known [rad^2, m^2], and weights."""
+        return np.concatenate([np.ones(6), self.variances])
 
     @property
     def beyond(self) -> Floats:
@@ -120,7 +123,7 @@ def _unlikelihood(design: Floats, residuals: Floats, own: Floats, error: ArmPose
     """Return minus twice the log of the marginal likelihood, but for a constant."""
     noise = own + error.beyond
     weighted = design.transpose(0, 2, 1) @ np.linalg.inv(noise)
-    variances = np.concatenate([FREE, error.variances])
+    variances = error.with_camera
     information = (weighted @ design).sum(axis=0) * np.sqrt(variances[:, None] * variances)
     vector = (weighted @ residuals[..., None]).sum(axis=0)[:, 0] * np.sqrt(variances)
     inner = np.eye(len(variances)) + information

@@ -68,7 +68,7 @@ def _beyond(value: float, others: Points, times: float) -> bool:
 
 
 __all__ = [
-    "CLOUD_SUFFIXES",
+    "CLOUD_FILES",
     "CONVERSIONS",
     "PER_METRE",
     "VENDOR",
@@ -84,7 +84,7 @@ LengthUnit = Literal["m", "mm", "in"]
 PER_METRE: Mapping[LengthUnit, float] = {"m": 1, "mm": 1000, "in": 1 / 0.0254}
 """How many of a unit are in a metre."""
 
-_OPENERS: Mapping[str, Callable[[Path], PointTable]] = {
+CLOUD_FILES: Mapping[str, Callable[[Path], PointTable]] = {
     ".asc": open_text,
     ".csv": open_text,
     ".npy": open_npy,
@@ -95,24 +95,22 @@ _OPENERS: Mapping[str, Callable[[Path], PointTable]] = {
     ".txt": open_text,
     ".xyz": open_text,
 }
-CLOUD_SUFFIXES = tuple(_OPENERS)
-"""Endings of the files that can be read."""
-_SAVE = "-C_EXPORT_FMT PLY -SAVE_CLOUDS"
+"""Files that can be read, by their ending."""
 VENDOR = {".zdf": "Zivid's SDK", ".praw": "Photoneo's PhoXi Control", ".mraw": "Mech-Mind's SDK"}
 """Files that only their maker can read, and with what to turn them into others."""
 CONVERSIONS: Mapping[str, str] = {
     **{end: f"only {by} reads it; export it as .ply or .pcd" for end, by in VENDOR.items()},
-    ".e57": "is an E57 scan, which is not read; save it as .ply: CloudCompare -O {file} " + _SAVE,
-    **dict.fromkeys(
-        (".las", ".laz"),
-        "is a LAS scan, which is not read; save it as .ply: CloudCompare -O {file} " + _SAVE,
-    ),
-    **dict.fromkeys(
-        (".stl", ".obj"),
-        "is a mesh, not a scan; sample it to points as .ply: CloudCompare -O {file} "
-        "-SAMPLE_MESH POINTS 1000000 " + _SAVE,
-    ),
-}
+    **{
+        ending: f"is {what} as .ply: CloudCompare -O {{file}} {step}-C_EXPORT_FMT PLY -SAVE_CLOUDS"
+        for endings, what, step in (
+            ((".e57",), "an E57 scan, which is not read; save it", ""),
+            ((".las", ".laz"), "a LAS scan, which is not read; save it", ""),
+            ((".stl", ".obj"), "a mesh, not a scan; sample it to points",
+             "-SAMPLE_MESH POINTS 1000000 "),
+        )
+        for ending in endings
+    },
+}  # fmt: skip
 """Ending -> what such a file is, and the command that turns it into one that can be read."""
 
 
@@ -125,7 +123,7 @@ def read_cloud(
     """Read a point cloud.
 
     Args:
-        path: A file with one of :data:`CLOUD_SUFFIXES`.
+        path: A file with one of :data:`CLOUD_FILES`.
         unit: Unit of the file's coordinates, where its heading does not state one.
         told: Takes what was concluded of it: numbers that stand for missing points, and a
             VIEWPOINT of the file that is not the identity.
@@ -182,11 +180,11 @@ def write_cloud(path: Path, cloud: PointCloud, unit: LengthUnit = "m") -> None:
 
 
 def _open(path: Path) -> PointTable:
-    opener, other = _OPENERS.get(path.suffix.lower()), CONVERSIONS.get(path.suffix.lower())
+    opener, other = CLOUD_FILES.get(path.suffix.lower()), CONVERSIONS.get(path.suffix.lower())
     if other is not None:
         refuse(path, other.format(file=path))
     if opener is None:
-        refuse(path, f"'{path.suffix}' is not a point cloud; known: {', '.join(_OPENERS)}")
+        refuse(path, f"'{path.suffix}' is not a point cloud; known: {', '.join(CLOUD_FILES)}")
     table = opener(path)
     if math.prod(table.shape) == 0:
         refuse(path, "holds no points")

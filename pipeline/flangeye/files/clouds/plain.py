@@ -28,11 +28,9 @@ from flangeye.files.clouds.table import (
     read_head,
     refuse,
 )
-from flangeye.files.regular import open_regular
+from flangeye.files.regular import MAX_FILE, open_regular
 from flangeye.files.words import reason_of
 
-MAX_ARRAY = 1 << 28
-"""What an array of an .npz file may expand to [bytes]: two million poses."""
 HEADER_ERRORS = (ValueError, TypeError, SyntaxError, TokenError)
 """What NumPy raises at a header that is none: it parses a Python literal."""
 
@@ -132,7 +130,7 @@ def load_npz(path: Path, only: str | None = None) -> dict[str, NDArray[Any]]:
 
 
 def _of_numbers(archive: ZipFile, info: ZipInfo) -> bool:
-    if info.file_size > MAX_ARRAY:
+    if info.file_size > MAX_FILE:
         return True  # to be refused by its size, nothing of it expanded
     with archive.open(info) as content:
         return _holds_numbers(content)
@@ -140,9 +138,9 @@ def _of_numbers(archive: ZipFile, info: ZipInfo) -> bool:
 
 def _member(path: Path, archive: ZipFile, name: str, info: ZipInfo) -> NDArray[Any]:
     """Return one array of the archive: its size is known before any of it is expanded."""
-    if info.file_size > MAX_ARRAY:
+    if info.file_size > MAX_FILE:
         raise StageError(
-            f"{path}: '{name}' expands to {info.file_size} bytes; at most {MAX_ARRAY} are read"
+            f"{path}: '{name}' expands to {info.file_size} bytes; at most {MAX_FILE} are read"
         )
     with archive.open(info) as content:
         return _array_of(f"{path}: '{name}'", content.read())

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flangeye.errors import StageError
+from flangeye.files.recording import MIN_CAPTURES
 from flangeye.files.tables.documents import MATRICES, TableDocument
 from flangeye.files.words import nearest
 from flangeye.types import Floats
@@ -144,8 +145,6 @@ def number_of(cell: Cell) -> float | None:
 
 WIDEST = 1000
 """Values of a record: one with more holds a scan."""
-FEWEST = 3
-"""Lists or names; fewer are no list of poses."""
 SCAN = "name"
 """Column of the names under which records stand."""
 _ENDING = re.compile(r"\.[A-Za-z]\w{1,4}$")
@@ -185,7 +184,7 @@ def _numbered(file: Path, data: Mapping[str, Any]) -> list[Rows]:
         if number and _is_record(value):
             stem = key[: number.start()] + "*" + key[number.end() :]
             groups.setdefault(stem, {})[int(number[0])] = key
-    groups = {stem: keys for stem, keys in groups.items() if len(keys) >= FEWEST}
+    groups = {stem: keys for stem, keys in groups.items() if len(keys) >= MIN_CAPTURES}
     found = []
     for numbers in dict.fromkeys(tuple(sorted(keys)) for keys in groups.values()):
         stems = [stem for stem, keys in groups.items() if tuple(sorted(keys)) == numbers]
@@ -240,7 +239,7 @@ def _side_by_side(where: Callable[[int], str], data: Mapping[str, Any]) -> list[
     )  # fmt: skip
     found = []
     for length, _ in stacks.most_common():
-        if length >= FEWEST or len(stacks) == 1:
+        if length >= MIN_CAPTURES or len(stacks) == 1:
             named = {name: value for name, value in lists.items() if len(value) == length}
             found.append(_columns(where, named)._replace(part=",".join(named)))
     return found

@@ -211,8 +211,6 @@ class RunView:
 
 Send = Callable[[LogMessage], None]
 
-HERE = "127.0.0.1"
-
 
 @contextmanager
 def foxglove_server(port: int) -> Iterator[Send]:
@@ -266,7 +264,7 @@ def gate(port: int, inside: tuple[str, int]) -> Iterator[None]:
     Raises:
         OSError: The port is taken.
     """
-    door = socket.create_server((HERE, port))
+    door = socket.create_server(("127.0.0.1", port))
     opened: Future[Callable[[], object]] = Future()
     serving = threading.Thread(target=lambda: asyncio.run(_serve(door, inside, opened)))
     serving.start()
@@ -315,7 +313,7 @@ def hidden_address() -> tuple[str, int]:
     try:
         found = socket.create_server((host, 0))
     except OSError:  # not every system has more than one address of its own
-        found = socket.create_server((HERE, 0))
+        found = socket.create_server(("127.0.0.1", 0))
     with found:
         address: tuple[str, int] = found.getsockname()
     return address

@@ -9,6 +9,7 @@ from typing import Any, get_args
 import numpy as np
 
 from flangeye.errors import RecipeError
+from flangeye.files.recording import MAX_REACH
 from flangeye.files.tables import Column, Table, read_table, rows_together
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.pose_corrections import inverted
@@ -25,7 +26,6 @@ from flangeye.maths.pose_formats import (
 from flangeye.maths.pose_formats import convention_of_maker as usual_of
 from flangeye.models.robots import RobotModel
 from flangeye.recipe.draft.evidence import (
-    FARTHEST,
     TURN,
     Choice,
     Writing,
@@ -530,7 +530,7 @@ def _rotation(pose: PoseColumns, questions: Questions, prefix: str, maker: str |
 def _length(numbers: Floats, pose: PoseColumns) -> str:
     if pose.length is not None:
         return pose.length
-    return "mm" if _reach(numbers, pose) > FARTHEST else "m"
+    return "mm" if _reach(numbers, pose) > MAX_REACH else "m"
 
 
 def _finite(numbers: Floats) -> Floats:
@@ -550,7 +550,7 @@ def _ask_lengths(arm: PoseColumns, target: PoseColumns | None, questions: Questi
         prefix: pose
         for prefix, pose in (("", arm), ("target-", target))
         if pose is not None and pose.is_pose and pose.length is None
-        and FARTHEST < _reach(_numbers(pose), pose) < nearest
+        and MAX_REACH < _reach(_numbers(pose), pose) < nearest
     }  # fmt: skip
     if "" not in unclear:
         return

@@ -26,8 +26,6 @@ from flangeye.maths.pose_formats import AngleUnit, LengthUnit, pose_of_numbers
 from flangeye.recipe.draft.headings import JOINTS, Headings, PoseColumns
 from flangeye.types import Floats
 
-FARTHEST = 20.0
-"""No arm reaches so far [m]: larger numbers are millimetres."""
 ROUNDED = 5e-3
 """By how much a written quaternion's length, or a rotation matrix, may be off."""
 TURN = 2 * math.pi + 0.01

@@ -14,13 +14,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from flangeye.files.tables import Cell, Column, Table, number_of
-from flangeye.maths.pose_formats import CONVENTIONS
+from flangeye.maths.pose_formats import ANGLES, CONVENTIONS, LENGTHS
 from flangeye.models.robots import joints_in_order
 
-POSITION = ("x", "y", "z")
 JOINTS = ("joints",)
 """In place of a rotation: joint angles."""
-_LENGTHS, _ANGLES = ("m", "cm", "mm"), ("rad", "deg")
 _PLACES = (
     "position",
     "pos",
@@ -237,7 +235,7 @@ def _grouped(table: Table) -> tuple[dict[str, Group], Headings]:
         elif _is_index(table, index, words):
             rest = replace(rest, index=name or index + 1)
         elif joint and not _is_quaternion(table, name):
-            unit = next((u for u in _ANGLES if u == words[-1].lower()), None)
+            unit = next((u for u in ANGLES if u == words[-1].lower()), None)
             rest = replace(rest, joints=(*rest.joints, name), joint_unit=unit)
         elif size in (*_POSES, 9):
             if nth == 0:
@@ -296,7 +294,7 @@ def list_name(name: str) -> str:
 def _of_list(listed: str, axis: str) -> list[str]:
     """Return the words of a list's entry, the unit last: ``translation_mm`` has ``x_mm``."""
     words = _words(listed)
-    unit = words.pop() if len(words) > 1 and words[-1].lower() in (*_LENGTHS, *_ANGLES) else ""
+    unit = words.pop() if len(words) > 1 and words[-1].lower() in (*LENGTHS, *ANGLES) else ""
     return [*words, axis, *filter(None, [unit])]
 
 
@@ -340,7 +338,7 @@ def _put(
     Four listed numbers are a quaternion, whatever they are called.
     """
     last = words[-1].lower()
-    unit = words.pop().lower() if last in (*_LENGTHS, *_ANGLES) and len(words) > 1 else None
+    unit = words.pop().lower() if last in (*LENGTHS, *ANGLES) and len(words) > 1 else None
     if _is_axis(words[0]) and not _is_axis(words[-1]):  # ``x_robot``
         words = [*words[1:], words[0]]
     axis, before = words[-1].lower(), words[:-1]
@@ -356,15 +354,15 @@ def _put(
     group.words = group.words or called
     group.columns.setdefault(axis, name)
     group.ordered &= ordered
-    if axis in POSITION and unit in _LENGTHS:
+    if axis in ("x", "y", "z") and unit in LENGTHS:
         group.length = unit
-    elif unit in _ANGLES:
+    elif unit in ANGLES:
         group.angle = unit
 
 
 def _is_axis(word: str) -> bool:
     """Return whether a word calls one number of a pose: an axis, an angle, an entry of a matrix."""
-    axes = {*POSITION, *(label for labels in ROTATIONS for label in labels)}
+    axes = {*"xyz", *(label for labels in ROTATIONS for label in labels)}
     return word.lower() in axes or _ENTRY.fullmatch(word.lower()) is not None
 
 
@@ -402,9 +400,9 @@ def _pose(table: Table, group: Group) -> PoseColumns | None:
     if sorted(map(len, apart.values())) == [3, 9]:  # r1 to r9 and t1 to t3
         turn, place = sorted(apart.values(), key=len, reverse=True)
         return PoseColumns(table, (*place, *turn), ("3x3",), *stated)
-    if not set(POSITION) <= set(group.columns):
+    if not {*"xyz"} <= set(group.columns):
         return None
-    place = tuple(group.columns[axis] for axis in POSITION)
+    place = tuple(group.columns[axis] for axis in "xyz")
     if group.rotation is not None:
         return PoseColumns(table, (*place, group.rotation), ("3x3",), *stated)
     if len(entries) == 9:

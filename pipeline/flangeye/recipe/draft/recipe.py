@@ -16,9 +16,9 @@ import numpy as np
 from flangeye.errors import RecipeError, StageError
 from flangeye.files.cameras import cameras_in
 from flangeye.files.clouds import CONVERSIONS, read_cloud
-from flangeye.files.images import MAX_FILE, ImageError, decode_image
+from flangeye.files.images import ImageError, decode_image
 from flangeye.files.recording import Archive, NotThisLayout, Recording
-from flangeye.files.regular import read_regular
+from flangeye.files.regular import MAX_FILE, read_regular
 from flangeye.files.scans import IMAGES
 from flangeye.files.tables import tables_in
 from flangeye.files.yaml_lines import entry, flow, parse_value
@@ -37,8 +37,6 @@ from flangeye.types import FLANGE, Floats, Observation, PoseFeature
 
 PLATE = "ISO 9409-1-50-4-M6"
 """What most small arms carry."""
-PRINTED = ("charuco", "checkerboard", "circles", "aruco")
-NONE = "none"
 
 
 @dataclass(frozen=True)
@@ -89,10 +87,10 @@ def draft_recipe(
 def _robot(survey: FolderSurvey, out: Path, questions: Questions) -> dict[str, Any]:
     """Return the arm as asked, or by the one URDF of the folder."""
     urdfs = survey.of((".urdf",))
-    usual = os.path.relpath(urdfs[0], out.parent) if len(urdfs) == 1 else NONE
+    usual = os.path.relpath(urdfs[0], out.parent) if len(urdfs) == 1 else "none"
     question = "which arm ('flangeye robots', or a .urdf)"
     answer = questions.ask("robot", question, usual, check=lambda a: _known_robot(a, out))
-    if answer == NONE:
+    if answer == "none":
         return {}
     return {"urdf": answer} if answer.endswith(".urdf") else {"model": answer}
 
@@ -101,7 +99,7 @@ def _known_robot(answer: str, out: Path) -> None:
     """Refuse a robot that is neither in the catalogue nor a file beside the recipe."""
     if answer.endswith(".urdf") and not (out.parent / answer).is_file():
         raise RecipeError(f"{answer}: is no file")
-    if answer != NONE and not answer.endswith(".urdf"):
+    if answer != "none" and not answer.endswith(".urdf"):
         load_model("robots", answer, out.parent)
 
 
@@ -288,7 +286,7 @@ def _some_images(records: Sequence[Recording]) -> Iterator[tuple[str, Any]]:
 def _target(answer: str) -> dict[str, Any]:
     value = parse_value(answer, "--target")
     target = {value: {}} if isinstance(value, str) else value
-    known = ("flange", "body", "sphere", *PRINTED)
+    known = ("flange", "body", "sphere", "charuco", "checkerboard", "circles", "aruco")
     if not isinstance(target, dict) or len(target) != 1 or next(iter(target)) not in known:
         raise RecipeError(f"--target {answer}: is none of {', '.join(known)}, with parameters")
     return target
@@ -311,13 +309,13 @@ def _head(
         robot, feature = {"flange": feature["standard"]}, {}
     question = "which scanner ('flangeye scanners')"
     scanner = questions.ask(
-        "scanner", question, NONE, check=lambda a: a == NONE or load_model("scanners", a)
+        "scanner", question, "none", check=lambda a: a == "none" or load_model("scanners", a)
     )
     configuration = _configuration(target, questions)
     body = _body(str(target["body"]), out, configuration) if "body" in target else {}
     named: Any = robot["model"] if set(robot) == {"model"} else robot
     sections = {
-        "robot": named, "scanner": {} if scanner == NONE else scanner,
+        "robot": named, "scanner": {} if scanner == "none" else scanner,
         "feature": feature, "target": body, "configuration": configuration,
     }  # fmt: skip
     return head | {name: section for name, section in sections.items() if section}

@@ -12,6 +12,7 @@ from pathlib import Path
 from flangeye.errors import FlangeyeError, RecipeError, StageError
 from flangeye.files.cameras import cameras_in
 from flangeye.files.clouds import CONVERSIONS
+from flangeye.files.recording import MIN_CAPTURES
 from flangeye.files.regular import is_pointer
 from flangeye.files.scans import CLOUDS, IMAGES, natural, texts_of_points
 from flangeye.files.tables import KINDS, Table, number_of, read_table, tables_in
@@ -99,10 +100,6 @@ class Questions:
                 refused = f"{error}\n"
             else:
                 return answer
-
-
-FEWEST_ROWS = 3
-"""Rows of a table of poses, and files that are named alike under one pattern."""
 
 
 @dataclass(frozen=True)
@@ -217,9 +214,9 @@ def places(folder: Path, files: Sequence[Path]) -> Iterator[tuple[str, list[Path
             alike = re.sub(r"\d+", "*", file.stem) + file.suffix
             groups[str(file.relative_to(folder).with_name(alike))].append(file)
     groups = {place: of for files in groups.values() for place, of in _series(folder, files)}
-    single = [file for files in groups.values() if len(files) < FEWEST_ROWS for file in files]
-    one_each = [n for n, count in Counter(f.name for f in single).items() if count >= FEWEST_ROWS]
-    yield from ((place, files) for place, files in groups.items() if len(files) >= FEWEST_ROWS)
+    single = [file for files in groups.values() if len(files) < MIN_CAPTURES for file in files]
+    one_each = [n for n, count in Counter(f.name for f in single).items() if count >= MIN_CAPTURES]
+    yield from ((place, files) for place, files in groups.items() if len(files) >= MIN_CAPTURES)
     for file in single:
         if file.name not in one_each:
             yield str(file.relative_to(folder)), [file]
@@ -238,7 +235,7 @@ def _series(folder: Path, files: Sequence[Path]) -> Iterator[tuple[str, list[Pat
     for at, run in enumerate(runs):
         parts[tuple(run[:-2])].append(at)
     last = Counter(run[-2] for run in runs if len(run) > 1)
-    whole = max(last.values(), default=0) == 1 or max(map(len, parts.values())) < FEWEST_ROWS
+    whole = max(last.values(), default=0) == 1 or max(map(len, parts.values())) < MIN_CAPTURES
     for ats in [list(range(len(files)))] if whole else parts.values():
         columns = zip(*(runs[at] for at in ats), strict=True)
         stem = "".join(
@@ -263,10 +260,10 @@ def _tables(folder: Path, place: str, files: int) -> list[Table]:
 
 
 def _holds_numbers(table: Table) -> bool:
-    if len(table.rows) < FEWEST_ROWS:
+    if len(table.rows) < MIN_CAPTURES:
         return False
     numbers = sum(number_of(cell) is not None for cell in table.rows[0][1])
-    return numbers >= FEWEST_ROWS
+    return numbers >= MIN_CAPTURES
 
 
 def _whole(folder: Path, tables: Sequence[Table]) -> list[Table]:

@@ -27,7 +27,6 @@ FORMATS = {
 }
 """RTDE's types as :mod:`struct` packs them; everything is big-endian."""
 
-NOT_FOUND = "NOT_FOUND"
 
 Values = Sequence[float] | Sequence[int]
 
@@ -322,8 +321,8 @@ class OutputRecipe:
 
     def __init__(self, names: Sequence[str]) -> None:
         """Look up the recipe's variables."""
-        self.types = [OUTPUTS[name].type if name in OUTPUTS else NOT_FOUND for name in names]
-        self.valid = NOT_FOUND not in self.types
+        self.types = [OUTPUTS[name].type if name in OUTPUTS else "NOT_FOUND" for name in names]
+        self.valid = "NOT_FOUND" not in self.types
         if self.valid:
             self._values = [OUTPUTS[name].values for name in names]
             self._packing = struct.Struct(">B" + "".join(FORMATS[t] for t in self.types))
@@ -348,8 +347,8 @@ class InputRecipe:
     def __init__(self, names: Sequence[str]) -> None:
         """Look the names up."""
         self.names = list(names)
-        self.types = [INPUTS.get(name, NOT_FOUND) for name in names]
-        self.valid = NOT_FOUND not in self.types
+        self.types = [INPUTS.get(name, "NOT_FOUND") for name in names]
+        self.valid = "NOT_FOUND" not in self.types
         if self.valid:
             self._packing = struct.Struct(">" + "".join(FORMATS[t] for t in self.types))
             # A vector has no effect on this controller: its first number stands for it.

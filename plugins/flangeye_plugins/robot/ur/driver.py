@@ -31,7 +31,6 @@ PATIENCE = 0.5
 """Longest wait for one answer [s]."""
 
 
-RUNNING = 7
 REMOTE = "it is in local control: choose Remote Control at the top right of the pendant"
 
 POWER = "the arm has no power or its brakes are on: switch it on at the pendant"
@@ -161,7 +160,7 @@ def condition_of(sample: CycleSample, commanded: bool) -> Condition:
     if sample.safety_mode not in (1, 2):
         unknown: tuple[Mode, str] = ("not ready", f"safety mode {sample.safety_mode}")
         return Condition(*safety_of(sample.safety_mode) or unknown)
-    if sample.robot_mode != RUNNING:
+    if sample.robot_mode != 7:  # RUNNING
         return Condition("not ready", POWER)
     if sample.remote == 0:
         return Condition("not ready", REMOTE)
@@ -176,8 +175,7 @@ def condition_of(sample: CycleSample, commanded: bool) -> Condition:
     return Condition("moving" if moves else "ready")
 
 
-SHOWN = CONVENTIONS["ur"]
-POSE = SHOWN.in_units("m", "rad")
+POSE = CONVENTIONS["ur"].in_units("m", "rad")
 
 
 @part("robot.ur_rtde")
@@ -203,11 +201,11 @@ def robot_ur_rtde(model: RobotModel, params: ControllerParams, reads_only: bool 
     # Longest time until the client library is connected, first questions included [s]
     patience = 2.6 - (time.monotonic() - began)
     link = ControllerLink(name, params.host, facts.period, patience, reads_only)
-    expected = params.tool.flange_T_tool(SHOWN)
+    expected = params.tool.flange_T_tool(CONVENTIONS["ur"])
     try:
         # Which tool is set only the other side tells: a wrong one shows in where the flange is.
         offset = expected if reads_only else POSE.matrix(link.request("tool"))
-        require_tool(name, "ur_rtde", offset, expected, SHOWN)
+        require_tool(name, "ur_rtde", offset, expected, CONVENTIONS["ur"])
         # An arm that is not commanded may be silent for a while: nothing depends on it [s]
         patience = 0.5 if reads_only else UrRobot.stale
         robot = UrRobot(name, params.host, facts.period, link, offset, patience)
