@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -24,8 +25,6 @@ from flangeye_plugins.fit.planar import (
     scale_of,
 )
 from flangeye_plugins.fit.uncertainty import ScannerErrorParams
-
-NO_IMAGE = "there is no image; printed targets are found in the scanner's image"
 
 
 class PrintedTargetParams(ScannerErrorParams):
@@ -159,16 +158,13 @@ def fit_circles(capture: Capture, params: CirclesParams) -> PoseFeature | Reject
     The frame has its origin in the middle of the grid, x right, y up, z towards the camera; the
     first row begins half a step further to the left than the second.
     """
-    board = params.board
-    if capture.image is None:
-        return Rejected(NO_IMAGE)
-    middles = find_corners(board, capture.image)
-    if isinstance(middles, Rejected):
-        return middles
-    pose = poses_from_pixels(middles, capture.image, params.corner_noise)[0]
-    beside = middles_beside_centres(middles, capture.image, pose.matrix, params.diameter / 2)
-    centres = middles._replace(pixels=middles.pixels - beside)
-    return _fit_corners(centres, capture, capture.image, board, params)
+
+    def centres(middles: Corners, image: Image) -> Corners:
+        pose = poses_from_pixels(middles, image, params.corner_noise)[0]
+        beside = middles_beside_centres(middles, image, pose.matrix, params.diameter / 2)
+        return middles._replace(pixels=middles.pixels - beside)
+
+    return fit_board(capture, params.board, params, centres)
 
 
 @stage("fit.aruco")
@@ -182,14 +178,19 @@ def fit_aruco(capture: Capture, params: MarkerParams) -> PoseFeature | Rejected:
 
 
 def fit_board(
-    capture: Capture, board: Board, params: PrintedTargetParams
+    capture: Capture,
+    board: Board,
+    params: PrintedTargetParams,
+    corrected: Callable[[Corners, Image], Corners] | None = None,
 ) -> PoseFeature | Rejected:
     """Return a board's pose with its covariance, or the reason for a rejection."""
     if capture.image is None:
-        return Rejected(NO_IMAGE)
+        return Rejected("there is no image; printed targets are found in the scanner's image")
     corners = find_corners(board, capture.image)
     if isinstance(corners, Rejected):
         return corners
+    if corrected is not None:
+        corners = corrected(corners, capture.image)
     return _fit_corners(corners, capture, capture.image, board, params)
 
 
