@@ -82,6 +82,7 @@ class Form:
         count = f"{len(mistakes)} thing{'s' * (len(mistakes) > 1)} to mend in the recipe."
         self._bar.say(count if mistakes else "The recipe is valid.")
         self._next.set_enabled(not mistakes)
+        self._bar.simulated.set_visibility(self._project.simulated)
         for each in mistakes:
             mistake(f"line {each.line}: {each.path}: {each.text}" if each.line else each.text)
 

@@ -30,9 +30,14 @@ BESIDE = {
 
 
 class ActionBar:
-    """The bar below a page: the status line, and the primary button."""
+    """The bar below a page: the status line, and the primary button.
 
-    def __init__(self) -> None:
+    Attributes:
+        simulated: The line above the page that says that the cell is simulated.
+    """
+
+    def __init__(self, simulated: ui.label) -> None:
+        self.simulated = simulated
         with (
             ui.footer().classes("bar") as self._footer,
             ui.row().classes("items-center gap-3 no-wrap w-full"),
@@ -76,8 +81,7 @@ def page(project: Project, title: str) -> Iterator[ActionBar]:
         warning=LIGHT["unverified"],
     )  # fmt: skip
     ui.page_title(f"{title} · flangeye")
-    _header(project, title)
-    bar = ActionBar()
+    bar = ActionBar(_header(project, title))
     with ui.column().classes("w-full max-w-screen-xl mx-auto gap-3 page"):
         with ui.column().classes("gap-0"):
             ui.label(title).classes("title").props('role="heading" aria-level="1"')
@@ -85,7 +89,8 @@ def page(project: Project, title: str) -> Iterator[ActionBar]:
         yield bar
 
 
-def _header(project: Project, title: str) -> None:
+def _header(project: Project, title: str) -> ui.label:
+    """Show the steps; return the line that says that the cell is simulated."""
     done = project.done()
     with ui.header().classes("head"):
         with ui.element("nav").props('aria-label="Steps"').classes("ways"):
@@ -98,8 +103,9 @@ def _header(project: Project, title: str) -> None:
                 for name in BESIDE:
                     with ui.element("li"):
                         _way(name, name == title)
-        said = ui.label(SIMULATED).classes("simulated").props('role="note"')
-        said.bind_visibility_from(project, "simulated")
+        simulated = ui.label(SIMULATED).classes("simulated").props('role="note"')
+        simulated.set_visibility(project.simulated)
+    return simulated
 
 
 def _way(name: str, here: bool, number: str = "", done: bool = False) -> None:

@@ -28,11 +28,11 @@ def add(project: Project) -> None:
     """Add the page."""
 
     @ui.page("/watch")
-    async def watch() -> None:
+    def watch() -> None:
         with page(project, "Watch") as bar:
             stored = [run.name for run in project.runs() if (run / "calibration.yaml").exists()]
             if stored:
-                await Watch(project, stored, bar).show()
+                ui.timer(0.05, Watch(project, stored, bar).show, once=True)
             else:
                 ui.label("There is no calibration in this folder to watch yet.")
                 bar.lead("Cell", "Go to step 1: cell")

@@ -159,13 +159,13 @@ def found_body(facts: Facts) -> FoundBody | None:
     None too where it cannot be read here, as one of another version: the rest of the page stands.
     """
     poses, found = _marker_poses(facts), {o.id: o for o in facts.log.observations()}
-    data = facts.header
-    if not (data.get("target") or {}).get("body") or not poses:
+    section = facts.section("target")
+    if not section.get("body") or not poses:
         return None
     capture, pose = next(iter(poses.items()))
     with suppress(FlangeyeError, ValueError), carried_files(facts.log.models) as folder:
-        target = TargetSection.model_validate(data["target"])
-        model = (data.get("robot") or {}).get("model")
+        target = TargetSection.model_validate(section)
+        model = facts.section("robot").get("model")
         robot = load_model("robots", model, folder) if model else None
         body = body_of(target, robot, folder).at(found[capture].joints)
         return FoundBody(body.name, capture, mapped(pose, body.edges(600)))

@@ -52,7 +52,13 @@ class Facts:
     @cached_property
     def header(self) -> dict[str, Any]:
         """The recipe as data; empty without one."""
-        return (parse_yaml(self.recipe, "recipe").data or {}) if self.recipe else {}
+        found = parse_yaml(self.recipe, "recipe").data if self.recipe else {}
+        return found if isinstance(found, dict) else {}
+
+    def section(self, name: str) -> dict[str, Any]:
+        """Return a section of the recipe; empty where a foreign log has none, or something else."""
+        found = self.header.get(name)
+        return found if isinstance(found, dict) else {}
 
     def model(self, kind: Literal["robots", "scanners"]) -> Any:
         """Return the recipe's arm or scanner, where its file is here: it may be another machine's.
@@ -60,7 +66,7 @@ class Facts:
         Args:
             kind: Of the models, as their folder is called.
         """
-        name = (self.header.get(kind.removesuffix("s")) or {}).get("model")
+        name = self.section(kind.removesuffix("s")).get("model")
         with suppress(FlangeyeError), carried_files(self.log.models) as folder:
             return load_model(kind, name, folder) if name else None
         return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import os
 import re
 from dataclasses import replace
@@ -204,6 +205,25 @@ def test_no_uncertainty_is_printed_as_zero(result: Result, run: Path, tmp_path: 
         assert re.fullmatch(r"below 0\.\d*[1-9]\d* mm", standard_text(row))
     text = write_certificate(run, tmp_path / "c.html", Conditions()).read_text()
     assert not re.search(r'<td class="n">0\.0+( mm|°)?</td>', text)
+
+
+@pytest.mark.parametrize(
+    ("recipe", "target"),
+    [
+        ("target: {body: gripper.stl, at: flange}", "a body by its mesh, gripper.stl"),
+        ("target: {body: robot}", "the arm's own links"),
+        ("feature: {sphere: {diameter: 38.1 mm}}", "a sphere of 38.1 mm"),
+        ("feature: {standard: ISO 9409-1-50-4-M6}", "ISO 9409-1-50-4-M6"),
+        ("robot: ur5", "the robot's flange"),
+        ("target: [1]\nfeature: 4\nrobot: [ur5]\nscanner: 3", "the robot's flange"),
+        ("cell: {targets: {left: arm, right: arm}}", "left, right"),
+    ],
+)
+def test_the_target_is_said_as_the_recipe_has_it(run: Path, recipe: str, target: str) -> None:
+    log = read_run(run / "run.mcap")
+    log.attachments["recipe.resolved.yaml"] = log.attachments["recipe.yaml"] = recipe.encode()
+    page = html.unescape(render(facts_of(log), Conditions()))
+    assert re.search(rf"Target\s*(<[^>]+>\s*)+{re.escape(target)}\s*<", page)
 
 
 def test_a_simulation_has_a_watermark_and_nothing_to_sign(run: Path, tmp_path: Path) -> None:

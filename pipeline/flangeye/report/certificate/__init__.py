@@ -29,6 +29,7 @@ from flangeye.report.summary import transform_text
 from flangeye.report.units import degrees, millimetres
 from flangeye.result import result_of_camera, status_of
 from flangeye.result.sections import expected_error
+from flangeye.types import PoseFeature
 
 LEAST_LENGTH = 1e-6
 """Smallest uncertainty that is printed as a number [m]; the page shows three decimals of a mm."""
@@ -116,7 +117,7 @@ def _content(facts: Facts, conditions: Conditions) -> dict[str, Any]:
         "shares": shares_of(result),
         "use": use_budget_of(result, scanner, conditions),
         "transform": transform_text(*next(iter(result.transforms.items()))),
-        "objects": _objects(facts.header, scanner),
+        "objects": _objects(facts, scanner),
         "conditions": conditions,
         "expected": expected_error(result),
         "used": sum(o.used for o in result.observations),
@@ -125,23 +126,37 @@ def _content(facts: Facts, conditions: Conditions) -> dict[str, Any]:
     }
 
 
-def _objects(header: dict[str, Any], scanner: ScannerModel | None) -> list[tuple[str, str]]:
+def _objects(facts: Facts, scanner: ScannerModel | None) -> list[tuple[str, str]]:
     """Return what was calibrated with what: name and value."""
-    robot, feature = header.get("robot") or {}, header.get("feature") or {}
     rows = {
-        "Robot": str(robot.get("model", "")),
+        "Robot": str(facts.section("robot").get("model", "")),
         "Scanner": f"{scanner.maker} {scanner.model}" if scanner else "",
-        "Target": str(feature.get("standard") or feature.get("sphere") or "the robot's flange"),
-        "Configuration": _configured(header),
-        "Serial": str(_serial(header.get("scanner") or {})),
+        "Target": _target(facts),
+        "Configuration": _configured(facts),
+        "Serial": str(_serial(facts.section("scanner"))),
     }
     return [(name, value) for name, value in rows.items() if value]
 
 
-def _configured(header: dict[str, Any]) -> str:
-    if "cell" in header:
+def _target(facts: Facts) -> str:
+    """Return what was seen, in words."""
+    if targets := facts.section("cell").get("targets"):
+        return ", ".join(map(str, targets)) if isinstance(targets, dict) else ""
+    if body := facts.section("target").get("body"):
+        return "the arm's own links" if body == "robot" else f"a body by its mesh, {body}"
+    if any(isinstance(seen.feature, PoseFeature) for seen in facts.log.observations()):
+        return "a marker"
+    feature = facts.section("feature")
+    sphere = feature.get("sphere")
+    if isinstance(sphere, dict):
+        return f"a sphere of {sphere.get('diameter')}"
+    return str(feature.get("standard") or "the robot's flange")
+
+
+def _configured(facts: Facts) -> str:
+    if facts.of_cell:
         return "a cell of several cameras, arms or targets, all calibrated at once"
-    return str((header.get("configuration") or {}).get("name", "eye-on-base"))
+    return str(facts.section("configuration").get("name", "eye-on-base"))
 
 
 def _serial(section: dict[str, Any]) -> str:
