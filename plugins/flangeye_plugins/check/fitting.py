@@ -180,13 +180,16 @@ def _first_scale(block: ErrorBlock) -> Floats:
 def _weights(block: ErrorBlock, scale: Floats) -> Floats:
     """(K, N) what each sample counts: 0 where it was not measured."""
     distances = block.squares / scale[:, None] ** 2
-    return np.nan_to_num((TAILS + block.dimension) / (TAILS + distances))
+    weights = np.asarray((TAILS + block.dimension) / (TAILS + distances))
+    weights[np.isnan(weights)] = 0.0
+    return weights
 
 
 def _scale(block: ErrorBlock, weights: Floats) -> Floats:
-    seen = np.isfinite(block.squares).sum(axis=-1)
-    total = (weights * np.nan_to_num(block.squares)).sum(axis=-1)
-    return np.asarray(np.sqrt(np.maximum(total / (block.dimension * seen), block.finest**2)))
+    seen = np.isfinite(block.squares)
+    total = (weights * np.where(seen, block.squares, 0.0)).sum(axis=-1)
+    count = block.dimension * seen.sum(axis=-1)
+    return np.asarray(np.sqrt(np.maximum(total / count, block.finest**2)))
 
 
 def _normal_equations(
