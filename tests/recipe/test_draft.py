@@ -722,3 +722,24 @@ def test_images_tell_where_the_camera_is(
     np.savez(folder / "camera.npz", mtx=matrix, dist=np.zeros(5))
     told = init("--target", "charuco: {columns: 8, rows: 6, square: 30 mm, marker: 22 mm}")
     assert f"where the camera is mounted (base or flange): {mounted} (fits to 0." in told
+
+
+@pytest.mark.parametrize(
+    "records",
+    [
+        [{"tcp": [k, 1, 2, 0, 0, 0, 1], "tag": [0, 0, 0, 0, 0, 0, 0]} for k in range(6)],
+        [{"tcp": [k, 10**400, 2, 0, 0, 0, 1], "tag": [0, 0, 1, 0, 0, 0, 1]} for k in range(6)],
+        {"tcp": [[]], "tag": []},
+    ],
+)
+def test_numbers_that_are_no_poses_end_in_one_line(folder: Path, records: Any) -> None:
+    (folder / "log.json").write_text(json.dumps(records))
+    with pytest.raises((RecipeError, StageError)):
+        init("--camera", "base")
+
+
+def test_a_heading_above_shorter_rows_ends_in_one_line(folder: Path) -> None:
+    rows = ["1,2,3", "4,5,6", "7,8,9", "1"]
+    (folder / "log.csv").write_text("x,y,z,image\n" + "\n".join(rows) + "\n")
+    with pytest.raises((RecipeError, StageError)):
+        init()

@@ -425,9 +425,9 @@ def counted_quaternion(f, j, a, s):
 
 
 def calibration(f, j, a, s):
-    lens = {"mtx": np.array([[900.0, 0, 640], [0, 900, 480], [0, 0, 1]]), "dist": np.zeros(5)}
+    matrix = np.array([[900.0, 0, 640], [0, 900, 480], [0, 0, 1]])
     places, turns = vector(s)[:, :3, None], vector(s)[:, 3:, None]
-    np.savez(f / "camera.npz", tvecs=places, rvecs=turns, **lens)
+    np.savez(f / "camera.npz", tvecs=places, rvecs=turns, mtx=matrix, dist=np.zeros(5))
     np.save(f / "gripper2base.npy", a)
 
 

@@ -195,7 +195,8 @@ def stacked(rows: Floats) -> Floats | None:
         if rows.ndim != 2 or rows.shape[1] != width or not len(rows) or len(rows) % lines:
             continue
         stack = rows.reshape(-1, lines, width)
-        gram = stack[:, :3, :3] @ stack[:, :3, :3].swapaxes(1, 2)
+        with np.errstate(all="ignore"):  # numbers that are no rotation's can be of any size
+            gram = stack[:, :3, :3] @ stack[:, :3, :3].swapaxes(1, 2)
         last = lines == 3 or bool((stack[:, 3] == [0, 0, 0, 1]).all())
         # By how much rows of a written rotation may differ from unit length, and from right angles
         if last and np.abs(gram - np.eye(3)).max() < 2e-3:

@@ -100,11 +100,12 @@ class Table:
         Raises:
             StageError: A cell is none; names its line.
         """
-        return np.array([self._row(row, columns, empty) for row in range(len(self.rows))])
+        rows = [self._row(row, columns, empty) for row in range(len(self.rows))]
+        return np.array(rows, dtype=np.float64)
 
     def texts(self, column: int) -> list[str]:
-        """Return the cells of a column."""
-        return [str(cells[column]) for _, cells in self.rows]
+        """Return the cells of a column; empty where a row is too short."""
+        return [str(cells[column]) if column < len(cells) else "" for _, cells in self.rows]
 
     def numbers_rows(self, column: int) -> bool:
         """Return whether the cells of a column are whole numbers, a different one in each row."""
@@ -134,8 +135,8 @@ class Table:
 
 def number_of(cell: Cell) -> float | None:
     """Return the number in a cell, with decimal point or comma, or Fortran's 1.5D+02; else None."""
-    if not isinstance(cell, str):
-        return cell
+    if not isinstance(cell, str):  # an integer of JSON can be larger than any float
+        return cell if isinstance(cell, float) or abs(cell) < 10**300 else None
     text = cell.replace(",", ".") if re.fullmatch(r"[-+]?\d+,\d+([eE][-+]?\d+)?", cell) else cell
     try:
         return float(re.sub(r"(?<=[\d.])[dD](?=[-+]?\d+$)", "e", text))
@@ -264,7 +265,7 @@ def _columns(where: Callable[[int], str], lists: Mapping[str, Any]) -> Rows:
         shape = _shape(value)
         if shape:
             array = np.asarray(value, dtype=np.float64)
-            if np.prod(shape[1:]) <= WIDEST:
+            if 0 < array.size <= len(array) * WIDEST:
                 flat = array.reshape(len(array), -1)
                 for i, index in enumerate(np.ndindex(*shape[1:])):
                     columns[".".join(filter(None, (name, *map(str, index))))] = flat[:, i].tolist()

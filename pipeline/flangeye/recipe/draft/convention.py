@@ -427,7 +427,7 @@ def _within_reach(arm: PoseColumns, robot: RobotModel | None) -> PoseColumns:
         return arm
     numbers = _numbers(arm)
     scale = LENGTHS[_unit(_length(numbers, arm))]
-    farthest = np.nanmax(np.linalg.norm(scale * numbers[:, :3], axis=1))
+    farthest = np.nanmax(np.linalg.norm(scale * numbers[:, :3], axis=1), initial=0.0)
     return as_joints(arm) if farthest > robot.length else arm
 
 
@@ -540,7 +540,8 @@ def _finite(numbers: Floats) -> Floats:
 def _reach(numbers: Floats, pose: PoseColumns) -> float:
     """Return the largest coordinate of positions."""
     of_matrix = slice(12, 15) if by_columns(_finite(numbers)) else [3, 7, 11]
-    return float(np.nanmax(np.abs(numbers[:, of_matrix if MATRIX in pose.rotations else slice(3)])))
+    places = numbers[:, of_matrix if MATRIX in pose.rotations else slice(3)]
+    return float(np.nanmax(np.abs(places), initial=0.0))
 
 
 def _ask_lengths(arm: PoseColumns, target: PoseColumns | None, questions: Questions) -> None:
