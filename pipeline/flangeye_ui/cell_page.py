@@ -299,36 +299,37 @@ class Import:
         self._form.choose(self._section, f"{self._words()[1]}.yaml")
 
 
-class Drafting:
-    """A command that writes a recipe, which then becomes the cell's."""
+async def draft(
+    project: Project, form: Form, words: Callable[[str], list[str]], stem: str
+) -> tuple[str, bool]:
+    """Let a command write a recipe, and take it over as the cell's.
 
-    def __init__(self, project: Project, form: Form) -> None:
-        self._project, self._form = project, form
+    Args:
+        project: Of the page.
+        form: Shows the recipe.
+        words: Gives the command's, for the name of the file that it is to write.
+        stem: That name; a free one is made of it.
 
-    def words(self, stem: str) -> list[str]:
-        """Return the command's words; the recipe's file is of this name, or a free one."""
-        raise NotImplementedError
-
-    async def draft(self, stem: str) -> tuple[str, bool]:
-        """Return what the command said, and whether there is a new recipe."""
-        folder = self._project.folder
-        names = (f"{stem}{i or ''}" for i in count())
-        name = next(n for n in names if not any(folder.glob(f"{n}.*")))
-        said = await asyncio.to_thread(self._project.run_command, self.words(name))
-        drafted = folder / f"{name}.yaml"
-        if not drafted.exists():
-            return said, False
-        self._project.text = drafted.read_text(encoding="utf-8")
-        drafted.unlink()
-        self._form.reload()
-        return said, True
+    Returns:
+        What the command said, and whether there is a new recipe.
+    """
+    names = (f"{stem}{i or ''}" for i in count())
+    name = next(n for n in names if not any(project.folder.glob(f"{n}.*")))
+    said = await asyncio.to_thread(project.run_command, words(name))
+    drafted = project.folder / f"{name}.yaml"
+    if not drafted.exists():
+        return said, False
+    project.text = drafted.read_text(encoding="utf-8")
+    drafted.unlink()
+    form.reload()
+    return said, True
 
 
-class Recordings(Drafting):
+class Recordings:
     """Scans and poses in a folder; ``flangeye init`` looks at them and writes the recipe."""
 
     def __init__(self, project: Project, form: Form) -> None:
-        super().__init__(project, form)
+        self._project, self._form = project, form
         self._given: dict[str, str] = {}
         self._folder = ui.input("Folder with scans and poses", placeholder="recordings/monday")
         self._folder.classes("w-full").props("stack-label").on("keydown.enter", self._look)
@@ -341,19 +342,19 @@ class Recordings(Drafting):
     def _another(self) -> None:
         self._given = {}
         self._told.clear()
-        self._line.text = self._project.command(*self.words("recorded"))
+        self._line.text = self._project.command(*self._words("recorded"))
         self._button.set_enabled(bool(self._folder.value))
 
-    def words(self, stem: str) -> list[str]:
+    def _words(self, stem: str) -> list[str]:
         """Return the command's words, with what was answered so far."""
         answers = [w for option, answer in self._given.items() for w in (option, answer)]
         return ["init", self._folder.value or "FOLDER", "--yes", *answers, "--out", f"{stem}.yaml"]
 
     async def _look(self) -> None:
         """Let the command look; show what it saw, and what it assumed in boxes to change."""
-        self._line.text = self._project.command(*self.words("recorded"))
+        self._line.text = self._project.command(*self._words("recorded"))
         self._button.disable()
-        said, drafted = await self.draft("recorded")
+        said, drafted = await draft(self._project, self._form, self._words, "recorded")
         self._button.enable()
         self._told.clear()
         lines = said.splitlines()[: -1 if drafted else None]
@@ -383,11 +384,11 @@ def _words_of(option: str) -> str:
     return option.removeprefix("--").replace("-", " ")
 
 
-class WhatRuns(Drafting):
+class WhatRuns:
     """Choose from what runs under ROS 2; ``flangeye init --ros2`` then writes the recipe."""
 
     def __init__(self, project: Project, form: Form) -> None:
-        super().__init__(project, form)
+        self._project, self._form = project, form
         self._chosen: dict[str, str] = {}
         button = ui.button("Look at what runs", on_click=self._look).props("outline no-caps")
         button.tooltip("Listens for a few seconds; publishes nothing and calls no service")
@@ -419,7 +420,7 @@ class WhatRuns(Drafting):
                 on_change=lambda e: self._choose("target", e.value),
             )
             printed.classes("w-full")
-            self._line = command_line(self._project.command(*self.words("running")))
+            self._line = command_line(self._project.command(*self._words("running")))
             ui.button("Write the recipe", on_click=self._draft).props("outline no-caps")
             self._told = ui.column().classes("w-full gap-0")
 
@@ -446,9 +447,9 @@ class WhatRuns(Drafting):
 
     def _choose(self, option: str, name: str) -> None:
         self._chosen[option] = name
-        self._line.text = self._project.command(*self.words("running"))
+        self._line.text = self._project.command(*self._words("running"))
 
-    def words(self, stem: str) -> list[str]:
+    def _words(self, stem: str) -> list[str]:
         """Return the command's words, with what was chosen."""
         given = {"scanner": self._project.section("scanner").get("model"), **self._chosen}
         options = [w for flag, answer in given.items() if answer for w in (f"--{flag}", answer)]
@@ -456,7 +457,7 @@ class WhatRuns(Drafting):
 
     async def _draft(self) -> None:
         """Let the command write a recipe of a new name, and take it over."""
-        said, drafted = await self.draft("running")
+        said, drafted = await draft(self._project, self._form, self._words, "running")
         self._told.clear()
         with self._told:
             if not drafted:

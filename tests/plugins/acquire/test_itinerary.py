@@ -80,12 +80,16 @@ def test_targets_that_were_seen_tell_the_plan_where_the_scanner_stands(measured,
     assert all(told[enough + 1 :])
 
 
-def test_what_does_not_fit_tells_the_plan_nothing() -> None:
+def poses_before_the_scanner(count):
     rng = np.random.default_rng(0)
-    poses = [
+    return [
         rigid(rotation_exp([np.pi, 0.0, 0.0]) @ rotation_exp(rng.normal(0, 0.2, 3)), place)
-        for place in rng.uniform([0.4, -0.2, 0.2], [0.7, 0.2, 0.5], (4, 3))
+        for place in rng.uniform([0.4, -0.2, 0.2], [0.7, 0.2, 0.5], (count, 3))
     ]
+
+
+def test_what_does_not_fit_tells_the_plan_nothing() -> None:
+    poses = poses_before_the_scanner(4)
     flanges = [seen(str(i), pose) for i, pose in enumerate(poses)]
     assert view_of(flanges) == pytest.approx(BASE_T_CAMERA, abs=1e-9)
     assert view_of(flanges[:2]) is None
@@ -93,11 +97,7 @@ def test_what_does_not_fit_tells_the_plan_nothing() -> None:
 
 
 def test_markers_tell_where_the_camera_stands_wherever_they_are_on_the_flange() -> None:
-    rng = np.random.default_rng(0)
-    poses = [
-        rigid(rotation_exp([np.pi, 0.0, 0.0]) @ rotation_exp(rng.normal(0, 0.2, 3)), place)
-        for place in rng.uniform([0.4, -0.2, 0.2], [0.7, 0.2, 0.5], (8, 3))
-    ]
+    poses = poses_before_the_scanner(8)
     markers = [marked(str(i), pose) for i, pose in enumerate(poses)]
     assert view_of(markers) == pytest.approx(BASE_T_CAMERA, abs=0.01)
     assert view_of(markers[:4]) is None
