@@ -186,18 +186,17 @@ SHOT = (160, 120)
 
 def picture_of(cloud: Floats, flange: Floats) -> str:
     """Return a scan as its camera sees it, near light and far dark, its flange blue: a data URL."""
-    shot = SHOT
-    image = np.zeros((shot[1], shot[0], 3), dtype=np.uint8)
+    image = np.zeros((SHOT[1], SHOT[0], 3), dtype=np.uint8)
     if len(cloud):
         rays = cloud[:, :2] / cloud[:, 2:]
         low, high = rays.min(axis=0), rays.max(axis=0)
-        scale = (np.array(shot) - 2) / max(float((high - low).max() / (shot[0] / shot[1])), 1e-9)
+        scale = (np.array(SHOT) - 2) / max(float((high - low).max() / (SHOT[0] / SHOT[1])), 1e-9)
         depth = np.argsort(-cloud[:, 2])
         shade = np.interp(cloud[:, 2], np.quantile(cloud[:, 2], [0.02, 0.98]), [235, 70])
         # Colour of the flange in it: blue, green, red.
         for points, colour in ((cloud[depth], shade[depth, None]), (flange, (239, 155, 60))):
             at = ((points[:, :2] / points[:, 2:] - low) * scale.min()).astype(int)
-            inside = ((at >= 0) & (at < np.array(shot) - 1)).all(axis=1)
+            inside = ((at >= 0) & (at < np.array(SHOT) - 1)).all(axis=1)
             values = np.broadcast_to(colour, (len(points), 3))[inside]
             for x, y in ((0, 0), (0, 1), (1, 0), (1, 1)):
                 image[at[inside, 1] + y, at[inside, 0] + x] = values
