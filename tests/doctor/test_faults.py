@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye.doctor import examine
+from flangeye.doctor import examine, mended_together
 from flangeye.doctor.diagnosis import Finding, RecordedSession
 from flangeye.errors import StageError
 from flangeye.maths.geometry import rigid, rotation_exp
@@ -515,6 +515,9 @@ def test_two_mistakes_are_both_named_and_one_line_mends_both() -> None:
     assert findings[-1].fix == (
         "- acquire.archive: {reader: {corrected: {reader: auto, robot: {scale: 0.001}}}, leave_out: ['004']}"
     )
+    wrong, known, steps = mended_together(findings)
+    assert wrong == f"{findings[0].what}; and {findings[1].what}"
+    assert known.count(" before, ") == 2 and steps == [findings[-1].fix]
 
 
 def hard(seed):
@@ -604,3 +607,49 @@ def test_a_check_never_changes_the_session() -> None:
     assert isinstance(session, RecordedSession)
     for name, array in before.items():
         assert np.array_equal(getattr(session, name), array)
+
+
+PARALLEL = [
+    ("pose convention", lambda poses: reread(poses, "wxyz", "xyzw")),
+    ("pose direction", inverted),
+    ("pose direction", transposed),
+    ("shifted poses", lambda poses: np.roll(poses, 1, axis=0)),
+    ("poses backwards", lambda poses: poses[::-1]),
+    ("mirrored axis", lambda poses: scaled(poses, np.array([1.0, -1.0, 1.0]))),
+]
+
+
+@pytest.mark.parametrize(("name", "mistake"), PARALLEL)
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_mistake_in_poses_that_hardly_turn_is_no_tool(name: Any, mistake: Any, seed: int) -> None:
+    """All normals stand alike off any axis there: that alone does not make a tool of it."""
+    session = session_of("flange", seed=seed, turn=2e-3)
+    elsewhere = rigid(rotation_exp(np.array([0.4, 2.0, 0.3])), np.zeros(3))  # of the base
+    session = session.with_poses(elsewhere @ session.poses)
+    assert named(session.with_poses(mistake(session.poses))) == [name]
+
+
+def test_a_turned_tool_of_poses_that_hardly_turn_asks_for_others() -> None:
+    session = session_of("flange", turn=2e-3)
+    tool = rigid(rotation_exp(np.array([0.3, 0.2, 0.5])), np.array([0.02, 0.0, 0.15]))
+    first, second = examine(session.with_poses(session.poses @ tool), CHECKS).findings
+    assert first.name == "tool offset" and first.fix.startswith("record again: without a tool")
+    assert second.name == "too little rotation"
+
+
+@pytest.mark.parametrize("factor", [0.98, 1.02])
+def test_a_scanner_whose_depths_are_wrong(factor: float) -> None:
+    session = session_of("flange")
+    along = np.array([1.0, 1.0, factor])
+    finding = only(replace(session, centres=session.centres * along))
+    assert finding.name == "scale" and finding.what.endswith("times as far along its axis")
+    ((x, y, z),) = [line["acquire.archive"]["stretch"] for line in finding.lines]
+    assert x == y == 1.0 and abs(z * factor - 1) < 2e-3
+
+
+def test_clouds_with_the_axes_of_opengl_are_turned_as_they_are() -> None:
+    """Both mirrors are found one after the other; the last line has both."""
+    session = session_of("flange").with_changes(stretch=[1.0, 1.0, -1.0])
+    flip = np.array([1.0, -1.0, 1.0])
+    finding = only(replace(session, centres=session.centres * flip, normals=session.normals * flip))
+    assert finding.lines[0]["acquire.archive"]["stretch"] == [1.0, -1.0, -1.0]

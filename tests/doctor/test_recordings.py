@@ -159,6 +159,32 @@ def test_mirrored_clouds(tmp_path: Path, sign: tuple[float, ...]) -> None:
     assert examine(open_session(archive, REGISTRY, mended), CHECKS).findings == ()
 
 
+def test_a_run_of_clouds_behind_the_scanner_leads_to_the_doctor(
+    tmp_path: Path, command: Callable[..., tuple[int, str, str]]
+) -> None:
+    """The axes of OpenGL: y up, z backward. The run says so, and what the doctor gives cures."""
+    path = recipe_names()["ur5_phoxi-m_sample"]
+    archive = tmp_path / "opengl"
+    shutil.copytree(load_recipe(path, REGISTRY).steps[0].params.path, archive)
+    for cloud in archive.glob("*.pcd"):
+        points = read_cloud(cloud)
+        write_cloud(cloud, PointCloud(points.frame, points.xyz * [1, -1, -1]), "m")
+    stated = yaml.safe_load(path.read_text())
+    stated["steps"][0]["acquire.archive"]["path"] = str(archive)
+    recipe = tmp_path / "opengl.yaml"
+    recipe.write_text(yaml.safe_dump(stated))
+    code, _, err = command("run", recipe, "--out", tmp_path / "run")
+    assert code == 2 and err.splitlines()[-1].startswith("error: no capture can be used")
+    assert "all points lie behind the scanner (z < 0)" in " ".join(err.split())
+    (asked,) = [line for line in err.splitlines() if line.endswith(" looks for a mistake")]
+    code, out, _ = command(*asked.removesuffix(" looks for a mistake").split()[1:], "--json")
+    step = yaml.safe_load(json.loads(out)["findings"][-1]["fix"])[0]
+    assert code == 1 and step["acquire.archive"]["stretch"] == [1.0, -1.0, -1.0]
+    stated["steps"][0] = step
+    recipe.write_text(yaml.safe_dump(stated))
+    assert command("run", recipe, "--out", tmp_path / "cured")[0] == 0
+
+
 def test_a_log_of_ours_needs_no_recipe(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -38,7 +38,7 @@ def test_centres_that_fit_in_a_mirror_only_are_refused() -> None:
     require_right_handed(centres + 100 * noise, tcps)  # noise alone is no mirror
     for axis in range(3):
         mirrored = (centres + noise) * np.where(np.arange(3) == axis, -1.0, 1.0)
-        with pytest.raises(StageError, match=r"only when mirrored \(0.1 mm rms instead of"):
+        with pytest.raises(CalibrationRefused, match=r"only when mirrored \(0.1 mm rms instead of"):
             require_right_handed(mirrored, tcps)
 
 
@@ -58,7 +58,9 @@ def test_a_mirror_is_named_that_leaves_a_tenth_of_more_than_a_millimetre(
     if not refused:
         require_right_handed(centres, saddle)
         return
-    with pytest.raises(StageError, match=f"mirrored \\({noise * 1e3:.1f} mm rms instead of "):
+    with pytest.raises(
+        CalibrationRefused, match=f"mirrored \\({noise * 1e3:.1f} mm rms instead of "
+    ):
         require_right_handed(centres, saddle)
 
 
@@ -142,7 +144,9 @@ def test_centres_are_about_as_far_apart_as_the_poses(ratio: float, taken: bool) 
     if taken:
         require_same_units(ratio * tcps + 5.0, tcps)
         return
-    with pytest.raises(StageError, match=f"the circle centres are {ratio:.4g} times as far apart"):
+    with pytest.raises(
+        CalibrationRefused, match=f"the circle centres are {ratio:.4g} times as far apart"
+    ):
         require_same_units(ratio * tcps + 5.0, tcps)
 
 

@@ -7,7 +7,14 @@ import pytest
 
 from flangeye import CalibrationRefused, StageError
 from flangeye.maths.geometry import rigid, rotation_exp, rotation_from_rpy
-from flangeye.types import CAMERA, TARGET, PoseFeature, Transform
+from flangeye.types import (
+    CAMERA,
+    TARGET,
+    PoseFeature,
+    Transform,
+    by_frame,
+    warnings_of,
+)
 from tests.estimation.cells import CONFIGURATIONS, Noise, errors, moves, session, solved
 
 MARKER = CONFIGURATIONS["eye-in-hand, marker"]
@@ -146,7 +153,7 @@ def test_a_mirrored_camera_is_recognised() -> None:
         )
         for o in made.observations
     ]
-    told = refusal(replace(made, observations=mirrored), StageError)
+    told = refusal(replace(made, observations=mirrored), CalibrationRefused)
     assert told.startswith("what the camera saw fits the poses only when mirrored (")
     assert told.endswith("flip one axis of the scanner's or the robot's frame")
 
@@ -228,3 +235,23 @@ def test_a_size_that_the_motion_does_not_tell_is_refused() -> None:
     told = refusal(made, target_size="unknown")
     assert told.startswith("the target's size is known to ")
     assert told.endswith("move the arm further between poses, or say target_size: known")
+
+
+@pytest.mark.parametrize(("tilt", "warned"), [(2e-3, True), (0.3, False)])
+def test_poses_that_hardly_turn_show_no_tool_and_that_is_said(tilt: float, warned: bool) -> None:
+    flange = CONFIGURATIONS["eye-on-base, flange"]
+    made = session(flange, np.random.default_rng(5), n=15, tilt=tilt, feature="normal")
+    warnings = warnings_of(solved(made).notes)
+    assert [w.startswith("the poses hardly turn the flange") for w in warnings] == [True] * warned
+
+
+def test_a_tool_that_the_poses_show_is_no_unseen_one() -> None:
+    """The misfit of a tool of 150 mm is not taken for noise in which it would not show."""
+    flange = CONFIGURATIONS["eye-on-base, flange"]
+    made = session(flange, np.random.default_rng(5), n=15, tilt=0.3, feature="normal")
+    tool = rigid(np.eye(3), np.array([0.0, 0.0, 0.15]))
+    tipped = [
+        replace(o, poses=by_frame(Transform("base", "flange", o.base_T_flange.matrix @ tool)))
+        for o in made.observations
+    ]
+    assert not warnings_of(solved(replace(made, observations=tipped)).notes)

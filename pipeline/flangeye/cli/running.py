@@ -166,7 +166,7 @@ def _explain_refusal(
     from rich.console import Console
 
     from flangeye.cli.summary import print_refusal
-    from flangeye.doctor import evidence_of
+    from flangeye.doctor import mended_together
     from flangeye.files.elsewhere import with_urls
 
     wrong = str(result.refused)
@@ -177,11 +177,9 @@ def _explain_refusal(
         print_refusal(Console(), wrong, known, [with_urls(again)])
         return
     doctor = with_urls(f"flangeye doctor {log}")
-    finding = _first_finding(log, registry, recipe)
-    if finding:
-        evidence = evidence_of(finding)
-        known = f"tried with that mended: {evidence}" if evidence else wrong
-        print_refusal(Console(), finding.what, known, finding.choices[:2] or [doctor])
+    if findings := _findings(log, registry, recipe):
+        named, tried, steps = mended_together(findings)
+        print_refusal(Console(), named, tried or wrong, steps[:2] or [doctor])
         return
     known = "no mistake was recognised in poses or scans"
     failed = [step for step, found in result.verifications.items() if not found.passed]
@@ -199,8 +197,8 @@ def _after_verification(recipe: Recipe) -> list[str]:
     return names[verified[-1] + 1 :] if verified else []
 
 
-def _first_finding(log: Path, registry: Registry, recipe: Recipe) -> Finding | None:
-    """Return the mistake that explains most of a run's errors, if the doctor finds one."""
+def _findings(log: Path, registry: Registry, recipe: Recipe) -> Sequence[Finding]:
+    """Return the mistakes that the doctor finds in a run, the one that explains most first."""
     from flangeye.cli.console import of_foreign
     from flangeye.doctor import examine, examine_cell, open_cell, open_session
 
@@ -215,8 +213,8 @@ def _first_finding(log: Path, registry: Registry, recipe: Recipe) -> Finding | N
             else:
                 found = examine(open_session(log, registry, recipe), checks, checked)
     except FlangeyeError:
-        return None  # the doctor needs more than this log has, and says so when it is asked
-    return next(iter(found.findings), None)
+        return ()  # the doctor needs more than this log has, and says so when it is asked
+    return found.findings
 
 
 def _recipe_of(
@@ -277,6 +275,7 @@ def _record(
     except FlangeyeError:
         if folder.log.exists():
             _say_how_to_go_on(recipe, called, folder, start)
+            _name_mistake(recipe, called, registry, folder, start)
         raise
     run = with_urls(quote(str(folder.path)))
     print_summary(Console(), result, run, len(registry.exports()), progress.said)
@@ -298,6 +297,25 @@ def _say_how_to_go_on(recipe: Recipe, called: str, folder: RunFolder, start: Sta
         lines.append(f"resume it: flangeye run --resume {folder.path}{moving}")
     for line in lines:
         say(with_urls(line), err=True)
+
+
+def _name_mistake(
+    recipe: Recipe, called: str, registry: Registry, folder: RunFolder, start: Start
+) -> None:
+    """Say what is wrong with recordings that a step could not use, or what would look for it."""
+    from rich.console import Console
+
+    from flangeye.cli.summary import print_refusal
+    from flangeye.doctor import mended_together
+    from flangeye.files.elsewhere import with_urls
+
+    if (read := start.archive.path or recipe.archive) is None:
+        return
+    if findings := _findings(folder.log, registry, recipe):
+        print_refusal(Console(stderr=True), *mended_together(findings))
+    else:
+        doctor = f"flangeye doctor {quote(str(read))} --recipe {quote(called)}"
+        say(with_urls(f"{doctor} looks for a mistake"), err=True)
 
 
 def _tls(ca: Path | None, cert: Path | None, key: Path | None) -> Tls | None:

@@ -104,7 +104,7 @@ def print_refusal(console: Console, wrong: str, known: str, next_steps: Collecti
     write(console, wrapped(console, f"What is wrong     {wrong}", 18), "red")
     write(console, wrapped(console, f"How it is known   {known}", 18))
     for name, step in zip(("Next step", "or"), next_steps, strict=False):
-        if step.startswith("- "):  # a line of the recipe, to paste as it stands
+        if step.startswith(("- ", "configuration:")):  # of the recipe, to paste as it stands
             write(console, f"{name:<15}   write in the recipe:\n  {step}")
         else:
             write(console, wrapped(console, f"{name:<15}   {step}", 18))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import takewhile
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,7 @@ __all__ = [
     "examine",
     "examine_cell",
     "fix_lines",
+    "mended_together",
     "open_cell",
     "open_session",
 ]
@@ -64,6 +67,20 @@ def evidence_of(finding: Finding) -> str:
     times = finding.gain / np.log(10.0)
     likelier = f"; 10^{times:.0f} times likelier" if 1 <= times < np.inf else ""
     return f"{error}{likelier}; by chance {_chance(finding.probability)}"
+
+
+def mended_together(findings: Sequence[Finding]) -> tuple[str, str, list[str]]:
+    """Return what is wrong, how it is known, and what to do, of findings that lines mend together.
+
+    Each was found with those before it mended, so the last line of a section mends them all. A
+    mistake that no line mends is told alone.
+    """
+    together = list(takewhile(lambda finding: finding.lines, findings)) or [findings[0]]
+    lines = {finding.fix.split(": ")[0]: finding.fix for finding in together}
+    wrong = "; and ".join(finding.what for finding in together)
+    known = "; then ".join(filter(None, map(evidence_of, together)))
+    steps = ["\n  ".join(sorted(lines.values()))] if len(lines) > 1 else together[-1].choices
+    return wrong, known and f"tried with that mended: {known}", steps
 
 
 def fix_lines(finding: Finding, indent: str) -> list[str]:

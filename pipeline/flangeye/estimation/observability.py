@@ -161,11 +161,11 @@ def require_same_units(centres: Floats, tcps: Floats) -> None:
     centres matter.
 
     Raises:
-        StageError: Says the ratio.
+        CalibrationRefused: Says the ratio.
     """
     ratio = _median_distance(centres) / _median_distance(tcps)
     if not 0.5 < ratio < 2.0:
-        raise StageError(
+        raise CalibrationRefused(
             f"the circle centres are {ratio:.4g} times as far apart as the robot's poses: "
             "both must be in metres, and each scan must belong to its pose"
         )
@@ -175,12 +175,12 @@ def require_right_handed(centres: Floats, tcps: Floats) -> None:
     """Refuse centres that only fit the TCPs in a mirror, both (N, 3).
 
     Raises:
-        StageError: Gives both residuals.
+        CalibrationRefused: Gives both residuals.
     """
     straight = _fit_rms(centres, tcps)
     mirrored = _fit_rms(centres * [1.0, 1.0, -1.0], tcps)
     if straight > 1e-3 and mirrored < 0.1 * straight:
-        raise StageError(
+        raise CalibrationRefused(
             f"the centres fit the poses only when mirrored ({mirrored * 1e3:.1f} mm rms instead "
             f"of {straight * 1e3:.1f} mm): flip one axis of the scanner's or the robot's frame"
         )

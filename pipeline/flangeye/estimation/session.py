@@ -13,7 +13,7 @@ from flangeye.estimation.effects.camera import camera_effects, drift_effects
 from flangeye.estimation.effects.clock import clock_effects, delayed
 from flangeye.estimation.effects.effect import Effect
 from flangeye.estimation.effects.scanner import scanner_effects
-from flangeye.estimation.effects.target import target_effects, wrong_offset
+from flangeye.estimation.effects.target import offset_shown_to, target_effects, wrong_offset
 from flangeye.estimation.estimate import Estimate, estimate, model_at
 from flangeye.estimation.graph import Carrier, Places, Problem
 from flangeye.estimation.mixed import TELLING, fit
@@ -31,7 +31,7 @@ from flangeye.maths.geometry import rigid
 from flangeye.maths.statistics import MISFIT, chi2_quantile
 from flangeye.models.cell import Cell
 from flangeye.models.scanners import ScannerModel
-from flangeye.types import Floats, Indices, Mask, Note, Observation, PoseFeature
+from flangeye.types import Floats, Indices, Mask, Note, Observation, PoseFeature, Warn
 
 CONFIGURED = (
     "that the recipe's configuration is the cell's (place: unknown, where nobody has measured "
@@ -114,10 +114,10 @@ def session_of(
     """Return the estimate from a cell's observations.
 
     Raises:
-        StageError: Too few sightings, all the same, those of a mirrored camera, or the pose of
-            something that moves is missing.
-        CalibrationRefused: Fewer than half of them agree, nothing gives a start, a clock is off
-            by more than was recorded, or a marker has another size than was said.
+        StageError: Too few sightings, all the same, or the pose of something that moves is missing.
+        CalibrationRefused: They fit only when mirrored, fewer than half of them agree, nothing
+            gives a start, a clock is off by more than was recorded, or a marker has another size
+            than was said.
     """
     problem = problem_of(observations, cell, asked.normals)
     _require_enough(problem)
@@ -229,7 +229,7 @@ def _require_right_handed(problem: Problem, places: Places) -> None:
     """Refuse sightings that agree far better in a mirror.
 
     Raises:
-        StageError: Gives both residuals.
+        CalibrationRefused: Gives both residuals.
     """
     flip, s = np.array([1.0, 1.0, -1.0]), problem.seen
     mirrored = replace(
@@ -244,7 +244,7 @@ def _require_right_handed(problem: Problem, places: Places) -> None:
     theirs = float(np.median(distances(mirrored, there)))
     # A tenth of the residuals: the mirrored fit is the right one
     if theirs < 0.1**2 * ours:
-        raise StageError(
+        raise CalibrationRefused(
             "what the camera saw fits the poses only when mirrored "
             f"({np.sqrt(theirs) * 1e3:.1f} mm instead of {np.sqrt(ours) * 1e3:.1f} mm): flip one "
             "axis of the scanner's or the robot's frame"
@@ -469,6 +469,15 @@ def _size_far_off(session: Session) -> float | None:
     return factor if better > chi2_quantile(1 - MISFIT, 1) else None
 
 
+def _unseen_tool(known: float) -> Warn:
+    told = f"known to {known * 1e3:.0f} mm only" if known < 1 else "not known at all"
+    return Warn(
+        "the poses hardly turn the flange, so a tool set in the controller would not show: an "
+        f"offset of the flange from the reported poses is {told}",
+        "see that the controller's tool is zero, or add poses turned by 20 deg about two axes",
+    )
+
+
 def _with_offset(session: Session) -> Session:
     """Return the session with the circle where the poses show it, if it is not where was said.
 
@@ -477,8 +486,12 @@ def _with_offset(session: Session) -> Session:
     """
     found = session.found
     wrong = wrong_offset(found.problem, found.effects)
-    if wrong is None or not found.outgrown("offset"):
+    if wrong is None:
         return session
+    if not found.outgrown("offset"):
+        known = offset_shown_to(found.problem.where(found.inliers), found.places)
+        # The shortest tools are five times as long [m]
+        return session.noted(_unseen_tool(known)) if known > 0.01 else session
     again = estimate(found.problem, found.places, wrong, found.inliers)
     _, mean, covariance = again.numbers("offset")[0]
     if mean @ np.linalg.solve(covariance, mean) < chi2_quantile(1 - MISFIT, 3):

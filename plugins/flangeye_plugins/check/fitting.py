@@ -491,6 +491,25 @@ def _spread(session: RecordedSession) -> float:
     return max(float(np.linalg.norm(side.std(axis=0))) for side in sides)
 
 
+def covariance_of(information: Floats) -> Floats:
+    """Return the inverse; directions without information get a variance beyond all limits."""
+    size = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    scaled = information / np.outer(size, size) + 1e-13 * np.eye(len(size))
+    return np.asarray(np.linalg.inv(scaled) / np.outer(size, size))
+
+
+def offset_left_open(session: RecordedSession) -> float:
+    """Return how well the poses show a constant offset of the target from the flange [m].
+
+    Returns:
+        One sigma along the direction that they show least; 0 where that is below a millimetre, so
+        that a tool set in the controller would show.
+    """
+    free = fit(equations_of(session).with_free_place())
+    known = float(np.sqrt(np.linalg.eigvalsh(covariance_of(free.information[0])[6:9, 6:9])[-1]))
+    return known if known >= 1e-3 else 0.0
+
+
 def size_by_chance(session: RecordedSession) -> float:
     """Return the probability that errors of the arm show so wrong a marker's size by chance."""
     one_arm = session.seconds is None and session.links is None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -18,6 +17,7 @@ from flangeye.doctor.diagnosis import (
     NotApplicable,
     RecordedSession,
 )
+from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.maths.pose_corrections import delaying, shifted, without_tool
 from flangeye.maths.streams import later, pose_at
 from flangeye.types import Floats, Indices, Mask
@@ -33,6 +33,7 @@ from flangeye_plugins.check.fitting import (
     helps,
     moved_helps,
     narrowed,
+    offset_left_open,
 )
 
 Change = Callable[[Floats], tuple[Floats, Mask]]
@@ -344,63 +345,75 @@ def _moved_finding(session: RecordedSession, evidence: Significance, start: int)
 def tool(session: RecordedSession) -> Findings:
     """The poses are those of a tool (TCP): a constant offset and turn in the flange frame."""
     _require_known_place(session)
-    centres = replace(session, normals=np.full_like(session.normals, np.nan))
-    turn = _turned(session, fit(equations_of(centres).with_free_place()))
-    read = centres if turn else session
-    null, found = fit_of(read), fit(equations_of(read).with_free_place())
-    offset = session.place[:3, :3] @ (found.unknowns.place[0, 0] - session.places[0])
+    turn, read = _turned(session)
+    known, free = fit(equations_of(read)), fit(equations_of(read).with_free_place())
+    offset = read.place[:3, :3] @ (free.unknowns.place[0, 0] - read.places[0])
     length = float(np.linalg.norm(offset))
-    evidence = best_of(null, found, 3)
-    freedom = float(null.count[0]) - found.parameters
-    ratio = float(found.likelihood[0] - null.likelihood[0])
+    evidence = best_of(known, free, 3)
+    freedom = float(known.count[0]) - free.parameters
+    ratio = float(free.likelihood[0] - known.likelihood[0])
     # A seen circle further from where the arm has it is a mistake [m]
-    p = exceedance(ratio, float(null.count[0]), 3, freedom, length / 1e-3)
-    known = p < 1 and _known(found, offset)
-    if not known and (not turn or session.seconds is not None):
-        return
-    listed = [f"{value * 1e3:.2f} mm" for value in offset + 0.0]
-    told = [f"{length * 1e3:.1f} mm from where the arm carries it"] if known else []
+    p = exceedance(ratio, float(known.count[0]), 3, freedom, length / 1e-3)
+    shows = p < 1 and _known(free, offset)
+    told = [f"{length * 1e3:.1f} mm from where the arm carries it"] if shows else []
     told += [f"turned by {np.degrees(turn):.0f} deg from the flange's axis"] if turn else []
+    if not told or (session.seconds is not None and not shows):
+        return
     what = (
         f"the seen target is {' and '.join(told)}, constantly: the poses are probably those of a "
         "tool set in the controller, or it is mounted there, which configuration: {place: "
         "unknown} says"
     )
-    evidence = evidence._replace(probability=p)
     if turn and session.seconds is None:
-        # The same turn in all samples is no chance, and no misread rotation
-        evidence = evidence._replace(probability=0.0, gain=math.inf)
-        free = replace(centres, places=np.full_like(session.places, np.nan))
+        null = fit_of(session)
+        # An axis has two parameters more. It may point anywhere and is known as well as normals
+        # tell: a misread rotation that explains the turn as exactly is likelier by the share
+        evidence = best_of(null, free, 5) if shows else best_of(null, known, 2)
+        share = float(known.scales[0, 1]) ** 2 / session.seen.sum()
+        gain = evidence.gain + float(np.log(null.count[0] * share))
+        evidence = evidence._replace(gain=gain)
+        unknown = replace(read, places=np.full_like(session.places, np.nan), again=None)
         fix = "configuration: {name: eye-on-base, place: unknown}"
-        yield evidence.finding("tool offset", what, free, fix)
+        if offset_left_open(read):
+            fix = (
+                "record again: without a tool in the controller, or turn the flange by 20 deg and "
+                "more about two axes between samples"
+            )
+        yield evidence.finding("tool offset", what, unknown, fix)
         return
     corrected_session = session.corrected(
         lambda poses: without_tool(poses, -offset),
         "both" if session.seconds is None else "second",
-        offset=listed,
+        offset=[f"{value * 1e3:.2f} mm" for value in offset + 0.0],
     )
-    yield evidence.finding("tool offset", what, corrected_session)
+    yield evidence._replace(probability=p).finding("tool offset", what, corrected_session)
 
 
-def _turned(session: RecordedSession, centres: VariantFits) -> float:
-    """Return by how much all normals alike are off the target's axis [rad]; 0 where they are not.
+def _turned(session: RecordedSession) -> tuple[float, RecordedSession]:
+    """Return by how much all normals alike are off the target's axis [rad], and it turned so.
 
-    Args:
-        session: The samples.
-        centres: The calibration by their centres.
+    Returns:
+        0 and the session as it is where they are not.
     """
     seen = np.isfinite(session.normals[:, 0])
     if not seen.any() or session.links is not None:
-        return 0.0
-    turns = equations_of(session).carried(centres.unknowns.other)[0, seen, :3, :3]
-    there = session.normals[seen] @ centres.unknowns.rotation[0].T
+        return 0.0, session
+    centres = replace(session, normals=np.full_like(session.normals, np.nan))
+    fitted = fit(equations_of(centres).with_free_place())
+    turns = equations_of(session).carried(fitted.unknowns.other)[0, seen, :3, :3]
+    there = session.normals[seen] @ fitted.unknowns.rotation[0].T
     own = (turns.swapaxes(-1, -2) @ there[..., None])[..., 0]
     axis = own.mean(axis=0) / np.linalg.norm(own.mean(axis=0))
     scatter = float(np.sqrt(np.median(np.sum((own - axis) ** 2, axis=1))))
     # Where z points inwards, it is the frame's convention and no turn
-    turn = float(np.arccos(np.clip(abs(axis[2]), 0.0, 1.0)))
+    axis *= np.sign(axis[2])
+    turn = float(np.arccos(np.clip(axis[2], 0.0, 1.0)))
     # A face is cut squarer than that; and known to a tenth of it
-    return turn if turn > max(np.radians(2.0), 10 * scatter) else 0.0
+    if not turn > max(np.radians(2.0), 10 * scatter):
+        return 0.0, session
+    about = np.cross([0.0, 0.0, 1.0], axis)
+    tilted = rigid(rotation_exp(turn * about / np.linalg.norm(about)), np.zeros(3))
+    return turn, replace(session, place=session.place @ tilted)
 
 
 def _require_known_place(session: RecordedSession) -> None:

@@ -16,11 +16,13 @@ from flangeye_plugins.check.fitting import (
     Significance,
     VariantFits,
     best_of,
+    covariance_of,
     exceedance,
     fit,
     fit_of,
     log_of,
     negligible,
+    offset_left_open,
 )
 
 FLIPS: dict[str, Floats] = {
@@ -226,19 +228,12 @@ def _uncertainty(session: RecordedSession, null: VariantFits) -> tuple[float, fl
     # Larger ones [m, rad] are a mistake's or an outlier's, and no motion makes up for them
     errors = np.array([3e-3, np.radians(1.0)])
     share = min(1.0, float((errors[: len(scales)] / scales).min()))
-    covariance = share**2 * _covariance(null.information[0])[:6, :6]
+    covariance = share**2 * covariance_of(null.information[0])[:6, :6]
     work = null.unknowns.rotation[0] @ np.nanmean(session.centres, axis=0)
     at_work = np.concatenate([-hat(work), np.eye(3)], axis=1)
     turn = np.linalg.eigvalsh(covariance[:3, :3])[-1]
     shift = np.linalg.eigvalsh(at_work @ covariance @ at_work.T)[-1]
     return float(np.sqrt(max(turn, 0.0))), float(np.sqrt(max(shift, 0.0)))
-
-
-def _covariance(information: Floats) -> Floats:
-    """Return the inverse; directions without information get a variance beyond all limits."""
-    size = np.sqrt(np.maximum(np.diag(information), 1e-300))
-    scaled = information / np.outer(size, size) + 1e-13 * np.eye(len(size))
-    return np.asarray(np.linalg.inv(scaled) / np.outer(size, size))
 
 
 def _rotations(session: RecordedSession) -> tuple[float, float]:
@@ -263,10 +258,7 @@ def _offset_unknown(session: RecordedSession) -> Findings:
     """Note where a constant offset of the target could not be seen."""
     if not np.isfinite(session.places).all() or session.carried == "camera":
         return
-    free = fit(equations_of(session).with_free_place())
-    known = float(np.sqrt(np.linalg.eigvalsh(_covariance(free.information[0])[6:9, 6:9])[-1]))
-    # An offset of the target that would be known less well cannot be told [m]
-    if known < 1e-3:
+    if not (known := offset_left_open(session)):
         return
     spread, axes = _rotations(session)
     told = f"{known * 1e3:.2g} mm" if known < 1 else "nothing"

@@ -278,8 +278,10 @@ def axes(session: RecordedSession) -> Findings:
 def mirrored(session: RecordedSession) -> Findings:
     """Positions have an axis with the wrong sign, or two columns that stand for each other."""
     session.require_samples()
-    # Where each axis would do, one that leaves targets before the camera
-    axes = sorted(range(3), key=lambda at: (at == 2) == (np.nanmedian(session.centres[:, 2]) > 0))
+    # Where each axis would do, one that leaves targets before the camera; beside z, y (OpenGL)
+    before = bool(np.nanmedian(session.centres[:, 2]) > 0)
+    turned = session.changes.get("stretch", (1.0, 1.0, 1.0))[2] < 0
+    axes = sorted(range(3), key=lambda at: ((at == 2) == before, (at == 1) != turned))
     tried = [
         (*_negated("target", "xyz"[axis]), session.stretched(np.where(np.arange(3) == axis, -1, 1)))
         for axis in axes

@@ -216,8 +216,8 @@ def size(session: RecordedSession) -> Findings:
     if not marker and not np.isfinite(session.places).all():
         raise NotApplicable("neither a marker's pose was measured, nor where the target stands")
     null = fit_of(session)
-    factors = {kind: _factor(session, null, along) for kind, along in ALONG.items()}
-    factors = factors if marker else {"size": factors["size"]}
+    kinds = [*ALONG] if marker or session.acquire == "acquire.archive" else ["size"]
+    factors = {kind: _factor(session, null, ALONG[kind]) for kind in kinds}
     tried = [_stretched(session, kind, k) for kind, k in factors.items() if 0.2 < k < 5]
     if not tried:
         return
@@ -233,33 +233,40 @@ def size(session: RecordedSession) -> Findings:
     if p == 1 or not explained(corrected_session):
         return
     evidence = evidence._replace(probability=min(1.0, len(tried) * p))
+    if marker:
+        what, fix = _wrong_marker(session, kind, factor)
+        name = "focal length" if kind == "focal" else "target size"
+        yield evidence.finding(name, what, corrected_session, fix)
+    # Poses between which an arm's motion was interpolated are a little too near each other
+    elif evidence.after.position <= HELPS**2 * evidence.before.position:
+        what = f"what the scanner measures fits the arm's motion if it is {factor:.4f} times as far"
+        what += " along its axis" if kind == "focal" else ""
+        fix = session.stretched(1 + (factor - 1) * ALONG[kind]).step()
+        yield evidence.finding("scale", what, corrected_session, fix)
+
+
+def _wrong_marker(session: RecordedSession, kind: str, factor: float) -> tuple[str, str]:
+    """Return what is wrong with a marker or its camera, and what to do."""
     calibrate = _calibrate_camera(session)
     focal = f"the camera's focal length is {factor:.4f} times as long as its calibration says"
     if kind == "focal":
-        yield evidence.finding("focal length", focal, corrected_session, calibrate)
-    elif not marker:
-        # Poses between which an arm's motion was interpolated are a little too near each other
-        if evidence.after.position > HELPS**2 * evidence.before.position:
-            return
-        what = f"what the scanner measures fits the arm's motion if it is {factor:.4f} times as far"
-        fix = session.stretched(factor * np.ones(3)).step()
-        yield evidence.finding("scale", what, corrected_session, fix)
-    else:
-        what = f"the marker is {factor:.4f} times as large as the recipe says"
-        fix = f"measure it after printing: its lengths in the fit step times {factor:.4f}"
-        if session.acquire == "acquire.samples":
-            fix = session.read_with(target={"scale": float(f"{factor:.4f}")}).step()
-        elif session.acquire == "acquire.images":  # where the target stays near the camera's axis
-            what = f"{what}, or {focal}"
-            fix = f"{fix}; where the print is as the recipe says: {calibrate}"
-        yield evidence.finding("target size", what, corrected_session, fix)
+        return focal, calibrate
+    what = f"the marker is {factor:.4f} times as large as the recipe says"
+    if session.acquire == "acquire.samples":
+        return what, session.read_with(target={"scale": float(f"{factor:.4f}")}).step()
+    fix = f"measure it after printing: its lengths in the fit step times {factor:.4f}"
+    if session.acquire == "acquire.images":  # where the target stays near the camera's axis
+        return f"{what}, or {focal}", f"{fix}; where the print is as the recipe says: {calibrate}"
+    return what, fix
 
 
 def _stretched(
     session: RecordedSession, kind: str, factor: float
 ) -> tuple[str, float, RecordedSession]:
     scale = 1 + (factor - 1) * ALONG[kind]
-    return kind, factor, replace(session, centres=session.centres * scale)
+    normals = session.normals / scale
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    return kind, factor, replace(session, centres=session.centres * scale, normals=normals)
 
 
 def _factor(session: RecordedSession, null: VariantFits, along: Floats) -> float:

@@ -288,11 +288,11 @@ def segment_flange(
         StageError: The cloud is in millimetres, or otherwise a thousand times off.
     """
     from flangeye_plugins.segment.discs import DiscLimits, crop
-    from flangeye_plugins.segment.grid import coarse_view
+    from flangeye_plugins.segment.grid import coarse_view, nothing_before_scanner
 
     view = coarse_view(capture.cloud.xyz, flange.rim / 15)
     if view is None:
-        return Rejected("no finite point")
+        return Rejected(nothing_before_scanner(capture.cloud.xyz))
     check_scale(view.xyz, capture.id)
     inside = _pass_through(view, params)
     if inside is None:

@@ -98,6 +98,13 @@ def range_image(points: Singles, pitch: float) -> Grid | None:
     return project(drawn if len(drawn) else few, angle)  # all of them may be at one place
 
 
+def nothing_before_scanner(points: Singles) -> str:
+    """Return why a scan without a :func:`coarse_view` has none."""
+    if np.isfinite(points).all(axis=-1).any():
+        return "all points lie behind the scanner (z < 0): its z must point forward, y down"
+    return "no finite point"
+
+
 def _before_scanner(points: Singles) -> Singles:
     """Return the points that can have been seen."""
     # The sum of the three is finite when they are; a point behind the scanner is none.

@@ -10,7 +10,7 @@ from flangeye import stage
 from flangeye.models.targets import Sphere
 from flangeye.types import Capture, FlangeCloud, Floats, Indices, PointCloud, Rejected, Singles
 from flangeye_plugins.segment.discs import in_box
-from flangeye_plugins.segment.grid import Grid, coarse_view
+from flangeye_plugins.segment.grid import Grid, coarse_view, nothing_before_scanner
 from flangeye_plugins.segment.scale import RangeParams, check_scale
 
 CANDIDATES = 6
@@ -68,7 +68,7 @@ def segment_sphere(
         # Coarse points across the sphere.
         view = coarse_view(capture.cloud.xyz, 2 * radius / 16)
         if view is None:
-            return Rejected("no finite point")
+            return Rejected(nothing_before_scanner(capture.cloud.xyz))
         check_scale(view.xyz, capture.id)
         view = _between(view, params.near, params.far)
         found += find_spheres(view, radius, params.tolerance, sized=sphere.size is not None)

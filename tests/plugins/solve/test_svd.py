@@ -151,7 +151,7 @@ def test_centres_in_line_are_refused_with_the_motion_that_is_missing() -> None:
 
 def test_millimetres_beside_metres_are_refused() -> None:
     tcps = cloud(2)
-    with pytest.raises(StageError) as refused:
+    with pytest.raises(CalibrationRefused) as refused:
         solve(1000 * to_camera(tcps), tcps)
     assert str(refused.value) == (
         "the circle centres are 1000 times as far apart as the robot's poses: "
@@ -161,7 +161,7 @@ def test_millimetres_beside_metres_are_refused() -> None:
 
 def test_a_mirrored_scanner_frame_is_refused() -> None:
     tcps = cloud(3)
-    with pytest.raises(StageError) as refused:
+    with pytest.raises(CalibrationRefused) as refused:
         solve(to_camera(tcps) * [-1, 1, 1], tcps)
     assert str(refused.value).startswith("the centres fit the poses only when mirrored (0.0 mm rms")
 

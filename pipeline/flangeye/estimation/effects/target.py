@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from flangeye.estimation.effects.effect import Block, Effect
-from flangeye.estimation.graph import Linear, Problem
+from flangeye.estimation.graph import Linear, Places, Problem
 from flangeye.types import Floats
 
 
@@ -42,6 +42,22 @@ def wrong_offset(problem: Problem, effects: Sequence[Effect]) -> list[Effect] | 
         replace(e, size=2e-3, factor=3.0) if e.kind == "offset" else e
         for e in effects
     ]
+
+
+def offset_shown_to(problem: Problem, places: Places) -> float:
+    """Return how well the poses show where a flange's circle is in its flange [m], one sigma.
+
+    A constant offset d is at R_i d in pose i. Only where the R_i differ does it not pass for a
+    shift of the camera.
+    """
+    linear, shown = problem.linearised(places), np.zeros((3, 3))
+    for pair in np.unique(problem.seen.pairs):
+        turns = linear.turns[problem.seen.pairs == pair]
+        turned = turns - turns.mean(axis=0)
+        shown += np.einsum("nij,nik->jk", turned, turned)
+    # Larger errors [m] are a mistake's: of the arm and the scanner they say nothing
+    error = min(float(np.sqrt((linear.residuals[:, 3:] ** 2).mean())), 1e-3)
+    return error / float(np.sqrt(max(np.linalg.eigvalsh(shown)[0], 1e-12)))
 
 
 def _tilt(circles: list[int]) -> Block:
