@@ -105,7 +105,7 @@ def test_a_recipe_exports_wherever_the_step_stands(exporting: Any, tmp_path: Pat
         (
             TOY_RECIPE,
             ("--to", "kuka", "--set", "number=x"),
-            "--set number: must be a valid integer, unable to parse string as an integer, not 'x'",
+            "--set number: must be a whole number, not 'x'",
         ),
         (
             TOY_RECIPE,

@@ -263,6 +263,7 @@ def _record(
     from rich.console import Console
 
     from flangeye.cli.summary import RunProgress, print_summary
+    from flangeye.errors import StageError
     from flangeye.files.elsewhere import with_urls
     from flangeye.run.session import record_run
 
@@ -272,10 +273,11 @@ def _record(
         with RunProgress(Console(stderr=True), labels, opening) as progress:
             registry.hooks.register(progress)
             result = record_run(recipe, registry, folder, start)
-    except FlangeyeError:
+    except FlangeyeError as error:
         if folder.log.exists():
             _say_how_to_go_on(recipe, called, folder, start)
-            _name_mistake(recipe, called, registry, folder, start)
+            if isinstance(error, StageError):
+                _name_mistake(recipe, called, registry, folder, start)
         raise
     run = with_urls(quote(str(folder.path)))
     print_summary(Console(), result, run, len(registry.exports()), progress.said)

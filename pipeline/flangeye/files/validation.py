@@ -32,8 +32,13 @@ def sentence(details: Any, model: type[Any], given: Any) -> str:
         is_now = {type(None): "holds nothing", list: "is a list", str: "is a text"}
         what = is_now.get(type(given), f"is {given}")
         return f"{what}; it must be a mapping with the keys {fields}"
+    kind = str(details["type"]).partition("_")[0]
+    kinds = {"tuple": "a list", "list": "a list", "int": "a whole number", "float": "a number"}
+    kinds |= {"bool": "true or false", "string": "a text"}
     message = str(details["msg"]).removeprefix("Value error, ")
     message = message.replace("Input should be", "must be")
+    if kind in kinds and details["type"].endswith(("_type", "_parsing", "_float")):
+        message = f"must be {kinds[kind]}"
     if details["type"].startswith(("greater", "less")) and isinstance(given, str):
         message += " in SI units"
     if isinstance(given, (str, int, float)) and str(given) not in message:

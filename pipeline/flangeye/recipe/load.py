@@ -282,9 +282,14 @@ class _Checker:
     def _explain(
         self, at: tuple[Hashable, ...], errors: Iterable[Any], model: type[BaseModel]
     ) -> None:
+        said: dict[tuple[Hashable, ...], list[str]] = {}
         for details in errors:
-            keys = (*at, *details["loc"])
-            self.complain(keys, sentence(details, model, self._given(keys, details["input"])))
+            # Where a value may be of several types, each is named in brackets and has its error
+            keys = (*at, *(key for key in details["loc"] if "[" not in str(key)))
+            told = sentence(details, model, self._given(keys, details["input"]))
+            said.setdefault(keys, []).append(told)
+        for keys, sentences in said.items():
+            self.complain(keys, ", or ".join(sentences))
 
     def _given(self, keys: Sequence[Hashable], parsed: Any) -> Any:
         """Return what the person wrote at ``keys``, before any of it was converted."""

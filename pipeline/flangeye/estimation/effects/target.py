@@ -49,15 +49,18 @@ def offset_shown_to(problem: Problem, places: Places) -> float:
 
     A constant offset d is at R_i d in pose i. Only where the R_i differ does it not pass for a
     shift of the camera.
+
+    Returns:
+        0 where a mistake hides it.
     """
     linear, shown = problem.linearised(places), np.zeros((3, 3))
     for pair in np.unique(problem.seen.pairs):
         turns = linear.turns[problem.seen.pairs == pair]
         turned = turns - turns.mean(axis=0)
         shown += np.einsum("nij,nik->jk", turned, turned)
+    error = float(np.sqrt((linear.residuals[:, 3:] ** 2).mean()))
     # Larger errors [m] are a mistake's: of the arm and the scanner they say nothing
-    error = min(float(np.sqrt((linear.residuals[:, 3:] ** 2).mean())), 1e-3)
-    return error / float(np.sqrt(max(np.linalg.eigvalsh(shown)[0], 1e-12)))
+    return error / float(np.sqrt(max(np.linalg.eigvalsh(shown)[0], 1e-12))) if error < 5e-3 else 0.0
 
 
 def _tilt(circles: list[int]) -> Block:

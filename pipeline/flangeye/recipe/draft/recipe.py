@@ -289,6 +289,16 @@ def _target(answer: str) -> dict[str, Any]:
     known = ("flange", "body", "sphere", "charuco", "checkerboard", "circles", "aruco")
     if not isinstance(target, dict) or len(target) != 1 or next(iter(target)) not in known:
         raise RecipeError(f"--target {answer}: is none of {', '.join(known)}, with parameters")
+    if target.get("body") == {}:
+        raise RecipeError("--target body: needs its mesh, as in --target 'body: gripper.stl'")
+    sphere = target.get("sphere")
+    if sphere is not None and not (
+        isinstance(sphere, dict) and {"diameter", "centre"} <= {*sphere}
+    ):
+        raise RecipeError(
+            f"--target {answer}: needs its diameter and its centre in the flange's frame, as in "
+            "--target 'sphere: {diameter: 38.1 mm, centre: [0 mm, 0 mm, 60 mm]}'"
+        )
     return target
 
 
