@@ -189,6 +189,11 @@ def _not_shown(
     name, found = next(iter(missed.items()))
     seen = board_seen(first.pixels)
     instead = f"it shows {seen.what}: write fit.{seen.fit}" if seen else found.reason
+    mirrored = Image(np.ascontiguousarray(first.pixels[:, ::-1]), first.camera_matrix)
+    # Squares alone look the same in a mirror
+    marked = board.kind in ("charuco", "marker")
+    if marked and isinstance(find_corners(board, mirrored), Corners):
+        instead = "it shows the board in a mirror: switch off that the driver flips images"
     what = board.kind if board.kind == "marker" else f"{board.kind}, {board.columns} x {board.rows}"
     return StageError(
         f"none of {len(missed)} of the {count} images, spread over all, shows the board ({what}); "

@@ -115,6 +115,13 @@ def test_a_board_that_is_in_no_image_ends_early_and_the_one_that_is_seen_is_name
     assert (len(looked), sum(looked)) == (10, 2)
 
 
+def test_a_board_in_a_mirror_is_named_as_that() -> None:
+    board = Board("charuco", 7, 5, 0.03, 0.022)
+    seen = {name: pixels[:, ::-1] for name, pixels in images(board, 9, 0.2).items()}
+    with pytest.raises(StageError, match="0: it shows the board in a mirror: switch off that"):
+        lens_of(seen, board)
+
+
 def test_images_without_a_board_are_left_out_and_named(views: Any) -> None:
     blank = np.full_like(views["0"], 90)
     lens = lens_of({**views, "blank": blank}, BOARD)
