@@ -50,6 +50,7 @@ from flangeye.types import (
     Pair,
     Transform,
     TransformEstimate,
+    warnings_of,
 )
 
 
@@ -186,7 +187,7 @@ def calibrate_at(
 def with_expected_error(
     calibration: HandEye, cell: Cell, scanner: ScannerModel | None, work: Box | None
 ) -> HandEye:
-    """Return a calibration by any method with its expected error at the work.
+    """Return a calibration by any method with its expected error at the work, and warnings.
 
     As it was, where the model refuses its observations or has unknowns that the method leaves out.
     """
@@ -195,7 +196,8 @@ def with_expected_error(
     with suppress(FlangeyeError, KeyError):
         places = {name: found[cell.name_of(name)] for name in cell.unknown_frames}
         answer = calibrate_at(places, observations, cell, scanner, Options(work=work), "")
-        return replace(calibration, expected=answer.expected)
+        notes = tuple(dict.fromkeys((*calibration.notes, *warnings_of(answer.notes))))
+        return replace(calibration, expected=answer.expected, notes=notes)
     return calibration
 
 
