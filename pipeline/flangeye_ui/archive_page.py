@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import csv
+import io
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 from nicegui import ui
 
 from flangeye.errors import FlangeyeError
+from flangeye.files.regular import read_regular, read_text
 from flangeye.report.look import LIGHT
 from flangeye.report.units import millimetres
 from flangeye.result import status_of
@@ -45,7 +47,7 @@ def add(project: Project) -> None:
                 ui.echart(comparison(rows)).classes("w-full h-48").props('aria-label="Errors"')
             _reports(project)
             Scrubber(project)
-            for path in sorted(project.folder.glob("batches/*/sessions.csv")):
+            for path in project.found("batches/*/sessions.csv"):
                 _batch(path)
             command_line(project.command("show", f"runs/{rows[0]['run']}/run.mcap"))
 
@@ -56,8 +58,8 @@ def row_of(run: Path) -> dict[str, Any]:
     if not path.exists():
         return {"run": run.name, "status": "unfinished", "note": "ended before its result"}
     try:
-        result = Result.model_validate_json(path.read_bytes())
-    except (OSError, ValueError) as error:
+        result = Result.model_validate_json(read_regular(path))
+    except (FlangeyeError, ValueError) as error:
         return {"run": run.name, "status": "unreadable", "note": str(error).splitlines()[0]}
     held = result.holdout
     used = sum(o.used for o in result.observations)
@@ -100,13 +102,13 @@ def _batch(path: Path) -> None:
     """Show a batch's table, its numbers in SI units."""
     ui.label(f"Batch {path.parent.name}").classes("text-h6")
     try:
-        with path.open(newline="", encoding="utf-8") as file:
-            # Of a batch's table that are sent to the page
-            rows = list(islice(csv.DictReader(file), 5_000))
-    except (OSError, ValueError, csv.Error) as error:
+        lines = io.StringIO(read_text(path), newline="")
+        # Of a batch's table that are sent to the page
+        rows = list(islice(csv.DictReader(lines, restkey=""), 5_000))
+    except (FlangeyeError, csv.Error) as error:
         mistake(f"batches/{path.parent.name}/{path.name}: cannot be read: {error}")
         return
-    names = [name for name in (rows[0] if rows else {}) if any(row[name] for row in rows)]
+    names = [name for name in (rows[0] if rows else {}) if name and any(row[name] for row in rows)]
     columns = [
         {"name": n, "label": n.replace("_", " "), "field": n, "align": "left", "sortable": True}
         for n in names
@@ -115,9 +117,8 @@ def _batch(path: Path) -> None:
 
 
 def _reports(project: Project) -> None:
-    pages = [*project.folder.glob("runs/*/report.html"), *project.folder.glob("batches/*/*.html")]
     with ui.row().classes("gap-4"):
-        for path in sorted(pages):
+        for path in (*project.found("batches/*/*.html"), *project.found("runs/*/report.html")):
             link(project, path)
 
 

@@ -13,6 +13,7 @@ from nicegui import ui
 
 from flangeye.errors import FlangeyeError, RecipeError
 from flangeye.files.paths import bundled
+from flangeye.files.regular import read_text
 from flangeye.files.yaml_lines import flow, parse_yaml, read_yaml
 from flangeye.models.graph import Running
 from flangeye.models.scanners import ScannerModel
@@ -319,7 +320,7 @@ async def draft(
     drafted = project.folder / f"{name}.yaml"
     if not drafted.exists():
         return said, False
-    project.text = drafted.read_text(encoding="utf-8")
+    project.text = read_text(drafted)
     drafted.unlink()
     form.reload()
     return said, True

@@ -11,10 +11,10 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from shutil import copyfile
 from typing import Any
 
 from flangeye.errors import FlangeyeError, RecipeError, StageError
+from flangeye.files.regular import read_regular, read_text, write_whole
 from flangeye.files.yaml_lines import edited, flow, parse_yaml
 from flangeye.log.read import read_run
 from flangeye.plugin.registry import Registry
@@ -58,7 +58,8 @@ class Project:
         self.owner, self.ran = "", ""
         self.planned, self.plan = "", list[dict[str, Any]]()
         if not self.recipe_path.exists():
-            copyfile(Path(__file__).with_name("new.yaml"), self.recipe_path)
+            self.text = read_text(Path(__file__).with_name("new.yaml"))
+        read_regular(self.recipe_path)
 
     @property
     def recipe_path(self) -> Path:
@@ -68,11 +69,11 @@ class Project:
     @property
     def text(self) -> str:
         """The recipe's text on disk; ``check`` tells of bytes that are none."""
-        return self.recipe_path.read_text(encoding="utf-8", errors="replace")
+        return read_regular(self.recipe_path).decode("utf-8", "replace")
 
     @text.setter
     def text(self, text: str) -> None:
-        self.recipe_path.write_text(text, encoding="utf-8")
+        write_whole(self.recipe_path, text)
 
     def data(self) -> dict[str, Any]:
         """Return the recipe as data; empty while it is no mapping."""
@@ -100,7 +101,7 @@ class Project:
 
     def start_from(self, recipe: Path) -> None:
         """Take over another recipe; the files that it names stay where they are."""
-        text = recipe.read_text(encoding="utf-8")
+        text = read_text(recipe)
         for name in set(re.findall(r"[\w./-]+", text)):
             beside = (recipe.parent / name).resolve()
             if "." in name and beside.exists():
@@ -134,8 +135,17 @@ class Project:
 
     def runs(self) -> list[Path]:
         """Return the folders of all runs, newest first."""
-        logs = self.folder.glob("runs/*/run.mcap")
+        logs = self.found("runs/*/run.mcap")
         return [p.parent for p in sorted(logs, key=lambda p: p.stat().st_mtime, reverse=True)]
+
+    def found(self, pattern: str) -> list[Path]:
+        """Return files of the folder by a pattern, sorted; without those whose names are no text.
+
+        A page cannot show those: Python stands half a UTF-16 pair in for a byte that is no UTF-8.
+        """
+        paths = sorted(self.folder.glob(pattern))
+        here = len(str(self.folder))
+        return [p for p in paths if not re.search("[\ud800-\udfff]", str(p)[here:])]
 
     def read(self, run: Path) -> Facts:
         """Return the log of a run.

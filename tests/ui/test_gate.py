@@ -5,6 +5,7 @@ from __future__ import annotations
 import http.client
 import http.server
 import os
+import shutil
 import socket
 import threading
 import time
@@ -18,8 +19,9 @@ import pytest
 pytest.importorskip("nicegui", reason="nicegui is not installed")
 
 from flangeye.errors import StageError
+from flangeye.plugin.registry import load_registry
 from flangeye.recipe.find import find_recipe
-from flangeye_ui.project import MoveCodes
+from flangeye_ui.project import MoveCodes, Project
 from tests.ui.conftest import Served, ended, serve
 
 HOSTILE = """<!doctype html><title>loading</title><script>
@@ -214,6 +216,49 @@ def test_files_of_a_run_are_locked_in(hostile: Served, cookie: str) -> None:
     for path in ("report.txt", "../../cell.yaml", "..%2f..%2fcell.yaml", "%00", "", "nothing"):
         assert Answer(hostile, f"{files}/{path}", Cookie=cookie).status == 404, path
     assert Answer(hostile, f"{files}/report.html").status == 403
+
+
+def test_what_is_no_file_or_has_no_name_hides_nothing(hostile: Served, cookie: str) -> None:
+    """Devices, FIFOs, folders, names that are no UTF-8 and crooked tables are shown or passed by."""
+    folder = hostile.folder
+    for name in ("runs/fifo", "runs/endless", "runs/folder/result.json", "runs/\udcff\udcfe",
+                 "batches/fifo", "batches/crooked", "batches/folder/sessions.csv"):  # fmt: skip
+        (folder / name).mkdir(parents=True)
+    for run in ("fifo", "folder", "\udcff\udcfe"):
+        (folder / "runs" / run / "run.mcap").write_bytes(b"no log")
+        (folder / "runs" / run / "report.html").write_text("x")
+    os.mkfifo(folder / "runs" / "fifo" / "result.json")
+    os.mkfifo(folder / "batches" / "fifo" / "sessions.csv")
+    for name in ("run.mcap", "result.json", "calibration.yaml"):
+        (folder / "runs" / "endless" / name).symlink_to("/dev/zero")
+    (folder / "batches" / "crooked" / "sessions.csv").write_text("a,b,\n1,2,3,4\n5\n")
+    try:
+        for page in ("archive", "watch", "result", "result?run=endless", "use", ""):
+            answer = Answer(hostile, f"{inside(hostile, cookie)}/{page}", Cookie=cookie)
+            assert answer.status == 200, page
+            assert b"runs/fifo/report.html" in answer.body or page != "archive"
+    finally:
+        for room, name in (("runs", "fifo"), ("runs", "endless"), ("runs", "folder"),
+                           ("runs", "\udcff\udcfe"), ("batches", "")):  # fmt: skip
+            shutil.rmtree(folder / room / name)
+
+
+@pytest.mark.parametrize("sort", ["a folder", "a device, a FIFO or a socket"])
+def test_a_recipe_that_is_no_file_is_refused(tmp_path: Path, sort: str) -> None:
+    recipe = tmp_path / "cell.yaml"
+    recipe.mkdir() if sort == "a folder" else os.mkfifo(recipe)
+    with pytest.raises(StageError, match=f"cell.yaml: is {sort}; a file is needed"):
+        Project(tmp_path, load_registry(), MoveCodes(print))
+
+
+def test_a_recipe_that_leads_elsewhere_is_not_written_through(tmp_path: Path) -> None:
+    other = tmp_path / "other.yaml"
+    other.write_text("steps: []\n")
+    (tmp_path / "cell.yaml").symlink_to(other)
+    project = Project(tmp_path, load_registry(), MoveCodes(print))
+    project.edit({"title": "mine"})
+    assert project.data()["title"] == "mine"
+    assert other.read_text() == "steps: []\n"
 
 
 def entered(browser: Any, served: Served) -> Any:

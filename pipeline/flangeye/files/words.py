@@ -31,7 +31,7 @@ def printable(text: str) -> str:
     # All but tab and line feed: escape sequences begin with them, and directions hide what is
     # said.
     return re.sub(
-        "[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]",
+        "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]",
         lambda found: ascii(found[0])[1:-1],
         text,
     )

@@ -195,7 +195,9 @@ class CalibratedPose:
 
 
 def _one_line(text: str) -> str:
-    return " ".join(re.sub(r"[^ -~]", " ", text.encode("ascii", "replace").decode()).split())
+    line = " ".join(re.sub(r"[^ -~]", " ", text.encode("ascii", "replace").decode()).split())
+    # In a Python file's first two lines it would name the encoding in which all else is read
+    return re.sub("coding(?=[:=])", "coding ", line)
 
 
 @dataclass(frozen=True)

@@ -4,9 +4,11 @@ Where PyPI has the maker's library it reads; else the maker's definition is spel
 elementary rotations, not with the code that wrote the file.
 """
 
+import io
 import re
 import subprocess
 import sys
+import tokenize
 import types
 import warnings
 from math import cos, pi, sin
@@ -424,6 +426,7 @@ HOSTILE = (
     "../../x",
     "%s {0} {name} \\",
     "%YAML:1.0 # *a &b",
+    "coding: utf-7 +AAo-raise SystemExit+AAo-",
 )
 BENIGN = Transform(BASE, CAMERA, rigid(rotation_exp(np.array([0.1, 0.2, 0.3])), [0.1, 0.2, 0.3]))
 OF_FRAMES = {
@@ -463,6 +466,7 @@ def test_a_hostile_remark_stays_a_comment(name: str, remark: str) -> None:
 
     def without_comments(pose: CalibratedPose) -> list[str]:
         text = written(name, pose).text
+        assert tokenize.detect_encoding(io.BytesIO(text.encode()).readline)[0] == "utf-8"
         assert text.isascii()
         assert text.replace("\n", "").isprintable()
         require_same(READERS[name](text), pose)
