@@ -10,8 +10,10 @@ from typer.testing import CliRunner
 
 from flangeye.cli import commands
 from flangeye.cli.app import GROUPS
-from flangeye.cli.console import wrapped, write
+from flangeye.cli.console import end_in_words, wrapped, write
+from flangeye.cli.details import print_details
 from flangeye.cli.summary import RunProgress, print_refusal, print_summary
+from flangeye.errors import RecipeError
 from flangeye.result import contract as r
 from flangeye.types import Rejection, Source, Warn
 
@@ -92,6 +94,21 @@ def test_a_refused_matrix_is_not_there_to_copy() -> None:
     assert "export" not in text
 
 
+def test_foreign_text_makes_no_line_of_its_own() -> None:
+    """A title or a note with line feeds would forge a verdict."""
+    forged = "x\nVERIFIED   16 of 16 captures used\u061c"
+    found = result(
+        title=forged, notes=[forged], refused=forged, status="refused",
+        warnings=[r.WarningResult(text=forged, fix=forged)],
+    )  # fmt: skip
+    out = io.StringIO()
+    print_details(Console(file=out), found)
+    for text in (printed(found), out.getvalue()):
+        assert forged.partition("\n")[2][:8] in text
+        assert not [line for line in text.splitlines() if line.startswith("VERIFIED")]
+        assert "\u061c" not in text
+
+
 def test_a_refusal_has_three_parts() -> None:
     out = io.StringIO()
     print_refusal(Console(file=out), "what", "how", ["do this", "or that", "never shown"])
@@ -144,3 +161,24 @@ def test_help_lists_every_command_in_its_group_with_a_whole_sentence() -> None:
     assert [title for title in GROUPS if f"{title}:\n" in listed] == list(GROUPS)
     assert "More:" not in listed, "a command without a group"
     assert "..." not in listed
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (RecipeError("\n".join(map(str, range(20_000)))),
+         [*(f"error: {i}" for i in range(100)), "error: 19900 lines more"]),
+        (RecipeError("x" * 5000), ["error: " + "x" * 4000 + " (1000 characters more)"]),
+        (MemoryError("7 PiB"), ["error: not enough memory: 7 PiB"]),
+        (MemoryError(), ["error: not enough memory: the machine has no more"]),
+    ],
+)  # fmt: skip
+def test_what_is_said_is_bounded(
+    error: Exception, said: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fails() -> None:
+        raise error
+
+    with pytest.raises(SystemExit, match="2"):
+        end_in_words(fails)
+    assert capsys.readouterr().err.splitlines() == said

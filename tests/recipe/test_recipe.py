@@ -1,6 +1,7 @@
 """Every mistake a recipe can hold, word for word."""
 
 import json
+import time
 from pathlib import Path
 from typing import Any
 
@@ -385,3 +386,16 @@ def test_limits_are_held_against_the_arms_own_data(
 ) -> None:
     told = mistakes(DRIVEN.format(model=model, limits=limits), load_registry())
     assert [line.partition(": ")[2] for line in told if "robot.limits" in line] == expected
+
+
+@pytest.mark.parametrize("each", ["k{}: 1\n", "k{}: {{a: {{b: 1}}}}\n"])
+def test_ten_times_as_many_mistakes_take_ten_times_as_long(
+    each: str, toy_registry: Registry
+) -> None:
+    def taken(count: int) -> float:
+        text = STEPS + "".join(each.format(i) for i in range(count))
+        begun = time.process_time()
+        assert len(mistakes(text, toy_registry)) == count
+        return time.process_time() - begun
+
+    assert taken(8000) < 25 * taken(800)

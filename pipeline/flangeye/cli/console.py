@@ -34,10 +34,13 @@ def write(console: Console, text: str, style: str = "") -> None:
 
 
 def wrapped(console: Console, text: str, indent: int = 2) -> str:
-    """Return a text wrapped to the terminal's width; commands are not broken."""
+    """Return a text wrapped to the terminal's width; commands are not broken.
+
+    Breaks of its own it has none: a line of foreign text would pass for one of ours.
+    """
     return textwrap.fill(
-        text, width(console), subsequent_indent=" " * indent, break_long_words=False,
-        break_on_hyphens=False, drop_whitespace=True, replace_whitespace=False,
+        text.replace("\n", " "), width(console), subsequent_indent=" " * indent,
+        break_long_words=False, break_on_hyphens=False, replace_whitespace=False,
     )  # fmt: skip
 
 
@@ -97,6 +100,8 @@ def end_in_words(command: Callable[[], object]) -> None:
         say(plan)
     except FlangeyeError as error:
         _fail(error)
+    except MemoryError as error:
+        _fail(FlangeyeError(f"not enough memory: {str(error) or 'the machine has no more'}"))
     except BrokenPipeError:
         _discard_output()
         sys.exit(0)
@@ -130,10 +135,14 @@ def _fail(error: FlangeyeError) -> NoReturn:
 
         traceback.print_exception(error)
     with suppress(OSError):
-        longest = 4000  # of a line of an error [characters]: names in it come from files
-        for line in printable(str(error)).splitlines():
+        # Of an error, lines, and characters of each: mistakes and names in it come from files
+        most, longest = 100, 4000
+        lines = printable(str(error)).splitlines()
+        for line in lines[:most]:
             more = f" ({len(line) - longest} characters more)" if len(line) > longest else ""
             sys.stderr.write(f"error: {line[:longest]}{more}\n")
+        if len(lines) > most:
+            sys.stderr.write(f"error: {len(lines) - most} lines more\n")
     sys.exit(error.exit_code)
 
 

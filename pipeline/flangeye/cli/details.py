@@ -47,9 +47,8 @@ def print_details(console: Console, result: Result) -> None:
 
 def _hung(console: Console, line: str) -> str:
     """Return one line, wrapped to a terminal's width; commands and lines for a file stay whole."""
-    line = line.replace("\n", " ")
     if line.startswith("  ->") or not console.is_terminal:
-        return line
+        return line.replace("\n", " ")
     return wrapped(console, line, 21 if line.startswith("  ") else 2)
 
 

@@ -32,7 +32,7 @@ def print_summary(
         said: Warnings that were printed before.
     """
     used = sum(o.used for o in result.observations)
-    write(console, result.title, "bold")
+    write(console, wrapped(console, result.title), "bold")
     verdict = status_of(result).replace(result.status, result.status.upper())
     shades = {"verified": "bold green", "unverified": "bold yellow", "refused": "bold red"}
     colour = shades.get(result.status, "bold")

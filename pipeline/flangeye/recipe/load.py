@@ -154,7 +154,7 @@ class _Checker:
         self._models = models or lookup.folder
         self._document = document
         self._overridden: list[tuple[Hashable, ...]] = []
-        self._left_out: list[tuple[Hashable, ...]] = []
+        self._left_out = set[tuple[Hashable, ...]]()
         self._mistakes: list[str] = []
 
     def check(self, name: str, text: str, overrides: Sequence[str]) -> Recipe:
@@ -189,18 +189,18 @@ class _Checker:
             except ValidationError as error:
                 new = [e for e in error.errors() if not self._follows(e["loc"])]
                 self._explain((), new, Header)
-                self._left_out += [
-                    e["loc"] for e in error.errors() if e["type"] != "extra_forbidden"
-                ]
+                for each in error.errors():
+                    if each["type"] != "extra_forbidden":
+                        self._left_out.update(_prefixes(each["loc"]))
                 leave_out(rest, [e["loc"] for e in error.errors()])
 
     def _follows(self, keys: tuple[Hashable, ...]) -> bool:
         """Return whether a mistake follows from what was left out at or below its place."""
-        return any(left_out[: len(keys)] == keys for left_out in self._left_out)
+        return keys in self._left_out
 
     def _context(self, header: Header) -> Context:
         """Return what the sections offer; what a broken one would offer is there as None."""
-        broken = {left_out[0] for left_out in self._left_out}
+        broken = {left_out[0] for left_out in self._left_out if left_out}
 
         def complain(keys: Sequence[Hashable], message: str) -> None:
             if not (len(keys) == 1 and keys[0] in broken):
@@ -299,9 +299,9 @@ class _Checker:
 
 def leave_out(data: dict[Hashable, Any], paths: Iterable[tuple[Hashable, ...]]) -> None:
     """Delete the deepest existing prefix of each path from the data; list items go as a whole."""
-    gone: list[tuple[Hashable, ...]] = []
+    gone = set[tuple[Hashable, ...]]()
     for path in paths:
-        if any(path[: len(each)] == each for each in gone):
+        if not gone.isdisjoint(_prefixes(path)):
             continue
         there = _existing(data, path)
         while there and isinstance(there[-1], int):  # else the row's other elements would move up
@@ -309,10 +309,14 @@ def leave_out(data: dict[Hashable, Any], paths: Iterable[tuple[Hashable, ...]]) 
         if not there:
             data[path[0]] = PLACEHOLDERS[path[0]]
             continue
-        gone.append(there)
+        gone.add(there)
         del _at(data, there[:-1])[there[-1]]
         if there[0] in PLACEHOLDERS:
             data[there[0]] = PLACEHOLDERS[there[0]]
+
+
+def _prefixes(path: tuple[Hashable, ...]) -> list[tuple[Hashable, ...]]:
+    return [path[:depth] for depth in range(len(path) + 1)]
 
 
 def _existing(data: Any, path: tuple[Hashable, ...]) -> tuple[Hashable, ...]:
