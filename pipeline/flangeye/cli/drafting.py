@@ -154,10 +154,9 @@ def _seen(
         return None
 
 
-def _of_what_runs(folder: Path, out: Path, questions: Questions, registry: Registry) -> Draft:
+def _of_what_runs(_: Path, out: Path, questions: Questions, registry: Registry) -> Draft:
     from flangeye.recipe.draft import draft_live
 
-    del folder
     with registry.graph() as graph:
         cell = graph.cell(questions.ask, out.stem)
     for line in cell.seen:

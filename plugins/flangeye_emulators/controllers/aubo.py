@@ -258,22 +258,6 @@ def _set_tool(box: AuboController, params: Mapping[str, Any]) -> int:
     return OK
 
 
-def _move_joint(box: AuboController, params: Mapping[str, Any]) -> int:
-    return box.move_joint(_numbers(params["q"]), params["a"], params["v"])
-
-
-def _move_line(box: AuboController, params: Mapping[str, Any]) -> int:
-    return box.move_line(_numbers(params["pose"]), params["a"], params["v"])
-
-
-def _speed_line(box: AuboController, params: Mapping[str, Any]) -> int:
-    return box.speed_line(_numbers(params["xd"]), params["a"], params["t"])
-
-
-def _speed_joint(box: AuboController, params: Mapping[str, Any]) -> int:
-    return box.speed_joint(_numbers(params["qd"]), params["a"], params["t"])
-
-
 METHODS: dict[str, Method] = {
     "getRobotNames": _tell(lambda box: ["rob1"]),
     "getAxisNames": _tell(lambda box: []),
@@ -294,10 +278,10 @@ METHODS: dict[str, Method] = {
     "RobotState.getToolPose": _tell(lambda box: _pose(_flange(box))),
     "RobotState.getTcpSpeed": _tell(lambda box: box.arm.twist.tolist()),
     "RobotState.getTcpForce": _tell(lambda box: box.arm.felt.tolist()),
-    "MotionControl.moveJoint": _move_joint,
-    "MotionControl.moveLine": _move_line,
-    "MotionControl.speedLine": _speed_line,
-    "MotionControl.speedJoint": _speed_joint,
+    "MotionControl.moveJoint": lambda box, p: box.move_joint(_numbers(p["q"]), p["a"], p["v"]),
+    "MotionControl.moveLine": lambda box, p: box.move_line(_numbers(p["pose"]), p["a"], p["v"]),
+    "MotionControl.speedLine": lambda box, p: box.speed_line(_numbers(p["xd"]), p["a"], p["t"]),
+    "MotionControl.speedJoint": lambda box, p: box.speed_joint(_numbers(p["qd"]), p["a"], p["t"]),
     "MotionControl.stopLine": lambda box, p: box.halt(p["acc"], in_space=True),
     "MotionControl.stopJoint": lambda box, p: box.halt(p["acc"], in_space=False),
     "MotionControl.getExecId": _tell(lambda box: box.exec_id),

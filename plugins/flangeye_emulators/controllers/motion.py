@@ -7,11 +7,12 @@ the arm slows down on its path and never leaves it.
 from __future__ import annotations
 
 import math
-from functools import partial
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
 
+from flangeye.maths.geometry import rigid
 from flangeye.types import Floats
 from flangeye_emulators.controllers.poses import (
     JointStance,
@@ -19,48 +20,6 @@ from flangeye_emulators.controllers.poses import (
     rotation_matrix,
     rotation_vector,
 )
-
-
-class Space(Protocol):
-    """Where straight lines are drawn: joint angles (n,), or poses (4, 4)."""
-
-    def distance(self, start: Floats, end: Floats) -> float:
-        """Return the length of the straight line."""
-
-    def between(self, start: Floats, end: Floats, share: float) -> Floats:
-        """Return the point at ``share`` (0 to 1) of the straight line."""
-
-
-class JointSpace:
-    """Joint angles; the joint that moves furthest sets the length [rad]."""
-
-    def distance(self, start: Floats, end: Floats) -> float:
-        """Return the largest change of a joint [rad]."""
-        return float(np.abs(end - start).max())
-
-    def between(self, start: Floats, end: Floats, share: float) -> Floats:
-        """Return joint angles (n,) at ``share`` of the way."""
-        return start + share * (end - start)
-
-
-class PoseSpace:
-    """Poses (4, 4); the tool's point goes straight while the tool turns evenly about one axis."""
-
-    def distance(self, start: Floats, end: Floats) -> float:
-        """Return the way of the tool's point, or its turn where that counts more [m]."""
-        turn = np.linalg.norm(rotation_vector(start[:3, :3].T @ end[:3, :3]))
-        # A turn of one radian counts as this many metres [m/rad]: a wrist turns about as fast as a
-        # tool moves at such a distance. Where a move is mostly a turn, its speed limits the turn.
-        return float(max(np.linalg.norm(end[:3, 3] - start[:3, 3]), 0.25 * turn))
-
-    def between(self, start: Floats, end: Floats, share: float) -> Floats:
-        """Return the pose (4, 4) at ``share`` of the way."""
-        pose = np.eye(4)
-        pose[:3, 3] = start[:3, 3] + share * (end[:3, 3] - start[:3, 3])
-        turn = rotation_vector(start[:3, :3].T @ end[:3, :3])
-        pose[:3, :3] = start[:3, :3] @ rotation_matrix(share * turn)
-        return pose
-
 
 SLOWEST = 1e-4
 """Speeds and accelerations below this are taken as this: a move must end."""
@@ -88,11 +47,15 @@ class Travel:
     """
 
     def __init__(
-        self, space: Space, start: Floats, end: Floats, speed: float, acceleration: float
+        self,
+        between: Callable[[float], Floats],
+        end: Floats,
+        length: float,
+        speed: float,
+        acceleration: float,
     ) -> None:
-        """Plan the ride from ``start`` to ``end`` (joints or poses, as the space has them)."""
-        self._between = partial(space.between, start, end)
-        self._end, self._length = end, space.distance(start, end)
+        """Plan the ride to ``end``; ``between`` gives the target at a share (0 to 1) of the way."""
+        self._between, self._end, self._length = between, end, length
         self._acceleration = max(acceleration, SLOWEST)
         # Accelerating all the way and braking would meet at the second speed.
         self._top = min(max(speed, SLOWEST), math.sqrt(self._acceleration * self._length))
@@ -123,13 +86,23 @@ class Travel:
 
 
 def joint_move(start: Floats, end: Floats, speed: float, acceleration: float) -> Travel:
-    """Return a move straight in joint angles (n,); the leading joint keeps speed [rad/s]."""
-    return Travel(JointSpace(), start, end, speed, acceleration)
+    """Return a move in joint angles (n,); speed and acceleration are those of the leading joint."""
+    way = end - start
+    length = float(np.abs(way).max())
+    return Travel(lambda share: start + share * way, end, length, speed, acceleration)
 
 
 def linear_move(start: Floats, end: Floats, speed: float, acceleration: float) -> Travel:
-    """Return a move straight in space from pose to pose (4, 4); speed in [m/s]."""
-    return Travel(PoseSpace(), start, end, speed, acceleration)
+    """Return a straight move of the tool's point, (4, 4) poses, turning evenly about one axis."""
+    way, turn = end[:3, 3] - start[:3, 3], rotation_vector(start[:3, :3].T @ end[:3, :3])
+    # A turn of one radian counts as this many metres [m/rad]: a wrist turns about as fast as a
+    # tool moves at such a distance. Where a move is mostly a turn, its speed limits the turn.
+    length = float(max(np.linalg.norm(way), 0.25 * np.linalg.norm(turn)))
+
+    def between(share: float) -> Floats:
+        return rigid(start[:3, :3] @ rotation_matrix(share * turn), start[:3, 3] + share * way)
+
+    return Travel(between, end, length, speed, acceleration)
 
 
 class Speed:

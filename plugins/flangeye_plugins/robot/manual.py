@@ -158,12 +158,10 @@ class ManualRobot(Device):
 
     def move_joints(self, joints: Floats, speed: float, acceleration: float) -> None:
         """Ask the person to move the flange to where joint angles put it."""
-        del speed, acceleration
         self._ask(self._arm.flange(joints), joints)
 
     def move_linear(self, base_T_flange: Transform, speed: float, acceleration: float) -> None:
         """Ask the person to move the flange to a pose."""
-        del speed, acceleration
         self._ask(base_T_flange.matrix, self._joints)
 
     def move_velocity(self, twist: Floats, acceleration: float) -> None:

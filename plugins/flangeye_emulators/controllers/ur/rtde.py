@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from flangeye_emulators.controllers.network import Connection, Network
-from flangeye_emulators.controllers.poses import inverse_pose
 from flangeye_emulators.controllers.ur.controller import Registers, RobotMode, Runtime, URController
 
 FORMATS = {
@@ -67,12 +66,9 @@ class Output(NamedTuple):
 
 def _raw_wrench(box: URController) -> Values:
     """Wrench at the flange in the flange's axes, nothing subtracted."""
-    force = box.arm.felt[:3]
-    tool = inverse_pose(box.arm.chain.flange_T_tcp)
-    force_in_flange = tool[:3, :3].T @ box.arm.stance.base_T_tcp[:3, :3].T @ force
-    lever = box.arm.chain.flange_T_tcp[:3, 3]
-    x, y, z = lever
-    fx, fy, fz = force_in_flange
+    tool, base_T_tcp = box.arm.chain.flange_T_tcp, box.arm.stance.base_T_tcp
+    fx, fy, fz = tool[:3, :3] @ base_T_tcp[:3, :3].T @ box.arm.felt[:3]
+    x, y, z = tool[:3, 3]
     return [fx, fy, fz, y * fz - z * fy, z * fx - x * fz, x * fy - y * fx]
 
 
@@ -251,8 +247,7 @@ class RtdeSession(Connection):
         (version,) = struct.unpack(">H", body[:2].rjust(2, b"\0"))
         self._answer("V", bytes([version == 2]))
 
-    def _tell_version(self, body: bytes) -> None:
-        del body
+    def _tell_version(self, _: bytes) -> None:
         self._answer("v", struct.pack(">4I", *self._port.box.box.version))
 
     def _set_outputs(self, body: bytes) -> None:
@@ -276,13 +271,11 @@ class RtdeSession(Connection):
             self._recipes[number] = recipe
         self._answer("I", bytes([number]) + ",".join(types).encode())
 
-    def _start(self, body: bytes) -> None:
-        del body
+    def _start(self, _: bytes) -> None:
         self._started = self._output is not None
         self._answer("S", bytes([self._started]))
 
-    def _pause(self, body: bytes) -> None:
-        del body
+    def _pause(self, _: bytes) -> None:
         self._started = False
         self._answer("P", b"\1")
 

@@ -112,8 +112,7 @@ class URFaultInjector(FaultInjector):
         super().clear()
         self._box.remote_control = self._box.wired = True
 
-    def _go_local(self, seconds: float | None) -> None:
-        del seconds
+    def _go_local(self, _: float | None) -> None:
         self._box.remote_control = False
 
 

@@ -244,7 +244,6 @@ class FreedriveArm(Listener):
 
     def move_joints(self, joints: Floats, speed: float, acceleration: float) -> None:
         """Wait until others have moved the arm and it stands; suggest the most informative pose."""
-        del speed, acceleration
         pose = self.arm.flange(joints)
         lean = np.degrees(np.arccos(np.clip(pose[:3, 2] @ self._facing(), -1.0, 1.0)))
         if self._left is not None:  # the first scan is taken where the arm stands
