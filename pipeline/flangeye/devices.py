@@ -75,7 +75,6 @@ class Device(Protocol):
 
     def close(self) -> None:
         """Disconnect; safe to call twice."""
-        ...
 
     def __enter__(self) -> Self:
         return self
@@ -107,7 +106,6 @@ class Robot(Device, Protocol):
         It is also the proof that somebody watches: a motion that nobody looked at for SILENT ends,
         and is not taken up again.
         """
-        ...
 
     def move_joints(self, joints: Floats, speed: float, acceleration: float) -> None:
         """Start a move to joint angles (n,) [rad]; speed of the fastest joint [rad/s].
@@ -115,30 +113,24 @@ class Robot(Device, Protocol):
         The mode is ``moving`` from here on until the move has ended, so nobody takes an arm that
         has not begun for one that has arrived.
         """
-        ...
 
     def move_linear(self, base_T_flange: Transform, speed: float, acceleration: float) -> None:
         """Start a straight move of the flange [m/s, m/s^2]; the mode is as for joints."""
-        ...
 
     def move_velocity(self, twist: Floats, acceleration: float) -> None:
         """Move at a twist (6,) until the next command; brake if none comes within GRACE.
 
         Acceleration in [m/s^2] and [rad/s^2].
         """
-        ...
 
     def wait_cycle(self) -> None:
         """Return at the start of the controller's next cycle."""
-        ...
 
     def stop(self) -> None:
         """Begin to brake at once; does nothing if the arm is at rest."""
-        ...
 
     def close(self) -> None:
         """Stop and disconnect; safe to call twice, also after the connection was lost."""
-        ...
 
 
 @runtime_checkable
@@ -196,7 +188,6 @@ class Scanner(Device, Protocol):
             FrameDropped: This exposure gave nothing; the scanner is still there.
             DeviceError: The scanner is lost, or gave nothing in time.
         """
-        ...
 
 
 @runtime_checkable
@@ -205,7 +196,6 @@ class HearsLoss(Protocol):
 
     def require_alive(self) -> None:
         """Raise DeviceError when the scanner is lost; called some times a second, never waits."""
-        ...
 
 
 @runtime_checkable
@@ -222,7 +212,6 @@ class Overhears(Protocol):
             FrameDropped: Nobody took one in time.
             DeviceError: The scanner is lost.
         """
-        ...
 
 
 @runtime_checkable
@@ -242,7 +231,6 @@ class KnowsTorch(Protocol):
 
     def true_torch(self) -> tuple[Floats, Floats]:
         """Return times (K,) [s] and where the torch really was then (K, 3), in base [m]."""
-        ...
 
 
 @runtime_checkable
@@ -261,7 +249,6 @@ class StateSource(Protocol):
 
     def state(self) -> RobotState:
         """Return the newest sample."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -297,7 +284,6 @@ class TactileSensor(Device, Protocol):
         Raises:
             DeviceError: The camera is lost.
         """
-        ...
 
 
 @dataclass(frozen=True)
@@ -335,7 +321,6 @@ class Profiler(Device, Protocol):
         Raises:
             DeviceError: The sensor is lost.
         """
-        ...
 
 
 @runtime_checkable
@@ -356,15 +341,12 @@ class Arc(Device, Protocol):
         Raises:
             DeviceError: The power source, or what switches it, is lost.
         """
-        ...
 
     def burn(self, on: bool) -> None:
         """Start or end wire and arc; never waits, raises as :meth:`gas` does."""
-        ...
 
     def burning(self) -> bool | None:
         """Return whether the arc is established; None if there is no such signal. Never waits."""
-        ...
 
 
 @dataclass(frozen=True)

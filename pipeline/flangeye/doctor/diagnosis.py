@@ -304,7 +304,6 @@ class Check(Protocol):
 
     def __call__(self, session: RecordedSession) -> Iterable[Finding]:
         """Return the mistakes that it can defend; raise :class:`NotApplicable` to abstain."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)

@@ -168,7 +168,6 @@ class Storage(Protocol):
 
     def read(self, name: str) -> bytes | None:
         """Return a file's content; None if it does not exist."""
-        ...
 
     def write(self, name: str, content: bytes) -> None:
         """Write a file, and the folders above it: readers find the old one or the new one.
@@ -176,7 +175,6 @@ class Storage(Protocol):
         Raises:
             StageError: It cannot be written.
         """
-        ...
 
     def draft(self, name: str) -> AbstractContextManager[Path]:
         """Yield the path of a file to be written, which becomes the one of that name at the end.
@@ -184,15 +182,12 @@ class Storage(Protocol):
         Raises:
             StageError: It cannot be written.
         """
-        ...
 
     def names(self, folder: str) -> list[str]:
         """Return the files of a folder as names from here, sorted; none if it is not there."""
-        ...
 
     def remove(self, name: str) -> None:
         """Remove a file, or a folder with all that is in it, if it is there."""
-        ...
 
 
 def place_at(at: str) -> Storage:

@@ -36,7 +36,6 @@ class Reader(Protocol):
 
     def __call__(self, path: Path) -> Archive:
         """Return what the path holds; raise :class:`NotThisLayout` where it is something else."""
-        ...
 
 
 class NotThisLayout(StageError):

@@ -34,52 +34,42 @@ class JointAxis(Protocol):
     @property
     def a(self) -> float:
         """Link length [m]."""
-        ...
 
     @property
     def alpha(self) -> float:
         """Link twist [rad]."""
-        ...
 
     @property
     def d(self) -> float:
         """Link offset [m]."""
-        ...
 
     @property
     def theta(self) -> float:
         """Offset added to the angle [rad]."""
-        ...
 
     @property
     def xyz(self) -> tuple[float, float, float]:
         """Origin of the joint's frame in that of the link before [m]."""
-        ...
 
     @property
     def rpy(self) -> tuple[float, float, float]:
         """Roll, pitch, yaw of the joint's frame in that of the link before [rad]."""
-        ...
 
     @property
     def axis(self) -> tuple[float, float, float]:
         """Direction it turns about or slides along, in its own frame."""
-        ...
 
     @property
     def slides(self) -> bool:
         """Whether it slides [m] instead of turning [rad]."""
-        ...
 
     @property
     def lower(self) -> float:
         """Lower limit [rad or m]."""
-        ...
 
     @property
     def upper(self) -> float:
         """Upper limit [rad or m]."""
-        ...
 
 
 class SerialChain(Protocol):
@@ -88,17 +78,14 @@ class SerialChain(Protocol):
     @property
     def joints(self) -> Sequence[JointAxis]:
         """Base to flange."""
-        ...
 
     @property
     def convention(self) -> Literal["standard", "modified", "urdf"]:
         """Denavit-Hartenberg, standard or modified (Craig), or a URDF's origins and axes."""
-        ...
 
     @property
     def link_T_flange(self) -> Floats:
         """(4, 4) the flange in the frame of the last link."""
-        ...
 
 
 def altered(joint: JointAxis, convention: str, lengths: Floats) -> dict[str, Any]:

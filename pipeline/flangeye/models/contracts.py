@@ -24,7 +24,6 @@ class Cost(Protocol):
 
     def __call__(self, error: PoseError) -> float:
         """Return the cost; zero for no error."""
-        ...
 
 
 class ErrorMeasure(Protocol):
@@ -38,7 +37,6 @@ class ErrorMeasure(Protocol):
         flange: Flange | None,
     ) -> PoseError | None:
         """Return the error of ``base_T_camera``, from poses and views the solver has not seen."""
-        ...
 
 
 class ViewGuess(Protocol):
@@ -46,7 +44,6 @@ class ViewGuess(Protocol):
 
     def __call__(self, arm: Arm, scanner: ScannerModel) -> Floats:
         """Return (4, 4) base_T_camera [m]."""
-        ...
 
 
 class RobotPart(Protocol):
@@ -54,7 +51,6 @@ class RobotPart(Protocol):
 
     def __call__(self, model: RobotModel) -> Robot:
         """Return the open arm."""
-        ...
 
 
 class ScannerPart(Protocol):
@@ -62,7 +58,6 @@ class ScannerPart(Protocol):
 
     def __call__(self, model: ScannerModel | None) -> Scanner:
         """Return the open scanner."""
-        ...
 
 
 class SensorPart(Protocol):
@@ -70,7 +65,6 @@ class SensorPart(Protocol):
 
     def __call__(self, finger: Finger, robot: StateSource, seed: Seed) -> TactileSensor:
         """Return the open camera."""
-        ...
 
 
 class ArcPart(Protocol):
@@ -78,7 +72,6 @@ class ArcPart(Protocol):
 
     def __call__(self) -> Arc:
         """Return the open power source, gas and arc off."""
-        ...
 
 
 class ProfilerPart(Protocol):
@@ -89,4 +82,3 @@ class ProfilerPart(Protocol):
 
         A real one needs nothing of the finger's sensor; a simulated one sees what that stands in.
         """
-        ...

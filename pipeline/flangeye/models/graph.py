@@ -82,7 +82,6 @@ class Ask(Protocol):
         Raises:
             RecipeError: Nothing is likely, and nobody can be asked.
         """
-        ...
 
 
 class Graph(Device, Protocol):
@@ -90,11 +89,9 @@ class Graph(Device, Protocol):
 
     def topics(self) -> list[Topic]:
         """Return the topics that run, by name."""
-        ...
 
     def running(self) -> list[Running]:
         """Return the running nodes that a recipe can use; publishes nothing, calls no service."""
-        ...
 
     def cell(self, ask: Ask, name: str) -> RunningCell:
         """Return the arm and the camera that run.
@@ -106,7 +103,6 @@ class Graph(Device, Protocol):
         Raises:
             FlangeyeError: There is no arm or no camera; says what there is.
         """
-        ...
 
     def publish(self, pose: CalibratedPose, frames: Mapping[str, str]) -> list[str]:
         """Put a pose on the graph as static transforms, until the graph is closed.
@@ -121,7 +117,6 @@ class Graph(Device, Protocol):
         Raises:
             DeviceError: A frame already stands elsewhere, or the transform cannot be published.
         """
-        ...
 
     def stay(self) -> None:
         """Block for ever, so that published transforms stay.
@@ -129,7 +124,6 @@ class Graph(Device, Protocol):
         Raises:
             DeviceError: The graph was lost.
         """
-        ...
 
 
 @dataclass(frozen=True)

@@ -110,11 +110,9 @@ class Bodies(Protocol):
         Raises:
             RecipeError: A body is missing or wrong; names its link.
         """
-        ...
 
     def meshes(self) -> Iterator[tuple[int, Any]]:
         """Yield each link's visible mesh (trimesh, in its moving frame) and its number."""
-        ...
 
 
 class RobotModel(Model):

@@ -359,7 +359,6 @@ class Planner(Protocol):
 
     def __call__(self, site: Site, rng: np.random.Generator) -> Plan:
         """Return the poses to visit; ``rng`` is the only randomness."""
-        ...
 
 
 def poses_near(

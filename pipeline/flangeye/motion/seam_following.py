@@ -111,56 +111,45 @@ class Controller(Protocol):
     @property
     def mode(self) -> str:
         """Its name, for people."""
-        ...
 
     @property
     def side(self) -> float:
         """Which wall is pressed: 1 for the left one, -1 for the right."""
-        ...
 
     @property
     def phase(self) -> Phase:
         """The controller's present phase."""
-        ...
 
     @property
     def reason(self) -> str:
         """Why it stopped."""
-        ...
 
     @property
     def tip(self) -> float:
         """Arc length of the tip's progress on the plan [m]."""
-        ...
 
     @property
     def torch(self) -> float:
         """Arc length of the torch's progress [m]."""
-        ...
 
     @property
     def wanted(self) -> float:
         """Deflection asked of the tip at present [m]."""
-        ...
 
     @property
     def sigma(self) -> float:
         """Standard deviation of the torch's place across the seam [m]."""
-        ...
 
     @property
     def bound(self) -> float:
         """Upper bound of the torch's distance from the seam [m]."""
-        ...
 
     @property
     def band(self) -> float:
         """The bound that holds for 95 % of the seam [m]."""
-        ...
 
     def step(self, pose: ToolPose, touches: Sequence[Touch]) -> Command:
         """Return the command for this cycle; ``touches`` are measurements since the last one."""
-        ...
 
 
 class ControllerPart(Protocol):
@@ -168,7 +157,6 @@ class ControllerPart(Protocol):
 
     def __call__(self, task: FollowingTask) -> Controller:
         """Return a controller at the start of its task."""
-        ...
 
 
 def turned(vector: Floats, angle: float) -> Floats:

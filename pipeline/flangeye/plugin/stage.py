@@ -316,11 +316,9 @@ class PartLookup(Protocol):
 
     def part(self, name: str) -> Part:
         """Return the part ``kind.name``, or raise LookupError naming the nearest."""
-        ...
 
     def siblings(self, part: Part) -> Siblings:
         """Return the other parts of a part's kind."""
-        ...
 
 
 @dataclass(frozen=True)

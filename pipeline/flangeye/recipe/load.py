@@ -397,4 +397,3 @@ class Guide(Protocol):
         self, recipe: Recipe, motion: MotionAllowed, ask: Callable[[str], None], out: Path
     ) -> str:
         """Lead the person, write the outcome to ``out`` and return a line about it."""
-        ...

@@ -32,7 +32,6 @@ class Repeat(Protocol):
 
     def __call__(self, log: Path, step: str) -> ReplayedStep:
         """Return how the decisions of ``step``, made again from its log, compare."""
-        ...
 
 
 def replay_steps(log: Path, registry: Registry) -> Iterator[tuple[str, ReplayedStep]]:

@@ -235,7 +235,6 @@ class StageLog(Protocol):
 
     def __call__(self, name: str, value: Any) -> None:
         """Log ``value``: a dataclass of ours, an :class:`Image`, or plain JSON data."""
-        ...
 
 
 @dataclass(frozen=True)

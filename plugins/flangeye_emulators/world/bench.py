@@ -134,11 +134,9 @@ class StandingArm(Protocol):
 
     def state(self) -> RobotState:
         """Return its reported state."""
-        ...
 
     def true_flange(self) -> Floats:
         """Return where its flange really is (4, 4), in base."""
-        ...
 
 
 _ARMS: WeakSet[StandingArm] = WeakSet()

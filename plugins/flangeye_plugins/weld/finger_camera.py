@@ -121,7 +121,6 @@ class FingerCameraReader(Protocol):
     @property
     def behind(self) -> float | None:
         """Distance of the profile behind the torch [m]; None without a profiler."""
-        ...
 
     def looks(self) -> list[WeldProfile]:
         """Return new profiles of the bead; never waits.
@@ -129,7 +128,6 @@ class FingerCameraReader(Protocol):
         Raises:
             DeviceError: The profile sensor is lost.
         """
-        ...
 
     def seen(self) -> list[TagObservation]:
         """Return new sights; never waits.
@@ -137,15 +135,12 @@ class FingerCameraReader(Protocol):
         Raises:
             DeviceError: The camera is lost.
         """
-        ...
 
     def tell(self, state: RobotState) -> None:
         """Take the arm's newest sample, for a sensor that asks for it; never waits."""
-        ...
 
     def true_torch(self) -> tuple[Floats, Floats] | None:
         """Return the true path of a simulated torch after the weld; else None."""
-        ...
 
     def __enter__(self) -> Self: ...
 
