@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from flangeye import stage
-from flangeye.maths.geometry import arc_lengths, rotation_exp
+from flangeye.maths.geometry import arc_lengths, rotation_exp, rows_at
 from flangeye.models.workpiece import load_workpiece
 from flangeye.types import CAMERA, Floats, PointCloud, Seam, Seed, VerifiedHandEye, WorkpieceScan
 from flangeye_emulators.world.bench import LaidParams
@@ -51,4 +51,4 @@ def _dense(points: Floats) -> Floats:
     along = arc_lengths(points)
     # Between two points of a seam [m]
     ticks = np.linspace(0.0, along[-1], round(along[-1] / 1e-3) + 1)
-    return np.stack([np.interp(ticks, along, axis) for axis in points.T], axis=1)
+    return rows_at(ticks, along, points)

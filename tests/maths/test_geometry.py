@@ -13,6 +13,7 @@ from flangeye.maths.geometry import (
     rotation_exp,
     rotation_from_rpy,
     rotation_log,
+    rows_at,
     rpy_from_rotation,
 )
 
@@ -65,3 +66,12 @@ def test_roll_pitch_and_yaw_give_the_rotation_at_any_pitch(r: Any, p: Any, y: An
 def test_a_frame_whose_z_lies_along_any_axis_has_angles(axis: Any) -> None:
     angles = rpy_from_rotation(basis_of_plane(axis).T)
     np.testing.assert_allclose(rotation_from_rpy(*angles)[:, 2], axis, atol=1e-15)
+
+
+def test_rows_are_interpolated_column_by_column() -> None:
+    times, points = np.array([0.0, 1.0, 3.0]), np.array([[0.0, 0, 0], [1, 2, 3], [3, 2, 1.0]])
+    found = rows_at(np.array([0.5, 2.0]), times, points)
+    assert found == pytest.approx(np.array([[0.5, 1, 1.5], [2, 2, 2]]))
+    assert rows_at(2.0, times, points) == pytest.approx([2, 2, 2])
+    assert rows_at(2.0, times, points[:, 0]) == pytest.approx(2.0)
+    assert rows_at([0.5], times, points[:, None]).shape == (1, 1, 3)

@@ -11,7 +11,7 @@ from flangeye.estimation.estimate import Estimate
 from flangeye.estimation.graph import Carrier
 from flangeye.maths.arm_correction import effects as field_effects
 from flangeye.maths.arm_correction import field_over
-from flangeye.maths.geometry import hat
+from flangeye.maths.geometry import levers
 from flangeye.types import ArmCorrection, Floats
 
 CORRECTED = frozenset({"zeros", "lengths", "twists", "field"})
@@ -86,8 +86,7 @@ def _as_field(found: Estimate, carrier: Carrier) -> Floats:
             rows = _rows(found, carrier, kind)
             if kind not in CORRECTED and rows is not None:
                 rest += columns[:, 3:] @ mean[rows]
-    still = np.tile(np.eye(3), (len(places), 1, 1))
-    motions = np.concatenate([-hat(places - field.about), still], axis=2).reshape(-1, 6)
+    motions = levers(places - field.about).reshape(-1, 6)
     bent = rest.ravel() - motions @ np.linalg.lstsq(motions, rest.ravel(), rcond=1e-9)[0]
     moves = field_effects(field, places).reshape(len(bent), -1)
     return np.asarray(np.linalg.lstsq(moves, bent, rcond=1e-6)[0])

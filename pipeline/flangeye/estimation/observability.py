@@ -15,7 +15,7 @@ import numpy as np
 from flangeye.errors import CalibrationRefused, StageError
 from flangeye.estimation.graph import Places, Problem
 from flangeye.maths.frame_graph import chain
-from flangeye.maths.geometry import hat, invert, kabsch, rotation_exp, rotation_log, stack_rows
+from flangeye.maths.geometry import invert, kabsch, levers, rotation_exp, rotation_log, stack_rows
 from flangeye.maths.statistics import chi2_quantile
 from flangeye.types import CAMERA, TARGET, Floats
 
@@ -231,9 +231,7 @@ def require_observable(
 
 def information_of_centres(tcps: Floats, noise: float) -> Floats:
     """Return the (6, 6) Fisher information of (N, 3) centres with equal isotropic noise [m]."""
-    n = len(tcps)
-    levers = -hat(tcps - tcps.mean(axis=0))
-    jacobian = np.concatenate([levers, np.broadcast_to(np.eye(3), (n, 3, 3))], axis=2)
+    jacobian = levers(tcps - tcps.mean(axis=0))
     return np.asarray(np.einsum("nai,naj->ij", jacobian, jacobian) / noise**2)
 
 

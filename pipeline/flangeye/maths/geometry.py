@@ -19,6 +19,13 @@ def arc_lengths(points: Floats) -> Floats:
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
+def rows_at(at: ArrayLike, known: Floats, rows: Floats) -> Floats:
+    """Interpolate the rows (N, ...) that stand at ``known`` (N,), rising, at (M,): (M, ...)."""
+    columns = rows.reshape(len(rows), -1).T
+    there = np.stack([np.interp(np.asarray(at), known, column) for column in columns], axis=-1)
+    return there.reshape((*np.shape(at), *rows.shape[1:]))
+
+
 def hat(vectors: ArrayLike) -> Floats:
     """Return the (..., 3, 3) cross-product matrices of (..., 3) vectors: ``hat(a) @ b = a x b``."""
     v = np.asarray(vectors, dtype=np.float64)
@@ -230,6 +237,11 @@ def kabsch(source: Floats, target: Floats, weights: Floats | None = None) -> tup
     return rotation, mean_t - rotation @ mean_s
 
 
+def levers(points: Floats) -> Floats:
+    """Return (..., 3, 6): how (..., 3) points move with (rotation, translation) about 0."""
+    return np.concatenate([-hat(points), np.broadcast_to(np.eye(3), (*points.shape, 3))], axis=-1)
+
+
 def adjoint_shift(offset: Floats) -> Floats:
     """Return the (6, 6) map of a perturbation (phi, tau) to another reference point.
 
@@ -249,9 +261,7 @@ def covariance_at(covariance: Floats, about: Floats, points: Floats) -> Floats:
         about: (3,) reference point [m].
         points: (N, 3) in the parent frame [m].
     """
-    jacobian = np.zeros((len(points), 3, 6))
-    jacobian[:, :, :3] = -hat(np.asarray(points) - about)
-    jacobian[:, :, 3:] = np.eye(3)
+    jacobian = levers(np.asarray(points) - about)
     return np.asarray(jacobian @ covariance @ jacobian.transpose(0, 2, 1))
 
 

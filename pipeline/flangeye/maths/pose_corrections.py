@@ -11,6 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from flangeye.maths.geometry import rows_at
 from flangeye.types import Floats, Mask
 
 
@@ -126,8 +127,7 @@ def delaying(poses: Floats, times: Floats) -> Callable[[float], tuple[Floats, Ma
         inside = np.clip(wanted, times[0], times[-1])
         out = np.array(poses)
         out[:, :3, :3] = turning(inside).as_matrix()
-        for axis in range(3):
-            out[:, axis, 3] = np.interp(inside, times, poses[:, axis, 3])
+        out[:, :3, 3] = rows_at(inside, times, poses[:, :3, 3])
         return out, np.asarray(kept)
 
     return later

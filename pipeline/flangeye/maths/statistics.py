@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flangeye.maths.geometry import hat, rotation_exp
+from flangeye.maths.geometry import levers, rotation_exp
 from flangeye.types import Feature, Floats, Observation, PoseFeature, Transform
 
 T = TypeVar("T", bound=np.floating)
@@ -102,10 +102,7 @@ def largest_error_quantile(
     root = axes * np.sqrt(np.clip(variances, 0.0, None))
     samples = 4000  # a 95 % quantile from this many draws varies by one percent
     draws = np.random.default_rng(0).standard_normal((samples, 6)) @ root.T
-    motions = np.concatenate(
-        [-hat(corners - about), np.broadcast_to(np.eye(3), (len(corners), 3, 3))], axis=2
-    )
-    errors = (draws @ motions.reshape(-1, 6).T).reshape(samples, -1, 3)
+    errors = (draws @ levers(corners - about).reshape(-1, 6).T).reshape(samples, -1, 3)
     squares = np.einsum("sci,sci->sc", errors, errors).max(axis=1)
     return float(np.sqrt(np.quantile(squares, probability)))
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flangeye.maths.geometry import nearest_rotation, rigid, rotation_log
+from flangeye.maths.geometry import nearest_rotation, rigid, rotation_log, rows_at
 from flangeye.types import Floats, Motion
 
 STILL_DISTANCE = 0.5e-3
@@ -69,7 +69,7 @@ def interpolated(times: Floats, poses: Floats, at: Floats) -> Floats:
 
     inside = np.clip(at, times[0], times[-1])
     turned = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))(inside).as_matrix()
-    moved = np.stack([np.interp(inside, times, poses[:, k, 3]) for k in range(3)], axis=1)
+    moved = rows_at(inside, times, poses[:, :3, 3])
     return np.array([rigid(r, p) for r, p in zip(turned, moved, strict=True)])
 
 
@@ -104,10 +104,7 @@ def with_joints(motion: Motion, at: float, of: str, stream: tuple[Floats, Floats
     told = (at + motion.times >= times[0]) & (at + motion.times <= times[-1])
     told |= motion.times == 0
     joints = {name: each[told] for name, each in motion.joints.items()}
-    columns = values.reshape(len(times), -1).T
-    joints[of] = np.stack(
-        [np.interp(at + motion.times[told], times, each) for each in columns], axis=1
-    )
+    joints[of] = rows_at(at + motion.times[told], times, values.reshape(len(times), -1))
     others = {name: poses[told] for name, poses in motion.others.items()}
     return Motion(motion.times[told], motion.poses[told], others, joints)
 
@@ -129,7 +126,7 @@ def joints_at(motion: Motion, time: float, of: str) -> Floats | None:
     """Return the (n,) joints that move a frame at a time of a motion; None if not recorded."""
     if of not in motion.joints:
         return None
-    return np.array([np.interp(time, motion.times, each) for each in motion.joints[of].T])
+    return rows_at(time, motion.times, motion.joints[of])
 
 
 def rates_of(motions: Sequence[Motion], of: str | None = None) -> Floats:

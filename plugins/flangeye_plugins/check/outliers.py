@@ -9,7 +9,7 @@ import numpy as np
 
 from flangeye import part
 from flangeye.doctor.diagnosis import Finding, Findings, NotApplicable, RecordedSession
-from flangeye.maths.geometry import hat, rotation_exp
+from flangeye.maths.geometry import levers, rotation_exp
 from flangeye.types import Floats
 from flangeye_plugins.check.equations import equations_of
 from flangeye_plugins.check.fitting import (
@@ -230,7 +230,7 @@ def _uncertainty(session: RecordedSession, null: VariantFits) -> tuple[float, fl
     share = min(1.0, float((errors[: len(scales)] / scales).min()))
     covariance = share**2 * covariance_of(null.information[0])[:6, :6]
     work = null.unknowns.rotation[0] @ np.nanmean(session.centres, axis=0)
-    at_work = np.concatenate([-hat(work), np.eye(3)], axis=1)
+    at_work = levers(work)
     turn = np.linalg.eigvalsh(covariance[:3, :3])[-1]
     shift = np.linalg.eigvalsh(at_work @ covariance @ at_work.T)[-1]
     return float(np.sqrt(max(turn, 0.0))), float(np.sqrt(max(shift, 0.0)))

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field
 
 from flangeye.estimation.observability import in_base
-from flangeye.maths.geometry import angle_between, hat, rigid, rotation_from_rpy
+from flangeye.maths.geometry import angle_between, hat, levers, rigid, rotation_from_rpy
 from flangeye.motion.reach import Plan, PlannedPose, Site, tilted
 from flangeye.plugin.stage import Params, part
 from flangeye.types import Box, Floats
@@ -193,9 +193,3 @@ class Chooser:
             np.einsum("mai,maj->mij", of_centre, of_centre) / self._params.noise**2
             + np.einsum("mai,maj->mij", of_normal, of_normal) / np.radians(0.1) ** 2
         )
-
-
-def levers(places: Floats) -> Floats:
-    """Return (N, 3, 6): how places (N, 3) move with rotation and translation about the origin."""
-    still = np.broadcast_to(np.eye(3), (len(places), 3, 3))
-    return np.concatenate([-hat(places), still], axis=2)

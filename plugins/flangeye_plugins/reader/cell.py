@@ -16,6 +16,7 @@ from pydantic import Field, model_validator
 from flangeye import Params, StageError, part
 from flangeye.files.recording import Archive, NotThisLayout, Recording
 from flangeye.files.tables import Column, Table, files_at
+from flangeye.maths.geometry import rows_at
 from flangeye.maths.pose_corrections import inverted
 from flangeye.maths.pose_formats import ANGLES, LENGTHS
 from flangeye.maths.streams import (
@@ -311,7 +312,7 @@ def _by_time(
 def _moment(first: Moved, moved: Sequence[Moved], found: MatchedPose) -> Moment:
     at = {each.name: found.pose if each is first else _at(each, found.time) for each in moved}
     joints = {
-        m.name: np.array([np.interp(found.time, np.asarray(m.times), each) for each in m.joints.T])
+        m.name: rows_at(found.time, np.asarray(m.times), m.joints)
         for m in moved
         if m.joints is not None
     }
@@ -347,7 +348,7 @@ def _signals(arm: Signal, events: Floats, values: Sequence[Floats | Path | None]
 def _at(each: Moved, time: float) -> Floats:
     times = np.asarray(each.times)
     if each.values.ndim == 1:
-        return np.asarray(np.interp(time, times, each.values))
+        return rows_at(time, times, each.values)
     return np.asarray(interpolated(times, each.values, np.array([time]))[0])
 
 

@@ -19,7 +19,7 @@ from flangeye import BoundPart, Choose, Params, StageError, part
 from flangeye.doctor.diagnosis import Arms
 from flangeye.estimation.readings import Axes, optical
 from flangeye.files.recording import Archive, Recording
-from flangeye.maths.geometry import rigid
+from flangeye.maths.geometry import rigid, rows_at
 from flangeye.maths.pose_corrections import (
     delayed,
     inverted,
@@ -201,7 +201,7 @@ def _delay(
     def moved(rows: Floats) -> Floats:
         if rows.ndim == 3:
             return delayed(rows, times, params.delay)[0]
-        return np.stack([np.interp(wanted, times, column) for column in rows.T], axis=-1)
+        return rows_at(wanted, times, rows)
 
     return _replaced(recordings, moved, kept, params.arms)
 

@@ -20,6 +20,7 @@ from pydantic import Field
 
 from flangeye import Params, StageError, part
 from flangeye.files.recording import Archive, Recording
+from flangeye.maths.geometry import rows_at
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.pose_corrections import inverted
 from flangeye.maths.streams import mean_pose, turning, with_joints
@@ -454,6 +455,4 @@ def _motion(joints: Stream | None, found: MatchedPose) -> Motion | None:
 
 
 def _angles(joints: Stream | None, found: MatchedPose) -> Floats | None:
-    if joints is None:
-        return None
-    return np.array([np.interp(found.time, joints[0], each) for each in joints[1].T])
+    return None if joints is None else rows_at(found.time, *joints)

@@ -26,6 +26,7 @@ from flangeye import StageError, part
 from flangeye.files.recording import Archive, NotThisLayout, Recording
 from flangeye.files.scans import Poses, recording_of, scans_of
 from flangeye.files.tables import Column, Table, files_at, number_of, rows_together
+from flangeye.maths.geometry import rows_at
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.pose_corrections import inverted
 from flangeye.maths.pose_formats import LengthUnit as PoseLength
@@ -309,9 +310,7 @@ def _with_joints(
     if joints is None:
         return recordings
     return [
-        replace(r, joints=np.array([np.interp(r.time_ns * 1e-9, times, each) for each in joints.T]))
-        if r.motion is None
-        else r
+        replace(r, joints=rows_at(r.time_ns * 1e-9, times, joints)) if r.motion is None else r
         for r in recordings
     ]
 

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from flangeye import CalibrationRefused, Params
 from flangeye.maths.arm_correction import reported_flange
-from flangeye.maths.geometry import arc_lengths
+from flangeye.maths.geometry import arc_lengths, rows_at
 from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
@@ -125,7 +125,7 @@ def resampled(line: Floats, spacing: float) -> Floats:
     """
     arc = arc_lengths(line[:, :3])
     at = np.linspace(0.0, arc[-1], max(2, round(arc[-1] / spacing) + 1))
-    return np.stack([np.interp(at, arc, column) for column in line.T], axis=1)
+    return rows_at(at, arc, line)
 
 
 def refuse_outside(stage: str, points_in_base: Floats, workspace: Box | None) -> None:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flangeye.maths.geometry import arc_lengths
+from flangeye.maths.geometry import arc_lengths, rows_at
 from flangeye.types import Floats
 from flangeye_plugins.seam.planned import resampled
 from flangeye_plugins.seam.template import EDGES, FACES, OFFSETS, JointShape, Section
@@ -446,8 +446,7 @@ def _with_openings(points: Floats, openings: Floats, closed: bool, eyes: Floats)
     arc = arc_lengths(line)
     at = np.linspace(0.0, arc[-1], len(line))
     wrapped = np.vstack([openings, openings[:1]]) if closed else openings
-    even = np.stack([np.interp(at, arc, line[:, k]) for k in range(3)], axis=1)
-    out = np.stack([np.interp(at, arc, wrapped[:, k]) for k in range(3)], axis=1)
+    even, out = rows_at(at, arc, line), rows_at(at, arc, wrapped)
     step = float(arc[-1] / (len(line) - 1))
     if closed:
         even, out = even[:-1], out[:-1]

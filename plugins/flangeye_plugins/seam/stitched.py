@@ -17,7 +17,7 @@ import numpy as np
 
 from flangeye import CalibrationRefused
 from flangeye.maths.arm_correction import corrected_flange
-from flangeye.maths.geometry import covariance_at, hat
+from flangeye.maths.geometry import covariance_at, levers
 from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
@@ -39,7 +39,6 @@ class OfPose(Protocol):
 
     def __call__(self, points_in_base: Floats) -> Floats:
         """Return the (K, 3, 3) covariances [m^2] of (K, 3) points."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,9 +162,9 @@ class _AsSeveral:
         for place, share in zip(self.places, self._shares(points_in_base), strict=True):
             flange = np.asarray(place.base_T_flange)
             inside = (points_in_base - flange[:3, 3]) @ flange[:3, :3]
-            of_camera += share[:, None, None] * (flange[:3, :3] @ _moved(inside - camera.about))
+            of_camera += share[:, None, None] * (flange[:3, :3] @ levers(inside - camera.about))
             if self.robot is not None:
-                moved = _moved(points_in_base - flange[:3, 3])
+                moved = levers(points_in_base - flange[:3, 3])
                 turning = Arm(self.robot).jacobian(place.joints)
                 of_zeros += share[:, None, None] * (moved @ turning)
         zeros = 0.0 if self.robot is None else self.robot.joint_accuracy**2
@@ -186,11 +185,6 @@ class _AsSeveral:
         nearest = np.argmin([tree.query(points)[0] for tree in trees], axis=0)
         counts[nearest, np.arange(len(points))] += 1e-3  # beyond what any shows: the nearest alone
         return np.asarray(counts / counts.sum(axis=0))
-
-
-def _moved(arms: Floats) -> Floats:
-    """Return (K, 3, 6): what a small rotation and translation do at (K, 3) from where they act."""
-    return np.concatenate([-hat(arms), np.tile(np.eye(3), (len(arms), 1, 1))], axis=2)
 
 
 def _apart(clouds: Sequence[Floats]) -> float | None:

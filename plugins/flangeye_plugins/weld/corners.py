@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flangeye.errors import StageError
-from flangeye.maths.geometry import arc_lengths
+from flangeye.maths.geometry import arc_lengths, rows_at
 from flangeye.types import Floats, Seam
 from flangeye_plugins.weld.frame import rolled_out
 from flangeye_plugins.weld.path import CHORD
@@ -59,9 +59,7 @@ def _turn(planar: Floats, along: Floats, s: float) -> float:
     """Return by how much a polyline turns to the left at an arc length; nothing at its ends."""
     if not CHORD <= s <= along[-1] - CHORD:
         return 0.0
-    before, here, after = (
-        np.array([np.interp(s + d, along, axis) for axis in planar.T]) for d in (-CHORD, 0.0, CHORD)
-    )
+    before, here, after = rows_at(s + np.array([-CHORD, 0.0, CHORD]), along, planar)
     (ax, ay), (bx, by) = here - before, after - here
     return float(np.arctan2(ax * by - ay * bx, ax * bx + ay * by))
 
@@ -126,8 +124,8 @@ def _rounded(seam: Seam, corners: list[Corner], params: WeldTactileParams, radiu
     return replace(
         seam,
         points_in_base=np.concatenate([points[kept], *(arc for _, arc in pieces)])[order],
-        openings_in_base=_at(at[order], along, seam.openings_in_base),
-        covariance=_at(at[order], along, seam.covariance),
+        openings_in_base=rows_at(at[order], along, seam.openings_in_base),
+        covariance=rows_at(at[order], along, seam.covariance),
     )
 
 
@@ -138,18 +136,11 @@ def _arc(
 
     A rational quadratic curve of this weight is a circle's (Piegl and Tiller 1997, 7.3).
     """
-    first, corner, last = _at(here + cut * np.array([-1.0, 0.0, 1.0]), along, points)
+    first, corner, last = rows_at(here + cut * np.array([-1.0, 0.0, 1.0]), along, points)
     t = np.linspace(0.0, 1.0, 40)[:, None]
     weights = np.hstack([(1 - t) ** 2, 2 * t * (1 - t) * np.cos(turn / 2.0), t**2])
     arc = weights @ np.stack([first, corner, last]) / weights.sum(axis=1, keepdims=True)
     return here + cut * np.linspace(-1.0, 1.0, 40), arc
-
-
-def _at(at: Floats, along: Floats, rows: Floats) -> Floats:
-    """Return rows (N, ...) by arc length (N,), at others (K,)."""
-    columns = rows.reshape(len(rows), -1).T
-    there = np.stack([np.interp(at, along, column) for column in columns], axis=1)
-    return np.asarray(there.reshape(len(at), *rows.shape[1:]))
 
 
 def _require_room(corner: Corner, seam: Seam, params: WeldTactileParams) -> None:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from flangeye.maths.geometry import arc_lengths, rigid, rotation_from_rpy
+from flangeye.maths.geometry import arc_lengths, rigid, rotation_from_rpy, rows_at
 from flangeye.models.finger import FingerGeometry
 from flangeye.motion.seam_following import Command, ToolPose
 from flangeye.types import BASE, FLANGE, Floats, Transform
@@ -107,11 +107,11 @@ class WorkSurface:
         self.path = Path(self.points, wraps)
         along = arc_lengths(self.points)
         ticks = self.path.step * np.arange(len(self.path.points), dtype=np.float64)
-        line = _interpolated(ticks, along, points)
+        line = rows_at(ticks, along, points)
         ahead = np.gradient(line, self.path.step, axis=0)
         # A scanned opening scatters from place to place: the mean over a chord counts.
         width = max(1, round(CHORD / self.path.step))
-        up = uniform_filter1d(_interpolated(ticks, along, openings), width, 0, mode="nearest")
+        up = uniform_filter1d(rows_at(ticks, along, openings), width, 0, mode="nearest")
         self._rows: Floats = np.hstack([line, ahead, up])
         self._plain = self._rows.tolist()
         planar = np.hstack([self.path.points[:, :2], self.path.tangents, self._rows])
@@ -256,10 +256,6 @@ class WorkSurface:
         chord /= np.linalg.norm(chord, axis=1)[:, None]
         up = axes[:, :, 2] - np.einsum("ki,ki->k", axes[:, :, 2], chord)[:, None] * chord
         return np.asarray(up / np.linalg.norm(up, axis=1)[:, None]), behind
-
-
-def _interpolated(at: Floats, along: Floats, rows: Floats) -> Floats:
-    return np.stack([np.interp(at, along, axis) for axis in rows.T], axis=1)
 
 
 def _gone_around(points: Floats, openings: Floats) -> tuple[Floats, Floats, float]:

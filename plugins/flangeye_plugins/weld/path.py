@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flangeye.maths.geometry import arc_lengths
+from flangeye.maths.geometry import arc_lengths, rows_at
 from flangeye.types import Floats
 
 PATH_SPACING = 0.5e-3
@@ -57,7 +57,7 @@ class Path:
         known = float(along[-1])
         self.length, self.first, self.last = known - 2 * wraps, -wraps, known - wraps
         ticks = np.linspace(0.0, known, max(2, round(known / PATH_SPACING)) + 1)
-        self.points = np.stack([np.interp(ticks, along, axis) for axis in points.T], axis=1)
+        self.points = rows_at(ticks, along, points)
         self.step = float(ticks[1])
         slopes = np.gradient(self.points, self.step, axis=0)
         norms = np.linalg.norm(slopes[:, :2], axis=1, keepdims=True)

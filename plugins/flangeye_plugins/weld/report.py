@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from flangeye.maths.geometry import rows_at
 from flangeye.motion.seam_following import Controller, turned
 from flangeye.types import Floats, Note, Seam, WeldReport
 from flangeye_plugins.weld.frame import LeaningTool, WorkSurface
@@ -60,7 +61,7 @@ def report_of(  # noqa: PLR0913  all that a weld had
         sigma=_stated(np.array(every["sigma"])[kept]),
         bound=_stated(np.array(every["bound"])[kept]),
         band=_stated(np.array(every["band"])[kept]),
-        true_torch=np.zeros((0, 3)) if truth is None else _at(cycle["time"], *truth),
+        true_torch=np.zeros((0, 3)) if truth is None else rows_at(cycle["time"], *truth),
         loop=_loop(weld_log),
         notes=_advice(controller),
     )
@@ -100,11 +101,6 @@ def _stated(deviations: Floats) -> Floats:
     return deviations if np.isfinite(deviations).all() else np.zeros(0)
 
 
-def _at(times: Floats, known: Floats, points: Floats) -> Floats:
-    """Return points (N, 3) at times (K,), between those (N,) at which they are known."""
-    return np.stack([np.interp(times, known, axis) for axis in points.T], axis=1)
-
-
 def learned_figures(controller: Controller) -> Mapping[str, float]:
     """Return the sweep's estimates."""
     root = follower_of(controller)
@@ -136,7 +132,7 @@ def _tip_displacements(
     if not felt:
         return robot[kept], np.zeros(len(kept))
     times = np.array([feeling.time_ns for feeling in felt]) * 1e-9
-    then = np.stack([np.interp(times, every["time"], axis) for axis in robot.T], axis=1)
+    then = rows_at(times, np.array(every["time"]), robot)
     angle = np.interp(times, every["time"], every["angle"])
     level = np.array([feeling.displacement for feeling in felt]) @ body.level_R_tool.T
     moved = np.array([turned(d, a) for d, a in zip(level, angle, strict=True)])

@@ -30,7 +30,7 @@ from flangeye_plugins.weld.following.belief import Belief
 from flangeye_plugins.weld.frame import WorkSurface
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.reachability import _nearest, flange_speed
-from flangeye_plugins.weld.report import _at, _figures, _loop, _stated
+from flangeye_plugins.weld.report import _figures, _loop, _stated
 from flangeye_plugins.weld.settings import Following
 from tools.weld_bench import FINGER
 
@@ -183,10 +183,6 @@ def test_a_tip_keeps_to_the_plan_and_to_what_its_finger_stands(
 
 
 def test_a_report_has_what_was_counted_and_how_the_loop_kept_time() -> None:
-    times, points = np.array([0.0, 1.0, 3.0]), np.array([[0.0, 0, 0], [1, 2, 3], [3, 2, 1.0]])
-    assert _at(np.array([0.5, 2.0]), times, points) == pytest.approx(
-        np.array([[0.5, 1, 1.5], [2, 2, 2]])
-    )
     assert _stated(np.array([1.0, 2.0])).tolist() == [1.0, 2.0]
     assert len(_stated(np.array([1.0, np.inf]))) == 0
     cycles = [SimpleNamespace(turn=t, computing=1e-3 * c, answering=2e-3 * c, period=8e-3 + p)

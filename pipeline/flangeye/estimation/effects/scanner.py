@@ -16,7 +16,7 @@ import numpy as np
 from flangeye.estimation.effects.effect import Effect
 from flangeye.estimation.graph import Linear, Problem, Sightings
 from flangeye.maths.arm_correction import features, powers
-from flangeye.maths.geometry import hat, stack_rows
+from flangeye.maths.geometry import levers, stack_rows
 from flangeye.models.scanners import ScannerModel
 from flangeye.types import Floats
 
@@ -155,6 +155,4 @@ class DistortionField:
         return np.asarray(columns.reshape(len(points), 3, -1))
 
     def _motions(self, points: Floats) -> Floats:
-        about = points - np.array([0.0, 0.0, self._depths[0]])
-        still = np.broadcast_to(np.eye(3), (len(points), 3, 3))
-        return np.concatenate([-hat(about), still], axis=2)
+        return levers(points - np.array([0.0, 0.0, self._depths[0]]))

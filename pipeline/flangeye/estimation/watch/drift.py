@@ -31,7 +31,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from flangeye.maths.geometry import hat
+from flangeye.maths.geometry import hat, levers
 from flangeye.maths.statistics import MISFIT, chi2_quantile, f_quantile
 from flangeye.types import Floats
 
@@ -268,8 +268,7 @@ def _deviation(motion: Floats, covariance: Floats, corners: Floats) -> float:
     shifts = np.cross(motion[:3], corners) + motion[3:]
     lengths = np.linalg.norm(shifts, axis=1)
     worst = int(lengths.argmax())
-    rows = np.concatenate([-hat(corners[worst]), np.eye(3)], axis=1)
-    along = shifts[worst] / max(lengths[worst], 1e-12) @ rows
+    along = shifts[worst] / max(lengths[worst], 1e-12) @ levers(corners[worst])
     return float(np.sqrt(along @ covariance @ along))
 
 
@@ -376,7 +375,7 @@ def sightings_of(  # noqa: PLR0913  one argument a measured quantity
     has = np.asarray(np.isfinite(normals).all(axis=1))
     tilts = np.where(has[:, None], np.einsum("nai,ni->na", across, seen - axes), 0.0)
     effects = np.zeros((len(centres), 5, 6))
-    effects[:, :3, :3], effects[:, :3, 3:] = -hat(mapped - about), np.eye(3)
+    effects[:, :3] = levers(mapped - about)
     effects[:, 3:, :3] = -across @ hat(seen) * has[:, None, None]
     own = np.array(covariances)
     own[~has, 3:, 3:] = NO_NORMAL * np.eye(2)

@@ -11,12 +11,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 from typing import Literal
 
 import numpy as np
 
 from flangeye.errors import StageError
-from flangeye.maths.geometry import hat
+from flangeye.maths.geometry import levers
 from flangeye.maths.statistics import corners_of
 from flangeye.models.scanners import ScannerModel
 from flangeye.result.contract import Result, TransformResult
@@ -176,17 +177,16 @@ def budget_of(result: Result) -> Budget:
     _, estimate = _estimate_of(result)
     point = _worst_corner(result, estimate)
     standard, correlation = correlation_of(np.array(estimate.covariance))
-    lever = -hat(point - np.array(estimate.about))
+    sensitivities = levers(point - np.array(estimate.about)).T
     evidence = _evidence(result)
-    rows = [
-        *(("Rotation about", axis, "rad", lever[:, i]) for i, axis in enumerate("xyz")),
-        *(("Translation along", axis, "m", np.eye(3)[i]) for i, axis in enumerate("xyz")),
-    ]
+    causes = product((("Rotation about", "rad"), ("Translation along", "m")), "xyz")
     return Budget(
         point,
         [
             Contribution(f"{what} {axis}", "A", u, unit, c, np.inf, evidence)  # type: ignore[arg-type]
-            for (what, axis, unit, c), u in zip(rows, standard.tolist(), strict=True)
+            for ((what, unit), axis), c, u in zip(
+                causes, sensitivities, standard.tolist(), strict=True
+            )
         ],
         correlation,
     )
@@ -234,7 +234,7 @@ def shares_of(result: Result) -> list[Share]:
     own model, and the uncertainty of the causes' own sizes.
     """
     _, estimate = _estimate_of(result)
-    motions = _motions(_worst_corner(result, estimate)[None], np.array(estimate.about))[0]
+    motions = levers(_worst_corner(result, estimate) - np.array(estimate.about))
 
     def variance(covariance: Sequence[Sequence[float]]) -> float:
         return float(np.trace(motions @ np.array(covariance) @ motions.T))
@@ -262,13 +262,6 @@ def _standard_error(variance: float, count: int) -> float:
     return variance * float(np.sqrt(2 / max(count, 1)))
 
 
-def _motions(points: Floats, about: Floats) -> Floats:
-    """Return (N, 3, 6): how points move with a perturbation (rotation, translation)."""
-    return np.concatenate(
-        [-hat(points - about), np.broadcast_to(np.eye(3), (len(points), 3, 3))], axis=2
-    )
-
-
 def _estimate_of(result: Result) -> tuple[str, TransformResult]:
     found = next(iter(result.transforms.items()), None)
     if found is None:
@@ -282,7 +275,7 @@ def _worst_corner(result: Result, estimate: TransformResult) -> Floats:
         raise StageError("nothing says where the work is: give the recipe a 'workspace'")
     box = result.workspace
     corners = corners_of(np.array(box.centre), np.array(box.size))
-    motions = _motions(corners, np.array(estimate.about))
+    motions = levers(corners - np.array(estimate.about))
     variances = np.einsum("nia,ab,nib->n", motions, np.array(estimate.covariance), motions)
     return np.asarray(corners[int(variances.argmax())])
 
@@ -307,7 +300,7 @@ def _of_one_pose(result: Result) -> list[Contribution]:
     poses = held.figures.get("poses", 0.0) - held.figures.get("outliers", 0.0)
     _, estimate = _estimate_of(result)
     corners = corners_of(np.array(box.centre), np.array(box.size))
-    motions = _motions(corners, np.array(estimate.about))
+    motions = levers(corners - np.array(estimate.about))
     own = np.einsum("nia,ab,nib->n", motions, np.array(estimate.covariance), motions).mean()
     hidden = _standard_error(held.rms**2, int(3 * poses))
     beyond = held.rms**2 - float(own)
