@@ -23,7 +23,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from flangeye.batch.cluster import PREFIX
-from flangeye.doctor.monitor import History, stored_calibration
+from flangeye.doctor.monitor.history import History
+from flangeye.doctor.monitor.stored import stored_calibration
 from flangeye.errors import FlangeyeError
 from flangeye.files.processes import python_command
 from flangeye.log.read import read_run

@@ -13,8 +13,8 @@ import numpy as np
 from nicegui import ui
 from pydantic import ValidationError
 
-from flangeye.doctor import examine, open_session
-from flangeye.doctor.diagnosis import Finding
+from flangeye.doctor.diagnosis import Finding, examine
+from flangeye.doctor.opening import open_session
 from flangeye.errors import FlangeyeError, RecipeError
 from flangeye.files.yaml_lines import parse_yaml
 from flangeye.models.robots import RobotModel

@@ -8,8 +8,9 @@ from typing import Any
 
 from nicegui import ui
 
-from flangeye.doctor.monitor import History, history_beside, stored_calibration
 from flangeye.doctor.monitor.chart import COLOURS, sentence
+from flangeye.doctor.monitor.history import History, history_beside
+from flangeye.doctor.monitor.stored import stored_calibration
 from flangeye.errors import FlangeyeError
 from flangeye_ui.archive_page import link
 from flangeye_ui.charts import residual_chart

@@ -11,8 +11,8 @@ from flangeye import StageError
 from flangeye.files.paths import bundled
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.load import load_recipe
-from flangeye.report.certificate import Conditions, budget_of, write_certificate
-from flangeye.report.certificate.budget import shares_of
+from flangeye.report.certificate import write_certificate
+from flangeye.report.certificate.budget import Conditions, budget_of, shares_of
 from flangeye.result import result_of_camera
 from flangeye.run.folder import RunFolder
 from flangeye.run.session import Start, record_run

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flangeye.doctor import examine
+from flangeye.doctor.diagnosis import examine
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.maths.pose_corrections import inverted, reread, scaled, shifted, without_tool
 from flangeye_plugins.check import CHECKS

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import yaml
 
-from flangeye.doctor import examine, open_session
-from flangeye.doctor.diagnosis import RecordedSession
+from flangeye.doctor.diagnosis import RecordedSession, examine
+from flangeye.doctor.opening import open_session
 from flangeye.errors import FlangeyeError
 from flangeye.maths.geometry import rotation_exp, rotation_log
 from flangeye.maths.pose_corrections import inverted, reread, scaled, shifted, transposed

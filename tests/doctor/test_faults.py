@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye.doctor import examine, mended_together
-from flangeye.doctor.diagnosis import Finding, RecordedSession
+from flangeye.doctor import mended_together
+from flangeye.doctor.diagnosis import Finding, RecordedSession, examine
 from flangeye.errors import StageError
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.maths.pose_corrections import (

@@ -12,8 +12,8 @@ import pytest
 import yaml
 
 from flangeye import cli
-from flangeye.doctor import examine, open_session
-from flangeye.doctor.diagnosis import RecordedSession
+from flangeye.doctor.diagnosis import RecordedSession, examine
+from flangeye.doctor.opening import open_session
 from flangeye.files.clouds import read_cloud, write_cloud
 from flangeye.maths.pose_corrections import inverted, scaled, shifted, without_tool
 from flangeye.plugin.registry import load_registry

@@ -530,7 +530,8 @@ def _results(folder):
 
 
 def _read_certified(path):
-    from flangeye.report.certificate import Conditions, write_certificate
+    from flangeye.report.certificate import write_certificate
+    from flangeye.report.certificate.budget import Conditions
 
     content, source = path.read_bytes(), sound_log(path.parent / "sound")
     changed = rewritten(source, path.with_suffix(".mcap"),

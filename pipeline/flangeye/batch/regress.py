@@ -15,7 +15,8 @@ from flangeye.batch import run_sessions
 from flangeye.batch.dataset import Dataset, Ledger, columns_of
 from flangeye.batch.outcome import Request, SessionOutcome
 from flangeye.batch.plan import BatchSession, plan, software_of
-from flangeye.doctor import examine, open_session
+from flangeye.doctor.diagnosis import examine
+from flangeye.doctor.opening import open_session
 from flangeye.errors import FlangeyeError, RecipeError
 from flangeye.files.paths import place_at
 from flangeye.models.model import Model, read_model

@@ -130,7 +130,8 @@ def certificate(  # noqa: PLR0913  one argument an option
     ] = True,
 ) -> None:
     """Write a certificate after the GUM, to print and sign."""
-    from flangeye.report.certificate import Conditions, print_pdf, write_certificate
+    from flangeye.report.certificate import print_pdf, write_certificate
+    from flangeye.report.certificate.budget import Conditions
 
     conditions = Conditions(temperature, spread, place, operator)
     with at_work("certificate"):
@@ -206,14 +207,10 @@ def doctor(
     """
     import json
 
-    from flangeye.doctor import (
-        as_json,
-        as_text,
-        examine,
-        examine_cell,
-        open_cell,
-        open_session,
-    )
+    from flangeye.doctor import as_json, as_text
+    from flangeye.doctor.cells import examine_cell
+    from flangeye.doctor.diagnosis import examine
+    from flangeye.doctor.opening import open_cell, open_session
     from flangeye.log.read import log_of
     from flangeye.recipe.find import is_recipe
 

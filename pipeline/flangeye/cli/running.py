@@ -200,7 +200,9 @@ def _after_verification(recipe: Recipe) -> list[str]:
 def _findings(log: Path, registry: Registry, recipe: Recipe) -> Sequence[Finding]:
     """Return the mistakes that the doctor finds in a run, the one that explains most first."""
     from flangeye.cli.console import of_foreign
-    from flangeye.doctor import examine, examine_cell, open_cell, open_session
+    from flangeye.doctor.cells import examine_cell
+    from flangeye.doctor.diagnosis import examine
+    from flangeye.doctor.opening import open_cell, open_session
 
     checks = [registry.part(name) for name in registry.parts if name.startswith("check.")]
     try:

@@ -13,7 +13,8 @@ from flangeye.cli.app import Overrides, app, load_plugins
 from flangeye.cli.console import say
 
 if TYPE_CHECKING:
-    from flangeye.doctor.monitor import MonitorCheck, StoredCalibration
+    from flangeye.doctor.monitor.history import MonitorCheck
+    from flangeye.doctor.monitor.stored import StoredCalibration
     from flangeye.estimation.watch.drift import DriftTest
     from flangeye.plugin.registry import Registry
 
@@ -75,17 +76,10 @@ def monitor(  # noqa: PLR0913  one argument an option
     by the last check: 0 OK, 1 DEGRADED, 2 MOVED or nothing could be checked: a script that stops
     the cell on 2 is safe either way.
     """
-    from flangeye.doctor.monitor import (
-        CODES,
-        History,
-        as_json,
-        history_beside,
-        only_user,
-        stored_calibration,
-        take,
-        write_chart,
-    )
-    from flangeye.doctor.monitor.watchman import write_state
+    from flangeye.doctor.monitor.chart import write_chart
+    from flangeye.doctor.monitor.history import History, as_json, history_beside, only_user
+    from flangeye.doctor.monitor.stored import stored_calibration
+    from flangeye.doctor.monitor.watchman import CODES, take, write_state
     from flangeye.errors import StageError
 
     archive = [*(archive or ()), *(more or ())]

@@ -8,21 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from flangeye.doctor.cells import examine_cell
-from flangeye.doctor.diagnosis import Diagnosis, Finding, Misfit, examine
-from flangeye.doctor.opening import open_cell, open_session
-
-__all__ = [
-    "Diagnosis",
-    "as_json",
-    "as_text",
-    "examine",
-    "examine_cell",
-    "fix_lines",
-    "mended_together",
-    "open_cell",
-    "open_session",
-]
+from flangeye.doctor.diagnosis import Diagnosis, Finding, Misfit
 
 
 def as_text(diagnosis: Diagnosis) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flangeye.errors import StageError
-from flangeye.files.clouds import load_npy, load_npz
+from flangeye.files.clouds.plain import load_npy, load_npz
 from flangeye.files.regular import read_text
 from flangeye.types import Floats
 

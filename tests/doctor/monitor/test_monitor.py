@@ -20,10 +20,11 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from flangeye.cli import commands
-from flangeye.doctor.monitor import History, from_arm, judge, stored_calibration
+from flangeye.doctor.monitor import from_arm
 from flangeye.doctor.monitor.chart import figure
-from flangeye.doctor.monitor.history import CheckFinding
-from flangeye.doctor.monitor.watchman import write_state
+from flangeye.doctor.monitor.history import CheckFinding, History
+from flangeye.doctor.monitor.stored import stored_calibration
+from flangeye.doctor.monitor.watchman import judge, write_state
 from flangeye.errors import FlangeyeError, StageError
 from flangeye.estimation.watch.drift import DriftTest
 from flangeye.maths.geometry import rigid

@@ -10,13 +10,9 @@ import pytest
 from typer.testing import CliRunner
 
 from flangeye.cli import commands
-from flangeye.doctor.monitor import (
-    History,
-    MonitorCheck,
-    StoredCalibration,
-    judge,
-    stored_calibration,
-)
+from flangeye.doctor.monitor.history import History, MonitorCheck
+from flangeye.doctor.monitor.stored import StoredCalibration, stored_calibration
+from flangeye.doctor.monitor.watchman import judge
 from flangeye.estimation.watch.drift import DriftTest
 from flangeye.types import Observation
 

@@ -19,16 +19,19 @@ from flangeye.log.read import read_run
 from flangeye.maths.geometry import covariance_at
 from flangeye.models.loading import load_model
 from flangeye.report.certificate import (
-    Conditions,
-    budget_of,
     print_pdf,
     render,
     sandbox,
     standard_text,
-    use_budget_of,
     write_certificate,
 )
-from flangeye.report.certificate.budget import Share, shares_of
+from flangeye.report.certificate.budget import (
+    Conditions,
+    Share,
+    budget_of,
+    shares_of,
+    use_budget_of,
+)
 from flangeye.report.facts import facts_of
 from flangeye.report.units import millimetres
 from flangeye.result.contract import ExpectedErrorResult, Result

@@ -8,17 +8,8 @@ from typing import Any
 
 from flangeye import types as t
 from flangeye.devices import MotionAllowed
-from flangeye.doctor.monitor.chart import write_chart
-from flangeye.doctor.monitor.history import (
-    History,
-    MonitorCheck,
-    as_json,
-    history_beside,
-    only_user,
-    prints_of,
-)
-from flangeye.doctor.monitor.stored import StoredCalibration, stored_calibration
-from flangeye.doctor.monitor.watchman import CODES, judge, take
+from flangeye.doctor.monitor.history import MonitorCheck, prints_of
+from flangeye.doctor.monitor.stored import StoredCalibration
 from flangeye.errors import StageError
 from flangeye.files.yaml_lines import dumped, parse_yaml
 from flangeye.log.read import RunLog, log_of, read_run
@@ -27,22 +18,6 @@ from flangeye.recipe.load import parse_recipe
 from flangeye.run.folder import CHECKS, RunFolder, recipe_of_log
 from flangeye.run.runner import Runner
 from flangeye.run.session import record_scans
-
-__all__ = [
-    "CODES",
-    "History",
-    "MonitorCheck",
-    "StoredCalibration",
-    "as_json",
-    "from_archive",
-    "from_arm",
-    "history_beside",
-    "judge",
-    "only_user",
-    "stored_calibration",
-    "take",
-    "write_chart",
-]
 
 
 def from_archive(

@@ -18,8 +18,6 @@ import numpy as np
 from flangeye.files.clouds.pcd import Viewpoint, open_pcd
 from flangeye.files.clouds.plain import (
     STATED,
-    load_npy,
-    load_npz,
     open_npy,
     open_npz,
     open_text,
@@ -66,19 +64,6 @@ def mark_missing(xyz: Points) -> str:
 def _beyond(value: float, others: Points, times: float) -> bool:
     return bool(others.size) and value > times * float(others.max())
 
-
-__all__ = [
-    "CLOUD_FILES",
-    "CONVERSIONS",
-    "PER_METRE",
-    "VENDOR",
-    "LengthUnit",
-    "check_cloud_file",
-    "load_npy",
-    "load_npz",
-    "read_cloud",
-    "write_cloud",
-]
 
 LengthUnit = Literal["m", "mm", "in"]
 PER_METRE: Mapping[LengthUnit, float] = {"m": 1, "mm": 1000, "in": 1 / 0.0254}

@@ -15,7 +15,6 @@ from flangeye.files.regular import write_whole
 from flangeye.log.read import read_run
 from flangeye.models.scanners import ScannerModel
 from flangeye.report.certificate.budget import (
-    Budget,
     Conditions,
     Contribution,
     Share,
@@ -163,13 +162,3 @@ def _serial(section: dict[str, Any]) -> str:
     driver = section.get("driver")
     settings = next(iter(driver.values()), None) if isinstance(driver, dict) else None
     return str(settings.get("serial", "")) if isinstance(settings, dict) else ""
-
-
-__all__ = [
-    "Budget",
-    "Conditions",
-    "budget_of",
-    "print_pdf",
-    "use_budget_of",
-    "write_certificate",
-]
