@@ -17,6 +17,7 @@ from flangeye.report.look import LIGHT
 from flangeye.report.units import millimetres
 from flangeye.result import status_of
 from flangeye.result.contract import Result
+from flangeye_ui.charts import bar_chart
 from flangeye_ui.foreign import address_of
 from flangeye_ui.layout import command_line, mistake, page
 from flangeye_ui.project import Project
@@ -86,16 +87,10 @@ def comparison(rows: list[dict[str, Any]]) -> dict[str, Any]:
             ("expected", "expected error, mm", LIGHT["bar"]),
         )
     ]  # fmt: skip
-    return {
-        "animation": False, "tooltip": {"trigger": "axis"}, "series": series,
+    return bar_chart([r["run"] for r in ordered], series) | {
         "legend": {"top": 0, "textStyle": {"color": LIGHT["axis"]}},
         "grid": {"left": 45, "right": 10, "top": 35, "bottom": 25},
-        "xAxis": {"type": "category", "data": [r["run"] for r in ordered],
-                  "axisLabel": {"color": LIGHT["axis"]}},
-        "yAxis": {"type": "value", "name": "mm", "nameTextStyle": {"color": LIGHT["axis"]},
-                  "axisLabel": {"color": LIGHT["axis"]},
-                  "splitLine": {"lineStyle": {"opacity": 0.3}}},
-    }  # fmt: skip
+    }
 
 
 def _batch(path: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Set
+from collections.abc import Mapping, Sequence, Set
 from typing import Any
 
 import numpy as np
@@ -25,24 +25,26 @@ def residual_chart(
         label = {"formatter": "limit", "color": LIGHT["axis"], "position": "insideEndTop"}
         series["markLine"] = {"symbol": "none", "data": [line], "label": label}
     crosses = [[n, 0] for n in sorted(aside)]
+    marks = {
+        "type": "scatter", "name": "set aside", "data": crosses, "color": LIGHT["refused"],
+        "symbol": "diamond", "symbolSize": 12,
+    }  # fmt: skip
+    chart = bar_chart(names, [series, marks])
+    chart["yAxis"]["axisLabel"] = {"color": LIGHT["axis"], "showMaxLabel": not limit}
+    if limit:
+        chart["yAxis"]["max"] = float(f"{1.1e3 * max(limit, *sizes.values()):.2g}")
+    return chart
+
+
+def bar_chart(names: Sequence[str], series: Sequence[Any]) -> dict[str, Any]:
+    """Return bars [mm], a group for each name."""
+    words = {"color": LIGHT["axis"]}
     return {
-        "animation": False,
+        "animation": False, "series": series, "tooltip": {"trigger": "axis"},
         "grid": {"left": 45, "right": 10, "top": 25, "bottom": 25},
-        "tooltip": {"trigger": "axis"},
-        "xAxis": {"type": "category", "data": names, "axisLabel": {"color": LIGHT["axis"]}},
-        "yAxis": {
-            "type": "value", "name": "mm", "nameTextStyle": {"color": LIGHT["axis"]},
-            "axisLabel": {"color": LIGHT["axis"], "showMaxLabel": not limit},
-            "splitLine": {"lineStyle": {"opacity": 0.3}},
-            **({"max": float(f"{1.1e3 * max(limit, *sizes.values()):.2g}")} if limit else {}),
-        },
-        "series": [
-            series,
-            {
-                "type": "scatter", "name": "set aside", "data": crosses, "color": LIGHT["refused"],
-                "symbol": "diamond", "symbolSize": 12,
-            },
-        ],
+        "xAxis": {"type": "category", "data": names, "axisLabel": words},
+        "yAxis": {"type": "value", "name": "mm", "nameTextStyle": words, "axisLabel": words,
+                  "splitLine": {"lineStyle": {"opacity": 0.3}}},
     }  # fmt: skip
 
 

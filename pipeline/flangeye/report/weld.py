@@ -288,13 +288,8 @@ def _profile(seam: t.Seam, truth: list[Floats]) -> dict[str, Any]:
         errors = [distances_to_line(seam.points_in_base, line) for line in truth]
         nearest = min(errors, key=lambda each: float(each.max()))
         traces.append(curve(along, nearest * 1e3, "true error", SERIES["truth"], width=2))
-    layout = {
-        "xaxis": {"title": {"text": "along the seam [mm]"}},
-        "yaxis": {"title": {"text": "across it [mm]"}, "rangemode": "tozero"},
-        "legend": {"orientation": "h", "x": 0, "y": 1, "yanchor": "bottom"},
-        "margin": {"l": 60, "r": 10, "t": 10, "b": 50},
-        "showlegend": True,
-    }
+    layout = layout2d("along the seam [mm]", "across it [mm]")
+    layout["yaxis"]["rangemode"] = "tozero"
     return {"data": traces, "layout": layout}
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, get_args
 
@@ -72,11 +72,7 @@ def read_ur(folder: Path) -> Archive:
         str(i): pose_from_matrix(f"{poses_file}: pose {i}", matrix)
         for i, matrix in enumerate(matrices)
     }
-    clouds = _clouds(folder)
-    _refuse_unpaired(clouds, poses, poses_file)
-    recordings = _with_centres(folder, poses, clouds, MM)
-    files = [poses_file, *_centre_files(folder)]
-    return Archive(f"ancorasir {folder.name}", folder, recordings, files, cloud_unit="mm")
+    return _in_millimetres(folder, poses_file, poses)
 
 
 def read_franka(folder: Path) -> Archive:
@@ -87,12 +83,18 @@ def read_franka(folder: Path) -> Archive:
         str(i): pose_from_quaternion(f"{poses_file}: pose {i}", row[:3], row[3:])
         for i, row in enumerate(rows)
     }
+    archive = _in_millimetres(folder, poses_file, poses)
+    notes = ["the Franka's poses are those it was sent to, not those it measured"]
+    return replace(archive, layout="ancorasir franka", notes=notes)
+
+
+def _in_millimetres(folder: Path, poses_file: Path, poses: Poses) -> Archive:
+    """Return poses with the clouds and centres that are numbered as they are."""
     clouds = _clouds(folder)
     _refuse_unpaired(clouds, poses, poses_file)
     recordings = _with_centres(folder, poses, clouds, MM)
-    notes = ["the Franka's poses are those it was sent to, not those it measured"]
     files = [poses_file, *_centre_files(folder)]
-    return Archive("ancorasir franka", folder, recordings, files, "mm", notes)
+    return Archive(f"ancorasir {folder.name}", folder, recordings, files, cloud_unit="mm")
 
 
 def read_kinect(folder: Path) -> Archive:

@@ -25,7 +25,7 @@ from flangeye.maths.kinematics import Arm
 from flangeye.maths.pose_corrections import inverted
 from flangeye.maths.streams import mean_pose, turning, with_joints
 from flangeye.models.robots import RobotModel, joints_in_order
-from flangeye.types import FLANGE, Floats, Motion
+from flangeye.types import FLANGE, Floats
 from flangeye.units import param
 from flangeye_plugins.reader.pairing import MatchedPose, PairingParams, Signal, pair
 from flangeye_plugins.reader.ros2_messages import (
@@ -288,12 +288,8 @@ class Target:
     def recordings(self, pairs: Sequence[MatchedPose], joints: Stream | None) -> list[Recording]:
         """Return a recording a pair."""
         return [
-            Recording(
-                f"{i:03}",
-                {FLANGE: found.pose},
-                joints=_angles(joints, found),
-                time_ns=round(found.time * 1e9),
-                motion=_motion(joints, found),
+            replace(
+                _recording(i, found, joints),
                 camera_T_target=mean_pose(self.poses[list(found.events)]),
             )
             for i, found in enumerate(pairs)
@@ -366,13 +362,9 @@ class Scans:
         files = self._files(self.first, chosen)
         images = files if self.clouds is None else self._beside(chosen)
         return [
-            Recording(
-                f"{i:03}",
-                {FLANGE: found.pose},
+            replace(
+                _recording(i, found, joints),
                 cloud=files[event] if self.clouds else None,
-                joints=_angles(joints, found),
-                time_ns=round(found.time * 1e9),
-                motion=_motion(joints, found),
                 image=images.get(event),
                 camera=self.camera,
             )
@@ -447,12 +439,11 @@ def _target(bag: Bag, params: BagParams) -> Target:
     return Target(times, np.array([inverted(pose) for pose in poses]))
 
 
-def _motion(joints: Stream | None, found: MatchedPose) -> Motion | None:
-    """Return how the arm passed, with its joints where they were recorded."""
-    if found.motion is None or joints is None:
-        return found.motion
-    return with_joints(found.motion, found.time, FLANGE, joints)
-
-
-def _angles(joints: Stream | None, found: MatchedPose) -> Floats | None:
-    return None if joints is None else rows_at(found.time, *joints)
+def _recording(number: int, found: MatchedPose, joints: Stream | None) -> Recording:
+    """Return where the arm stood, or how it passed, with its joints where they were recorded."""
+    angles, motion = None, found.motion
+    if joints is not None:
+        angles = rows_at(found.time, *joints)
+        motion = motion and with_joints(motion, found.time, FLANGE, joints)
+    pose, time_ns = {FLANGE: found.pose}, round(found.time * 1e9)
+    return Recording(f"{number:03}", pose, joints=angles, time_ns=time_ns, motion=motion)
