@@ -1,6 +1,7 @@
 """Every bundled recipe is checked and run."""
 
 import json
+from itertools import pairwise
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -12,15 +13,17 @@ from flangeye.log.read import read_run
 from flangeye.models.cell import Cell
 from flangeye.models.configuration import Configuration
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.find import recipe_names
+from flangeye.recipe.find import find_recipe, recipe_names
 from flangeye.recipe.load import load_recipe
 from flangeye.recipe.schema import recipe_schema
 from flangeye.run.folder import RunFolder
 from flangeye.run.session import Start, record_run
 from tests.conftest import Call
+from tools.kill import KINDS
 from tools.outcomes import outcome, outcomes, run
 
 NAMES = list(recipe_names())
+KILLED = [kind.command for kind in KINDS.values() if kind.command[0] in ("run", "batch")]
 
 
 def first_step(name):
@@ -207,3 +210,9 @@ def test_editors_accept_a_recipe_that_runs(editor: Any, name: Any) -> None:
 def test_editors_mark_a_recipe_that_does_not(editor: Any) -> None:
     recipe = {"title": "T", "steps": [{"fit.rim": {"inlir": "0.2 mm"}}]}
     assert not editor.is_valid(recipe)
+
+
+@pytest.mark.parametrize("command", KILLED, ids=lambda words: words[1])
+def test_what_is_killed_at_random_would_run(command: tuple[str, ...]) -> None:
+    given = [words for option, words in pairwise(command) if option == "--set"]
+    load_recipe(find_recipe(command[1]), load_registry(), given)

@@ -44,7 +44,7 @@ SMALL = (
     "--set", "acquire.simulated.resolution=0.5",
     "--set", "acquire.simulated.poses={grid: {counts: [2, 2, 2]}}",
 )  # fmt: skip
-FEWER = ("--set", "acquire.live.poses={next_best: {count: 6, candidates: 60}}")
+FEWER = ("--set", "acquire.live.poses={next_best: {count: 6}}")
 
 
 class Kind(NamedTuple):

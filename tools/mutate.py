@@ -34,7 +34,7 @@ from tools.covering import FAST
 
 ROOT = Path(__file__).parents[1]
 ROOMS: dict[str, tuple[str, ...]] = {
-    "motion": ("pipeline/flangeye/motion", "tests/motion"),
+    "motion": ("pipeline/flangeye/motion", "tests/motion", "tests/plugins/arc"),
     "estimator": ("pipeline/flangeye/estimation", "tests/estimation"),
     "fit": ("plugins/flangeye_plugins/fit", "tests/plugins/fit"),
     "segment": ("plugins/flangeye_plugins/segment", "tests/plugins/segment"),
@@ -42,7 +42,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "log": ("pipeline/flangeye/log", "tests/log"),
     "monitor": ("pipeline/flangeye/doctor/monitor", "tests/doctor/monitor"),
     "export": ("plugins/flangeye_plugins/export", "tests/plugins/export", "tests/cli"),
-    "robot": ("plugins/flangeye_plugins/robot", "tests/plugins/robot"),
+    "robot": ("plugins/flangeye_plugins/robot", "tests/plugins/robot", "tests/plugins/ros2"),
     "weld": ("plugins/flangeye_plugins/weld", "tests/plugins/weld"),
     "run": (
         "pipeline/flangeye/run", "tests/run", "tests/plugins/reader/test_cell.py",

@@ -80,6 +80,15 @@ def test_gas_comes_before_the_arc_and_flows_on_after_it() -> None:
     assert arc.history == [("burn", False), ("gas", False)]
 
 
+def test_gas_that_no_arc_followed_flows_no_longer() -> None:
+    arc = SimulatedArc()
+    arm = arced(arc, gas_after="50 ms")
+    lead(arm, GAS)
+    del arc.history[:]
+    lead(arm, OFF, 2)
+    assert arc.history == [("burn", False), ("gas", False)]
+
+
 @pytest.mark.parametrize(
     "stop",
     [
