@@ -4,7 +4,7 @@ import os
 import socket
 import threading
 import time
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -203,6 +203,28 @@ def test_no_other_page_than_foxgloves_own_may_look(origin: str | None, lets_in: 
         ) as viewer,
     ):
         assert "serverInfo" in viewer.recv(timeout=10)
+
+
+def test_what_a_program_sends_reaches_no_terminal(caplog: pytest.LogCaptureFixture) -> None:
+    pytest.importorskip("foxglove")
+    websockets = pytest.importorskip("websockets.sync.client")
+    from websockets.exceptions import ConnectionClosed
+
+    from flangeye.log.watch import foxglove_server
+
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    address, protocol = f"ws://127.0.0.1:{port}", ["foxglove.sdk.v1"]
+    with foxglove_server(port):
+        for sent in ('{"op":"\\u001b]0;mine\\u0007"}', "x", b"\xff", "x" * 20_000_000):
+            with websockets.connect(address, subprotocols=protocol) as viewer:
+                assert "serverInfo" in viewer.recv(timeout=10)
+                with suppress(OSError, ConnectionClosed):
+                    viewer.send(sent)
+                    while True:
+                        viewer.recv(timeout=0.5)
+    assert not caplog.records
 
 
 def test_a_port_that_is_taken_is_one_line(log: Any) -> None:

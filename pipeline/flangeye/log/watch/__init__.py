@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import io
 import ipaddress
+import logging
 import secrets
 import socket
 import threading
@@ -224,6 +225,8 @@ def foxglove_server(port: int) -> Iterator[Send]:
     except ImportError:
         raise StageError("--foxglove needs foxglove-sdk: pip install 'flangeye[watch]'") from None
     channels: dict[str, foxglove.Channel] = {}
+    # It quotes whatever a client sent, escapes and all
+    logging.getLogger("foxglove").setLevel(logging.CRITICAL)
     host, hidden = hidden_address()
     opened = ExitStack()
     try:
