@@ -87,7 +87,7 @@ CASES = {
     a_quaternion_of_another_norm:
         "/poses.csv:6: pose '04': the quaternion's norm is 1.414; it must be 1 (within 0.001)",
     duplicated_poses:
-        ": poses '01' and '04' are the same; every capture needs a pose of its own",
+        ": poses '01' and '04' are the same; every capture needs a pose of its own; 'flangeye doctor' names those to leave out",
     a_verification_cloud_that_is_trained_on:
         "/02.pcd: is the verification cloud 04.pcd again; a cloud that verifies must not be "
         "calibrated with",

@@ -176,7 +176,7 @@ def _repeated(names: Sequence[str], same: Indices, pose: Floats) -> str:
         return f"{told}: the driver had no others to give; record again"
     return (
         f"poses '{names[same[0]]}' and '{names[same[1]]}' are the same; every capture needs a pose "
-        "of its own"
+        "of its own; 'flangeye doctor' names those to leave out"
     )
 
 

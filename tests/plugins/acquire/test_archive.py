@@ -392,7 +392,7 @@ def test_a_pose_given_twice_is_refused(
     captures[2] = moved(captures[2], captures[0].base_T_flange.matrix)
     rewrite(archive, captures)
     assert refused() == (
-        f"{archive}: poses 'one' and 'three' are the same; every capture needs a pose of its own"
+        f"{archive}: poses 'one' and 'three' are the same; every capture needs a pose of its own; 'flangeye doctor' names those to leave out"
     )
 
 
