@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import os
 import struct
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from flangeye.files.regular import open_regular
 
 MAX_PIXELS = 1 << 26
 """Largest image that is decoded; the largest scanner's has a tenth."""
@@ -69,3 +72,19 @@ def _is_cut_png(raw: bytes) -> bool:
         length, kind = struct.unpack_from(">I4s", raw, at)
         at += 12 + length
     return raw.startswith(PNG) and at > len(raw)
+
+
+def is_depth_image(path: Path) -> bool:
+    """Return whether a file is a depth image: by its name or its folder's, and its header.
+
+    An image of 16 bits that is not called depth may be that of a camera.
+    """
+    folder = path.parent.name.lower()
+    called = folder.startswith("depth") or folder.endswith("depth") or "depth" in path.stem.lower()
+    ending = path.suffix.lower()
+    if not called or ending not in (".png", ".tif", ".tiff") or not path.is_file():
+        return False
+    with open_regular(path) as file:
+        head = file.read(26)
+    # Bits of a pixel, and 0 for grey
+    return ending != ".png" or head[24:] == bytes([16, 0])

@@ -15,6 +15,7 @@ from flangeye.errors import StageError
 from flangeye.files.clouds import CONVERSIONS, VENDOR
 from flangeye.files.clouds.plain import open_npz, open_text
 from flangeye.files.clouds.table import read_head
+from flangeye.files.images import is_depth_image
 from flangeye.files.recording import Recording
 from flangeye.types import FLANGE, Floats
 
@@ -277,8 +278,8 @@ def _kinds(scans: Sequence[Path]) -> set[bool]:
 
 
 def is_cloud(path: Path) -> bool:
-    """Return whether a scan is a cloud, by its ending."""
-    return path.suffix.lower() in (*CLOUDS, *POINTS)
+    """Return whether a scan is a cloud, by its ending, or a depth image."""
+    return path.suffix.lower() in (*CLOUDS, *POINTS) or is_depth_image(path)
 
 
 def recording_of(name: str, pose: Floats, scans: Sequence[Path]) -> Recording:
@@ -288,7 +289,7 @@ def recording_of(name: str, pose: Floats, scans: Sequence[Path]) -> Recording:
         StageError: It has two of one sort, or a file is neither.
     """
     clouds = [p for p in scans if is_cloud(p)]
-    images = [p for p in scans if p.suffix.lower() in IMAGES]
+    images = [p for p in scans if p.suffix.lower() in IMAGES and p not in clouds]
     if len(clouds) > 1 or len(images) > 1:
         names = ", ".join(p.name for p in scans)
         raise StageError(f"pose '{name}' has more than one cloud or image: {names}")
@@ -317,7 +318,7 @@ def _beside(scan: Path, suffixes: Sequence[str]) -> Path | None:
         named_alike = sorted(scan.parent.glob(f"{escape(scan.stem)}.*"))
     except OSError as error:  # its folder has a name that no file system takes
         raise StageError(f"{scan}: {error.strerror}") from None
-    found = [path for path in named_alike if path.suffix.lower() in suffixes]
+    found = [p for p in named_alike if p.suffix.lower() in suffixes and p != scan]
     if len(found) > 1:
         names = " and ".join(path.name for path in found)
         raise StageError(f"{scan.parent}: {names} both belong to {scan.name}; keep one of them")

@@ -11,7 +11,8 @@ import numpy as np
 from pydantic import Field
 
 from flangeye import StageError, stage
-from flangeye.files.clouds import PER_METRE, LengthUnit, check_cloud_file, read_cloud
+from flangeye.files.clouds import PER_METRE, LengthUnit
+from flangeye.files.depth import check_scan, read_scan
 from flangeye.files.elsewhere import is_elsewhere
 from flangeye.files.recording import (
     Archive,
@@ -134,9 +135,9 @@ def _usable(archive: Archive, unreadable: str) -> tuple[list[Recording], list[st
         try:
             # What is set aside must be known now, so then the inside is looked at too.
             if unreadable == "reject":
-                read_cloud(cloud)
+                read_scan(cloud)
             elif not is_elsewhere(cloud):
-                check_cloud_file(cloud)
+                check_scan(cloud)
         except StageError as error:
             if unreadable == "refuse":
                 raise
@@ -176,7 +177,7 @@ def _first_distance(
     """Return the first cloud with a finite point, and its median distance in its own unit."""
     for _, path in _clouds(usable):
         told.clear()
-        raw = median_distance(read_cloud(path, "m", told.append, from_viewpoint))
+        raw = median_distance(read_scan(path, "m", told.append, from_viewpoint))
         if math.isfinite(raw):
             return path, raw
     raise StageError(f"{root}: none of its {len(usable)} clouds has a finite point (all NaN)")
@@ -191,7 +192,7 @@ def _captures(
 ) -> Iterator[Capture]:
     """Read one cloud at a time, and the image beside it."""
     for recording, path in _clouds(usable):
-        cloud = read_cloud(path, unit, from_viewpoint=params.viewpoint)
+        cloud = read_scan(path, unit, from_viewpoint=params.viewpoint)
         if params.stretch != (1.0, 1.0, 1.0):
             cloud = PointCloud(cloud.frame, cloud.xyz * np.array(params.stretch, np.float32))
         check_unit(path, median_distance(cloud), unit, scanner)
@@ -215,7 +216,7 @@ def _camera_note(usable: Iterable[Recording], camera: CameraParams | None) -> li
     first = next((r for r in usable if r.image), None)
     if camera is not None or first is None or first.image is None or first.cloud is None:
         return []
-    image = image_of_cloud(read_image(first.image), read_cloud(first.cloud))
+    image = image_of_cloud(read_image(first.image), read_scan(first.cloud))
     if image is None:
         return [
             f"left out the images, such as {first.image.name}: no pinhole camera fits the clouds "

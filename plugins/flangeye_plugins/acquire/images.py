@@ -12,7 +12,8 @@ from pydantic import Field, model_validator
 
 from flangeye import Params, StageError, stage
 from flangeye.files.cameras import CameraFile, camera_in, cameras_in
-from flangeye.files.clouds import LengthUnit, read_cloud
+from flangeye.files.clouds import LengthUnit
+from flangeye.files.depth import read_scan
 from flangeye.files.recording import Recording, check_poses, digests_of
 from flangeye.models.boards import Board, Dictionary, Kind
 from flangeye.models.corners import Corners, board_seen, find_corners
@@ -453,7 +454,7 @@ def _captures(
     for recording in usable:
         if recording.image is not None:
             image = Image(read_image(recording.image), *cameras[recording.id])
-            cloud = read_cloud(recording.cloud, unit) if recording.cloud else nothing
+            cloud = read_scan(recording.cloud, unit) if recording.cloud else nothing
             yield Capture(
                 recording.id, cloud, poses_of(recording), recording.joints,
                 recording.time_ns, recording.role, image, motion=recording.motion,

@@ -39,7 +39,7 @@ from flangeye import Params, RecipeError, StageError, part
 from flangeye.files.clouds import PER_METRE, LengthUnit
 from flangeye.files.recording import Archive, NotThisLayout, Recording
 from flangeye.files.regular import read_text
-from flangeye.files.scans import CLOUDS, IMAGES, with_companion
+from flangeye.files.scans import CLOUDS, IMAGES, is_cloud, with_companion
 from flangeye.files.yaml_lines import read_yaml
 from flangeye.types import FLANGE, FLANGE2, Floats, Role
 from flangeye_plugins.reader.poses import pose_from_quaternion, pose_from_rotation_vector
@@ -112,7 +112,7 @@ def _unit(file: Path, stated: LengthUnit | None, param: LengthUnit | None) -> Le
 
 def _recording(where: str, row: PoseRow, root: Path, unit: LengthUnit) -> Recording:
     cloud, image = (None if name is None else root / name for name in (row.cloud, row.image))
-    if cloud and cloud.suffix.lower() in IMAGES:
+    if cloud and cloud.suffix.lower() in IMAGES and not is_cloud(cloud):
         cloud, image = None, image or cloud
     name = row.id or (cloud or image or root).stem
     joints = None if row.joints_rad is None else np.array(row.joints_rad)

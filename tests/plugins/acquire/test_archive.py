@@ -77,9 +77,9 @@ def test_clouds_are_read_one_at_a_time(
 
     def noted(path, *unit, **options):
         read.append(path)
-        return read_cloud(path, *unit, **options)
+        return read_scan(path, *unit, **options)
 
-    monkeypatch.setattr(module, "read_cloud", noted)
+    monkeypatch.setattr(module, "read_scan", noted)
     stream = iter(acquire())
     assert len(read) == 1, "one cloud, for its unit"
     next(stream)

@@ -15,7 +15,8 @@ import numpy as np
 
 from flangeye.errors import RecipeError, StageError
 from flangeye.files.cameras import cameras_in
-from flangeye.files.clouds import CONVERSIONS, read_cloud
+from flangeye.files.clouds import CONVERSIONS
+from flangeye.files.depth import read_scan
 from flangeye.files.images import ImageError, decode_image
 from flangeye.files.recording import Archive, NotThisLayout, Recording
 from flangeye.files.regular import MAX_FILE, read_regular
@@ -122,7 +123,7 @@ def _reader(
     if any(p.name.startswith("pos0") and p.suffix in (".yaml", ".yml") for p in survey.files):
         return {"zivid": {"length": _length_of_files(questions)}}
     if survey.tables:
-        scans = bool(survey.clouds or survey.of(IMAGES))
+        scans = bool(survey.clouds or survey.images)
         try:
             return {"table": table_params(survey.tables, questions, _model(robot), scans)}
         except RecipeError as error:
@@ -166,7 +167,7 @@ def _missing(survey: FolderSurvey, reason: StageError) -> str:
             tables_in(path.parent, path.name)
         except StageError as error:
             return str(error)
-    scans = survey.clouds or survey.of(IMAGES)
+    scans = survey.clouds or survey.images
     if scans:
         column = "cloud" if survey.clouds else "image"
         line = "x_mm,y_mm,z_mm,rx_rad,ry_rad,rz_rad"
@@ -420,7 +421,7 @@ def _summary(archive: Archive, reader: Any) -> list[str]:
 
 def _of_cloud(path: Path) -> str:
     notes: list[str] = []
-    cloud = read_cloud(path, told=notes.append)
+    cloud = read_scan(path, told=notes.append)
     size = " x ".join(map(str, reversed(cloud.xyz.shape[:-1])))
     far = median_distance(cloud)
     try:

@@ -12,6 +12,7 @@ from pathlib import Path
 from flangeye.errors import FlangeyeError, RecipeError, StageError
 from flangeye.files.cameras import cameras_in
 from flangeye.files.clouds import CONVERSIONS
+from flangeye.files.images import is_depth_image
 from flangeye.files.recording import MIN_CAPTURES
 from flangeye.files.regular import is_pointer
 from flangeye.files.scans import CLOUDS, IMAGES, natural, texts_of_points
@@ -124,7 +125,12 @@ class FolderSurvey:
     def clouds(self) -> list[Path]:
         """The clouds, those in texts and archives of arrays too."""
         found = {*self.of(CLOUDS), *self.points}
-        return [path for path in self.files if path in found]
+        return [path for path in self.files if path in found or is_depth_image(path)]
+
+    @property
+    def images(self) -> list[Path]:
+        """The images of a camera."""
+        return [path for path in self.of(IMAGES) if not is_depth_image(path)]
 
     def of(self, suffixes: Sequence[str]) -> list[Path]:
         """Return the files that end so; tables of poses are no clouds."""
@@ -139,7 +145,7 @@ class FolderSurvey:
             f"{what}: {', '.join(f'{n} {suffix}' for suffix, n in sorted(kinds.items()))}"
             for what, paths in (
                 ("clouds", self.clouds),
-                ("images", self.of(IMAGES)),
+                ("images", self.images),
                 (
                     "not read",
                     [p for p in self.of(unread) if p not in read],

@@ -1,0 +1,112 @@
+"""Read scans: clouds, and depth images with the calibration of their camera beside them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from flangeye.errors import StageError
+from flangeye.files.cameras import CameraFile, cameras_in
+from flangeye.files.clouds import PER_METRE, LengthUnit, check_cloud_file, read_cloud
+from flangeye.files.images import ImageError, decode_image, is_depth_image
+from flangeye.files.regular import MAX_FILE, read_regular
+from flangeye.files.tables.documents import document_of
+from flangeye.types import CAMERA, Floats, PointCloud
+
+
+def read_scan(
+    path: Path,
+    unit: LengthUnit = "m",
+    told: Callable[[str], None] | None = None,
+    from_viewpoint: bool = False,
+) -> PointCloud:
+    """Read a cloud, or a depth image as an organised one; arguments as of :func:`read_cloud`.
+
+    Raises:
+        StageError: As :func:`read_cloud`, or the camera's calibration is missing.
+    """
+    if not is_depth_image(path):
+        return read_cloud(path, unit, told, from_viewpoint)
+    depths, camera = _depths(path)
+    if told:
+        told(camera.note())
+    z = np.where(depths > 0, depths * (_scale_of(camera.path) / PER_METRE[unit]), np.nan)
+    rays = _rays(depths.shape, camera.matrix.tobytes(), camera.distortion.tobytes())
+    return PointCloud(CAMERA, np.asarray(z[..., None] * rays, dtype=np.float32))
+
+
+def check_scan(path: Path) -> int:
+    """Return the number of points in a scan; see :func:`check_cloud_file`.
+
+    Raises:
+        StageError: As :func:`read_scan`.
+    """
+    return math.prod(_depths(path)[0].shape) if is_depth_image(path) else check_cloud_file(path)
+
+
+def _depths(path: Path) -> tuple[Floats, CameraFile]:
+    """Return (H, W) depths along z in the file's own unit, 0 or less where nothing was seen."""
+    import cv2
+
+    try:
+        pixels = decode_image(read_regular(path, MAX_FILE), cv2.IMREAD_UNCHANGED)
+    except ImageError as error:
+        raise StageError(f"{path}: {error}") from None
+    if pixels.ndim != 2 or pixels.dtype not in (np.uint16, np.float32):
+        raise StageError(
+            f"{path}: is no depth image: those have one channel, of 16 bits or of floats"
+        )
+    camera = _camera_beside(path.parent)
+    if camera is None:
+        raise StageError(
+            f"{path}: needs the calibration of its camera: put its file beside the depth images, "
+            "for example camera.yaml with {fx: 910.2, fy: 909.8, cx: 640.1, cy: 361.0}"
+        )
+    # The axis of a depth camera hits its image about the middle
+    if np.abs(camera.matrix[:2, 2] / pixels.shape[::-1] - 0.5).max() > 0.25:
+        told = ", ".join(f"{value:.0f}" for value in camera.matrix[:2, 2])
+        raise StageError(
+            f"{path}: has {pixels.shape[1]} x {pixels.shape[0]} px, but {camera.path.name} its "
+            f"principal point at {told}: it is of images of another size"
+        )
+    return np.nan_to_num(pixels.astype(np.float64)), camera
+
+
+@lru_cache(maxsize=8)
+def _camera_beside(folder: Path) -> CameraFile | None:
+    """Return the calibration in a folder or above it; the depth camera's, if there are several."""
+    # A folder of depth images alone stands in that of the session
+    for place in (folder, folder.parent) if "depth" in folder.name.lower() else (folder,):
+        found = cameras_in(place)
+        called = [camera for camera in found if "depth" in camera.path.name.lower()]
+        if found:
+            return (called or found)[0]
+    return None
+
+
+@lru_cache(maxsize=8)
+def _scale_of(path: Path) -> float:
+    """Return by what a camera's file says that depths are multiplied; 1 where it does not.
+
+    RealSense's ``depth_scale`` gives metres; that of the BOP datasets gives millimetres.
+    """
+    document = document_of(path)
+    stated = document.data if document is not None else None
+    scale = stated.get("depth_scale") if isinstance(stated, Mapping) else None
+    return float(scale) if isinstance(scale, (int, float)) and scale > 0 else 1.0
+
+
+@lru_cache(maxsize=2)
+def _rays(shape: tuple[int, ...], matrix: bytes, distortion: bytes) -> Floats:
+    """Return (H, W, 3) the points at a depth of one; the matrix and OpenCV's lens as bytes."""
+    import cv2
+
+    rows, columns = np.mgrid[: shape[0], : shape[1]]
+    pixels = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2).astype(np.float64)
+    lens = np.frombuffer(distortion)
+    rays = cv2.undistortPoints(pixels, np.frombuffer(matrix).reshape(3, 3), lens)
+    return np.asarray(cv2.convertPointsToHomogeneous(rays).reshape(*shape, 3), dtype=np.float64)
