@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from flangeye import StageError
-from flangeye.files.clouds import read_cloud, write_cloud
+from flangeye.files.clouds import write_cloud
+from flangeye.files.depth import read_scan
 from flangeye.log.record import Recorder
 from flangeye.types import ArchivePath, Capture, PointCloud, Source, Transform
 from flangeye_plugins.acquire import archive as module
