@@ -39,7 +39,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "fit": ("plugins/flangeye_plugins/fit", "tests/plugins/fit"),
     "segment": ("plugins/flangeye_plugins/segment", "tests/plugins/segment"),
     "verify": ("plugins/flangeye_plugins/verify", "tests/plugins/verify"),
-    "log": ("pipeline/flangeye/log", "tests/log"),
+    "log": ("pipeline/flangeye/log", "tests/log", "tests/test_hard_cases.py"),
     "monitor": ("pipeline/flangeye/doctor/monitor", "tests/doctor/monitor"),
     "export": ("plugins/flangeye_plugins/export", "tests/plugins/export", "tests/cli"),
     "robot": ("plugins/flangeye_plugins/robot", "tests/plugins/robot", "tests/plugins/ros2"),
