@@ -62,6 +62,17 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     assert np.array_equal(entry.value.centre, CIRCLE.centre)
 
 
+def test_names_that_are_no_utf_8_are_written_out_or_replaced(tmp_path: Path) -> None:
+    """Python stands half a UTF-16 pair in for such a byte of a folder's or file's name."""
+    recorder = Recorder(tmp_path / "r.mcap", {"recipe.yaml": "archive: a\udcff"}, True)
+    recorder.flangeye_run_started(t.Source("hash", ("archive a\udcff",)), 0)
+    recorder.flangeye_run_finished({"status": "verified", "notes": ["archive a\udcff"]})
+    log = read_run(tmp_path / "r.mcap")
+    assert log.messages == ["archive a\\udcff"]
+    assert log.attachments["recipe.yaml"] == b"archive: a?"
+    assert log.complete and not log.damage
+
+
 @pytest.mark.parametrize("codec", ["lz4", "zstd"])
 def test_a_log_whose_chunks_were_packed_is_read_alike(tmp_path: Path, codec: str) -> None:
     recorded(tmp_path / "r.mcap").flangeye_run_finished({"status": "verified"})

@@ -60,13 +60,18 @@ def row_of(session: BatchSession, outcome: SessionOutcome, columns: Mapping[str,
         name: text if columns[name] == "string" else parse_value(text, name)
         for name, text in session.varied.items()
     }
-    return {
+    row = {
         "session": session.id,
         "recipe": session.recipe.stem,
         "archive": session.archive,
         **varied,
         "seed": session.seed,
         **vars(outcome),
+    }
+    # Names of files may be no UTF-8; a table's text is
+    return {
+        name: cell.encode("utf-8", "replace").decode() if isinstance(cell, str) else cell
+        for name, cell in row.items()
     }
 
 

@@ -219,7 +219,7 @@ def _digest_of(path: Path) -> str:
 def fingerprint_of(root: Path, digests: dict[Path, str]) -> str:
     """Return one hash of files: it changes with any content and any name, not with the root."""
     lines = sorted(f"{_name_below(root, path)} {d}\n" for path, d in digests.items())
-    return hashlib.sha256("".join(lines).encode()).hexdigest()
+    return hashlib.sha256("".join(lines).encode("utf-8", "surrogatepass")).hexdigest()
 
 
 def _name_below(root: Path, path: Path) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flangeye.errors import StageError
+from flangeye.files.words import printable
 from flangeye.maths.geometry import basis_of_plane, quaternion_from_rotation, rigid
 from flangeye.maths.seam_geometry import seam_frames, tube_rings
 from flangeye.types import CircleFeature, Floats, Image, PointCloud, Seam, Transform
@@ -149,7 +150,7 @@ def log(message: str, level: str, time_ns: int) -> Any:
     """Return a foxglove.Log line; the level is one of its enumeration, such as ``INFO``."""
     from foxglove_schemas_protobuf.Log_pb2 import Log
 
-    line = Log(level=Log.Level.Value(level), message=message, name="flangeye")
+    line = Log(level=Log.Level.Value(level), message=printable(message), name="flangeye")
     line.timestamp.FromNanoseconds(time_ns)
     return line
 

@@ -116,7 +116,7 @@ class Recorder:
             )
             self._writer.start(profile="", library=f"flangeye {VERSION}")
             for name, text in recipe.items():
-                self._attach(name, "application/yaml", text.encode())
+                self._attach(name, "application/yaml", text.encode("utf-8", "replace"))
         except OSError as error:
             raise self._unwritable(error) from None
 
@@ -196,7 +196,8 @@ class Recorder:
     def flangeye_run_finished(self, result: dict[str, Any]) -> None:
         """Attach the result and close the file."""
         try:
-            self._attach("result.json", "application/json", dump_result(result).encode())
+            told = dump_result(result).encode("utf-8", "replace")
+            self._attach("result.json", "application/json", told)
             self._writer.finish()  # type: ignore[no-untyped-call]
         except OSError as error:
             raise self._unwritable(error) from None

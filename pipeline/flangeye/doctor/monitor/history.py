@@ -234,7 +234,7 @@ def _when(check: MonitorCheck) -> str | None:
 
 
 def _digest(key: str, body: bytes) -> str:
-    return hashlib.sha256(key.encode() + b"\n" + body).hexdigest()
+    return hashlib.sha256(key.encode("utf-8", "surrogatepass") + b"\n" + body).hexdigest()
 
 
 def _plain(check: MonitorCheck) -> Any:
