@@ -17,7 +17,7 @@ from hypothesis.extra.numpy import arrays
 
 from flangeye import types as t
 from flangeye.errors import StageError
-from flangeye.log.read import read_run
+from flangeye.log.read import RunLog, read_run
 from flangeye.log.record import Recorder, adapter
 from tests.crafted import rewritten
 
@@ -126,6 +126,30 @@ def test_viewers_find_foxglove_schemas_and_frames(tmp_path: Path) -> None:
         ("foxglove.FrameTransform", "protobuf"), ("foxglove.SceneUpdate", "protobuf"),
         ("foxglove.Log", "protobuf"), ("flangeye.CircleFeature", "jsonschema"),
     } <= schemas  # fmt: skip
+
+
+@pytest.mark.parametrize("full", [True, False])
+def test_whole_scans_are_kept_where_they_are_asked_for(tmp_path: Path, full: bool) -> None:
+    from mcap.reader import make_reader
+
+    recorded(tmp_path / "r.mcap", full).flangeye_run_finished({})
+    with (tmp_path / "r.mcap").open("rb") as file:
+        topics = {channel.topic for _, channel, _ in make_reader(file).iter_messages()}
+    assert "/capture/cloud" in topics
+    assert ("/capture/scan" in topics) == full
+
+
+@pytest.mark.parametrize(("count", "told"), [(1, ""), (2, " (and 1 more)"), (12, " (and 11 more)")])
+def test_how_much_is_damaged_is_said(count: int, told: str) -> None:
+    log = RunLog(Path("r.mcap"))
+    log.require_sound()
+    log.damage += map(str, range(count))
+    with pytest.raises(StageError) as error:
+        log.require_sound()
+    said = "r.mcap: damaged: 0; kept: 0 captures, 0 values of steps"
+    assert str(error.value) == said + told
+    assert log.notes[0] == said
+    assert log.notes[10:] == ["r.mcap: damaged: and 2 more"] * (count == 12)
 
 
 @pytest.mark.parametrize("keep", [0.2, 0.5, 0.8, 0.99])
