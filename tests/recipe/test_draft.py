@@ -212,6 +212,29 @@ def test_the_board_in_the_images_is_proposed(folder: Path) -> None:
     assert (board.columns, board.rows, board.dictionary) == (7, 5, "4X4_250")
 
 
+@pytest.mark.parametrize("printed", [True, False])
+def test_colour_beside_depth_is_meant_where_it_shows_a_board(folder: Path, printed: bool) -> None:
+    """A folder of an RGB-D camera: depth images, that are clouds, and colour of one number."""
+    table(folder, "x,y,z,qx,qy,qz,qw", quaternion)
+    page = np.pad(print_of(Board("charuco", 7, 5, 0.03, 0.022), 60), 60, constant_values=255)
+    for name, pixels in (
+        ("depth", np.full((480, 640), 600, np.uint16)),
+        ("color", page if printed else np.full((480, 640), 90, np.uint8)),
+    ):
+        (folder / name).mkdir()
+        for k in range(5):
+            cv2.imwrite(str(folder / name / f"{k}.png"), pixels)
+    (folder / "depth_camera.yaml").write_text("{fx: 600, fy: 600, cx: 320, cy: 240}")
+    if printed:
+        with pytest.raises(RecipeError, match="0.png shows a ChArUco board of 7 x 5 squares"):
+            init()
+        init("--target", "charuco: {columns: 7, rows: 5, square: 30 mm, marker: 22 mm}")
+    else:
+        assert "0.png: 640 x 480 points, at 639.4 mm (median); camera of " in init()
+    stage = "acquire.images" if printed else "acquire.archive"
+    assert recipe(folder).steps[0].stage.name == stage
+
+
 @pytest.mark.parametrize(
     ("scan", "heading", "separator"),
     [

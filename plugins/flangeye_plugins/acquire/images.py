@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -14,9 +15,11 @@ from flangeye import Params, StageError, stage
 from flangeye.files.cameras import CameraFile, camera_in, cameras_in
 from flangeye.files.clouds import LengthUnit
 from flangeye.files.depth import read_scan
+from flangeye.files.images import is_depth_image
 from flangeye.files.recording import Recording, check_poses, digests_of
 from flangeye.models.boards import Board, Dictionary, Kind
 from flangeye.models.corners import Corners, board_seen, find_corners
+from flangeye.models.scanners import ScannerData, detect_unit, median_distance
 from flangeye.types import (
     CAMERA,
     ArchivePath,
@@ -345,9 +348,9 @@ class ImagesParams(OpeningParams):
         None,
         description="Find the camera by the views of this board; refine focal_length, if given.",
     )
-    cloud_unit: LengthUnit = Field(
-        "m", description="Unit of the clouds that lie beside the images, where the archive's "
-        "layout does not say."
+    cloud_unit: LengthUnit | None = Field(
+        None, description="Unit of the clouds that lie beside the images, where the archive's "
+        "layout does not say; metres or millimetres, whichever scanners can see, if not given."
     )  # fmt: skip
 
     def camera(self, recording: Recording) -> Camera | None:
@@ -377,7 +380,9 @@ def acquire_images(
     files = [path for r in usable for path in (r.image, r.cloud) if path is not None]
     skipped = skipped_note(recorded, lambda r: r.image is not None, "image")
     source = source_of(recorded, [*skipped, *told], digests_of([*files, *recorded.files]))
-    unit = recorded.cloud_unit or params.cloud_unit
+    # Depth images are seldom those of the colour camera, pixel by pixel: they tell nothing here
+    usable = [replace(r, cloud=None) if r.cloud and is_depth_image(r.cloud) else r for r in usable]
+    unit = recorded.cloud_unit or params.cloud_unit or _unit_of_clouds(usable)
     return Captures(_captures(usable, cameras, unit), source, total=len(usable), recorded=True)
 
 
@@ -444,6 +449,13 @@ def _filed(root: Path, name: str | None) -> CameraFile | None:
         names = ", ".join(str(camera.path.relative_to(folder)) for camera in found)
         raise StageError(f"{folder}: which took the images? write camera_file: one of {names}")
     return found[0] if found else None
+
+
+def _unit_of_clouds(usable: Sequence[Recording]) -> LengthUnit:
+    for path in (recording.cloud for recording in usable):
+        if path and np.isfinite(raw := median_distance(read_scan(path))):
+            return detect_unit(path, raw, ScannerData(model="the scanner"))
+    return "m"
 
 
 def _captures(

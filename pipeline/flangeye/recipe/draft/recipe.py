@@ -17,7 +17,7 @@ from flangeye.errors import RecipeError, StageError
 from flangeye.files.cameras import cameras_in
 from flangeye.files.clouds import CONVERSIONS
 from flangeye.files.depth import read_scan
-from flangeye.files.images import ImageError, decode_image
+from flangeye.files.images import ImageError, decode_image, is_depth_image
 from flangeye.files.recording import Archive, NotThisLayout, Recording
 from flangeye.files.regular import MAX_FILE, read_regular
 from flangeye.files.scans import IMAGES
@@ -210,6 +210,8 @@ def _convertible(survey: FolderSurvey, count: int) -> RecipeError | None:
 def _what(archive: Archive, questions: Questions) -> tuple[str, dict[str, Any]]:
     """Return the acquire stage, and the target: its name with parameters, empty where measured."""
     records = archive.recordings
+    if _shows_print(records, questions):
+        return "acquire.images", printed_target(_some_images(records), questions)
     if any(r.cloud for r in records):
         answer = questions.ask(
             "target",
@@ -219,8 +221,6 @@ def _what(archive: Archive, questions: Questions) -> tuple[str, dict[str, Any]]:
             check=_target,
         )
         return "acquire.archive", _target(answer)
-    if any(r.image for r in records):
-        return "acquire.images", printed_target(_some_images(records), questions)
     for stage, seen in (
         ("acquire.samples", [r.camera_T_target for r in records]),
         ("acquire.centres", [r.centre_in_camera for r in records]),
@@ -232,6 +232,23 @@ def _what(archive: Archive, questions: Questions) -> tuple[str, dict[str, Any]]:
         if both:
             return stage, {}
     raise StageError(f"{archive.root}: holds poses, but neither scans nor what the camera measured")
+
+
+def _shows_print(records: Sequence[Recording], questions: Questions) -> bool:
+    """Whether a printed target in images is meant: they are alone, or beside depth images.
+
+    Beside these it is what was asked for, or what an image shows where nothing was.
+    """
+    from flangeye.models.corners import board_seen
+
+    images = any(r.image for r in records)
+    if not images or not any(r.cloud for r in records):
+        return images
+    if not any(r.cloud and is_depth_image(r.cloud) for r in records):
+        return False
+    if given := questions.given.get("target"):
+        return not {"flange", "body", "sphere"} & set(_target(given))
+    return any(board_seen(pixels) is not None for _, pixels in _some_images(records))
 
 
 def mounting_seen(observations: Iterable[Observation]) -> tuple[str, str] | None:
