@@ -16,7 +16,7 @@ from flangeye import types as t
 from flangeye.errors import StageError
 from flangeye.log.read import read_run
 from flangeye.log.record import Recorder
-from flangeye.log.watch import follow, watch_run
+from flangeye.log.watch import follow, may_look, watch_run
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import parse_recipe
 from flangeye.run.runner import Runner
@@ -203,6 +203,14 @@ def test_no_other_page_than_foxgloves_own_may_look(origin: str | None, lets_in: 
         ) as viewer,
     ):
         assert "serverInfo" in viewer.recv(timeout=10)
+
+
+@pytest.mark.parametrize("before", ["", "Host: 127.0.0.1:1\r\n"])
+@pytest.mark.parametrize("name", ["Origin", "origin", "ORIGIN "])
+def test_an_origin_is_seen_wherever_it_stands(before: str, name: str) -> None:
+    head = f"GET / HTTP/1.1\r\n{before}{name}: {{}}\r\n\r\n"
+    assert may_look(head.format("https://app.foxglove.dev").encode())
+    assert not may_look(head.format("http://evil.example").encode())
 
 
 def test_what_a_program_sends_reaches_no_terminal(caplog: pytest.LogCaptureFixture) -> None:

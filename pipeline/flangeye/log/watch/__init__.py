@@ -305,7 +305,9 @@ def may_look(head: bytes) -> bool:
     """Return whether a request is a program's, or that of Foxglove's page or desktop files."""
     lines = head.decode("latin-1").split("\r\n")[1:]
     told = [
-        v.strip() for k, _, v in (line.partition(":") for line in lines) if k.lower() == "origin"
+        v.strip()
+        for k, _, v in (line.partition(":") for line in lines)
+        if k.strip().lower() == "origin"
     ]
     return all(o in ("https://app.foxglove.dev", "file://") for o in told)
 
