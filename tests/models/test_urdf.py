@@ -18,7 +18,7 @@ from flangeye.errors import RecipeError, StageError
 from flangeye.maths.geometry import rotation_from_rpy
 from flangeye.maths.kinematics import Arm
 from flangeye.models.urdf import robot_from_urdf
-from flangeye.models.urdf_meshes import capsule_of, fit_capsule, vertices
+from flangeye.models.urdf_meshes import _outermost, capsule_of, fit_capsule, vertices
 from flangeye.motion.clearance import ArmVolume
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.load import describe_recipe, load_recipe
@@ -120,6 +120,19 @@ def test_a_capsule_holds_its_points_and_is_no_larger_than_a_ball_about_them(
     assert capsule.distance(points).max() < 1e-9
     ball = np.linalg.norm(points - points.mean(axis=0), axis=1).max()
     assert capsule.volume < 4 / 3 * np.pi * (1.5 * ball) ** 3
+
+
+@pytest.mark.parametrize("spread", [(1.0, 0.2), (1.0, 0.0)], ids=["plane", "line"])
+def test_the_point_farthest_from_a_place_is_among_the_outermost(
+    spread: tuple[float, float],
+) -> None:
+    rng = np.random.default_rng(0)
+    flat = rng.normal(size=(500, 2)) * spread @ [[0.8, 0.6], [-0.6, 0.8]]
+    outer = _outermost(flat)
+    assert len(outer) < 50 or spread[1] == 0
+    for place in rng.normal(size=(100, 2)):
+        farthest = [one[((one - place) ** 2).sum(axis=1).argmax()] for one in (flat, outer)]
+        assert (farthest[0] == farthest[1]).all()
 
 
 @pytest.mark.parametrize("name", ["stl", "obj", "dae"])

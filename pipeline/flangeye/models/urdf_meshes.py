@@ -246,9 +246,25 @@ def _along(points: Floats, direction: Floats) -> Capsule:
 
 def _middle(flat: Floats) -> Floats:
     """Return nearly the centre of the smallest circle about (N, 2) points (Badoiu, Clarkson)."""
+    flat = _outermost(flat)
     centre = (flat.min(axis=0) + flat.max(axis=0)) / 2
     # Steps towards the smallest circle; its radius is then too large by a thousandth at most
     for step in range(1, 2000):
         farthest = flat[((flat - centre) ** 2).sum(axis=1).argmax()]
         centre = centre + (farthest - centre) / (step + 1)
     return np.asarray(centre)
+
+
+def _outermost(flat: Floats) -> Floats:
+    """Return those of (N, 2) points on or next to their convex hull; no other is ever farthest."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        sides = ConvexHull(flat).equations
+    except (QhullError, ValueError):  # on a line, or not finite
+        return flat
+    least = -1e-9 * np.ptp(flat, axis=0).max()
+    near = np.zeros(len(flat), bool)
+    for x, y, offset in sides:
+        near |= flat @ [x, y] + offset > least
+    return np.asarray(flat[near])
