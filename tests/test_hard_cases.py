@@ -360,7 +360,7 @@ def test_one_changed_byte_anywhere_is_named_and_the_rest_is_read(
         ("result_bytes", only("result.json", b"\xff\xfe"), "the attached result.json: "),
         ("result_deep", only("result.json", b"[" * 99999), "the attached result.json: "),
         ("finished_empty", only("/capture/finished", b"{}"), " on /capture/finished: "),
-        ("source_list", only("/source", b"[1]"), "message 0 on /source: it is no object"),
+        ("source_list", only("/source", b"[1]"), "message 0 on /source: it is not an object"),
         ("source_nan", only("/source", b'{"total": NaN}'), "message 0 on /source: it holds NaN"),
         ("recipe_bytes", only("recipe.yaml", b"\xff\xfe"), "the attached recipe.yaml: it is not"),
         ("capture_empty", only("/capture", b"{}"), "on /capture: "),

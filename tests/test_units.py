@@ -31,7 +31,7 @@ def test_a_quantity_becomes_si(text: str, kind: str, si: Any) -> None:
         ("0.3", "'0.3' has no unit: a length needs one (mm, m, um, for example '31.5 mm')"),
         (
             "5 deg",
-            "'5 deg' is no length, it has a unit of angle: a length needs mm, m, um, for example "
+            "'5 deg' is not a length, it has a unit of angle: a length needs mm, m, um, for example "
             "'31.5 mm'",
         ),
         (

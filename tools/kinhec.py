@@ -10,7 +10,7 @@ with `target_size: unknown`. Three sequences of the motion track turn about one 
 can know the translation along it, and what the references leave there is what they guess.
 
 One draw of the noise says little of a solver, and the best of eleven by the truth is the luckiest: to
-be within 1.05 of it on every sequence is no property that a single solver can have, and the page counts
+be within 1.05 of it on every sequence is not a property that a single solver can have, and the page counts
 how often each one is. Where ours is not, and the noise is independent and normal, it is drawn again
 (`--redraws`) and held against the one reference that is best over all draws; where that is better, over
 six times as many.

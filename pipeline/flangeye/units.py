@@ -52,7 +52,7 @@ def parse_quantity(value: object, kind: str) -> float:
         raise ValueError(f"'{value}' has no unit: {a_kind} needs one ({allowed})")
     if unit not in units:
         other = next((k for k, (_, known) in _UNITS.items() if unit in known), None)
-        what = f"is no {kind}, it has a unit of {other}" if other else "has an unknown unit"
+        what = f"is not a {kind}, it has a unit of {other}" if other else "has an unknown unit"
         raise ValueError(f"'{value}' {what}: {a_kind} needs {allowed}")
     try:
         si = float(Decimal(number) * units[unit])

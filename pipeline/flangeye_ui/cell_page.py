@@ -534,7 +534,7 @@ def _put_step(steps: list[Any], path: list[Any], value: Any) -> None:
 
 
 def _plain(text: str) -> Any:
-    """Return what is typed as YAML would have it; text that is no YAML stays text."""
+    """Return what is typed as YAML would have it; text that is not YAML stays text."""
     try:
         return parse_yaml(text, "field").data
     except RecipeError:

@@ -76,7 +76,7 @@ class Project:
         write_whole(self.recipe_path, text)
 
     def data(self) -> dict[str, Any]:
-        """Return the recipe as data; empty while it is no mapping."""
+        """Return the recipe as data; empty while it is not a mapping."""
         try:
             data = parse_yaml(self.text, self.recipe_path.name).data
         except RecipeError:
@@ -91,7 +91,7 @@ class Project:
         return {"model": given} if isinstance(given, str) else {}
 
     def steps(self) -> list[tuple[str, dict[str, Any]]]:
-        """Return name and given parameters of every step; of what is no step, empty ones."""
+        """Return name and given parameters of every step; of what is not a step, empty ones."""
         given = self.data().get("steps")
         return [_step_of(entry) for entry in given] if isinstance(given, list) else []
 
@@ -139,9 +139,9 @@ class Project:
         return [p.parent for p in sorted(logs, key=lambda p: p.stat().st_mtime, reverse=True)]
 
     def found(self, pattern: str) -> list[Path]:
-        """Return files of the folder by a pattern, sorted; without those whose names are no text.
+        """Return files of the folder by a pattern, sorted; without those whose names are not text.
 
-        A page cannot show those: Python stands half a UTF-16 pair in for a byte that is no UTF-8.
+        A page cannot show those: Python stands half a UTF-16 pair in for a byte that is not UTF-8.
         """
         paths = sorted(self.folder.glob(pattern))
         here = len(str(self.folder))

@@ -331,7 +331,7 @@ def base_T_camera_of(recipe: Recipe) -> Floats | None:
     """Return the scanner's guessed or simulated pose; None without one.
 
     Raises:
-        StageError: The poses that were shown are no poses of this arm.
+        StageError: The poses that were shown are not poses of this arm.
     """
     params: Any = recipe.steps[0].params
     robot, scanner = (recipe.context.get(m) for m in (RobotModel, ScannerModel))

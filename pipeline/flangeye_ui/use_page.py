@@ -192,7 +192,7 @@ def _number(key: str, text: str) -> float | None:
     try:
         return float(text) if text else None
     except ValueError:
-        raise ValueError(f"{ASKED[key]}: '{text}' is no number") from None
+        raise ValueError(f"{ASKED[key]}: '{text}' is not a number") from None
 
 
 def exported(result: r.Result, exports: Sequence[Stage]) -> dict[str, ExportedFile]:

@@ -121,7 +121,7 @@ def bound(tcps: Floats, noise: float, points: Floats) -> dict[str, float]:
     """Return the least standard deviations any unbiased estimate can have (Cramér-Rao).
 
     Args:
-        tcps: (N, 3) of the poses that are no outliers [m].
+        tcps: (N, 3) of the poses that are not outliers [m].
         noise: Standard deviation of each coordinate [m].
         points: (M, 3) of the workspace, for ``workspace_rms`` [m].
     """

@@ -49,7 +49,7 @@ class RealisationOutcome:
         error: (6,) x, y, z [m], roll, pitch, yaw [rad] in ``camera``, at its origin.
         at_centre: (3,) displacement at the workspace's centre, in ``camera`` [m].
         rms: Over the workspace [m].
-        alone: The same of least squares on the poses that are no outliers [m].
+        alone: The same of least squares on the poses that are not outliers [m].
         bound: Cramér-Rao, see :func:`bound`.
     """
 
@@ -75,7 +75,7 @@ def verify_realisations(
     Figures [m, rad]: ``x_std``, ``x_mean`` and so on for x, y, z, roll, pitch, yaw at the
     camera's origin, as the paper prints them; ``centre_x_std``, ... at the workspace's centre;
     ``workspace_rms`` over the workspace; ``inliers_alone_rms`` of least squares on the poses that
-    are no outliers; ``bound_x``, ..., ``bound_workspace_rms`` (Cramér-Rao); ``realisations`` and
+    are not outliers; ``bound_x``, ..., ``bound_workspace_rms`` (Cramér-Rao); ``realisations`` and
     how many of them were ``refused``.
 
     Raises:

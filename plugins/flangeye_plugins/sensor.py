@@ -226,7 +226,7 @@ def _logged(path: Path, finger: Finger) -> Iterator[tuple[float, Image]]:
 
 def _listed(path: Path) -> list[Path]:
     if not path.is_dir():
-        raise StageError(f"{path}: is no folder")
+        raise StageError(f"{path}: is not a folder")
     return list(path.iterdir())
 
 

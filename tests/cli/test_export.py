@@ -94,9 +94,13 @@ def test_a_recipe_exports_wherever_the_step_stands(exporting: Any, tmp_path: Pat
         (
             TOY_RECIPE,
             ("--to", "kukka"),
-            "--to kukka: is no format; did you mean kuka? 'flangeye export --list' names the formats",
+            "--to kukka: is not a format; did you mean kuka? 'flangeye export --list' names the formats",
         ),
-        (TOY_RECIPE, ("--to", "ros"), "--to ros: is no format; did you mean ros2_command or ros2_"),
+        (
+            TOY_RECIPE,
+            ("--to", "ros"),
+            "--to ros: is not a format; did you mean ros2_command or ros2_",
+        ),
         (
             TOY_RECIPE,
             ("--anyway",),
@@ -148,9 +152,9 @@ def judged(result: Any) -> None:
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
-        (renamed("base_T_cam; touch PWNED;"), "'cam; touch PWNED;' is no name of a frame"),
-        (renamed("x"), "'' is no name of a frame"),
-        (renamed("base_T_" + "c" * 99), "is no name of a frame"),
+        (renamed("base_T_cam; touch PWNED;"), "'cam; touch PWNED;' is not a valid frame name"),
+        (renamed("x"), "'' is not a valid frame name"),
+        (renamed("base_T_" + "c" * 99), "is not a valid frame name"),
         (stretched, "base_T_camera is not a rigid transform"),
         (judged, "status: Input should be 'verified', 'unverified', 'refused' or 'incomplete'"),
     ],

@@ -199,7 +199,7 @@ def test_a_log_of_ours_needs_no_recipe(
     code, out, err = run(monkeypatch, capsys, log)
     assert (code, err) == (0, "")
     assert out.startswith("8 of 8 samples have a target in them")
-    # A result that was changed afterwards is no mistake of the samples, and is named beside them.
+    # A result that was changed afterwards is not a mistake of the samples, and is named beside them.
     raw = bytearray(log.read_bytes())
     raw[bytes(raw).rindex(b'"verified"') + 1] = ord("V")
     log.write_bytes(raw)

@@ -130,7 +130,7 @@ def test_all_matrices_have_the_quadratics_values_for_rotations_alone(three: bool
     if three:
         at = squares.features(places)
         at[squares.families[-1].at[3, 4]] += 0.5
-        assert abs(at @ (matrix - dual.bare) @ at) > 0.1  # it is no product of two places
+        assert abs(at @ (matrix - dual.bare) @ at) > 0.1  # it is not a product of two places
 
 
 def test_of_one_rotation_twenty_are_independent_and_of_two_in_products_as_many_as_they_can() -> (

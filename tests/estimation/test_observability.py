@@ -35,7 +35,7 @@ def test_centres_that_fit_in_a_mirror_only_are_refused() -> None:
     centres = (tcps - [0.6, 0.0, 1.0]) @ rotation_exp(np.array([2.0, 0.3, -0.4]))
     noise = 1e-4 * rng.standard_normal((8, 3))
     require_right_handed(centres + noise, tcps)
-    require_right_handed(centres + 100 * noise, tcps)  # noise alone is no mirror
+    require_right_handed(centres + 100 * noise, tcps)  # noise alone is not a mirror
     for axis in range(3):
         mirrored = (centres + noise) * np.where(np.arange(3) == axis, -1.0, 1.0)
         with pytest.raises(CalibrationRefused, match=r"only when mirrored \(0.1 mm rms instead of"):

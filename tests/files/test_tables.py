@@ -80,7 +80,7 @@ def test_no_name_takes_long_or_ends_in_a_traceback(name: str, tmp_path: Path) ->
     try:
         assert files_at(tmp_path, name) in ([], [tmp_path / ("a" * 200)])
     except StageError as error:
-        assert "is no name of a file: " in str(error) and len(str(error)) < 300
+        assert "is not a valid file name: " in str(error) and len(str(error)) < 300
     assert time.process_time() - began < 1.0
 
 
@@ -121,10 +121,10 @@ def test_the_positions_of_a_program_are_rows(tmp_path: Path, columns: str) -> No
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("t.json", "[1", "t.json: is no JSON: Expecting ',' delimiter"),
-        ("t.json", "[" * 100_000, "t.json: is no JSON: maximum recursion depth exceeded"),
+        ("t.json", "[1", "t.json: is not JSON: Expecting ',' delimiter"),
+        ("t.json", "[" * 100_000, "t.json: is not JSON: maximum recursion depth exceeded"),
         ("t.json", "7", "t.json: expected a list of records, or one under each scan's name"),
-        ("t.jsonl", '{"x": 1}\n{"x":\n', "t.jsonl:2: is no JSON: Expecting value"),
+        ("t.jsonl", '{"x": 1}\n{"x":\n', "t.jsonl:2: is not JSON: Expecting value"),
         ("t.yaml", "a: [1", "t.yaml:1: not valid YAML"),
         ("t.yaml", "# " + "x" * 1_000_000, "t.yaml: is larger than 1000000 bytes; write it as"),
         ("t.json", json.dumps([[0] * 1001]),

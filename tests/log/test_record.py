@@ -180,7 +180,7 @@ def test_a_damaged_file_never_raises_anything_else(
 def test_what_is_no_log_is_said(tmp_path: Path) -> None:
     with pytest.raises(StageError, match="none.mcap: cannot be read: No such file"):
         read_run(tmp_path / "none.mcap")
-    (tmp_path / "text.mcap").write_text("hello, this is no log at all")
+    (tmp_path / "text.mcap").write_text("hello, this is not a log at all")
     with pytest.raises(StageError, match=r"text.mcap: is not an MCAP file"):
         read_run(tmp_path / "text.mcap")
     (tmp_path / "empty.mcap").write_bytes(b"")

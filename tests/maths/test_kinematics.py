@@ -170,7 +170,7 @@ def test_a_calibrated_arm_starts_from_the_nominal_one() -> None:
 
 
 def rail_and_arm():
-    """An arm of a URDF's kind on a rail, with an axis that is no coordinate axis."""
+    """An arm of a URDF's kind on a rail, with an axis that is not a coordinate axis."""
     text = {"lower": "0 m", "upper": "2 m"}
     rail = Joint(axis=(1, 1, 0), slides=True, xyz=("0 m", "0 m", "100 mm"), **text)
     elbow = Joint(axis=(0, 1, 0), xyz=("0 m", "0 m", "400 mm"), lower="-2 rad", upper="2 rad")

@@ -258,7 +258,7 @@ def test_a_rail_and_a_base_of_ones_own(kuka: Path) -> None:
         (lambda t: f'<!DOCTYPE r [<!ENTITY a "aa">]>{t}', "declares a document type or entities"),
         (lambda t: t.replace("0 0 0.400", "0 0 9e307"), "an <origin> reaches 9e.307 m; a URDF's"),
         (lambda t: t.replace('axis xyz="0 0 -1"', 'axis xyz="0 0 -1e-320"'), "needs a direction"),
-        (lambda t: t.replace("robot", "sdf"), "is no URDF: its outermost element is <sdf>"),
+        (lambda t: t.replace("robot", "sdf"), "is not a URDF: its root element is <sdf>"),
         (lambda t: t.replace(">", ' xmlns:xacro="http://wiki.ros.org/xacro"><xacro:macro/>', 1), "expand it: xacro"),
         (lambda t: t.replace("tool0", "a").replace("flange", "b").replace("</robot>",
          '<link name="c"/><joint name="c" type="fixed"><parent link="link_6"/><child link="c"/>'
@@ -325,7 +325,7 @@ def test_long_chains_take_time_with_their_length_and_messages_stay_short(
     ("content", "name", "words"),
     [
         (b"<!DOCTYPE COLLADA [<!ENTITY a 'x'>]><COLLADA/>", "m.dae", "declares a document type"),
-        (b"mtllib ../../secret.mtl\n", "m.gltf", "'.gltf' is no mesh that is read; known: .stl"),
+        (b"mtllib ../../secret.mtl\n", "m.gltf", "'.gltf' is not a mesh format; known: .stl"),
         (None, "m.stl", "is a device, a FIFO or a socket; a file is needed"),
     ],
 )

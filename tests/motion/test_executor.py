@@ -38,7 +38,7 @@ def test_it_drives_every_leg_to_its_end_and_settles() -> None:
     assert told[-1].joints == pytest.approx(goal, abs=1e-3)
     assert any(np.allclose(state.joints, middle, atol=1e-3) for state in told)
     assert robot.arm.standing
-    # Each cycle once, and an arm at rest that nobody leads is no fault.
+    # Each cycle once, and an arm at rest that nobody leads is not a fault.
     times = np.diff([state.time_ns for state in told[1:]])
     assert (times == round(robot.period * 1e9)).all()
     for _ in range(2000):

@@ -84,8 +84,8 @@ LOOPBACK = "ur5e_phoxi-m_loopback"
         ("robot.limits.joint_speed=181 deg/s", "at most 180 deg/s for a ur5e, not 181 deg/s"),
         ("robot.limits.box.size=[-1 m, 1 m, 1 m]", "must be greater than 0"),
         ("robot.limits.box.size=[0 m, 1 m, 1 m]", "must be greater than 0"),
-        ("robot.limits.box.size=[1e300 m, 1 m, 1 m]", "is no box for a ur5e, which reaches"),
-        ("robot.limits.box.centre=[50 m, 0 m, 0 m]", "is no box for a ur5e, which reaches"),
+        ("robot.limits.box.size=[1e300 m, 1 m, 1 m]", "is not a box for a ur5e, which reaches"),
+        ("robot.limits.box.centre=[50 m, 0 m, 0 m]", "is not a box for a ur5e, which reaches"),
     ],
 )
 def test_limits_are_held_against_what_the_arm_can_do(override: str, said: str) -> None:

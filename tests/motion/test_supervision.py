@@ -85,7 +85,9 @@ def test_what_is_no_number_stops_an_arm_that_stands_or_moves(what: str, number: 
         assert not watch.judge(state)
         if led:
             watch.led()
-        with pytest.raises(SafetyFault, match="joint angles, speeds or forces that are no numbers"):
+        with pytest.raises(
+            SafetyFault, match="joint angles, speeds or forces that are not numbers"
+        ):
             watch.judge(bad)
         assert len(watch.samples) == 1
 

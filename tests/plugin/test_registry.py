@@ -134,7 +134,7 @@ def test_a_stage_says_which_configurations_it_serves() -> None:
     with pytest.raises(TypeError) as caught:
         stage("solve.x", serves=["eye-on-wall"])
     assert str(caught.value) == (
-        "stage 'solve.x' serves 'eye-on-wall', which is no configuration; known: eye-on-base, "
+        "stage 'solve.x' serves 'eye-on-wall', which is not a configuration; known: eye-on-base, "
         "eye-in-hand, eye-on-arm, two-arms, cell"
     )
 

@@ -126,7 +126,7 @@ def test_an_arm_of_four_joints_turns_about_one_axis() -> None:
         ),
         (
             TWO.replace("right: base", "right: {on: base, link: 3}"),
-            "r.yaml:2: cell.cameras.right.link: 'base' is no arm and has no links: leave out link",
+            "r.yaml:2: cell.cameras.right.link: 'base' is not an arm and has no links: leave out link",
         ),
         (
             TWO.replace("right: base", "right: {on: arm, link: 7}"),

@@ -593,7 +593,7 @@ def two_poses_of_nobody(folder):
         (arrays_of_nobody, [], "not known: which poses are the arm's (poses.npz:A, poses.npz:B); "
          "add --table poses.npz:A"),
         (arrays_of_nobody, ["--table", "A"],
-         "--table A: is no table of poses; known: poses.npz:A, poses.npz:B"),
+         "--table A: is not a table of poses; known: poses.npz:A, poses.npz:B"),
         (arrays_of_the_arm, [], "rec/robot.npy: has poses of the arm, but there are no scans beside "
          "it, and no columns of what the camera saw; add --target-columns NAMES, or put the scans"),
         (lambda folder: table(folder, "x,y,z,qx,qy,qz,qw", quaternion), [],
@@ -625,7 +625,7 @@ def two_poses_of_nobody(folder):
         (lambda folder: None, [],
          "rec: is empty; put the clouds or images and their poses there"),
         (lambda folder: folder.rmdir(), [],
-         "rec: is no folder; name the one that holds the recordings"),
+         "rec: is not a folder; name the one that holds the recordings"),
         (sample, ["--camera", "wrist"], "--camera wrist: is neither base nor flange"),
         (sample, ["--target", "cube"],
          "--target cube: is none of flange, body, sphere, charuco, checkerboard, circles, aruco, "
@@ -634,7 +634,7 @@ def two_poses_of_nobody(folder):
          "--target charuco.rows: is missing\n--target charuco.square: is missing\n"),
         (sample, ["--reader", "table"], "--reader table: rotation and length: is missing"),
         (odd_heading, ["--table", "a.csv"],
-         "--table a.csv: is no table of poses; known: log.csv"),
+         "--table a.csv: is not a table of poses; known: log.csv"),
         (sample, ["--out", "rec/poses.yaml", "--robot", "ur55"], "--robot model: no robot 'ur55'"),
     ],
 )  # fmt: skip

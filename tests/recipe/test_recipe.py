@@ -61,7 +61,7 @@ def test_a_good_recipe_resolves_to_itself(toy_registry: Registry) -> None:
         ),
         (
             STEPS.replace("- fit.toy", "- fit.toy: {inlier: 2 deg}"),
-            ["r.yaml:5: steps.2.fit.toy.inlier: '2 deg' is no length, it has a unit of angle: a "
+            ["r.yaml:5: steps.2.fit.toy.inlier: '2 deg' is not a length, it has a unit of angle: a "
              "length needs mm, m, um, for example '31.5 mm'"],
         ),
         (
@@ -359,7 +359,7 @@ SOUND = "{centre: [450 mm, 0 mm, 500 mm], size: [1 m, 1 m, 900 mm]}"
             "ur5e",
             "{box: {centre: [9 m, 0 m, 0 m], size: [1 m, 1 m, 1 m]}}",
             [
-                "robot.limits.box: is no box for a ur5e, which reaches 1.31 m from its base: each "
+                "robot.limits.box: is not a box for a ur5e, which reaches 1.31 m from its base: each "
                 "side is at most 5.25 m, and some of it is within reach"
             ],
         ),
@@ -367,7 +367,7 @@ SOUND = "{centre: [450 mm, 0 mm, 500 mm], size: [1 m, 1 m, 900 mm]}"
             "ur5e",
             "{box: {centre: [0 m, 0 m, 0 m], size: [1e300 m, 1 m, 1 m]}}",
             [
-                "robot.limits.box: is no box for a ur5e, which reaches 1.31 m from its base: each "
+                "robot.limits.box: is not a box for a ur5e, which reaches 1.31 m from its base: each "
                 "side is at most 5.25 m, and some of it is within reach"
             ],
         ),

@@ -144,7 +144,7 @@ def test_a_table_of_the_arm_one_of_what_was_seen_and_a_recipe(tmp_path: Path, cl
 def test_what_is_no_run_of_a_cell_has_no_tables(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    said = "run.mcap: is no run of a cell, and tables are written of cells alone"
+    said = "run.mcap: is not a run of a cell; only cells are exported as tables"
     with pytest.raises(StageError, match=said):
         write_tables(log_of(None, []), tmp_path, UNUSED)
     monkeypatch.setattr(tables, "recipe_of_log", lambda *_: SimpleNamespace(context={}))

@@ -219,7 +219,7 @@ def test_files_of_a_run_are_locked_in(hostile: Served, cookie: str) -> None:
 
 
 def test_what_is_no_file_or_has_no_name_hides_nothing(hostile: Served, cookie: str) -> None:
-    """Devices, FIFOs, folders, names that are no UTF-8 and crooked tables are shown or passed by."""
+    """Devices, FIFOs, folders, names that are not UTF-8 and crooked tables are shown or passed by."""
     folder = hostile.folder
     for name in ("runs/fifo", "runs/endless", "runs/folder/result.json", "runs/\udcff\udcfe",
                  "batches/fifo", "batches/crooked", "batches/folder/sessions.csv"):  # fmt: skip

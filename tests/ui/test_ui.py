@@ -810,7 +810,7 @@ def test_the_certificate_is_previewed(browser: Any, served: Served, finished: Pa
     shot(page, "certificate")
     page.get_by_label("Temperature of the air, °C").fill("warm")
     page.get_by_label("Temperature of the air, °C").press("Tab")
-    page.get_by_text("Temperature of the air, °C: 'warm' is no number").wait_for()
+    page.get_by_text("Temperature of the air, °C: 'warm' is not a number").wait_for()
     assert page.problems == []
 
 

@@ -88,7 +88,7 @@ def at_work(what: str, steps: int | None = None) -> Iterator[Callable[[], None]]
 def end_in_words(command: Callable[[], object]) -> None:
     """Run the command line; every foreseen mistake is one line and an exit code."""
     keep_current_folder_out()
-    # Ours are no plugins of pydantic; it would look for one in every installed distribution.
+    # Ours are not plugins of pydantic; it would look for one in every installed distribution.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     _open_streams()
     try:

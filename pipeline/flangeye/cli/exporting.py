@@ -141,7 +141,7 @@ def _format_named(to: str, registry: Registry) -> str:
         return f"export.{spoken[0]}"
     near = [name for name in words if to.lower() in name] or spoken or nearest(to, words)
     hint = f"did you mean {' or '.join(near[:3])}? " if near else ""
-    raise StageError(f"--to {to}: is no format; {hint}{FORMATS}")
+    raise StageError(f"--to {to}: is not a format; {hint}{FORMATS}")
 
 
 def _exported(

@@ -45,7 +45,7 @@ def touch_points(  # noqa: PLR0913  one for each option
         overrides: Changes to the calibration's recipe: another address of the arm.
 
     Raises:
-        StageError: There is no calibration, its recipe names no arm, or a point is no point.
+        StageError: There is no calibration, its recipe names no arm, or a point cannot be read.
     """
     seen, tip = np.array([_point("--seen", x) for x in given[0]]), _point("--tip", given[1])
     log = read_run(run)

@@ -264,7 +264,7 @@ class Foretold:
     Attributes:
         misfit: Medians over the sightings, of the pair where they are largest.
         share: That of places, as a share of how far the pair's sightings are apart: a unit that
-            changes no error is no finding.
+            changes no error is not a finding.
     """
 
     misfit: Misfit

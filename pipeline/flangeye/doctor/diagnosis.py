@@ -263,7 +263,7 @@ class Finding:
     def lines(self) -> list[dict[str, Any]]:
         """The lines of a recipe to choose from, a step or section each, by its name.
 
-        Empty where a person has something to do that is no line.
+        Empty where a person has something to do that is not a line.
         """
         lines = [
             choice.removeprefix("- ")
@@ -313,7 +313,7 @@ class Diagnosis:
     Attributes:
         session: What they looked at.
         findings: In the order they were found, each with those before it mended.
-        notes: What is no mistake, but worth knowing.
+        notes: What is not a mistake, but worth knowing.
         checks: Names of the checks.
         idle: Those that do not apply to this session, by name, and why.
     """

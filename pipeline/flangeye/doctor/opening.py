@@ -139,7 +139,7 @@ def open_session(path: Path, registry: Registry, recipe: Recipe | None = None) -
 def open_cell(
     path: Path, registry: Registry, recipe: Recipe | None = None
 ) -> tuple[Sequence[t.Observation], Cell, Mapping[str, Any]] | None:
-    """Return a cell's sightings, its graph, and how tables were read; None if it is no cell.
+    """Return a cell's sightings, its graph, and how tables were read; None if it is not a cell.
 
     Args:
         path: A run.mcap, or a folder that the recipe's reader knows.

@@ -124,7 +124,7 @@ def work_of_frames(found: Rough, cell: Cell, seen: Sequence[Observation]) -> Map
 
     A camera where it saw something; what else there is about its origin.
     """
-    # About the origin of what is no camera, errors count so far off [m]
+    # About the origin of what is not a camera, errors count so far off [m]
     corners = 0.1 * np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
     work = {}
     for name, place in found.places.items():

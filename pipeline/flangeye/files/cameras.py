@@ -275,7 +275,7 @@ def _colmap(path: Path, lines: list[str]) -> CameraFile | None:
 
 
 def _checked(path: Path, matrix: Floats, lens: Iterable[float]) -> CameraFile | None:
-    """Return a calibration; None where the matrix is no camera's."""
+    """Return a calibration; None where the matrix is not a camera's."""
     coefficients = np.asarray(lens, dtype=np.float64).ravel()
     # OpenCV's longest row of coefficients
     most_coefficients = 14

@@ -27,7 +27,7 @@ def read_dxf(path: Path) -> tuple[Floats, str | None]:
     """Return the line segments (E, 2, 3) of a DXF drawing, and its unit if it states one.
 
     Raises:
-        StageError: It is no ASCII DXF, is too large, or holds numbers that are none.
+        StageError: It is not an ASCII DXF, is too large, or holds invalid numbers.
     """
     groups = _groups(path)
     pieces: list[Floats] = []
@@ -35,7 +35,7 @@ def read_dxf(path: Path) -> tuple[Floats, str | None]:
         try:
             line = _upright(path, name, entity, _line(name, entity))
         except (ValueError, OverflowError):
-            raise StageError(f"{path}: a {name} has a coordinate that is no number") from None
+            raise StageError(f"{path}: a {name} has a coordinate that is not a number") from None
         pieces += [np.stack([line[:-1], line[1:]], axis=1)] if len(line) > 1 else []
         if sum(map(len, pieces)) > MOST_PIECES:
             raise StageError(
@@ -53,7 +53,7 @@ def _groups(path: Path) -> list[Group]:
     try:
         return [(int(rows[k]), rows[k + 1].strip()) for k in range(0, len(rows) - 1, 2)]
     except ValueError:
-        raise StageError(f"{path}: is no ASCII DXF; save it as one (R12 to 2018)") from None
+        raise StageError(f"{path}: is not an ASCII DXF; save it as one (R12 to 2018)") from None
 
 
 def _unit(groups: list[Group]) -> str | None:
@@ -81,7 +81,7 @@ def _entities(groups: list[Group]) -> Iterator[Entity]:
 
 
 def _line(name: str, groups: list[Group]) -> Floats:
-    """Return an entity as a polyline (N, 3); N is zero of what is no line."""
+    """Return an entity as a polyline (N, 3); N is zero of what is not a line."""
     of = {code: value for code, value in reversed(groups) if code != 0}
     if name == "LINE":
         return np.array([[float(of.get(c + k, "0")) for c in (10, 20, 30)] for k in (0, 1)])

@@ -24,7 +24,7 @@ PNG = b"\x89PNG\r\n\x1a\n"
 
 
 class ImageError(ValueError):
-    """The bytes are no image, damaged, or of a size that no camera has."""
+    """The bytes are not an image, damaged, or of a size that no camera has."""
 
 
 def decode_image(raw: bytes, flags: int) -> NDArray[Any]:

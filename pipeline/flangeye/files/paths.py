@@ -120,7 +120,7 @@ def find_named(kind: Kind, name: str) -> Path | None:
     """Return the file that this machine's settings give a name; None without one.
 
     Raises:
-        DeviceError: The settings cannot be read, or the entry is no file by its whole path.
+        DeviceError: The settings cannot be read, or the entry is not the absolute path of a file.
     """
     variable = f"FLANGEYE_{'PROGRAM' if kind == 'programs' else 'LIBRARY'}_{name.upper()}"
     given, where = os.environ.get(variable), variable
@@ -130,7 +130,7 @@ def find_named(kind: Kind, name: str) -> Path | None:
         return None
     path = Path(str(given))
     if not path.is_absolute() or not path.is_file():
-        raise DeviceError(f"{where}: {given} is no file; give its whole path")
+        raise DeviceError(f"{where}: {given} is not a file; give its absolute path")
     return path
 
 

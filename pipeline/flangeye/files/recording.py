@@ -22,7 +22,7 @@ from flangeye.files.elsewhere import digest_elsewhere
 from flangeye.types import CAMERA, FLANGE, TARGET, Floats, Indices, Motion, Note, Role
 
 MIN_CAPTURES = 3
-"""Fewer poses determine nothing, and fewer rows, lists or files are no list of poses."""
+"""Fewer poses determine nothing, and fewer rows, lists or files are not a list of poses."""
 MIN_SPREAD = 1e-3
 """Largest distance of a flange from their mean [m] below which the arm has not moved at all."""
 MAX_REACH = 20.0

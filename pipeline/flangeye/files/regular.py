@@ -93,7 +93,7 @@ def read_text(path: Path, limit: int = MAX_TEXT, error: type[FlangeyeError] = St
     """Return a regular file's UTF-8 text, without a byte-order mark.
 
     Raises:
-        FlangeyeError: As :func:`read_regular`, or it is no UTF-8.
+        FlangeyeError: As :func:`read_regular`, or it is not UTF-8.
     """
     try:
         return read_regular(path, limit, error).decode("utf-8-sig")
@@ -105,7 +105,7 @@ def read_any_text(path: Path) -> str:
     """Return a text file decoded as UTF-8, UTF-16 (Excel), or else Latin-1.
 
     Raises:
-        StageError: As :func:`read_regular`, or it is no text.
+        StageError: As :func:`read_regular`, or it is not text.
     """
     raw = read_regular(path)
     if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
@@ -126,7 +126,7 @@ def write_whole(path: Path, content: str | bytes, error: type[FlangeyeError] = S
     """Write a file atomically: after a crash it is the old one or the new one, never a part.
 
     Args:
-        path: The file, whose folder is made where there is none; what is no regular file, such
+        path: The file, whose folder is made where there is none; what is not a regular file, such
             as ``/dev/stdout``, is written as it is.
         content: UTF-8 text, or bytes.
         error: What to raise.

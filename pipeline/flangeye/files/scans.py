@@ -203,7 +203,7 @@ def scans_of(
     Args:
         folder: Where the scans are.
         poses: What they belong to.
-        taken: Files that hold poses, and are no scans.
+        taken: Files that hold poses, and are not scans.
 
     Raises:
         StageError: The names differ, there are not as many, or two folders hold scans for all.

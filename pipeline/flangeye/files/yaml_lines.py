@@ -73,7 +73,7 @@ def parse_yaml(text: str, name: str) -> Document:
 
 @lru_cache(maxsize=64)  # a batch reads its recipe and its robot's file once a session
 def _parse(text: str, name: str) -> Document:
-    if _SURROGATE.search(text):  # a byte of the command line that is no UTF-8
+    if _SURROGATE.search(text):  # a byte of the command line that is not UTF-8
         raise RecipeError(f"{name}: is not UTF-8 text")
     try:
         root = _composed(text, name)
@@ -142,7 +142,7 @@ def _build(node: yaml.Node, path: Keys, lines: dict[Keys, int], name: str) -> An
 
 
 def _text(node: yaml.Node, name: str) -> str:
-    """Return the text of a scalar; an escape can write what is no character and has no UTF-8."""
+    """Return the text of a scalar; an escape can write what is not a character and has no UTF-8."""
     text = str(node.value)
     if _SURROGATE.search(text):
         raise RecipeError(f"{name}:{node.start_mark.line + 1}: is not UTF-8 text")

@@ -455,12 +455,12 @@ def decode_json(raw: bytes) -> dict[str, Any]:
         raise DamageError(f"it has {len(raw)} bytes; at most {most} are read")
     data = json.loads(raw, parse_constant=_no_number)
     if not isinstance(data, dict):
-        raise DamageError(f"it is no object but of type {type(data).__name__}")
+        raise DamageError(f"it is not an object but of type {type(data).__name__}")
     return data
 
 
 def _no_number(text: str) -> None:
-    raise DamageError(f"it holds {text}, which is no number")
+    raise DamageError(f"it holds {text}, which is not a number")
 
 
 def _error_line(message: LogMessage, error: Exception) -> str:

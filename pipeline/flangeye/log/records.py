@@ -131,7 +131,7 @@ class LogFile:
             size: Size of the file, where it is known [bytes]: no record is longer.
 
         Raises:
-            NotMcapError: It is no MCAP file.
+            NotMcapError: It is not an MCAP file.
         """
         for number, (opcode, body) in enumerate(self._records(file, size)):
             try:
@@ -144,7 +144,7 @@ class LogFile:
         self._check_hashes()
 
     def _records(self, file: IO[bytes], size: int) -> Iterator[tuple[int, bytes]]:
-        """Yield (opcode, content); a record that is cut off was being written, and is no damage."""
+        """Yield (opcode, content); a truncated last record is not damage."""
         magic = b"\x89MCAP0\r\n"
         begin = file.read(len(magic))
         if not magic.startswith(begin):

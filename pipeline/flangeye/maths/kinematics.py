@@ -273,7 +273,7 @@ class Arm:
         if solved.all() or (solved.any() and not each):
             return self._distinct(self._within_limits(joints[solved]))
         # Iterations from a closed form; a calibrated arm takes about five
-        # Farther from a pose than this [rad, m], what a closed form gives is no start towards it
+        # Farther from a pose than this [rad, m], what a closed form gives is not a start towards it
         return self.inverse_near(base_T_flange, joints[error < 0.1], 8)
 
     def inverse_near(self, base_T_flange: Floats, joints: Floats, iterations: int = 40) -> Floats:

@@ -336,7 +336,7 @@ def convention_of_maker(maker: str | None) -> str | None:
 
 
 MATRIX, APART = "matrix", "3x3"
-"""Rotations that are no numbers of a convention: 12 or 16 numbers row by row, and 9 behind a
+"""Rotations that are not numbers of a convention: 12 or 16 numbers row by row, and 9 behind a
 position."""
 PLAIN = ("xyzw", "wxyz", "vector", *EULER_ORDERS)
 """Rotations that no maker's name stands for."""
@@ -363,7 +363,7 @@ def pose_of_numbers(
         angle: Unit of angles, or of a rotation vector's length.
 
     Raises:
-        ValueError: They are no pose in this convention.
+        ValueError: They are not a pose in this convention.
     """
     if rotation not in (MATRIX, APART):
         return written(rotation, length, angle).matrix(numbers)

@@ -14,7 +14,7 @@ from flangeye.types import Floats, Seam
 def tube_radii(seam: Seam, probability: float = 0.95) -> Floats:
     """Return the (N,) radii within which the true seam passes each point [m].
 
-    Across the seam only: a shift along it is no error of a line. The radius is that of a circle
+    Across the seam only: a shift along it is not an error of a line. The radius is that of a circle
     around the ellipse which holds the share, so the tube is never too thin.
     """
     covariances = across(seam.covariance, seam.tangents)

@@ -79,7 +79,7 @@ class TargetBody:
 
 
 ARM = "robot"
-"""The name of a body that is no file: the arm itself."""
+"""The name of a body that is not a file: the arm itself."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +193,7 @@ def load_body(name: str, unit: LengthUnit | None, near: Path) -> TargetBody:
         near: Folder of the recipe.
 
     Raises:
-        RecipeError: There is no such body, its file is damaged, or its size is no tool's.
+        RecipeError: There is no such body, its file is damaged, or its size is not a tool's.
     """
     path = near / name
     if path.suffix.lower() not in MESHES:

@@ -256,7 +256,7 @@ def emptiness(flat: Floats, pitch: float, half_width: float) -> Floats | None:
     for reach in range(2, max(3, int(half_width / pitch * TICKS / (2 * np.pi)) + 1)):
         smooth = sum(np.roll(count, k) for k in range(-reach, reach + 1))
         usual = float(np.percentile(smooth, 75))
-        # Points a place that is no hole must hold, for an empty place to mean anything
+        # Points a place that is not a hole must hold, for an empty place to mean anything
         if usual >= 5:
             return np.asarray(np.clip(1.0 - smooth / usual, 0.0, 1.0))
     return None

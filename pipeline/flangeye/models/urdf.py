@@ -102,7 +102,7 @@ def robot_from_urdf(
         packages: Where the packages are that meshes are named by.
 
     Raises:
-        RecipeError: It is no URDF, or base and flange cannot be told: says which links there are.
+        RecipeError: It is not a URDF, or its base or flange link is ambiguous.
     """
     return arm_of(read_urdf(path), base, flange, standard, packages).robot
 
@@ -154,7 +154,7 @@ def parse_urdf(text: str, path: Path) -> Urdf:
     except ET.ParseError as error:
         raise RecipeError(f"{path}:{error.position[0]}: not valid XML: {error}") from None
     if root.tag != "robot":
-        raise RecipeError(f"{path}: is no URDF: its outermost element is <{root.tag}>, not <robot>")
+        raise RecipeError(f"{path}: is not a URDF: its root element is <{root.tag}>, not <robot>")
     if any("xacro" in element.tag for element in root.iter()):
         raise RecipeError(f"{path}: is xacro, not yet a URDF; expand it: xacro {path} > arm.urdf")
     links = {link.get("name", ""): link for link in root.findall("link")}

@@ -82,7 +82,7 @@ def _points(body: ET.Element, urdf: Path, packages: Mapping[str, Path]) -> Float
     if body.tag == "mesh":
         scale = np.array(numbers_of(urdf, body, "scale", "1 1 1"))
         return np.asarray(vertices(_find(body.get("filename", ""), urdf, packages)) * scale)
-    raise RecipeError(f"{urdf}: <{body.tag}> is no body that URDF knows")
+    raise RecipeError(f"{urdf}: <{body.tag}> is not a body that URDF knows")
 
 
 def _number(body: ET.Element, name: str, urdf: Path) -> float:
@@ -140,7 +140,7 @@ def vertices(path: Path) -> Floats:
     """Return the vertices (V, 3) of a mesh, decoded from its bytes: it opens no other file.
 
     Raises:
-        RecipeError: It is no regular file of a known kind, is too large, or is damaged.
+        RecipeError: It is not a regular file of a known kind, is too large, or is damaged.
     """
     return np.asarray(_loaded(path).vertices, dtype=np.float64).reshape(-1, 3)
 
@@ -151,7 +151,7 @@ def _loaded(path: Path) -> Any:
     kind = path.suffix.lower()
     meshes = (".stl", ".obj", ".dae", ".ply")
     if kind not in meshes:
-        raise RecipeError(f"{path}: '{kind}' is no mesh that is read; known: {', '.join(meshes)}")
+        raise RecipeError(f"{path}: '{kind}' is not a mesh format; known: {', '.join(meshes)}")
     raw = read_regular(path, 200_000_000, RecipeError)
     if kind == ".dae" and (b"<!DOCTYPE" in raw or b"<!ENTITY" in raw):
         raise RecipeError(f"{path}: declares a document type or entities, which are not read")
@@ -159,7 +159,7 @@ def _loaded(path: Path) -> Any:
         mesh: Any = trimesh.load(io.BytesIO(raw), file_type=kind[1:], force="mesh")
         points = np.asarray(mesh.vertices, dtype=np.float64).reshape(-1, 3)
     except Exception as error:  # trimesh raises whatever its readers do
-        raise RecipeError(f"{path}: is no mesh that can be read: {reason_of(error)}") from None
+        raise RecipeError(f"{path}: is not a readable mesh: {reason_of(error)}") from None
     if not len(points) or not np.isfinite(points).all():
         raise RecipeError(f"{path}: has no vertices, or some that are not finite")
     return mesh

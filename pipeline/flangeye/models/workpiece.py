@@ -147,7 +147,7 @@ def read_mesh(path: Path) -> tuple[Floats, NDArray[np.int32]]:
         StageError: It is missing, damaged, or holds no triangles.
     """
     if path.suffix.lower() not in MESHES:
-        raise StageError(f"{path}: '{path.suffix}' is no CAD; known: {', '.join(MESHES)}")
+        raise StageError(f"{path}: '{path.suffix}' is not CAD; known: {', '.join(MESHES)}")
     if path.suffix.lower() in (*STEP_SUFFIXES, ".3mf") and find_spec("cascadio") is None:
         raise StageError(f"{path}: STEP and 3MF need: pip install 'flangeye[cad]'")
     # Largest CAD file [bytes]: five million triangles
@@ -157,7 +157,7 @@ def read_mesh(path: Path) -> tuple[Floats, NDArray[np.int32]]:
     if not np.isfinite(vertices).all():
         raise StageError(f"{path}: holds vertices that are not finite")
     if triangles.min() < 0 or triangles.max() >= len(vertices):
-        raise StageError(f"{path}: has a triangle whose corner is no vertex of it; is it whole?")
+        raise StageError(f"{path}: has a triangle whose corner is not a vertex of it; is it whole?")
     return vertices, triangles.astype(np.int32)
 
 

@@ -131,7 +131,7 @@ class WatchedArm:
             self._wire.send((request, content))
 
     def _hear(self, patience: float | None, complaint: str) -> Report:
-        """Return the next report that is no reason to end.
+        """Return the next report that is not a reason to end.
 
         Raises:
             DeviceError: A safety fault, or no report in time.

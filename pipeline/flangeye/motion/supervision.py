@@ -189,10 +189,10 @@ class Supervisor:
 
 
 def _require_numbers(state: RobotState) -> None:
-    """Doubt what is no number: every comparison with it is false, as if all were well."""
+    """Doubt what is not a number: every comparison with it is false, as if all were well."""
     force = np.zeros(0) if state.force is None else state.force
     if not np.isfinite(np.concatenate([state.joints, state.joint_speeds, force])).all():
         raise SafetyFault(
-            "the controller reports joint angles, speeds or forces that are no numbers: look at "
+            "the controller reports joint angles, speeds or forces that are not numbers: look at "
             "it, then start again"
         )

@@ -409,7 +409,7 @@ def stage(name: str, serves: Iterable[str] = ()) -> Callable[[Callable[..., Any]
     unknown = sorted(set(serves) - {*EVERY, CELL})
     if unknown:
         raise TypeError(
-            f"stage '{name}' serves '{unknown[0]}', which is no configuration; known: "
+            f"stage '{name}' serves '{unknown[0]}', which is not a configuration; known: "
             f"{', '.join((*EVERY, CELL))}"
         )
 

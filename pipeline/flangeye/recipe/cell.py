@@ -96,7 +96,7 @@ def _standing(section: CellSection) -> Iterator[Mistake]:
         if each.on in carriers and each.on not in section.arms:
             yield (
                 (group, name, "link"),
-                f"'{each.on}' is no arm and has no links: leave out link",
+                f"'{each.on}' is not an arm and has no links: leave out link",
             )
     for name, _ in () if lost else _movers(section):
         try:

@@ -264,7 +264,7 @@ def _check_limits(limits: LimitsSection, robot: RobotModel, complain: Complain) 
     if nearest > robot.length or np.any(high - low > most):
         complain(
             ("robot", "limits", "box"),
-            f"is no box for a {robot.model}, which reaches {robot.length:.2f} m from its base: "
+            f"is not a box for a {robot.model}, which reaches {robot.length:.2f} m from its base: "
             f"each side is at most {most:.2f} m, and some of it is within reach",
         )
 

@@ -168,7 +168,7 @@ class StepOrder:
             self._need(("steps", index, name), need, purpose)
 
     def lose_track(self) -> None:
-        """Note an entry that is no valid step: its output is unknown from here on."""
+        """Note an entry that is not a valid step: its output is unknown from here on."""
         self._lost = True
 
     def _need(self, at: tuple[Hashable, ...], need: Any, purpose: str) -> None:

@@ -27,7 +27,7 @@ from flangeye.result.sections import workspace_result
 def logged_result(log: RunLog) -> Result | None:
     """Return the result of a log; None when the run did not come to its end.
 
-    One that is no result is counted among the log's damage, and not given.
+    One that is not a result is counted among the log's damage, and not given.
     """
     if log.result is None:
         return None

@@ -477,7 +477,7 @@ def _refined(found: t.HandEye, before: t.HandEye | None) -> t.HandEye:
 
 
 def _unread_joint(capture: t.Capture) -> str | None:
-    """Return which joint angle is no number: a driver that had none to give leaves NaN."""
+    """Return which joint angle is not a number: a driver that had none to give leaves NaN."""
     joints = () if capture.joints is None else capture.joints.tolist()
     for number, angle in enumerate(joints, 1):
         if not math.isfinite(angle):

@@ -41,11 +41,11 @@ def write_tables(log: RunLog, folder: Path, registry: Registry) -> list[Path]:
         The files, the recipe last.
 
     Raises:
-        StageError: The run is none of a cell, or nothing was seen in it.
+        StageError: The run is not of a cell, or it holds no sightings.
     """
     recipe = recipe_of_log(log, registry) if log.has_recipe else None
     if recipe is None or Cell not in recipe.context:
-        raise StageError(f"{log.path}: is no run of a cell, and tables are written of cells alone")
+        raise StageError(f"{log.path}: is not a run of a cell; only cells are exported as tables")
     cell, seen = recipe.context[Cell], log.observations()
     if not seen:
         raise StageError(f"{log.path}: nothing was seen in this run")

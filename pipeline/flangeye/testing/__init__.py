@@ -98,7 +98,7 @@ class CheckConformance(Conformance):
         require(first == again, "two calls with equal input differ")
 
     def test_it_finds_nothing_where_nothing_is_wrong(self) -> None:
-        """A known cell with 0.05 mm of noise; a note is no mistake."""
+        """A known cell with 0.05 mm of noise; a note is not a mistake."""
         mistakes = [finding.what for finding in self.found(session()) if not finding.note]
         require(not mistakes, f"found in good recordings: {'; '.join(mistakes)}")
 

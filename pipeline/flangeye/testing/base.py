@@ -146,7 +146,7 @@ class Conformance:
         """Its kind, a line for people, and parameters that explain themselves."""
         plugin = self.plugin
         kinds = {**KINDS, **PARTS}
-        require(plugin.kind in kinds, f"'{plugin.kind}' is no kind; kinds: {', '.join(kinds)}")
+        require(plugin.kind in kinds, f"'{plugin.kind}' is not a kind; kinds: {', '.join(kinds)}")
         require(
             not self.kind or plugin.kind == self.kind,
             f"{plugin.name} is tested as a {self.kind}, but is a {plugin.kind}",

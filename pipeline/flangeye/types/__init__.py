@@ -217,7 +217,7 @@ class ExportedFile:
     def __post_init__(self) -> None:
         """Refuse a name that leads out of the folder."""
         if not re.fullmatch(r"\w[\w.-]*", self.name, re.ASCII):
-            raise ValueError(f"{self.name!a} is no plain file name")
+            raise ValueError(f"{self.name!a} is not a plain file name")
 
 
 @dataclass(frozen=True)

@@ -88,7 +88,7 @@ class Transform:
             # Names of frames are identifiers: they reach recipes, logs and other
             # programs' files
             if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]{0,63}", frame):
-                raise ValueError(f"{frame[:80]!a} is no name of a frame: letters, digits and _")
+                raise ValueError(f"{frame[:80]!a} is not a valid frame name: letters, digits and _")
         freeze(self, matrix=(4, 4))
         rotation = self.matrix[:3, :3]
         # Not np.allclose: poses come 500 times a second, and it takes 30 us.

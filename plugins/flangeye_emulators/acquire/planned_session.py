@@ -63,7 +63,7 @@ UPRIGHT = np.radians([0, -90, 90, -90, -90, 0])
 FACING = float(np.radians(50.0))
 """A camera sees a target whose z is this far from the view at most [rad]."""
 FIELD = float(np.radians(50.0)), float(np.radians(40.0))
-"""Horizontal and vertical field of view of a camera that is no scanner [rad]."""
+"""Horizontal and vertical field of view of a camera that is not a scanner [rad]."""
 
 
 class ArmsParams(Params):

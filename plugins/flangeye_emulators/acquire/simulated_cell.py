@@ -109,7 +109,7 @@ def acquire_simulated_cell_scans(
     All scanners are of the recipe's model, each with a distortion of its own.
 
     Raises:
-        StageError: A target is no flange, the place of an unknown is not given, or a camera or
+        StageError: A target is not a flange, the place of an unknown is not given, or a camera or
             target takes part in too few sightings.
     """
     _require_flanges(cell)

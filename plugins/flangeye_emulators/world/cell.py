@@ -1,4 +1,4 @@
-"""The simulated cell: an arm on a table, a wall, and a stand with a disc that is no flange."""
+"""The simulated cell: an arm on a table, a wall, and a stand with a disc that is not a flange."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ class ArmPoses:
     """N poses of the arms.
 
     Attributes:
-        joints: (N, n) of the first arm [rad]; None where it is no arm of the catalogue.
+        joints: (N, n) of the first arm [rad]; None where it is not an arm of the catalogue.
         second: (N, m) of the second arm [rad]; None where there is none.
         camera: (N, 4, 4) where the camera is carried, in ``base``.
         flange: (N, 4, 4) base_T_flange.

@@ -254,8 +254,8 @@ def _require_known(root: Path, what: str, given: Iterable[str], known: tuple[str
     for name in dict.fromkeys(given):
         if name not in known:
             raise StageError(
-                f"{root}: has recordings of '{name}', which is no {what} of the recipe's cell; it "
-                f"has {', '.join(known) or 'none'}"
+                f"{root}: has recordings of '{name}', which is not a {what} of the recipe's cell; "
+                f"it has {', '.join(known) or 'none'}"
             )
 
 

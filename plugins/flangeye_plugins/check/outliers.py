@@ -161,7 +161,7 @@ def _flipped(
 
 
 TURN = np.radians(2.0)
-"""Uncertainty of the camera's rotation that is no answer (one sigma) [rad]."""
+"""Uncertainty of the camera's rotation that is not an answer (one sigma) [rad]."""
 SHIFT = 5e-3
 """Likewise of where it sees the work [m]."""
 LITTLE = np.radians(10.0)

@@ -90,7 +90,7 @@ def _written_otherwise(session: RecordedSession) -> Iterator[Rereading]:
             continue
         for other in _conventions(*said):
             changes = {"rotation": other[0], "angle": other[1]}
-            with suppress(StageError):  # the numbers are no poses in it
+            with suppress(StageError):  # the numbers are not poses in it
                 read = session.again(changes if of_arm else {}, changes if of_target else {})
                 if read.ids == session.ids:
                     yield Rereading(read, name, _spelt(said), _spelt(other))
@@ -196,7 +196,7 @@ def _stated(session: RecordedSession, of: str | None = None) -> str | None:
 
 
 def _plain(rotation: str) -> str:
-    """Return how a convention writes rotations, or what is no convention's name."""
+    """Return how a convention writes rotations, or what is not a convention's name."""
     return CONVENTIONS[rotation].rotation if rotation in CONVENTIONS else rotation
 
 

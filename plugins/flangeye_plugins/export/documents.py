@@ -275,7 +275,7 @@ def _chain(file: Path, mount: str, optical: str) -> Floats:
     """Return ``mount_T_optical`` (4, 4) along the fixed joints of a URDF.
 
     Raises:
-        FlangeyeError: The file is no URDF, or no fixed joints lead from one link to the other.
+        FlangeyeError: The file is not a URDF, or no fixed joints lead from one link to the other.
     """
     above = {
         child: joint

@@ -97,7 +97,7 @@ def require_identifier(name: str, reserved: Iterable[str] = ()) -> str:
         StageError: It is none, or a word of that language.
     """
     if not re.fullmatch(NAME, name):
-        raise StageError(f"--set name: {name!a} is no identifier; allowed: {NAME}")
+        raise StageError(f"--set name: {name!a} is not an identifier; allowed: {NAME}")
     if name.lower() in reserved:
         raise StageError(f"--set name: '{name}' is a word of that language; choose another")
     return name

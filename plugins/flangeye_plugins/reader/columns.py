@@ -66,7 +66,7 @@ class WrittenParams(Params):
         """Return the pose (4, 4) or the point (3,) [m] of a row of numbers.
 
         Raises:
-            StageError: They are no pose in this convention.
+            StageError: They are not a pose in this convention.
         """
         if self.rotation == POINT:
             if numbers.size != 3 or not np.isfinite(numbers).all():
@@ -173,7 +173,7 @@ def readings_of(own: Table, given: ColumnsParams, taken: Sequence[Column] = ()) 
         taken: Columns that hold something else.
 
     Raises:
-        StageError: A cell is no number, or the times do not ascend.
+        StageError: A cell is not a number, or the times do not ascend.
     """
     other = own.indices([column for column in (given.time, *taken) if column is not None])
     width = max(len(cells) for _, cells in own.rows)  # empty last cells are not counted

@@ -432,8 +432,8 @@ def _target(bag: Bag, params: BagParams) -> Target:
     if name in bag.poses:
         return Target(*in_order(*bag.poses[name]))
     if params.camera is None:
-        raise StageError(f"{bag.path}: target: '{name}' is no PoseStamped topic; as a frame of tf "
-                         "it needs the camera's frame, camera: NAME")  # fmt: skip
+        raise StageError(f"{bag.path}: target: '{name}' is not a PoseStamped topic; as a frame of "
+                         "tf it needs the camera's frame, camera: NAME")  # fmt: skip
     # Seen from the target the chain is the same, and its times are those of the target's own tf.
     times, poses = bag.frames.between(name, params.camera)
     return Target(times, np.array([inverted(pose) for pose in poses]))

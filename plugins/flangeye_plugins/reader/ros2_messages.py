@@ -148,7 +148,7 @@ def _mcap_messages(file: Path, topics: Collection[str]) -> Iterator[Raw]:
 
 @contextmanager
 def _opened(file: Path) -> Iterator[sqlite3.Connection]:
-    """Give a bag's database; views, whose queries need not end, are no tables of a bag.
+    """Give a bag's database; views, whose queries need not end, are not tables of a bag.
 
     Raises:
         StageError: It is a database of something else.
@@ -156,7 +156,7 @@ def _opened(file: Path) -> Iterator[sqlite3.Connection]:
     with closing(sqlite3.connect(f"file:{file}?mode=ro", uri=True)) as database:
         tables = database.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
         if not {("topics",), ("messages",)} <= set(tables):
-            raise StageError(f"{file}: is no ROS 2 bag: it has no tables topics and messages")
+            raise StageError(f"{file}: is not a ROS 2 bag: it has no tables topics and messages")
         yield database
 
 

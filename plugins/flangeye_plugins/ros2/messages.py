@@ -91,7 +91,7 @@ def decoded(data: bytes, kind: str, use: Callable[[Any], Any] = lambda message: 
     except StageError:
         raise
     except Exception as error:  # damaged bytes can break the library, and its use, in any way
-        raise StageError(f"a message is no sound {kind}: {reason_of(error)}") from None
+        raise StageError(f"a message is not a valid {kind}: {reason_of(error)}") from None
 
 
 def encoded(message: Any) -> bytes:

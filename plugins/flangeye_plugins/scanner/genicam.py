@@ -99,7 +99,7 @@ def _enable_range(nodes: Any) -> None:
     there = has_node(nodes, "ComponentSelector")
     components = nodes.ComponentSelector.symbolics if there else ()
     if "Range" not in components:
-        raise DeviceError(f"{NAME}: the device has no component Range: it is no 3D scanner")
+        raise DeviceError(f"{NAME}: the device has no component Range: it is not a 3D scanner")
     for component in sorted(components, key="Range".__eq__):  # Range last, to be read below
         nodes.ComponentSelector.value = component
         _write(nodes, "ComponentEnable", component == "Range")
@@ -248,7 +248,7 @@ def _add(harvester: Any, path: Path) -> None:
     try:
         harvester.add_file(str(path), check_existence=True, check_validity=True)
     except Exception as error:  # a producer is a library of some maker, and fails in its own ways
-        raise DeviceError(f"{NAME}: {path} is no GenTL producer: {error}") from None
+        raise DeviceError(f"{NAME}: {path} is not a GenTL producer: {error}") from None
 
 
 def _acquirer(harvester: Any, serial: str | None) -> Any:

@@ -100,7 +100,7 @@ def surface_end(way: Floats, past: Mask, covered: Mask, pitch: float) -> End | N
     """Return where a surface ends, from the ends of its lanes; None with too few lanes.
 
     The median over lanes, of those behind which the scanner sees something farther away where
-    there are enough. Lanes that end at two places are no sample of one.
+    there are enough. Lanes that end at two places are not a sample of one place.
 
     Args:
         way: (L,) ends of lanes along the way to the end [m].

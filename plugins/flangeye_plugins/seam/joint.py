@@ -351,7 +351,7 @@ def _judged(found: Found, params: JointParams) -> dict[str, float]:
     leaning = np.abs(found.swept.section.shape[:4]) - 3 * np.radians(JOINTS[params.joint].spread)
     if leaning.max() > 0:
         raise CalibrationRefused(
-            f"{STAGE}: this is no {params.joint} joint: an angle between its surfaces is off by "
+            f"{STAGE}: this is not a {params.joint} joint: an angle between its surfaces is off by "
             f"{np.degrees(np.abs(found.swept.section.shape[:4]).max()):.0f} deg"
         )
     # Of a joint, most points about its line are on it, and most of its length shows both plates.
@@ -362,8 +362,8 @@ def _judged(found: Found, params: JointParams) -> dict[str, float]:
     for what, value in shares.items():
         if value < 0.6:
             raise CalibrationRefused(
-                f"{STAGE}: this is no {params.joint} joint: {value:.0%} {what}, at least 60% are "
-                "needed"
+                f"{STAGE}: this is not a {params.joint} joint: {value:.0%} {what}, at least 60% "
+                "are needed"
             )
     if astray is not None:
         raise CalibrationRefused(

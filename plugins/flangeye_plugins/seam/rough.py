@@ -157,7 +157,7 @@ def _placed(
     lines: tuple[Line, ...],
     tolerance: float,
 ) -> JointPlace | None:
-    """Return the joint whose half-planes are these lines, or None where that is no joint."""
+    """Return the joint whose half-planes are these lines, or None where that is not a joint."""
     nominal, spread = (np.radians([x[k] for k in present]) for x in (joint.angles, joint.spread))
     off = np.array([line.angle for line in lines]) - nominal
     weights = 1 / spread**2

@@ -144,7 +144,7 @@ def _one_arm(problem: Problem) -> tuple[Floats, Floats]:
     """Return ``G`` and ``M`` of ``G X M`` that is the same at every pose, both (N, 4, 4).
 
     Raises:
-        StageError: The measurements are no whole poses, or the unknowns are others.
+        StageError: The measurements are not whole poses, or the unknowns are others.
     """
     if not (problem.seen.ranks == 6).all():
         raise StageError(

@@ -120,7 +120,7 @@ def read_surface(path: Path, unit: LengthUnit, rotation: Floats, offset: Floats)
         offset: (3,) origin of the CAD frame in ``flange`` [m].
 
     Raises:
-        StageError: The file is no cloud, or too small.
+        StageError: The file is not a cloud, or too small.
     """
     xyz = read_cloud(path, unit).points().astype(np.float64)
     fewest_points = 100

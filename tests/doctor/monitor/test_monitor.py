@@ -204,7 +204,7 @@ CRAFTED: dict[str, Callable[[dict[str, Any]], Any]] = {
         covariance=[[0, 1e-8, 0], [1e-8, 0, 0], [0, 0, 1e-8]]
     ),
     "no pose of the flange": lambda r: r["check"]["seen"][0]["poses"].clear(),
-    "a pose that is no rotation": lambda r: r["check"]["seen"][0]["poses"]["flange"].update(
+    "a pose that is not a rotation": lambda r: r["check"]["seen"][0]["poses"]["flange"].update(
         matrix=[[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
     ),
     "another kind of feature": lambda r: r["check"]["seen"][0].update(feature={}),

@@ -461,7 +461,7 @@ def test_a_hostile_frame_stays_a_string(name: str, frame: str) -> None:
 @pytest.mark.parametrize("remark", HOSTILE)
 @pytest.mark.parametrize("name", READERS)
 def test_a_hostile_remark_stays_a_comment(name: str, remark: str) -> None:
-    """The target's parser finds the pose; what is no comment is the same for any remark."""
+    """The target's parser finds the pose; what is not a comment is the same for any remark."""
     mark = "<!--" if name == "urdf" else written(name, CalibratedPose(BENIGN, ("x",))).text[0]
 
     def without_comments(pose: CalibratedPose) -> list[str]:
@@ -486,7 +486,7 @@ def test_a_hostile_name_is_refused(name: str, text: str) -> None:
     if text in HOSTILE:
         with pytest.raises((StageError, ValueError)):
             stage(pose=CalibratedPose(BENIGN), params=params_of(name).model_construct(name=text))
-    with pytest.raises(ValueError, match="is no name of a frame"):
+    with pytest.raises(ValueError, match="is not a valid frame name"):
         Transform(BASE, text, np.eye(4))
 
 

@@ -159,7 +159,7 @@ def _of_one_camera(data: Any) -> None:
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        (_renamed, "{}: has recordings of 'secnd', which is no camera of the recipe's cell; it has "
+        (_renamed, "{}: has recordings of 'secnd', which is not a camera of the recipe's cell; it has "
          "first, second"),
         (_alone, "{}: 'second' sees nothing; add its table to the reader, or leave it out of the "
          "cell"),

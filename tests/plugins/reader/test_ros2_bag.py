@@ -202,7 +202,9 @@ def test_a_bags_numbers_name_file_and_topic_and_its_tables_are_tables(tmp_path: 
             "CREATE VIEW messages AS WITH RECURSIVE r(n) AS (SELECT 1 UNION ALL SELECT n + 1 "
             "FROM r) SELECT n AS id, 1 AS topic_id, n AS timestamp, x'00' AS data FROM r"
         )
-    with pytest.raises(StageError, match=r"is no ROS 2 bag: it has no tables topics and messages"):
+    with pytest.raises(
+        StageError, match=r"is not a ROS 2 bag: it has no tables topics and messages"
+    ):
         read(file)
 
 
@@ -395,7 +397,7 @@ def test_a_bag_of_a_simulated_session_gives_the_same_matrix(bag: Callable[..., A
          "{ros2_bag: {base: …, flange: …}} (frames of tf: end, map) or robot: NAME ('flangeye "
          "robots' lists them) or robot: {urdf: arm.urdf} in the recipe (for the angles of "
          "/joints)"),
-        ("tf two", {"target": "marker"}, "target: 'marker' is no PoseStamped topic; as a frame of "
+        ("tf two", {"target": "marker"}, "target: 'marker' is not a PoseStamped topic; as a frame of "
          "tf it needs the camera's frame, camera: NAME"),
         ("tf late", {}, "the arm's poses are from 1700000000.000 to 1700000008.200 s, the "
          "measurements from 1700001000.000 to 1700001000.000 s: they have no time in common; set "

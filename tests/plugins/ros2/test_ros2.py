@@ -127,7 +127,7 @@ def test_what_goes_wrong_with_an_arm_is_one_line(env):
                 for _ in range(50):
                     robot.wait_cycle()
             arm.tell(stamped=True, nan=True)
-            with pytest.raises(DeviceError, match="a joint's position is no number"):
+            with pytest.raises(DeviceError, match="a joint's position is not a number"):
                 for _ in range(50):
                     robot.wait_cycle()
 

@@ -101,7 +101,7 @@ def test_a_missing_producer_is_said(monkeypatch: pytest.MonkeyPatch, tmp_path: P
         "scanner.genicam: no GenTL producer 'other' on this machine; it has: maker.cti"
     )
     assert refused(None, GenicamParams(producer="maker")).startswith(
-        f"scanner.genicam: {maker} is no GenTL producer: "
+        f"scanner.genicam: {maker} is not a GenTL producer: "
     )
 
 
@@ -215,7 +215,7 @@ def test_a_unit_the_device_keeps_is_believed() -> None:
 @pytest.mark.parametrize(
     ("description", "message"),
     [
-        (Description(), "the device has no component Range: it is no 3D scanner"),
+        (Description(), "the device has no component Range: it is not a 3D scanner"),
         (
             phoxi(enable={"access": "RO"}),
             "the device does not let its component Range be enabled",

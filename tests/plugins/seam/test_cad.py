@@ -227,7 +227,7 @@ def test_the_sample_workpieces_are_closed_and_face_outwards(plate: Any) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (("plate.stl", "plate.iges"), "plate.iges: '.iges' is no CAD; known: .stl, .ply"),
+        (("plate.stl", "plate.iges"), "plate.iges: '.iges' is not CAD; known: .stl, .ply"),
         (("plate.stl", "none.stl"), "none.stl: cannot be read: No such file"),
         (
             ("-15.0, 14.0]\n", "-15.0, 140.0]\n"),

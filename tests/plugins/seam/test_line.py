@@ -85,7 +85,7 @@ def test_a_sharp_edge_of_a_cad_is_a_line(tmp_path) -> None:
     ("name", "text", "told"),
     [
         ("a.dxf", "", "holds no line"),
-        ("a.dxf", "this is\nno drawing\n", "is no ASCII DXF"),
+        ("a.dxf", "this is\nno drawing\n", "is not an ASCII DXF"),
         ("a.csv", "x,y,z\nnan,nan,nan\n1,2,3\n", "not three finite numbers"),
         ("a.csv", "", "holds no line"),
         ("a.pdf", "x", "'.pdf' holds no line; known: .csv, "),

@@ -272,7 +272,7 @@ def test_one_tag_and_no_other_is_taken_for_the_finger_s(
 
 
 def test_a_tag_that_is_seen_with_three_tenths_of_confidence_is_felt() -> None:
-    """Its corners are then off by 0.7 px at most; what is worth less is no touch."""
+    """Its corners are then off by 0.7 px at most; what is worth less is not a touch."""
     image, corners = Image(np.zeros((60, 90), np.uint8), MATRIX), np.full((4, 2), 30.0)
     for confidence, felt in ((0.29, False), (0.3, True), (0.31, True)):
         reader: Any = FingerReader(FINGER)

@@ -280,7 +280,7 @@ def test_a_tag_that_is_seen_less_than_fifteen_times_says_nothing() -> None:
 
 
 def test_measurements_scatter_as_their_second_differences_do() -> None:
-    """A drift is no scatter, and one that is far off counts little."""
+    """A drift is not a scatter, and one that is far off counts little."""
     rng = np.random.default_rng(0)
     values = 3e-5 * rng.standard_normal(4000) + np.linspace(0.0, 5e-3, 4000)
     assert _scatter(values) == pytest.approx(3e-5, rel=0.05)

@@ -20,7 +20,7 @@ SOME = {
     "s": "blind",
     "": "weave_frequency",
 }
-"""What is nothing is no answer."""
+"""An empty answer is refused."""
 NONE = {
     "m": "arm_sigma distortion root_gap weave_width",
     "": "friction gain_drift",

@@ -56,7 +56,7 @@ def test_the_noise_of_the_tip_in_the_plane_is_below_20_um() -> None:
     assert len(felt) > 50
     spread = np.std([f.displacement for f in felt], axis=0)
     assert spread[:2].max() < 20e-6
-    # What is predicted of the noise holds it, and is no exaggeration.
+    # What is predicted of the noise holds it, and is not an exaggeration.
     predicted = np.sqrt(np.diag(felt[0].covariance))
     assert (spread[:2] < 2 * predicted[:2]).all()
     assert predicted[:2].max() < 40e-6
@@ -206,7 +206,7 @@ def test_a_folder_of_images_comes_in_its_own_time(folder: Any) -> None:
 def test_folders_without_images(tmp_path: Path) -> None:
     with pytest.raises(StageError, match="holds no image; known: .png"):
         sensor_image_folder.function(FINGER, Clock(), 0, ImageFolderParams(path=tmp_path))
-    with pytest.raises(StageError, match="is no folder"):
+    with pytest.raises(StageError, match="is not a folder"):
         sensor_image_folder.function(FINGER, Clock(), 0, ImageFolderParams(path=tmp_path / "x"))
 
 

@@ -107,8 +107,8 @@ class DistortionField:
     def _over_volume(self) -> tuple[Floats, float]:
         """Return the rigid part (6, K) of each basis field, and the factor to the file's error.
 
-        The rigid part is no distortion: it only moves the camera. Without it, the field is scaled
-        to the calibration error [m] of the scanner's file.
+        The rigid part is not a distortion: it only moves the camera. Without it, the field is
+        scaled to the calibration error [m] of the scanner's file.
         """
         middle, half = self._depths
         grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, 7)] * 3), axis=-1).reshape(-1, 3)

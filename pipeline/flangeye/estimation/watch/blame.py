@@ -89,7 +89,7 @@ def _designs(
         return found
     k = after.joints.shape[2]
     columns = stack_rows(after.joints)
-    # The first joint turns the base as the scanner would, so it is no suspect of its own.
+    # The first joint turns the base as the scanner would, so it is not a suspect of its own.
     scale = np.full(k - 1, LARGEST)
     one = {f"joint {j + 1} re-mastered": (columns[:, [j]], scale[:1]) for j in range(1, k)}
     return found | one | {"arm re-mastered": (columns[:, 1:], scale)}

@@ -308,7 +308,7 @@ class CompressedTable:
             )
         if compressed > found:
             refuse(self.path, f"truncated: {compressed} compressed bytes promised, it has {found}")
-        # A token of three bytes writes 264 at most: more than that is no LZF stream
+        # A token of three bytes writes 264 at most: more than that is not an LZF stream
         if decompressed > 88 * compressed:
             refuse(self.path, f"{compressed} compressed bytes cannot stand for {decompressed}")
 

@@ -88,7 +88,7 @@ def files_at(folder: Path, name: str) -> list[Path]:
             raise ValueError("** is not known; write */ for each folder between")
         return sorted((p for p in found if p.is_file()), key=lambda path: natural(str(path)))
     except (OSError, ValueError, NotImplementedError) as error:
-        raise StageError(f"{name[:80]!a}: is no name of a file: {reason_of(error)}") from None
+        raise StageError(f"{name[:80]!a}: is not a valid file name: {reason_of(error)}") from None
 
 
 def read_table(folder: Path, name: str | Sequence[str]) -> Table:

@@ -65,7 +65,7 @@ def _loaded(where: str, text: str) -> Any:
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise StageError(f"{where}: is no JSON: {reason_of(error)}") from None
+        raise StageError(f"{where}: is not JSON: {reason_of(error)}") from None
 
 
 def _toml(file: Path) -> TableDocument | None:
@@ -195,7 +195,7 @@ def stacked(rows: Floats) -> Floats | None:
         if rows.ndim != 2 or rows.shape[1] != width or not len(rows) or len(rows) % lines:
             continue
         stack = rows.reshape(-1, lines, width)
-        with np.errstate(all="ignore"):  # numbers that are no rotation's can be of any size
+        with np.errstate(all="ignore"):  # numbers that are not a rotation's can be of any size
             gram = stack[:, :3, :3] @ stack[:, :3, :3].swapaxes(1, 2)
         last = lines == 3 or bool((stack[:, 3] == [0, 0, 0, 1]).all())
         # By how much rows of a written rotation may differ from unit length, and from right angles

@@ -68,7 +68,7 @@ def follow(
         note: Is told of what is damaged.
 
     Raises:
-        StageError: The file cannot be read, or is no MCAP file.
+        StageError: The file cannot be read, or is not an MCAP file.
     """
 
     def damaged(what: str) -> None:
@@ -284,7 +284,7 @@ async def _serve(
 ) -> None:
     async def enter(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         with closing(writer), suppress(OSError, TimeoutError, EOFError, asyncio.LimitOverrunError):
-            # Whoever says nothing for so long [s] is no browser
+            # Whoever says nothing for so long [s] is not a browser
             head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), 10.0)
             if may_look(head):
                 await _joined(head, reader, writer, inside)

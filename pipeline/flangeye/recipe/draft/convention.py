@@ -179,7 +179,7 @@ def _arm(
             if asked in (pose.name, pose.table.name):
                 return pose
         known = ", ".join([pose.name for pose in poses] or [table.name for table in tables])
-        raise RecipeError(f"--table {asked}: is no table of poses; known: {known}")
+        raise RecipeError(f"--table {asked}: is not a table of poses; known: {known}")
     if not poses:
         raise RecipeError(_unplain(tables[0]))
     return _likeliest(poses, questions)
@@ -209,7 +209,7 @@ def _likeliest(poses: Sequence[PoseColumns], questions: Questions) -> PoseColumn
         answer = questions.ask("table", question, None, likely[0].name, one_of(*names))
         matching = [p for p in likely if answer in (p.name, p.table.name)]
         if not matching:
-            raise RecipeError(f"--table {answer}: is no table of poses; known: {known}")
+            raise RecipeError(f"--table {answer}: is not a table of poses; known: {known}")
         first = matching[0]
     if first.guess:
         questions.assumed.append(f"{first.table.name}: {first.guess} (--columns changes it)")
@@ -242,7 +242,7 @@ def _table_of(tables: Sequence[Table], found: Sequence[PoseColumns], questions: 
             return table
     if asked is not None:
         known = ", ".join(table.name for table in tables)
-        raise RecipeError(f"--table {asked}: is no table of poses; known: {known}")
+        raise RecipeError(f"--table {asked}: is not a table of poses; known: {known}")
     arms = [p.table for p in found if p.role == "arm"] or [p.table for p in found if p.role is None]
     return (arms or list(tables))[0]
 
@@ -599,7 +599,7 @@ def _target_params(
 
 
 def _rest(table: Table) -> dict[str, Any]:
-    """Return the columns of a table that are no poses."""
+    """Return the columns of a table that are not poses."""
     rest = poses_of(table)[1]
     params: dict[str, Any] = {}
     if rest.time is not None:

@@ -59,7 +59,7 @@ def poses_by_number(table: Table) -> tuple[list[PoseColumns], Headings]:
 def _is_index(numbers: Floats) -> bool:
     """Return whether the first column counts the rows, or calls them by whole numbers.
 
-    With gaps it counts only before six numbers that are no quaternion's: whole numbers before a
+    With gaps it counts only before six numbers that are not a quaternion's: whole numbers before a
     position and a quaternion may be times (TUM's trajectories). In no order it calls the rows,
     where others are not whole.
     """
@@ -195,7 +195,7 @@ class Writing(NamedTuple):
     kinematics: Arm | None = None
 
     def poses(self, numbers: Floats) -> Floats | None:
-        """Return (N, 4, 4) poses [m]; None if a row is no valid pose in this convention."""
+        """Return (N, 4, 4) poses [m]; None if a row is not a valid pose in this convention."""
         if self.kinematics is not None:
             return self.kinematics.flange(np.radians(numbers) if self.angle == "deg" else numbers)
         try:

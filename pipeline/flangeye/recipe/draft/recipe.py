@@ -99,7 +99,7 @@ def _robot(survey: FolderSurvey, out: Path, questions: Questions) -> dict[str, A
 def _known_robot(answer: str, out: Path) -> None:
     """Refuse a robot that is neither in the catalogue nor a file beside the recipe."""
     if answer.endswith(".urdf") and not (out.parent / answer).is_file():
-        raise RecipeError(f"{answer}: is no file")
+        raise RecipeError(f"{answer}: is not a file")
     if answer != "none" and not answer.endswith(".urdf"):
         load_model("robots", answer, out.parent)
 

@@ -133,7 +133,7 @@ class FolderSurvey:
         return [path for path in self.of(IMAGES) if not is_depth_image(path)]
 
     def of(self, suffixes: Sequence[str]) -> list[Path]:
-        """Return the files that end so; tables of poses are no clouds."""
+        """Return the files that end so; tables of poses are not clouds."""
         read = {file for table in self.tables for file in table.files}
         return [p for p in self.files if p.suffix.lower() in suffixes and p not in read]
 
@@ -163,7 +163,7 @@ def look(folder: Path) -> FolderSurvey:
         RecipeError: There is none, or it is empty.
     """
     if not folder.is_dir():
-        raise RecipeError(f"{folder}: is no folder; name the one that holds the recordings")
+        raise RecipeError(f"{folder}: is not a folder; name the one that holds the recordings")
     cameras: set[Path] = set()
     folder = _where_files_are(folder)
     found = (p for p in (*folder.glob("*"), *folder.glob("*/*")) if p.is_file())

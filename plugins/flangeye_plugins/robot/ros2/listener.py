@@ -198,7 +198,7 @@ class Listener(Device):
         self._angles = {}
         if not np.isfinite(joints).all():
             raise DeviceError(
-                f"{self.name}: a joint's position is no number: is the arm's hardware active?"
+                f"{self.name}: a joint's position is not a number: is the arm's hardware active?"
             )
         time_ns = self._bridge.local_ns(self._params.joint_states, message)
         sample = JointSample(joints, time_ns, message.received_ns)

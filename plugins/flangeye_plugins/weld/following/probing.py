@@ -232,7 +232,7 @@ class Probing:
 
     def _climbs(self, felt: Floats, at: Floats, gain: float, bend: tuple[float, float]) -> str:
         """Say that the tip rises where it is pressed hard, or shows less there; else nothing."""
-        # A gain off by more is no drift but another finger, or a tip that climbs.
+        # A gain off by more is not a drift but another finger, or a tip that climbs.
         if abs(gain) > 0.35:
             return f"the finger's gain is off by {gain:.0%}, or the tip climbs the wall"
         if bend[0] > 0.1 + 3.0 * bend[1]:
