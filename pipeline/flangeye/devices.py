@@ -269,7 +269,7 @@ class TactileSensor(Device, Protocol):
     """A camera that watches a tag on a compliant finger.
 
     Attributes:
-        name: For people.
+        name: Shown in messages and reports.
         camera_matrix: (3, 3) [px].
         distortion: (k,) OpenCV's coefficients; empty for none.
     """
@@ -306,7 +306,7 @@ class Profiler(Device, Protocol):
     """A profile sensor on the tool that measures the bead at a fixed distance behind the torch.
 
     Attributes:
-        name: For people.
+        name: Shown in messages and reports.
         behind: How far behind the torch it looks [m].
     """
 
@@ -330,7 +330,7 @@ class Arc(Device, Protocol):
     Gas and arc are off when it opens, and are switched off when it closes, also after an error.
 
     Attributes:
-        name: For people.
+        name: Shown in messages and reports.
     """
 
     name: str

@@ -306,7 +306,7 @@ async def draft(
     """Let a command write a recipe, and take it over as the cell's.
 
     Args:
-        project: Of the page.
+        project: Project that the page shows.
         form: Shows the recipe.
         words: Gives the command's, for the name of the file that it is to write.
         stem: That name; a free one is made of it.

@@ -226,7 +226,7 @@ class Project:
         """Start ``flangeye run`` with words of its command line, for a page.
 
         Args:
-            words: Of the command, without ``--move``.
+            words: Words of the command, without ``--move``.
             owner: The page.
             code: From the terminal, which lets the run move an arm; without one nothing moves.
 

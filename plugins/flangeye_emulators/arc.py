@@ -15,7 +15,7 @@ class SimulatedArc(Device):
     """An arc that burns when commanded.
 
     Attributes:
-        name: For people.
+        name: Shown in messages and reports.
         history: What was switched: ``gas`` or ``burn``, and whether on.
     """
 

@@ -55,7 +55,7 @@ class SimulatedRobot(Device):
     speed and acceleration, and a joint's limit or a singularity on the way is a protective stop.
 
     Attributes:
-        name: For people.
+        name: Shown in messages and reports.
         period: Length of one cycle [s].
         flange_T_tool: The identity: no tool is set.
         arm: The arm itself: ``arm.surfaces`` is what it may touch, ``arm.true_flange()`` where it

@@ -38,7 +38,7 @@ class AsPrinted:
     """The paper's controller.
 
     Attributes:
-        mode: Its name, for people.
+        mode: Shown in messages and reports.
         phase: Following until the torch is at the end of the plan.
         reason: Always empty: it knows no reason to stop.
         tip: Arc length of the plan's point nearest to the robot's end point [m].

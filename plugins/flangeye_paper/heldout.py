@@ -38,7 +38,7 @@ class CentreSet(NamedTuple):
     """One set of centres.
 
     Attributes:
-        name: For people.
+        name: Shown in messages and reports.
         stored: Whose stored results belong to these centres.
     """
 

@@ -23,7 +23,7 @@ class ManualArc(Device):
     """Tells a person what to do, on standard error and by the terminal's bell.
 
     Attributes:
-        name: For people.
+        name: Shown in messages and reports.
     """
 
     def __init__(self) -> None:
@@ -83,7 +83,7 @@ class UrDigitalArc(Device):
     """A power source behind a controller's outputs.
 
     Attributes:
-        name: For people.
+        name: Shown in messages and reports.
     """
 
     def __init__(self, params: UrDigitalParams) -> None:

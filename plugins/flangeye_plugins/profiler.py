@@ -53,7 +53,7 @@ class TcpProfiler(Device):
     """Reads lines in a thread, and keeps the newest profile.
 
     Attributes:
-        name: For people.
+        name: Shown in messages and reports.
         behind: How far behind the torch it looks [m].
     """
 

@@ -46,7 +46,7 @@ class OpenCVCamera(Device):
     """Reads images in a thread of its own, and keeps the newest.
 
     Attributes:
-        name: For people.
+        name: Shown in messages and reports.
         camera_matrix: (3, 3) [px].
         distortion: (k,) OpenCV's coefficients.
     """
@@ -152,7 +152,7 @@ class RecordedImages(Device):
     """Replays recorded images at the pace of the robot's clock.
 
     Attributes:
-        name: For people.
+        name: Shown in messages and reports.
         camera_matrix: (3, 3) [px].
         distortion: (k,) OpenCV's coefficients.
     """

@@ -146,7 +146,7 @@ class Figure:
 
     Attributes:
         column: Its name.
-        title: For people.
+        title: Shown in messages and reports.
         unit: What it is shown in.
         scale: From SI to that unit.
     """
@@ -161,7 +161,7 @@ def drawings_of(rows: Sequence[Row], varied: Sequence[str]) -> list[tuple[str, D
     """Return (title, plot) for every figure that some session has.
 
     Args:
-        rows: Of the sessions to draw.
+        rows: Rows of the sessions to draw.
         varied: Columns that the grid sets.
     """
     x, colour = _axes(rows, varied)

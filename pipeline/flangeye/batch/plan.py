@@ -189,7 +189,7 @@ class BatchSession:
 
     @property
     def number(self) -> str:
-        """Sixteen hexadecimal digits, unique to it."""
+        """Identifier of the session: sixteen hexadecimal digits."""
         return self.id[-16:]
 
 
@@ -201,7 +201,7 @@ class Variant:
         overrides: All of them.
         varied: Path in the recipe -> value as written, for what differs between variants.
         common: Hash of all that decides their results.
-        seeds: Of its sessions.
+        seeds: Seeds of its sessions.
     """
 
     overrides: tuple[str, ...]

@@ -43,7 +43,7 @@ class ManifestComparison:
     told: str
 
     def line(self) -> str:
-        """Return the comparison for people."""
+        """Return the comparison as printable text."""
         return f"{self.verdict:11}  {self.name}: {self.told}"
 
 
@@ -177,14 +177,14 @@ class Expected(Model):
     tolerance: Length | None = Field(None, description="How far the closure may be from that.")
     findings: tuple[str, ...] | None = Field(
         None,
-        description="Names of what flangeye doctor finds, in any order; not asked if not given.",
+        description="Names of what flangeye doctor finds, in any order. Default: not compared.",
     )
 
 
 class Manifest(Model):
     """One recording."""
 
-    title: str = Field(description="One line for people.")
+    title: str = Field(description="One line shown in reports.")
     recording: str = Field(
         description="The folder or file, from the manifest's folder, or from ~; skipped if absent."
     )

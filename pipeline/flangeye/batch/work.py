@@ -63,7 +63,7 @@ class Job:
         out: The batch's folder, the same path or URL on every worker.
         report: Make each session's report.
         software: What the batch was planned with.
-        columns: Of the rows.
+        columns: Columns of the rows.
         start: Tells the parts of this start from those of others.
     """
 

@@ -62,7 +62,7 @@ def in_configuration(
 
     Args:
         session: The session of one arm beside its camera, as far as is known.
-        configuration: Says otherwise.
+        configuration: Replaces the configuration that the session assumes.
         robot: The arm's model, where the recipe names one.
         states: What else was recorded, by the samples' ids.
 

@@ -1,4 +1,4 @@
-"""Which of several poses that explain a scan alike is the target's: the arm's motion tells.
+"""Choose the target's pose among several that fit a scan equally well, by the arm's motion.
 
 What holds for one capture holds for all: ``X C = W P``, with the camera ``X`` and the target ``P``
 in what carries them, the pose ``C`` in the scan, and ``W`` between the carriers, as controllers

@@ -29,7 +29,7 @@ class ArmParameters:
     Attributes:
         values: To add to those of the arm's model.
         deviations: Standard deviations of these.
-        sizes: How large each is in such an arm.
+        sizes: Estimated standard deviation of each in arms like this one.
         told: (4n, 4n) covariance by the poses alone, in units of the sizes.
         ways: How many ways to the poses fit alike, where no joint angles were recorded; infinity
             for an arm of more joints than a pose has coordinates.

@@ -38,7 +38,7 @@ class Estimate:
         problem: What was given.
         effects: What may be wrong.
         places: (4, 4) of each unknown, linearised about: the posterior mean.
-        posterior: Of moves of the places and of the effects' numbers.
+        posterior: Posterior of the corrections to poses and effect parameters.
         inliers: (N,) which sightings took part.
         squares: (N,) squared distances of each from what the others predict, over its rank.
     """

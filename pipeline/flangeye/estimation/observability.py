@@ -132,7 +132,7 @@ def require_poses(count: int, needed: int = 3) -> None:
     """Refuse fewer than ``needed`` poses.
 
     Raises:
-        StageError: Says how many there are.
+        StageError: There are fewer.
     """
     if count < needed:
         raise StageError(
@@ -144,7 +144,7 @@ def require_several_places(tcps: Floats) -> None:
     """Refuse (N, 3) TCPs [m] that are all the same to within 1 mm.
 
     Raises:
-        StageError: Says where they are.
+        StageError: All are at one place, which the message gives.
     """
     radius = spread_of(tcps).radius
     if radius < 1e-3:
@@ -161,7 +161,7 @@ def require_same_units(centres: Floats, tcps: Floats) -> None:
     centres matter.
 
     Raises:
-        CalibrationRefused: Says the ratio.
+        CalibrationRefused: The ratio of the two medians is not between 0.5 and 2.
     """
     ratio = _median_distance(centres) / _median_distance(tcps)
     if not 0.5 < ratio < 2.0:
@@ -263,7 +263,7 @@ def require_enough(problem: Problem, needed: int) -> None:
     """Refuse fewer sightings than the unknowns need, or sightings that are all the same.
 
     Raises:
-        StageError: Says how many there are, or that nothing moved.
+        StageError: There are fewer than ``needed``, or all poses are the same.
     """
     if len(problem.seen) < needed:
         raise StageError(

@@ -194,7 +194,7 @@ def foreseen(moments: Sequence[Observation], places: Places, cell: Cell) -> list
 
 
 def foreseen_poses(moments: Sequence[Observation], places: Places, cell: Cell) -> Floats:
-    """Return (M, 4, 4) camera_T_target at such moments, predicted from the estimate so far."""
+    """Return (M, 4, 4) camera_T_target at these moments, predicted from the estimate so far."""
     frames = {
         name: replace(frame, place=places.get(name, frame.place))
         for name, frame in cell.graph(moments).items()

@@ -409,10 +409,10 @@ def _resized(observations: Sequence[Observation], factor: float) -> list[Observa
 
 
 def _require_size(session: Session) -> None:
-    """Refuse a marker of another size than was said, or a camera of another focal length.
+    """Refuse a marker size or focal length that contradicts the arm's motion.
 
     Raises:
-        CalibrationRefused: Says how large the one, or how long the other is; the surer of both.
+        CalibrationRefused: One contradicts it; the message gives the better-known estimate.
     """
     told = [
         (float(mean[0]), float(np.sqrt(covariance[0, 0])), kind)

@@ -139,7 +139,7 @@ class _Loop(NamedTuple):
     """What one camera saw of one target.
 
     Attributes:
-        problem: Of these sightings alone, all other places known.
+        problem: Problem of these sightings only; all other poses are known.
         seen: They.
         camera: Known (N, 4, 4) and unknown names, in turn, from the root to the camera.
         target: Likewise to the target.

@@ -50,7 +50,7 @@ class CameraFile(NamedTuple):
     lens_of: str = ""
 
     def note(self) -> str:
-        """Return the note for people on this calibration file."""
+        """Return a printable note on this calibration file."""
         (fx, _, cx), (_, fy, cy), _ = self.matrix
         lens = f"{len(self.distortion)} coefficients" if self.distortion.any() else "no distortion"
         lens += f" of {self.lens_of}" if self.lens_of else ""

@@ -35,7 +35,7 @@ def decode_image(raw: bytes, flags: int) -> NDArray[Any]:
         flags: OpenCV's, such as ``cv2.IMREAD_GRAYSCALE``.
 
     Raises:
-        ImageError: Says what is wrong.
+        ImageError: The bytes are damaged, not an image, or larger than ``MAX_PIXELS``.
     """
     import cv2
 

@@ -57,11 +57,11 @@ class Recording:
         image: The camera's image; None when the archive has none for this pose.
         camera_T_target: (4, 4) ready-made pose of a marker [m], if the archive has one.
         camera: (3, 3) camera matrix of the image [px] and OpenCV's distortion, if it has them.
-        axes: Of a cell, where each rail and positioner was [m or rad].
+        axes: For a cell, where each rail and positioner was [m or rad].
         seen_by: Which camera of a cell looked.
         saw: Which target of a cell it saw.
         motion: How the (first) arm's flange passed, where that was recorded and it moved.
-        arm_joints: Of a cell, (n,) joint angles of each arm that has them [rad].
+        arm_joints: For a cell, (n,) joint angles of each arm that has them [rad].
     """
 
     id: str
@@ -87,7 +87,7 @@ class Recording:
 
     @property
     def passes_alone(self) -> bool:
-        """Whether only the flange's poses at other times are known of the arms."""
+        """Whether the flange's trajectory around the capture is the only arm data."""
         return self.motion is not None and self.joints is None and set(self.poses) == {FLANGE}
 
 
@@ -116,7 +116,7 @@ def check_ids(archive: Archive) -> None:
     """Refuse an archive without poses, or with two of one name.
 
     Raises:
-        StageError: Says which.
+        StageError: There is no pose, or two share a name.
     """
     if not archive.recordings:
         raise StageError(f"{archive.root}: holds no poses")

@@ -74,7 +74,7 @@ def in_order(where: str, count: int, what: str, names: Sequence[str]) -> str:
         where: What messages begin with.
         count: How many rows there are.
         what: What stands in a row, in the plural: poses.
-        names: Of the scans, in their order.
+        names: Names of the scans, in their order.
 
     Raises:
         StageError: There are not as many.

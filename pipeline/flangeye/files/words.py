@@ -20,8 +20,8 @@ def require_name(where: str, name: str) -> str:
     # A link, joint or frame in another program's file: no quote, no line break, no markup.
     if not re.fullmatch(r"\w[\w ./:+()\-]{0,127}", name):
         raise RecipeError(
-            f"{where}: {name[:LONGEST]!a} is not a valid name: letters, digits and _ . / : + - ( ) or "
-            "a space are allowed, 128 at most; rename it in the file"
+            f"{where}: {name[:LONGEST]!a} is not a valid name: letters, digits and _ . / : + - ( ) "
+            "or a space are allowed, 128 at most; rename it in the file"
         )
     return name
 

@@ -97,7 +97,7 @@ class JournalEntry:
 
     Attributes:
         step: Its label, such as ``7.weld.tactile``.
-        name: Under which it was written.
+        name: Name of the entry.
         value: Plain data; pixels (H, W) or (H, W, 3) for an image.
     """
 
@@ -120,7 +120,7 @@ class RunLog:
         entries: Every value, in order.
         rejections: Captures set aside.
         finished: Ids of the captures that went through.
-        messages: Log lines for people.
+        messages: Log lines as text.
         noted: Steps that wrote into their logs, by label; see :func:`read_notes`.
         damage: What could not be read, and why, a sentence each.
     """
@@ -374,7 +374,7 @@ def take(log: RunLog, message: LogMessage, clouds: dict[str, t.PointCloud]) -> N
     Args:
         log: What is known so far.
         message: The next one.
-        clouds: What messages before it left for the values to come, by topic.
+        clouds: Clouds read so far that later values refer to, by topic.
     """
     try:
         _take(log, message, clouds)

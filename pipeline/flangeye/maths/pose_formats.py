@@ -52,7 +52,7 @@ class PoseConvention:
     """One way to write a pose.
 
     Attributes:
-        name: For people.
+        name: Shown in messages and reports.
         labels: What each number is called, position first.
         rotation: ``vector``, a quaternion's order (``xyzw``, ``wxyz``) or one of
             :data:`EULER_ORDERS`, in which angles are written in the order of their axes.

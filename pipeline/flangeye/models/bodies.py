@@ -31,7 +31,7 @@ class TargetBody:
     """A body's surface, in the frame of its file.
 
     Attributes:
-        name: For people.
+        name: Shown in messages and reports.
         vertices: (V, 3) [m].
         triangles: (T, 3) indices of vertices.
         note: How its unit was judged; empty where it was stated.
@@ -189,7 +189,7 @@ def load_body(name: str, unit: LengthUnit | None, near: Path) -> TargetBody:
 
     Args:
         name: A bundled body's name, or a path with the suffix of a mesh.
-        unit: Of the mesh's coordinates; judged by its size if not given.
+        unit: Unit of the mesh's coordinates; judged by its size if not given.
         near: Folder of the recipe.
 
     Raises:

@@ -101,7 +101,7 @@ class Finger(FingerGeometry):
         "0.1 mm", ge=0, description="Standard deviation of the tip, along each axis of the flange."
     )
     travel: Length = param("6 mm", gt=0, description="How far the tip may be displaced.")
-    largest_force: Force = param("10 N", gt=0, description="With which the tip may press.")
+    largest_force: Force = param("10 N", gt=0, description="Largest force the tip may press with.")
     calibration: Calibration | None = None
 
     def force(self, displacement: Floats) -> float | None:

@@ -108,7 +108,7 @@ class Graph(Device, Protocol):
         """Put a pose on the graph as static transforms, until the graph is closed.
 
         Args:
-            pose: Of one camera, or of a whole cell.
+            pose: Pose of one camera, or of a whole cell.
             frames: Our name of a frame -> the graph's.
 
         Returns:
@@ -155,7 +155,7 @@ class Emulator:
     """A controller on loopback.
 
     Attributes:
-        name: For people.
+        name: Shown in messages and reports.
         maker: Whose arms it controls, as ``data/robots/*.yaml`` spells it.
         serve: Runs it until the process is told to end.
     """

@@ -108,7 +108,7 @@ def check_unit(path: Path, distance: float, unit: LengthUnit, scanner: ScannerDa
         scanner: What it was recorded with.
 
     Raises:
-        StageError: Says what the unit looks like instead.
+        StageError: The range contradicts it; the message names the likely unit.
     """
     if not times_outside(distance, scanner) > STATED_LIMIT:
         return

@@ -22,7 +22,7 @@ class Flange(BaseModel):
     """The circle to look for on this robot, as the recipe states it. All SI, radii.
 
     Attributes:
-        name: For people.
+        name: Shown in messages and reports.
         rim: Radius of the visible edge: outer radius less its chamfer, or the wrist circle.
         outer: Nominal outer radius.
         bore: Radius of the bore's visible edge (nominal plus chamfer), or None.

@@ -91,9 +91,9 @@ class Workpiece:
     """A workpiece in its CAD's own frame.
 
     Attributes:
-        title: For people.
+        title: Shown in messages and reports.
         path: Its file.
-        unit: In which the CAD was said to be.
+        unit: Unit of the CAD, as configured.
         vertices: (V, 3) [m].
         triangles: (T, 3) indices of vertices.
         seams: By name.

@@ -51,7 +51,7 @@ class WatchedArm:
     """An arm under guard: a watchdog process checks it and can stop it.
 
     Attributes:
-        name: For people.
+        name: Shown in messages and reports.
         period: Between two of the controller's cycles [s].
     """
 

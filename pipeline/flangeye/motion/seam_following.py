@@ -82,11 +82,11 @@ class FollowingTask:
         step: Arc length between two of the points [m].
         torch_distance: From the torch to the tip in front of it [m].
         side: 1 where the left wall is pressed, -1 for the right one.
-        speed: Of the tip along the seam [m/s].
-        deflection: Of the tip against the wall [m].
+        speed: Speed of the tip along the seam [m/s].
+        deflection: Deflection of the tip against the wall [m].
         preload: Displacement of the tip into the groove [m].
-        servo_gain: Of the deflection's control [1/s].
-        height_gain: Of the preload's control [1/s].
+        servo_gain: Gain of the deflection controller [1/s].
+        height_gain: Gain of the preload controller [1/s].
         lateral_speed: Largest speed across the seam, and in height [m/s].
         turn_rate: Largest angular velocity of the tool [rad/s].
     """
@@ -110,7 +110,7 @@ class Controller(Protocol):
 
     @property
     def mode(self) -> str:
-        """Its name, for people."""
+        """Name shown in messages and reports."""
 
     @property
     def side(self) -> float:

@@ -76,7 +76,7 @@ class Contract:
         takes: Types of the value the kind works on, of which it needs one; none for the first.
         gives: Types it may return.
         opens: What later steps may ask for once such a step has run.
-        meaning: One line for people.
+        meaning: One line shown in messages and reports.
         several: Whether a recipe may have more than one step of the kind.
     """
 
@@ -130,7 +130,7 @@ class PartKind:
     """A kind of parts.
 
     Attributes:
-        meaning: One line for people.
+        meaning: One line shown in messages and reports.
         contract: ``module:Protocol`` that says how such a part is called and what it gives. It is
             named rather than imported, because it stands beside the types it is about.
     """

@@ -304,7 +304,7 @@ class LogSection(RecipeSection):
 class Header(RecipeSection):
     """A recipe, its steps not yet checked."""
 
-    title: str = Field(description="One line for people.")
+    title: str = Field(description="One line shown in reports.")
     description: str = Field("", description="A longer description.")
     robot: RobotSection | None = None
     second_robot: SecondRobotSection | None = None

@@ -143,7 +143,7 @@ class FoundBody(NamedTuple):
     """A body that is the target, as one capture showed it.
 
     Attributes:
-        name: For people.
+        name: Shown in messages and reports.
         capture: Its id.
         edges: (E, 2, 3) the ends of its edges in the camera [m].
     """

@@ -64,7 +64,7 @@ class Facts:
         """Return the recipe's arm or scanner, where its file is here: it may be another machine's.
 
         Args:
-            kind: Of the models, as their folder is called.
+            kind: Kind of the models, as their folder is called.
         """
         name = self.section(kind.removesuffix("s")).get("model")
         with suppress(FlangeyeError), carried_files(self.log.models) as folder:

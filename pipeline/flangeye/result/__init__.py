@@ -65,7 +65,7 @@ def calibrated_pose(
     Args:
         result: Result of a run.
         anyway: Give a refused one too; its remarks say so.
-        camera: Of a cell, the one camera to give.
+        camera: For a cell, the one camera to give.
 
     Raises:
         StageError: There is no calibration, or no such camera.
@@ -143,7 +143,7 @@ def require_one(format_name: str, pose: t.CalibratedPose, result: Result) -> Non
     """Refuse to write several transforms into a format that carries one.
 
     Raises:
-        StageError: Says how to choose.
+        StageError: There are several transforms; the message says how to choose one.
     """
     if pose.others:
         names = " or ".join(f"--camera {camera}" for camera in cameras_of(result))

@@ -58,9 +58,9 @@ def worked_ahead(
 ) -> Generator[tuple[T, Callable[[], R]]]:
     """Yield each item in order with a function that returns or raises its result.
 
-    Items are pulled in this thread and worked on in others, as many as there are workers and one
-    that waits, fewer where the work is done sooner than the next is there: what is held in memory
-    does not grow with the number of items. Whoever stops pulling has no work begun beyond that.
+    Items are pulled in this thread and processed in worker threads. At most ``workers`` + 1 items
+    are in flight, so memory does not grow with the number of items. If the consumer stops early,
+    pending items are cancelled.
     """
     pool = ThreadPoolExecutor(workers, thread_name_prefix="flangeye")
     waiting: deque[tuple[T, Future[R]]] = deque()

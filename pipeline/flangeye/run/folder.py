@@ -47,8 +47,8 @@ class RunFolder:
         """Make ``out``, or a folder ``<time>_<name>`` under ``under``, for this run alone.
 
         Raises:
-            FolderError: It cannot be made, or it already holds files, were it another run's that
-                begins at the same time.
+            FolderError: The folder cannot be made, or it already holds files, for example those of
+                a run that began at the same time.
         """
         first = under / f"{time.strftime('%Y-%m-%dT%H-%M-%S')}_{name}"
         more = (first.with_name(f"{first.name}-{n}") for n in count(2))

@@ -24,7 +24,7 @@ class Outlook:
     Attributes:
         residuals: By pose, of those that the solver used [m].
         set_aside: Why the solver did not use a pose, by pose.
-        error: 95 % of the errors to expect at the work are below [m]; None where unknown.
+        error: Predicted 95 % error at the work [m]; None where unknown.
         missing: What the solver lacks, in its own words: the motion that is missing; else empty.
         coverage: What of the work the poses have been in, where it is known.
     """
@@ -36,7 +36,7 @@ class Outlook:
     coverage: Coverage | None = None
 
     def lines(self) -> list[str]:
-        """Return it for people, a line each."""
+        """Return the outlook as printable lines."""
         poses = [f"{pose}  {size * 1e3:.3f} mm" for pose, size in self.residuals.items()]
         poses += [f"{pose}  set aside: {why}" for pose, why in self.set_aside.items()]
         worth = "expected error: not known yet"

@@ -96,7 +96,7 @@ class Scene:
     radius: float
 
     def changed(self, change: Change) -> Scene:
-        """Return the scene after something was done to all of it."""
+        """Return the scene with the change applied to its points, centre, normal and radius."""
         return Scene(
             change.point(self.xyz),
             change.point(self.centre),

@@ -167,7 +167,7 @@ class CalibratedPose:
             ``flange_T_camera``, translation in [m].
         remarks: Lines that have to stand in the file: what it is, how it was judged, and, for one
             that was refused, that it must not be used. Made printable ASCII, one line each.
-        others: Of a cell of which no camera was chosen, every other transform that was found; only
+        others: For a cell of which no camera was chosen, every other transform that was found; only
             formats that declare to serve cells are given them.
     """
 

@@ -151,7 +151,7 @@ class Observation(Placed):
     """A fitted feature and the robot poses it belongs to: one equation for the solver.
 
     Attributes:
-        id: Of the capture.
+        id: Id of the capture.
         feature: What was measured.
         poses: What the controllers reported, by frame.
         joints: (n,) joint angles [rad], when known.

@@ -51,8 +51,8 @@ class CellSessionParams(ArmsParams):
     plan: Literal["random", "grid", "next_best"] = Field(
         "random",
         description="Which moments are taken: drawn at random, or a grid of joints, in turn for "
-        "each camera and target; or always the camera, the target and the joints that promise to "
-        "tell most of the whole cell, by what was seen so far.",
+        "each camera and target; or always the camera, the target and the joints that "
+        "are most informative for the whole cell, given the sightings so far.",
     )
     spread: Angle = param("30 deg", gt=0, description="Largest change of a joint from there.")
     joints: bool = Field(

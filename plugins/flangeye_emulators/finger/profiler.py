@@ -26,7 +26,7 @@ class SimulatedProfiler(Device):
     """Measures the simulated bead, at the torch's true place.
 
     Attributes:
-        name: For people.
+        name: Shown in messages and reports.
         behind: How far behind the torch it looks [m].
     """
 

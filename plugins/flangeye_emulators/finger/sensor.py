@@ -65,7 +65,7 @@ class SimulatedFinger(Device):
     """A finger on an arm, over a workpiece, in a world of its own.
 
     Attributes:
-        name: For people.
+        name: Shown in messages and reports.
         camera_matrix: (3, 3) [px].
         distortion: (k,) OpenCV's coefficients.
         world: What is true. A stage must not look.
@@ -214,7 +214,7 @@ def sensor_simulated_finger(
     Args:
         finger: What the controller knows of it: nothing here depends on it.
         robot: Carries it.
-        seed: Of noise and of the world's own chance.
+        seed: Seed of the noise and of the world's random values.
         params: The world.
     """
     del finger

@@ -38,9 +38,9 @@ class GrooveSection:
     """The joint's cross-section.
 
     Attributes:
-        half_angle: Of each wall from their bisector [rad].
+        half_angle: Angle of each wall from the bisector [rad].
         depth: From the plate's face to the root [m].
-        lean: Of the bisector from the vertical, to the left [rad]; a fillet's is 45 degrees.
+        lean: Lean of the bisector from the vertical, to the left [rad]; a fillet's is 45 degrees.
     """
 
     half_angle: float

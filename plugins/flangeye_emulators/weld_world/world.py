@@ -78,7 +78,7 @@ class WeldWorld:
         Args:
             nominal: What the files say.
             truth: What is true.
-            seed: Of its chance.
+            seed: Seed of its random values.
             rolled_out: Returns where a torch (3,) is when the work's surface is rolled out, from
                 where it is in the plane that touches the surface at the tip (3,): its arguments
                 are tip and torch. The surface is flat where it is not given.

@@ -318,7 +318,7 @@ def _require_certain(lens: CalibratedLens) -> None:
     largest = 0.01  # as a share of the focal length; beyond, nothing is believed
     if not share <= largest:
         raise StageError(
-            f"the {lens.views} views tell the focal length to {share:.1%} only (at most "
+            f"the {lens.views} views determine the focal length to {share:.1%} only (at most "
             f"{largest:.0%} is allowed): {TOO_ALIKE}"
         )
 

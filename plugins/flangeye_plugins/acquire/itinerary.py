@@ -139,7 +139,7 @@ class Itinerary:
         """Refuse a plan of fewer than three poses.
 
         Raises:
-            StageError: Says why the others are impossible.
+            StageError: There are fewer; the message says why the others are impossible.
         """
         fewest = 3  # without which no camera pose can be found
         if found < fewest:
@@ -257,8 +257,8 @@ class PlanRow:
     Attributes:
         id: Identifier of the capture; None where no pose is possible.
         role: What it is for: verification, calibration, or ``left out``.
-        place: Of the flange in ``base`` [m].
-        tilt: Of the flange against the line of sight [rad].
+        place: Place of the flange in ``base`` [m].
+        tilt: Tilt of the flange against the line of sight [rad].
         path: ``direct`` or ``by home``; None where nobody knows, or there is none.
         seconds: What the motion takes [s].
         why_not: Why the arm cannot get there.

@@ -186,7 +186,7 @@ def require_inside(state: RobotState, allowed: MotionLimits) -> None:
     """Refuse an arm that starts outside its limits, where no checked path begins.
 
     Raises:
-        StageError: Says where it stands, and what is allowed.
+        StageError: The arm is outside; the message says where, and what is allowed.
     """
     where = allowed.outside(state.base_T_flange.translation) or allowed.beyond(state.joints)
     if where:

@@ -116,7 +116,7 @@ def source_of(
     Args:
         archive: The archive; its notes come first.
         told: What else to tell.
-        digests: Of all files that are used; of the archive's own if not given.
+        digests: Digests of all files that are used; of the archive's own if not given.
     """
     notes = (with_urls(f"archive: {archive.layout}, {archive.root}"), *archive.notes, *told)
     used = digests_of(archive.files) if digests is None else digests

@@ -54,7 +54,7 @@ class BodyFit:
         noise: Robust standard deviation of the points from the surface [m].
         points: How many points of surfaces count.
         edges: How many points of edges do.
-        size: Of the body [m].
+        size: Size of the body [m].
         centre: (3,) of the body in ``camera`` [m].
         bread: (14, 14) change of what is estimated by the scores: of the pose and what a scanner
             does to it at the scale of the mesh, and in the last row that of the scale.
@@ -107,7 +107,7 @@ class BodyFit:
         Args:
             model_error: Standard deviation of the surface against the CAD, along each axis [m]; a
                 smooth field over the body.
-            distortion: Of the scanner, (P, 3, K): how each of K independent weights of unit
+            distortion: Scanner distortion, (P, 3, K): how each of K independent weights of unit
                 variance moves (P, 3) points [m].
         """
         about_centre = self._spread(model_error, distortion)[:6, :6]
@@ -167,7 +167,7 @@ class _Laying:
 
     Attributes:
         points: (N, 3) that are used [m].
-        edges: Of the scan.
+        edges: Edges of the scan.
         shape: The body.
         spacing: Between points at unit depth.
         raster: Standard deviation of a scan's end across its edge [m].

@@ -79,7 +79,7 @@ class Looks(Shape):
         Args:
             poses: (K, 4, 4).
             view: The scan.
-            count: Of surface points, and of ends of faces.
+            count: Number of surface points, and of ends of faces.
             tolerance: How far off the scan may be, as a share of the size.
         """
         number, reach = self.view_of(poses), tolerance * self.size

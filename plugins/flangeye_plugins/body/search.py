@@ -30,7 +30,7 @@ class BodyVerdict(NamedTuple):
 
     Attributes:
         due: Rays that should meet the body, away from its edges.
-        agree: Of these, how many do.
+        agree: How many of these agree.
         against: How many show something that cannot be there: behind the body, or right before it.
         goes_on: Rays beside it that show its surface where it has ended.
         beside: Rays beside it that show anything.
@@ -372,7 +372,7 @@ class BodySearch:
         return self.near(self._as_well(poses, 0.9 * found.verdict.agree))
 
     def unrivalled(self, found: list[FoundPose], rivals: list[FoundPose]) -> list[FoundPose]:
-        """Return the poses but those of which a rival explains all, and a coherent patch more."""
+        """Drop poses where a rival explains the same cells and another connected patch."""
         own, others = ([self._agreeing(one.pose) for one in each] for each in (found, rivals))
         return [
             one for one, cells in zip(found, own, strict=True)

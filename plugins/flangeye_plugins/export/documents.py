@@ -220,7 +220,7 @@ class UrdfParams(FramesParams):
         None, description="Where the optical frame is in the mount link, if that is known."
     )
     camera_urdf: RecipeFile | None = Field(
-        None, description="The camera's own URDF (xacro already run), which tells the same."
+        None, description="The camera's URDF (xacro already run); gives the same transform."
     )
 
 

@@ -152,7 +152,7 @@ def middles_beside_centres(corners: Corners, image: Image, pose: Floats, radius:
         corners: The discs; their middles in the image, their centres in ``target``.
         image: With the camera's matrix and distortion.
         pose: (4, 4) ``camera_T_target`` [m].
-        radius: Of the discs [m].
+        radius: Radius of the discs [m].
     """
     import cv2
 

@@ -31,7 +31,7 @@ class SphereProfileParams(Params):
 
     side: Literal["+y", "-y"] = Field(
         description="On which side of the laser's plane, in the scanner's frame, the centre of "
-        "the sphere is. A profile cannot tell; keep every pose of a session on one side.",
+        "the sphere is. One profile cannot show it; keep all poses of a session on one side.",
     )
     # Least and largest distance of the centre from the plane, in radii. Near the middle the
     # distance follows badly from the circle's size, near the edge the circle is small; the best
@@ -129,7 +129,7 @@ def find_arc(
         points: (N, 2) of the profile, x and z [m].
         radius: The sphere's [m].
         params: Gives tolerance and the distances from the plane that are asked for.
-        seed: Of the draw.
+        seed: Seed of the draw.
     """
     centres, radii = _candidates(points, radius, params, seed)
     if not len(radii):

@@ -118,10 +118,10 @@ class Moved:
     """Recorded poses of one controller.
 
     Attributes:
-        name: Of what moves.
+        name: Name of the frame that moves.
         text: The table.
         values: (N, 4, 4) poses, or (N,) values of an axis [m or rad].
-        keys: Of each row: the pose's number, its place in the table; None where it has a time.
+        keys: Number of each row's pose, by its position in the table; None where it has a time.
         times: (N,) [s], or None.
         joints: (N, n) of an arm that told them [rad], or None.
     """
@@ -150,9 +150,9 @@ class Moment:
     """The reported poses of all carriers at one moment.
 
     Attributes:
-        at: Of what moves, by name: (4, 4), or the value of an axis [m or rad].
-        joints: (n,) of each arm that told them [rad].
-        time: Of it [s].
+        at: Pose (4, 4) of each carrier by name, or the position of an axis [m or rad].
+        joints: (n,) joint angles of each arm that reported them [rad].
+        time: Time of the moment [s].
         motion: How everything passed it.
     """
 

@@ -98,8 +98,8 @@ class TableParams(FlangePoseParams, JointsParams, CloudUnitParams):
     length: PoseLength = Field("m", description="Unit of the positions.")
     scan: Column | None = Field(
         None,
-        description="Column of the scans' file names, or of what the rows are called, as in the "
-        "target's table; if not given, the one called scan, or the first where it holds text.",
+        description="Column of the scans' file names, or of row names shared with the target's "
+        "table. Default: the column called scan, or the first column if it holds text.",
     )
     target: TargetParams | None = Field(
         None, description="The target as the camera measured it, in place of scans."

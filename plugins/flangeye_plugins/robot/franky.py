@@ -159,7 +159,7 @@ class FrankyRobot(Device):
         """Take over a connection.
 
         Args:
-            name: For people.
+            name: Shown in messages and reports.
             sdk: The module ``franky``.
             connection: Its ``Robot``.
 

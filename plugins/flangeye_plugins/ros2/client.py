@@ -353,7 +353,7 @@ def ros_python(asker: str) -> list[str]:
         if version and (Path(folder) / "rclpy").is_dir():
             found = shutil.which(f"python{version[1]}")
             if found is None:
-                raise DeviceError(f"{asker}: {folder} is for python{version[1]}, which is not here")
+                raise DeviceError(f"{asker}: {folder} needs python{version[1]}; not installed")
             return [found]
     if find_spec("rclpy") is not None:
         return python_command()

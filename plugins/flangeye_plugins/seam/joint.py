@@ -75,7 +75,7 @@ class Found:
         pitch: Distance between neighbouring points [m].
         rays: What the scanner saw along its rays.
         ends: Where along the course it starts and ends [m].
-        deviations: Of both ends [m]; infinite where an end was not seen.
+        deviations: Standard deviations of both ends [m]; infinite where an end was not seen.
     """
 
     course: Course
@@ -324,10 +324,10 @@ def _half_width(swept: Swept) -> float | None:
 
 
 def _judged(found: Found, params: JointParams) -> dict[str, float]:
-    """Return the figures, or refuse what is not known.
+    """Return the quality figures of the seam, or refuse it.
 
     Raises:
-        CalibrationRefused: Says which figure, and its limit.
+        CalibrationRefused: A figure is beyond its limit; the message gives both.
     """
     explained, coverage, astray = _shares(found)
     start, stop = found.ends

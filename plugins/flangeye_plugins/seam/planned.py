@@ -132,7 +132,7 @@ def refuse_outside(stage: str, points_in_base: Floats, workspace: Box | None) ->
     """Refuse a seam that leaves the workspace, where the calibration was not checked.
 
     Raises:
-        CalibrationRefused: Says how far, and which way.
+        CalibrationRefused: It leaves it; the message says how far and along which axis.
     """
     if workspace is None:
         return

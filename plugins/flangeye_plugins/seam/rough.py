@@ -263,7 +263,7 @@ class Spline:
     """Cubic B-splines of several numbers over a line.
 
     Attributes:
-        length: Of the line [m].
+        length: Length of the line [m].
         closed: Whether it comes back to its start.
         values: (m, k) coefficients.
     """

@@ -46,8 +46,8 @@ class PlacedScan:
     """A scan with its pose and covariance.
 
     Attributes:
-        base_T_camera: Of the camera; of several places, of the middle one.
-        covariance: Of points mapped to the base.
+        base_T_camera: Pose of the camera; of the middle scan if there are several.
+        covariance: Covariance of points mapped to the base.
         eyes: (P, 3) where the camera was at each place, in ``camera`` [m].
         clouds: P of (N, 3), what it saw there, in ``camera`` [m].
         apart: Median distance of one place's face from its neighbour's, the largest of all [m];

@@ -28,7 +28,7 @@ class Swept:
     Attributes:
         spline: The line, and how the section is rolled along it.
         section: The section.
-        sigma: Of the points that are on it [m].
+        sigma: Standard deviation of the points that are on it [m].
         covariance: (3m + k, 3m + k) of the coefficients and what is free of the shape.
     """
 

@@ -27,7 +27,7 @@ class JointShape:
     """One joint.
 
     Attributes:
-        angles: Of the four normals from z, positive towards y [deg].
+        angles: Angles of the four normals from z, positive towards y [deg].
         spread: Standard deviation of each [deg].
         heights: Whether the faces lie above the seam.
         gap: Whether a root gap is between the edges; the seam is in its middle.

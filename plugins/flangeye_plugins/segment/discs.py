@@ -351,7 +351,7 @@ def rim_ratio(
         flat: (N, 2) points in the disc's plane [m].
         centre: (2,) of the rim, as :func:`ring_shares` finds it [m].
         pitch: Typical distance of neighbours [m].
-        radius: Of the rim [m].
+        radius: Radius of the rim [m].
     """
     edge = flat[edge_points(flat, centre, SECTORS)] - centre
     tolerance = 1e-3 + pitch

@@ -25,7 +25,7 @@ def check_scale(xyz: NDArray[np.float32], where: str) -> None:
         where: Whose cloud it is, for the message.
 
     Raises:
-        StageError: Says which unit it looks like.
+        StageError: The median depth is not plausible; the message names the likely unit.
     """
     # Coordinates that settle the median depth.
     depths = np.abs(xyz[..., 2].ravel()[:: 1 + xyz.size // 100_000])

@@ -276,7 +276,8 @@ def check_poses(observations: Sequence[Observation]) -> None:
     """Refuse observations that determine no pose by any method.
 
     Raises:
-        StageError: Says what is wrong with them.
+        StageError: There are too few, or they are all at one place.
+        CalibrationRefused: Units differ, or the centres fit only when mirrored.
     """
     require_poses(len(observations))
     centres, tcps = centres_of(observations), tcps_of(observations)

@@ -50,7 +50,7 @@ class RobustParams(LimitsParams):
     required: Length | None = param(
         None,
         gt=0,
-        description="Stop acquiring once 95 % of the errors to expect at the work are below. By "
+        description="Stop acquiring once the predicted 95 % error at the work is below this. By "
         "default every pose is used.",
     )
 
@@ -128,7 +128,7 @@ def pull(
     required: float,
     stage_log: StageLog | None = None,
 ) -> list[Observation]:
-    """Take observations until 95 % of the errors to expect at the work are below ``required``."""
+    """Take observations until the predicted 95 % error at the work is below ``required``."""
     pulled: list[Observation] = []
     for observation in observations:
         pulled.append(observation)

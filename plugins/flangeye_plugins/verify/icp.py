@@ -125,7 +125,7 @@ def require_views(views: Views) -> Views:
     """Return the views, if there are any.
 
     Raises:
-        StageError: Says how to get one.
+        StageError: There is none.
     """
     if not views:
         raise StageError(

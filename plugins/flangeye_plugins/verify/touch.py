@@ -33,7 +33,7 @@ class TouchParams(Params):
         description="Tool tip in the flange frame, from the tool's own calibration."
     )
     touches: tuple[TouchedPoint, ...] = Field(
-        min_length=1, description="Three or more at different places and heights tell most."
+        min_length=1, description="Use three or more at different places and heights."
     )
     max_error: Length = param("1 mm", gt=0, description="Largest distance that passes.")
 

@@ -94,7 +94,7 @@ class CameraJob(NamedTuple):
     Attributes:
         sensor: Opens it, given finger, arm and seed.
         finger: The finger, calibrated.
-        state: Of the arm, where it stands now.
+        state: Current state of the arm.
         seed: For what is simulated.
         look: Opens a profile sensor behind the torch, if there is one.
     """

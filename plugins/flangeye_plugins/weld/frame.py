@@ -200,7 +200,7 @@ class WorkSurface:
         """Return points (K, 3) of the plane, in base.
 
         Args:
-            points: In the plane [m]; beside a seam that goes around it may lie on itself.
+            points: Points in the plane [m]; on a closed seam the plane may overlap itself.
             near: (K,) about where beside the seam they are, by arc length [m].
         """
         pairs = zip(points.tolist(), near.tolist(), strict=True)
@@ -368,8 +368,8 @@ class Tool:
         """Return where the flange is with the tip at (3,) in the plane, the tool at an angle.
 
         Args:
-            position: Of the tip [m].
-            angle: Of the tool in the plane [rad].
+            position: Position of the tip [m].
+            angle: Angle of the tool in the plane [rad].
             near: About where beside the seam that is, by arc length [m].
         """
         surface = self._surface

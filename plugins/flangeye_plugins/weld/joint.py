@@ -20,7 +20,7 @@ class WeldJoint:
 
     Attributes:
         half_angle: Between each wall and their bisector [rad].
-        lean: Of the bisector from the plane's normal, to the left [rad].
+        lean: Lean of the bisector from the plane's normal, to the left [rad].
     """
 
     half_angle: float
@@ -59,9 +59,9 @@ def joint_of(
 
     Args:
         kind: What joint it is.
-        half_angle: Of its walls from the plan's opening [rad], where the plan knows it.
+        half_angle: Angle of the walls from the plan's opening [rad], if the plan has it.
         side: 1 where the left wall is pressed, -1 for the right one.
-        radius: Of the tip's ball [m].
+        radius: Radius of the tip's ball [m].
         gap: Between the plates of a square butt joint [m].
     """
     if half_angle is not None:

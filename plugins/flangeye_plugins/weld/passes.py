@@ -43,8 +43,8 @@ class Traced:
     """Result of the root pass: the seam with its variance, and the tool's height.
 
     Attributes:
-        rows: Of each piece of the root pass: the torch's arc length, the end point's height and the
-            torch's standard deviation [m].
+        rows: For each piece of the root pass: the torch's arc length, the end point's height and
+            the torch's standard deviation [m].
     """
 
     def __init__(self, root: Follower, plan: Path, before: Floats) -> None:

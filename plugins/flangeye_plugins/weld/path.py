@@ -37,7 +37,7 @@ class Path:
     """A curve that continues straight beyond both ends; the seam's start has arc length zero.
 
     Attributes:
-        length: Of the seam, in the plane.
+        length: Length of the seam in the plane [m].
         first: Arc length of the curve's first point: below zero where the seam goes once around,
             and the curve goes on around beyond both of its ends.
         last: Arc length of its last point.

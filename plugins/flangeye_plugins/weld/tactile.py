@@ -112,7 +112,7 @@ class Planned:
 
     Attributes:
         seam: The leg that is welded.
-        surface: Of the work.
+        surface: Surface of the workpiece.
         plan: The seam, rolled out.
         finger: What the arm carries.
         body: How it stands.

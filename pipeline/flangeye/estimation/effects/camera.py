@@ -78,7 +78,7 @@ def _smoothed(problem: Problem, linear: Linear, whose: Mask) -> Floats:
 def drift_effects(problem: Problem) -> list[Effect]:
     """Return how each camera drifts: shifts and turns, piecewise linear in time.
 
-    What it sees may be what moved.
+    The target may be what drifted instead.
     """
     # Five sightings between two knots at least
     knots = min(len(problem.seen) // 5, 12)

@@ -46,7 +46,7 @@ class Viewpoint:
         return np.asarray((xyz - np.array(self.words[:3])) @ turn, dtype=np.float32)
 
     def note(self, applied: bool) -> str:
-        """Return the note for people on this viewpoint."""
+        """Return a printable note on this viewpoint."""
         shown = f"VIEWPOINT {' '.join(f'{word:g}' for word in self.words)}"
         if applied:
             return f"points turned into the scanner's frame by {shown}"

@@ -167,7 +167,7 @@ class TextTable:
         skipped: Rows before the points.
         rows: Rows in all, points and others.
         delimiter: What separates values, white space if None.
-        unit: Of the coordinates, where a heading states it; else empty.
+        unit: Unit of the coordinates, where a heading states it; else empty.
         comma: Whether decimals are behind a comma.
         remarks: Whether lines between the rows are remarks.
         viewpoint: As for :class:`BinaryTable`.

@@ -264,7 +264,7 @@ class TextBlock:
     """Rows without a blank line, a comment or a title between them.
 
     Attributes:
-        rows: Of each row, where it stands and its cells.
+        rows: Location and cells of each row.
         heading: Names of its columns.
         title: The last line of words above it.
         after_blank: Whether a blank line or a title stands above it, not a comment alone.

@@ -30,10 +30,10 @@ class Rows(NamedTuple):
 
     Attributes:
         heading: Names of the columns; empty without a heading.
-        rows: Of each row, where it stands and its cells.
+        rows: Location and cells of each row.
         part: What names it within its file: an array's name, a block's title; empty for all of it.
         names: What each row is called, where rows have names; else empty.
-        convention: Of the poses, where the way of writing shows it: a robot program's.
+        convention: Convention of the poses, if the format shows it, as a robot program does.
     """
 
     heading: tuple[str, ...]
@@ -51,10 +51,10 @@ class Table:
         name: As a recipe names it: FILE, FILE:PART, a pattern of files, or files side by side.
         file: The first of it with the folder, for messages.
         heading: Names of the columns; empty without a heading.
-        rows: Of each row, where it stands and its cells.
+        rows: Location and cells of each row.
         files: The files that were read.
         names: What each row is called, where rows have names; else empty.
-        convention: Of the poses, where the way of writing shows it.
+        convention: Convention of the poses, if the format shows it.
     """
 
     name: str

@@ -43,7 +43,7 @@ def write_certificate(
         run: The run's folder or its ``run.mcap``.
         path: The file; by default ``certificate.html`` beside the log.
         conditions: What the person says of the place.
-        camera: Of a cell, the camera that is certified.
+        camera: For a cell, the camera that is certified.
 
     Raises:
         StageError: There is no log, no calibration in it, it is of a cell and no camera was

@@ -58,7 +58,7 @@ class Listener(Device):
     """An arm that is listened to; see :class:`flangeye.devices.Robot` for its state.
 
     Attributes:
-        name: For people.
+        name: Shown in messages and reports.
         period: Between two joint states [s].
         flange_T_tool: None: joint states know no tool.
     """

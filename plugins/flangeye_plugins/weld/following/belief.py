@@ -25,14 +25,14 @@ class Belief:
         distance: From the torch to the tip, seen from above [m].
         lateral: Stiffness across the finger [N/m]; of a soft one where its file gives none.
         axial: Stiffness along the finger [N/m].
-        half_angle: Of the joint's walls from their bisector [rad]; None where it is not known.
+        half_angle: Angle of the joint's walls from their bisector [rad]; None if unknown.
         noise: Standard deviations of one measurement across and up [m].
         torch_sigma: Standard deviation of the torch across the tool, relative to the tip [m].
         along_sigma: Standard deviation of the distance from the torch to the tip [m].
         tip_sigma: Standard deviation of the tip in the flange, along each axis [m].
         two_walls: Whether there is a wall on the other side too.
-        lean: Of the walls' bisector from the plane's normal, to the left [rad].
-        radius: Of the tip's ball [m].
+        lean: Lean of the walls' bisector from the plane's normal, to the left [rad].
+        radius: Radius of the tip's ball [m].
         level_R_tool: Rows of the tool's axes in level ones; see :mod:`flangeye_plugins.weld.frame`.
         behind: How far behind the torch a second look sees the bead [m]; None where nothing does.
         arc: Gas before the arc; standing while it is struck; standing while the crater fills [s].
@@ -110,11 +110,11 @@ class Belief:
         return math.tan(max(self.joint.left if side > 0 else self.joint.right, math.radians(1.0)))
 
     def seating(self, settings: Following) -> float | None:
-        """Return by how much the preload outweighs the deflection on a wall; below 1 it climbs.
+        """Return the ratio of the force into the joint to the force that lifts the tip.
 
-        The force into the joint over the one that pushes up the pressed wall; upright that is
-        axial stiffness times preload times cot(half angle), over lateral stiffness times
-        deflection. Friction helps and is left out. None where the half angle is not known.
+        Below 1 the tip climbs the pressed wall. For an upright joint the ratio is axial stiffness
+        times preload times cot(half angle), divided by lateral stiffness times deflection.
+        Friction helps and is neglected. None if the half angle is not known.
         """
         if self.joint is None:
             return None

@@ -45,7 +45,7 @@ class Trail:
             time: [s].
             s: Its arc length [m].
             raw: How far to the left of the refined path it is measured to be [m].
-            variance: Of what the tip felt there, seen from the torch [m^2].
+            variance: Variance of the offset that the tip measured there, at the torch [m^2].
         """
         # A place every 0.2 mm is enough: what is looked at is hardly smaller.
         if not self._along or s >= self._along[-1] + 0.2e-3:
@@ -79,7 +79,7 @@ class Bias:
         Args:
             prior: Variance of the bias about zero, P0 [m^2].
             distortion: Standard deviation of heat's part of it, D [m].
-            length: Of the tool, from the torch to the tip, L [m].
+            length: Length of the tool, from the torch to the tip, L [m].
         """
         self.value, self.doubt = 0.0, ""
         self.prior, self._length = prior, length

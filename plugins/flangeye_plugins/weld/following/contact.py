@@ -57,7 +57,7 @@ class Felt(NamedTuple):
         time: [s].
         s: Arc length.
         offset: To the left of the plan.
-        angle: Of the tool [rad].
+        angle: Angle of the tool [rad].
         aside: To the left of where the seam was expected.
         spread: Variance of it, of measurement and expectation [m^2].
         height: Above the plan's.

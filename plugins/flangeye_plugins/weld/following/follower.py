@@ -93,7 +93,7 @@ class Follower:
 
     @property
     def mode(self) -> str:
-        """Its name, for people."""
+        """Name shown in messages and reports."""
         return "tactile" if self.task.touch else "vision"
 
     @property

@@ -45,9 +45,9 @@ class Located(NamedTuple):
     Attributes:
         s: Arc length of the plan [m].
         seam: The seam there, if the tip is seated.
-        deflection: Of the tip, towards the pressed wall [m].
-        compression: Of the tip, into the joint [m].
-        angle: Of the tool [rad].
+        deflection: Deflection of the tip, towards the pressed wall [m].
+        compression: Compression of the tip, into the joint [m].
+        angle: Angle of the tool [rad].
     """
 
     s: float
@@ -67,7 +67,7 @@ class Sensing:
         felt: The seam at the tip, smoothed; None before anything was felt.
         seen: Time of the newest touch [s].
         heard: When it came [s].
-        latency: Of the touches, a running mean [s].
+        latency: Latency of the touches, a running mean [s].
     """
 
     def __init__(self, task: WeldTask, progress: Progress, pressing: Pressing) -> None:
@@ -341,10 +341,10 @@ class SeamEstimate:
         """Update the contact modes by a touch of the wall on a side, 1 for the left.
 
         Args:
-            time: Of the touch [s].
+            time: Time of the touch [s].
             found: Where the tip was.
             learned: What the sweep found.
-            side: Of the wall that is pressed.
+            side: Side of the wall that is pressed.
         """
         s, seam = found.s, found.seam
         offset, variance = self.refined.expected(s)

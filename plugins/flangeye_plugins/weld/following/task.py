@@ -38,7 +38,7 @@ class Start:
     Attributes:
         tip: Where the tip is set down, by arc length [m].
         torch: Where the torch begins to weld, by arc length; 0 for where the seam begins [m].
-        angle: Of the tool to the seam [rad].
+        angle: Angle of the tool to the seam [rad].
     """
 
     tip: float

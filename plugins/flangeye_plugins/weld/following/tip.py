@@ -15,10 +15,10 @@ class Progress:
     """Tip and torch by arc length of the plan.
 
     Attributes:
-        tip: Of the tip, where the arm will be once it has done all it was told [m].
-        torch: Of the torch, where the arm is [m].
-        coming: Of the torch, where the arm will be [m].
-        place: Of the plan, at the tip.
+        tip: Position of the tip once the arm has carried out all commands sent [m].
+        torch: Position of the torch now [m].
+        coming: Position of the torch once the arm has carried out all commands sent [m].
+        place: Point of the plan at the tip.
     """
 
     def __init__(self, task: WeldTask) -> None:

@@ -77,7 +77,7 @@ class Welding:
 
         Args:
             slant: Sine of the angle between the tool and the path.
-            pose: Of the tool.
+            pose: Pose of the tool.
         """
         belief, settings, learned = self._task.belief, self._task.settings, self._sensing.learned
         refined, torch = self._seam.refined, self._progress.torch
@@ -164,7 +164,7 @@ class Welding:
         Args:
             now: The time [s].
             raw: How far to the left of the refined path the torch is measured to be [m].
-            variance: Of the torch's place [m^2].
+            variance: Variance of the torch's place [m^2].
 
         Returns:
             Why the weld must not go on, or nothing.
@@ -190,7 +190,7 @@ class Welding:
         """Return where the seam that was felt is known least, and the torch's bound there [m].
 
         Args:
-            variance: Of the torch's place where it is now [m^2].
+            variance: Variance of the torch's place where it is now [m^2].
         """
         refined, torch = self._seam.refined, self._progress.torch
         place, felt = refined.worst(torch, self.ends)

@@ -40,7 +40,7 @@ def pivot(what: str, poses: Sequence[Floats], displaced: Sequence[Floats] | None
     """Return the point that is fixed in all poses (least squares), with its covariance.
 
     Args:
-        what: Its name, for people.
+        what: Shown in messages and reports.
         poses: (4, 4) of the flange in base.
         displaced: (3,) for each pose: how far the point was from its rest then, in the flange's
             axes [m]; nothing for a rigid one.
