@@ -68,7 +68,7 @@ class Project:
 
     @property
     def text(self) -> str:
-        """The recipe's text on disk; ``check`` tells of bytes that are none."""
+        """The recipe's text on disk; ``check`` reports bytes that are not text."""
         return read_regular(self.recipe_path).decode("utf-8", "replace")
 
     @text.setter

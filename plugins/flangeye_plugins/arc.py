@@ -43,7 +43,7 @@ class ManualArc(Device):
             self._tell("STRIKE THE ARC NOW" if on else "END THE ARC NOW")
 
     def burning(self) -> bool | None:
-        """Return None: no signal tells."""
+        """Return None: there is no arc signal."""
         return None
 
     def close(self) -> None:

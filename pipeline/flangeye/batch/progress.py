@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 FIGURES = ("holdout_rms_m", "expected_p95_m", "true_rms_m")
-"""Of which medians are told."""
+"""Quantities whose medians are reported."""
 
 
 Names = tuple[Any, ...]

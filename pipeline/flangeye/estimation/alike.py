@@ -25,7 +25,7 @@ Poses = Sequence[Observation]
 def told_apart(
     cell: Cell, sure: Poses, held: Sequence[Poses], last: bool
 ) -> list[Observation | None]:
-    """Return of each capture the pose that the others bear out; None where they do not tell.
+    """Return for each capture the pose that the others support; None if it stays ambiguous.
 
     Args:
         cell: Who carries whom.

@@ -199,7 +199,7 @@ def fit(model: LinearModel, sizes: Floats, with_slopes: bool = False) -> Fit:
 
 
 def _solved(model: LinearModel, sizes: Floats, information: Floats, right: Floats) -> Fit:
-    """Return places and effects by what sightings tell.
+    """Return the poses and effects that the sightings determine.
 
     Raises:
         numpy.linalg.LinAlgError: The equations are not positive definite.

@@ -90,7 +90,7 @@ class Reading(NamedTuple):
 
 
 def meant(pairs: Pairs, carried: float, standing: float, robot: RobotModel | None) -> list[Reading]:
-    """Return the readings that may be meant, likeliest first; several where the data do not tell.
+    """Return the readings that may be meant, likeliest first; several if the data do not decide.
 
     Args:
         pairs: As they were read; one calibration fits them. Centres are turned by NaN, and are

@@ -120,7 +120,7 @@ def _list(names: Sequence[str]) -> str:
 
 CLOUDS = (".pcd", ".ply", ".npy", ".xyz", ".pts", ".asc")
 POINTS = (".csv", ".txt", ".npz")
-"""Files that hold points, or poses: their content tells."""
+"""Files that hold points or poses; their content decides which."""
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 
 

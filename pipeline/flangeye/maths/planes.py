@@ -25,7 +25,7 @@ RESTLESS = 0.01
 """Share of a thinned group's points that may still change sides before the whole group is asked."""
 
 ENOUGH = 2000
-"""Points that tell one plane from another."""
+"""Points that distinguish one plane from another."""
 
 
 class Plane(NamedTuple):

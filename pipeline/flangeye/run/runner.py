@@ -204,7 +204,7 @@ class Runner:
             yield from self._told(stream)
 
     def _told(self, stream: t.Captures, last: bool = False) -> Iterator[t.Observation]:
-        """Yield the captures held back of which the arm's motion has told the pose by now.
+        """Yield held-back captures whose pose the arm's motion has decided by now.
 
         Those of which it does not are set aside after the last capture.
         """

@@ -36,7 +36,7 @@ from flangeye.maths.statistics import MISFIT, chi2_quantile, f_quantile
 from flangeye.types import Floats
 
 NO_NORMAL = 1.0
-"""Variance [rad^2] of a tilt that was not measured: it tells nothing."""
+"""Variance [rad^2] of a tilt that was not measured: no information."""
 
 
 State = Literal["OK", "DEGRADED", "MOVED"]

@@ -179,7 +179,7 @@ def _of_six(table: Table, part: list[int], numbers: Floats, told: str) -> PoseCo
 FEWEST_PAIRS = 5
 """Poses; fewer fit several conventions."""
 MOST_PAIRS = 60
-"""Poses whose pairs are looked at: enough to tell frames apart."""
+"""Poses whose pairs are looked at: enough to distinguish frames."""
 CLEARER = 3.0
 """By what factor the next best has to be worse, beyond 0.2 deg or 2 mm."""
 LOOSE_PLACE = 2e-3

@@ -34,7 +34,7 @@ PIVOTS = 0.1
 """The tool is turned about the tip to either side by this [rad]."""
 
 PIVOTED = 0.02e-3
-"""So well the sweep tells how far ahead the tip is, at best [m]."""
+"""Best accuracy of the tip distance estimated by the sweep [m]."""
 
 LONGEST = 4.0
 """So well the mean of what is felt at the hard end is to be known [m]; no longer is awaited [s]."""

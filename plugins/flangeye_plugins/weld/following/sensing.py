@@ -204,7 +204,7 @@ class Track:
 
 
 class _Sample(NamedTuple):
-    """What the path is told of a touch: see :meth:`RefinedPath.add`."""
+    """A touch as added to the path: see :meth:`RefinedPath.add`."""
 
     s: float
     offset: float
