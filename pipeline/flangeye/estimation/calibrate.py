@@ -61,7 +61,7 @@ class Options:
     Attributes:
         limits: Largest standard deviations of a rotation [rad] and of a translation [m].
         mark: Whether translations that the motion cannot show are marked instead of refused.
-        certify: Whether to say if the answer is the best of all.
+        certify: Whether to try to prove the answer globally optimal.
         work: Where the error to expect is taken; None for where the session was.
         asked: What is to be found.
     """

@@ -25,7 +25,7 @@ class Frame:
     place: Floats | None = None
 
     def at(self, times: Indices) -> Frame:
-        """Return it at some of the times alone."""
+        """Return the frame at some of the times only."""
         if self.place is None or self.place.ndim == 2:
             return self
         return replace(self, place=self.place[times])

@@ -30,7 +30,7 @@ WRITTEN: Mapping[str, Any] = {"number": "number", "rotation": "xyzw", "length": 
 def write_tables(log: RunLog, folder: Path, registry: Registry) -> list[Path]:
     """Write a table for each moving carrier and each camera, and a recipe that reads them.
 
-    What cameras saw are the scans, where the log has them whole, else what was found in them.
+    The camera tables name whole scans if the log holds them, else the features found in them.
 
     Args:
         log: A run of a recipe with a cell.

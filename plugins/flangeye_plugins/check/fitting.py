@@ -403,8 +403,8 @@ def exceedance(ratio: float, count: float, further: int, freedom: float, effect:
     Args:
         ratio: Logarithm of the likelihood ratio.
         count: Coordinates that were measured.
-        further: Parameters that the alternative has more.
-        freedom: Degrees of freedom that are left to it.
+        further: Number of additional parameters of the alternative.
+        freedom: Residual degrees of freedom of the alternative.
         effect: Size of what it changes, in units of what is negligible.
     """
     from scipy.special import fdtrc

@@ -25,12 +25,12 @@ INSIDE = 1.5e-3
 class PassParams(Params):
     """A pass after the root pass, along the seam it found, without touch."""
 
-    across: Length = param("0 mm", ge=-0.03, le=0.03, description="To the left of the seam.")
+    across: Length = param("0 mm", ge=-0.03, le=0.03, description="Offset to the left.")
     up: Length = param(
         "3 mm", gt=0, le=0.05, description="Higher than the root pass, the finger too; it must "
         "clear what was welded.",
     )  # fmt: skip
-    weave_width: Length = param("0 mm", ge=0, le=0.03, description="As of the weld itself.")
+    weave_width: Length = param("0 mm", ge=0, le=0.03, description="As in the root pass.")
 
 
 class Following(Params):
@@ -201,8 +201,8 @@ class WeldTactileParams(Following):
     look: Annotated[BoundPart, Choose("profiler")] | None = Field(
         None,
         description="A profile sensor that sees the bead behind the torch, for example {tcp: "
-        "{host: 192.168.1.20, port: 9000, behind: 30 mm}}: what it sees of heat, and of where the "
-        "torch really is, is made up for.",
+        "{host: 192.168.1.20, port: 9000, behind: 30 mm}}. Thermal distortion and torch offset that it "
+        "measures are compensated.",
     )
     arc: Annotated[BoundPart, Choose("arc")] | None = Field(
         None,

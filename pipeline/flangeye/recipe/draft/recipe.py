@@ -267,8 +267,8 @@ def _mounting(both: Sequence[tuple[Floats, Floats]]) -> tuple[str, str] | None:
 def printed_target(images: Iterable[tuple[str, Any]], questions: Questions) -> dict[str, Any]:
     """Return the printed target that is seen, its name with parameters.
 
-    The question tells what the first image that shows one shows. Its lengths are those of the
-    print, and have to be measured.
+    The question names the target found in the first image that shows one. Measure its lengths on
+    the print.
 
     Args:
         images: Names, and pixels (H, W) or (H, W, 3).
