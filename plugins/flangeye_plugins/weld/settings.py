@@ -25,7 +25,7 @@ INSIDE = 1.5e-3
 class PassParams(Params):
     """A pass after the root pass, along the seam it found, without touch."""
 
-    across: Length = param("0 mm", ge=-0.03, le=0.03, description="Offset to the left.")
+    across: Length = param("0 mm", ge=-0.03, le=0.03, description="Offset to the left of the seam.")
     up: Length = param(
         "3 mm", gt=0, le=0.05, description="Higher than the root pass, the finger too; it must "
         "clear what was welded.",
@@ -201,8 +201,8 @@ class WeldTactileParams(Following):
     look: Annotated[BoundPart, Choose("profiler")] | None = Field(
         None,
         description="A profile sensor that sees the bead behind the torch, for example {tcp: "
-        "{host: 192.168.1.20, port: 9000, behind: 30 mm}}. Thermal distortion and torch offset that it "
-        "measures are compensated.",
+        "{host: 192.168.1.20, port: 9000, behind: 30 mm}}. The thermal distortion and torch "
+        "offset that it measures are compensated.",
     )
     arc: Annotated[BoundPart, Choose("arc")] | None = Field(
         None,
