@@ -27,7 +27,9 @@ class PaperIcpParams(Params):
         description="Normals of the CAD cloud: as Open3D up to 0.7 computed them, with its defect "
         "on flat faces, or sound ones.",
     )
-    iterations: int = Field(30, ge=1, description="Iterations of ICP at most; 30 was the default.")
+    iterations: int = Field(
+        30, ge=1, le=10_000, description="Iterations of ICP at most; 30 was the default."
+    )
     change: float = Field(
         1e-6,
         ge=0,
@@ -148,7 +150,7 @@ def _summary(figures: dict[str, float]) -> str:
 class ByIterationParams(Params):
     """Parameters of ``verify.algorithm_1_by_iteration``: those of ``solve.iterative``."""
 
-    pool: int = Field(4, ge=3, description="Number of poses in the pool.")
+    pool: int = Field(4, ge=3, le=1000, description="Number of poses in the pool.")
     error: Annotated[BoundPart, Choose("error")] = param(
         {"icp_as_in_paper": {}}, description="Measure of a candidate's error."
     )

@@ -37,6 +37,7 @@ class CellSessionParams(ArmsParams):
     sightings: int = Field(
         60,
         ge=3,
+        le=100_000,
         description="Number of sightings, evenly distributed over the pairs of camera and target.",
     )
     places: dict[str, PlaceParams] = Field(

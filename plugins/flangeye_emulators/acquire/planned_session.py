@@ -79,7 +79,7 @@ class ArmsParams(Params):
 class SessionParams(ArmsParams):
     """Common parameters of simulated sessions."""
 
-    poses: int = Field(20, ge=3, description="Number of captures.")
+    poses: int = Field(20, ge=3, le=100_000, description="Number of captures.")
     spread: Angle = param("17 deg", gt=0, description="Largest change of a joint from there.")
     camera: PlaceParams | None = Field(
         None,

@@ -67,7 +67,10 @@ class SimulatedParams(ScannerQuality):
     )
     camera: CameraPose = Field(default_factory=CameraPose, description="The scanner's true pose.")
     verification: int = Field(
-        1, ge=0, description="Captures that are kept from solving, near the workspace's middle."
+        1,
+        ge=0,
+        le=1000,
+        description="Captures that are kept from solving, near the workspace's middle.",
     )
     arm: ArmErrors = Field(
         default_factory=ArmErrors,

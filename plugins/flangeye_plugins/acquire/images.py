@@ -56,8 +56,10 @@ class SeenBoardParams(Params):
     """The board that calibrates the camera, with its fit step's parameters."""
 
     kind: Kind = Field("charuco", description="charuco, checkerboard, or circles.")
-    columns: int = Field(ge=3, description="Squares, or circles of a row, from left to right.")
-    rows: int = Field(ge=3, description="Squares, or rows of circles, from top to bottom.")
+    columns: int = Field(
+        ge=3, le=200, description="Squares, or circles of a row, from left to right."
+    )
+    rows: int = Field(ge=3, le=200, description="Squares, or rows of circles, from top to bottom.")
     square: Length = param(gt=0, description="Edge of a square, or distance of rows of circles.")
     marker: Length = param("0 mm", ge=0, description="Edge of a ChArUco board's markers.")
     dictionary: Dictionary = Field("4X4_50", description="Family of the markers.")

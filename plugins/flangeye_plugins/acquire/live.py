@@ -96,7 +96,10 @@ class LiveParams(Params):
         {"next_best": {}}, description="Poses the robot visits."
     )
     verification: int = Field(
-        1, ge=0, description="Captures that are kept from solving, near the workspace's middle."
+        1,
+        ge=0,
+        le=1000,
+        description="Captures that are kept from solving, near the workspace's middle.",
     )
     home: tuple[JointPosition, ...] | None = Field(
         None,

@@ -52,8 +52,8 @@ class DictionaryParams(PrintedTargetParams):
 class SquaresParams(PrintedTargetParams):
     """Common parameters of fits of boards of squares."""
 
-    columns: int = Field(ge=3, description="Squares from left to right, inner and outer.")
-    rows: int = Field(ge=3, description="Squares from top to bottom.")
+    columns: int = Field(ge=3, le=200, description="Squares from left to right, inner and outer.")
+    rows: int = Field(ge=3, le=200, description="Squares from top to bottom.")
     square: Length = param(gt=0, description="Edge of a square, measured on the print.")
 
 
@@ -79,8 +79,8 @@ class CheckerboardParams(SquaresParams):
     """Parameters of ``fit.checkerboard``."""
 
     # OpenCV finds no grid of fewer than three inner corners a side
-    columns: int = Field(ge=4, description="Squares from left to right, inner and outer.")
-    rows: int = Field(ge=4, description="Squares from top to bottom.")
+    columns: int = Field(ge=4, le=200, description="Squares from left to right, inner and outer.")
+    rows: int = Field(ge=4, le=200, description="Squares from top to bottom.")
 
     @model_validator(mode="after")
     def _asymmetric(self) -> CheckerboardParams:
@@ -100,8 +100,10 @@ class CheckerboardParams(SquaresParams):
 class CirclesParams(PrintedTargetParams):
     """Parameters of ``fit.circles``."""
 
-    columns: int = Field(ge=2, description="Circles per row.")
-    rows: int = Field(ge=3, description="Rows, every other one shifted by half a step; odd.")
+    columns: int = Field(ge=2, le=200, description="Circles per row.")
+    rows: int = Field(
+        ge=3, le=200, description="Rows, every other one shifted by half a step; odd."
+    )
     spacing: Length = param(gt=0, description="Distance of two rows, measured on the print.")
     diameter: Length = param(gt=0, description="Diameter of the circles, measured on the print.")
 

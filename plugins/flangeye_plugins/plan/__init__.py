@@ -90,7 +90,7 @@ def _pose_at(
 class NextBestParams(PlanParams):
     """Parameters of ``plan.next_best``."""
 
-    count: int = Field(30, ge=3, description="Number of poses.")
+    count: int = Field(30, ge=3, le=10_000, description="Number of poses.")
     # Candidate poses compared for each choice
     candidates: ClassVar[int] = 400
     # Expected standard deviation of a centre per axis: scanner, fit and arm [m]

@@ -44,7 +44,7 @@ from flangeye_plugins.solve.observations import (
 class IterativeParams(Params):
     """Parameters of ``solve.iterative``."""
 
-    pool: int = Field(4, ge=3, description="Number of poses in the pool.")
+    pool: int = Field(4, ge=3, le=1000, description="Number of poses in the pool.")
     required: Length = param(
         "0.3 mm", ge=0, description="Stop acquiring once the cost is this small."
     )
