@@ -556,6 +556,7 @@ def test_the_space_bar_stops_a_run_and_a_second_page_sees_it(browser: Any, serve
     page.get_by_text("another page started it").wait_for()
     page.reload()  # the run is found again, and nothing was started by it
     page.get_by_text("another page started it").wait_for()
+    page.wait_for_function("window.socket?.connected")  # before, no key reaches the server
     page.locator("body").press(" ")
     page.get_by_text("stopped on this page").first.wait_for()
     assert len(list(served.folder.glob("runs/*"))) <= before + 1
