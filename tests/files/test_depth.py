@@ -78,6 +78,8 @@ def test_a_calibration_that_is_missing_or_of_another_size_is_named(tmp_path: Pat
     cv2.imwrite(str(path), slope())
     with pytest.raises(StageError, match=r"needs the calibration of its camera: put its file"):
         read_scan(path)
+    camera_file(tmp_path)  # put there once it was asked for
+    assert read_scan(path).organised
     other = tmp_path / "half"
     other.mkdir()
     cv2.imwrite(str(other / "depth_1.png"), slope()[::2, ::2])

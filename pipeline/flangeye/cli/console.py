@@ -36,7 +36,7 @@ def write(console: Console, text: str, style: str = "") -> None:
 def wrapped(console: Console, text: str, indent: int = 2) -> str:
     """Return a text wrapped to the terminal's width; commands are not broken.
 
-    Breaks of its own it has none: a line of foreign text would pass for one of ours.
+    Line breaks in it become spaces, so that foreign text cannot look like a line of ours.
     """
     return textwrap.fill(
         text.replace("\n", " "), width(console), subsequent_indent=" " * indent,

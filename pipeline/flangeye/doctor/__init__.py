@@ -56,10 +56,10 @@ def evidence_of(finding: Finding) -> str:
 
 
 def mended_together(findings: Sequence[Finding]) -> tuple[str, str, list[str]]:
-    """Return what is wrong, how it is known, and what to do, of findings that lines mend together.
+    """Return what is wrong, how it is known, and what to do, as one answer to several findings.
 
-    Each was found with those before it mended, so the last line of a section mends them all. A
-    mistake that no line mends is told alone.
+    Each was found with those before it mended, so the last line of a section of the recipe mends
+    them all. A first mistake that no line mends stands alone.
     """
     together = list(takewhile(lambda finding: finding.lines, findings)) or [findings[0]]
     lines = {finding.fix.split(": ")[0]: finding.fix for finding in together}

@@ -91,10 +91,10 @@ def calibrate(
         method: Name of the stage.
 
     Raises:
-        StageError: Too few sightings, all the same, those of a mirrored camera, or the pose of
-            something that moves is missing.
-        CalibrationRefused: Fewer than half of the sightings agree, the motion leaves something
-            unknown (it says which motion is missing), or a marker has another size than was said.
+        StageError: Too few sightings, all the same, or the pose of something that moves is missing.
+        CalibrationRefused: The sightings fit only when mirrored, fewer than half of them agree, the
+            motion leaves something unknown (it says which motion is missing), or a marker has
+            another size than was said.
     """
     session = session_of(observations, cell, scanner, options.asked)
     return answered(_at_best(session) if options.certify else session, options, method)

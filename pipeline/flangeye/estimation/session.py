@@ -474,7 +474,7 @@ def _unseen_tool(known: float) -> Warn:
     return Warn(
         "the poses hardly turn the flange, so a tool set in the controller would not show: an "
         f"offset of the flange from the reported poses is {told}",
-        "see that the controller's tool is zero, or add poses turned by 20 deg about two axes",
+        "check that the controller's tool is zero, or add poses turned by 20 deg about two axes",
     )
 
 

@@ -58,9 +58,11 @@ def _depths(path: Path) -> tuple[Floats, CameraFile]:
         raise StageError(f"{path}: {error}") from None
     if pixels.ndim != 2 or pixels.dtype not in (np.uint16, np.float32):
         raise StageError(
-            f"{path}: is no depth image: those have one channel, of 16 bits or of floats"
+            f"{path}: is not a depth image: those have one channel, of 16 bits or of floats"
         )
-    camera = _camera_beside(path.parent)
+    # Of the folder as it is now: the page lives on while a file is put there
+    changed = path.parent.stat().st_mtime_ns, path.parent.parent.stat().st_mtime_ns
+    camera = _camera_beside(path.parent, changed)
     if camera is None:
         raise StageError(
             f"{path}: needs the calibration of its camera: put its file beside the depth images, "
@@ -77,7 +79,7 @@ def _depths(path: Path) -> tuple[Floats, CameraFile]:
 
 
 @lru_cache(maxsize=8)
-def _camera_beside(folder: Path) -> CameraFile | None:
+def _camera_beside(folder: Path, _changed: tuple[int, int]) -> CameraFile | None:
     """Return the calibration in a folder or above it; the depth camera's, if there are several."""
     # A folder of depth images alone stands in that of the session
     for place in (folder, folder.parent) if "depth" in folder.name.lower() else (folder,):
@@ -90,7 +92,7 @@ def _camera_beside(folder: Path) -> CameraFile | None:
 
 @lru_cache(maxsize=8)
 def _scale_of(path: Path) -> float:
-    """Return by what a camera's file says that depths are multiplied; 1 where it does not.
+    """Return the factor of the depths that a camera's file states; 1 where it states none.
 
     RealSense's ``depth_scale`` gives metres; that of the BOP datasets gives millimetres.
     """

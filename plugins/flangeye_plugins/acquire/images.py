@@ -382,7 +382,7 @@ def acquire_images(
     files = [path for r in usable for path in (r.image, r.cloud) if path is not None]
     skipped = skipped_note(recorded, lambda r: r.image is not None, "image")
     source = source_of(recorded, [*skipped, *told], digests_of([*files, *recorded.files]))
-    # Depth images are seldom those of the colour camera, pixel by pixel: they tell nothing here
+    # A depth image is seldom aligned with the colour image, so it is left out
     usable = [replace(r, cloud=None) if r.cloud and is_depth_image(r.cloud) else r for r in usable]
     unit = recorded.cloud_unit or params.cloud_unit or _unit_of_clouds(usable)
     return Captures(_captures(usable, cameras, unit), source, total=len(usable), recorded=True)

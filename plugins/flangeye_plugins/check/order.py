@@ -366,8 +366,8 @@ def tool(session: RecordedSession) -> Findings:
     )
     if turn and session.seconds is None:
         null = fit_of(session)
-        # An axis has two parameters more. It may point anywhere and is known as well as normals
-        # tell: a misread rotation that explains the turn as exactly is likelier by the share
+        # A free axis costs two parameters: the share of all directions that the normals leave to
+        # it. So a misread rotation, which leaves nothing free, wins where both fit alike
         evidence = best_of(null, free, 5) if shows else best_of(null, known, 2)
         share = float(known.scales[0, 1]) ** 2 / session.seen.sum()
         gain = evidence.gain + float(np.log(null.count[0] * share))
@@ -390,10 +390,10 @@ def tool(session: RecordedSession) -> Findings:
 
 
 def _turned(session: RecordedSession) -> tuple[float, RecordedSession]:
-    """Return by how much all normals alike are off the target's axis [rad], and it turned so.
+    """Return the angle of all normals to the target's axis [rad], and the session turned by it.
 
     Returns:
-        0 and the session as it is where they are not.
+        0 and the session as it is, where the normals do not all stand alike.
     """
     seen = np.isfinite(session.normals[:, 0])
     if not seen.any() or session.links is not None:

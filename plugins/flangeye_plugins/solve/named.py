@@ -260,8 +260,9 @@ def solve_svd(observations: Observations, params: SvdParams) -> HandEye:
     few poses so that its 95 % region holds its share (see ``covariance_inflation``).
 
     Raises:
-        StageError: Fewer than three poses, all at one place, or not in one unit.
-        CalibrationRefused: The centres lie on a line, or leave a rotation unknown.
+        StageError: Fewer than three poses, or all at one place.
+        CalibrationRefused: The centres are in another unit or mirrored, lie on a line, or leave a
+            rotation unknown.
     """
     pulled = list(observations)
     check_poses(pulled)

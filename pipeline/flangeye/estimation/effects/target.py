@@ -45,13 +45,13 @@ def wrong_offset(problem: Problem, effects: Sequence[Effect]) -> list[Effect] | 
 
 
 def offset_shown_to(problem: Problem, places: Places) -> float:
-    """Return how well the poses show where a flange's circle is in its flange [m], one sigma.
+    """Return the standard deviation of a circle's offset in its flange, if it were free [m].
 
-    A constant offset d is at R_i d in pose i. Only where the R_i differ does it not pass for a
-    shift of the camera.
+    A constant offset d moves the circle by R_i d at pose i. Where all R_i are alike, it cannot be
+    told from a shift of the camera.
 
     Returns:
-        0 where a mistake hides it.
+        Along the direction that the poses show least; 0 where the residuals are no noise.
     """
     linear, shown = problem.linearised(places), np.zeros((3, 3))
     for pair in np.unique(problem.seen.pairs):
@@ -59,7 +59,7 @@ def offset_shown_to(problem: Problem, places: Places) -> float:
         turned = turns - turns.mean(axis=0)
         shown += np.einsum("nij,nik->jk", turned, turned)
     error = float(np.sqrt((linear.residuals[:, 3:] ** 2).mean()))
-    # Larger errors [m] are a mistake's: of the arm and the scanner they say nothing
+    # Larger residuals [m] are those of a mistake, not of the arm and the scanner
     return error / float(np.sqrt(max(np.linalg.eigvalsh(shown)[0], 1e-12))) if error < 5e-3 else 0.0
 
 
