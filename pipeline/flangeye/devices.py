@@ -58,7 +58,7 @@ class RobotState:
         time_ns: When the controller sampled it, by ``time.monotonic_ns``.
         mode: What the controller is able to do; anything but ready and moving is a safety fault.
         force: (6,) force and torque on the flange in the base's axes [N, N m], if it is measured.
-        message: What the controller says of a mode that is not ready, for people.
+        message: Text of the controller about a mode that is not ready.
     """
 
     base_T_flange: Transform
@@ -91,7 +91,7 @@ class Robot(Device, Protocol):
     controller is in a mode in which it cannot move.
 
     Attributes:
-        name: For people: what it is and where, ``ur5e at 192.168.1.10``.
+        name: Model and address, as messages show it: ``ur5e at 192.168.1.10``.
         period: Between two of the controller's cycles [s].
         flange_T_tool: The tool offset set in the controller; None where it cannot be read.
     """
@@ -169,7 +169,7 @@ class Scanner(Device, Protocol):
     """A 3D scanner. Opened by its driver, used as a context.
 
     Attributes:
-        name: For people, with the serial number.
+        name: Model and serial number, as messages show it.
         facts: What the device itself says: unit, layout, size, firmware, …; logged.
     """
 
@@ -316,7 +316,7 @@ class Profiler(Device, Protocol):
     def profile(self) -> WeldProfile | None:
         """Return the newest profile not yet returned, or None; never waits.
 
-        Where no bead and joint can be told in a profile there is no look.
+        A profile in which no bead and joint can be recognised gives no look.
 
         Raises:
             DeviceError: The sensor is lost.

@@ -27,7 +27,7 @@ class NothingSeen(StageError):
 
 
 class CalibrationRefused(FlangeyeError):
-    """The input was valid, but no answer is reliable; says why and what is missing."""
+    """The input was valid, but no answer is reliable; the message says why and what is missing."""
 
     exit_code = 1
 

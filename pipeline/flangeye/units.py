@@ -35,7 +35,7 @@ def parse_quantity(value: object, kind: str) -> float:
     """Return ``value`` in SI units; ``kind`` is a key of the unit table, such as ``length``.
 
     Raises:
-        ValueError: There is no unit, or it measures something else; says what is allowed.
+        ValueError: There is no unit, or it measures something else; the message lists the units.
     """
     example, units = _UNITS[kind]
     a_kind = f"an {kind}" if kind[0] in "aeiou" else f"a {kind}"
@@ -105,7 +105,7 @@ def param(default: Any = ..., *, description: str = "", **limits: Any) -> Any:
 
 
 def in_mm(point: Iterable[float]) -> str:
-    """Return a point [m] for people: ``600, 0, 950 mm``."""
+    """Return a point [m] as text: ``600, 0, 950 mm``."""
     return ", ".join(f"{1e3 * x:.0f}" for x in point) + " mm"
 
 

@@ -78,7 +78,7 @@ class Form:
 
     @ui.refreshable_method
     def verdict(self) -> None:
-        """Say whether the recipe can run, and everything that is wrong with it."""
+        """Show whether the recipe can run, and everything that is wrong with it."""
         _, mistakes = self._project.check()
         count = f"{len(mistakes)} thing{'s' * (len(mistakes) > 1)} to mend in the recipe."
         self._bar.say(count if mistakes else "The recipe is valid.")

@@ -55,7 +55,7 @@ class PosePlanner:
         self._settle()
 
     def _settle(self) -> None:
-        """Say how things stand, and show the button that leads on from there."""
+        """Show the state of the poses, and the button of the next step."""
         checked = self._project.planned == self._project.text
         if not self._recipe.plans:
             self._bar.say("The recipe plans no poses: there is nothing to check.")

@@ -132,7 +132,7 @@ class RunProcess:
             self._fitted.set()
 
     def _judge(self) -> None:
-        """Say what the poses so far are worth, again and again, the newest first."""
+        """Judge the calibration by the poses so far, whenever there are new ones."""
         recipe, judged = None, 0
         while self.code is None or len(self.log.observations()) > judged:
             if not self._fitted.wait(0.2):

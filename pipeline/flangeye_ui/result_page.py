@@ -73,7 +73,7 @@ class TouchBox:
         return {key: [x.strip() for x in text.split(",")] for key, text in texts.items() if text}
 
     def _look(self) -> None:
-        """Say what is known by what was given so far."""
+        """Show what follows from the answers given so far."""
         given = self._given()
         examples = {key: example for key, (_, example) in ASKED.items()}
         # Those of them that ``flangeye touch`` takes: it reads the arm itself.

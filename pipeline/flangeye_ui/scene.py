@@ -361,7 +361,7 @@ class ScanView:
         self._scene = Scene3D(340, SCANNED)
 
     def say(self, text: str) -> None:
-        """Say something in place of a scan's verdict."""
+        """Show a text in place of a scan's verdict."""
         self._told.text = text
 
     def show(self, capture: str) -> None:

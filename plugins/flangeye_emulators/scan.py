@@ -27,7 +27,7 @@ def scan_simulated(look: Look | None, seed: Seed, params: SimulatedScanParams) -
             "simulates none; use acquire.simulated, or scan.file"
         )
     workpiece = load_workpiece(params.workpiece)
-    # Tells this use of the recipe's seed from others
+    # Gives this use of the recipe's seed a stream of its own
     rng = np.random.default_rng([7, seed])
     bodies = bench_with(workpiece, params.base_T_part, params.covered, rng)
     note = f"workpiece: {workpiece.title}, simulated, with {CLUTTER} things about it"

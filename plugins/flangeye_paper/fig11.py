@@ -59,7 +59,7 @@ def stored(archive: Path, robot: str) -> Runs:
     """Return the authors' 50 runs on one robot."""
     file = stored_file(archive, robot)
     shifts, turns = (read_npz(file, name, (None, None, 3)) for name in ("arr_1", "arr_2"))
-    first = 5  # the authors' loop tells its first error once five poses are there
+    first = 5  # the authors' loop gives its first error once five poses are there
     poses = list(range(first, first + shifts.shape[1]))
     return Runs(poses, np.concatenate([shifts, turns], axis=2))
 

@@ -173,7 +173,7 @@ class StoredParams(Params):
 def verify_stored_results(
     calibration: HandEye, archive: ArchivePath, params: StoredParams
 ) -> Verification:
-    """Say what the authors' ICP would have given for this calibration, by their 50 stored results.
+    """Predict what the authors' ICP would give for this calibration, from their 50 stored results.
 
     It measures and does not judge: every run passes.
 

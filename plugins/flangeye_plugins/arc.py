@@ -20,7 +20,7 @@ class ManualArcParams(ArcTimes, Params):
 
 
 class ManualArc(Device):
-    """Tells a person what to do, on standard error and by the terminal's bell.
+    """Asks a person to switch, on standard error and by the terminal's bell.
 
     Attributes:
         name: Shown in messages and reports.

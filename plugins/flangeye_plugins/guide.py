@@ -79,7 +79,7 @@ def guide_tool(recipe: Recipe, motion: MotionAllowed, ask: Callable[[str], None]
 def _guided(
     recipe: Recipe, motion: MotionAllowed, ask: Callable[[str], None], out: Path, body: bool
 ) -> str:
-    """Go through the procedure and write the file; return what was found, for people."""
+    """Go through the procedure and write the file; return what was found, as text."""
     params = _weld_params(recipe)
     finger: Finger = read_model(params.finger, Finger)
     driver: RobotDriver = recipe.context[RobotDriver]
@@ -154,7 +154,7 @@ class _Arm:
 
 
 def _summary_lines(found: Calibration, measured: bool) -> list[str]:
-    """Return what was found, for people."""
+    """Return what was found, as text."""
     noise = ", ".join(f"{x * 1e3:.4f}" for x in found.noise)
     rest = ", ".join(f"{x * 1e3:.3f}" for x in found.rest)
     lines = [f"rest       tag at ({rest}) mm in the camera", f"noise      {noise} mm of the tip"]

@@ -178,7 +178,7 @@ def refine_arm(
 
     The pose for the arm as its controller reports it stays; the pose for the arm so corrected is
     put beside it, if it is expected to help. The notes say which parameters the poses identify
-    and which not, and propose poses that would tell more. ``export.robot`` writes the corrected
+    and which not, and propose poses that would identify more. ``export.robot`` writes the corrected
     arm as a robot file.
 
     Raises:
@@ -244,7 +244,7 @@ def _listed(told: ArmParameters) -> list[str]:
 
 
 def _ways(told: ArmParameters) -> list[str]:
-    """Say that the joints may have been otherwise, where nobody recorded them."""
+    """Return a note that joint angles are ambiguous, where they were not recorded."""
     if told.ways == 1:
         return []
     ways = "any number of" if np.isinf(told.ways) else told.ways
@@ -266,7 +266,7 @@ def _proposed(session: Session, told: ArmParameters, count: int) -> list[str]:
     )
     them = "them" if told.ways == 1 else "them, and all joint angles,"
     return [
-        f"poses that would tell more, joints in deg: {listed}; with {them} "
+        f"poses that would identify more, joints in deg: {listed}; with {them} "
         f"{after.identified.sum()} of {after.sizes.size} parameters are identified singly, and "
         f"{_combinations(after)}"
     ]

@@ -62,7 +62,7 @@ _LOCAL = {
         ),
         1,
     ),
-    # A session counts its own starts (work.py), which tells the culprit from those that waited.
+    # A session counts its own starts (work.py), so it knows the culprit from those that waited.
     "distributed.scheduler.allowed-failures": 1_000_000,
     # A worker that paused for want of memory would never go on; one that is killed is replaced.
     "distributed.worker.memory.target": False,
@@ -319,7 +319,7 @@ def run_all(
 
     def submit() -> None:
         held = sum(len(chunk.sessions) for chunk in waiting.values())
-        # It is told of further ones when it knows of less than so much of that
+        # Submit further ones once the scheduler holds less than this share of the limit
         if not pace.asks(len(waiting), held, 0.7):
             return  # many at once cost the scheduler less than one after the other
         some: list[Chunk] = []
@@ -344,7 +344,7 @@ def run_all(
             yield told
         if not future.cancelled():
             submit()
-        future.release()  # so that each is forgotten once it was told
+        future.release()  # the scheduler forgets each result once it is read
 
 
 def _outcome(future: Future, job: Job, chunk: Chunk) -> ChunkTold | None:

@@ -42,7 +42,7 @@ _HEADINGS: Mapping[str, str] = {
 COLOURS = (
     "#3a7ebf", "#d9822b", "#3f9b57", "#b8485f", "#7d62b5", "#8a6d3b", "#c06fa8", "#5b6474",
 )  # fmt: skip
-"""Told apart on white and on black; a second thing that varies has at most so many values."""
+"""Distinct on white and on black; a second varied parameter has at most this many values."""
 
 
 @dataclass(frozen=True)

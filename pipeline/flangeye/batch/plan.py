@@ -99,8 +99,7 @@ def _paths(value: Any) -> Iterator[Path]:
 def _state(file: Path) -> str:
     try:
         stat = file.stat()
-        # Files up to so many bytes are told apart by content, larger ones by size and time of
-        # change
+        # Small files [bytes] are compared by content, larger ones by size and time of change
         if stat.st_size <= 65_536:
             return hashlib.sha256(file.read_bytes()).hexdigest()
         return f"{stat.st_size} {stat.st_mtime_ns}"

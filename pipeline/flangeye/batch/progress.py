@@ -223,7 +223,7 @@ class BatchProgress:
         self._progress.stop()
 
     def note(self, line: str) -> None:
-        """Say a line above the bar."""
+        """Print a line above the bar."""
         self._console.print(printable(line), markup=False, highlight=False, soft_wrap=True)
 
     def ended(self, told: ChunkTold) -> None:

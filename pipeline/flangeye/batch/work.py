@@ -64,7 +64,7 @@ class Job:
         report: Make each session's report.
         software: What the batch was planned with.
         columns: Columns of the rows.
-        start: Tells the parts of this start from those of others.
+        start: Random name of this start, so that its parts of the table differ from others'.
     """
 
     out: str
@@ -125,7 +125,7 @@ def write_rows(job: Job, chunk: Chunk, outcomes: Sequence[SessionOutcome]) -> Ch
     part = f"{job.start}-{chunk.sessions[0].number}"
     Dataset(job.place, job.columns).write_part(chunk.block, part, rows)
     bad = [(session.id, o) for session, o in pairs if o.status not in ACCEPTED]
-    # Sessions of a chunk without a calibration that are told at once; the rows have all
+    # The console names this many failed sessions of a chunk at once; the rows have all
     return ChunkTold(Counter(o.status for o in outcomes), bad[:11], 0.0)
 
 
@@ -175,7 +175,7 @@ def run_session(job: Job, session: BatchSession, recipes: Recipes) -> SessionOut
     begun = time.perf_counter()
     try:
         known = finished_outcome(job.place, session.id, session.key, job.report)
-        if known:  # by a worker that was lost before it could tell, or at an earlier start
+        if known:  # by a worker that was lost before it reported, or at an earlier start
             return known
         outcome = _started(job, session, recipes)
     except FlangeyeError as error:

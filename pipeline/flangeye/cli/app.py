@@ -124,7 +124,7 @@ def ask(question: str, instead: str, default: str | None = None) -> str:
     """Ask at the terminal and return the answer; ``default`` for an empty line.
 
     Raises:
-        FlangeyeError: There is nobody to answer; says what to give ``instead``.
+        FlangeyeError: There is nobody to answer; the message says what to give ``instead``.
     """
     shown = bool(default)  # an empty default is only what Enter says
     try:

@@ -287,7 +287,7 @@ def _record(
 
 
 def _say_how_to_go_on(recipe: Recipe, called: str, folder: RunFolder, start: Start) -> None:
-    """Say where the captures of a run that failed are, and the commands that use them."""
+    """Print where the captures of a failed run are, and the commands that use them."""
     from flangeye.files.elsewhere import with_urls
     from flangeye.run.restart import restart_hint, resumable
 
@@ -306,7 +306,7 @@ def _say_how_to_go_on(recipe: Recipe, called: str, folder: RunFolder, start: Sta
 def _name_mistake(
     recipe: Recipe, called: str, registry: Registry, folder: RunFolder, start: Start
 ) -> None:
-    """Say what is wrong with recordings that a step could not use, or what would look for it."""
+    """Print what is wrong with unusable recordings, or the command that looks for it."""
     from rich.console import Console
 
     from flangeye.cli.summary import print_refusal

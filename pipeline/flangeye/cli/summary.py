@@ -173,7 +173,7 @@ class RunProgress:
 
     @hookimpl
     def flangeye_capture_rejected(self, rejection: Rejection) -> None:
-        """Say which capture was rejected, and why; of those that share a reason, the first."""
+        """Print which capture was rejected, and why; of those that share a reason, the first."""
         alike = self._rejected.setdefault(rejection.kind, [])
         if not alike:
             write(self._console, wrapped(self._console, f"rejected {rejection.id}: {rejection}"))

@@ -69,7 +69,7 @@ def examine_cell(
         tables: Parameters of ``reader.cell``, where it read them.
 
     Raises:
-        StageError: There are too few sightings to tell anything.
+        StageError: There are too few sightings to judge.
     """
     session = _session(observations)
     require_enough(session)

@@ -172,7 +172,7 @@ class RecordedSession:
         Args:
             change: Gives an arm's poses (N, 4, 4) as they should be.
             arms: Whose.
-            correction: What the reader is told.
+            correction: Options to add to the reader, which make the same change.
         """
         poses = self.poses if arms == "second" else change(self.poses)
         given = self.seconds
@@ -339,7 +339,7 @@ def examine(
         checked: Called after each check; each correction is followed by another round of all.
 
     Raises:
-        StageError: There are too few samples to tell anything.
+        StageError: There are too few samples to judge.
     """
     bound = [check.bind() for check in checks]
     found, current = [r for r in session.remarks if not r.note], session

@@ -55,7 +55,7 @@ def bundled_file(
     """Return a validator for a parameter that names a bundled file of ``data/FOLDER`` or one's own.
 
     Args:
-        kind: What it is, for people: ``workpiece``.
+        kind: Kind of file, as messages name it: ``workpiece``.
         folder: Where those that come with the project are: ``workpieces``.
         own: How the names of one's own files end; ``.yml`` is taken too.
     """
@@ -138,7 +138,7 @@ def require_named(kind: Kind, name: str, asker: str) -> Path:
     """Return the file that this machine's user gave a name.
 
     Raises:
-        DeviceError: There is none; says where to name it, and what there is.
+        DeviceError: There is none; the message says where to name it, and what there is.
     """
     path = find_named(kind, name)
     if path is None:
@@ -216,7 +216,7 @@ class _Here:
     @contextmanager
     def draft(self, name: str) -> Iterator[Path]:
         path = self._root / name
-        # No fsync: a file that a power cut tears is told from a whole one, and made again.
+        # No fsync: a file that a power cut tears is recognised as torn, and made again.
         draft = path.with_name(f".{path.name}.{os.getpid()}")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)

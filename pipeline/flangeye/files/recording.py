@@ -39,7 +39,7 @@ class Reader(Protocol):
 
 
 class NotThisLayout(StageError):
-    """The path does not have the layout of this reader; says what was expected."""
+    """The path does not have the layout of this reader; the message says what was expected."""
 
 
 @dataclass(frozen=True, eq=False)

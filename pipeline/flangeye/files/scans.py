@@ -103,7 +103,7 @@ def _differing(
     theirs: tuple[Sequence[str], Sequence[str]],
     what: str,
 ) -> str:
-    """Say how names differ: each side's, and those of it without a partner."""
+    """Return how names differ: each side's, and those of it without a partner."""
     (poses, lone), (others, other_lone) = ours, theirs
     count = f"{len(poses)} poses ({poses[0]}, …) and {len(others)} {what} ({others[0]}, …)"
     if not lone and not other_lone:

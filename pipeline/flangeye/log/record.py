@@ -29,7 +29,7 @@ topic                         schema                      content
 A ``flangeye.Scan`` is the scan's points, three little-endian float32 each, as
 :mod:`flangeye.log.records` packs them; ``shape`` of its ``flangeye.Capture`` has rows and columns.
 JSON messages of steps are ``{"capture": id or null, "seconds": s, "value": …, "shapes": …}``; the
-shapes are those of the clouds' arrays, whose messages do not tell rows and columns. Attachments:
+shapes are those of the clouds' arrays, whose messages have no rows and columns. Attachments:
 ``recipe.yaml``, ``recipe.resolved.yaml`` and, when the run ended, ``result.json``. Every message
 is a chunk of its own and is handed to the operating system at once: a killed run loses nothing
 that was finished.
@@ -205,7 +205,7 @@ class Recorder:
 
     def ended(self, reason: str) -> None:
         """Log that the run ended early, and why; a viewer that follows it stops waiting."""
-        with suppress(LogWriteError):  # a full disk has been told already
+        with suppress(LogWriteError):  # a full disk has been reported already
             if not self._file.closed:
                 self._log(reason, "ERROR")
                 self._json("/ended", "Ended", {"reason": reason})

@@ -99,7 +99,7 @@ class LogFile:
     """One pass through a log.
 
     Attributes:
-        damaged: Is told of every damaged part, in one sentence.
+        damaged: Called with one sentence about each damaged part.
         library: What wrote the log.
         attachments: Name -> bytes, of those that are sound.
         ended: Whether the log has its end.

@@ -68,7 +68,7 @@ class SeenBoard(NamedTuple):
     Attributes:
         kind: Which kind of board.
         params: What the image shows of its parameters: columns, rows, dictionary, id.
-        what: The same for people.
+        what: The same as text.
     """
 
     kind: Kind

@@ -38,7 +38,7 @@ class Running(NamedTuple):
 
     Attributes:
         name: With its namespace.
-        line: What it is, for people: its type, how often it comes, by whom.
+        line: Line of text about it: its type, its rate, its publisher.
         answers: The option of ``flangeye init`` that may name it; empty where none does.
     """
 
@@ -60,7 +60,7 @@ class RunningCell:
             came; None for one of clouds or depths.
         files: Texts of the files that the sections name, by name.
         steps: Steps to add at the recipe's end.
-        seen: What runs, a line each for people.
+        seen: Lines of text about what runs.
     """
 
     robot: Mapping[str, Any]
@@ -101,7 +101,7 @@ class Graph(Device, Protocol):
             name: What to call the files.
 
         Raises:
-            FlangeyeError: There is no arm or no camera; says what there is.
+            FlangeyeError: There is no arm or no camera; the message says what there is.
         """
 
     def publish(self, pose: CalibratedPose, frames: Mapping[str, str]) -> list[str]:
@@ -157,7 +157,7 @@ class Emulator:
     Attributes:
         name: Shown in messages and reports.
         maker: Whose arms it controls, as ``data/robots/*.yaml`` spells it.
-        serve: Runs it until the process is told to end.
+        serve: Runs it until the process receives a signal to end.
     """
 
     name: str

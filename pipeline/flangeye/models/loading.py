@@ -81,7 +81,7 @@ def robot_of_joints(
     """Return an arm of joints as text, ``d: 89.159 mm, alpha: 90 deg``, base to flange.
 
     Raises:
-        RecipeError: A joint is not of that form; says which.
+        RecipeError: A joint is not of that form; the message says which.
     """
     from pydantic import ValidationError
 

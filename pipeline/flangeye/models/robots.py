@@ -148,7 +148,7 @@ class RobotModel(Model):
 
     @property
     def notes(self) -> tuple[Note, ...]:
-        """Notes for people on how the arm was derived from its file."""
+        """Notes on how the arm was derived from its file."""
         return self._notes
 
     def from_urdf(self, bodies: Bodies, notes: tuple[Note, ...]) -> RobotModel:
@@ -181,7 +181,7 @@ class RobotModel(Model):
         """Return the capsules that bound the arm, without which no move is planned.
 
         Raises:
-            StageError: They are not known; says why, and what to write.
+            StageError: They are not known; the message says why, and what to write.
         """
         filled = self.filled()
         if filled.volumes_missing:

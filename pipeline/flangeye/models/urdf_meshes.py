@@ -32,7 +32,7 @@ def capsule_of(body: ET.Element, urdf: Path, packages: Mapping[str, Path]) -> Ca
         packages: Where packages are, by name.
 
     Raises:
-        MissingMesh: The mesh is not there; says where it was looked for.
+        MissingMesh: The mesh is not there; the message says where it was looked for.
         RecipeError: It cannot be read.
     """
     if body.tag == "sphere":

@@ -165,7 +165,7 @@ def watched(
             to the person, in a thread of this one.
         model: The arm's model.
         limits: What the arm must keep to.
-        told: Is told the arm's state now and then while it is under way.
+        told: Called with the arm's state several times during the motion.
 
     Raises:
         DeviceError: The arm cannot be opened, or must not be moved.

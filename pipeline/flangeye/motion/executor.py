@@ -32,7 +32,7 @@ class Executor:
 
     Attributes:
         robot: The arm.
-        told: Is told each of its states.
+        told: Called with each state of the arm.
         limits: What it must keep to.
     """
 

@@ -35,7 +35,7 @@ class MotionLimits:
     upper: Floats
 
     def outside(self, place: Floats, slack: float = 0.0) -> str | None:
-        """Say where a place (3,) in ``base`` leaves the box by more than ``slack`` [m]."""
+        """Return how a place (3,) in ``base`` is outside the box by more than ``slack`` [m]."""
         box = (place.tolist(), self.low.tolist(), self.high.tolist())  # floats: 500 times a second
         for axis, value, low, high in zip("xyz", *box, strict=True):
             if not low - slack <= value <= high + slack:
@@ -46,7 +46,7 @@ class MotionLimits:
         return None
 
     def beyond(self, joints: Floats, margin: float = 0.0) -> str | None:
-        """Say which of (n,) joint angles is nearer than ``margin`` [rad] to its limit."""
+        """Return which of (n,) joint angles is nearer than ``margin`` [rad] to its limit."""
         room = np.minimum(joints - self.lower, self.upper - joints)
         joint = int(np.argmin(room))
         if room[joint] >= margin:

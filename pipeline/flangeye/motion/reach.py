@@ -239,7 +239,7 @@ class Reach:
         return self._seen(joints)[1] >= 0.6
 
     def _why_not(self, reachable: Floats) -> str:
-        """Say why none of (K, n) postures is allowed."""
+        """Return why none of (K, n) postures is allowed."""
         clear = next((joints for joints in reachable if self._clear(joints)), None)
         if clear is not None:
             return self._too_near(clear) or "with too little of the body in view"
@@ -254,7 +254,7 @@ class Reach:
         return np.where(allowed, nearer, joints)
 
     def _too_near(self, joints: Floats) -> str | None:
-        """Say what a posture comes too near to."""
+        """Return what a posture comes too near to; None if nothing."""
         if self._margins is None:
             return None
         limits, room, singularity = self._margins
@@ -315,7 +315,7 @@ class Site:
             None where the arm cannot show it.
         joints: Gives the joint angles for a flange pose (4, 4), or None where the arm cannot or
             must not go.
-        lost: Gives the places, in order of their visit, of the poses that told nothing.
+        lost: Gives the indices, in order of their visit, of the poses that were of no use.
         shown: Gives the axis (3,) of the flange that faces the scanner where the target does.
     """
 
@@ -330,7 +330,7 @@ class Site:
 class PlannedPose(NamedTuple):
     """Where to send the flange: (4, 4) ``base_T_flange``, and (n,) joint angles that do it.
 
-    ``why`` tells people what it is expected to be good for, where the plan knows.
+    ``why`` is a text that says what the pose is good for, where the plan knows.
     """
 
     base_T_flange: Floats

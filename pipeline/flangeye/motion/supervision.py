@@ -19,7 +19,7 @@ STANDING = 1e-3
 
 
 class SafetyFault(Exception):
-    """A reason to stop; its text is for people."""
+    """A reason to stop, with its text."""
 
 
 class RememberedState(NamedTuple):

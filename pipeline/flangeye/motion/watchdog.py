@@ -86,7 +86,7 @@ class Report(NamedTuple):
     Attributes:
         what: ``opened``, ``state``, ``cycle`` (a state that was asked for), ``arrived``,
             ``samples``, ``stopped`` (by the operator) or ``fault``.
-        content: A state, samples, or text for people.
+        content: A state, samples, or a message's text.
     """
 
     what: str
@@ -242,7 +242,7 @@ class Watchdog:
             self._wire.send(Report("fault", reason))
 
     def _operator(self) -> str | None:
-        """Say who asked for a stop; take in the program's signs of life."""
+        """Return who asked for a stop, None if nobody; take in the program's signs of life."""
         watched = [fd for fd in (self._charge.alarm, self._charge.keyboard) if fd is not None]
         ready = select.select(watched, [], [], 0)[0] if watched else []
         said = {fd: os.read(fd, 64) for fd in ready}

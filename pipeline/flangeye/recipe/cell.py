@@ -34,7 +34,7 @@ def cell_of(header: Header, model: Callable[[str], RobotModel], complain: Compla
     Args:
         header: The sections.
         model: Reads an arm's model by its name.
-        complain: Told each mistake: where, and what.
+        complain: Called with each mistake: where it is, and what.
     """
     section = header.cell
     if section is None:
@@ -108,7 +108,7 @@ def _standing(section: CellSection) -> Iterator[Mistake]:
 def _beyond_links(
     section: CellSection, movers: Mapping[str, RobotModel | Axis]
 ) -> Iterator[Mistake]:
-    """Tell of links that arms do not have."""
+    """Complain of links that the arms do not have."""
     for group, name, each, link in _on_links(section):
         arm = movers[each.on]
         most = 0 if isinstance(arm, Axis) else len(arm.joints)
@@ -121,7 +121,7 @@ def _beyond_links(
 
 
 def _at_one_place(section: CellSection) -> Iterator[Mistake]:
-    """Tell of what stands where another one does: one of the two places is not known."""
+    """Complain of two things that stand at one place: one of the two is not known."""
     seen: dict[str, str] = {}
     for name, each in _movers(section):
         if each.place != "known":

@@ -53,7 +53,7 @@ def context_of(header: Header, folder: Path, complain: Complain) -> Context:
     Args:
         header: The sections.
         folder: Folder of the recipe; files it names are beside it.
-        complain: Told each mistake: where, and what.
+        complain: Called with each mistake: where it is, and what.
     """
     context: Context = {t.Seed: header.seed}
     offer = partial(_offer, context, complain)

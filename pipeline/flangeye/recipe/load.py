@@ -86,7 +86,7 @@ class Recipe:
 
     @property
     def notes(self) -> tuple[t.Note, ...]:
-        """Notes for people on how its own files were read."""
+        """Notes on how its own files were read."""
         robot = self.context.get(RobotModel)
         return robot.notes if robot else ()
 

@@ -25,7 +25,7 @@ def recipe_schema(registry: Registry) -> dict[str, Any]:
 
 
 def header_line(path: Path | None) -> str:
-    """Return the comment that tells YAML editors the schema's path."""
+    """Return the comment in which YAML editors find the schema's path."""
     return f"# yaml-language-server: $schema={path or 'recipe.schema.json'}"
 
 

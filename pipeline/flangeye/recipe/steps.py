@@ -25,7 +25,7 @@ class Offer(NamedTuple):
     """Where in a recipe's header something comes from.
 
     Attributes:
-        what: What it is, for people.
+        what: Noun for it, as messages use it.
         sections: The sections that can give it.
         example: How to write it.
     """
@@ -119,7 +119,7 @@ class StepOrder:
         """Start before the first step.
 
         Args:
-            complain: Told each mistake: where, and what.
+            complain: Called with each mistake: where it is, and what.
             given: What stages may ask for from the start, by type.
         """
         self._cell = Cell in given

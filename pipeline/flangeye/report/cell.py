@@ -46,7 +46,7 @@ def cell_drawing(facts: Facts) -> PlotlyFigure | None:
 
     In the base where the camera stands there. Where an arm's flange carries the camera also in
     the base, each capture from where the camera was: what stands still must then lie in one place.
-    On a link, whose place the log does not tell, in the link's frame.
+    On a link, whose place is not in the log, in the link's frame.
     """
     found = facts.estimate
     carrier = found[0].partition("_T_")[0] if found else t.BASE

@@ -179,7 +179,7 @@ class TransformText:
 
 
 def transform_text(name: str, estimate: r.TransformResult) -> TransformText:
-    """Return an estimated transform for people."""
+    """Return an estimated transform as text."""
     parent, _, child = name.partition("_T_")
     matrix = np.array(estimate.matrix)
     unknown = "not measured"

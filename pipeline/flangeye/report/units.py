@@ -13,7 +13,7 @@ def millimetres(metres: float) -> str:
 
 
 def rounded_mm(metres: float) -> str:
-    """Return a length [m] in mm without its unit, rounded for people: 0.16."""
+    """Return a length [m] as rounded text in mm, without the unit: 0.16."""
     value = metres * 1e3
     decimals = 1 if abs(value) >= 10 else 2 if abs(value) >= 0.1 else 3
     return f"{value:.{decimals}f}"

@@ -197,7 +197,7 @@ def _label(start: float, end: float, phase: str) -> dict[str, Any]:
 
 
 def _loop(weld: WeldReport) -> list[tuple[str, str]]:
-    """Return the loop's figures for people."""
+    """Return the loop's figures as text."""
     loop = weld.loop
     rows = [
         ("cycles", f"{loop.get('cycles', 0):.0f}"),

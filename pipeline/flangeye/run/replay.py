@@ -17,7 +17,7 @@ class ReplayedStep:
     """How decisions made again compare with those in the log.
 
     Attributes:
-        what: What was decided, for people.
+        what: Text of what was decided.
         same: Whether they are the same.
         figures: How far they differ, by name with its unit.
     """

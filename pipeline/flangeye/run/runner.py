@@ -456,7 +456,7 @@ class Runner:
         self._hooks.flangeye_noted(step=step, name=name, value=value)
 
     def _finished(self, step: Step, capture: str | None, value: Any, seconds: float = 0.0) -> None:
-        """Tell what a step gave; what is there already took no time."""
+        """Pass a step's result on to the hooks; a result that was there already took no time."""
         self._hooks.flangeye_stage_finished(
             step=step.label, capture=capture, value=value, seconds=seconds
         )

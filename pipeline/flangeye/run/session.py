@@ -46,7 +46,7 @@ def record_run(
 ) -> Result:
     """Run a recipe with a log; delete the folder if nothing was recorded.
 
-    Plugins registered with ``registry`` are told what happens, as ever.
+    The hooks of the plugins registered with ``registry`` are called as in any run.
 
     Args:
         recipe: The checked recipe.

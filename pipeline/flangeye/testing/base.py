@@ -143,7 +143,7 @@ class Conformance:
         )
 
     def test_it_declares_what_it_is(self) -> None:
-        """Its kind, a line for people, and parameters that explain themselves."""
+        """Its kind, a line of help, and parameters that explain themselves."""
         plugin = self.plugin
         kinds = {**KINDS, **PARTS}
         require(plugin.kind in kinds, f"'{plugin.kind}' is not a kind; kinds: {', '.join(kinds)}")
@@ -198,9 +198,7 @@ def require_one_line(error: Exception) -> None:
     """Raise AssertionError unless a refusal is one line that a person can act on."""
     text = str(error)
     require(text and "\n" not in text, f"an error is one line, not {text!r}")
-    require(
-        not text.startswith(("Traceback", "<")), f"an error is a sentence for people, not {text!r}"
-    )
+    require(not text.startswith(("Traceback", "<")), f"an error is a sentence, not {text!r}")
 
 
 def require_refusal(call: Callable[[], Any], rejected: type, what: str) -> None:

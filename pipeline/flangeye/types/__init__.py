@@ -281,10 +281,10 @@ class Seam:
             together [m^2]. Neighbours share most of it.
         half_angle: Between a wall and the opening [rad], or None where it is not known.
         half_width: From the root's plane to a shoulder [m], or None where it is not known.
-        source: What it was planned from, for people.
+        source: What it was planned from, as text.
         figures: How well that went, in SI units, by name.
         notes: What is to be done, and what is for the record.
-        cloud: The part of the scan around it, in ``base``, for people.
+        cloud: The part of the scan around it, in ``base``, for pictures only.
     """
 
     points_in_base: Array
@@ -375,7 +375,7 @@ class WeldReport:
     def __post_init__(self) -> None:
         k = len(self.phases)
         for name in ("refined", "tip", "torch", "robot", "true_torch"):
-            if not len(getattr(self, name)):  # JSON does not tell (0, 3) from (0,)
+            if not len(getattr(self, name)):  # JSON writes (0, 3) as (0,)
                 object.__setattr__(self, name, np.zeros((0, 3)))
         n = len(self.planned)
         freeze(self, planned=(n, 3), refined=(len(self.refined), 3), openings=(n, 3))

@@ -65,7 +65,7 @@ class PoseFeature:
         camera_T_target: Its pose; the target's z points towards the scanner.
         covariance: (6, 6), order (rotation [rad], translation [m]), left perturbation in
             ``camera``, the translation taken at the target's origin.
-        figures: What the fit has to tell of its quality, by name, in SI units and pixels.
+        figures: Measures of the fit's quality, by name, in SI units and pixels.
         corners: (N, 4) the target's corners in the image, right and down, and what has to be
             added to come to where the pose has them [px]; none where it was found otherwise.
         shared: (6, k) what one standard deviation of each of k errors that all captures of a
@@ -79,7 +79,7 @@ class PoseFeature:
     shared: Array = field(default_factory=lambda: np.zeros((6, 0)))
 
     def __post_init__(self) -> None:
-        corners = np.reshape(self.corners, (-1, 4))  # JSON does not tell (0, 4) from (0,)
+        corners = np.reshape(self.corners, (-1, 4))  # JSON writes (0, 4) as (0,)
         object.__setattr__(self, "corners", corners)
         shared = np.reshape(self.shared, (6, -1))
         object.__setattr__(self, "shared", shared)
@@ -158,7 +158,8 @@ class Observation(Placed):
         camera: Frame of the camera that saw it; a cell has several.
         target: Frame of what it saw.
         motion: How the flange passed it, where that was recorded and it moved.
-        arm_joints: (n,) joint angles of each arm of a cell that told them [rad], by its frame.
+        arm_joints: (n,) joint angles of each arm of a cell whose joints are known [rad], by its
+            frame.
     """
 
     id: str

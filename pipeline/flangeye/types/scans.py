@@ -40,7 +40,7 @@ class Image:
         view = pixels.view()
         view.setflags(write=False)
         object.__setattr__(self, "pixels", view)
-        known = np.size(self.camera_covariance) == 0  # JSON does not tell (0, 0) from (0,)
+        known = np.size(self.camera_covariance) == 0  # JSON writes (0, 0) as (0,)
         object.__setattr__(self, "camera_covariance", np.reshape(
             self.camera_covariance, (0, 0) if known else (8, 8)))  # fmt: skip
         freeze(self, camera_matrix=(3, 3), distortion=np.shape(self.distortion),
@@ -62,7 +62,8 @@ class Capture(Placed):
         camera: Frame of the scanner that took it; a cell has several.
         target: Frame of what it looked at.
         motion: How the flange passed, where that was recorded and it moved.
-        arm_joints: (n,) joint angles of each arm of a cell that told them [rad], by its frame.
+        arm_joints: (n,) joint angles of each arm of a cell whose joints are known [rad], by its
+            frame.
     """
 
     id: str
@@ -100,7 +101,7 @@ class FlangeCloud:
     others: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
 
     def __post_init__(self) -> None:
-        others = np.reshape(self.others, (-1, 4, 4))  # JSON does not tell (0, 4, 4) from (0,)
+        others = np.reshape(self.others, (-1, 4, 4))  # JSON writes (0, 4, 4) as (0,)
         object.__setattr__(self, "others", others)
         freeze(self, centre=(3,), normal=(3,), others=others.shape)
         if self.camera_T_target is not None:
@@ -138,7 +139,7 @@ class WorkpieceScan:
     Attributes:
         cloud: In ``camera``; of several places the clouds one after the other, each in ``camera``
             as it stood there.
-        source: Where it comes from, for people.
+        source: Where it comes from, as text.
         notes: What is to be done, and what is for the record.
         truth: Simulation only: the true seams by name, (N, 3) in ``base`` [m]. The runner keeps it
             from the stages that plan and weld.

@@ -79,7 +79,7 @@ class Captures(Stream[Capture | Rejection]):
         return None
 
     def close(self) -> None:
-        """Tell the source that nothing more is wanted: a generator's ``finally`` runs now."""
+        """Close the source: a generator's ``finally`` runs now."""
         if isinstance(self._items, Generator):
             self._items.close()
 

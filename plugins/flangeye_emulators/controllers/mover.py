@@ -71,7 +71,7 @@ class Mover:
             self._motion, self._cycles_left = stop(velocity, deceleration, in_space), math.inf
 
     def drive(self) -> None:
-        """Say what moves the arm in the cycle that comes."""
+        """Choose what moves the arm in the coming cycle."""
         if self._motion is not None and self._motion.done:
             self._motion = None
         if isinstance(self._motion, Speed):

@@ -294,7 +294,7 @@ def parse_fault(text: str, kinds: dict[str, Kind]) -> Fault:
     """Read ``NAME[=DURATION][@WHEN]``, such as ``freeze=3 s@moving``; WHEN is a duration too.
 
     Raises:
-        StageError: There is no such fault, or a duration is wrong; says what there is.
+        StageError: There is no such fault, or a duration is wrong; the message says what there is.
     """
     what, _, when = text.partition("@")
     name, _, amount = what.partition("=")

@@ -333,7 +333,7 @@ class FingerCamera:
         """Return the columns and rows in which the paper may be seen."""
         rim = np.array([[0, 0, 1], [size, 0, 1], [size, size, 1], [0, size, 1]]) - [0.5, 0.5, 0.0]
         ends = rim @ sheet.T
-        if (ends[:, 2] <= 0).any():  # partly behind the camera: no telling from its corners
+        if (ends[:, 2] <= 0).any():  # partly behind the camera: its corners cannot be projected
             return slice(0, self._lens.width), slice(0, self._lens.height)
         across = ends[:, :2] / ends[:, 2:]
         low = np.clip(np.floor(across.min(axis=0)) - 1, 0, None).astype(int)

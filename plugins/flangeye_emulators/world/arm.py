@@ -59,7 +59,7 @@ class ImperfectArm:
     """An arm with joint zeros, lengths, encoders and elasticity of its own; a rail is perfect.
 
     The first joint's zero is right by definition: it is what fixes the base's x axis, and an error
-    of it could not be told from a turn of the base.
+    of it could not be distinguished from a turn of the base.
     """
 
     def __init__(

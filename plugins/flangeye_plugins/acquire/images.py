@@ -142,7 +142,7 @@ def lens_of(images: Mapping[str, Grey], board: Board, start: Image | None = None
         start: A camera to begin with, refined; None for one that is not known at all.
 
     Raises:
-        StageError: Too few show the board, or they are too alike to tell the camera.
+        StageError: Too few show the board, or they are too alike to estimate the intrinsics.
     """
     sizes = {pixels.shape[::-1] for pixels in images.values()}
     if len(sizes) > 1:

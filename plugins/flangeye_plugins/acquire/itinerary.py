@@ -109,7 +109,7 @@ class Itinerary:
         return self._router.route(start, stop.pose.joints)
 
     def why_not(self) -> str:
-        """Say why poses were impossible, and how often."""
+        """Return why poses were impossible, and how often."""
         return self._reach.why_refused() or "none was tried"
 
     def shown(self, start: Floats | None) -> tuple[str, dict[str, Any]]:
@@ -203,7 +203,7 @@ def _by_circles(seen: Sequence[Observation]) -> tuple[Floats, float] | None:
 
 def _by_poses(seen: Sequence[Observation]) -> tuple[Floats, float] | None:
     """Return base_T_camera, and how far a target is from where it should be [m]; by Shah, 2013."""
-    fewest = 5  # of which two tell the turns, if they are about two axes
+    fewest = 5  # two of them determine the rotations, if they turn about two axes
     if len(seen) < fewest:
         return None
     flanges = np.array([o.base_T_flange.matrix for o in seen])
@@ -273,7 +273,7 @@ class PlanRow:
     why_not: str | None = None
 
     def line(self) -> str:
-        """Return it for people."""
+        """Return the stop as a line of a table."""
         place = " ".join(f"{1e3 * x:7.1f}" for x in self.place)
         if self.id is None or self.tilt is None:
             return f"{'-':4}  {self.role:12}  {place}           {self.why_not}"
@@ -313,7 +313,7 @@ def seconds_of(rows: Iterable[PlanRow]) -> float:
 def as_plan(
     head: str, rows: Sequence[PlanRow], without: Sequence[PlanRow]
 ) -> tuple[str, dict[str, Any]]:
-    """Return a plan for people, below its first line, and for programs."""
+    """Return a plan as lines of text, below its first line, and as data for programs."""
     listed = 12  # of the places left out
     more = len(without) - listed
     lines = [

@@ -115,7 +115,7 @@ def source_of(
 
     Args:
         archive: The archive; its notes come first.
-        told: What else to tell.
+        told: Further lines for the person.
         digests: Digests of all files that are used; of the archive's own if not given.
     """
     notes = (with_urls(f"archive: {archive.layout}, {archive.root}"), *archive.notes, *told)

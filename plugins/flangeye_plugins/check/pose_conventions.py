@@ -108,7 +108,7 @@ def _said(session: RecordedSession, of: str | None = None) -> Convention | None:
 
 
 def _params(session: RecordedSession, of: str | None = None) -> Mapping[str, Any]:
-    """Return what the recipe tells the reader, or tells it of the target."""
+    """Return the reader's options in the recipe, for the arm or for the target."""
     if isinstance(session.reader, str):
         return {}
     ((_, params),) = session.reader.items()

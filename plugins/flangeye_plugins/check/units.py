@@ -120,7 +120,7 @@ def _finding(session: RecordedSession, found: OtherUnit, evidence: Significance)
 
 
 def _of_targets_unit(session: RecordedSession, found: OtherUnit, evidence: Significance) -> Finding:
-    """Say that the target's lengths are wrong; the arm's in the inverse unit fit as well."""
+    """Return that the target's lengths are wrong; the arm's in the inverse unit fit as well."""
     said, meant = found.said, found.meant
     if found.arms is not None:
         said, meant = meant, said

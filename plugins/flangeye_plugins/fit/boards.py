@@ -173,7 +173,7 @@ def fit_circles(capture: Capture, params: CirclesParams) -> PoseFeature | Reject
 def fit_aruco(capture: Capture, params: MarkerParams) -> PoseFeature | Rejected:
     """Find one ArUco or AprilTag marker.
 
-    Four corners tell little: a board with many gives a pose several times better. Seen nearly
+    A board with many corners gives a pose several times better than these four. Seen nearly
     frontally a marker has two poses that fit alike, and is set aside unless depth decides.
     """
     return fit_board(capture, params.board, params)
@@ -258,7 +258,7 @@ def _better(
 
 
 def _ambiguity(poses: list[PlanarPose]) -> Rejected | None:
-    """Say so when another pose explains the corners nearly as well."""
+    """Reject corners that another pose explains nearly as well."""
     if len(poses) < 2:
         return None
     best, other = poses

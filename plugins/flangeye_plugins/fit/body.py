@@ -75,7 +75,7 @@ def fit_body(
     if len(cloud.others):
         return Rejected(
             f"{1 + len(cloud.others)} poses of {body.name} explain the scan, and of a single one "
-            "nothing tells which is right; FlangeCloud.alone gives each of them"
+            "nothing shows which is right; FlangeCloud.alone gives each of them"
         )
     body = body.at(capture.joints if capture else None)
     fit = fitted(cloud.cloud.xyz, prepared(body), cloud.camera_T_target)

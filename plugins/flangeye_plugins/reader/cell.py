@@ -123,7 +123,7 @@ class Moved:
         values: (N, 4, 4) poses, or (N,) values of an axis [m or rad].
         keys: Number of each row's pose, by its position in the table; None where it has a time.
         times: (N,) [s], or None.
-        joints: (N, n) of an arm that told them [rad], or None.
+        joints: (N, n) of an arm whose joints were recorded [rad], or None.
     """
 
     name: str

@@ -131,7 +131,7 @@ class JointsParams(Params):
     joints: tuple[Column, ...] = Field(
         (),
         description="Columns of the joint angles, from the base, where they were recorded: what is "
-        "wrong with an arm is told by them, and a link's place needs them.",
+        "wrong with an arm is estimated from them, and a link's place needs them.",
     )
     joint_unit: Literal["rad", "deg"] = Field(
         "rad", description="Unit of the joint angles; with rad, joints that slide are in m."

@@ -79,7 +79,7 @@ class Bag:
         path: The bag.
         files: Its files.
         topics: Topic -> type, of those with messages.
-        frames: What tf tells.
+        frames: Transforms from tf.
         poses: Topic -> times and poses, of PoseStamped.
         joints: Topic -> times and, each, name -> angle.
         stamps: Topic -> times of clouds and images.
@@ -187,7 +187,7 @@ def _arm(
     """Return the flange's poses, how they were found, and the joints, if their order is known.
 
     Raises:
-        StageError: Nothing in the bag tells where the flange is, or several things do.
+        StageError: Nothing in the bag gives the flange's poses, or several things do.
     """
     joints = _joints(bag, params)
     if params.robot in bag.of_type(Type.JOINT_STATE):
@@ -236,7 +236,7 @@ def _names(bag: Bag, topic: str) -> str:
 
 
 def _ways(bag: Bag) -> str:
-    """Say what to write so that the flange's poses are found in what the bag holds."""
+    """Return what to write so that the flange's poses are found in the bag."""
     ways = {
         "base: …, flange: …": bag.frames.names and f"frames of tf: {', '.join(bag.frames.names)}",
         "robot: …": bag.poses and f"PoseStamped topics: {', '.join(bag.poses)}",
@@ -327,7 +327,7 @@ class Scans:
 
     def signals(self, arm: Stream) -> tuple[Signal, Signal] | None:
         """Difference of each value from the one before, if they are frequent enough to compare."""
-        # From so many measurements a second on, their own change tells when something moved
+        # From so many measurements a second on, their own change shows when something moved
         if len(self.times) < 20 or len(arm[0]) < 20 or np.median(np.diff(self.times)) > 1 / 3.0:
             return None
         looks = self._sound(self.first, range(len(self.times)), lambda _, message: _look(message))

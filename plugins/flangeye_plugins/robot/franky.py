@@ -43,7 +43,7 @@ MODES: dict[str, tuple[Mode, str]] = {
     "AutomaticErrorRecovery": ("not ready", "it recovers from an error"),
     "Other": ("not ready", "joints locked or FCI off: unlock and activate FCI in Desk"),
 }
-"""libfranka's RobotMode: what it means for motion, and for people."""
+"""libfranka's RobotMode: what it means for motion, and its text."""
 
 
 def require_answer(name: str, host: str, realtime: bool) -> None:

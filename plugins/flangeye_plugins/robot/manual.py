@@ -35,7 +35,7 @@ class OperatorConsole:
         self._ended = False
 
     def say(self, text: str) -> None:
-        """Say a line."""
+        """Show the person a line."""
         self._said.write(text + "\n")
         self._said.flush()
 
@@ -173,7 +173,7 @@ class ManualRobot(Device):
         time.sleep(self._period)
 
     def stop(self) -> None:
-        """Tell the person to stop moving the arm."""
+        """Ask the person to stop moving the arm."""
         if self._waiting:
             self._waiting, self._stopped = False, True
             self._desk.say("Stop: leave the arm where it is.")

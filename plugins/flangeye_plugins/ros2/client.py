@@ -50,7 +50,7 @@ class Bridge(Device):
     """A ROS 2 node in its own process.
 
     Attributes:
-        asker: Who is told of in errors: the driver.
+        asker: Name of the driver, for errors.
         middleware: The RMW implementation that the node uses.
     """
 
@@ -62,7 +62,7 @@ class Bridge(Device):
         """Start it.
 
         Args:
-            asker: Who is told of in errors.
+            asker: Name of the driver, for errors.
             sim_time: Whether stamps are those of the topic ``/clock``.
 
         Raises:
@@ -100,7 +100,7 @@ class Bridge(Device):
 
     @property
     def place(self) -> str:
-        """Which graph this is, for people."""
+        """Text that names this graph."""
         domain = os.environ.get("ROS_DOMAIN_ID", "0")
         return f"(ROS_DOMAIN_ID {domain}, RMW_IMPLEMENTATION {self.middleware})"
 

@@ -80,7 +80,7 @@ class Frames:
         """Return ``parent_T_child`` (4, 4) now.
 
         Raises:
-            DeviceError: Nothing joins the two, or a frame between them is not told of any more.
+            DeviceError: No chain of frames joins the two, or one in it is no longer published.
         """
         up, down = self._chain(child), self._chain(parent)
         shared = next((name for name in up if name in down), None)
@@ -112,8 +112,8 @@ class Frames:
     def _from(self, name: str, ancestor: str) -> Floats:
         """Return the pose of a frame in one of its ancestors."""
         pose = np.eye(4)
-        # A frame that moves and was not told of for so long is lost: robot_state_publisher
-        # publishes at 20 Hz unless it is told otherwise [s].
+        # A moving frame that was not published for so long is lost [s]: robot_state_publisher
+        # publishes at 20 Hz unless configured otherwise.
         stale = 0.25
         while name != ancestor:
             frame = self.frames[name]
@@ -199,7 +199,7 @@ class Ros2Graph(Device):
 
         Raises:
             DeviceError: No arm or no camera runs.
-            RecipeError: The URDF does not tell which link is the base.
+            RecipeError: The URDF is not of a known arm, or its links are ambiguous.
         """
         topics = self.topics()
         if not any(
@@ -371,7 +371,7 @@ class Heard(NamedTuple):
     def scans(self) -> str:
         """The parameter of ``scanner.ros2`` that takes it; empty where it has no scans.
 
-        Depths are told from images by their encoding, or by their topic's name where none came.
+        Depth images are recognised by their encoding, or by their topic's name where none came.
         """
         kind, name = self.topic.type, self.topic.name
         if kind not in SCANS or name.endswith("/compressedDepth"):
@@ -407,7 +407,7 @@ def described_arm(text: str, path: Path, ask: Ask) -> tuple[UrdfArm, dict[str, A
     """Return the arm of a URDF to be saved at ``path``, and the recipe's section for it.
 
     Raises:
-        RecipeError: It is none, or does not tell which link is the base.
+        RecipeError: It is no URDF, or its base link is ambiguous.
     """
     packages, urdf, flange = packages_of(text), parse_urdf(text, path), None
     links = flange_links(urdf)
@@ -438,7 +438,7 @@ def states_of(heard: Sequence[Heard], joints: Sequence[str]) -> tuple[str, Float
     Of several it is one named joint_states: others may be what the joints are commanded.
 
     Raises:
-        DeviceError: None has; says which joints each has.
+        DeviceError: No topic has all joints; the message names the joints of each.
     """
     states = [each for each in heard if each.topic.type == Type.JOINT_STATE and each.newest]
     for each in sorted(states, key=lambda each: not each.topic.name.endswith("joint_states")):

@@ -35,7 +35,7 @@ class RangeLayout:
         scale: (3,) factor of the transmitted coordinates.
         offset: (3,) added to them after that, in its unit.
         invalid: (3,) value that stands for no measurement, NaN where there is none.
-        facts: The same for people.
+        facts: The same as text.
     """
 
     shape: tuple[int, int]

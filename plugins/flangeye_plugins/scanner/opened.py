@@ -130,7 +130,7 @@ class OpenScanner(Device):
     def __init__(
         self, name: str, facts: Mapping[str, str], model: ScannerModel | None = None
     ) -> None:
-        """Say who it is, see :class:`flangeye.devices.Scanner`, and what it can see."""
+        """Take name and facts, see :class:`flangeye.devices.Scanner`, and the model if known."""
         self.name = name
         self.facts = dict(facts)
         self._model = model

@@ -84,7 +84,7 @@ class WatchedFolder(OpenScanner):
 
         The exposure is said to have begun when the folder was last seen without the file, so a
         file that came while the arm moved cannot pass for one of where it stands. The person is
-        told when to scan.
+        asked to scan.
         """
         limit = time.monotonic() + self._params.timeout
         incomplete = ""

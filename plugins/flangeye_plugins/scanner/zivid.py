@@ -77,7 +77,7 @@ class ZividScanner(OpenScanner):
             raise DeviceError(f"{self.name}: is closed")
         started = time.monotonic_ns()
         try:
-            # SDK 2.14 gave 3D its own name; before, capture() told by the settings.
+            # SDK 2.14 gave 3D its own name; before, the settings decided what capture() did.
             capture = getattr(self._camera, "capture_3d", None) or self._camera.capture
             frame = capture(self._settings)
         except RuntimeError as error:

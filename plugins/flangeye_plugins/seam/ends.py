@@ -128,7 +128,7 @@ def soonest(ends: list[End], limit: float) -> tuple[float, float]:
 
     Surfaces that go on to the limit of what is looked at do not end; where none ends the deviation
     is infinite.
-    Surfaces that end there as well, for all that is known, tell its place together. One whose end
+    Surfaces that may end at the same place, within their errors, are averaged. One whose end
     is hidden or blurred, and is not seen so far, may end anywhere in between.
     """
     ends = [end for end in ends if end.place < limit]

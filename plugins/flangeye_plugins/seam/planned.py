@@ -35,8 +35,8 @@ class SeamParams(Params):
     arm: Literal["as-reported", "corrected"] = Field(
         "as-reported",
         description="as-reported: with the pose that is best for the arm as its controller has "
-        "it; corrected: with that of the corrected arm, each point where the controller has to be "
-        "told to go so that the tool comes to the seam.",
+        "it; corrected: with that of the corrected arm, each point moved to the command that "
+        "brings the tool to the seam.",
     )
     tool: Length = param(
         "0 mm", ge=0, description="corrected: from the flange to the tool's tip, along its z."
@@ -103,7 +103,7 @@ def for_the_controller(
             f"the seam cannot be corrected for the arm's error: {error}; move the workpiece to "
             "where the arm was calibrated, or write arm: as-reported"
         ) from None
-    note = "points are where the controller has to be told to go: the arm's error is taken off"
+    note = "points are commands for the controller, with the arm's estimated error taken off"
     return replace(seam, points_in_base=np.array(told)[:, :3], notes=(*seam.notes, note))
 
 
@@ -152,7 +152,7 @@ def cloud_around(points: Floats, seam: Floats, base_T_camera: Transform) -> Poin
     low, high = seam.min(axis=0), seam.max(axis=0)
     margin = 0.3 * np.linalg.norm(high - low) + 0.03
     points = points[((points > low - margin) & (points < high + margin)).all(axis=1)]
-    # Points of the scan that are kept for people
+    # Points of the scan that are kept for pictures
     cloud_points = 20_000
     points = points[:: max(1, -(-len(points) // cloud_points))]
     return PointCloud(BASE, base_T_camera.apply(points).astype(np.float32))

@@ -202,7 +202,7 @@ def choose(
     fitting = _distinct([disc for disc in discs if disc.flaw is None], flange.rim)
     if not fitting:
         return _why_none(discs, flange)
-    # A wrist circle has no holes to tell it by; what is seen of its rim has to do.
+    # A wrist circle has no holes to recognise; the visible share of its rim has to do.
     cuts = [cut(disc) for disc in fitting]
     scores = [
         _hole_score(disc, points, flange) if flange.holes else disc.seen

@@ -84,7 +84,7 @@ def solve_robust(  # noqa: PLR0913  what it asks the runner for
         StageError: Too few poses, all the same, those of a mirrored camera, or a carrier's pose is
             missing.
         CalibrationRefused: Fewer than half of the poses agree, the motion leaves something unknown
-            (it says which motion is missing), or a marker has another size than its fit was told.
+            (it says which motion is missing), or a marker's size is not the configured one.
     """
     standing = cell or cell_of(configuration or DEFAULT, robot, second.model if second else None)
 
@@ -132,7 +132,7 @@ def pull(
     pulled: list[Observation] = []
     for observation in observations:
         pulled.append(observation)
-        # Poses before an online run may stop: fewer tell too little of the noise.
+        # Poses before an online run may stop: fewer leave the noise too uncertain.
         if len(pulled) < 6:
             continue
         error = _expected(pulled, solve)

@@ -245,7 +245,7 @@ def _judge(
 ) -> Registration | str:
     about_axis = unknown[:, 2] ** 2
     if len(unknown) > 1 or (about_axis < 0.5).any():
-        return "the matched points are too flat to tell a shift along the face"
+        return "the matched points are too flat to show a shift along the face"
     distances = _equations(source, surface, motion, distance)[1]
     overlap = len(distances) / len(source)
     if overlap < 0.5:

@@ -119,7 +119,7 @@ class SeamReach:
         return self._touches(here, high) or Route((*over.legs, *down.legs))
 
     def _touches(self, start: Floats, goal: Floats) -> Barred | None:
-        """Say where finger or torch would come too near to the work's face."""
+        """Return where finger or torch would come too near to the work's face."""
         count = 2 + int(np.abs(goal - start).max() / LARGEST_TURN)
         postures = start + np.linspace(0.0, 1.0, count)[:, None] * (goal - start)
         task = self._task
@@ -188,7 +188,7 @@ class SeamReach:
         return np.asarray(chain + np.where(allowed, turns, 0.0))
 
     def _bars(self, before: Floats, joints: Floats) -> Barrier | None:
-        """Say why a posture must not be taken after another."""
+        """Return why a posture must not be taken after another; None if it may."""
         # The order matters: of all that was tried, what came farthest in it is told.
         axes = self._volume.axes(self._arm.frames(joints))
         if not self._volume.above(axes, TABLE):

@@ -200,7 +200,7 @@ def test_a_plain_disc_cannot_tell_a_shift_along_its_face() -> None:
     )
     assert result.reason == (
         "ICP failed, the error is infinite: view v: "
-        "the matched points are too flat to tell a shift along the face"
+        "the matched points are too flat to show a shift along the face"
     )
 
 

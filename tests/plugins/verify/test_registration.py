@@ -140,13 +140,13 @@ def test_a_cylinder_or_two_walls_do_not_tell_a_shift_along_them() -> None:
     walls = SampledSurface(corner.points[:3000], corner.normals[:3000])
     for shape in (cylinder, walls):
         assert register(shape.points, shape, 1 * MM, 1 * MM) == (
-            "the matched points are too flat to tell a shift along the face"
+            "the matched points are too flat to show a shift along the face"
         )
 
 
 def test_a_face_alone_does_not_tell_a_shift_along_it() -> None:
     assert register(FACE.points, FACE, 20 * MM, 1 * MM) == (
-        "the matched points are too flat to tell a shift along the face"
+        "the matched points are too flat to show a shift along the face"
     )
 
 

@@ -34,7 +34,7 @@ class MonitorCheck:
     """The measurements of one check.
 
     Attributes:
-        source: Where it came from, for people.
+        source: Where it came from, as text.
         seen: The sightings of the flange.
         time_ns: When; 0 where that is not known.
     """
@@ -77,7 +77,7 @@ class History:
 
     Attributes:
         path: The file.
-        key: What tells the calibration from others.
+        key: Identifies the calibration.
         checks: What was seen.
         findings: What it said; one for each check that was judged.
     """

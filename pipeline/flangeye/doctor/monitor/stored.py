@@ -190,7 +190,7 @@ def _arm_of(log: RunLog) -> Arm | None:
 
 
 def _alike(one: Arm, other: Arm) -> bool:
-    """Tell whether two arms are of one model: corrected lengths and zeros move a flange less."""
+    """Return whether two arms are of one model; either may be corrected."""
     if one.n != other.n:
         return False
     at_zero = np.zeros(one.n)

@@ -55,7 +55,7 @@ def _without_misfits(
     before = _before(stored, history, test)
     seen = stored.sightings(check.seen, np.zeros(len(check.seen), dtype=np.intp))
     wrong = misfits(seen, before, test)
-    # Scans of a check from which one that differs can be told, and the share of it that may
+    # Two scans that disagree do not show which one is wrong; at most one in three may be
     fewest_scans = 3
     if 0 < fewest_scans * wrong.sum() <= len(wrong):
         fine = tuple(o for o, bad in zip(check.seen, wrong, strict=True) if not bad)

@@ -38,7 +38,7 @@ def mark_missing(xyz: Points) -> str:
         xyz: (N, 3) in the file's own unit.
 
     Returns:
-        What was taken for missing and how often, for people; empty where nothing was.
+        Sentence about what was taken for missing, and how often; empty where nothing was.
     """
     some = xyz[:: max(1, len(xyz) // 4096)]
     some = some[np.isfinite(some).all(axis=1)]
@@ -110,8 +110,8 @@ def read_cloud(
     Args:
         path: A file with one of :data:`CLOUD_FILES`.
         unit: Unit of the file's coordinates, where its heading does not state one.
-        told: Takes what was concluded of it: numbers that stand for missing points, and a
-            VIEWPOINT of the file that is not the identity.
+        told: Called with each note about the file: numbers that stand for missing points, and a
+            VIEWPOINT that is not the identity.
         from_viewpoint: Whether to turn the points into the frame of the file's VIEWPOINT.
 
     Returns:

@@ -60,7 +60,7 @@ def open_pcd(path: Path) -> PointTable:
     """Return where a PCD file keeps its points.
 
     Raises:
-        StageError: It is not a PCD file of points; says what is wrong with its header.
+        StageError: It is not a PCD file of points; the message says what is wrong with its header.
     """
     lines, offset = split_header(path, b"DATA", "PCD")
     header = {words[0]: words[1:] for words in lines if words and not words[0].startswith("#")}

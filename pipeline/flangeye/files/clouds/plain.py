@@ -92,7 +92,7 @@ def _is_wide(shape: Shape) -> bool:
 
 
 def _may_be_points(shape: Shape) -> bool:
-    """Return whether an array without a telling name may be points, and no poses: (N, 4, 4)."""
+    """Return whether an array of unknown name may be points, and not poses (N, 4, 4)."""
     return (len(shape) == 2 or (len(shape) == 3 and shape[1] > 4)) and shape[-1] in (3, 4, 6)
 
 
@@ -159,7 +159,7 @@ def _array_of(where: str, raw: bytes) -> NDArray[Any]:
 def _holds_numbers(file: IO[bytes]) -> bool:
     """Return whether a .npy member of an archive holds numbers.
 
-    A header that cannot be read counts: reading its array tells what is wrong.
+    A header that cannot be read counts: reading its array raises the error that says why.
     """
     try:
         return _header(file)[1].kind in NUMBERS

@@ -49,7 +49,7 @@ def open_ply(path: Path) -> PointTable:
     """Return where a PLY file keeps its vertices.
 
     Raises:
-        StageError: It is not a PLY file of points; says what is wrong with its header.
+        StageError: It is not a PLY file of points; the message says what is wrong with its header.
     """
     lines, offset = split_header(path, b"end_header", "PLY")
     if lines[0] != ["ply"]:

@@ -65,7 +65,7 @@ def follow(
     Args:
         path: The log.
         wait: Called while there is nothing new; whatever it raises ends the reading.
-        note: Is told of what is damaged.
+        note: Called with a sentence about each damaged part.
 
     Raises:
         StageError: The file cannot be read, or is not an MCAP file.
@@ -93,7 +93,7 @@ class RunView:
         arm: Where the arm was last: position [m], and when [s].
         progress: What the solver last knew of its error.
         next: Where the arm goes, and why there: the capture's id, and what it promises.
-        events: The latest lines for people.
+        events: The latest lines of the log.
         newest_ns: When the last message was logged.
         ended: Whether the run came to its end.
     """

@@ -212,7 +212,7 @@ class Choice:
     Attributes:
         arm: How the arm's poses are written.
         target: How the target's are.
-        told: With what the choice was made, for people.
+        told: Text that states the evidence for the choice.
     """
 
     arm: Writing
@@ -259,7 +259,7 @@ def _by_places(
 ) -> Choice | None:
     """Return which of several writings leaves the target in one place; None where none does best.
 
-    Quaternions whose numbers are all permuted turn by the same angles, so these do not tell.
+    Quaternions whose numbers are all permuted turn by the same angles, so angles decide nothing.
     """
     some = np.linspace(0, len(arm) - 1, min(len(arm), MOST_PAIRS)).astype(int)
     tried = []
@@ -309,7 +309,7 @@ def mounting_of(
     """Return the mounting that fits; None where none does, or several do.
 
     A camera on the flange with ``camera_T_target`` and one beside the robot with
-    ``target_T_camera`` are one equation with its unknowns exchanged, so no data tell them apart:
+    ``target_T_camera`` are one equation with its unknowns exchanged, so no data can decide:
     of such twins it is the one whose target is written as ``targets`` begins.
 
     Args:

@@ -110,7 +110,7 @@ class PoseColumns:
         called: What names it: the columns' common name; empty where they have none.
         length: Unit of the position that a name states.
         angle: The same for angles.
-        guess: What was concluded from the numbers alone, for people; empty if names say it.
+        guess: Text of what was concluded from the numbers alone; empty if names decide.
         parent_first: Whether base_to_tool names the tool's pose in the base, as ROS does.
     """
 

@@ -46,7 +46,7 @@ class Draft:
 
     Attributes:
         text: YAML.
-        told: What was found in the archive, a line each.
+        told: Lines about what was found in the archive.
         files: Texts of files that it names.
     """
 
@@ -67,7 +67,7 @@ def draft_recipe(
         registry: The plugins on offer.
 
     Raises:
-        FlangeyeError: Something is missing that no answer gives; says which line to add.
+        FlangeyeError: Something is missing that no answer gives; the message has the line to add.
     """
     unread = _convertible(survey, 1)
     read = survey.tables or survey.clouds or survey.of((*IMAGES, ".mcap", ".db3"))
@@ -156,7 +156,7 @@ def _model(robot: Mapping[str, Any]) -> RobotModel | None:
 
 
 def _missing(survey: FolderSurvey, reason: StageError) -> str:
-    """Say what is missing, and the line that would bring it."""
+    """Return a message that names what is missing, and the line to add."""
     if not isinstance(reason, NotThisLayout):
         lines = re.search(r"\b(?:reader|robot): ", str(reason)) is not None
         how = "; flangeye init takes such lines as --reader '{…}' and --robot NAME"
@@ -414,7 +414,7 @@ def steps_of(target: Mapping[str, Any]) -> list[Any]:
     return [*found, "solve.robust", "verify.holdout"]
 
 
-# --- what to tell
+# --- lines for the person
 
 
 def _summary(archive: Archive, reader: Any) -> list[str]:

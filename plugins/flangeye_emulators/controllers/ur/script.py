@@ -23,7 +23,7 @@ from flangeye_emulators.controllers.ur.controller import RefusedError, URControl
 class ControlScript:
     """The script, cycle by cycle."""
 
-    # What the first register tells the client
+    # Values of the first register, which the client reads
     ready: ClassVar[int] = 1
     done: ClassVar[int] = 2
 

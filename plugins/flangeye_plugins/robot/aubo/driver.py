@@ -42,7 +42,7 @@ SAFETY: dict[str, tuple[Mode, str]] = {
     "Fault": ("not ready", "safety fault: restart the controller"),
     "Undefined": ("not ready", "the safety system does not answer"),
 }
-"""SafetyModeType: what it means for motion, and for people."""
+"""SafetyModeType: what it means for motion, and its text."""
 
 
 class AuboParams(ControllerParams):
@@ -102,7 +102,7 @@ class AuboRobot(Device):
         """Read the tool and the cycle of a connected controller.
 
         Raises:
-            DeviceError: It does not tell.
+            DeviceError: The controller does not answer.
         """
         self.name, self._client, self._reads_only = name, client, reads_only
         self.period = float(client.ask("cycle time", client.config.getCycletime))

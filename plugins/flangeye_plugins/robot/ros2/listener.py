@@ -233,7 +233,7 @@ class Listener(Device):
         return self._samples[-1]
 
     def _fault(self, newest: JointSample) -> str:
-        """Say why a sample is no news of the arm; empty where it is."""
+        """Return why a sample is not a new state of the arm; empty if it is one."""
         age = 1e-9 * (time.monotonic_ns() - newest.received_ns)
         if age > self.stale:
             allowed = self.patience or self.stale
@@ -248,7 +248,7 @@ class Listener(Device):
         return ""
 
     def _missing(self) -> str:
-        """Say which joints were looked for, where messages came without them."""
+        """Return which joints are missing from the messages that came."""
         lost = [joint for joint in self._params.joints if joint not in self._heard]
         if not self._heard or not lost:
             return ""

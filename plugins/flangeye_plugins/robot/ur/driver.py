@@ -53,7 +53,7 @@ SAFETY: Mapping[tuple[int, str], tuple[Mode, str]] = {
     ),
 }  # fmt: skip
 """RTDE ``safety_mode`` (RTDE guide) and the dashboard's word for it: what it means for motion, and
-for people."""
+its text."""
 
 
 def safety_of(told: int | str) -> tuple[Mode, str] | None:

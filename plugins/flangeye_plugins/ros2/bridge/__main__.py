@@ -139,7 +139,7 @@ class BridgeNode:
         """Find a service of type std_srvs/srv/Trigger.
 
         Its client is kept: the answer to a call is lost while the server does not know the client
-        yet, and nobody tells when it does.
+        yet, and there is no event for when it does.
         """
         kind = getattr(importlib.import_module("std_srvs.srv"), "Trigger")  # noqa: B009
         self._clients[service] = self._node.create_client(kind, service)

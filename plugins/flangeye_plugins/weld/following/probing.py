@@ -231,7 +231,7 @@ class Probing:
         return (less, hardly), gain, leads if pivoted else 1e3
 
     def _climbs(self, felt: Floats, at: Floats, gain: float, bend: tuple[float, float]) -> str:
-        """Say that the tip rises where it is pressed hard, or shows less there; else nothing."""
+        """Return that the tip rises, or its reading falls, where it is pressed hard; else ""."""
         # A gain off by more is not a drift but another finger, or a tip that climbs.
         if abs(gain) > 0.35:
             return f"the finger's gain is off by {gain:.0%}, or the tip climbs the wall"

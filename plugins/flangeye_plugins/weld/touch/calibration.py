@@ -40,7 +40,7 @@ def calibrate(rest: Sequence[TagReading], held: Sequence[Held], source: str) -> 
     Args:
         rest: Readings of the undeformed finger.
         held: Readings with the tip held, displaced along all three axes.
-        source: For people: when and how.
+        source: Text: when and how it was measured.
 
     Raises:
         StageError: Too few readings, an axis that was not moved along, or a tip that slid.
