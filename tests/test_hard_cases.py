@@ -537,6 +537,39 @@ def test_a_current_folder_that_was_deleted_is_said(tmp_path: Path) -> None:
     ]
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("init", SAMPLE, "--yes", "--out", "new.yaml"),
+        ("layout", "foxglove", "--out", "new.yaml"),
+        ("new-scanner", "mine", "--near", "300 mm", "--far", "900 mm", "--out", "new.yaml"),
+    ],
+)
+def test_a_new_file_that_does_not_fit_is_named_and_not_left(
+    words: tuple[Any, ...], tmp_path: Path
+) -> None:
+    """The file size limit of the process stands in for a full disk."""
+    script = (
+        "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (10, 10)); "
+        "from flangeye import cli; cli.main()"
+    )
+    told = subprocess.run(
+        python_command("-c", script, *map(str, words)), cwd=tmp_path, capture_output=True, text=True
+    )
+    assert told.returncode == 2
+    assert told.stderr == "error: new.yaml: cannot be written: File too large\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_blueprint_that_cannot_be_written_is_said(
+    flangeye: Callable[..., Any], tmp_path: Path
+) -> None:
+    pytest.importorskip("rerun", reason="rerun is not installed")
+    assert one_line(flangeye("layout", "rerun", "--out", "no/x.rbl")).startswith(
+        "no/x.rbl: cannot be written: "
+    )
+
+
 def test_a_file_that_cannot_be_written_is_said(
     flangeye: Callable[..., Any], tmp_path: Path
 ) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from inspect import Parameter, Signature, signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -81,6 +82,7 @@ def init(
 
     Inspects the folder or the running graph and asks for what it does not show.
     """
+    from flangeye.files.regular import write_whole
     from flangeye.recipe.draft import Questions
     from flangeye.recipe.load import load_recipe
 
@@ -95,13 +97,14 @@ def init(
     for path in set(texts) - set(new):
         if path.read_bytes() != texts[path].encode():
             raise RecipeError(f"{path}: exists already; choose another name with --out")
-    for path in new:
-        path.write_bytes(texts[path].encode())
     try:
+        for path in new:
+            write_whole(path, texts[path], RecipeError)
         checked = load_recipe(out, registry)
     except RecipeError as error:
         for path in new:
-            path.unlink()
+            with suppress(OSError):  # those that could not be written
+                path.unlink()
         # Of the recipe that is not kept nobody knows: its target is what was asked for.
         # Mistakes in a target, in a recipe that was drafted
         raise RecipeError(

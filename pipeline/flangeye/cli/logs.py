@@ -150,13 +150,14 @@ def layout(
 ) -> None:
     """Write a layout for logs in Foxglove or Rerun."""
     from flangeye.errors import StageError
+    from flangeye.files.regular import write_whole
     from flangeye.log.foxglove import foxglove_layout, write_rerun_blueprint
 
     if viewer not in ("foxglove", "rerun"):
         raise StageError(f"no layout for '{viewer}'; known: foxglove, rerun")
     path = out or Path("flangeye.json" if viewer == "foxglove" else "flangeye.rbl")
     if viewer == "foxglove":
-        path.write_text(foxglove_layout(), encoding="utf-8")
+        write_whole(path, foxglove_layout())
         say(f"{path}: in Foxglove, Layouts, Import from file; then open the run.mcap")
     else:
         write_rerun_blueprint(path)

@@ -97,9 +97,9 @@ def monitor(  # noqa: PLR0913  one argument an option
             finding = take(stored, kept, check, test)
             kept.write()
         say(as_json(kept, finding))
-    write_chart(kept, test, kept.path.with_suffix(".html"))
-    if opcua:
+    if opcua:  # before the chart: a disk that is full keeps no cell going
         write_state(url, node, kept.findings[-1], opcua_security)
+    write_chart(kept, test, kept.path.with_suffix(".html"))
     raise typer.Exit(CODES[kept.findings[-1].state])
 
 

@@ -199,7 +199,7 @@ def write_rerun_blueprint(path: Path) -> None:
     """Write a blueprint for Rerun: ``rerun run.mcap layout.rbl`` opens a run with it.
 
     Raises:
-        StageError: The extra ``rerun`` is not installed.
+        StageError: The extra ``rerun`` is not installed, or the file cannot be written.
     """
     try:
         import rerun.blueprint as rrb
@@ -213,4 +213,7 @@ def write_rerun_blueprint(path: Path) -> None:
     columns = rrb.Horizontal(cell, rrb.Vertical(image, log), column_shares=[2, 1])
     # Rerun keeps one layout for each application; that of a log is its file's name,
     # ``run.mcap``.
-    rrb.Blueprint(columns, collapse_panels=True).save("run", str(path))
+    try:
+        rrb.Blueprint(columns, collapse_panels=True).save("run", str(path))
+    except RuntimeError as error:
+        raise StageError(f"{path}: cannot be written: {error}") from None

@@ -10,6 +10,7 @@ import numpy as np
 
 from flangeye.errors import RecipeError
 from flangeye.files.paths import bundled
+from flangeye.files.regular import write_whole
 from flangeye.files.words import nearest
 from flangeye.files.yaml_lines import dumped, parse_value, read_yaml
 from flangeye.maths.kinematics import Arm
@@ -121,7 +122,7 @@ def write_scanner(path: Path, values: Mapping[str, Any]) -> str:
 
 def _write(path: Path, data: Mapping[str, Any]) -> None:
     require_new(path)
-    path.write_text(dumped(dict(data)), "utf-8")
+    write_whole(path, dumped(dict(data)), RecipeError)
 
 
 def require_new(path: Path) -> None:

@@ -331,6 +331,21 @@ def test_a_plc_on_another_machine_is_written_to_in_the_open_only_when_asked(cell
     assert "--opcua-security" in str(refused.exception) and not (cell / "never.jsonl").exists()
 
 
+def test_a_plc_is_told_even_where_the_chart_cannot_be_written(
+    cell: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "h.html").mkdir()
+    told: list[str] = []
+    monkeypatch.setattr(
+        "flangeye.doctor.monitor.watchman.write_state",
+        lambda url, node, finding, security: told.append(finding.state),
+    )
+    plc = ("--opcua", "opc.tcp://127.0.0.1:1,ns=2;s=x")
+    refused = monitor(cell, tmp_path / "h.jsonl", "ok-00", options=plc)
+    assert str(refused.exception) == f"{tmp_path / 'h.html'}: cannot be written: Is a directory"
+    assert told == ["OK"]
+
+
 def test_a_state_is_written_signed_and_encrypted(tmp_path: Path) -> None:
     asyncua = pytest.importorskip("asyncua", reason="asyncua is not installed")
     crypto = pytest.importorskip("asyncua.crypto.cert_gen")
