@@ -50,6 +50,7 @@ def evidence_of(finding: Finding) -> str:
     if finding.before is None or finding.after is None:
         return ""
     error = f"error {_error(finding.before)} before, {_error(finding.after)} after"
+    # `gain` is a natural logarithm; the line shows a power of ten
     times = finding.gain / np.log(10.0)
     likelier = f"; 10^{times:.0f} times likelier" if 1 <= times < np.inf else ""
     return f"{error}{likelier}; by chance {_chance(finding.probability)}"

@@ -76,6 +76,7 @@ def examine_cell(
     some = _thinned(observations)
     before = foretold(some, cell)
     found = [] if before.ordinary else _likeliest(before, suspicions(some, cell, tables or {}))
+    # Links last: one before a joint that hardly moved fits as well as the right one does
     if not (found or before.ordinary):
         found = _likeliest(before, _of_links(some, cell))
     found = found or _mispaired(observations, cell)
@@ -88,7 +89,8 @@ def _likeliest(before: Foretold, suspected: Iterator[Suspicion]) -> list[Finding
     if not tried:
         return []
     after, best = min(tried, key=lambda each: each[0].size)
-    # A mistake that is one leaves at most this share of the errors held out once it is mended
+    # Once a true mistake is mended at most half of the held-out errors remain; the best of many
+    # wrong suspicions lowers them a little too
     if not after.ordinary or after.size > 0.5 * before.size:
         return []
     known = before.misfit if np.isfinite(before.size) else None
@@ -240,7 +242,7 @@ def _mispaired(observations: Sequence[Observation], cell: Cell) -> list[Finding]
     except (FlangeyeError, np.linalg.LinAlgError):
         return []
     errors = np.linalg.norm(found.errors[:, 3:], axis=1)
-    # A sighting set aside belongs elsewhere when it is off by so many times what others are
+    # What the solver sets aside may be noise; a sighting of another pose is off by far more
     ordinary = 5.0 * np.sqrt((errors[found.inliers] ** 2).mean())
     wrong = ~found.inliers & (errors > ordinary)
     far = [o.id for o, gone in zip(observations, wrong, strict=True) if gone]
@@ -274,7 +276,8 @@ class Foretold:
     def size(self) -> float:
         """Of the errors, in units of ordinary ones."""
         # Errors of sound sightings, as a share of how far they are apart, and of their rotations
-        # [rad].
+        # [rad]: so large that noise does not reach them, for a wrong unit, side or mounting gives
+        # errors as large as the motion itself
         ordinary = 0.02, np.radians(1.0)
         return float(max(self.share / ordinary[0], (self.misfit.angle or 0.0) / ordinary[1]))
 
@@ -290,10 +293,12 @@ def foretold(observations: Sequence[Observation], cell: Cell) -> Foretold:
         found = rough(problem_of(observations, cell), cell.freedoms)
     except (FlangeyeError, np.linalg.LinAlgError):
         return Foretold(Misfit(np.inf), np.inf)
+    # Rows are twists, the rotation before the translation
     turns, places = (np.linalg.norm(found.errors[:, at], axis=1) for at in (slice(3), slice(3, 6)))
     centres = np.array([o.feature.centre for o in observations])
     of_pairs = []
     for of in _by_pair(observations).values():
+        # Medians: a few sightings beside wrong poses are not yet a mistake of the whole pair
         spread = max(float(np.linalg.norm(centres[of].std(axis=0))), 1e-12)
         place, turn = float(np.median(places[of])), float(np.median(turns[of]))
         of_pairs.append(Foretold(Misfit(place, turn), place / spread))
@@ -305,7 +310,8 @@ def _possible(suspicion: Suspicion) -> bool:
     seen = np.array([np.linalg.norm(o.feature.centre) for o in suspicion.observations])
     reach = [x.translation for o in suspicion.observations for x in o.poses.values()]
     far = np.linalg.norm(reach, axis=1)
-    # Sightings and poses in the middle of a cell are so far from camera and base [m].
+    # A wrong unit makes half a metre half a millimetre or half a kilometre; without bounds [m] a
+    # cell shrunk to a point would have the smallest errors of all
     nearest, farthest = 0.02, 10.0
     return bool(nearest < np.median(seen) < farthest and nearest < np.median(far) < farthest)
 
@@ -319,7 +325,7 @@ def _by_pair(observations: Sequence[Observation]) -> dict[tuple[str, str], list[
 
 def _thinned(observations: Sequence[Observation]) -> list[Observation]:
     """Return some sightings of each pair, evenly over the session."""
-    # Sightings of each camera and target that are looked at
+    # Twelve of each pair are enough to compare; every suspicion costs a solution of the graph
     return [
         observations[of[i]]
         for of in _by_pair(observations).values()

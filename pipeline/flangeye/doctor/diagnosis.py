@@ -153,6 +153,7 @@ class RecordedSession:
         """Return the session without masked samples, left out by a line of the recipe."""
         names = [name for name, gone in zip(self.ids, mask, strict=True) if gone]
         earlier = self.changes.get("leave_out", [])
+        # The reader would bring the samples back, so nothing is read again from here on
         kept = replace(self.where(~mask), again=None)
         return kept.with_changes(leave_out=[*earlier, *names])
 
@@ -178,15 +179,18 @@ class RecordedSession:
         given = self.seconds
         seconds = given if given is None or arms == "first" else change(given)
         read = self.read_with(arms=arms, **correction)
+        # How the flange passed was recorded with the poses before the change
         return replace(read, poses=poses, seconds=seconds, motions=None)
 
     def stretched(self, factors: Floats) -> RecordedSession:
         """Return the session with what was seen (3,) times as far along each axis, as read so."""
+        # A mirror (a factor below 0) turns directions over; a unit leaves them as they are
         normals = self.normals * np.sign(factors)
         seen = replace(self, centres=self.centres * factors, normals=normals)
         if self.acquire == "acquire.archive":
             earlier = np.array(self.changes.get("stretch", (1.0, 1.0, 1.0)))
             return seen.with_changes(stretch=[float(f"{k:.6g}") for k in earlier * factors])
+        # A reader of tables takes one mirrored axis or one unit, never both
         mirrored = {"mirrored": "xyz"[int(np.argmin(factors))]} if factors.min() < 0 else {}
         scale = float(f"{np.abs(factors[0]):.6g}")
         return seen.read_with(target=mirrored or {"scale": scale})
@@ -331,7 +335,7 @@ def examine(
     """Run the checks; return their findings, the most significant first.
 
     Each check has counted the alternatives it tried; here the checks are counted (Bonferroni), so
-    that a session without a mistake gives any finding with :data:`FALSE_ALARM` at most.
+    that a session without a mistake gives any finding with a probability of 1e-3 at most.
 
     Args:
         session: The recordings.
@@ -352,6 +356,8 @@ def examine(
         # What else these samples seem to show is made up like them.
         return Diagnosis(session, (*found, made_up[0]), known, _names(bound), idle)
     while mendable := [f for f in offered if f.corrected_session is not None and not f.note]:
+        # The likeliest first: a large mistake imitates and hides smaller ones, which are looked
+        # for again once it is mended
         found.append(max(mendable, key=lambda finding: finding.gain))
         current = found[-1].corrected_session or current
         offered = []
@@ -359,7 +365,7 @@ def examine(
         if len(found) == 8 or current.seen.sum() < FEWEST_SAMPLES:
             break
         offered, _ = _offered(current, bound, checked)
-        # What all samples share is read once: the same mistake again would be of the first mending.
+        # A mistake of all samples is mended once: found again, it comes of the first correction
         named = {f.name for f in found if not f.samples}
         offered = [f for f in offered if f.samples or f.name not in named]
     found += [f for f in offered if f.corrected_session is None and not f.note]
@@ -385,7 +391,7 @@ def _offered(
             continue
         finally:
             checked()
-        # Probability of any finding at all about a session without a mistake
+        # Bonferroni over the checks; each has done so over the alternatives that it tried
         found += [f for f in findings if f.probability * len(checks) < 1e-3]
     return found, idle
 

@@ -1,10 +1,7 @@
 """Read an archive, with the recipe that would run on it, into the arrays that checks use.
 
-The reader's poses are taken as they are, whatever is wrong with them.
-
-What a recipe's own steps find in an archive's scans, whatever is wrong with its poses.
-
-It does not depend on the poses: they are found with stand-ins that no step can object to.
+The reader's poses are taken as they are, whatever is wrong with them. Features are found in the
+scans by the recipe's own steps with stand-in poses, so that wrong ones cannot spoil them.
 """
 
 from __future__ import annotations
@@ -87,6 +84,7 @@ def in_configuration(
             seconds = frames[t.FLANGE2].place
         else:
             links = frames[configuration.camera].place
+    # A place that is to be found is unknown to the checks too; the origin would be a claim
     places = session.places if known is not None else np.full_like(session.places, np.nan)
     return replace(
         session,
@@ -210,6 +208,7 @@ def _set_aside(log: RunLog) -> Iterator[Finding]:
         # Samples that are written out
         told = ", ".join(f"'{o['id']}' {1e3 * o['residual']:.1f} mm" for o in worst[:8])
         what = f"the run's solver did not use {len(gone)} of the samples: {told} off"
+        # The solver's own reason for the worst names what to look for in all of them
         fix = f"look at these samples; {worst[0]['reason']}"
         yield Finding("set aside", what, fix, tuple(o["id"] for o in worst), note=True)
 
@@ -442,8 +441,8 @@ def found_in(
     """Return the features that the recipe finds in the scans; read them otherwise if none is found.
 
     Returns:
-        The features by id; what the captures set aside tell; the parameters they were found with
-        and why not with those of the recipe, if so.
+        The features by id; findings from the captures set aside; where the recipe's parameters
+        find none, those that do, and why.
     """
     stated = None if first.params is None else getattr(first.params, "unit", None)
     seen = _seen_by(archive, first, recipe, registry)
@@ -451,7 +450,7 @@ def found_in(
     if any(remark.fix for remark in remarks):
         return seen.features, remarks, None
     if len(seen.features) < FEWEST_SAMPLES and first.params is not None and stated is not None:
-        # What else clouds may be in, or lie behind the scanner as they were written
+        # Other units; last the z of clouds that were written with the scene behind the scanner
         tried: list[dict[str, Any]] = [
             {"unit": unit} for unit in ("auto", "m", "mm", "in") if unit != stated
         ]
@@ -483,7 +482,7 @@ def _seen_by(archive: Archive, first: Step, recipe: Recipe, registry: Registry) 
 
 
 def _with_stand_in_poses(archive: Archive) -> Archive:
-    # Between two stand-in poses [m]
+    # 10 mm apart, half a metre above the base: no two alike, and every one within reach
     recordings = [
         replace(
             recording,

@@ -47,7 +47,7 @@ def not_told(poses: Poses) -> Rejected:
     angle = float(np.linalg.norm(turn))
     x, y, z = turn / max(angle, 1e-9)
     return Rejected(
-        f"{len(poses)} poses of the target explain the scan, and the arm's motion does not tell "
+        f"{len(poses)} poses of the target explain the scan, and the arm's motion does not show "
         "which is right",
         f"they are {np.degrees(angle):.0f} deg apart about ({x:.2f}, {y:.2f}, {z:.2f}) of the "
         "target",
@@ -96,6 +96,7 @@ def _off_place(k: int, carried: Floats, seen: Floats, spread: Floats) -> Floats:
     there = seen @ invert(carried) @ carried[k]
     turn = rotation_log(there[:, :3, :3] @ seen[k, :3, :3].T)
     off = np.concatenate([turn, there[:, :3, 3] - seen[k, :3, 3]], axis=1)
+    # An error phi of the other sighting's rotation moves the target here by phi x (here - there)
     moved = np.tile(np.eye(6), (len(seen), 1, 1))
     moved[:, 3:, :3] = hat(seen[:, :3, 3] - seen[k, :3, 3])
     spread = spread[k] + moved @ spread @ moved.transpose(0, 2, 1)
@@ -103,7 +104,9 @@ def _off_place(k: int, carried: Floats, seen: Floats, spread: Floats) -> Floats:
 
 
 def _off_angle(k: int, carried: Floats, seen: Floats, spread: Floats) -> Floats:
-    """Return (M,): by how much less or more the target turned in scans than controllers say."""
+    """Return (M,): by how much less or more the target turned in scans than controllers report."""
+    # X C = W P: a turn of C and that of W between two captures are the same but for their frames,
+    # so their angles agree whatever the unknown X and P are
     told, found = (
         np.linalg.norm(rotation_log((invert(all_[k]) @ all_)[:, :3, :3]), axis=1)
         for all_ in (carried, seen)
@@ -122,6 +125,7 @@ def _costs(nearest: Floats, starts: Indices) -> Floats:
     typical = np.full(len(nearest), np.inf)
     typical[known] = np.nanmedian(nearest[known], axis=1)
     scale = max(1.0, float(np.median(np.minimum.reduceat(typical, starts))))
+    # Cauchy's likelihood: a wrong pose of the arm adds a logarithm, not a square
     return np.asarray(np.nansum(np.log1p(nearest / scale), axis=1))
 
 

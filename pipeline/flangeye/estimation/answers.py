@@ -7,7 +7,8 @@ and b its least-squares rigid part,
 
 .. math:: p_{reported} = p + A\,\delta, \qquad b = \arg\min \sum_{work} |d - b|^2
 
-over positions and turns, these at a short lever: of work in a line they tell the turn about it.
+over positions and turns, these at a short lever: with the work in a line only they determine the
+turn about it.
 
 What is common to all poses cancels, so that it is known far better than the true pose.
 """
@@ -37,7 +38,7 @@ class Answer:
     Attributes:
         mean: (P,) moves of the places from those of the estimate.
         covariance: (P, P) of them.
-        shares: (P, P) of it by what causes it; the rest is that few poses tell how large each is.
+        shares: (P, P) of it by cause; the rest comes from the causes' sizes being uncertain.
     """
 
     mean: Floats
@@ -56,6 +57,7 @@ def functional(found: Estimate, a: Floats) -> Answer:
     rows = np.concatenate([np.tile(np.eye(p), (len(a), 1, 1)), a], axis=2)
     each = rows @ found.posterior.mean
     within = rows @ found.posterior.covariance @ np.swapaxes(rows, 1, 2)
+    # Law of total covariance over the boxes that may be meant
     apart = each - each.mean(axis=0)
     covariance = within.mean(axis=0) + apart.T @ apart / max(len(a) - 1, 1)
     of_effects, noise = shares(found.posterior, rows.mean(axis=0))
@@ -156,8 +158,8 @@ class _Commands:
 
     def _explained(self, by: Floats, moved: Floats) -> Floats:
         """Return (B, 6, K) the least-squares amounts, over each box, of (W, 6, 6) in (W, 6, K)."""
-        # Turns count like what they do so far from the flange [m]: enough to tell the turn about a
-        # line where the work is in one, and no more, for the work is a matter of positions
+        # Turns count like what they do so far from the flange [m]: enough to determine the turn
+        # about a line where the work is in one, and no more, for the work is at positions
         weight = np.repeat([0.02, 1.0], 3)[:, None]
         across = np.swapaxes(weight**2 * by, 1, 2)
         gram, right = (np.tensordot(self.boxes, across @ each, axes=1) for each in (by, moved))
@@ -175,6 +177,7 @@ class _Commands:
                 for place in places:
                     base = base @ place
                 parts.append(adjoint(base) @ self._rigid_parts[carrier.frame])
+        # Arms that disagree about the root share it: its reported coordinates are their mean's
         count = self._of_arm.shape[2]
         return np.asarray(
             sum(parts) / len(parts) if parts else np.zeros((len(self.boxes), 6, count))
@@ -192,6 +195,7 @@ class _Commands:
         for carrier in work.carriers:
             if work.frames[carrier.frame].parent == name and carrier.link is None:
                 gauge = gauge + adjoint(place) @ self._rigid_parts[carrier.frame]
+        # Twists about the parent's origin, then about the place's own: tau + phi x t
         shift = np.eye(6)
         shift[3:, :3] = -hat(known[name][:3, 3])
         return np.asarray(shift @ adjoint(invert(parent)) @ gauge)
@@ -273,6 +277,7 @@ def foreseen(found: Estimate, work: Work) -> Foreseen:
     for each in known.fits:
         noise = model.noise(each.sizes)[:, 3:, 3:]
         covariance = spread_of(lasting, each.covariance[np.ix_(moved, moved)]) + noise
+        # A nanometre keeps the root real where a prediction has no error along an axis
         root = np.linalg.cholesky(covariance + 1e-18 * np.eye(3))
         # Eight of an error at each pose and each draw of the sizes, for its quantiles
         drawn.append((root @ rng.standard_normal((8, len(rows), 3, 1)))[..., 0])
@@ -295,6 +300,7 @@ def expected_error(
     bias = there.means - there.rows @ np.concatenate([answer, numbers])
     exact = (bias**2).sum(axis=2).mean(axis=1) + there.squares
     values = ((bias[:, None] + there.drawn) ** 2).sum(axis=3).reshape(len(exact), -1)
+    # The draws are for the quantile alone; scaled so that their mean is the exact mean square
     values *= (exact / values.mean(axis=1))[:, None]
     weights = np.broadcast_to(there.chances[:, None], values.shape)
     order = np.argsort(values, axis=None)

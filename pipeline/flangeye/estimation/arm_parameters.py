@@ -30,7 +30,7 @@ class ArmParameters:
         values: To add to those of the arm's model.
         deviations: Standard deviations of these.
         sizes: Estimated standard deviation of each in arms like this one.
-        told: (4n, 4n) covariance by the poses alone, in units of the sizes.
+        told: (4n, 4n) covariance from the poses alone, in units of the sizes.
         ways: How many ways to the poses fit alike, where no joint angles were recorded; infinity
             for an arm of more joints than a pose has coordinates.
     """
@@ -68,6 +68,7 @@ def parameters_of(session: Session) -> ArmParameters:
         )
     ways = _ways(session, carrier)
     costs = np.array([way.posterior.cost for way in ways])
+    # Costs are -2 log of the likelihood; the least is taken off so that no exponential underflows
     chances = np.exp((costs.min() - costs) / 2)
     chances /= chances.sum()
     each = [_of_one_way(way, carrier.arm) for way in ways]
@@ -139,7 +140,7 @@ def most_telling_poses(
 
     Args:
         session: What was seen.
-        known: What it tells of the arm.
+        known: The arm's parameters as estimated from it.
         candidates: As they would be, with joints.
         count: How many to choose.
     """

@@ -93,8 +93,8 @@ def calibrate(
     Raises:
         StageError: Too few sightings, all the same, or the pose of something that moves is missing.
         CalibrationRefused: The sightings fit only when mirrored, fewer than half of them agree, the
-            motion leaves something unknown (it says which motion is missing), or a marker has
-            another size than was said.
+            motion leaves something unknown (the message says which motion is missing), or a
+            marker's size is not the configured one.
     """
     session = session_of(observations, cell, scanner, options.asked)
     return answered(_at_best(session) if options.certify else session, options, method)
@@ -108,6 +108,8 @@ def answered(session: Session, options: Options, method: str) -> HandEye:
     """
     found, weak, work = session.found, _weak(session, options), _work(session, options)
     left = np.repeat([not (e.of_arm and e.kind in CORRECTED) for e in found.effects], found.counts)
+    # A corrected arm no longer has the errors that its correction takes: only the others displace
+    # what it reports
     every = commanded(found, work)
     commands = every, every * left
     uncorrected, righted = (functional(found, each) for each in commands)
@@ -121,6 +123,7 @@ def answered(session: Session, options: Options, method: str) -> HandEye:
 
     @on_one_thread
     def without(poses: Indices) -> HandEye:
+        # Where commands lead is a property of cell and work: it stays without a few sightings
         rest = session.without(poses)
         weak = _weak(rest, options)
         of_arm, anew = (
@@ -324,7 +327,7 @@ def _estimate(
         covariance: (6, 6), rotation and translation, this at the child's origin.
         shares: (6, 6) of it, likewise.
         about: (3,) in the parent [m].
-        free: (6, k) moves that nothing tells of, taken like the covariance.
+        free: (6, k) unobservable moves, taken like the covariance.
     """
     shift = adjoint_shift(about - transform.translation)
     sizes = np.linalg.norm(free, axis=0)
@@ -369,6 +372,7 @@ def _noise_beyond(found: Estimate) -> tuple[float, float]:
     every = (
         model.noise(found.posterior.mode.sizes) - (np.eye(6) - q) - found.problem.seen.covariances
     )
+    # Per measured axis: the diagonal of a projector sums to how many of them there are
     squares = np.diagonal(q @ every @ q, axis1=1, axis2=2).reshape(-1, 2, 3).sum(axis=(0, 2))
     freedoms = np.diagonal(q, axis1=1, axis2=2).reshape(-1, 2, 3).sum(axis=(0, 2))
     turn, shift = np.sqrt(np.maximum(squares / np.maximum(freedoms, 1.0), 0.0))

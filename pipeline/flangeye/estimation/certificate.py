@@ -1,23 +1,23 @@
 r"""Certify a local minimum as the global one. Arrays only.
 
-Squared errors are a quadratic ``r' Q r`` of features of the unknown places
-(:mod:`flangeye.estimation.lifted`).
-Many other quadratics are naught for all places, since rotations
-are rotations and products are products. Where one of them, C, leaves
+Squared errors are a quadratic form ``r' Q r`` in features ``r`` of the unknown places
+(:mod:`flangeye.estimation.lifted`). Other quadratic forms vanish for all places, because rotation
+matrices are orthonormal and a product of features may be written in several ways. If one of these,
+C, makes
 
-    L = Q - C - f E,   positive semidefinite,
+    L = Q - C - f E   positive semidefinite,
 
-no place costs less than ``f``, for E picks the one: Lagrangian duality, as used for many cameras
-and targets in arXiv 2507.23045. All rotations' features have one length: if L is semidefinite with
-``e`` more on their diagonal, nothing better than ``f`` by more than ``e`` times its square exists.
-Translations have any length, and get no more. That it is semidefinite, a Cholesky decomposition
-shows, to what it rounds.
+where E selects the square of the constant feature 1, then no places cost less than ``f``:
+Lagrangian duality, as used for many cameras and targets in arXiv 2507.23045. The features of
+rotations have a fixed length, so that L may lack ``e`` on their diagonal: then no places cost less
+than ``f`` by more than ``e`` times the square of that length. Translations have any length, and
+allow no such slack. A Cholesky factorisation proves that L is semidefinite, to its rounding.
 
-What is naught for all products of two places' features is what products of two bases do not span,
-one of either place: all C are one projection by small matrices. C is sought by quasi-Newton steps
-that bring L to the matrices that are semidefinite and leave the answer as it is: no solver of
-semidefinite programs. Where there is none, the part of L that is negative is like the features of
-better places: where it leads to such, they are given.
+The forms that vanish are orthogonal to all products of features. These are spanned by products of
+two bases, one of either place, so that projecting onto the forms takes small matrices only. C is
+sought by quasi-Newton steps that bring L to the semidefinite matrices that vanish at the answer;
+there is no solver of semidefinite programs. Where no C is found, eigenvectors of the negative part
+of L resemble the features of better places: a descent from these is tried.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def certify(sightings: LiftedSightings, places: Floats) -> Certificate:
     squares = squares_of(sightings, places)
     found = squares.descend(np.tile(np.eye(4), (len(places), 1, 1)))
     cost = squares.cost(found)
-    # Rounding, as a share of the size of `Q`, where the cost is none
+    # The unit of all shares is the cost; of exact data, whose cost is zero, it is the rounding
     size = max(cost, 1e-12 / GAP * float(np.trace(squares.quadratic)))
     bare = squares.quadratic / size
     bare[0, 0] -= cost / size
@@ -141,6 +141,8 @@ class _Dual(NamedTuple):
         for family in families:
             for other in family.after:
                 bounded[family.of(other)[:, 9:]] = 0.0
+        # Squared length of these: (1, R) has 1 + 3, times (1, R', ...) with 1 + 3 for each other
+        # place; the 1 is shared by the families
         length = 1 + sum(4 * (1 + 3 * len(family.after)) - 1 for family in families)
         blocks = [_Block(f.at.ravel(), _of_first(), _of_others(len(f.after))) for f in families]
         return cls(bare, blocks, bounded / length)
@@ -172,6 +174,7 @@ class _Dual(NamedTuple):
 
         def apart(multipliers: Floats) -> tuple[float, Floats]:
             matrix = self.at(multipliers)
+            # Half the squared distance from a convex set has the distance itself as gradient
             off = matrix - _nearest(still @ matrix @ still)
             return 0.5 * float((off**2).sum()), self.parts(off)
 
@@ -217,6 +220,7 @@ def _nearest(matrix: Floats) -> Floats:
 @cache
 def _of_first() -> Floats:
     """Return (100, 35) what products of a one and a rotation's entries span."""
+    # 55 products of ten features, less 11 by R R' = R' R = 1 and 9 by rows being cross products
     return _spanned(_any_places(1, 100)[:, :10])
 
 

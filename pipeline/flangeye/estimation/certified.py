@@ -1,9 +1,9 @@
 """Certify that an answer is the global optimum, for any graph of frames.
 
-Between a camera and what it saw the graph has known places and unknown ones. From any of its frames
-on one may look at it: places that then lead the other way go over as their inverses. Where two at
-most are unknown on either way, from where both part, ``C M = T`` can be written as certificates
-take it (:mod:`flangeye.estimation.certificate`). It is looked at from where that takes least.
+A sighting is an equation ``C M = T``, with C the places from a root to the camera and T those to
+the target. A certificate (:mod:`flangeye.estimation.certificate`) takes at most two unknown places
+on either side. Any frame may be the root: the places on the way to it are then replaced by their
+inverses. The root with the smallest certificate is taken.
 """
 
 from __future__ import annotations
@@ -173,8 +173,8 @@ def _far_away(shown: Certificate, root: str, answer: CertifiedAnswer) -> str | N
     turns = shown.places[:, :3, :3] @ invert(places)[:, :3, :3]
     away = np.linalg.norm(rotation_log(turns), axis=1)
     known = [np.linalg.eigvalsh(each[:3, :3])[-1] for each in answer.covariances.values()]
-    # Five standard deviations, and rounding [rad]: what weights that stay as they are may move
-    # it
+    # The certificate's weights are those at the answer, which moves its minimum a little: by five
+    # standard deviations at most, and rounding [rad]
     beyond = away > 5.0 * np.sqrt(known) + 1e-9
     if not beyond.any():
         return None
@@ -249,6 +249,7 @@ def _of_pair(answer: CertifiedAnswer, ends: tuple[str, str], root: str) -> Lifte
     camera, target = (_side(answer, way, answer.times[rows]) for way in answer.ways(ends, root))
     places = _array(_turned(answer.places, root, answer))
     there, seen = camera.at(places), target.at(places)
+    # Errors are in the camera; the equation has them where the ways to camera and target part
     turn = np.kron(np.eye(2), there[:, :3, :3])
     weights = turn @ answer.weights[rows] @ np.swapaxes(turn, 1, 2)
     measured = _measured(invert(there) @ seen, answer.errors[rows])

@@ -174,8 +174,8 @@ def _between(covariances: Floats, parts: Floats) -> tuple[list[Floats], Indices]
 def _parts(seen: Sightings) -> Floats:
     """Return (D, N, 6, 6) projectors onto turns and shifts; of whole poses along and across apart.
 
-    What a fit to points in space states knows of the line of sight; what is told from an image has
-    one deviation for all directions.
+    Circles and centres are fitted to points in space, and their covariances know the line of sight;
+    a whole pose needs sizes of its own along it.
     """
     whole, both = seen.ranks == 6, np.kron(np.eye(2)[:, :, None] * np.eye(2), np.eye(3))
     every = np.repeat(both[:, None], len(seen), axis=1)
@@ -216,6 +216,7 @@ def estimate(problem: Problem, start: Places, effects: Sequence[Effect], agree: 
         # Linearised about for good [rad, m]: what is left is of second order, 1e-10
         if np.abs(step).max(initial=0.0) < 1e-5 and (key == inliers.tobytes() or key in seen):
             break
+        # Two sets of outliers may alternate for ever: a set seen before ends the rounds above
         seen.add(key)
         places = problem.moved(places, step)
         inliers = good if good.sum() >= 3 else inliers

@@ -238,6 +238,7 @@ def _residuals(
     predicted = np.broadcast_to(invert(camera) @ target, (len(s), 4, 4))
     rotations = predicted[:, :3, :3]
     centres = (rotations @ s.offsets[..., None])[..., 0] + predicted[:, :3, 3]
+    # A circle's rotation about its axis was not measured: the shortest turn between the axes
     turns = rotation_between(rotations[:, :, 2], s.rotations[:, :, 2])
     whole = s.ranks == 6
     turns[whole] = rotation_log(s.rotations[whole] @ np.swapaxes(rotations[whole], 1, 2))
@@ -252,6 +253,7 @@ def _blocks(
     back = np.swapaxes(camera[..., :3, :3], -1, -2)
     tip = (target[..., :3, :3] @ offsets[..., None])[..., 0] + target[..., :3, 3]
     blocks: dict[str, Floats] = {}
+    # What moves the camera moves what it sees the other way
     for end, sign in zip(ends, (-1.0, 1.0), strict=True):
         before = np.eye(4)
         for name in chain(frames, end):

@@ -11,9 +11,8 @@ for shifts, along the line of sight and across it, and what else scatters from s
 Sizes s_k, D and t_m
 maximise the restricted likelihood (REML, Patterson & Thompson 1971) times their priors, and are
 then integrated over by importance sampling about that mode, for a dozen sightings do not determine
-them. Henderson's
-mixed-model equations give p and delta at every set of sizes by one Cholesky factorisation of as
-many unknowns as places and effects have: the cost is linear in N. Arrays only.
+them. Henderson's mixed-model equations give p and delta at every set of sizes by one Cholesky
+factorisation of as many unknowns as places and effects have: the cost is linear in N. Arrays only.
 """
 
 from __future__ import annotations
@@ -144,6 +143,7 @@ class Fit:
     @cached_property
     def covariance(self) -> Floats:
         """(P + K, P + K) of places and effects."""
+        # LAPACK's inverse from a factor has one triangle; the diagonal is in both halves
         half = dpotri(self.root, lower=1)[0]
         whole = half + half.T
         whole[np.diag_indices(len(whole))] /= 2
@@ -187,6 +187,8 @@ def fit(model: LinearModel, sizes: Floats, with_slopes: bool = False) -> Fit:
     known = told(model, sizes)
     found = _solved(model, sizes, known.rows.T @ known.rows, known.rows.T @ known.errors)
     left, prior = known.errors - known.rows @ found.mean, sizes[model.sizes.effect] ** -2.0
+    # -2 log REML in Henderson's terms: log |R| + log |S| + log |C| + e'R^-1 e + d'S^-1 d, with S
+    # the effects' variances and C the matrix of the mixed-model equations
     cost = float(
         known.log_noise
         - np.log(prior).sum()
@@ -218,7 +220,7 @@ def _solved(model: LinearModel, sizes: Floats, information: Floats, right: Float
 def told_of_places(model: LinearModel, sizes: Floats) -> Floats:
     """Return the information (P, P) about the places, the effects marginalised.
 
-    By the Schur complement, which stays exact where nothing is told; an inverse covariance is not.
+    By the Schur complement, exact along unobservable moves too; the inverse of a covariance is not.
     """
     rows, p = told(model, sizes).rows, model.p
     whole = rows.T @ rows
@@ -360,6 +362,7 @@ def mode_of(model: LinearModel, start: Floats | None = None) -> Mode:
         slope = prior.mix.T @ here.gradient / 2 + z
         values, vectors = np.linalg.eigh(prior.mix.T @ here.curvature @ prior.mix / 2)
         # A size that nothing shows has the prior's curvature, one.
+        # Absolute values: at a saddle Newton's step would climb
         values = np.maximum(np.abs(values + 1), 0.25)
         step = -vectors @ (vectors.T @ slope / values)
         # Of the likelihood's logarithm; what the step leaves is about the square of that
@@ -367,7 +370,7 @@ def mode_of(model: LinearModel, start: Floats | None = None) -> Mode:
             z = z + step
             break
         better = _better(model, z, here, step * min(1.0, 3.0 / np.linalg.norm(step)))
-        if better is None:  # what is left is less than rounding, where places are hardly told
+        if better is None:  # the gain is less than rounding, where places are hardly observable
             break
         z, here = better
     # The symmetric root: eigenvectors have no sign of their own, and draws are to be the same for
@@ -394,10 +397,11 @@ def posterior(model: LinearModel, mode: Mode, at_mode: Fit) -> Posterior:
     for draw in _draws(len(z), 32):
         at = z + spread @ draw
         found = fit(some, prior.at(at))
+        # Posterior exp(-(cost + z'z) / 2) over the density of the draw: the importance weight
         logs.append(0.5 * float(draw @ draw - found.cost - at @ at))
         fits.append(found)
     if some is not model:
-        # So many sightings tell the noise's own sizes to a few percent.
+        # So many sightings determine the noise's own sizes to a few percent
         own = model.factors
         for k, each in enumerate(fits):
             sizes = each.sizes.copy()
@@ -410,7 +414,7 @@ def posterior(model: LinearModel, mode: Mode, at_mode: Fit) -> Posterior:
 
 def _told_less(taken: LinearModel, fits: Sequence[Fit]) -> Iterator[Fit]:
     """Give fits without some of their sightings, each at its sizes."""
-    # What is told depends on the noise's sizes alone
+    # The information of a sighting depends on the noise's sizes alone, which many fits share
     amounts = np.array([each.sizes[taken.factors].prod(axis=1) for each in fits])
     amounts, which = np.unique(amounts, axis=0, return_inverse=True)
     noise = taken.still + np.tensordot(amounts, taken.causes, axes=1)

@@ -57,6 +57,7 @@ def weak_moves(information: Floats, limits: Floats) -> WeakMoves:
         information: (P, P) Fisher information.
         limits: (P,) largest standard deviation of each unknown [rad, m].
     """
+    # In units of the limits: an eigenvalue below one is a standard deviation above its limit
     values, vectors = np.linalg.eigh(information * np.outer(limits, limits))
     weak = values < 1.0
     excess = 1.0 / np.sqrt(np.maximum(values[weak], 1e-12))
@@ -201,6 +202,7 @@ def require_observable(
     Raises:
         CalibrationRefused: Names the axis and the motion that is missing.
     """
+    # Of the rotation alone, with translation and nuisances marginalised (Schur complement)
     rest = np.linalg.pinv(information[3:, 3:], hermitian=True)
     of_rotation = information[:3, :3] - information[:3, 3:] @ rest @ information[3:, :3]
     weak = weak_moves(of_rotation, np.full(3, limit))
@@ -239,6 +241,7 @@ def robust_sigma(residuals: Floats) -> float:
     """Return the noise of one coordinate [m] by the median of (N, 3) residuals of a rigid fit."""
     n = len(residuals)
     median = float(np.median(np.linalg.norm(residuals, axis=1)))
+    # A rigid fit takes six degrees of freedom off 3 n coordinates
     unbiased = np.sqrt(3 * n / max(3 * n - 6, 1))
     return float(unbiased * median / np.sqrt(chi2_quantile(0.5, 3)))
 
@@ -467,7 +470,7 @@ def _untold(
     share = np.abs(weak.moves[:, 0] / scale).reshape(-1, 2, 3).max(axis=(0, 2))
     # What is named is to make everything known three times better than its limit
     motions, left = telling(information, scale / 3.0, _seen_again(problem, places, freedoms))
-    # Known to thirty times its limit is no matter of another tie, but of more of them
+    # Within thirty limits more sightings of the same kind help; beyond, the parts lack a tie
     untied = left and left.excess[0] > 30.0
     cures = _asked(problem, motions)
     cures += [_tie(problem, _named(problem, left, scale))] if untied else []
@@ -543,7 +546,7 @@ def _moved_tells(problem: Problem, places: Places, name: str, twist: Floats) -> 
     moved = replace(problem, frames={**problem.frames, name: frame})
     linear, before, s = moved.linearised(places), problem.linearised(places), problem.seen
     rows = np.concatenate([linear.blocks[n] for n in problem.unknown], axis=2)
-    # What is not measured of a circle turns with it.
+    # Projectors are those of the targets as they were seen: rows are turned back to these
     back = np.kron(np.eye(2), before.turns @ np.swapaxes(linear.turns, 1, 2))
     rows = s.projectors @ back @ rows
     # Noise that further sightings will have [rad, m]

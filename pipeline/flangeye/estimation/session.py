@@ -47,7 +47,7 @@ class Asked:
     Attributes:
         normals: Whether circles' normals count.
         size_unknown: Whether the sizes of markers are found from the arm's motion.
-        size_limit: Share by which a marker may be of another size than was said.
+        size_limit: Share by which a marker's size may differ from the configured one.
     """
 
     normals: bool = True
@@ -66,8 +66,8 @@ class Session:
         asked: What is to be found.
         found: The posterior.
         notes: For the person.
-        tool_offset: (3,) of the seen circle in the frame that carries it, where it is mounted or
-            the tool frame is set elsewhere than was said [m].
+        tool_offset: (3,) of the seen circle in the frame that carries it, where its mount or the
+            controller's tool frame is not as configured [m].
     """
 
     observations: Sequence[Observation]
@@ -116,8 +116,8 @@ def session_of(
     Raises:
         StageError: Too few sightings, all the same, or the pose of something that moves is missing.
         CalibrationRefused: They fit only when mirrored, fewer than half of them agree, nothing
-            gives a start, a clock is off by more than was recorded, or a marker has another size
-            than was said.
+            gives a start, a clock is off by more than was recorded, or a marker's size is not the
+            configured one.
     """
     problem = problem_of(observations, cell, asked.normals)
     _require_enough(problem)
@@ -231,6 +231,7 @@ def _require_right_handed(problem: Problem, places: Places) -> None:
     Raises:
         CalibrationRefused: Gives both residuals.
     """
+    # Rotations as S R S, S the mirror, which is a rotation again; S R alone is not
     flip, s = np.array([1.0, 1.0, -1.0]), problem.seen
     mirrored = replace(
         problem,
@@ -242,7 +243,7 @@ def _require_right_handed(problem: Problem, places: Places) -> None:
         return
     ours = float(np.median(distances(problem, places)))
     theirs = float(np.median(distances(mirrored, there)))
-    # A tenth of the residuals: the mirrored fit is the right one
+    # Distances are squares: the mirrored fit leaves a tenth of the residuals
     if theirs < 0.1**2 * ours:
         raise CalibrationRefused(
             "what the camera saw fits the poses only when mirrored "
@@ -260,7 +261,7 @@ def _require_majority(found: Estimate) -> None:
         )
 
 
-# --- the joints of arms that did not tell them ---------------------------------------------------
+# --- joints that were not recorded ---------------------------------------------------------------
 
 
 def _on_branches(problem: Problem, places: Places, agree: Mask) -> tuple[Problem, tuple[Note, ...]]:
@@ -464,7 +465,8 @@ def _size_far_off(session: Session) -> float | None:
         return None
     effects = effects_of(problem, session.scanner, session.asked)
     other = estimate(problem, places, effects, agree).posterior.cost
-    # The same numbers in another unit of length: three coordinates of each are so much larger.
+    # Likelihoods are densities per length: with coordinates times `factor`, -2 log of one grows by
+    # 2 log(factor) for each of three coordinates, which is no evidence against the factor
     better = found.posterior.cost - other + 6 * len(observations) * np.log(factor)
     return factor if better > chi2_quantile(1 - MISFIT, 1) else None
 
@@ -479,10 +481,10 @@ def _unseen_tool(known: float) -> Warn:
 
 
 def _with_offset(session: Session) -> Session:
-    """Return the session with the circle where the poses show it, if it is not where was said.
+    """Return the session with the circle where the poses show it, if that is not as configured.
 
-    The tool frame of the controller, or what the circle is mounted on, is then another than the
-    recipe says: a mistake of millimetres, not the offset that every circle has a little of.
+    The tool frame of the controller, or what the circle is mounted on, is then not the recipe's: a
+    mistake of millimetres, where the offset of a sound circle is a fraction of one.
     """
     found = session.found
     wrong = wrong_offset(found.problem, found.effects)

@@ -63,6 +63,7 @@ def _measured(feature: Feature, normals: bool) -> tuple[Floats, Floats, Floats]:
     covariance[3:, 3:], projector[3:, 3:] = feature.covariance, np.eye(3)
     if feature.normal is None or feature.normal_covariance is None or not normals:
         return np.eye(3), covariance, projector
+    # An error dn of a normal n is the turn n x dn
     turn = hat(feature.normal)
     covariance[:3, :3] = turn @ feature.normal_covariance @ turn.T
     projector[:3, :3] = np.eye(3) - np.outer(feature.normal, feature.normal)
@@ -127,7 +128,7 @@ def branches_of(problem: Problem, carrier: Carrier) -> Iterator[Floats]:
         if np.linalg.norm((reached - poses)[:, :3, 3], axis=1).max() < REACHED:
             yield carrier.joints
         return
-    # The arm has no closed form of them
+    # 48 starts, for arms without a closed form
     starts = arm.inverse(poses[0], 48)[:, None]
     each, all_reached = reached_from(
         arm, np.broadcast_to(poses, (len(starts), *poses.shape)), starts

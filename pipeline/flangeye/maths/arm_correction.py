@@ -50,6 +50,8 @@ def powers(degree: int) -> tuple[tuple[int, ...], ...]:
 
 def features(scaled: Floats, exponents: Sequence[tuple[int, ...]]) -> Floats:
     """Return (..., K) values of the kernel's features at (..., 3) places in units of its length."""
+    # A Gaussian kernel exp(-|x - y|^2 / 2) is the sum over p of f_p(x) f_p(y) with
+    # f_p(x) = exp(-|x|^2 / 2) x^p / sqrt(p!): cut at a degree, a smooth process of low rank
     bell = np.exp(-0.5 * (scaled**2).sum(axis=-1))
     norms, each = np.sqrt([prod(map(factorial, p)) for p in exponents]), np.array(exponents)
     raised = scaled[..., None] ** np.arange(each.max() + 1)  # which few powers share
@@ -91,6 +93,7 @@ def corrected_flange(
         angles = _near(arm, base_T_flange, correction.joints) if joints is None else joints
         built = arm if correction.lengths is None else arm.altered(np.asarray(correction.lengths))
         moved = built.flange(angles + correction.joint_offsets)
+        # Only what the change moves the flange by: the pose as reported need not be the model's
         pose = pose @ np.linalg.inv(arm.flange(angles)) @ moved
     pose[:3, 3] += pose[:3, :3] @ correction.tool_offset
     return pose
@@ -228,6 +231,8 @@ def _least_step(jacobian: Floats, twist: Floats) -> Floats:
 def _twist(wanted: Floats, reached: Floats) -> Floats:
     """Return (..., 6) that leads from one pose to another, exact when they are near."""
     turn = wanted[..., :3, :3] @ np.swapaxes(reached[..., :3, :3], -1, -2)
+    # The skew part has the sine of the angle: the angle itself where Newton's method ends, but 0
+    # for half a turn too, so that it must begin nearer than that
     skew = 0.5 * (turn - np.swapaxes(turn, -1, -2))
     axis = np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], axis=-1)
     return np.concatenate([axis, wanted[..., :3, 3] - reached[..., :3, 3]], axis=-1)

@@ -69,7 +69,7 @@ def rotation_log(rotation: Floats) -> Floats:
     sines = 0.5 * _skew_part(r)
     length = np.sqrt((sines**2).sum(axis=-1, keepdims=True))
     cosine = 0.5 * (np.trace(r, axis1=-2, axis2=-1)[..., None] - 1.0)
-    # Cosine below which a rotation's axis is read off its quaternion
+    # Near half a turn the sine is lost to rounding, and with it the axis; a quaternion keeps it
     if (cosine < -0.9).any():
         return _rotation_log_anywhere(r)
     ratio = np.arctan2(length, cosine) / np.maximum(length, 1e-300)
@@ -115,6 +115,7 @@ def quaternion_from_rotation(rotation: Floats) -> Floats:
     r = np.asarray(rotation, dtype=np.float64)
     symmetric = r + np.swapaxes(r, -1, -2)
     trace = np.trace(r, axis1=-2, axis2=-1)[..., None, None]
+    # Three times the paper's matrix, which has the same eigenvectors
     k = np.empty((*r.shape[:-2], 4, 4))
     k[..., :3, :3] = symmetric - trace * np.eye(3)
     k[..., 3, 3] = trace[..., 0, 0]
@@ -199,6 +200,7 @@ def invert(transforms: Floats) -> Floats:
 def nearest_rotation(matrices: Floats) -> Floats:
     """Return the proper rotations (..., 3, 3) nearest to any (..., 3, 3), by Frobenius norm."""
     u, _, vt = np.linalg.svd(matrices)
+    # A reflection is turned over along the least singular value, where that costs least
     u[..., :, 2] *= (np.linalg.det(u) * np.linalg.det(vt))[..., None]
     return np.asarray(u @ vt)
 

@@ -213,7 +213,9 @@ class Arm:
         frames = self.frames(joints)
         moved = self.flange_of(frames) if link is None else frames[..., link, :, :]
         first, last = frames[..., :-1, :, :], frames[..., 1:, :, :]
-        # Along whose x and z it is longer, and about whose x it is twisted
+        # Along whose x and z it is longer, and about whose x it is twisted. A standard link is
+        # Rz(q) Tz(d) Tx(a) Rx(alpha), a modified one Tx(a) Rx(alpha) Tz(d) Rz(q): what stands
+        # left of the turn is in the frame before, what stands right of it in the frame after
         x, z, about = {
             "standard": (last, first, last),
             "modified": (first, last, first),
@@ -474,6 +476,8 @@ def _pose_error(wanted: Floats, reached: Floats) -> Floats:
 def _damped_steps(jacobian: Floats, error: Floats) -> Floats:
     n = jacobian.shape[-1]
     transposed = np.swapaxes(jacobian, -1, -2)
+    # Near a solution the damping vanishes with the squared error, and steps are Newton's; the
+    # constant keeps the equations of a singular arm solvable
     damping = 0.5 * (error * error).sum(axis=-1) + 1e-12
     normal = transposed @ jacobian + damping[:, None, None] * np.eye(n)
     steps = np.linalg.solve(normal, transposed @ error[..., None])[..., 0]

@@ -29,10 +29,11 @@ Numbers = NDArray[np.complex128]
 
 @dataclass(frozen=True, eq=False)
 class OffsetWrist:
-    """Geometry of an arm with an offset wrist; z is axis 1, y is axis 2 at zero.
+    """An arm with an offset wrist, and its inverse kinematics.
 
-    Parts across axis 2 are complex numbers z + ix: turning joints 2 and 3 multiplies them. So are
-    vectors across axis 1, y - ix where joint 1 is looked for.
+    Its frame has z along axis 1, y along axis 2 at zero, and its origin on axis 1. Vectors in the
+    plane normal to axis 2 are complex numbers z + ix, so that a turn of joint 2 or 3 is a product
+    with a number of length one. For joint 1 likewise y - ix.
 
     Attributes:
         to_axes: (4, 4) from the base's frame to that one, its origin on axis 1 as high as axis 2.
@@ -95,11 +96,15 @@ class OffsetWrist:
         seen = orbits @ _circle(angles.ravel())
         place, height, axis, upwards = seen.reshape(4, *angles.shape)
         shoulder, elbow = np.array([[1j, 1j, -1j, -1j], [1j, -1j, 1j, -1j]])[:, way]
+        # Joint 1: the wrist is `aside` from the plane of the upper arm, so the rest of its
+        # distance from axis 1 lies before or behind that axis
         across = place.real**2 + place.imag**2
         forward = shoulder * np.sqrt(across - self.aside**2)
         turn = place * (forward + self.aside) / across
         reach = height + forward
         upper, fore = abs(self.upper), abs(self.fore)
+        # Joint 3: the law of cosines in the triangle of upper arm, forearm and reach; its root is
+        # NaN where the reach is too long or too short
         squares = reach.real**2 + reach.imag**2
         cosine = (squares - (upper**2 + fore**2)) * (0.5 / (upper * fore))
         bend = cosine + elbow * np.sqrt(1.0 - cosine * cosine)

@@ -133,6 +133,7 @@ def sharp_edges(vertices: Floats, triangles: NDArray[np.int32], angle: float) ->
 
     Edges of one triangle alone are sharp too.
     """
+    # STL writes a corner anew in every triangle: those in one cell of a fine grid are the same
     grid = max(float(np.ptp(vertices, axis=0).max()) * 1e-6, 1e-12)
     points, same = np.unique(np.round(vertices / grid), axis=0, return_inverse=True)
     corners = same.reshape(-1)[triangles]

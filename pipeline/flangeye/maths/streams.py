@@ -40,7 +40,7 @@ def standstills(times: Floats, poses: Floats) -> list[Span]:
     first = 0
     while first < len(times):
         last = _still_until(times, poses, first)
-        # An arm stands still while it stays so near to one pose [m, rad], for so long at least [s]
+        # An arm that only passes a pose slowly is not still: it has to stay for so long [s]
         if times[last] - times[first] >= 0.3:
             found.append(Span(float(times[first]), float(times[last])))
             first = last + 1
@@ -98,7 +98,7 @@ def passed(
 def with_joints(motion: Motion, at: float, of: str, stream: tuple[Floats, Floats]) -> Motion:
     """Return the motion about a moment ``at`` [s] with the joints that move a frame.
 
-    It is as long as their stream tells: of times (N,) and values (N, n), or (N,) of one axis.
+    It is cut to the stream's own times: (N,), with values (N, n), or (N,) of one axis.
     """
     times, values = stream
     told = (at + motion.times >= times[0]) & (at + motion.times <= times[-1])
@@ -176,6 +176,7 @@ def clock_offset(
     # Of two signals of motion, below which their best shift means nothing
     if alike[best] < 0.7 or best in (0, len(shifts) - 1):
         return 0.0, 0.0
+    # The top of the parabola through the best shift and its neighbours
     left, middle, right = alike[best - 1 : best + 2]
     bend = left - 2 * middle + right
     finer = 0.0 if bend == 0 else 0.5 * (left - right) / bend
@@ -198,6 +199,7 @@ def _correlation(
 def offset_into(spans: list[Span], at: Floats) -> float:
     """Return the smallest shift that brings most of the moments ``at`` into the spans [s]."""
     shifts = np.arange(-LARGEST_OFFSET, LARGEST_OFFSET, 0.01)
+    # By size: of shifts that do as well the first, and so the smallest, is taken
     shifts = shifts[np.argsort(np.abs(shifts), kind="stable")]
     starts, ends = (np.array([getattr(s, end) for s in spans]) for end in ("start", "end"))
     moved = at[None, :] + shifts[:, None]

@@ -88,7 +88,8 @@ def _from_archive(stored: StoredCalibration) -> str:
     """Return the calibration's recipe, made to read recordings."""
     data = _steps(stored)
     first = data["steps"][0]
-    # They read later recordings as they read the calibration's
+    # These steps read later recordings as they read the calibration's. One scan is a check,
+    # though it would be no calibration: hence `fewest`
     reads_recordings = ("acquire.archive", "acquire.centres", "acquire.samples", "acquire.images")
     name = next((name for name in reads_recordings if name in first), None)
     params = first[name] if name and isinstance(first, dict) else None

@@ -146,6 +146,7 @@ class History:
             json.dumps({"check": _plain(c), "finding": asdict(f)}, allow_nan=False) + "\n"
             for c, f in pairs
         ).encode()
+        # Over the key as well: a history that is given another calibration's key is refused
         digest = _digest(self.key, body)
         head = {"format": FORMAT, "calibration": self.key, "sha256": digest}
         write_whole(self.path, json.dumps(head).encode() + b"\n" + body)

@@ -157,6 +157,7 @@ class StoredCalibration:
         joints = [o.joints for o in seen if o.joints is not None]
         if self.arm is None or len(joints) < len(seen):
             return None
+        # Rows are (w, v) of the flange's origin; a point at r from it moves by v + w x r
         found = self.arm.jacobian(np.array(joints))
         found[:, 3:] += np.cross(found[:, :3], levers[:, :, None], axis=1)
         return found
@@ -195,7 +196,7 @@ def _alike(one: Arm, other: Arm) -> bool:
         return False
     at_zero = np.zeros(one.n)
     between = one.flange(at_zero)[:3, 3] - other.flange(at_zero)[:3, 3]
-    # How far the flanges of two arms of one model may be apart, with all joints at zero [m]
+    # A correction moves a flange by millimetres, another model has it centimetres away [m]
     return bool(np.linalg.norm(between) < 0.03)
 
 
@@ -205,6 +206,8 @@ def _covariances(turn: Floats, features: Sequence[t.Feature], expected: Floats) 
     for own, feature, frame in zip(out, features, expected, strict=True):
         own[:3, :3] = turn @ feature.centre_covariance @ turn.T
         if feature.normal_covariance is not None:
+            # (2, 3) from an error of the normal in the camera to its parts along the target's x
+            # and y; along z a unit vector has none
             across = frame[:3, :2].T @ turn
             own[3:, 3:] = across @ feature.normal_covariance @ across.T
     return out

@@ -92,6 +92,7 @@ def judge(stored: StoredCalibration, history: History, test: DriftTest) -> Check
     checks = information_of(sightings, test.daily)
     earlier = history.findings[-1] if history.findings else None
     prior, corners = stored.prior, stored.corners
+    # Later checks agree with each other, not with the calibration: a new test would find no step
     if earlier and earlier.state == "MOVED" and earlier.since is not None:
         found = moved_since(checks, prior, corners, test, earlier.since, earlier.statistic)
     else:
@@ -120,6 +121,7 @@ def _blamed(
     scanner = stored.estimate.transform.translation
     parts = blame(before, sightings.of(found.since, n), stored.estimate.about, scanner, test.daily)
     (suspect, probability), *_ = suspects(parts)
+    # The arm's parts are named by their joints too; `suspects` has added these up
     words = {"arm": ("arm", "joint")}.get(suspect, (suspect,))
     likeliest = next(part for part in parts if part.startswith(words))
     return likeliest, probability

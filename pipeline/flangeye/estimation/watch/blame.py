@@ -34,6 +34,7 @@ def blame(
         scanner: (3,) the scanner's position, about which it rotates, in base [m].
         daily: Standard deviation of the cell's day-to-day motion at the work [m].
     """
+    # Residuals are -J z (see drift): adding J z takes off the motion before the change
     residuals = after.residuals + after.effects @ before.mean
     designs = _designs(after, about, scanner)
     noise = _noise(before, after, daily)
@@ -76,7 +77,10 @@ def _designs(
     after: CheckSightings, about: Floats, scanner: Floats
 ) -> dict[str, tuple[Floats, Floats]]:
     n = len(after.residuals)
+    # About the scanner's own position, for what is loose in its mount turns there; taken about
+    # the work a small turn would look like a large shift
     at_scanner = -after.effects[..., :6] @ adjoint_shift(about - scanner)
+    # A new flange has its circle shifted by d in its own axes, by R d in the base; no tilt
     tool = np.concatenate([after.flanges, np.zeros((n, 2, 3))], axis=1)
     moved = stack_rows(at_scanner)
     found = {
@@ -99,6 +103,7 @@ def _noise(before: Information, after: CheckSightings, daily: float) -> Floats:
     """Return the (5N, 5N) covariance of the residuals without a change."""
     stacked = stack_rows(after.effects)
     out = stacked @ before.covariance @ stacked.T
+    # The day's motion is the same for all scans of a check, and independent between checks
     same = np.repeat(after.check, 5)[:, None] == np.repeat(after.check, 5)
     out += same * (stacked[:, :6] @ allowance(daily) @ stacked[:, :6].T)
     for i, own in enumerate(after.covariances):
@@ -108,6 +113,7 @@ def _noise(before: Information, after: CheckSightings, daily: float) -> Floats:
 
 def _evidence(residuals: Floats, noise: Floats, design: Floats, prior: Floats) -> float:
     """Return the log of the marginal likelihood of residuals under a linear cause."""
+    # The amounts are integrated out, so that a part with more of them must explain more
     total = noise + (design * prior**2) @ design.T
     _, volume = np.linalg.slogdet(total)
     return float(-0.5 * (residuals @ np.linalg.solve(total, residuals) + volume))

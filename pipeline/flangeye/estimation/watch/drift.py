@@ -9,8 +9,8 @@ What the arm does wrong alike at every visit (``pose_error``) is one unknown of 
 the calibration: its weights stand behind :math:`\xi` in one vector :math:`z`.
 
 **Steps.** The last :math:`w` checks, with :math:`H` and :math:`g`, are held against those before,
-which start from the calibration's own sightings and tell :math:`z = m` with information
-:math:`B`. A motion of the camera between them has the information and the score
+which start from the calibration's own sightings and estimate :math:`z` as :math:`m` with
+information :math:`B`. A motion of the camera between them has the information and the score
 
 .. math:: I = P^\top (H - H (H + B)^{-1} H) P, \quad s = P^\top (1 - H (H + B)^{-1}) (g - H m)
 
@@ -151,7 +151,7 @@ class Information:
 
     @property
     def covariance(self) -> Floats:
-        """(6 + K, 6 + K)."""
+        """(6 + K, 6 + K); zero along what no sighting shows, which pinv does not invert."""
         return np.asarray(np.linalg.pinv(self.matrix, hermitian=True))
 
     @property
@@ -162,7 +162,7 @@ class Information:
 
 def allowance(deviation: float) -> Floats:
     """Return the (6, 6) covariance of a motion that moves the work by ``deviation`` [m] an axis."""
-    # What moves the work by a length turns it by the length over half a metre
+    # The work is about a metre across: what moves its edge by a length turns it by length / 0.5 m
     return np.diag([(deviation / 0.5) ** 2] * 3 + [deviation**2] * 3)
 
 
@@ -171,7 +171,7 @@ class Prior:
     """Prior of the camera's motion and of the arm's error, before the first check.
 
     Attributes:
-        told: By the calibration, of the camera's motion since and of the arm's error.
+        told: The calibration's information on the camera's motion since and on the arm's error.
         freedom: Degrees of freedom from which the size of the arm's error is known.
     """
 
@@ -182,6 +182,8 @@ class Prior:
 def information_of(sightings: CheckSightings, daily: float) -> Information:
     """Return each check's information, with the motion common to its day marginalised."""
     told = _unmarginalised(sightings)
+    # The day's motion u ~ N(0, A) adds to xi: marginalised it leaves
+    # H - H_u (H_uu + A^-1)^-1 H_u^T, with H_u the columns of the motion, and g likewise
     motions = told.matrix[:, :, :6]
     taken = motions @ np.linalg.inv(motions[:, :6] + np.linalg.inv(allowance(daily)))
     matrix = told.matrix - taken @ told.matrix[:, :6]
@@ -208,6 +210,7 @@ def prior_of(sightings: CheckSightings, variances: Floats) -> Prior:
     """
     told = _unmarginalised(sightings).summed(0, 1)
     start = Information.of_covariance(np.diag(variances))
+    # Degrees of freedom: three a centre, two a tilt, less the six of the camera
     tilts = np.count_nonzero(sightings.covariances[:, 3, 3] < NO_NORMAL)
     return Prior(start.plus(told), max(3.0 * len(sightings.check) + 2.0 * tilts - 6.0, 1.0))
 
@@ -217,11 +220,13 @@ def verdict(checks: Information, prior: Prior, corners: Floats, test: DriftTest)
 
     Args:
         checks: The n checks in order.
-        prior: What the calibration tells.
+        prior: The calibration's information.
         corners: (8, 3) of the work, from ``about`` [m].
         test: How it is set.
     """
     n = len(checks.matrix)
+    # A step is held against a calibration that the seasons may have moved. Slow drift is that
+    # motion itself, so nothing is allowed for it in `_slow`
     start = Prior(prior.told.loosened(test.seasonal), prior.freedom)
     found = max((_step(checks, start, n - w, test) for w in _windows(n, test)), key=lambda s: s[0])
     if found[0] > 1.0:
@@ -283,6 +288,7 @@ def _step(checks: Information, start: Prior, first: int, test: DriftTest) -> tup
     after = checks.summed(first, len(checks.matrix))
     statistic, rank = (x.item() for x in _surprise(_change(after, before)))
     scale, freedom = _scatter(checks, before, (low, first), start.freedom)
+    # With a scatter that is itself estimated, s' I+ s is distributed as rank * scale * F
     rate = test.false_alarms / test.window
     limit = rank * scale * f_quantile(1 - rate, int(rank), freedom) if rank else np.inf
     return statistic / limit, first
@@ -290,6 +296,7 @@ def _step(checks: Information, start: Prior, first: int, test: DriftTest) -> tup
 
 def _change(after: Information, before: Information) -> Information:
     """Return the estimate of a motion (..., 6) between the checks before and after."""
+    # I and s of the module's head: H is `after`, B `before`, and P the cut to the first six
     taken = after.matrix @ np.linalg.inv(after.matrix + before.matrix)
     left = after.vector - after.matrix @ before.mean
     score = left - (taken @ left[..., None])[..., 0]
@@ -300,6 +307,7 @@ def _change(after: Information, before: Information) -> Information:
 def _surprise(change: Information) -> tuple[Floats, Floats]:
     """Return the squared distances (...) of a motion from none, and ranks."""
     values, axes = np.linalg.eigh(change.matrix)
+    # Axes that few scans do not show have eigenvalues of rounding alone: their ratio is noise
     seen = values > 1e-9 * values[..., -1:]
     along = (np.swapaxes(axes, -1, -2) @ change.vector[..., None])[..., 0]
     squares = np.where(seen, along**2 / np.where(seen, values, 1.0), 0.0)
@@ -323,6 +331,8 @@ def _scatter(
         return 1.0, freedom
     own = Information(checks.matrix[slice(*span)], checks.vector[slice(*span)])
     squares, ranks = _surprise(_change(own, before))
+    # A median is less certain than the mean of as many squares; 0.4 is below its efficiency for
+    # chi-squares of three degrees and more, so the threshold is rather too high
     typical = [chi2_quantile(0.5, int(rank)) for rank in ranks]
     return max(float(np.median(squares / typical)), 0.25), 0.4 * float(ranks.mean()) * n
 
@@ -376,6 +386,7 @@ def sightings_of(  # noqa: PLR0913  one argument a measured quantity
     tilts = np.where(has[:, None], np.einsum("nai,ni->na", across, seen - axes), 0.0)
     effects = np.zeros((len(centres), 5, 6))
     effects[:, :3] = levers(mapped - about)
+    # A turn w moves a normal n by w x n = -[n]x w
     effects[:, 3:, :3] = -across @ hat(seen) * has[:, None, None]
     own = np.array(covariances)
     own[~has, 3:, 3:] = NO_NORMAL * np.eye(2)
