@@ -81,6 +81,7 @@ def page(project: Project, title: str) -> Iterator[ActionBar]:
         warning=LIGHT["unverified"],
     )  # fmt: skip
     ui.page_title(f"{title} · flangeye")
+    ui.on_exception(lambda error: ui.notify(str(error), type="negative"))
     bar = ActionBar(_header(project, title))
     with ui.column().classes("w-full max-w-screen-xl mx-auto gap-3 page"):
         with ui.column().classes("gap-0"):

@@ -10,6 +10,7 @@ its own in its place. Nothing behind the gate sees cookies.
 from __future__ import annotations
 
 import ipaddress
+import logging
 import os
 import secrets
 import socket
@@ -25,7 +26,8 @@ from nicegui import app, ui
 from starlette.datastructures import Headers, QueryParams
 from starlette.responses import HTMLResponse, PlainTextResponse, Response
 
-from flangeye.errors import StageError
+from flangeye.errors import FlangeyeError, StageError
+from flangeye.files.words import printable
 from flangeye.plugin.registry import Registry
 from flangeye_ui import (
     archive_page,
@@ -68,7 +70,7 @@ def serve(folder: Path, registry: Registry, host: str, port: int, browser: bool)
         browser: Open one, where there is one.
 
     Raises:
-        StageError: The port is taken, or the folder is not there.
+        StageError: The port is taken, or the folder is not there or cannot be written.
     """
     if not folder.is_dir():
         raise StageError(f"{folder}: is not a folder")
@@ -85,6 +87,7 @@ def serve(folder: Path, registry: Registry, host: str, port: int, browser: bool)
     app.on_shutdown(lambda: project.run.stop("the page's server ended") if project.run else None)
     say(f"open {at}{keys.token}")
     app.config.socket_io_js_transports = ["websocket"]
+    logging.getLogger("nicegui").addFilter(in_words)
     file = way_in(folder, at + keys.token)
     app.on_shutdown(lambda: file.unlink(missing_ok=True))  # also where the server is terminated
     if browser:
@@ -103,15 +106,28 @@ def say(line: str) -> None:
     print(line, flush=True)  # noqa: T201
 
 
+def in_words(record: logging.LogRecord) -> bool:
+    """Return True; a foreseen mistake in the record becomes one line, as a command says it."""
+    if record.exc_info and isinstance(error := record.exc_info[1], FlangeyeError):
+        record.msg, record.exc_info = printable(f"error: {error}"), None
+    return True
+
+
 def way_in(folder: Path, address: str) -> Path:
     """Write a file that leads to an address which other users of the machine must not see.
 
     What a program is started with can be read by everybody, so a browser is started with a file
     that only its user can read, in the folder, where a confined browser may read it too.
+
+    Raises:
+        StageError: The folder cannot be written.
     """
-    handle, name = tempfile.mkstemp(".html", "open_", folder)
-    with os.fdopen(handle, "w") as file:
-        file.write(forwarding(address))
+    try:
+        handle, name = tempfile.mkstemp(".html", "open_", folder)
+        with os.fdopen(handle, "w") as file:
+            file.write(forwarding(address))
+    except OSError as error:
+        raise StageError(f"{folder}: cannot be written: {error.strerror or error}") from None
     return Path(name).resolve()
 
 

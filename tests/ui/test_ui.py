@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import resource
 import socket
 import subprocess
 import sys
@@ -572,6 +573,23 @@ def test_a_log_that_cannot_be_read_is_one_line(browser: Any, served: Served) -> 
     assert "is not an MCAP file" in page.get_by_role("alert").inner_text()
     go(page, "Archive")
     page.get_by_text("is not an MCAP file").wait_for()
+
+
+def test_a_recipe_that_cannot_be_saved_is_said_and_kept(browser: Any, served: Served) -> None:
+    """A limit of the server's files stands in for a full disk."""
+    recipe, most = served.folder / "cell.yaml", resource.RLIMIT_FSIZE
+    recipe.write_text(SMALL)
+    page = opened(browser, served)
+    soft, hard = resource.prlimit(served.process.pid, most)
+    resource.prlimit(served.process.pid, most, (10, hard))
+    try:
+        write_recipe(page, SMALL.replace("A small cell", "Another"))
+        page.get_by_text("cell.yaml: cannot be written: File too large").wait_for()
+    finally:
+        resource.prlimit(served.process.pid, most, (soft, hard))
+    assert recipe.read_text() == SMALL
+    assert any(line.endswith("cannot be written: File too large") for line in served.said)
+    assert not any("Traceback" in line for line in served.said)
 
 
 def test_a_port_that_is_taken_is_one_line() -> None:
