@@ -159,6 +159,26 @@ def test_the_command_writes_the_page_and_prints_it(run: Path, tmp_path: Path) ->
     assert len(re.findall(rb"/Type\s*/Page[^s]", printed.read_bytes())) <= 2
 
 
+@pytest.mark.parametrize("printed", ["true", 'printf %%PDF-1.4 > "$to"'])
+def test_a_pdf_that_is_not_whole_is_said_and_the_old_one_stays(
+    printed: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What Chromium leaves on a full disk: nothing, or a part, and no word."""
+    browser = tmp_path / "bin" / "chromium"
+    browser.parent.mkdir()
+    find = "for word; do case $word in --print-to-pdf=*) to=${word#*=};; esac; done"
+    browser.write_text(f"#!/bin/sh\n{find}\n{printed}\n")
+    browser.chmod(0o755)
+    monkeypatch.setenv("PATH", str(browser.parent), prepend=os.pathsep)
+    page, old = tmp_path / "certificate.html", tmp_path / "certificate.pdf"
+    page.write_text("<p>new")
+    old.write_bytes(b"%PDF-1.4 old %%EOF")
+    with pytest.raises(StageError, match=r"certificate.pdf: .* does not print"):
+        print_pdf(page)
+    assert old.read_bytes() == b"%PDF-1.4 old %%EOF"
+    assert {each.name for each in tmp_path.iterdir()} == {"bin", page.name, old.name}
+
+
 def test_without_a_calibration_there_is_nothing_to_certify(tmp_path: Path) -> None:
     scripted(Script(solved=False, verified=None, points=50), tmp_path / "run.mcap")
     with pytest.raises(StageError, match="gave no calibration, so there is nothing to certify"):

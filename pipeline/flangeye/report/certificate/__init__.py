@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -62,7 +63,7 @@ def print_pdf(page: Path) -> Path | None:
     """Print a page to a PDF beside it, with Chromium; None where there is none.
 
     Raises:
-        StageError: Chromium is there and does not print.
+        StageError: Chromium is there and does not print, or not all of it.
     """
     names = ("chromium", "chromium-browser", "google-chrome", "chrome")
     browser = next(filter(None, map(shutil.which, names)), None)
@@ -70,9 +71,15 @@ def print_pdf(page: Path) -> Path | None:
         return None
     out = page.with_suffix(".pdf")
     options = ["--headless", *sandbox(), "--disable-gpu", "--no-pdf-header-footer"]
-    command = [browser, *options, f"--print-to-pdf={out.resolve()}", page.resolve().as_uri()]
     try:
-        subprocess.run(command, check=True, capture_output=True, timeout=120)
+        with tempfile.TemporaryDirectory(dir=page.parent) as folder:
+            draft = Path(folder).resolve() / out.name
+            command = [browser, *options, f"--print-to-pdf={draft}", page.resolve().as_uri()]
+            subprocess.run(command, check=True, capture_output=True, timeout=120)
+            # On a full disk Chromium prints a part, or nothing, and ends as if all were well
+            if not draft.read_bytes().rstrip().endswith(b"%%EOF"):
+                raise StageError(f"{out}: {browser} does not print all of it")
+            draft.replace(out)
     except (subprocess.SubprocessError, OSError) as error:
         raise StageError(f"{out}: {browser} does not print: {error}") from None
     return out
