@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import trimesh
 
-from flangeye.estimation.alike import told_apart
+from flangeye.estimation.alike import disambiguated
 from flangeye.maths.geometry import rigid, rotation_exp, rotation_from_rpy, rotation_log
 from flangeye.models.bodies import TargetBody, load_body
 from flangeye.models.cell import cell_of
@@ -208,7 +208,7 @@ def session(trials, rng):
     ]
     sure = [poses[0] for poses in held if len(poses) == 1]
     open_ = [poses for poses in held if len(poses) > 1]
-    told = told_apart(cell_of(Configuration(stands=ORIGIN), None), sure, open_, True)
+    told = disambiguated(cell_of(Configuration(stands=ORIGIN), None), sure, open_, True)
     by = {one.id: one.feature for one in [*sure, *told] if one}
     return [by.get(str(k)) for k in range(len(trials))]
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flangeye.estimation.alike import not_told, told_apart
+from flangeye.estimation.alike import ambiguous, disambiguated
 from flangeye.maths.geometry import invert, rigid, rotation_exp
 from flangeye.models.cell import cell_of
 from flangeye.models.configuration import ORIGIN, Configuration
@@ -47,7 +47,7 @@ def told(captures, stands=ORIGIN, last=True):
     cell = cell_of(Configuration(stands=stands), None)
     sure = [poses[0] for poses in captures if len(poses) == 1]
     held = [poses for poses in captures if len(poses) > 1]
-    found = told_apart(cell, sure, held, last)
+    found = disambiguated(cell, sure, held, last)
     return [one and poses.index(one) for poses, one in zip(held, found, strict=True)]
 
 
@@ -82,7 +82,7 @@ def test_an_arm_that_moves_about_their_axis_alone_does_not_tell_and_the_motion_i
     arm = [turned(rng, (0, 0, 1)) for _ in range(6)]
     captures = session(arm)
     assert told(captures) == [None] * 6
-    why = not_told(captures[0])
+    why = ambiguous(captures[0])
     assert "2 poses of the target explain the scan" in why.reason
     assert "180 deg apart about (" in why.figures
     assert "1.00) of the target" in why.figures

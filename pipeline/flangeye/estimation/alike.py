@@ -22,7 +22,7 @@ Poses = Sequence[Observation]
 """One capture, once for each pose that explains its scan; the features are ``PoseFeature``."""
 
 
-def told_apart(
+def disambiguated(
     cell: Cell, sure: Poses, held: Sequence[Poses], last: bool
 ) -> list[Observation | None]:
     """Return for each capture the pose that the others support; None if it stays ambiguous.
@@ -34,13 +34,13 @@ def told_apart(
         last: Whether no capture is left to come. Then, where the target's place is to be found and
             no capture is sure, the first capture's best pose is called the target's.
     """
-    told = _told(cell, sure, held)
+    told = _supported(cell, sure, held)
     if last and held and not (sure or any(told)) and cell.frames[held[0][0].target].place is None:
-        return [held[0][0], *_told(cell, held[0][:1], held[1:])]
+        return [held[0][0], *_supported(cell, held[0][:1], held[1:])]
     return told
 
 
-def not_told(poses: Poses) -> Rejected:
+def ambiguous(poses: Poses) -> Rejected:
     """Return why a capture is set aside that several poses explain: how they differ, what to do."""
     one, other, *_ = (feature.camera_T_target.matrix for feature in _features(poses))
     turn = rotation_log((invert(one) @ other)[:3, :3])
@@ -56,7 +56,7 @@ def not_told(poses: Poses) -> Rejected:
     )
 
 
-def _told(cell: Cell, sure: Poses, held: Sequence[Poses]) -> list[Observation | None]:
+def _supported(cell: Cell, sure: Poses, held: Sequence[Poses]) -> list[Observation | None]:
     each = [*held, *([o] for o in sure if isinstance(o.feature, PoseFeature))]
     every = [pose for poses in each for pose in poses]
     ends = {end for pose in every for end in (pose.camera, pose.target)}

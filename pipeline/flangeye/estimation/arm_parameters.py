@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flangeye.errors import StageError
-from flangeye.estimation.effects.arm import told
+from flangeye.estimation.effects.arm import joints_known
 from flangeye.estimation.estimate import Estimate, estimate
 from flangeye.estimation.graph import Carrier
 from flangeye.estimation.mixed import fit
@@ -30,7 +30,7 @@ class ArmParameters:
         values: To add to those of the arm's model.
         deviations: Standard deviations of these.
         sizes: Estimated standard deviation of each in arms like this one.
-        told: (4n, 4n) covariance from the poses alone, in units of the sizes.
+        alone: (4n, 4n) covariance from the poses alone, in units of the sizes.
         ways: How many ways to the poses fit alike, where no joint angles were recorded; infinity
             for an arm of more joints than a pose has coordinates.
     """
@@ -38,19 +38,19 @@ class ArmParameters:
     values: Floats
     deviations: Floats
     sizes: Floats
-    told: Floats
+    alone: Floats
     ways: float = 1
 
     @property
     def identified(self) -> Mask:
         """(n, 4) which parameters the poses identify singly."""
-        alone = np.diag(self.told).reshape(self.sizes.shape) <= KNOWN**2
-        return np.asarray(alone & (self.deviations <= KNOWN * self.sizes))
+        singly = np.diag(self.alone).reshape(self.sizes.shape) <= KNOWN**2
+        return np.asarray(singly & (self.deviations <= KNOWN * self.sizes))
 
     @property
     def combinations(self) -> int:
         """How many combinations of the parameters the poses identify."""
-        return int((np.linalg.eigvalsh(self.told) <= KNOWN**2).sum())
+        return int((np.linalg.eigvalsh(self.alone) <= KNOWN**2).sum())
 
 
 def parameters_of(session: Session) -> ArmParameters:
@@ -61,7 +61,7 @@ def parameters_of(session: Session) -> ArmParameters:
     Raises:
         StageError: The arm's model does not reach its poses.
     """
-    carrier = next((c for c in session.found.problem.carriers if told(c)), None)
+    carrier = next((c for c in session.found.problem.carriers if joints_known(c)), None)
     if carrier is None:
         raise StageError(
             "refine.arm: the robot's model does not reach the poses; name the arm that was recorded"
@@ -152,4 +152,4 @@ def most_telling_poses(
     chosen, after = most_telling(rows, covariance, levers, count)
     left = levers @ after @ levers.T
     deviations = known.sizes * np.sqrt(np.diag(left)).reshape(known.sizes.shape)
-    return chosen, replace(known, told=left, deviations=np.minimum(deviations, known.deviations))
+    return chosen, replace(known, alone=left, deviations=np.minimum(deviations, known.deviations))

@@ -25,7 +25,7 @@ from flangeye.estimation.corrections import CORRECTED, corrections_of, put_right
 from flangeye.estimation.effects.arm import COMMON
 from flangeye.estimation.estimate import Estimate, estimate
 from flangeye.estimation.graph import Places, Problem
-from flangeye.estimation.mixed import told_of_places
+from flangeye.estimation.mixed import marginal
 from flangeye.estimation.observability import meaningless, unobservable
 from flangeye.estimation.session import Asked, Session, session_of
 from flangeye.estimation.sightings import roll_note
@@ -234,7 +234,7 @@ def _weak(session: Session, options: Options) -> Floats:
     return unobservable(
         agreeing,
         found.places,
-        told_of_places(model, sizes),
+        marginal(model, sizes),
         options.limits,
         options.mark,
         session.cell.freedoms,

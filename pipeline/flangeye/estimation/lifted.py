@@ -1,11 +1,11 @@
 r"""Squared errors of sightings as one quadratic in lifted features of the unknowns. Arrays only.
 
-Where a sighting says ``A U B V C = A' U' B' V' C'``, with any of K unknown places or none for each
-of U, V, U' and V', either side is linear in the entries of V, of U, and in the products of U's
-rotation with V's entries: the features. Squares of the errors, each weighed by its own covariance,
-are then a quadratic ``r' Q r``, with ``r`` a one and all features. U may have several V after it;
-no place may be U here and V there. Without a U the features are V's rotation alone. Translations
-that stand in no product follow from the rest.
+A sighting is an equation ``A U B V C = A' U' B' V' C'``, in which each of U, V, U' and V' is one of
+K unknown places, or none. Either side is linear in the entries of V, of U, and in the products of
+U's rotation with V's entries: the features. Squares of the errors, each weighed by its own
+covariance, are then a quadratic ``r' Q r``, with ``r`` a one and all features. U may have several V
+after it; no place may be U here and V there. Without a U the features are V's rotation alone.
+Translations that stand in no product follow from the rest.
 
 An error is the turn and shift that take one side to the other, in the frame of both. Far from the
 answer a turn counts as its sine does, and what that misses as ``1 - cos``, with the mean weight.
@@ -23,8 +23,9 @@ import numpy as np
 from flangeye.maths.geometry import hat, nearest_rotation, rigid, rotation_exp
 from flangeye.types import Floats, Indices, Mask
 
-TOLD = 1e-7
-"""How well a turn is known at least, of the best known one: a circle's about itself is not."""
+OBSERVABLE = 1e-7
+"""Smallest singular value of an observable move, as a share of the largest: a circle's turn about
+its own axis has a smaller one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +196,7 @@ class Squares:
         moves = self.moves(places)
         able = np.flatnonzero(np.abs(moves).max(axis=0))
         _, sizes, ways = np.linalg.svd(self.root @ moves[:, able])
-        untold = ways[int((sizes > TOLD * sizes[0]).sum()) :]
+        untold = ways[int((sizes > OBSERVABLE * sizes[0]).sum()) :]
         # Places that may be alike
         steps = np.zeros((20 if len(untold) else 0, len(places), 6))
         drawn = np.random.default_rng(0).uniform(-np.pi, np.pi, (len(steps), len(untold)))
@@ -209,7 +210,7 @@ class Squares:
         """Return the places (K, 4, 4) at the bottom of their valley (Gauss-Newton)."""
         for _ in range(50):
             slopes, errors = self.root @ self.moves(places), self.root @ self.features(places)
-            step = -np.asarray(np.linalg.lstsq(slopes, errors, rcond=TOLD)[0]).reshape(-1, 6)
+            step = -np.asarray(np.linalg.lstsq(slopes, errors, rcond=OBSERVABLE)[0]).reshape(-1, 6)
             places = _moved(places, step)
             if np.abs(step).max() < 1e-12:
                 break

@@ -150,7 +150,7 @@ class Fit:
         return np.asarray(whole)
 
 
-class Told(NamedTuple):
+class Whitened(NamedTuple):
     """The whitened sightings at given variance components.
 
     Attributes:
@@ -166,14 +166,14 @@ class Told(NamedTuple):
     log_noise: float
 
 
-def told(model: LinearModel, sizes: Floats) -> Told:
+def whitened(model: LinearModel, sizes: Floats) -> Whitened:
     """Return the whitened sightings at (S,) sizes of the noise."""
     roots = np.linalg.cholesky(model.noise(sizes))
     whitening = np.sqrt(model.shares)[:, None, None] * np.linalg.inv(roots)
     errors = (whitening @ model.residuals[..., None]).ravel()
     logs = np.log(np.diagonal(roots, axis1=1, axis2=2)).sum(axis=1)
     rows = stack_rows(whitening @ model.design)
-    return Told(whitening, rows, errors, float(2 * model.shares @ logs))
+    return Whitened(whitening, rows, errors, float(2 * model.shares @ logs))
 
 
 def fit(model: LinearModel, sizes: Floats, with_slopes: bool = False) -> Fit:
@@ -184,7 +184,7 @@ def fit(model: LinearModel, sizes: Floats, with_slopes: bool = False) -> Fit:
     Raises:
         numpy.linalg.LinAlgError: The equations are not positive definite.
     """
-    known = told(model, sizes)
+    known = whitened(model, sizes)
     found = _solved(model, sizes, known.rows.T @ known.rows, known.rows.T @ known.errors)
     left, prior = known.errors - known.rows @ found.mean, sizes[model.sizes.effect] ** -2.0
     # -2 log REML in Henderson's terms: log |R| + log |S| + log |C| + e'R^-1 e + d'S^-1 d, with S
@@ -217,18 +217,18 @@ def _solved(model: LinearModel, sizes: Floats, information: Floats, right: Float
     return Fit(sizes, information, right, root)
 
 
-def told_of_places(model: LinearModel, sizes: Floats) -> Floats:
+def marginal(model: LinearModel, sizes: Floats) -> Floats:
     """Return the information (P, P) about the places, the effects marginalised.
 
     By the Schur complement, exact along unobservable moves too; the inverse of a covariance is not.
     """
-    rows, p = told(model, sizes).rows, model.p
+    rows, p = whitened(model, sizes).rows, model.p
     whole = rows.T @ rows
     effects = whole[p:, p:] + np.diag(sizes[model.sizes.effect] ** -2.0)
     return np.asarray(whole[:p, :p] - whole[:p, p:] @ np.linalg.solve(effects, whole[p:, :p]))
 
 
-def _with_slopes(model: LinearModel, found: Fit, known: Told, left: Floats) -> Fit:
+def _with_slopes(model: LinearModel, found: Fit, known: Whitened, left: Floats) -> Fit:
     r"""Return the fit with the derivatives of its cost by the logarithms x of the sizes.
 
     With P what projects onto the residuals, :math:`P = V^{-1} - V^{-1} G (G'V^{-1}G)^{-1} G'V^{-1}`
@@ -316,7 +316,7 @@ class Posterior:
         """Return the estimate without some sightings in closed form; variance components stay."""
         shares, taken = self.model.shares.copy(), self.model.where(rows)
         shares[rows] = 0.0
-        mode, *fits = _told_less(taken, [self.mode, *self.fits])
+        mode, *fits = _without(taken, [self.mode, *self.fits])
         left = self.model.weighted(shares)
         return replace(self, model=left, mode=mode, fits=tuple(fits))
 
@@ -412,7 +412,7 @@ def posterior(model: LinearModel, mode: Mode, at_mode: Fit) -> Posterior:
     return Posterior(model, at_mode, tuple(fits), chances / chances.sum(), cost)
 
 
-def _told_less(taken: LinearModel, fits: Sequence[Fit]) -> Iterator[Fit]:
+def _without(taken: LinearModel, fits: Sequence[Fit]) -> Iterator[Fit]:
     """Give fits without some of their sightings, each at its sizes."""
     # The information of a sighting depends on the noise's sizes alone, which many fits share
     amounts = np.array([each.sizes[taken.factors].prod(axis=1) for each in fits])

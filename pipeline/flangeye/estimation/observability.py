@@ -334,7 +334,7 @@ def unobservable(
             the motion that is missing.
     """
     scale = np.tile(np.repeat(limits, 3), len(problem.unknown))
-    basis = _told(problem, places)
+    basis = _meaningful(problem, places)
     weak = weak_moves(
         basis.T @ (information * np.outer(scale, scale)) @ basis, np.ones(basis.shape[1])
     )
@@ -350,11 +350,11 @@ def unobservable(
             f"{_of_what(problem, directions)}: {missing_motion(problem, places)}"
         )
     raise CalibrationRefused(
-        _untold(problem, places, (information, scale), WeakMoves(moves, weak.excess), freedoms)
+        _refusal(problem, places, (information, scale), WeakMoves(moves, weak.excess), freedoms)
     )
 
 
-def _told(problem: Problem, places: Places) -> Floats:
+def _meaningful(problem: Problem, places: Places) -> Floats:
     """Return (P, m) an orthonormal basis of all moves but the meaningless ones."""
     nothing = _turned(problem, places, meaningless(problem))
     if not nothing.shape[1]:
@@ -457,7 +457,7 @@ def _arms(problem: Problem) -> list[tuple[str, Floats]]:
     return [("the arm", invert(poses(target)) @ poses(camera))]
 
 
-def _untold(
+def _refusal(
     problem: Problem,
     places: Places,
     known: tuple[Floats, Floats],
@@ -531,12 +531,12 @@ def _seen_again(
     every = freedoms or {name: np.eye(6) for name in problem.moving}
     for name, twists in every.items():
         for twist in np.transpose(twists):
-            told = [_moved_tells(problem, places, name, x) for x in (twist, -twist)]
+            told = [_information_if_moved(problem, places, name, x) for x in (twist, -twist)]
             again[name, tuple(map(float, twist))] = np.sum(told, axis=0)
     return again
 
 
-def _moved_tells(problem: Problem, places: Places, name: str, twist: Floats) -> Floats:
+def _information_if_moved(problem: Problem, places: Places, name: str, twist: Floats) -> Floats:
     # What moves is turned [rad] or moved [m] so far to find out what that would show
     turn, shift = np.split(twist * np.repeat([np.radians(20), 0.1], 3), 2)
     place = np.array(problem.frames[name].place)

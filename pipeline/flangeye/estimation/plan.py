@@ -1,8 +1,8 @@
 """Choose a cell's most informative next sighting, and when to stop, by its covariance.
 
-A sighting of one target by one camera tells of every frame between them, and by what those share
-of all others. So a candidate counts by how much it is expected to shrink the error at the work of
-all that is to be found, in closed form: with J its rows, whitened, and C the covariance of all,
+A sighting of one target by one camera informs about every frame between them and, through their
+correlation, about all others. A candidate is worth the expected decrease of the error at the work
+of all unknowns, in closed form: with J its rows, whitened, and C the covariance of all,
 
     C' = C - C J^T (1 + J C J^T)^-1 J C
 
@@ -21,7 +21,7 @@ from flangeye.errors import FlangeyeError
 from flangeye.estimation.effects.effect import Effect
 from flangeye.estimation.estimate import Estimate, judged, model_at
 from flangeye.estimation.graph import Places, Problem
-from flangeye.estimation.mixed import Fit, LinearModel, fit, left_out, told_of_places
+from flangeye.estimation.mixed import Fit, LinearModel, fit, left_out, marginal
 from flangeye.estimation.observability import unobservable
 from flangeye.estimation.session import Asked, effects_of
 from flangeye.estimation.sightings import problem_of
@@ -89,7 +89,7 @@ def rough(problem: Problem, freedoms: Mapping[str, Floats] | None = None) -> Rou
         found = fit(model, model.sizes.at(np.zeros(model.sizes.mix.shape[1])))
         places = problem.moved(places, found.mean[: model.p])
         agree = judged(model, found)[1] & agree
-    known = told_of_places(model, found.sizes)
+    known = marginal(model, found.sizes)
     # Largest standard deviations [rad, m] of what is known
     unobservable(
         problem.where(agree), places, known, (float(np.radians(2)), 20e-3), False, freedoms
@@ -152,6 +152,7 @@ def most_telling(
     for _ in range(min(count, len(rows))):
         gain = covariance @ np.swapaxes(rows, 1, 2)
         inner = np.linalg.inv(rows @ gain + np.eye(6))
+        # The trace that the levers' covariance loses, tr(L C J' (1 + J C J')^-1 J C L')
         moved = levers @ gain
         worth = np.einsum("mai,mij,maj->m", moved, inner, moved)
         worth[chosen] = -np.inf

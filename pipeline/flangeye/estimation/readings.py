@@ -1,13 +1,13 @@
 r"""Which of several readings of an arm's and a marker's poses is meant, where all fit alike.
 
 With the arm's poses :math:`P`, what it carries at :math:`C` from its flange and what stands at
-:math:`S` in its base, every sample says :math:`P C = S M`, :math:`M` being what was seen, the
-standing frame to the carried one. The same numbers say as well
+:math:`S` in its base, every sample satisfies :math:`P C = S M`, :math:`M` being what was seen, the
+standing frame to the carried one. The same numbers also satisfy
 
 .. math:: P^{-1} S = C M^{-1}, \quad M C^{-1} = S^{-1} P, \quad M^{-1} S^{-1} = C^{-1} P^{-1}:
 
 both inverted, exchanged, and both; and in each the camera may stand or be carried. The residuals
-of the eight differ little. What tells them apart is where things then are, and which errors are
+of the eight differ little. They differ in where things then are, and in which errors are
 left: a marker's position is measured better than its turn times its distance, and an arm errs by
 its joints.
 """
@@ -74,7 +74,7 @@ class Reading(NamedTuple):
         marker = invert(marker) if self.marker_inverted else marker
         return Pairs(robot, marker, in_hand != self.remounted)
 
-    def told(self, in_hand: bool) -> str:
+    def mistake(self, in_hand: bool) -> str:
         """Return what is wrong, in words; the camera is now carried, or not."""
         both = self.robot_inverted and self.marker_inverted
         words = [
@@ -102,8 +102,8 @@ def meant(pairs: Pairs, carried: float, standing: float, robot: RobotModel | Non
     # Median distance [m] and spread of its logarithm, from the flange of what an arm carries, and
     # from its base of what stands: as tools and cells are, with room for either to be odd
     held, away = (0.12, 0.8), (0.9, 0.5)
-    # Log odds by which places tell two readings apart, and by which errors do: the priors of their
-    # sizes alone make one or two thousand
+    # Log odds from which places decide between two readings, and from which errors do: the priors
+    # of the errors' sizes alone make odds of one or two thousand
     told, likelier = np.log(20.0), np.log(1e4)
     whole = bool(np.isfinite(pairs.marker).all())
     plausible = {
@@ -169,7 +169,7 @@ def other_axes(places: Floats) -> Axes | None:
 def _costs(readings: list[Reading], pairs: Pairs, robot: RobotModel | None) -> Floats:
     """Return minus the logarithms of restricted likelihoods, on the samples that agree in all.
 
-    Sixty samples tell two readings apart as well as thousands do.
+    Sixty samples decide between two readings as well as thousands do.
     """
     some = np.unique(np.linspace(0, len(pairs.robot) - 1, 60).round().astype(int))
     kept = np.isin(np.arange(len(pairs.robot)), some)

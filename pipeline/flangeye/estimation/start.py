@@ -5,8 +5,8 @@ The loop of one camera and one target is a circle of unknown places U and of wha
 .. math:: U_1 K_1 U_2 K_2 \cdots = 1
 
 Up to three unknowns have closed forms. A loop is solved from all its sightings and from small sets
-of them drawn at random; that answer is taken which most of them agree with. What one loop tells is
-known in the next. Where no loop leads on, descents begin at random places.
+of them drawn at random; that answer is taken which most of them agree with. Its places are then
+known in the next loop. Where no loop leads on, descents begin at random places.
 """
 
 from __future__ import annotations
@@ -36,8 +36,7 @@ from flangeye.maths.geometry import (
 from flangeye.types import Floats, Indices, Mask
 
 SETS = 80
-"""Small sets drawn: where 40 % of the sightings are wrong, four of five in a set are right once in
-eight draws."""
+"""Small sets drawn: with 40 % of the sightings wrong, four are all right once in eight draws."""
 LEVER = 0.3
 """A turn counts like what it does so far away [m]: the distance of a target."""
 NOISE = 0.2e-3, 0.1e-3
@@ -188,7 +187,7 @@ def _way(problem: Problem, end: str, shared: int) -> list[Floats | str]:
 def _solved(loop: _Loop, rng: np.random.Generator) -> dict[str, Floats] | None:
     """Return the places that most sightings of a loop agree with.
 
-    The better half alone does not tell: where an arm stood still in half of the sightings, places
+    The better half alone does not decide: where an arm stood still in half of the sightings, places
     that fit those are many, and only the others say which is right. So it gives the scale, and
     squares beyond that count alike (MSAC, Torr & Zisserman 2000).
     """
@@ -326,7 +325,7 @@ def _of_points(loop: _Loop, rows: Indices) -> dict[str, Floats]:
     before, after = (np.asarray(moved[i])[rows] for i in (0, 2))
     there = each_applied(np.asarray(other[0])[rows], across[rows])
     points, seen = each_applied(after, own[rows]), each_applied(invert(before), there)
-    if (s.ranks[rows] >= 5).all():  # axes are as good as points so far out on them
+    if (s.ranks[rows] >= 5).all():  # an axis counts as a second point, so far out along it
         far = LEVER * np.array([0.0, 0.0, 1.0])
         tips = own[rows] + s.rotations[rows] @ far if on_camera else own[rows] + far
         ends = across[rows] + far if on_camera else across[rows] + s.rotations[rows] @ far
@@ -334,6 +333,7 @@ def _of_points(loop: _Loop, rows: Indices) -> dict[str, Floats]:
         points, seen = np.vstack([points, each_applied(after, tips)]), np.vstack([seen, ends])
     if np.abs(points - points[0]).max() > 1e-6:
         return {name: rigid(*kabsch(points, seen))}
+    # All at one point, as the origin of a target is: only its place follows, and z from the axes
     turn = np.eye(3)
     if (s.ranks[rows] == 5).all():
         axes = (np.asarray(other[0])[rows, :3, :3] @ s.rotations[rows, :, 2, None])[..., 0]

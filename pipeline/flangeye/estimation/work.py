@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flangeye.estimation.effects.arm import known, told
+from flangeye.estimation.effects.arm import joints_known, known
 from flangeye.estimation.graph import Carrier, Places, Problem, Sightings
 from flangeye.maths.arm_correction import reached_from
 from flangeye.maths.frame_graph import composed
@@ -45,13 +45,13 @@ def work_of(problem: Problem, places: Places, box: Box | None = None) -> Work:
         problem: The session's sightings that agree.
         places: (4, 4) of each unknown.
         box: Where the flange is to be, along the axes of the root; None for where the session was,
-            which its poses tell to one spacing between neighbours.
+            known from its poses to one spacing between neighbours.
     """
     n = len(problem.seen)
     chosen = np.unique(np.linspace(0, n - 1, min(n, COUNT)).round().astype(int))
     session = _foreseen(problem.where(chosen), places)
     carrier = problem.carriers[0] if len(problem.carriers) == 1 else None
-    if carrier is None or carrier.link is not None or not told(carrier):
+    if carrier is None or carrier.link is not None or not joints_known(carrier):
         return _all_of(session)
     if box is not None:
         sides = np.asarray(box.centre) + np.array([[-0.5], [0.5]]) * box.size
@@ -61,8 +61,8 @@ def work_of(problem: Problem, places: Places, box: Box | None = None) -> Work:
     outward = (inner[1] - inner[0]) / max(n - 1, 1) * np.array([[-1.0], [1.0]])
     widest = 2.5  # spacings of poses that a box reaches beyond these
     wide = _foreseen(_in_box(problem, carrier, inner + widest * outward), places)
-    # Beyond the outermost of n poses drawn evenly, what is left is exponential.
-    # boxes that the poses may have been drawn from, as likely as each other
+    # Eight boxes that the poses may have been drawn from, equally likely: from the outermost of n
+    # evenly drawn poses to the box's side the distance is exponential, with the spacing as mean
     beyond = np.random.default_rng(0).exponential(size=(8, 2, 3)).clip(max=widest)
     return Work(session, wide, np.array([_inside(wide, inner + b * outward) for b in beyond]))
 

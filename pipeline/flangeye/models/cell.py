@@ -266,6 +266,7 @@ def _freedoms_of(robot: RobotModel) -> Floats:
     from flangeye.maths.kinematics import Arm
 
     arm = Arm(robot)
+    # At zero, axes that a bent arm has apart may be parallel
     axes = arm.axes(np.linspace(0.3, 0.7, arm.n))[0][~arm.slides]
     return np.eye(6)[:, [*_spanned(axes), True, True, True]]
 
@@ -285,6 +286,7 @@ def _freedoms_of_link(link: Link, arms: Mapping[str, RobotModel]) -> Floats:
 
 def _spanned(directions: Floats) -> Mask:
     """Return which of the three axes lie in the span of (N, 3) directions."""
+    # An axis is in the span where least squares reproduce it
     reached = np.linalg.lstsq(directions.T, np.eye(3), rcond=1e-9)[0]
     return np.asarray(np.linalg.norm(directions.T @ reached - np.eye(3), axis=0) < 1e-6)
 

@@ -302,9 +302,12 @@ def _upright(pixels: Floats, grey: Grey) -> Floats:
     Detection may give them mirrored, or begin at the wrong end: seen from the front the board's
     axes keep their sense, and its first square is black.
     """
+    # In an image, its y down, right x down is positive; negative where the grid is mirrored
     across, down = pixels[0, -1] - pixels[0, 0], pixels[-1, 0] - pixels[0, 0]
     if across[0] * down[1] - across[1] * down[0] < 0:
         pixels = pixels[:, ::-1]
+    # The first square's middle is half a diagonal outside the first corner; `beside` is on the edge
+    # between two squares, as grey as half way between black and white
     first = 1.5 * pixels[0, 0] - 0.5 * pixels[1, 1]
     beside = 0.5 * (pixels[0, 0] + pixels[1, 1]) + 0.5 * (pixels[0, 0] - pixels[0, 1])
     if _value(grey, first) > _value(grey, beside):
@@ -330,6 +333,7 @@ def corners_of_square(grey: NDArray[np.uint8], rough: Floats, image: Image) -> F
     lines = [_side(grey, rough[i], rough[(i + 1) % 4], image) for i in range(4)]
     if any(line is None for line in lines):
         return rough
+    # Two homogeneous lines meet in their cross product
     crossed = [np.cross(lines[i - 1], lines[i]) for i in range(4)]  # type: ignore[arg-type]
     corners = _bent(np.array([c[:2] / c[2] for c in crossed]), image)
     near = np.linalg.norm(corners - rough, axis=1).max() < ACROSS

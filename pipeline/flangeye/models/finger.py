@@ -79,6 +79,7 @@ class FingerGeometry(Model):
     @property
     def flange_R_tool(self) -> Floats:
         """(3, 3) the tool's axes in the flange's: z out of the work is back to the robot."""
+        # The flange's z points at the work: the tool's z is turned over, and its y with it
         c, s = np.cos(self.direction), np.sin(self.direction)
         return np.array([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]])
 

@@ -137,7 +137,7 @@ class EmulatorOptions:
         floor: Height of a horizontal surface the tool can touch [m]; None for no surface.
         faults: What shall go wrong, in the words of the controller.
         seed: Draws errors of the joints' zeros, as large as the robot's ``joint_accuracy``; None
-            for an arm that stands exactly where it says.
+            for an arm that stands exactly where it reports.
         with_input: Whether it ends when its standard input does.
     """
 

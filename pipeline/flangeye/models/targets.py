@@ -216,6 +216,7 @@ def match_holes(flat: Floats, flange: Flange) -> HoleMatch | None:
     scores = _correlate(empty, hole_pattern(flange))
     best = int(np.argmax(scores))
     apart = np.abs((np.arange(TICKS) - best + TICKS // 2) % TICKS - TICKS // 2)
+    # Elsewhere begins a quarter of the way to the next hole
     rival = float(scores[apart > TICKS / (4 * len(flange.holes))].max())
     angle = 2 * np.pi * (best + _vertex(scores, best)) / TICKS
     return HoleMatch(float(_wrap(angle)), float(scores[best]), rival)
@@ -224,7 +225,7 @@ def match_holes(flat: Floats, flange: Flange) -> HoleMatch | None:
 def roll_angle(flat: Floats, flange: Flange) -> float | None:
     """Return the angle of the flange's x axis in the face's own axes, or None if not visible.
 
-    The pin hole tells apart the rotations that the threads alone leave equal. On the published
+    The pin hole decides between the rotations that the threads alone leave equal. On the published
     clouds the right rotation scores 0.77 to 0.91, the next best 0.62 to 0.69; where the pin hole
     is out of sight both are equal, and there is no answer.
 
@@ -255,6 +256,7 @@ def emptiness(flat: Floats, pitch: float, half_width: float) -> Floats | None:
     # As narrow a window as the points allow, half a hole wide at most.
     for reach in range(2, max(3, int(half_width / pitch * TICKS / (2 * np.pi)) + 1)):
         smooth = sum(np.roll(count, k) for k in range(-reach, reach + 1))
+        # Holes take less than a quarter of the ring: so full is a place on the face
         usual = float(np.percentile(smooth, 75))
         # Points a place that is not a hole must hold, for an empty place to mean anything
         if usual >= 5:
@@ -285,6 +287,7 @@ def _openings(flange: Flange) -> list[tuple[float, float]]:
 
 def _correlate(empty: Floats, pattern: Floats) -> Floats:
     """Return, for every rotation, the emptiness inside the pattern less that outside it."""
+    # Circular correlation: the emptiness under the pattern, summed, at every rotation at once
     spectrum = np.fft.rfft(empty) * np.conj(np.fft.rfft(pattern))
     inside = np.fft.irfft(spectrum, TICKS)
     holes = pattern.sum()

@@ -122,6 +122,8 @@ def arm_of(
     shared = _shared(to_base, to_flange)
     if any(joint.get("type") in MOVES for joint in to_base[shared:]):
         raise RecipeError(f"{path}: base '{base}' moves against the arm; name a link before it")
+    # The controller's base may be a side branch, as ROS-Industrial's `base` is: the arm's chain
+    # begins where the two part
     base_T_root = invert(_fixed(path, to_base[shared:]))
     try:
         robot = _assemble(urdf, base_T_root, to_flange[shared:], standard)
@@ -147,6 +149,7 @@ def read_urdf(path: Path) -> Urdf:
 
 def parse_urdf(text: str, path: Path) -> Urdf:
     """Return the URDF in a text; raises as :func:`read_urdf`, of ``path``."""
+    # A few nested entities expand to gigabytes
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise RecipeError(f"{path}: declares a document type or entities, which are not read")
     try:
@@ -254,6 +257,7 @@ def _assemble(
     joints: list[Joint] = []
     before = base_T_first  # from the last moving link, or the base, to the link that is reached
     for joint in chain:
+        # Fixed joints on the way become part of the next moving joint's origin
         before = before @ origin_of(urdf.path, joint)
         if joint.get("type") in MOVES:
             joints.append(_joint(urdf, joint, before))
@@ -289,6 +293,7 @@ def _joint(urdf: Urdf, joint: ET.Element, pose: Floats) -> Joint:
             "supported between base and flange; recordings with the flange's poses need no "
             "kinematics: robot: {flange: ISO 9409-1-50-4-M6}"
         )
+    # Where the file states none, URDF's defaults hold: the axis x, and limits of 0
     axis, limit = joint.find("axis"), joint.find("limit")
     lower, upper = -2 * np.pi, 2 * np.pi
     if joint.get("type") != "continuous" and limit is not None:

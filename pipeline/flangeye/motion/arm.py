@@ -94,7 +94,7 @@ class WatchedArm:
     def lead(self, how: str, *motion: Any) -> None:
         """Send the next servo command: ``velocity`` or ``linear``, and its arguments."""
         self._say(how, motion)
-        self._asked = how == "velocity"  # who says a velocity waits for the next cycle
+        self._asked = how == "velocity"  # the guard answers it with the next cycle by itself
 
     def cycle(self) -> RobotState:
         """Return the state of the controller's next cycle.
@@ -107,14 +107,14 @@ class WatchedArm:
             self._say("cycle")
         self._asked = False
         while (report := self._hear(PATIENCE, "does not answer")).what != "cycle":
-            pass  # that it is under way, or has arrived, who waits for each cycle sees itself
+            pass  # reports of states and arrivals are for `wait`; a cycle's state shows both
         self._state = report.content
         return self._state
 
     def during(self, start_ns: int, end_ns: int) -> list[RememberedState]:
         """Return the arm's poses in a past interval, as far as recorded.
 
-        What else the guard says meanwhile, a safety fault too, is heard by the next :meth:`wait`.
+        Other reports that come meanwhile, safety faults too, are kept for the next :meth:`wait`.
         """
         self._say("samples", (start_ns, end_ns))
         while (report := self._read(PATIENCE, "does not answer")).what != "samples":
@@ -127,7 +127,7 @@ class WatchedArm:
         self._say("stop")
 
     def _say(self, request: str, content: Any = None) -> None:
-        with suppress(OSError):  # a guard that is gone has said why; that is still to be heard
+        with suppress(OSError):  # a guard that has ended sent the reason: the next read raises it
             self._wire.send((request, content))
 
     def _hear(self, patience: float | None, complaint: str) -> Report:

@@ -41,6 +41,7 @@ class ArmVolume:
 
     def above(self, axes: Floats, height: float) -> bool:
         """Return whether all that can move stays above a horizontal plane at this z [m]."""
+        # The base and the first link stand on the table
         moving = self.links >= 2
         return bool((axes[moving, :, 2].min(axis=1) - self.radii[moving] > height).all())
 
@@ -131,6 +132,7 @@ class PlacedBody(NamedTuple):
             met = scene.cast_rays(o3d.core.Tensor.from_numpy(lines), nthreads=1)["t_hit"].numpy()
             # A point's own surface is met at one, as exactly as single precision has it
             hidden |= met < 1 - 1e-3
+        # Points stand for equal areas: the cosine of incidence over the squared distance
         away = np.linalg.norm(rays, axis=1)
         return np.where(hidden, 0.0, np.abs(np.einsum("ni,ni->n", self.normals, rays)) / away**3)
 

@@ -1,10 +1,8 @@
-"""An arm that is driven from this process, and watched in each of its cycles like any other.
+"""Drive an arm along routes, or servo it with a velocity each cycle, always under supervision.
 
-An arm that a program leads from cycle to cycle, owned and watched by a guard beside it.
-
-The guard's process holds the arm's driver. The program waits for each cycle and answers it with a
-velocity; what it does not answer in time, or at all, the guard ends (:data:`HUNG` of
-:mod:`flangeye.motion.watchdog`). To the program it is a :class:`flangeye.devices.Robot`.
+A real arm's driver runs in a guard process. The program waits for each cycle and answers it with a
+velocity; where an answer is late or missing the guard stops the arm
+(:mod:`flangeye.motion.watchdog`). To the program it is a :class:`flangeye.devices.Robot`.
 """
 
 from __future__ import annotations

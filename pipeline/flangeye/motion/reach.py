@@ -262,6 +262,7 @@ class Reach:
             return "outside robot.limits.box"
         if limits.beyond(joints, room):
             return "near the limits of the joints"
+        # Lengths in units of the reach: singular values of metres and radians do not compare
         jacobian = self.arm.jacobian(joints)
         jacobian[3:] /= self._reach
         smallest = np.linalg.svd(jacobian, compute_uv=False)[-1]

@@ -105,11 +105,14 @@ class Router:
         places = self._arm.flange(postures)[:, :3, 3]
         turn = float(np.abs(goal - start).max())
         each = turn / (count - 1)
+        # Metres that the flange moves for a radian of the leading joint, at most
         lever = float(np.linalg.norm(np.diff(places, axis=0), axis=1).max()) / max(each, 1e-9)
         limits = self._limits
         speed = min(limits.joint_speed, limits.speed / max(lever, 1e-6))
         # Of the leading joint [rad/s^2]: a slow default, below what any arm here can do
         joint_acceleration = np.radians(60.0)
         acceleration = min(joint_acceleration, limits.acceleration / max(lever, 1e-6))
+        # Both ramps together take one ramp longer than cruising all the way; a short move is over
+        # before it has reached its speed
         ramp = min(speed / acceleration, np.sqrt(turn / acceleration))
         return Leg(goal, speed, acceleration, turn / speed + ramp)

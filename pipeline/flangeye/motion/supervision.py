@@ -42,7 +42,7 @@ class Supervisor:
     arrived: ClassVar[float] = float(np.radians(0.05))
 
     def __init__(self, robot: RobotModel, limits: MotionLimits, by_hand: bool = False) -> None:
-        """Begin; an arm that a person moves is where they say, when they say so."""
+        """Begin; the state of an arm moved by hand is what the person enters."""
         self._arm, self._limits, self._by_hand = Arm(robot), limits, by_hand
         self.samples: deque[RememberedState] = deque()
         self.leg: Leg | None = None
@@ -145,11 +145,13 @@ class Supervisor:
             )
 
     def _keep_route(self, state: RobotState, leg: Leg) -> None:
+        # A straight line in joint angles: how far along it the arm is, and how far off it. Joints
+        # driven one after the other would be off it, though each stays between its ends
         way = leg.joints - self._from
         along = float((state.joints - self._from) @ way)
         share = np.clip(along / max(float(way @ way), 1e-12), 0.0, 1.0)
         off = float(np.abs(state.joints - self._from - share * way).max())
-        # Farther from the commanded way, the arm is not doing what it was told [rad]
+        # Farther from the commanded way, the arm does not carry out its command [rad]
         if off > np.radians(3.0):
             raise SafetyFault(f"the arm is {np.degrees(off):.1f} deg away from its commanded path")
         waited = (state.time_ns - self._since_ns) * 1e-9
@@ -164,7 +166,7 @@ class Supervisor:
             )
 
     def _keep_going(self, state: RobotState, leg: Leg, set_off: bool) -> None:
-        """Doubt an arm that has ended its move: a driver does when nobody looks at it."""
+        """Refuse an arm that ended its move early, as a driver does that is not watched in time."""
         short = float(np.abs(state.joints - leg.joints).max())
         if not set_off or state.mode != "ready" or short < self.arrived:
             self._ready_ns = 0
@@ -189,7 +191,7 @@ class Supervisor:
 
 
 def _require_numbers(state: RobotState) -> None:
-    """Doubt what is not a number: every comparison with it is false, as if all were well."""
+    """Refuse values that are not numbers: every comparison with NaN is false, so no check fails."""
     force = np.zeros(0) if state.force is None else state.force
     if not np.isfinite(np.concatenate([state.joints, state.joint_speeds, force])).all():
         raise SafetyFault(

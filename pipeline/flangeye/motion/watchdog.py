@@ -6,7 +6,7 @@ the program is busy with; the space bar it reads itself; when the program dies i
 closes. Each of these stops the arm within one cycle. Through the same pipe the program proves that
 it lives (:data:`BEAT`); when it is silent for SILENT on the way, or this process was itself, the
 arm is stopped for good. While this process is silent, the arm's driver stops it. A program that
-leads the arm by velocities is told every cycle it asks for; when it says nothing, the arm is
+servos the arm is sent the state of each cycle; when it answers with no velocity, the arm is
 stopped too.
 """
 
@@ -96,7 +96,7 @@ class Report(NamedTuple):
 def watchdog_process(wire: Connection, charge: Charge, alarm: Connection) -> None:
     """Guard an arm until the program disconnects; main function of the guard process."""
     for told in STOPS:
-        signal.signal(told, signal.SIG_IGN)  # the alarm tells, and sooner
+        signal.signal(told, signal.SIG_IGN)  # the alarm pipe reports it sooner
     for ending in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(ending, lambda *_: sys.exit())  # as an exception, which stops the arm
     keyboard = _terminal(charge.keyboard)
@@ -171,7 +171,7 @@ class Watchdog:
             self._bar(str(fault))
 
     def _require_life(self) -> None:
-        """Doubt a program that is silent, and a guard that was held itself.
+        """Refuse to go on if the program was silent, or this process was suspended.
 
         Raises:
             SafetyFault: Who was silent, and for how long.
@@ -190,7 +190,7 @@ class Watchdog:
             )
 
     def _tell_cycle(self, state: RobotState) -> None:
-        """Answer who waits for the next cycle: never unasked, a full wire would hold the guard."""
+        """Send the state to a program that waits for it; unasked, a full pipe would block here."""
         if self._asked:
             # Share of a cycle in which a guard that is asked for states waits for the next word
             listening = 0.5
@@ -198,7 +198,7 @@ class Watchdog:
             self._wire.send(Report("cycle", state))
 
     def _keep_led(self) -> None:
-        """Stop an arm that is led by a program that says nothing any more."""
+        """Stop an arm whose servoing program sends no commands any more."""
         if self._led_ns is None:
             return
         silent = 1e-9 * (self._supervisor.samples[-1].time_ns - self._led_ns)
@@ -230,7 +230,7 @@ class Watchdog:
         self._robot.stop()
 
     def _bar(self, reason: str) -> None:
-        """Stop, and move no more: a safety fault is not outlived."""
+        """Stop the arm for good: after a safety fault this guard moves it no more."""
         self._legs, self._led_ns = [], None
         self._supervisor.halted()
         try:
@@ -267,7 +267,7 @@ class Watchdog:
             elif self._barred is None and request != "cycle":
                 self._command(request, content)
             if request in ("cycle", "velocity"):
-                # A program that leads waits for each cycle and answers it within: one word does.
+                # A servoing program sends one command a cycle: waiting for more would be in vain
                 self._asked = True
                 return True
         self._listens = 0.0

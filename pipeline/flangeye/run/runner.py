@@ -181,7 +181,7 @@ class Runner:
             with self._watch.timing(label):
                 capture = next(captures, None)
             if capture is None:
-                yield from self._told(stream, last=True)
+                yield from self._disambiguated(stream, last=True)
                 self._require_seen()
                 return
             seconds = self._watch.seconds[label] - before
@@ -201,25 +201,25 @@ class Runner:
                 stream.outcomes[capture.id] = poses[0] if poses else None
                 self._hooks.flangeye_capture_finished(capture=capture.id)
                 yield from poses
-            yield from self._told(stream)
+            yield from self._disambiguated(stream)
 
-    def _told(self, stream: t.Captures, last: bool = False) -> Iterator[t.Observation]:
+    def _disambiguated(self, stream: t.Captures, last: bool = False) -> Iterator[t.Observation]:
         """Yield held-back captures whose pose the arm's motion has decided by now.
 
         Those of which it does not are set aside after the last capture.
         """
-        from flangeye.estimation.alike import not_told, told_apart
+        from flangeye.estimation.alike import ambiguous, disambiguated
 
         if not self._held:
             return
-        found = told_apart(cell_in(self._values), self._outcome.seen, self._held, last)
+        found = disambiguated(cell_in(self._values), self._outcome.seen, self._held, last)
         pairs = list(zip(self._held, found, strict=True))
         self._held = [poses for poses, one in pairs if one is None and not last]
         for poses, one in pairs:
             if one is not None:
                 self._finished(self._steps("fit")[0], one.id, one.feature)
             elif last:
-                why, segment = not_told(poses), self._steps("segment")[0].stage.name
+                why, segment = ambiguous(poses), self._steps("segment")[0].stage.name
                 aside = t.Rejection(poses[0].id, segment, why.reason, why.figures, why.fix)
                 self._reject(aside)
             if one is not None or last:

@@ -370,7 +370,7 @@ def _choices(
 ) -> tuple[str, str, str, RecordedSession]:
     """Return the mistake in a word and in words, the lines to choose from, and what is meant."""
     in_hand = session.carried == "camera"
-    what = ", or ".join(dict.fromkeys(each.told(in_hand) for each in readings))
+    what = ", or ".join(dict.fromkeys(each.mistake(in_hand) for each in readings))
     made = [_read_so(session, each) for each in readings]
     fits = ": the samples fit each" if len(made) > 1 else ""
     name = "mounting" if readings[0].remounted else "pose direction"

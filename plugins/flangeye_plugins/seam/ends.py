@@ -113,7 +113,8 @@ def surface_end(way: Floats, past: Mask, covered: Mask, pitch: float) -> End | N
     seen = past.sum() >= FEWEST_LANES
     way = way[past] if seen else way
     low, middle, high = np.quantile(way, [0.25, 0.5, 0.75])
-    # Lanes whose middle half is spread over more pixels end at two places
+    # Lanes whose middle half is spread over more pixels end at two places; else it is the standard
+    # deviation of a median, 1.25 times that of a mean
     share = 1.25 / np.sqrt(len(way)) if seen and high - low <= 2.0 * pitch else 1.0
     # Of a normal distribution, from its quartiles' distance
     sigma_of_iqr = 0.7413
@@ -144,6 +145,7 @@ def soonest(ends: list[End], limit: float) -> tuple[float, float]:
             same.append(end)
     weights = np.array([max(end.deviation, 1e-6) ** -2 for end in same])
     place = float(weights @ [end.place for end in same] / weights.sum())
+    # Anywhere within the hidden stretch alike: a uniform distribution, of length / sqrt(12)
     hidden = max([0.0, *(place - end.place for end in ends)])
     if first.covered:
         hidden = limit - first.place

@@ -395,6 +395,7 @@ def _refuse_plane(found: Found) -> None:
                 f"{STAGE}: no joint is seen: one plane explains {plane:.0%} of the points as well"
             )
         return
+    # A point stands for a square of the pitch: so much of the gap's area has points in it
     gap, length = section.shape[6], found.ends[1] - found.ends[0]
     within = level[:, 0] & (beyond[:, list(EDGES)] > 0).all(axis=1)
     filled = min(float(within.sum() * pitch**2 / max(gap * length, 1e-12)), 1.0)

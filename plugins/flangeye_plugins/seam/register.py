@@ -115,6 +115,8 @@ def check_unit(points: Floats, workpiece: Workpiece) -> None:
     if len(points) < FEWEST:
         raise StageError(f"{STAGE}: the scan has {len(points)} points; {FEWEST} are needed")
     sample = points[:: max(1, len(points) // 50_000)]
+    # As if the points lay on a square: then FEWEST of them are as far across as sqrt(FEWEST) times
+    # their spacing
     extent = float(np.linalg.norm(np.ptp(sample, axis=0)))
     spacing, size, unit = extent / np.sqrt(len(points)), workpiece.diagonal, workpiece.unit
     if size > LARGER * extent:
@@ -134,7 +136,7 @@ def _other_unit(size: float, unit: LengthUnit, extent: float) -> str:
     resized = size * PER_METRE[unit] / PER_METRE[other]
     if resized < LARGER * extent:
         return f"with unit: {other} it would be {resized:.4g} m: set unit: {other}"
-    return "is the scan in the unit it was said to be, and of this part?"
+    return "is the scan's unit as configured, and does it show this part?"
 
 
 def _laid(scan: Singles, looks: Looks, pose: Floats) -> BodyFit | None:
@@ -146,6 +148,7 @@ def _seam_apart(seam: CadSeam, motion: Floats, size: float) -> float:
 
     A closed seam that is moved along itself stays where it is.
     """
+    # A second line, out along the openings, shows a turn about the seam itself
     lines = seam.points, seam.points + AROUND * size * seam.openings
     away = [
         distances_to_line(there, line) if seam.closed else np.linalg.norm(there - line, axis=1)

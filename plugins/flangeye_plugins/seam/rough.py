@@ -161,6 +161,7 @@ def _placed(
     nominal, spread = (np.radians([x[k] for k in present]) for x in (joint.angles, joint.spread))
     off = np.array([line.angle for line in lines]) - nominal
     weights = 1 / spread**2
+    # Weighted mean on the circle, for angles wrap
     roll = float(np.angle(weights @ np.exp(1j * off)))
     angles = np.full(4, 0.0)
     angles[present] = np.angle(np.exp(1j * (off - roll)))
@@ -250,6 +251,7 @@ def _ways(spots: list[list[JointPlace]]) -> list[list[JointPlace]]:
 
 
 def _jump(first: JointPlace, second: JointPlace, slabs: int) -> float:
+    # The joint wanders from slab to slab as a random walk: squared steps over the slabs between
     away = np.linalg.norm(first.q - second.q) / BESIDE
     rolled = np.angle(np.exp(1j * (first.roll - second.roll))) / np.radians(8)
     other = np.abs(first.shape[4:] - second.shape[4:]).max() / BESIDE
@@ -280,6 +282,8 @@ class Spline:
         count = max(round(length / knots), 8 if closed else 1) + (0 if closed else 3)
         empty = cls(length, closed, np.zeros((count, 3)))
         design = empty.basis(s).toarray()
+        # A P-spline (Eilers & Marx 1996): where there is nothing to fit, second differences keep
+        # the coefficients on a straight line
         bends = empty.bends()
         normal = design.T @ design + 0.01 * bends.T @ bends + 1e-9 * np.eye(count)
         return replace(empty, values=np.linalg.solve(normal, design.T @ values))
@@ -296,6 +300,7 @@ class Spline:
         design = BSpline.design_matrix(inside, knots, 3)
         if not self.closed:
             return design
+        # On a closed line the three bases beyond the end are those at its start
         fold = sparse.eye(pieces + 3, format="lil")[:, :pieces]
         for k in range(3):
             fold[pieces + k, k] = 1.0

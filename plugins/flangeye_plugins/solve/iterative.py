@@ -134,6 +134,7 @@ def improve_pool(
     """Run Algorithm 1 from a first pool; pulls from ``stream`` only while it is not good enough."""
     search = SearchState(list(first), _cost(first, evaluate))
     search.history.append(search.cost)
+    # Lines 4 and 5; k, which is never advanced as printed, is the length of the history
     while search.cost > required and len(search.history) <= k_max:
         newcomer = next(stream, None)
         if newcomer is None:
@@ -148,6 +149,8 @@ def _try(newcomer: Observation, search: SearchState, evaluate: Evaluate) -> None
     pools = [[*search.pool[:i], *search.pool[i + 1 :], newcomer] for i in range(len(search.pool))]
     costs = [_cost(pool, evaluate) for pool in pools]
     best = int(np.argmin(costs))
+    # While nothing can be measured all costs are infinite and `best` is 0, the oldest: replacing it
+    # anyway leads out of a pool that no view suits
     if costs[best] < search.cost or np.isinf(search.cost):
         change = f"{_mm(search.cost)} became {_mm(costs[best])}"
         search.losers[search.pool[best].id] = f"replaced in the pool by {newcomer.id}: {change}"
@@ -160,6 +163,7 @@ def _try(newcomer: Observation, search: SearchState, evaluate: Evaluate) -> None
 
 def _cost(pool: Sequence[Observation], evaluate: Evaluate) -> float:
     """Return the cost of a pool's answer; infinite for poses in line, which give none."""
+    # The rotation about a line through all centres [m] is free: the SVD would return any
     in_line = spread_of(tcps_of(pool)).width < 1e-3
     return float("inf") if in_line else evaluate(solve_pool(pool))
 
@@ -191,6 +195,8 @@ def _stopped(search: SearchState, params: IterativeParams) -> str:
 def _with_covariance(
     answer: Transform, pool: Sequence[Observation], seen: Sequence[Observation]
 ) -> TransformEstimate:
+    # A pool of four leaves six degrees of freedom, and was chosen for small residuals: the noise is
+    # taken from all poses seen, by a median, which a few bad ones do not move
     residuals = residuals_of(seen, answer.rotation, answer.translation)
     inflation = covariance_inflation(max(3 * len(seen) - 6, 3))
     sigma = max(robust_sigma(residuals), FINEST_NOISE) * float(np.sqrt(inflation))

@@ -99,6 +99,7 @@ def by_motions(method: Callable[[Motions], Floats]) -> ClosedForm:
 
     def closed(problem: Problem) -> Places:
         carried, seen = _one_arm(problem)
+        # Equation (2) of the paper, or (4) at two poses: the target's place drops out
         x = method(motions_of(carried, seen))
         return _placed(problem, x, place_of(carried, x, seen))
 
@@ -126,6 +127,8 @@ def by_three(
             )
         if len(problem.seen) < needed:
             raise StageError(f"{needed} poses needed, {len(problem.seen)} given")
+        # Equation (5) of the paper: X K0 Z^-1 K1 Y^-1 K2 = 1 round the circle is A X B = Y C Z with
+        # A = K2, B = K0 and C = K1^-1
         _, known = circle_of(problem)
         x, y, z = method(known[2], known[0], invert(known[1]))
         return _as_named(problem, [x, invert(z), invert(y)])
@@ -156,6 +159,7 @@ def _one_arm(problem: Problem) -> tuple[Floats, Floats]:
             f"has two unknowns, and the configuration leaves {count}: write place: unknown for a "
             "marker on or before one arm, or use solve.robust"
         )
+    # Round the circle X M Z^-1 G = 1, with the carriers' pose G after the target's place
     _, known = circle_of(problem)
     return known[1], known[0]
 
@@ -282,12 +286,15 @@ def check_poses(observations: Sequence[Observation]) -> None:
     """
     require_poses(len(observations))
     centres, tcps = centres_of(observations), tcps_of(observations)
+    # In this order: at one place the ratio of distances means nothing, and in another unit no
+    # mirror fits either
     require_several_places(tcps)
     require_same_units(centres, tcps)
     require_right_handed(centres, tcps)
 
 
 def _require_observable(tcps: Floats, residuals: Floats, limit: float) -> None:
+    # A floor, for residuals of three poses or of exact data would make any motion observable
     noise = max(robust_sigma(residuals), FINEST_NOISE)
     no_axes = np.zeros((0, 3))
     require_observable(tcps, no_axes, information_of_centres(tcps, noise), noise, limit)
@@ -304,6 +311,8 @@ def least_squares_estimate(
         tcps: (N, 3) in base [m].
         residuals: (N, 3) [m], of N >= 3 pairs.
     """
+    # A rigid fit takes six; the 95 % region of a variance that is estimated from the rest is wider
+    # than the chi-square's by F's quantile
     freedom = 3 * len(tcps) - 6
     sigma = float(np.sqrt((residuals**2).sum() / freedom * covariance_inflation(freedom)))
     covariance = kabsch_covariance(tcps, sigma)

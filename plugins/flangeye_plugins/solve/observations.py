@@ -55,6 +55,7 @@ def estimate_of(
     rotation: Floats, translation: Floats, covariance: Floats, about: Floats
 ) -> TransformEstimate:
     """Return ``base_T_camera`` with its (6, 6) covariance about a point in ``base``."""
+    # Symmetric to the last bit: a product of matrices rounds each half on its own
     transform = Transform(BASE, CAMERA, rigid(rotation, translation))
     return TransformEstimate(transform, 0.5 * (covariance + covariance.T), about)
 

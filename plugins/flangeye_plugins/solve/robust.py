@@ -91,6 +91,7 @@ def solve_robust(  # noqa: PLR0913  what it asks the runner for
     def solve(pulled: Sequence[Observation]) -> HandEye:
         return solve_cell(pulled, standing, params, scanner, workspace)
 
+    # With everything recorded already there is nothing to save by stopping early
     if params.required is None or observations.whole:
         return solve(list(observations))
     return solve(pull(observations, solve, params.required, stage_log))
@@ -135,6 +136,7 @@ def pull(
         # Poses before an online run may stop: fewer leave the noise too uncertain.
         if len(pulled) < 6:
             continue
+        # Solved anew from all poses so far: outliers among the first may show only now
         error = _expected(pulled, solve)
         if stage_log:
             stage_log("progress", Progress(len(pulled), error, required))

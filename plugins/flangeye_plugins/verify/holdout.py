@@ -236,8 +236,8 @@ def _misread(calibration: HandEye, cell: Cell, optical: bool) -> str | None:
         return (
             f"the arm would carry the one {near:.2f} m from its flange, the other would "
             f"stand {far:.2f} m from its base: probably "
-            f"{readings[0].told(pairs.in_hand)}, which fits as well; if they are right, state the "
-            "target's place (configuration: {place: …})"
+            f"{readings[0].mistake(pairs.in_hand)}, which fits as well; if they are right, state "
+            "the target's place (configuration: {place: …})"
         )
     axes = other_axes(markers[:, :3, 3]) if optical else None
     side = {"opengl": "behind", "ros": "beside"}

@@ -66,14 +66,17 @@ def predicted(plan: Path, belief: Belief, settings: Following) -> Predicted:
     )
     sine, turned = _stances(plan, s, belief.distance, settings.sign * settings.deflection)
     free, _ = _stances(plan, s, belief.distance, 0.0)
+    # Near its end the tip is released, which swings the tool from the one stance to the other
     least = np.minimum(np.abs(sine), np.abs(free))
     sine = np.where(s + belief.distance < lets_go, sine, least)
     minutes = (s + belief.distance) / settings.speed / 60.0
     weave = Weave(settings.weave_width, settings.weave_frequency)
-    # Between two walls the sweep at the start tells how far ahead the tip is.
+    # Between two walls the sweep at the start measures how far ahead the tip is.
     ahead = min(belief.ahead_known, PIVOTED if belief.two_walls else math.inf)
     press = settings.deflection / (SOFTER if belief.two_walls else 1.0)
     drift = settings.gain_drift * minutes * press
+    # A tip that is e ahead of its file is off across by e times what the tool turns between the
+    # tip's passing and the torch's; one that is e aside, by e (1 - cos), about e turned^2 / 2
     return Predicted(
         s, np.full(len(s), belief.fixed_variance(settings)), (belief.along_sigma * sine) ** 2,
         (ahead * turned) ** 2 + (belief.tip_sigma * turned**2 / 2.0) ** 2,

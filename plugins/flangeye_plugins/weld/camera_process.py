@@ -172,7 +172,7 @@ class CameraProcess:
 def camera_process(wire: Connection, job: CameraJob) -> None:
     """Open the camera and answer requests; main function of the camera process."""
     for told in (signal.SIGINT, signal.SIGTSTP):
-        signal.signal(told, signal.SIG_IGN)  # the program is told, and ends this
+        signal.signal(told, signal.SIG_IGN)  # the program gets it too, and ends this process
     latest = LatestState(job.state)
     with (
         suppress(EOFError, BrokenPipeError, ConnectionResetError),  # the program is gone

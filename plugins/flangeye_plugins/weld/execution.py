@@ -79,7 +79,7 @@ class WeldCell:
         eyes: Read the finger.
         tool: Translates between flange and plane.
         bounds: What the tip must keep to.
-        steered: What is told what a look behind the torch sees, where there is one.
+        steered: Takes each profile that a look behind the torch gives, where there is one.
         gas_after: Where there is a power source: for how long gas flows after its arc [s].
     """
 
@@ -137,7 +137,7 @@ def _watch(cell: WeldCell, weld_log: WeldLog) -> None:
 def follow(cell: WeldCell, controller: Controller, weld_log: WeldLog, longest: float) -> str:
     """Follow the seam; return why it ended early, or an empty text at its end.
 
-    Whatever happens the arm is told to stop, and the chronicle holds all up to then.
+    Whatever happens the arm is commanded to stop, and the log holds all up to then.
     """
     began: float | None = None
     cell.drive.lead()

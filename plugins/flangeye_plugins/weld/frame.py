@@ -360,7 +360,9 @@ class Tool:
         velocity = stand.unrolled(command.velocity)
         up, tilt = self._standing(s)
         going = float(velocity @ stand.axes[:, 0])
-        # It is brought to where it is to stand within a second, and kept there on the way.
+        # The turn asked for, about the surface's normal; what rights the tool within a second; and
+        # what keeps it upright as the surface tilts. The flange's origin then has v - w x r, r
+        # being the tip from there
         angular = command.turn * up + _cross(self.up(rotation), up) + going * _cross(up, tilt)
         return np.concatenate([velocity - _cross(angular, tip), angular])
 

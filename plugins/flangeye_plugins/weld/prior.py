@@ -49,6 +49,7 @@ def with_prior(belief: Belief, path: Path | None, finger: str) -> Belief:
             "file, or name another one (prior)"
         )
     found = prior.model_dump(exclude={"finger"})
+    # Half the information is twice the variance
     aged = {name: math.sqrt(2) * x for name, x in found.items() if name.endswith("_sigma")}
     return replace(belief, **{**found, **aged})
 

@@ -189,7 +189,7 @@ class SeamReach:
 
     def _bars(self, before: Floats, joints: Floats) -> Barrier | None:
         """Return why a posture must not be taken after another; None if it may."""
-        # The order matters: of all that was tried, what came farthest in it is told.
+        # The order matters: of several attempts, that which passes most of these checks is named
         axes = self._volume.axes(self._arm.frames(joints))
         if not self._volume.above(axes, TABLE):
             return Barrier(0, "the arm touches the table")

@@ -35,7 +35,7 @@ class Cycle(NamedTuple):
         sigma: Standard deviation of the torch's place across the seam.
         bound: What its distance from the seam does not exceed.
         band: The same for 95 % of the seam.
-        arc: What gas and arc were told: 0 off, 1 gas, 2 arc.
+        arc: Commanded state of gas and arc: 0 off, 1 gas, 2 arc.
         computing: Processor time that the cycle took, besides reading images [s].
         period: Since the last cycle began, on this computer's clock [s].
         answering: Until its command was given, by the same clock, besides reading images [s].

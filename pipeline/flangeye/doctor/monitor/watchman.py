@@ -73,7 +73,7 @@ def _without_misfits(
 
 def _before(stored: StoredCalibration, history: History, test: DriftTest) -> Information:
     """Return the information in the calibration and the earlier checks."""
-    known = stored.prior.told.loosened(test.seasonal)
+    known = stored.prior.information.loosened(test.seasonal)
     if not history.checks:
         return known
     told = information_of(stored.sightings(*history.sightings()), test.daily)
@@ -115,7 +115,7 @@ def _blamed(
     if found.since is None:
         return "", 0.0
     n = len(checks.matrix)
-    before = stored.prior.told.plus(
+    before = stored.prior.information.plus(
         checks.summed(max(found.since - test.reference, 0), found.since)
     )
     scanner = stored.estimate.transform.translation

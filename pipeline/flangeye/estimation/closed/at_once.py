@@ -54,6 +54,7 @@ def _screw_rows(motions: Motions) -> Floats:
 
 def _dual(motions: Floats) -> tuple[Floats, Floats]:
     """Return the vector parts (K, 3) of the real and dual quaternions of (K, 4, 4) motions."""
+    # The dual part is t q / 2, whose vector part is (w t + t x v) / 2
     q = quaternion_from_rotation(motions[:, :3, :3])
     shift = motions[:, :3, 3]
     return q[:, :3], 0.5 * (q[:, 3:] * shift + np.cross(shift, q[:, :3]))

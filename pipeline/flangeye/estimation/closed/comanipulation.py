@@ -79,7 +79,7 @@ def _settled(given: Triple, near: Triple) -> Triple:
         turns = np.stack([off[..., 2, 1], off[..., 0, 2], off[..., 1, 0]], axis=-1)
         by = np.broadcast_to(np.eye(3), second.shape)
         rows = np.concatenate([np.broadcast_to(-a, second.shape), by, second], axis=-1)
-        # Keeps turns where poses do not tell them
+        # Keeps the equations solvable along turns that the poses do not determine
         normal = np.einsum("knia,knib->kab", rows, rows) + 1e-9 * len(a) * np.eye(9)
         right = np.einsum("knia,kni->ka", rows, turns)
         dx, dy, dz = -np.linalg.solve(normal, right[..., None]).reshape(-1, 3, 3).swapaxes(0, 1)

@@ -33,14 +33,14 @@ KINDS = {
 for a metre of lever [rad/m], lengths [m], twists [rad]. Ratios seen in published calibrations of
 industrial arms (Nubiola & Bonev 2013; the zeros and lengths of ``refine.arm``), rounded."""
 ANEW = {"base": (1.0, 0.5), "flange": (1.2, 0.15), "each": (0.4, 0.1)}
-"""Likewise where the joints are not known, of turn [rad] and shift [m] that all poses have in
-common, of the base and in the flange, and that each has of its own: those of a UR5e and a Panda
+"""Typical turn [rad] and shift [m] where the joints are not known: common to all poses, of the base
+and in the flange, and of each pose alone. They are those of a UR5e and a Panda
 with errors of all these kinds (``tests/estimation/foreign.py``), over 240 mm and 20 to 35
 degrees."""
 COMMON = "common"
 """The kind of what all poses have in common: reported coordinates are right as they are."""
 ACCURACY = 0.3e-3
-"""Typical deviation of a joint's zero where no file says it [rad]: that of the catalogue's arms."""
+"""Typical deviation of a joint's zero where no file states it [rad]: the catalogue arms'."""
 QUALITY = 4.0
 """By how many times an arm may be better or worse than its file says, one sigma: joint accuracy is
 on no data sheet, and arms of one maker differ tenfold."""
@@ -53,7 +53,7 @@ def arm_effects(problem: Problem, arm: str) -> list[Effect]:
     carriers = [c for c in problem.carriers if c.arm == arm]
     accuracy = carriers[0].accuracy or ACCURACY
     effects = []
-    if _told(problem, arm):
+    if _joints_of_all_known(problem, arm):
         for kind, (name, ratio) in KINDS.items():
             block = _of_carriers(arm, kind)
             effects.append(Effect(name, block, ratio * accuracy, EACH, arm, True, kind))
@@ -106,7 +106,7 @@ def arm_scatters(problem: Problem) -> list[Scatter]:
     """
     out = []
     for arm, accuracy in {c.arm: c.accuracy or ACCURACY for c in problem.carriers}.items():
-        if _told(problem, arm):
+        if _joints_of_all_known(problem, arm):
             # Of a joint's angle from pose to pose [rad]: an arm that repeats to 0.03
             # mm by ISO 9283 at a reach of a metre has 0.03 mrad. What an arm repeats
             # to says nothing of how true it is: it has a quality of its own
@@ -119,13 +119,13 @@ def arm_scatters(problem: Problem) -> list[Scatter]:
     return out
 
 
-def _told(problem: Problem, arm: str) -> bool:
+def _joints_of_all_known(problem: Problem, arm: str) -> bool:
     """Whether the joints of all that an arm carries are known."""
     carriers = [c for c in problem.carriers if c.arm == arm]
-    return all(told(c) for c in carriers)
+    return all(joints_known(c) for c in carriers)
 
 
-def told(carrier: Carrier) -> bool:
+def joints_known(carrier: Carrier) -> bool:
     """Whether kinematics and joints of a carrier are known."""
     return carrier.joints is not None and carrier.kinematics is not None
 
@@ -200,6 +200,7 @@ def displacements(carrier: Carrier) -> dict[str, Floats]:
     columns = arm.jacobian(joints, link)
     waves = np.stack([np.sin(joints), np.cos(joints)], axis=1)
     links = arm.link_twists(joints, link)
+    # An eccentric encoder disc errs once a turn, e sin q + f cos q; a joint sags by the torque
     return {
         "zeros": columns,
         "encoders": (columns[:, :, None, :] * waves[:, None]).reshape(len(joints), 6, -1),
@@ -216,7 +217,8 @@ def _levers(arm: Arm, joints: Floats) -> Floats:
     """
     origins, (axes, places) = arm.frames(joints)[..., :3, 3], arm.axes(joints)
     beyond = [origins[:, i + 1 :].mean(axis=1) - places[:, i] for i in range(arm.n)]
-    # The base is level
+    # Gravity's torque about an axis a at lever r is a . (r x z) = (a x r) . z per unit of weight;
+    # the base is taken to be level
     return np.asarray(np.cross(axes, np.stack(beyond, axis=1)) @ np.array([0.0, 0.0, 1.0]))
 
 

@@ -9,7 +9,7 @@ from flangeye.estimation.graph import Linear, Problem
 from flangeye.types import Floats, Mask
 
 SIZE = 1e-3
-"""Typical share by which a printed marker is larger or smaller than was said: a tenth of a
+"""Typical share by which a printed marker is larger or smaller than configured: a tenth of a
 millimetre of 100 mm, what a ruler shows."""
 
 
@@ -19,7 +19,7 @@ def camera_effects(problem: Problem, size_unknown: bool = False) -> list[Effect]
     if s.shared.any():
         for camera in dict.fromkeys(camera for camera, _ in problem.ends):
             name = f"intrinsics of {camera}"
-            # Views told the stated deviation: it may be 1.05 times as much, one sigma
+            # The stated deviation comes from calibration views: 1.05 times as much, one sigma
             effects.append(Effect(name, _shared(camera), 1.0, 1.05, kind="shared"))
     # A tenth where the size is to be found
     size = 0.1 if size_unknown else SIZE
@@ -57,6 +57,7 @@ def _focal(camera: str) -> Block:
     def block(problem: Problem, linear: Linear) -> Floats:
         s, out = problem.seen, np.zeros((len(problem.seen), 6, 1))
         whose = np.array([problem.ends[k][0] == camera for k in s.pairs]) & (s.ranks == 6)
+        # x = f X / Z: a longer focal length leaves X and puts Z farther away
         out[whose, 5, 0] = -_smoothed(problem, linear, whose)[whose, 2]
         return out
 
@@ -101,6 +102,7 @@ def _drift(camera: str, knots: int, rows: slice) -> Block:
         out = np.zeros((count, 6, 3 * knots))
         at = np.linspace(0, knots - 1, count)[np.argsort(np.argsort(s.times))]
         hats = np.maximum(1 - np.abs(at[:, None] - np.arange(knots)), 0.0)
+        # The mean of a drift is the camera's place itself
         hats = hats - hats.mean(axis=0)
         whose = np.array([problem.ends[k][0] == camera for k in s.pairs])
         moved = hats[:, :, None, None] * np.eye(3)  # (N, knots, 3, 3)

@@ -59,7 +59,7 @@ def _edges(problem: Problem, linear: Linear) -> Floats:
 
     Where the wall behind an edge is in view a scanner rounds the edge off; on the other side it
     breaks off. So a centre lies too far from the camera's side, by the more the more the face is
-    tilted. Tilting also is what tells how far away a circle of unknown place is.
+    tilted. Only tilted views determine how far away a circle of unknown place is.
     """
     s = problem.seen
     out = np.zeros((len(s), 6, 1))
@@ -126,6 +126,8 @@ class DistortionField:
         radius = 30e-3  # to each side of a target [m]: a flange's radius
         bent = [(self.at(s.centres + radius * t) - self.at(s.centres - radius * t))
                 / (2 * radius) for t in (across, along)]  # fmt: skip
+        # A plate takes the field's gradient over it: its normal tilts by the rise along its two
+        # axes, and it rolls by half the curl
         rising = [np.einsum("ni,nik->nk", normals, each)[:, None] for each in bent]
         turning = np.einsum("ni,nik->nk", along, bent[0]) - np.einsum("ni,nik->nk", across, bent[1])
         turned = (

@@ -48,7 +48,7 @@ def offset_shown_to(problem: Problem, places: Places) -> float:
     """Return the standard deviation of a circle's offset in its flange, if it were free [m].
 
     A constant offset d moves the circle by R_i d at pose i. Where all R_i are alike, it cannot be
-    told from a shift of the camera.
+    distinguished from a shift of the camera.
 
     Returns:
         Along the direction that the poses show least; 0 where the residuals are no noise.

@@ -171,11 +171,11 @@ class Prior:
     """Prior of the camera's motion and of the arm's error, before the first check.
 
     Attributes:
-        told: The calibration's information on the camera's motion since and on the arm's error.
+        information: That of the calibration on the camera's motion since and on the arm's error.
         freedom: Degrees of freedom from which the size of the arm's error is known.
     """
 
-    told: Information
+    information: Information
     freedom: float = np.inf
 
 
@@ -227,7 +227,7 @@ def verdict(checks: Information, prior: Prior, corners: Floats, test: DriftTest)
     n = len(checks.matrix)
     # A step is held against a calibration that the seasons may have moved. Slow drift is that
     # motion itself, so nothing is allowed for it in `_slow`
-    start = Prior(prior.told.loosened(test.seasonal), prior.freedom)
+    start = Prior(prior.information.loosened(test.seasonal), prior.freedom)
     found = max((_step(checks, start, n - w, test) for w in _windows(n, test)), key=lambda s: s[0])
     if found[0] > 1.0:
         return moved_since(checks, prior, corners, test, found[1], found[0])
@@ -245,7 +245,7 @@ def moved_since(
     checks: Information, prior: Prior, corners: Floats, test: DriftTest, since: int, ratio: float
 ) -> DriftVerdict:
     """Return the camera's motion between the checks before ``since`` and those after it."""
-    start = prior.told.loosened(test.seasonal)
+    start = prior.information.loosened(test.seasonal)
     before = start.plus(checks.summed(max(since - test.reference, 0), since))
     change = _change(checks.summed(since, len(checks.matrix)), before)
     shift = largest_shift(change.mean, corners)
@@ -284,7 +284,7 @@ def _windows(n: int, test: DriftTest) -> range:
 def _step(checks: Information, start: Prior, first: int, test: DriftTest) -> tuple[float, int]:
     """Return the likelihood ratio of a step at check ``first``, over its threshold; and it."""
     low = max(first - test.reference, 0)
-    before = start.told.plus(checks.summed(low, first))
+    before = start.information.plus(checks.summed(low, first))
     after = checks.summed(first, len(checks.matrix))
     statistic, rank = (x.item() for x in _surprise(_change(after, before)))
     scale, freedom = _scatter(checks, before, (low, first), start.freedom)
@@ -341,8 +341,8 @@ def _slow(checks: Information, prior: Prior, test: DriftTest) -> tuple[Floats, F
     """Return the motion from the calibration and the first checks to the last ones."""
     n = len(checks.matrix)
     if n < test.settled:
-        return np.zeros(6), prior.told.covariance[:6, :6]
-    first = prior.told.plus(checks.summed(0, min(test.settled, n - test.settled)))
+        return np.zeros(6), prior.information.covariance[:6, :6]
+    first = prior.information.plus(checks.summed(0, min(test.settled, n - test.settled)))
     change = _change(checks.summed(n - test.settled, n), first)
     return change.mean, change.covariance
 

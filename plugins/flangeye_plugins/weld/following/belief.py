@@ -98,6 +98,7 @@ class Belief:
         """
         axes = np.array(self.level_R_tool)
         stiff = axes @ np.diag([self.lateral, self.lateral, self.axial]) @ axes.T
+        # No force along the seam, where the tip slides: the stiffness is condensed onto the rest
         free = stiff[1:, 1:] - np.outer(stiff[1:, 0], stiff[0, 1:]) / stiff[0, 0]
         facing = np.diag([settings.sign, -1.0])
         return np.asarray(facing @ free @ facing)
@@ -186,7 +187,7 @@ class Learned:
         noise: Standard deviation of one measurement across [m].
         swept: Largest deflection at which the tip stayed in its seat [m].
         ahead: The tip is ahead of where its file has it by this [m].
-        ahead_sigma: Its standard deviation, as far as the sweep tells it [m].
+        ahead_sigma: Its standard deviation after the sweep [m].
         width_sigma: Standard deviation of the width [m].
         stamp_sigma: Standard deviation of the stamp [s].
     """
@@ -220,6 +221,7 @@ class Learned:
         Play, taken for ``kept`` of its half width, is at the pressed side as often and anywhere in
         its width otherwise; and what the sweep left unexplained.
         """
+        # Of 1 with a probability, and uniform in [-1, 1] otherwise: E x^2 - (E x)^2
         spread = self.kept + (1.0 - self.kept) / 3.0 - self.kept**2
         return (spread * self.width**2 + self.unexplained**2) / (1.0 + self.gain) ** 2
 

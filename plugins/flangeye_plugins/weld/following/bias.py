@@ -6,7 +6,7 @@ of it is in what the files state beforehand, one variance P0 about zero. A look 
 how far the torch really was off where it passed; the measured part of it then is known, so
 z - raw is b there, with an error of variance R: of the look, of the arm and of what the tip felt.
 Such errors are alike over about a tool's length L (an arm that waves, a profile read askew), so a
-look that comes after a way d tells as much as d / L independent ones.
+look that comes after a way d counts as d / L independent ones.
 
 From place to place b is a random walk. The files state by how much heat moves the seam, D one
 sigma, while the torch goes on by L: D^2 / L per length. That is a Kalman filter of one state,

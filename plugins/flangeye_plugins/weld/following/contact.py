@@ -161,6 +161,7 @@ class Contact:
         weighed = (self.likely @ moves) * chances
         self.likely = weighed / weighed.sum()
         self._newest.append(_Weighed(felt, self.likely, moves, chances, climbed))
+        # Only a seated tip measures the height of the seam
         gain = float(self.likely[Mode.SEATED]) * self._spread / (self._spread + self.noise[1] ** 2)
         self._height += gain * (felt.height - self._height)
         self._spread *= 1.0 - gain
@@ -171,6 +172,7 @@ class Contact:
 
     def settled(self, until: float) -> Iterator[tuple[Felt, float]]:
         """Yield measurements up to a time [s] that count, each with its extra variance [m^2]."""
+        # Backward pass: `since` is how likely each mode makes all that was measured later
         since, off = np.ones(4), []
         for weighed in reversed(self._newest):
             likely = weighed.likely * since
@@ -232,6 +234,7 @@ def _up_a_wall(
     aside: float, up: float, across: float, tall: float, flat: float
 ) -> tuple[float, float]:
     """Return the density of a tip that rose by about RISE along a wall, and how far it has."""
+    # A rise r of N(RISE, RISE^2), seen as flat r aside and r up, integrated out in closed form
     weight = 1.0 / RISE**2 + flat**2 / across + 1.0 / tall
     risen = (1.0 / RISE + flat * aside / across + up / tall) / weight
     left = (risen - RISE) ** 2 / RISE**2

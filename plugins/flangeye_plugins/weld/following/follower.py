@@ -23,7 +23,7 @@ from flangeye_plugins.weld.following.welding import Welding
 from flangeye_plugins.weld.settings import INSIDE
 
 WAITING = 0.2
-"""Share of its speed that it keeps all the same: a wall that has ended is found out by going on."""
+"""Minimum speed fraction, so that a wall that has ended is noticed."""
 
 
 class Follower:
@@ -89,7 +89,7 @@ class Follower:
             return None
         return ResumePoint(self.seam.refined.samples(), self.torch, self.sensing.learned)
 
-    # --- what it tells others ---------------------------------------------------------------------
+    # --- what others read -------------------------------------------------------------------------
 
     @property
     def mode(self) -> str:
@@ -289,8 +289,8 @@ class Follower:
         if self.phase in ("following", "bridging") and self._aside(pose) > 0.7:
             return (
                 f"the plan curves with a radius of {1e3 / abs(plan.bend(self.tip)):.1f} mm "
-                "and the arm is off towards its centre: how far along it the tip is cannot be "
-                "told; plan better, or raise 'corner_radius'"
+                "and the arm is off towards its centre: the tip's place along it is not "
+                "observable; plan better, or raise 'corner_radius'"
             )
         if sensing.search.bent:
             return "the tip is displaced though nothing should touch it"
@@ -326,7 +326,7 @@ class Follower:
 
         Args:
             pose: Where the tool is.
-            coming: Where it will be when it has done all it was told.
+            coming: Where it will be when it has carried out all commands sent.
             elapsed: Time since the last cycle [s].
         """
         self.pressing.ramp(self.phase, self._press(), elapsed)

@@ -37,7 +37,7 @@ PIVOTED = 0.02e-3
 """Best accuracy of the tip distance estimated by the sweep [m]."""
 
 LONGEST = 4.0
-"""So well the mean of what is felt at the hard end is to be known [m]; no longer is awaited [s]."""
+"""Longest wait for the tip to rest, or for enough measurements at the hard end [s]."""
 
 
 class Probing:
@@ -108,7 +108,7 @@ class Probing:
     def _standing_since(self) -> float:
         """Return since when the arm stands [s], infinity where it still moves.
 
-        It does for a while after it was told to stop, longest where it turned as well.
+        It moves for a while after the command to stop, longest where it turned as well.
         """
         now, _, here, _ = self._cycles[-1] if self._cycles else (0.0, 0.0, 0.0, 0.0)
         since = math.inf
@@ -130,16 +130,16 @@ class Probing:
         # The mean at the hard end is to be known to 0.03 mm.
         return (self._noise[0] / 0.03e-3) ** 2
 
-    def note(self, time: float, told: float, lateral: float, slant: float = 0.0) -> None:
+    def note(self, time: float, sent: float, lateral: float, slant: float = 0.0) -> None:
         """Record a cycle.
 
         Args:
             time: [s].
-            told: Speed to the left that was commanded [m/s].
+            sent: Speed to the left that was commanded [m/s].
             lateral: The end point's offset to the left [m].
             slant: Sine of the tool's angle to the plan.
         """
-        self._cycles.append((time, told, lateral, slant))
+        self._cycles.append((time, sent, lateral, slant))
 
     def feel(self, time: float, across: float, height: float, along: float) -> None:
         """Remember a measurement: displacements to the left and forwards, the tip's height [m]."""
@@ -158,7 +158,7 @@ class Probing:
             return (
                 f"the finger has {2 * abs(found.width) * 1e3:.2f} mm of play or hysteresis and "
                 f"{found.noise * 1e3:.2f} mm of noise: pressed by {self._reach * 1e3:.2f} mm a "
-                "tip that is held cannot be told from one that is not; fasten it, or its tag"
+                "held tip and a free one look the same; fasten it, or its tag"
             )
         if not self._two_walls or half < max(found.least, self._settings.probe):
             return f"{climbs}; lower 'deflection' or raise 'preload', or calibrate the finger"
@@ -256,6 +256,7 @@ class Probing:
 
 def _scatter(values: Floats) -> float:
     """Return the standard deviation of one of a row of measurements, by second differences."""
+    # Second differences have no trend, and of white noise six times the variance
     return float(np.median(np.abs(np.diff(values, 2))) / 0.6745 / np.sqrt(6.0))
 
 
@@ -289,8 +290,8 @@ def _spread(unlikely: Floats, stamps: Floats, plays: Floats, best: int) -> tuple
 def _rows(at: Floats, slant: Floats, widths: Floats) -> Floats:
     """Return the design (C, N, 5): offset, gain, play, where in its play it began, and ahead.
 
-    Where the finger stood in its play at first is told by where it would have been had it begun at
-    the one end and at the other, until both have come to the same.
+    Where in its play the finger stood at first is a column of its own: the difference between
+    beginning at the one end and at the other, until both have come to the same.
     """
     left, right = (_dragged(at, widths, end) for end in (-1.0, 1.0))
     reversal, began = (left + right) / 2.0 - at, (right - left) / 2.0

@@ -33,6 +33,8 @@ class _Field:
     """Matern fields (smoothness 5/2), M of them side by side: state transitions and noise."""
 
     def __init__(self, sizes: Floats, lengths: Floats) -> None:
+        # Stationary covariance of offset, slope and curvature (Hartikainen & Sarkka 2010, with
+        # lambda = sqrt(5) / length and kappa = sigma^2 lambda^2 / 3)
         rate = math.sqrt(5.0) / lengths
         self.rate, tilt = rate, sizes**2 * rate**2 / 3.0
         self.stationary = np.zeros((len(rate), 3, 3))
@@ -42,6 +44,7 @@ class _Field:
 
     def over(self, way: Floats) -> Floats:
         """Return transitions (K, M, 3, 3) over ways (K,) [m]."""
+        # exp(F d) of the companion form, whose three eigenvalues are all -r
         d, r = way[:, None], self.rate
         rd = r * d
         rows = [
@@ -80,7 +83,7 @@ class RefinedPath:
             wander: Standard deviation of the seam about the plan's shape, at least [m].
         """
         self._plan, self.empty = plan, True
-        self.noise = 0.01e-3  # until the sweep tells
+        self.noise = 0.01e-3  # until the sweep measures it
         sizes, lengths = (grid.ravel() for grid in np.meshgrid(SIZES, LENGTHS, indexing="ij"))
         self._field = _Field(wander * sizes, lengths)
         models, self._start = len(sizes), -margin
@@ -155,6 +158,7 @@ class RefinedPath:
         full[:, :3, :3], full[:, 3:, 3:] = np.eye(3), turn
         self._state[:, 3:] = (turn @ self._state[:, 3:, None])[..., 0]
         self._covariance = full @ self._covariance @ np.swapaxes(full, 1, 2)
+        # What keeps a stationary field stationary is its process noise: Q = P - A P A'
         stationary = self._field.stationary
         self._covariance[:, 3:, 3:] += stationary - turn @ stationary @ back
         window = slice(self._low, self._next)
@@ -181,11 +185,12 @@ class RefinedPath:
         gain = cross / spread[:, None]
         self._state += gain * off[:, None]
         self._covariance -= gain[:, :, None] * cross[:, None, :]
+        # Places passed before learn of it by their covariance with the state
         window = slice(self._low, self._next)
-        told = self._cross[:, window] @ row
-        share = told / spread[:, None]
+        known = self._cross[:, window] @ row
+        share = known / spread[:, None]
         self._means[:, window] += share * off[:, None]
-        self._vars[:, window] -= share * told
+        self._vars[:, window] -= share * known
         self._cross[:, window] -= share[:, :, None] * cross[:, None, :]
 
     def _weigh(self, off: Floats, spread: Floats) -> None:
@@ -309,7 +314,7 @@ class RefinedPath:
         return between, (first > self._next - 1).nonzero()[0]
 
     def _ahead(self, s: Floats) -> Floats:
-        """Return by what the state tells the offset where the tip has not been (K, M, 6)."""
+        """Return how the state predicts the offset where the tip has not been (K, M, 6)."""
         over = self._field.offsets_over(np.maximum(s - self._at, 0.0))
         rows = np.empty((*over.shape[:2], 6))
         rows[..., :3], rows[..., 3:] = self._rows(s)[:, None, :], over
@@ -321,6 +326,7 @@ class RefinedPath:
     def _rows(self, s: Floats) -> Floats:
         """Return (K, 3): how a shift and a small turn of the plan move it along its normals."""
         points, tangents = self._plan.evaluate(s)
+        # A turn about the plan's start moves a place at lever l by (-l_y, l_x)
         levers = points[:, :2] - self._plan.points[0, :2]
         out = np.empty((len(s), 3))
         out[:, 0], out[:, 1] = -tangents[:, 1], tangents[:, 0]

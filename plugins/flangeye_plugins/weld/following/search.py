@@ -76,8 +76,8 @@ class SweepSearch:
         self._free.append(displacement)
         free = np.array(self._free)
         usual = np.median(np.abs(free[:, 2] - np.median(free[:, 2])))
-        # Ten measurements in the air, before the tip descends, and as many as tell a quarter of the
-        # preload: a rest that is off is taken for a touch.
+        # Ten measurements in the air, before the tip descends, and as many as resolve a quarter of
+        # the preload: a rest position that is off would be taken for a touch.
         enough = _needed(SIGMA_OF_MAD * usual, self._settings.preload / 4)
         if len(free) < np.clip(enough, 10, 5 * MOST):
             return

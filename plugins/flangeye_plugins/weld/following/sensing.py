@@ -349,7 +349,7 @@ class SeamEstimate:
         s, seam = found.s, found.seam
         offset, variance = self.refined.expected(s)
         aside = seam.offset - offset
-        # What play does is in the path already, which the touches before this one have told.
+        # The effect of play is in the path already, from the touches before this one.
         spread = variance + (learned.noise / (1.0 + learned.gain)) ** 2 + STEADY**2
         expected = time, s, seam.offset, found.angle, aside, spread, seam.height
         self.contact.take(Felt(*expected, found.deflection, found.compression), side)
@@ -374,7 +374,7 @@ class SeamEstimate:
         """Add accepted measurements up to a time [s], short of where the seam may end."""
         task = self._task
         end = task.plan.length - max(task.settings.ending / 4.0, task.beyond)
-        # Between two walls a tip that has fallen off the seam's end is told from one that has not.
+        # Between two walls a tip shows that it has fallen off the seam's end.
         if task.feels_ends and task.belief.two_walls:
             end = task.plan.length + task.beyond
         for felt, doubt in self.contact.settled(until):
@@ -395,7 +395,7 @@ class SeamEstimate:
     def moved(self, found: Located) -> str:
         """Return why the weld must stop if the seam has moved since it was measured; else ""."""
         before = self._task.before
-        enough = 15  # measurements tell whether it has moved
+        enough = 15  # measurements that show whether it has moved
         if before is None or len(self._moved) == enough or found.s > before.samples[-1, 0]:
             return ""
         self._moved.append(found.seam.offset - self.refined.offset(found.s))

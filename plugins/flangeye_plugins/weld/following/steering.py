@@ -30,6 +30,7 @@ class WeaveOffset(NamedTuple):
 
     def led(self, lag: float) -> WeaveOffset:
         """Return the swing that an arm follows with a time constant [s], to be on this one."""
+        # (1 + lag d/dt) undoes a first-order lag, 1 / (1 + lag s)
         return WeaveOffset(self.aside + lag * self.rate, self.rate + lag * self.rush, self.rush)
 
 
@@ -62,7 +63,8 @@ class Weave:
     @property
     def variance(self) -> float:
         """Variance of the torch across the seam due to the weave's timing error [m^2]."""
-        # The arm's delay is known to 10 ms: a swing is early or late by it.
+        # The arm's delay is known to 10 ms: a swing is early or late by it, and the mean square of
+        # its speed is half the square of the fastest
         return (self.fastest * 10e-3) ** 2 / 2.0
 
 
@@ -149,6 +151,9 @@ class Steering:
         aligning = -float(np.copysign(self.rate, sine))
         if not trusted:
             return aligning
+        # By (12) the torch has V_t = V_r - L w n_d, and it is to have V_t . n_t = sway - k_c e:
+        # w = (V_r . n_t + k_c e - sway) / (L n_d . n_t). Equation (16) has no k_c, so that an error
+        # of the torch would stay, and by a slip in (15) the other sign
         most = self.share * float(np.hypot(*velocity))
         asked = float(velocity @ normal) + min(max(self.gain * error, -most), most) - sway
         wanted = trusted * asked / (self.distance * cosine) + (1.0 - trusted) * aligning
@@ -169,6 +174,7 @@ class Steering:
         """
         cosine, _ = _cos_sin(tool, normal)
         pace, across = cosine / self.regular, speed * abs(float(along @ normal))
+        # Following alone turns the tool by v |t . n_t| / (L n_d . n_t): a share of its rate at most
         if across:
             pace = min(pace, self.usual * self.rate * self.distance * cosine / across)
         return speed * min(max(pace, SLOWEST), 1.0)

@@ -55,7 +55,7 @@ class Progress:
 
 
 class Pressing:
-    """The deflection asked of the tip.
+    """The deflection by which the tip is pressed against its wall, as the follower commands it.
 
     Attributes:
         most: While the tip follows its wall [m].
@@ -65,7 +65,7 @@ class Pressing:
 
     def __init__(self, task: WeldTask) -> None:
         self._task, settings = task, task.settings
-        # Before the sweep has told how much the tip stands.
+        # Until the sweep shows at which deflection the tip stays seated
         self.most = settings.deflection / (SOFTER if task.belief.two_walls else 1.0)
         self.wanted, self.side = 0.0, settings.sign
         self._lost = self._turned = self._firm = 0.0

@@ -48,7 +48,7 @@ def pivot(what: str, poses: Sequence[Floats], displaced: Sequence[Floats] | None
     Raises:
         StageError: Too few poses, a motion that is missing, or a point that did not stay.
     """
-    # Six unknowns, three equations a pose; as many again tell what does not fit.
+    # Six unknowns, three equations a pose: nine are left to show what does not fit
     if len(poses) < 5:
         raise StageError(f"pivot of the {what}: {len(poses)} poses, at least 5 are needed")
     given = np.array(poses)
