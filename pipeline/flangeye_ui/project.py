@@ -216,8 +216,9 @@ class Project:
         ours = self.run.path if self.run else None
         now = time.time()
         for run in self.runs()[:1]:
-            # A log that did not grow for so long is not being written any more [s]
-            fresh = now - (run / "run.mcap").stat().st_mtime < 10.0
+            # A log that did not grow for so long is not being written any more [s]; nor is one of
+            # a time to come: the clock was set back after it
+            fresh = abs(now - (run / "run.mcap").stat().st_mtime) < 10.0
             if fresh and run != ours and not (run / "result.json").exists():
                 return run
         return None
