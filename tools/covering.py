@@ -1,7 +1,8 @@
 """Which test runs which line: python -m tools.covering SOURCE OUT TESTS, from the repository.
 
-The fast tests of a file run once under coverage.py, each a context of its own. OUT (JSON) gets
-the processor time of every test that passes, and per file and line the tests that run it.
+The fast tests of a file run once under coverage.py, each a context of its own, or where it has none,
+those in real time. OUT (JSON) gets the processor time of every test that passes, and per file and
+line the tests that run it.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ from typing import Any
 import coverage
 import pytest
 
-FAST = ("-q", "-p", "no:cacheprovider", "-m", "not slow and not realtime")
-"""Options of pytest by which fast tests are chosen."""
+NAMED = ("-q", "-p", "no:cacheprovider", "-m", "not slow")
+"""Options of pytest for tests that are named; the last one is which of them."""
 
 
 class Covering:
@@ -28,10 +29,7 @@ class Covering:
         self._coverage = coverage.Coverage(data_file=None, source=[str(source)], config_file=False)
         self.seconds: dict[str, float] = {}
         self._failed: set[str] = set()
-
-    def pytest_sessionstart(self) -> None:
-        """Look from the first import on."""
-        self._coverage.start()
+        self._coverage.start()  # from the first import on
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[None]:
@@ -68,7 +66,9 @@ def main() -> Any:
     """Run the tests and write what ran what."""
     source, out, tests = sys.argv[1:]
     plugin = Covering(Path(source))
-    code = pytest.main([*FAST, tests], plugins=[plugin])
+    code = pytest.main([*NAMED[:-1], "not slow and not realtime", tests], plugins=[plugin])
+    if code == pytest.ExitCode.NO_TESTS_COLLECTED:
+        code = pytest.main([*NAMED, tests], plugins=[plugin])
     lines = plugin.lines()
     Path(out).write_text(json.dumps({"seconds": plugin.seconds, "lines": lines}), "utf-8")
     return code

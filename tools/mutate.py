@@ -1,11 +1,12 @@
 """Change the source in small ways and see which changes no fast test notices.
 
 python -m tools.mutate [SAMPLE] [--seed N] [--room NAME …] [--only FILE:LINE] [--tests FILE …]: a
-sample over the rooms below, each in a copy of the repository, under those fast tests of its room (or
-those named) that run the changed line (coverage.py says which, once for each file of tests:
-build/mutation), the file's own first, then the fastest: in a fork of a process that has them
-collected (tools/trying.py), and if it lives there, in a new process. A change that fails no test is a
-survivor: its place and what was changed are printed, and the share that was killed.
+sample over the rooms below, each in a copy of the repository, under those fast tests of its room
+(or those named; of a file that has none, those in real time, one at a time) that run the changed
+line (coverage.py says which, once for each file of tests: build/mutation), the file's own first,
+then the fastest: in a fork of a process that has them collected (tools/trying.py), and if it lives
+there, in a new process. A change that fails no test is a survivor: its place and what was changed
+are printed, and the share that was killed.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tools.covering import FAST
+from tools.covering import NAMED
 
 ROOT = Path(__file__).parents[1]
 ROOMS: dict[str, tuple[str, ...]] = {
@@ -186,7 +187,7 @@ class Copy:
     def __init__(self, folder: Path) -> None:
         self._root = folder / "copy"
         left_out = shutil.ignore_patterns(
-            ".git", ".venv", ".hypothesis", "runs", "site", "build", "__pycache__"
+            ".git", ".venv", ".hypothesis", "runs", "site", "build", "__pycache__", ".*_cache"
         )
         shutil.copytree(ROOT, self._root, symlinks=True, ignore=left_out)
         self._trying: subprocess.Popen[str] | None = None
@@ -237,7 +238,7 @@ class Copy:
         file.write_text(mutation.text(), "utf-8")
         patience = SLOWER * sum(tests.values()) + STARTS
         try:
-            return bool(self._run(["-m", "pytest", "-x", *FAST, *tests], patience))
+            return bool(self._run(["-m", "pytest", "-x", *NAMED, *tests], patience))
         finally:
             file.write_text(sound, "utf-8")
 

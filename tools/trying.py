@@ -23,7 +23,7 @@ from typing import Any
 
 import pytest
 
-from tools.covering import FAST
+from tools.covering import NAMED
 
 
 class Trying:
@@ -87,7 +87,7 @@ def _inside(code: CodeType) -> Iterator[CodeType]:
 
 def main() -> Any:
     """Collect the tests, then answer."""
-    return pytest.main([*FAST, *sys.argv[1:]], plugins=[Trying()])
+    return pytest.main([*NAMED, *sys.argv[1:]], plugins=[Trying()])
 
 
 if __name__ == "__main__":
