@@ -103,7 +103,7 @@ class Robot(Device, Protocol):
     def state(self) -> RobotState:
         """Return the newest sample; raise DeviceError when it is older than 100 ms.
 
-        It is also the proof that somebody watches: a motion that nobody looked at for SILENT ends,
+        It is also the proof that the motion is watched: one that was not read for SILENT ends,
         and is not taken up again.
         """
 

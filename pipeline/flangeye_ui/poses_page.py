@@ -92,7 +92,7 @@ class PosePlanner:
 
     @property
     def _simulated(self) -> Any:
-        """Where a simulated scanner stands, as its recipe says; None where nobody says."""
+        """Where a simulated scanner stands, by its recipe; None where that is not given."""
         camera = getattr(self._recipe.steps[0].params, "camera", None)
         return camera if hasattr(camera, "base_T_camera") else None
 

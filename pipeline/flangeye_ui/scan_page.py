@@ -208,7 +208,7 @@ class RunPanel:
             self._shot(run, capture, picture)
 
     def _tell(self) -> None:
-        """Show residuals, places and what was logged, while somebody looks at them."""
+        """Show residuals, places and the log, while that section is open."""
         run = self._project.run
         if run is None or not self._more.value:
             return

@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from flangeye.batch import _tell
+from flangeye.batch import _write_results
 from flangeye.batch.dataset import Dataset, Kind, Ledger, columns_of, row_of
 from flangeye.batch.outcome import SessionOutcome
 from flangeye.batch.page import drawings_of, write_page
@@ -77,7 +77,7 @@ def test_csv_and_parquet_hold_the_same(entries: Any, tmp_path: Path) -> None:
     for number, (session, outcome) in reversed(list(enumerate(entries))):
         dataset.write_part(0, str(number), [row_of(session, outcome, kinds)])
     tally = Tally(kinds, tuple(entries[0][0].varied), 3)
-    _tell(job, dataset, Ledger([session for session, _ in entries]), tally)
+    _write_results(job, dataset, Ledger([session for session, _ in entries]), tally)
     assert [path.name for path in (tmp_path / "sessions.parquet").iterdir()] == ["000000.parquet"]
     with (tmp_path / "sessions.csv").open(newline="") as file:
         read = list(csv.DictReader(file))

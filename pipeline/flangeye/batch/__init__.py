@@ -88,9 +88,9 @@ def run_sessions(
                 _run(client, job, todo, int(missing.sum()), console)
             finally:
                 job.place.remove(STARTS)
-                _tell(job, dataset, ledger, tally)
+                _write_results(job, dataset, ledger, tally)
     else:
-        _tell(job, dataset, ledger, tally)
+        _write_results(job, dataset, ledger, tally)
     return Batch(out, tally, known)
 
 
@@ -125,7 +125,7 @@ def _run(client: Client, job: Job, todo: Iterable[tuple[int, BatchSession]], cou
             progress.ended(told)
 
 
-def _tell(job: Job, dataset: Dataset, ledger: Ledger, tally: Tally) -> None:
+def _write_results(job: Job, dataset: Dataset, ledger: Ledger, tally: Tally) -> None:
     """Write ``sessions.csv`` and the page, from the rows that are there."""
     name = "sessions.csv"
     with job.place.draft(name) as path, path.open("w", newline="", encoding="utf-8") as file:

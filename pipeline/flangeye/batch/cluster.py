@@ -64,7 +64,7 @@ _LOCAL = {
     ),
     # A session counts its own starts (work.py), so it knows the culprit from those that waited.
     "distributed.scheduler.allowed-failures": 1_000_000,
-    # A worker that paused for want of memory would never go on; one that is killed is replaced.
+    # A worker that paused because memory ran out never goes on; one that is killed is replaced.
     "distributed.worker.memory.target": False,
     "distributed.worker.memory.spill": False,
     "distributed.worker.memory.pause": False,

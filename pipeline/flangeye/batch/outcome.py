@@ -136,7 +136,7 @@ class Request:
         vary: What ``repeat`` counts up; only ``seed`` can be.
         workers: Worker processes on this machine; None for one per core.
         scheduler: Address of a running dask scheduler, instead of workers here.
-        tls: What proves to that scheduler who we are, and to us that it is the one.
+        tls: Certificates by which scheduler and client authenticate each other.
         out: Folder of the batch, by path or URL; None for ``batches/<recipe>``.
         report: Make each session's ``report.html``.
     """

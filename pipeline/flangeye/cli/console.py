@@ -46,7 +46,7 @@ def wrapped(console: Console, text: str, indent: int = 2) -> str:
 
 def width(console: Console) -> int:
     """Return how many columns a line may have."""
-    # Columns of a line that goes to a file or another program, whose width nobody knows
+    # Columns of a line that goes to a file or another program, whose width is unknown
     return console.width if console.is_terminal else 100
 
 

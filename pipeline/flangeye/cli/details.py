@@ -190,7 +190,7 @@ def print_log(console: Console, log: RunLog) -> None:
     state = _state(log)
     expected = f" of {log.total}" if log.total else ""
     write(console, _hung(console, f"{log.path}: {state}"))
-    # Centres or poses of a target that somebody had found already are not captures.
+    # Centres or poses of a target that were found before this run are not captures.
     measured = any(entry.stage.startswith("acquire.") for entry in log.entries)
     arrived = "" if measured else f"{len(log.poses)}{expected} captures arrived, "
     went = f"{len(log.finished)}{expected} measurements" if measured else f"{len(log.finished)}"

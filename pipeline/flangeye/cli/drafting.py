@@ -105,8 +105,7 @@ def init(
         for path in new:
             with suppress(OSError):  # those that could not be written
                 path.unlink()
-        # Of the recipe that is not kept nobody knows: its target is what was asked for.
-        # Mistakes in a target, in a recipe that was drafted
+        # The drafted recipe is not kept, so a mistake in its target is named by the option --target
         raise RecipeError(
             re.sub(r"^.*?: steps\.\d+\.fit\.", "--target ", str(error), flags=re.MULTILINE)
         ) from None

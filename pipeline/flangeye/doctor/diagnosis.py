@@ -109,7 +109,7 @@ class RecordedSession:
 
     @property
     def uses_poses(self) -> bool:
-        """Whether flanges' poses matter: not to a camera on a link before a target in the base."""
+        """Whether the flange's poses matter; not where a camera on a link sees a fixed target."""
         return self.links is None or self.carried == "target"
 
     def require_samples(self) -> None:

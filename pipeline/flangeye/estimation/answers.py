@@ -212,9 +212,9 @@ class _Commands:
     def _seen_of_world(self, name: str) -> Floats:
         """Return (W, 6, 6) how a twist of reported root coordinates moves what is seen.
 
-        What stands at y is at y - b(y) in reported coordinates: seen through the reported arm, the
-        target stays where it is and the camera's chain is to make up for b; and likewise a target
-        in the hand before a camera that stands.
+        A fixed point y has reported coordinates y - b(y). Before a camera in hand the target stays
+        where it is, so the camera's pose has to take up b; before a fixed camera a target in hand
+        does.
         """
         work, frames = self.work, {}
         for each, frame in work.frames.items():

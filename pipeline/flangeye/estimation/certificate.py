@@ -85,7 +85,7 @@ def _across(features: Floats) -> Floats:
 
 
 def _elsewhere(squares: Squares, lack: Floats, count: int) -> Floats:
-    """Return the best places to which what is lacking leads: a sum of squares of features."""
+    """Return the best places found from the eigenvectors of the dual matrix's negative part."""
     tried = []
     # The three directions that lack most
     for way in np.linalg.eigh(lack)[1][:, -3:].T:
@@ -166,7 +166,7 @@ class _Dual(NamedTuple):
         """Return dual multipliers whose matrix is positive semidefinite, or nearly so.
 
         Args:
-            still: (n, n) projector across what the matrix has to leave as naught.
+            still: (n, n) projector across the directions in which the matrix has to vanish.
             tries: Steps at most.
             start: Multipliers to begin with; without them none.
         """

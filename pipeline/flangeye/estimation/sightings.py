@@ -108,7 +108,7 @@ def _carrier(frame: str, cell: Cell, joints: Mapping[str, Floats], rates: Floats
 
 
 def _motions(observations: Sequence[Observation], cell: Cell) -> list[Motion] | None:
-    """Return how all that moves passed every capture; None where nobody recorded it."""
+    """Return the recorded motion of every carrier about each capture; None where not recorded."""
     motions = [cell.passing(o.motion) for o in observations if o.motion is not None]
     told = [m for m in motions if {*cell.measured} <= {*m.others}]
     return told if len(told) == len(observations) else None

@@ -1,7 +1,7 @@
 """Remote archives and results, by URL: scans are fetched one at a time and not kept.
 
 The rest of the program knows paths alone. For an archive by URL a folder is made here that has
-every file by its name: the small ones whole, scans and images empty until somebody reads them.
+every file by its name: the small ones whole, scans and images empty until they are read.
 """
 
 from __future__ import annotations

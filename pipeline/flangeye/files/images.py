@@ -17,7 +17,7 @@ MAX_PIXELS = 1 << 26
 
 # OpenCV reads both once, when it is loaded; its own bound is eight times as large.
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_PIXELS))
-# What is wrong is said once, by us.
+# OpenCV would print its own message beside ours.
 os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
 
 PNG = b"\x89PNG\r\n\x1a\n"

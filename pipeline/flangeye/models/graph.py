@@ -80,7 +80,7 @@ class Ask(Protocol):
         """Return the answer to a question: given by the option ``flag``, a person, or by default.
 
         Raises:
-            RecipeError: Nothing is likely, and nobody can be asked.
+            RecipeError: There is no likely answer, and no person to ask.
         """
 
 

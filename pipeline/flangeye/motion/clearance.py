@@ -20,7 +20,7 @@ class ArmVolume:
         """Take them from the catalogue.
 
         Raises:
-            StageError: What the arm fills is not known, so nothing can be said to be clear of it.
+            StageError: The space that the arm fills is not known, so no clearance can be checked.
         """
         volumes = robot.known_volumes()
         self.links = np.array([volume.link for volume in volumes], dtype=np.intp)

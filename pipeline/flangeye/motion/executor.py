@@ -44,8 +44,7 @@ class Executor:
         """Begin to watch an open arm.
 
         Raises:
-            DeviceError: It is not the model's, has a tool set that nobody knows of, or is moved by
-                a person's hand.
+            DeviceError: It is not the model's, has an unknown tool set, or is moved by hand.
         """
         if isinstance(robot, MovedByHand):
             raise DeviceError(f"{robot.name}: is moved by hand; an arm that drives is needed")

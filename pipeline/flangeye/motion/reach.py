@@ -76,7 +76,7 @@ class Reach:
             margins: What a real arm has to keep to besides.
 
         Raises:
-            StageError: What the arm fills is not known, so nothing can be said to be clear of it.
+            StageError: The space that the arm fills is not known, so no clearance can be checked.
         """
         body = target if isinstance(target, TargetBody) else None
         self.arm = Arm(robot)

@@ -122,7 +122,7 @@ class Supervisor:
 
     def _keep_still(self, state: RobotState) -> None:
         moves = np.abs(state.joint_speeds).max() > 10 * STANDING
-        # An arm that still moves so long after it was stopped is moved by somebody else [s]
+        # An arm that still moves so long after it was stopped is moved by another program [s]
         braking = 2.0
         if moves and (state.time_ns - self._halted_ns) * 1e-9 > braking:
             raise SafetyFault(

@@ -66,7 +66,7 @@ class Offered(MutableMapping[str, Kind]):
 
         Raises:
             KeyError: None of this name is offered.
-            PluginNotFoundError: It cannot be imported, or is not where it is said to be.
+            PluginNotFoundError: It cannot be imported, or its entry point names nothing.
         """
         held = self._held[name]
         if isinstance(held, str):
@@ -98,7 +98,7 @@ class Registry:
         parts: Name -> part.
         broken: Entry point name -> why it could not be loaded.
         owners: Stage or part name -> entry point that offers it.
-        installed: Entry point name -> the package it comes from, None where nobody knows.
+        installed: Entry point name -> the package it comes from, None where unknown.
     """
 
     hooks: pluggy.PluginManager

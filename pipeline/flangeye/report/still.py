@@ -32,7 +32,7 @@ class StillScene:
         robot: The arm, drawn from its capsules.
         joints: Its joint values [rad or m]; None draws it ready to scan.
         scanner: What sees it.
-        base_T_camera: (4, 4) where that stands; None where nobody knows.
+        base_T_camera: (4, 4) pose of the camera; None where unknown.
         box: Centre and size of the box that the arm keeps to [m].
         poses: Places of the flange [m], and whether each is taken.
     """
@@ -152,7 +152,7 @@ def rods(robot: RobotModel, joints: Floats) -> list[tuple[float, Floats]]:
         for v, at in ((v, frames[v.link]) for v in robot.filled().volumes)
     ]
     origins = frames[:, :3, 3]
-    # Radius of the links of an arm whose capsules nobody has written down [m]
+    # Radius of the links of an arm whose capsules are not in its file [m]
     found = found or [(0.045, np.stack(pair)) for pair in pairwise(origins)]
     # Radius of the smallest flange plate of ISO 9409-1 that arms of this size carry [m]
     plate = 0.032

@@ -23,7 +23,7 @@ from flangeye.result import SIMULATED
 from flangeye.result.contract import AnswerResult, Result, TransformResult
 
 RUNS = Path("runs")
-"""Where folders go that nobody named."""
+"""Where the folders of runs go, unless one is named."""
 CHECKS = "checks"
 """Where beside a calibration the scans of its checks go."""
 

@@ -53,8 +53,8 @@ class Captures(Stream[Capture | Rejection]):
         outcomes: What became of each capture, by id: its observation, or None if it was set aside
             or kept for verifying. A source that chooses its next pose may look here.
         look: Simulation only: scans other things with the same scanner, see :data:`Look`.
-        recorded: Whether the captures wait for nobody, as those of an archive or a simulation do:
-            the next may be pulled before it is known what became of the last.
+        recorded: Whether pulling a capture moves nothing, as of an archive or a simulation: the
+            next may be pulled before it is known what became of the last.
     """
 
     def __init__(

@@ -57,7 +57,7 @@ REPORTED = float(np.radians(0.0115)), 0.05e-3
 """Standard deviation of a reported pose about and along each axis [rad, m]: half of what the data
 sheet of a UR5 gives for repeatability, 0.1 mm."""
 UNSEEN = 60
-"""Poses that take no part and show what a calibration is worth, where the arm is not as it says."""
+"""Poses that take no part and show what a calibration is worth, where the arm has errors."""
 UPRIGHT = np.radians([0, -90, 90, -90, -90, 0])
 """Joints of an arm at its first pose."""
 FACING = float(np.radians(50.0))

@@ -199,7 +199,7 @@ class RaycastScene:
         return out
 
     def _blocked(self, rays: Any) -> Mask:
-        """Return which of Open3D's rays (N, 6) meet something before they are as long as one."""
+        """Return which of Open3D's rays (N, 6) hit something before their end, at parameter 1."""
         # The last thousandth is not looked at: the point it leads to must not hide itself.
         hit = self._scene.test_occlusions(rays, tnear=0.0, tfar=1.0 - 1e-3, nthreads=1)
         return np.asarray(hit.numpy())

@@ -69,8 +69,8 @@ class ArchiveParams(OpeningParams):
         "mirrored, 0.99 where distances are 1 % too long.",
     )
     viewpoint: bool = Field(
-        False, description="Whether points stand in the frame in which a PCD's VIEWPOINT has the "
-        "scanner; they are turned into the scanner's."
+        False, description="Whether a PCD's points are in the frame in which its VIEWPOINT gives "
+        "the scanner's pose; they are then transformed into the scanner's frame."
     )  # fmt: skip
     unreadable: Literal["refuse", "reject"] = Field(
         "refuse",

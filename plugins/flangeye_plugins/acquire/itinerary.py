@@ -259,7 +259,7 @@ class PlanRow:
         role: What it is for: verification, calibration, or ``left out``.
         place: Place of the flange in ``base`` [m].
         tilt: Tilt of the flange against the line of sight [rad].
-        path: ``direct`` or ``by home``; None where nobody knows, or there is none.
+        path: ``direct`` or ``by home``; None where it is not known, or there is none.
         seconds: What the motion takes [s].
         why_not: Why the arm cannot get there.
     """

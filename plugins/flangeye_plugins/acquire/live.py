@@ -212,7 +212,7 @@ def _read(arm: RobotDriver, allowed: MotionLimits) -> tuple[Floats | None, str]:
 def _offline(
     params: LiveParams, robot: RobotModel, resumed: Resumed | None
 ) -> tuple[Floats | None, str]:
-    """Return the joint angles a plan begins at without the arm, None where nobody says; and a word.
+    """Return the joint angles at which a plan begins without the arm, None if unknown; and a note.
 
     Raises:
         StageError: acquire.live's home is of another arm.
@@ -265,7 +265,7 @@ class LiveSession:
         moved: A scan during which the flange moved by more is set aside [m].
         done: Captures that were taken before.
         stage_log: Hears where the arm goes next, and why there.
-        passive: Whether others move the arm, by ways that nobody here plans.
+        passive: Whether another program moves the arm, so that nothing is planned here.
         idle: How long the arm had nothing to do.
     """
 

@@ -261,7 +261,7 @@ class _Laying:
 
 
 def _bread(rest: _Settled) -> Floats:
-    """Return (14, 14) what scores do to pose and scanner at the mesh's scale, and to the scale."""
+    """Return (14, 14) that takes scores to pose and scanner, at the mesh's scale, and to it."""
     jacobian = rest.left.jacobian
     along = (jacobian.T * rest.weights) @ jacobian[:, -1]
     bread = np.zeros(2 * jacobian.shape[1:])

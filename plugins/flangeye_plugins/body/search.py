@@ -397,7 +397,7 @@ class BodySearch:
 
     @cached_property
     def _tolerance(self) -> float:
-        """How far off a cell of the view may be after the body is laid on the scan [m]."""
+        """Largest distance from scan to fitted body that counts as agreement [m]."""
         # As a share of the size, or in deviations
         return max(0.003 * self.looks.size, 3.5 * self._fine.noise)
 

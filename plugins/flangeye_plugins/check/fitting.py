@@ -362,7 +362,7 @@ def best_of(
     if against is None:
         against = np.zeros(len(alternatives.likelihood), dtype=int)
     ratios = alternatives.likelihood - null.likelihood[against]
-    # Of readings that come to the same, the first: they are listed by how common they are.
+    # Of readings with the same effect, the first: they are listed by how common they are.
     # Equal but for rounding
     index = int(np.flatnonzero(ratios >= ratios.max() - 1e-3)[0])
     at = int(against[index])
@@ -421,7 +421,7 @@ def exceedance(ratio: float, count: float, further: int, freedom: float, effect:
 def negligible(kinds: int) -> Floats:
     """Return (B,) negligible sizes of each kind of error [m, rad]."""
     # What is negligible of a normal's or a marker's rotation: 4 mrad
-    # Error that an arm's kinematics or a scanner may have without anybody's mistake [m]
+    # Error that an arm's kinematics or a scanner may have without a mistake [m]
     return np.array([0.5e-3, *[4e-3] * (kinds - 1)])
 
 

@@ -349,7 +349,7 @@ def _transposed_markers(session: RecordedSession) -> Iterator[tuple[RecordedSess
 
 
 def _may_be_mounted_otherwise(session: RecordedSession) -> bool:
-    """Whether camera and target, exchanged, come to the same as poses the other way round."""
+    """Whether exchanging camera and target has the same effect as inverting the poses."""
     unknown = not np.isfinite(session.places).any()
     return session.links is None and session.seconds is None and unknown
 

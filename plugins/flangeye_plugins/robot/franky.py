@@ -255,7 +255,7 @@ class FrankyRobot(Device):
                 self._closed, self._robot = True, None
 
     def _end_unwatched(self) -> None:
-        """Stop a motion that nobody looked at for SILENT, once.
+        """Stop a motion that was not read for SILENT, once.
 
         The library moves the arm on from a thread of this process. Where the whole process stands,
         that thread does as well, and the controller stops by itself after 20 lost cycles.

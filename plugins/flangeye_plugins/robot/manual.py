@@ -98,7 +98,7 @@ def robot_manual(model: RobotModel, params: ManualParams) -> Robot:
     mistake, and kept when the answer is ``yes``. The model's kinematics find its joint angles.
 
     Raises:
-        DeviceError: The input ends before a pose was said.
+        DeviceError: The input ends before a pose was entered.
     """
     return ManualRobot(model, params, OperatorConsole())
 
@@ -117,7 +117,7 @@ class ManualRobot(Device):
     """See :class:`flangeye.devices.MovedByHand`."""
 
     def __init__(self, model: RobotModel, params: ManualParams, desk: OperatorConsole) -> None:
-        """Wait until somebody says where the arm stands.
+        """Wait until the person enters where the arm stands.
 
         Raises:
             DeviceError: Nobody will.
@@ -150,7 +150,7 @@ class ManualRobot(Device):
             time_ns=time.monotonic_ns(),
             mode=self._mode(),
             message=(
-                "it was stopped on its way, and nobody has said where it stands"
+                "it was stopped on its way, and its pose was not entered since"
                 if self._stopped
                 else ""
             ),

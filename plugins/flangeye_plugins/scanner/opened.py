@@ -115,7 +115,7 @@ def require_in_range(name: str, cloud: PointCloud, model: ScannerModel | None) -
         return
     distance = median_distance(cloud)
     if times_outside(distance, model) > STATED_LIMIT:
-        cure = "is it this scanner, and its unit as it says?"
+        cure = "is the scanner's model right, and does it give the unit that it states?"
         if times_outside(distance / 1e3, model) <= DETECTED_LIMIT:
             cure = "these look like millimetres: let its driver give metres"
         raise DeviceError(

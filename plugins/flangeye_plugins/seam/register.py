@@ -45,14 +45,14 @@ class RegistrationLimits:
 
 @dataclass(frozen=True, eq=False)
 class Registered:
-    """A registration.
+    """A CAD part located in a scan, with the figures that show how well it fits.
 
     Attributes:
         fit: Pose ``camera_T_part`` and covariance.
-        seen: How much of the part was seen, of what it shows from its broadest side.
-        refuted: Share of what was looked at of it that the scanner saw through, or on which a face
-            goes on where the part's has ended.
-        second: Agreement of the next best pose with another seam, over that of this one.
+        seen: Seen share of the surface that the part shows from its broadest side.
+        refuted: Share of the surface in view where the scan contradicts the part: it goes through
+            it, or has a face beyond the part's edge.
+        second: Score of the best pose that has another seam, over the score of this pose.
     """
 
     fit: BodyFit

@@ -227,7 +227,7 @@ class Disc(NamedTuple):
 
 
 def of_size(part: PlanarPiece, cell: tuple[int, int], pitch: float, flange: Flange) -> Disc:
-    """Return a flat part as a disc, its width being its flaw if it cannot be the flange's.
+    """Return a flat part as a disc; with a flaw, its width, if it is too wide or too narrow.
 
     Args:
         part: The part.

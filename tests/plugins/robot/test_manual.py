@@ -154,7 +154,7 @@ def test_a_stop_is_told_and_leaves_the_pose_open(person: Person) -> None:
         assert person.last() == "Stop: leave the arm where it is."
         state = robot.state()
         assert state.mode == "not ready"
-        assert state.message == "it was stopped on its way, and nobody has said where it stands"
+        assert state.message == "it was stopped on its way, and its pose was not entered since"
         with pytest.raises(DeviceError) as error:
             robot.move_velocity(np.zeros(6), 0.1)
     assert (

@@ -47,7 +47,7 @@ def _without_misfits(
 ) -> tuple[MonitorCheck, tuple[str, ...]]:
     """Return a check without scans in which something else was found, and their ids.
 
-    Only while most of its scans are as if nothing had moved: what moves, all of them show.
+    Only where most of its scans agree that nothing moved: a real move shows in all of them.
 
     Raises:
         StageError: No single change of the cell explains all scans of the check.
@@ -154,7 +154,7 @@ def write_state(url: str, node: str, finding: CheckFinding, security: str | None
 
     Raises:
         StageError: asyncua is missing, the server does not answer, there is no such node, or the
-            server is on another machine and nothing is said of security.
+            server is on another machine and no security policy is given.
     """
     require_secured(url, security)
     try:

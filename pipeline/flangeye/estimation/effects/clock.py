@@ -20,7 +20,7 @@ def clock_effects(problem: Problem) -> list[Effect]:
         return []
     cameras = list(dict.fromkeys(camera for camera, _ in problem.ends))
     return [
-        # Two clocks that nobody set [s]: an exposure, a buffer, a network's delay; four
+        # Two clocks that were not synchronised [s]: an exposure, a buffer, a network's delay; four
         # times as much or as little, one sigma
         Effect(f"clock of {camera}", _delay(camera), 20e-3, 4.0, kind="clock", lasting=False)
         for camera in cameras

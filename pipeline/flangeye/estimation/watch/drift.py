@@ -323,8 +323,8 @@ def _scatter(
 ) -> tuple[float, float]:
     """Return by what factor checks scatter more than they say, and its degrees of freedom.
 
-    The median, so that one bad check does not hide the next; never below a quarter. Of few checks
-    nobody knows it, and the freedom is the calibration's.
+    The median, so that one bad check does not hide the next; never below a quarter. With few checks
+    it is unknown: the factor is 1, and the degrees of freedom are the calibration's.
     """
     n = span[1] - span[0]
     if n < fewest:

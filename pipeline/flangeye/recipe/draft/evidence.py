@@ -82,7 +82,7 @@ def _shape(numbers: Floats) -> bool:
 
 
 def _parts(numbers: Floats) -> list[tuple[int, int]]:
-    """Return start and width of each pose in rows: one, two beside each other, or with a point."""
+    """Return first column and width of each pose in a row: of one or two, or one and a point."""
     width = numbers.shape[1]
     if width == 9 and _orthonormal(numbers):
         return []  # rotations, whose positions stand elsewhere

@@ -174,7 +174,7 @@ def as_joints(pose: PoseColumns) -> PoseColumns:
 
 @dataclass
 class Group:
-    """Columns with one name before their axes."""
+    """Columns whose headings share a name before the axis, such as ``tcp_x`` and ``tcp_y``."""
 
     columns: dict[str, Column] = field(default_factory=dict)
     words: str = ""

@@ -141,7 +141,7 @@ def _bound(reader: Any, registry: Registry, robot: Mapping[str, Any]) -> BoundPa
     try:
         params: Any = parse_recipe(json.dumps(probe), "probe", registry).steps[0].params
     except RecipeError as error:
-        # Of the probe's file nobody knows.
+        # The probe's recipe has no file, so its mistakes are named by the command's options
         told = str(error).replace("probe:1: steps.0.acquire.centres.reader", "--reader")
         told = told.replace("probe:1: robot.", "--robot ")
         raise RecipeError(told.replace("--reader.", "--reader ")) from None

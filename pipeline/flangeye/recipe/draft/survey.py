@@ -41,7 +41,7 @@ class Questions:
 
     Attributes:
         given: Answers by option, from the command line or a person; None where not given.
-        prompt: Asks a person; None if nobody can be asked.
+        prompt: Asks a person; None where there is no terminal.
         assumed: Lines on the defaults that were used, to print at the end.
         likely: By option, the answer that the data suggest, and the evidence for it.
     """

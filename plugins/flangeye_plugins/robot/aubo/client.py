@@ -124,7 +124,7 @@ class Ride:
     """One move: velocities towards the goal, renewed at every reading of the arm.
 
     It begins at rest, heads straight for the goal with a trapezoidal profile of speed, comes to
-    rest near it, and leaves the last bit to the controller. A ride that nobody looked at for SILENT
+    rest near it, and leaves the last bit to the controller. A motion that was not read for SILENT
     is over: the piece under way has ended by itself.
     """
 

@@ -147,7 +147,7 @@ class AuboRobot(Device):
         """Return the arm's state, and how long it took to read [s]."""
         began = time.monotonic_ns()
         tell = self._client.state
-        # The mode comes before the pose: an arm that is said to stand stood when it was read.
+        # The mode is read before the pose: an arm that is reported to stand stood at that pose.
         speeds = np.array(self._ask("joint speeds", tell.getJointSpeeds))
         mode, message = self._condition(speeds)
         joints, pose, force = (

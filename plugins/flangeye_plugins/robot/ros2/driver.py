@@ -94,7 +94,7 @@ class Ros2Arm(Listener):
         """Hear where the arm is, and find the controller.
 
         Raises:
-            DeviceError: Joint states do not come, or nobody listens to the trajectories.
+            DeviceError: Joint states do not come, or no controller subscribes to the trajectories.
         """
         self._topic, self._names = params.trajectory, list(params.joints)
         self._motion: pieces.DrivenMotion | None = None
@@ -135,7 +135,7 @@ class Ros2Arm(Listener):
         super().wait_cycle()
         silent = time.monotonic() - self._renewed
         if self._motion is not None and silent > SILENT:
-            self.stop()  # nobody watched: what ended by itself is not taken up again
+            self.stop()  # it was not read in time: a motion that ended by itself is not resumed
         elif self._motion is not None and silent >= RENEWAL:
             self._renew()
 

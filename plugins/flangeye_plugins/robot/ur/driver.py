@@ -220,7 +220,7 @@ class UrRobot(Device):
     """An arm of Universal Robots; see :class:`flangeye.devices.Robot`.
 
     Every call ends within three seconds: connecting within two and a half, commands within one
-    and a half, a stop that nobody answers included.
+    and a half, an unanswered stop included.
 
     Attributes:
         offset: (4, 4) ``flange_T_tool`` as the controller has it.
@@ -320,7 +320,7 @@ class UrRobot(Device):
         self._link.close()
 
     def _base_T_tool(self, sample: CycleSample) -> Floats:
-        """Return the tool's pose (4, 4); a cycle asks twice for that of one sample."""
+        """Return the tool's pose (4, 4), computed once for each sample."""
         if self._posed[0] != sample.number:
             self._posed = sample.number, POSE.matrix(sample.tool_pose)
         return self._posed[1]

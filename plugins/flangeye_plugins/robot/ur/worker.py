@@ -44,7 +44,7 @@ GRACE = 0.1
 """A velocity ends when the next command is this late [s]; :data:`flangeye.devices.GRACE`."""
 
 SILENT = 0.15
-"""A motion ends when nobody looked for so long [s]; :data:`flangeye.devices.SILENT`."""
+"""A motion ends when it was not read for so long [s]; :data:`flangeye.devices.SILENT`."""
 
 
 class WorkerRefused(Exception):

@@ -185,7 +185,7 @@ class Probing:
         slid = felt[:, 3] - felt[:, 3].mean()
         middle = at[best] - at[best].mean()
         moved = float(middle @ middle) + 1e-12
-        # On walls that stand askew the tip slides along them: what is left is across the wall.
+        # On walls that stand askew the tip slides along them, and shows only what is across.
         askew = float(middle @ slid) / moved / across
         gain = across * (1.0 + askew**2) - 1.0
         left = max(float(rms[best]), noise)
@@ -291,7 +291,7 @@ def _rows(at: Floats, slant: Floats, widths: Floats) -> Floats:
     """Return the design (C, N, 5): offset, gain, play, where in its play it began, and ahead.
 
     Where in its play the finger stood at first is a column of its own: the difference between
-    beginning at the one end and at the other, until both have come to the same.
+    beginning at the one end and at the other, until both are the same.
     """
     left, right = (_dragged(at, widths, end) for end in (-1.0, 1.0))
     reversal, began = (left + right) / 2.0 - at, (right - left) / 2.0
