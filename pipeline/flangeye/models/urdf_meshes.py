@@ -82,7 +82,7 @@ def _points(body: ET.Element, urdf: Path, packages: Mapping[str, Path]) -> Float
     if body.tag == "mesh":
         scale = np.array(numbers_of(urdf, body, "scale", "1 1 1"))
         return np.asarray(vertices(_find(body.get("filename", ""), urdf, packages)) * scale)
-    raise RecipeError(f"{urdf}: <{body.tag}> is not a body that URDF knows")
+    raise RecipeError(f"{urdf}: <{body.tag}> is not a geometry of URDF")
 
 
 def _number(body: ET.Element, name: str, urdf: Path) -> float:
@@ -223,6 +223,7 @@ def fit_capsule(points: Floats) -> Capsule:
 
     The directions are the coordinate axes, as links are drawn, and the points' principal axes.
     """
+    # Makers draw links along their frame's axes, where a bracket would turn the principal ones
     principal = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
     candidates = [_along(points, axis) for axis in (*np.eye(3), *principal)]
     return min(candidates, key=lambda capsule: capsule.volume)

@@ -67,7 +67,7 @@ class Toucher:
         It is let go of before the person is asked to jog, and is only read afterwards.
 
         Raises:
-            StageError: There is no way to a point; the message says what bars it.
+            StageError: No collision-free path leads to a point; the message names the obstacle.
             DeviceError: The arm cannot be read or moved, or is not where it went to.
         """
         for number, point in enumerate(points, 1):

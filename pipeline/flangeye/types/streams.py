@@ -111,7 +111,7 @@ class Truth:
         others: The other unknowns of the configuration.
         unseen: What a scanner without noise would see at poses that took no part: where the
             flange (the target) really is, beside what the controllers report. They show what a
-            calibration is worth at the work where the arm is not what it says.
+            calibration is worth at the work where the arm has errors.
     """
 
     camera: Transform

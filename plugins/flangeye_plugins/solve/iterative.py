@@ -103,6 +103,7 @@ def solve_iterative(
         StageError: Fewer poses than the pool needs, or nothing to measure a candidate on.
         CalibrationRefused: No pool could be measured.
     """
+    # Pulling an observation drives a live arm to its next pose: none is pulled ahead of need
     stream = iter(observations)
     kept = list(islice(stream, params.reserve))
     first = list(islice(stream, params.pool))

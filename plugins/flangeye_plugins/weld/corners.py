@@ -109,6 +109,7 @@ def _rounded(seam: Seam, corners: list[Corner], params: WeldTactileParams, radiu
     ends = [0.0, *(along[each.point] for each in corners), along[-1]]
     pieces, kept = [], np.full(len(along), True)
     for corner, before, here, after in zip(corners, ends, ends[1:], ends[2:], strict=False):
+        # From the corner to where an arc of this radius touches its legs
         cut = radius * np.tan(abs(corner.turn) / 2.0)
         room = min(here - before, after - here) / 2.0
         if cut > room:

@@ -228,6 +228,8 @@ class Passes:
         self._estimate(error)
         across = sway.rate - GAIN * error
         torch_speed = settings.speed * place.tangent + across * place.normal
+        # The error of heading is taken back while the path's own curvature is followed; then, by
+        # (12), the end point moves at V_r = V_t + L w n_d
         turning = GAIN * _nearest(_heading(place) - pose.angle) + settings.speed * self._bend()
         turn = within(turning, settings.turn_rate)
         planar = torch_speed + distance * turn * np.array([-ahead[1], ahead[0]])

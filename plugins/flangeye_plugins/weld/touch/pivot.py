@@ -55,6 +55,7 @@ def pivot(what: str, poses: Sequence[Floats], displaced: Sequence[Floats] | None
     rotations, places = given[:, :3, :3], given[:, :3, 3]
     if displaced is not None:
         places = places + np.einsum("kij,kj->ki", rotations, np.array(displaced))
+    # R_k p + t_k = m at every pose k; less the mean over the poses, the mark m drops out
     rows = rotations - rotations.mean(axis=0)
     _require_turned(what, rows)
     information = np.einsum("kji,kjl->il", rows, rows)

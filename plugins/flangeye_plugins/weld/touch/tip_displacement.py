@@ -58,10 +58,12 @@ class Interpreter:
         self._rest = np.array(finger.calibration.rest)
         self._gain = np.array(finger.calibration.gain)
         self._upright = rotation_exp(np.array(finger.calibration.rotation))
+        # The gain is the camera's rotation with a little stretch and shear, which a rotation vector
+        # must not get
         self._tool_R_camera = nearest_rotation(self._gain)
 
     def feel(self, reading: TagReading, time_ns: int) -> TipDisplacement:
-        """Return the tip's displacement that the tag's pose speaks of."""
+        """Return the tip's displacement, from the tag's pose."""
         turn = rotation_log(rotation_exp(reading.rotation) @ self._upright.T)
         return TipDisplacement(
             time_ns,
