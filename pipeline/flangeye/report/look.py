@@ -5,6 +5,7 @@ Text colours have a contrast of at least 4.5 on their background (WCAG 2.1, AA),
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -57,14 +58,18 @@ def _variables(colours: dict[str, str]) -> str:
     return " ".join(f"--{name}: {value};" for name, value in colours.items())
 
 
+@cache
 def templates(*folders: Path) -> Environment:
-    """Return templates that escape everything, for ids, reasons and titles come from anywhere."""
+    """Return templates that escape everything, for ids, reasons and titles come from anywhere.
+
+    Kept while the process runs: parsing them takes longer than filling in a page of a batch.
+    """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     environment = Environment(
         loader=FileSystemLoader(folders),
         autoescape=True,
-        optimized=False,  # a page is rendered once
+        optimized=False,  # most processes render one page
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
