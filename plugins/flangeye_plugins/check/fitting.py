@@ -109,17 +109,17 @@ def _blocks(equations: Equations, unknowns: VariantUnknowns) -> list[ErrorBlock]
     Parameters: rotation and position of the camera (left perturbation); where the target's place
     is not known, its position, and its rotation if it has one; the second arm's base, if any.
     """
-    blocks = [_centre_block(equations, unknowns)]
+    mounts = equations.carried(unknowns.other)
+    blocks = [_centre_block(equations, unknowns, mounts)]
     if equations.has_rotations:
-        blocks.append(_rotation_block(equations, unknowns))
+        blocks.append(_rotation_block(equations, unknowns, mounts))
     elif np.isfinite(equations.normals).any():
-        blocks.append(_normal_block(equations, unknowns))
+        blocks.append(_normal_block(equations, unknowns, mounts))
     return blocks
 
 
-def _centre_block(equations: Equations, unknowns: VariantUnknowns) -> ErrorBlock:
+def _centre_block(equations: Equations, unknowns: VariantUnknowns, mounts: Floats) -> ErrorBlock:
     turned = equations.centres @ unknowns.rotation.swapaxes(-1, -2)
-    mounts = equations.carried(unknowns.other)
     expected = (mounts[..., :3, :3] @ unknowns.place[..., None])[..., 0] + mounts[..., :3, 3]
     residuals = turned + unknowns.position[:, None] - expected
     parts = [-hat(turned), np.broadcast_to(np.eye(3), (*turned.shape, 3))]
@@ -136,8 +136,8 @@ def _centre_block(equations: Equations, unknowns: VariantUnknowns) -> ErrorBlock
     return _block(residuals, parts, 3, 20e-6)
 
 
-def _rotation_block(equations: Equations, unknowns: VariantUnknowns) -> ErrorBlock:
-    turns = equations.carried(unknowns.other)[..., :3, :3]
+def _rotation_block(equations: Equations, unknowns: VariantUnknowns, mounts: Floats) -> ErrorBlock:
+    turns = mounts[..., :3, :3]
     expected = turns @ unknowns.turn[:, None]
     seen = unknowns.rotation[:, None] @ equations.rotations
     residuals = log_of(seen @ expected.swapaxes(-1, -2))
@@ -150,9 +150,9 @@ def _rotation_block(equations: Equations, unknowns: VariantUnknowns) -> ErrorBlo
     return _block(residuals, parts, 3, FINEST_ANGLE)
 
 
-def _normal_block(equations: Equations, unknowns: VariantUnknowns) -> ErrorBlock:
+def _normal_block(equations: Equations, unknowns: VariantUnknowns, mounts: Floats) -> ErrorBlock:
     turned = equations.normals @ unknowns.rotation.swapaxes(-1, -2)
-    expected = equations.carried(unknowns.other)[..., :3, 2]
+    expected = mounts[..., :3, 2]
     residuals = turned - expected
     zero = np.zeros((*turned.shape, 3))
     parts = [-hat(turned), zero, *([zero] if unknowns.free_place else [])]
@@ -200,10 +200,10 @@ def _normal_equations(
     gradient: Floats = np.zeros((1, p))
     for block, weight, scale in zip(blocks, weights, scales, strict=True):
         w = np.sqrt(weight)[..., None] / scale[:, None, None]
-        seen = weight[..., None] > 0
-        rows = np.where(seen[..., None], block.jacobian, 0.0) * w[..., None]
-        flat = rows.reshape(len(rows), -1, p)
-        errors = (np.where(seen, block.residuals, 0.0) * w).reshape(len(rows), -1, 1)
+        rows, errors = block.jacobian * w[..., None], block.residuals * w
+        unseen = ~(weight > 0)
+        rows[unseen], errors[unseen] = 0.0, 0.0
+        flat, errors = rows.reshape(len(rows), -1, p), errors.reshape(len(rows), -1, 1)
         information = information + flat.swapaxes(-1, -2) @ flat
         gradient = gradient + (flat.swapaxes(-1, -2) @ errors)[..., 0]
     return information, gradient
