@@ -11,11 +11,14 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import pluggy
 import pytest
+import typer.main
+import typer.testing
 from hypothesis import settings
 
 from flangeye import cli
@@ -35,6 +38,11 @@ os.environ["XDG_CACHE_HOME"] = _CACHE.name
 settings.register_profile("same", derandomize=True, deadline=None, max_examples=40)
 settings.register_profile("search", derandomize=False, deadline=None)
 settings.load_profile("same")
+
+# Typer builds all commands anew at each call, of signatures that do not change: a tenth of a second.
+_built = cache(typer.main.get_command)
+for _module, _name in ((typer.main, "get_command"), (typer.testing, "_get_command")):
+    setattr(_module, _name, _built)
 
 # A suite in the background of a script ignores Ctrl-C, and so would every process it starts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
