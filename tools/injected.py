@@ -31,7 +31,7 @@ POSES, ARM, RIGHT = 24, 0.1e-3, 1e-3
 
 
 class Rows(NamedTuple):
-    """Two tables as they are written, and how the recipe says they are."""
+    """Two tables as they are written, and how the recipe states they are."""
 
     arm: np.ndarray
     marker: np.ndarray
@@ -56,7 +56,7 @@ def written(poses: np.ndarray, how: str = "xyzw") -> np.ndarray:
 
 
 def plain(arm: np.ndarray, marker: np.ndarray) -> Rows:
-    """Return both tables as the recipe says."""
+    """Return both tables as the recipe states."""
     return Rows(written(arm), written(marker))
 
 

@@ -28,7 +28,7 @@ class Condition(NamedTuple):
         truth: What is true.
         settings: Settings of the controller, beside its defaults.
         planned: Shift [m] and turn [rad] of the plan.
-        belief: What the files say of the tool, beside its defaults.
+        belief: What the files state of the tool, beside its defaults.
         half_angle: Half angle of the groove [rad], as planned too, where it is not the usual one.
         section: Cross-section of another joint; the controller knows its kind alone.
         look: A look behind the torch, if there is one.

@@ -151,7 +151,7 @@ class Form:
         return choice.classes("w-full")
 
     def _agree(self) -> None:
-        """Let the fields show what the recipe says, and what is wrong with it at each."""
+        """Let the fields show what the recipe states, and what is wrong with it at each."""
         _, mistakes = self._project.check()
         self._agreeing = True
         for (section, key), choice in self._choices.items():

@@ -291,10 +291,10 @@ class RunPanel:
 
 
 class Shot(ui.element):
-    """One scan: its thumbnail and its outcome.
+    """The tile of one scan on the page: its thumbnail and its outcome.
 
     Attributes:
-        ended: Whether it says what can be done about it, the run being over.
+        ended: Whether the run is over, so that a cure is shown.
     """
 
     def __init__(self, capture: str) -> None:

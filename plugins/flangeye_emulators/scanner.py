@@ -131,7 +131,7 @@ class LoopbackScannerParams(Params):
 def scanner_loopback(model: ScannerModel | None, params: LoopbackScannerParams) -> Scanner:
     """Scan the simulated cell around a controller on loopback.
 
-    The model says which scanner to be.
+    The model decides which scanner is simulated.
 
     Raises:
         DeviceError: There is no model, no controller, or the controller moves another arm.

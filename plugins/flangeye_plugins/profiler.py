@@ -4,7 +4,7 @@ Profile sensors with an evaluation of their own, which send what they measure as
 
 Such a sensor is set up in its maker's program to find bead and joint in each profile, and sends how
 far one lies from the other over TCP, a line for each profile. Which of a line's columns that is, in
-which unit and to which side, the recipe says. A column that holds no number is not a look.
+which unit and to which side, the recipe states. A column that holds no number is not a look.
 """
 
 from __future__ import annotations

@@ -63,7 +63,7 @@ def refine_compensate(
     """Apply the error measured on a verification view to the answer: equation (19).
 
     The error takes the measured flange onto the predicted one, in ``camera``, so it goes to the
-    right: ``base_T_camera @ error`` puts what was measured where the robot says it is. That order,
+    right: ``base_T_camera @ error`` puts what was measured where the robot reports it. That order,
     the paper's, holds for an error of this direction only.
 
     The answer then is right for that one view, its noise, the arm's error there and the flange's

@@ -69,7 +69,7 @@ def test_a_folder_that_no_reader_knows_leads_to_init(
     (tmp_path / "rec" / "a.csv").write_text("1,2,3\n")
     assert command("doctor", "rec") == (
         2, "",
-        "error: rec: no reader knows this layout by itself, and no recipe says how it is read; "
+        "error: rec: no reader knows this layout by itself, and no recipe states how it is read; "
         "write one: flangeye init rec; then: flangeye doctor recipe.yaml\n",
     )  # fmt: skip
 

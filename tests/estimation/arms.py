@@ -29,7 +29,7 @@ REAL = ArmErrors(quality="real")
 
 
 def worse(times: float) -> ArmErrors:
-    """Return an arm whose joints' zeros are so many times worse than its file says."""
+    """Return an arm whose joints' zeros are so many times worse than its file states."""
     return ArmErrors(zeros=f"{times * ROBOT.joint_accuracy} rad")
 
 

@@ -565,7 +565,7 @@ CASES = [
         "scanner",
         "test_it_says_its_unit_and_layout",
         bad.scanner(bad.Plate, cloud=lambda self: PointCloud(CAMERA, np.ones((9, 3)))),
-        "the device says organised, the cloud is not",
+        "the device states organised, the cloud is not",
         {},
     ),
     (

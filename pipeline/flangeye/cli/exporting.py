@@ -22,7 +22,7 @@ FORMATS = "'flangeye export --list' names the formats"
 Camera = Annotated[str | None, typer.Option(help="Camera to export, for a cell with several.")]
 Anyway = Annotated[
     bool,
-    typer.Option("--anyway", help="Export even if the calibration was refused; the file says so."),
+    typer.Option("--anyway", help="Export a refused calibration too; the file states that."),
 ]
 
 

@@ -65,7 +65,7 @@ def examine_cell(
 
     Args:
         observations: Every sighting.
-        cell: What the recipe says stands on what.
+        cell: What the recipe states stands on what.
         tables: Parameters of ``reader.cell``, where it read them.
 
     Raises:
@@ -186,7 +186,7 @@ def _of_arms(
 
 
 def _of_mountings(observations: Sequence[Observation], cell: Cell) -> Iterator[Suspicion]:
-    """Yield cameras and targets that stand on something else than the recipe says."""
+    """Yield cameras and targets that stand on something else than the recipe states."""
     for group, name in _to_find(cell):
         for other in ("base", *cell.movers):
             if other != cell.frames[name].parent:
@@ -306,7 +306,7 @@ def foretold(observations: Sequence[Observation], cell: Cell) -> Foretold:
 
 
 def _possible(suspicion: Suspicion) -> bool:
-    """Whether everything is as near as things in a cell are."""
+    """Whether distances of targets from cameras and of flanges from bases are those of a cell."""
     seen = np.array([np.linalg.norm(o.feature.centre) for o in suspicion.observations])
     reach = [x.translation for o in suspicion.observations for x in o.poses.values()]
     far = np.linalg.norm(reach, axis=1)
@@ -377,6 +377,6 @@ def _scaled(pose: Floats, factor: float) -> Floats:
 
 
 def _other_units() -> Iterator[tuple[str, float]]:
-    """Give each unit of lengths, and the factor if they are in it and the recipe says another."""
+    """Give each unit of lengths, and the factor if they are in it and the recipe states another."""
     for unit, said in permutations(("m", "mm"), 2):
         yield unit, LENGTHS[unit] / LENGTHS[said]

@@ -66,8 +66,8 @@ class RecordedSession:
         marks_open: Whether the recipe's solver marks translations that the motion cannot show.
         remarks: Mistakes that opening the archive has shown already, mended here.
         damage: What of the log could not be read or was changed, a line each.
-        again: Gives the session as read with other parameters: the reader's, and its target's.
-            None where the reader's own numbers are not what is looked at.
+        again: Reads the session again with other parameters of the reader and of its target. None
+            where the session's numbers are not those of the reader any more.
     """
 
     ids: tuple[str, ...]

@@ -123,7 +123,7 @@ def open_session(path: Path, registry: Registry, recipe: Recipe | None = None) -
             brings its own, and a folder with ready-made centres needs none.
 
     Raises:
-        StageError: The archive cannot be read, or has scans and no recipe says what is in them.
+        StageError: The archive cannot be read, or has scans and no recipe states what is in them.
     """
     if not path.exists():
         raise StageError(f"{path}: does not exist")
@@ -181,7 +181,7 @@ def _of_log(path: Path, registry: Registry, recipe: Recipe | None) -> RecordedSe
 
 
 def _archive_again(recipe: Recipe, found: Mapping[str, t.Feature]) -> ReadAgain | None:
-    """Return how to read a log's own archive again, where the recipe says which it was."""
+    """Return how to read a log's own archive again, where the recipe states which it was."""
     params = recipe.steps[0].params
     path, reader = getattr(params, "path", None), getattr(params, "reader", None)
     if path is None or not isinstance(reader, BoundPart) or not Path(path).exists():
@@ -226,7 +226,7 @@ def _of_centres(path: Path, registry: Registry) -> RecordedSession:
         archive: Archive = registry.part("reader.auto").bind()(path)
     except NotThisLayout:
         raise StageError(
-            f"{path}: no reader knows this layout by itself, and no recipe says how it is read; "
+            f"{path}: no reader knows this layout by itself, and no recipe states how it is read; "
             f"write one: flangeye init {path}; then: flangeye doctor recipe.yaml"
         ) from None
     if not _ready_made(archive):
@@ -324,7 +324,7 @@ def _of_archive(archive: Archive, found: Mapping[str, t.Feature]) -> RecordedSes
         session = replace(session, motions=motions)
     if not np.isfinite(session.rotations).any():
         return replace(session, acquire="acquire.centres")
-    # A marker's place on what carries it is not known unless a recipe says so.
+    # A marker's place on what carries it is not known unless a recipe states it.
     unknown = np.full_like(session.places, np.nan)
     return replace(session, acquire="acquire.samples", places=unknown)
 
@@ -362,7 +362,7 @@ def _rotations(features: Iterable[t.Feature | None]) -> Floats:
 def _as_recipe(
     session: RecordedSession, recipe: Recipe, states: Mapping[str, State]
 ) -> RecordedSession:
-    """Add what the recipe says of the cell and of how the archive is read."""
+    """Add what the recipe states of the cell and of how the archive is read."""
     first = recipe.steps[0]
     scanner: ScannerData | None = recipe.context.get(ScannerData)
     robot: RobotModel | None = recipe.context.get(RobotModel)

@@ -90,7 +90,7 @@ class Carrier:
         accuracy: Median of the deviation of a joint's zero, by the robot's file [rad].
         link: Which link it is; None for the flange.
         rates: (T, 6) its twists per second at each time, in its base at its origin; None where
-            nobody recorded how it passed.
+            its motion was not recorded.
         axis: Whether it is a rail or a positioner.
     """
 

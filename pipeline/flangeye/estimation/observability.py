@@ -219,7 +219,7 @@ def require_observable(
     axis = weak.moves[:, 0] / limit
     cure = (
         "spread the poses further, and check that each scan belongs to its robot pose"
-        # Noise of a centre beyond which something is not as the recipe says [m]
+        # Noise of a centre beyond which something is not as the recipe states [m]
         if noise < 5e-3
         else "no scanner or arm is so noisy: check that each scan belongs to its robot pose, and "
         "that the target is where the recipe has it (configuration: {place: unknown} finds it)"

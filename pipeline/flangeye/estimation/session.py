@@ -205,7 +205,7 @@ def _require_agreement(problem: Problem, places: Places, agree: Mask) -> None:
         f"the sightings fit one calibration to {shift * 1e3:.1f} mm and {np.degrees(turn):.1f} "
         f"deg only, worst those of {target} by {camera}: check that each belongs to the poses "
         f"beside it (join: clock_offset, where the clock of {camera} is another), and that the "
-        "cell stands as the recipe says"
+        "cell stands as the recipe states"
     )
 
 
@@ -435,7 +435,7 @@ def _require_size(session: Session) -> None:
     factor = f"{1 + share:.4f} +- {sigma:.4f} times as"
     if kind == "size":
         raise CalibrationRefused(
-            f"the arm's motion shows that the target is {factor} large as the fit step says, or "
+            f"the arm's motion shows that the target is {factor} large as the fit step states, or "
             "the camera's focal length wrong by as much: measure the print (size_limit allows "
             "more, target_size: unknown estimates it)"
         )

@@ -1,4 +1,4 @@
-"""Arrays of numbers in files, with the shape a layout says they have."""
+"""Arrays of numbers in files, with the shape that a layout states."""
 
 from __future__ import annotations
 

@@ -1,11 +1,10 @@
 """Inverse kinematics of six revolute joints whose wrist is not spherical. Arrays only.
 
 Of most such arms axis 2 stands square to axis 1 and parallel to axis 3, and axis 5 meets axis 4.
-Where they meet is a point of link 3 and of link 5: with joint 6 held, the pose says where it is.
-Joints 1 to 3 follow in closed form, in four ways; that axes 4 and 5 keep their angle is the
-one equation left, in joint 6. Its roots are bracketed on a row of angles and refined (a search in
-one dimension over Paden-Kahan subproblems: Elias and Wen, "IK-Geo", Mechanism and Machine Theory
-2025).
+Where they meet is a point of link 3 and of link 5: with joint 6 held, the pose determines where it
+is. Joints 1 to 3 follow in closed form, in four ways; that axes 4 and 5 keep their angle is the one
+equation left, in joint 6. Its roots are bracketed on a row of angles and refined (a search in one
+dimension over Paden-Kahan subproblems: Elias and Wen, "IK-Geo", Mechanism and Machine Theory 2025).
 
 Inverse kinematics of six revolute joints in closed form, by EAIK. Arrays only.
 

@@ -200,7 +200,7 @@ class RobotModel(Model):
         first, second = (tuple(map(SI, point)) for point in placed)
         tool = Volume(link=len(self.joints), start=first, end=second, radius=SI(radius))
         arm = self.model_copy(update={"volumes": (*self.known_volumes(), tool)})
-        arm._bodies = None
+        arm._bodies = None  # else `filled` would replace these volumes by the URDF's, without tool
         return arm
 
     @property
@@ -229,11 +229,12 @@ class SecondRobot:
 
 
 def joints_in_order(names: Iterable[str]) -> tuple[str, ...]:
-    """Return joints from base to flange where their names say it; drivers sort by alphabet."""
+    """Return joints in order from base to flange, by their names; drivers sort by alphabet."""
     named = list(names)
     ur = [next((n for n in named if joint in n), "") for joint in UR_JOINTS]
     if all(ur):
         return tuple(ur)
+    # A joint's own number stands last, behind that of an arm
     numbers = {name: [int(n) for n in re.findall(r"\d+", name)] for name in named}
     numbered = sorted((n for n in named if numbers[n]), key=lambda n: numbers[n][::-1])
     return tuple(numbered) if len(numbered) in (6, 7) else ()

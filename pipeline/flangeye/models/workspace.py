@@ -30,7 +30,7 @@ class Coverage:
     turns: Floats
 
     def __str__(self) -> str:
-        """Return the workspace's limits as a line of text."""
+        """Return the coverage as a line of text."""
         both = int((self.turns.min(axis=1) >= ENOUGH).sum())
         angles = [f"-{low:.0f} to +{high:.0f}" for low, high in np.degrees(self.turns)]
         named = ", ".join(f"{axis} {angle}" for axis, angle in zip("xyz", angles, strict=True))

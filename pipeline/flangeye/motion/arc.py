@@ -21,7 +21,7 @@ from flangeye.models.arc import ArcTimes
 from flangeye.types import Floats, Transform
 
 OFF, GAS, BURN = 0.0, 1.0, 2.0
-"""What the seventh number asks for."""
+"""Values of the seventh number: what the arc is to do."""
 
 
 def with_arc(driver: RobotDriver, open_arc: Callable[[], Arc], times: ArcTimes) -> RobotDriver:

@@ -158,7 +158,7 @@ class Reach:
     def _rolls(self, centre: Floats) -> list[Floats]:
         """Return poses (4, 4) at a point that look at the scanner, turned about that view."""
         poses = []
-        # How many directions of the flange's x axis are tried for the one the arm likes best.
+        # Directions of the flange's x axis that are tried, to find where the arm moves best
         rolls = 8
         for side in _sides() if self._body else [np.eye(3)]:
             for step in range(rolls):

@@ -73,7 +73,7 @@ class Errors:
 
 
 def errors_of(facts: Facts) -> Errors:
-    """Return every error per pose that a run knows."""
+    """Return every error per pose that a run computed."""
     found = facts.result.verifications.items()
     held = {step: verification.errors for step, verification in found if verification.errors}
     return Errors(tuple(facts.measured), facts.residuals, held)

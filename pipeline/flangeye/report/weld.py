@@ -139,7 +139,7 @@ def _deviation(weld: WeldReport, plane: WeldPlane, truth: Floats | None) -> Figu
     if len(weld.refined) > 1 and len(weld.band) == len(weld.torch):
         along, _, beside = _beside(plane, weld.refined, weld.torch)
         for sign, name in ((1.0, "95 % band"), (-1.0, "95 % band, right")):
-            # A band that is wider is drawn so wide: it says that nothing is known [m]
+            # The band is drawn up to 5 mm to each side: a wider one means that nothing is known
             edge = sign * np.minimum(weld.band[beside], 5e-3) * 1e3
             traces.append(curve(along * 1e3, edge, name, SERIES["unused"], dash="dot"))
     return {"data": traces, "layout": layout2d("along the seam [mm]", "torch to the left [mm]")}

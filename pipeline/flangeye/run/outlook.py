@@ -53,7 +53,7 @@ class Outlook:
 
 
 def outlook_of_log(log: RunLog, registry: Registry) -> Outlook:
-    """Return the outlook of a log by its own recipe; the run may still go on."""
+    """Return how good the calibration from a log's captures is so far, by the log's recipe."""
     recipe = recipe_of_log(log, registry)
     return outlook(recipe, registry, log.observations(), log.source or t.Source(fingerprint=""))
 

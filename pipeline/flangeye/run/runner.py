@@ -354,7 +354,7 @@ class Runner:
         self._values[t.HandEye] = self._outcome.calibration = found
 
     def _with_expected_error(self, found: t.HandEye) -> t.HandEye:
-        """Return it with what the model says, where its solver states no error at the work."""
+        """Return it with the mixed model's expected error, where its solver states none."""
         from flangeye.estimation.calibrate import with_expected_error
 
         cell, given = cell_in(self._values), self._values.get

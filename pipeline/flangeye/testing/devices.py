@@ -267,7 +267,7 @@ class ScannerConformance(DriverConformance):
             require(any("unit" in name for name in facts), "facts do not say the device's unit")
             cloud = self.scanned(scanner).cloud
         if "organised" in facts.get("layout", ""):
-            require(cloud.organised, "the device says organised, the cloud is not")
+            require(cloud.organised, "the device states organised, the cloud is not")
 
     def test_an_exposure_has_its_time(self) -> None:
         """The exposure lies between request and return, on this computer's clock."""

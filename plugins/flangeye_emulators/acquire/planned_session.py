@@ -71,7 +71,7 @@ class ArmsParams(Params):
 
     arm: ArmErrors = Field(
         default_factory=ArmErrors,
-        description="How far the arms are from what their controllers say; by default by the "
+        description="How far the arms are from what their controllers report; by default by the "
         "noise of the pose alone.",
     )
 
@@ -174,7 +174,7 @@ def plan_session(
         robot: The first arm.
         second: The second one, where the configuration has two.
         configuration: Who carries what.
-        given: What the recipe says, and what the camera can see.
+        given: What the recipe states, and what the camera can see.
         rng: Draws poses and their noise.
 
     Raises:

@@ -70,7 +70,7 @@ class SimulatedImagesParams(ViewParams):
 
     board: Literal["charuco", "checkerboard", "marker"] = Field(
         "charuco",
-        description="What is really printed; the step that fits it says what is believed of it. "
+        description="What is really printed; the step that fits it states its assumed size. "
         "charuco: 7 x 5 squares of 30 mm, markers of 22 mm from 4X4_50; checkerboard: 8 x 5 "
         "squares of 25 mm; marker: number 7 of APRILTAG_36h11, 100 mm.",
     )

@@ -236,7 +236,7 @@ def starting_joints(robot: RobotModel, joints: Sequence[float] | Floats | None) 
 def joint_zeros(robot: RobotModel, seed: int | None) -> Floats:
     """Return how far the joints' true zeros are off (n,) [rad]; the first by definition not at all.
 
-    Drawn with the robot's ``joint_accuracy``; without a seed the arm stands exactly where it says.
+    Drawn with the robot's ``joint_accuracy``; without a seed the arm stands where it reports.
     """
     zeros = np.zeros(len(robot.joints))
     if seed is not None:

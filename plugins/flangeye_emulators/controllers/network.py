@@ -214,7 +214,7 @@ class FaultInjector:
     * ``drop``: every connection is reset, once.
     * ``die``: connections are reset and nobody answers any more, for good or for a duration.
     * ``freeze``: connections stay open and nothing comes through, for good or for a duration.
-    * ``garbage``: random bytes come in place of what the controller says, for good.
+    * ``garbage``: random bytes come in place of what the controller reports, for good.
     * ``latency``: every byte comes late by a duration, in both directions.
 
     The arm goes on with what it was doing when the network fails, as a real one does.

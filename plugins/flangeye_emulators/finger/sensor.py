@@ -56,7 +56,7 @@ class SimulatedFingerParams(LaidParams):
         None, description="The tag is out of sight from the first time to the second."
     )
     held: bool = Field(
-        False, description="The tip is held where it is first, as in a punch mark: to calibrate."
+        False, description="To calibrate: the tip stays where it first touches, as in a punch mark."
     )
     fails: Duration | None = param(None, description="When the camera is lost.")
 
@@ -212,7 +212,7 @@ def sensor_simulated_finger(
     """A compliant finger in a groove, simulated, on whatever arm the recipe drives.
 
     Args:
-        finger: What the controller knows of it: nothing here depends on it.
+        finger: The finger as configured for the controller; the simulation does not use it.
         robot: Carries it.
         seed: Seed of the noise and of the world's random values.
         params: The world.
@@ -344,7 +344,7 @@ class FingerCamera:
         )
 
     def _warped(self, sheet: Floats, x: slice, y: slice) -> NDArray[np.uint8]:
-        """Return the paper as seen in some columns and rows, each pixel the mean of four."""
+        """Return the printed sheet as some columns and rows see it, each pixel the mean of four."""
         import cv2
 
         k = 2

@@ -76,7 +76,7 @@ class WeldWorld:
         """Prepare a world.
 
         Args:
-            nominal: What the files say.
+            nominal: What the files state.
             truth: What is true.
             seed: Seed of its random values.
             rolled_out: Returns where a torch (3,) is when the work's surface is rolled out, from

@@ -157,7 +157,7 @@ def newest() -> StandingArm | None:
 def true_flange(reported: RobotState) -> Transform:
     """Return where the flange of the arm that reports this really is.
 
-    An arm that is not simulated here is where it says.
+    An arm that is not simulated here is where it reports.
     """
     for arm in _ARMS:
         state = arm.state()

@@ -60,7 +60,7 @@ class ArchiveParams(OpeningParams):
 
     unit: StatedUnit = Field(
         "auto",
-        description="Unit of the clouds. auto: what the layout says, else metres or millimetres, "
+        description="Unit of the clouds. auto: what the layout states, else metres or millimetres, "
         "whichever fits the scanner's range; either is reported.",
     )
     stretch: tuple[float, float, float] = Field(
@@ -163,7 +163,7 @@ def _unit(
     if params.unit != "auto":
         unit, how = params.unit, "as stated"
     elif archive.cloud_unit is not None:
-        unit, how = archive.cloud_unit, "as the layout says"
+        unit, how = archive.cloud_unit, "as the layout states"
     else:
         unit, how = detect_unit(path, raw, scanner), "detected"
     distance = raw / PER_METRE[unit]

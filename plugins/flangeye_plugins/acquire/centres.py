@@ -57,7 +57,7 @@ def acquire_centres(
     The centres go straight to the solver: no normals and no clouds come with them, so steps
     that need those cannot follow. Centres of verification poses are kept from it. Where the
     recipe's feature is the wrist's circle, its centres are taken to lie as far behind the flange
-    as the robot's file says. Those of a cell are read by ``reader: cell``.
+    as the robot's file states. Those of a cell are read by ``reader: cell``.
     """
     path = archive_path("acquire.centres", archive, params)
     if is_log(path):

@@ -200,7 +200,7 @@ def require_inside(state: RobotState, allowed: MotionLimits) -> None:
 
 
 def _read(arm: RobotDriver, allowed: MotionLimits) -> tuple[Floats | None, str]:
-    """Return the joint angles at which the arm stands, None where it cannot be read; and a word."""
+    """Return the arm's present joint angles, None where they cannot be read, and a note."""
     try:
         name, state = read_state(arm)
     except DeviceError as error:

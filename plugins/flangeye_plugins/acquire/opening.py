@@ -104,7 +104,7 @@ def open_archive(path: Path, params: OpeningParams) -> Archive:
         if name not in known:
             raise StageError(f"{archive.root}: leave_out: there is no pose '{name}'")
     kept = [r for r in archive.recordings if r.id not in params.leave_out]
-    note = f"left out as the recipe says: {', '.join(params.leave_out)}"
+    note = f"left out as the recipe states: {', '.join(params.leave_out)}"
     return replace(archive, recordings=kept, notes=(*archive.notes, note))
 
 

@@ -152,7 +152,7 @@ class Looks(Shape):
         return max(0.01 * self.size, 3 * view.noise)
 
     def settled(self, poses: Floats, view: CoarseImage, count: int, reach: float) -> Floats:
-        """Return poses (K, 4, 4) moved once towards the scan's surfaces and ends within reach."""
+        """Return poses (K, 4, 4) after one step of ICP to the scan's surfaces and edges."""
         number = self.view_of(poses)
         on, off = (listed[number, :count] for listed in self._listed)
         placed, facing = _placed(poses, *self._singles[0], on)

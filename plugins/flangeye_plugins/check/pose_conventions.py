@@ -101,7 +101,7 @@ Convention = tuple[str, str | None]
 
 
 def _said(session: RecordedSession, of: str | None = None) -> Convention | None:
-    """Return how the recipe says that rotations are written; None where it does not, or not so."""
+    """Return the convention of rotations that the recipe states; None if it states none."""
     stated = _params(session, of)
     rotation = stated.get("rotation")
     return (str(rotation), stated.get("angle")) if rotation in (*CONVENTIONS, *PLAIN) else None
@@ -190,7 +190,7 @@ def _readings(stated: str | None) -> Iterator[tuple[str, str]]:
 
 
 def _stated(session: RecordedSession, of: str | None = None) -> str | None:
-    """Return how the recipe says the arm's rotations are written, or the target's, if it does."""
+    """Return how the recipe states the arm's rotations are written, or the target's, if it does."""
     said = _said(session, of)
     return said and _plain(said[0])
 

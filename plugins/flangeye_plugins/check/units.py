@@ -248,15 +248,15 @@ def size(session: RecordedSession) -> Findings:
 def _wrong_marker(session: RecordedSession, kind: str, factor: float) -> tuple[str, str]:
     """Return what is wrong with a marker or its camera, and what to do."""
     calibrate = _calibrate_camera(session)
-    focal = f"the camera's focal length is {factor:.4f} times as long as its calibration says"
+    focal = f"the camera's focal length is {factor:.4f} times as long as its calibration states"
     if kind == "focal":
         return focal, calibrate
-    what = f"the marker is {factor:.4f} times as large as the recipe says"
+    what = f"the marker is {factor:.4f} times as large as the recipe states"
     if session.acquire == "acquire.samples":
         return what, session.read_with(target={"scale": float(f"{factor:.4f}")}).step()
     fix = f"measure it after printing: its lengths in the fit step times {factor:.4f}"
     if session.acquire == "acquire.images":  # where the target stays near the camera's axis
-        return f"{what}, or {focal}", f"{fix}; where the print is as the recipe says: {calibrate}"
+        return f"{what}, or {focal}", f"{fix}; where the print is as the recipe states: {calibrate}"
     return what, fix
 
 

@@ -230,7 +230,7 @@ def _by_depth(corners: Corners, capture: Capture, board: Board) -> PlanarPose | 
     # Share by which a print may be off and nobody needs to know
     if abs(scale - 1) > max(5.0 * sigma, 5e-3):
         return Rejected(
-            f"by the scanner's depth the target is {scale:.4f} times as large as the recipe says: "
+            f"by the scanner's depth the target has {scale:.4f} times the recipe's size: "
             f"{board.square * 1e3:.4g} mm is {board.square * scale * 1e3:.4g} mm; measure the print"
         )
     return pose_from_points(points, measured)

@@ -83,7 +83,7 @@ def fit_sphere(
 
     Robust least squares on the distance from the surface, over points seen within the incidence
     limit: beyond it scanners smear and lose points. The radius is fitted too, to tell whether it
-    is the sphere at all; the centre is that of the known radius unless the recipe wants it free.
+    is the sphere at all; the centre is that of the known radius unless the recipe leaves it free.
     There is no randomness.
     """
     points = cloud.cloud.xyz.astype(np.float64)

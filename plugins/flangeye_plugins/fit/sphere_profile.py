@@ -75,7 +75,7 @@ def fit_sphere_profile(
 
     The laser's plane, y = 0 of the scanner, cuts the sphere in a circle. Its centre gives x and z,
     its radius r the distance of the sphere's centre from the plane: ``y = sqrt(R^2 - r^2)``, on the
-    side that the recipe says. The uncertainty of r grows by r / y on its way to y.
+    side that the recipe states. The uncertainty of r grows by r / y on its way to y.
     """
     xyz = capture.cloud.points().astype(np.float64)
     xyz = xyz[np.isfinite(xyz).all(axis=1)]
@@ -112,7 +112,7 @@ def _why_no_profile(xyz: Floats) -> str | None:
     if off > 1e-4:
         return (
             f"no profile: points lie up to {off * 1e3:.3g} mm off the plane y = 0; a profile has "
-            "x along the line and z away from the scanner (a whole scan wants fit.sphere)"
+            "x along the line and z away from the scanner (a whole scan needs fit.sphere)"
         )
     return None
 

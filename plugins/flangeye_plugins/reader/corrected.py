@@ -124,7 +124,7 @@ def corrected(path: Path, params: CorrectedParams) -> Archive:
         recordings = _replaced(recordings, lambda rows: rows[::-1], every, params.arms)
     if params.delay:
         recordings = _delay(archive, recordings, params)
-    note = "poses corrected as the recipe says"
+    note = "poses corrected as the recipe states"
     return replace(archive, recordings=recordings, notes=(*archive.notes, note))
 
 

@@ -100,7 +100,7 @@ def _poses_file(path: Path) -> Path:
 
 def _unit(file: Path, stated: LengthUnit | None, param: LengthUnit | None) -> LengthUnit:
     if stated and param and stated != param:
-        raise StageError(f"{file}: positions are in {stated}, but the recipe says unit: {param}")
+        raise StageError(f"{file}: positions are in {stated}, but the recipe states unit: {param}")
     unit = stated or param
     if unit is None:
         raise StageError(

@@ -138,7 +138,7 @@ def ros2_bag(path: Path, params: BagParams, kinematics: RobotModel | None = None
 
 
 def _first_look(path: Path) -> Bag:
-    """Read all but the clouds and images, and of those the times."""
+    """Read a bag's small messages, and only the times of its clouds and images."""
     files = bag_files(path)
     bag = Bag(path, files, topics_of(files))
     wanted = bag.of_type(

@@ -133,4 +133,4 @@ def _refuse_other_type(file: Path, stated: str) -> None:
     parameters = document.data.get("parameters") if document else None
     written = parameters.get("calibration_type") if isinstance(parameters, Mapping) else None
     if written and written != stated:
-        raise StageError(f"{file}: was sampled for {written}, but the recipe says {stated}")
+        raise StageError(f"{file}: was sampled for {written}, but the recipe states {stated}")

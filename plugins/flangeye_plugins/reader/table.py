@@ -171,7 +171,7 @@ def _scan_column(text: Table, params: TableParams) -> int | None:
 
 
 def _columns(text: Table, params: TableParams, scan: int | None) -> list[int]:
-    """Return the arm's columns: as the recipe says, or all that nothing else uses."""
+    """Return the arm's columns: as the recipe states, or all that nothing else uses."""
     if params.columns:
         return text.indices(params.columns)
     others = [o for o in (params.target, params.second) if o and o.file is None]

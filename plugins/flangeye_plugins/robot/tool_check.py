@@ -56,7 +56,7 @@ def require_tool(
     # Largest difference of two tool offsets [m, rad]; pendants show 0.01 mm
     if _differ(offset, expected, (1e-4, 1e-3)):
         raise DeviceError(
-            f"{name}: the controller's tool is set to {shown.text(offset)}, the recipe says "
+            f"{name}: the controller's tool is set to {shown.text(offset)}, the recipe states "
             f"{shown.text(expected)}: poses are the flange's, so set the tool at the pendant, or "
             f"robot.driver.{driver}.tool in the recipe"
         )

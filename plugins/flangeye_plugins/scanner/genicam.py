@@ -52,12 +52,12 @@ class RangeLayout:
             parts: A frame's components by pixel format.
 
         Raises:
-            DeviceError: The frame is not laid out as the device said.
+            DeviceError: The frame is not laid out as the device stated.
         """
         raw = _raw_coordinates(parts)
         if raw.shape != (*self.shape, 3):
             raise DeviceError(
-                f"{NAME}: a frame of {raw.shape[1]} x {raw.shape[0]} points, but the device says "
+                f"{NAME}: a frame of {raw.shape[1]} x {raw.shape[0]} points, but the device states "
                 f"{self.shape[1]} x {self.shape[0]}"
             )
         missing = (raw == self.invalid).any(axis=-1)

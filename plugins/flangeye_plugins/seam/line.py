@@ -104,7 +104,7 @@ def _lines(path: Path, unit: LengthUnit, angle: float) -> list[Floats]:
         pieces, said = read_dxf(path)
         if said not in (None, unit):
             raise StageError(
-                f"{path}: states the unit {said} ($INSUNITS), the recipe says unit: {unit}"
+                f"{path}: states the unit {said} ($INSUNITS), the recipe states unit: {unit}"
             )
         return chained(pieces / PER_METRE[unit], meet)
     if suffix in MESHES:

@@ -99,7 +99,7 @@ def _step(
     normals = swept.section.normals[edges]
     residual[first:] = np.einsum("ni,ni->n", normals, q[first:]) - swept.section.heights[edges]
     size = np.where(np.arange(len(points)) < first, sigma, 0.5 * pitch)
-    tukey = 4.685
+    tukey = 4.685  # of Tukey's weights: as good as 95 % of the points would be, of normal noise
     weight = np.maximum(1 - (residual / (tukey * size)) ** 2, 0.0) ** 2
     sight = np.einsum("ni,ni->n", swept.section.normals[which], turn(points[:, 3:], line[:, 2]))
     # Sine of 8 deg to the line of sight: pixels that see both sides of a jump in depth look
@@ -133,6 +133,8 @@ def _design(swept: Swept, basis: Any, line: Floats, q: Floats, which: Any) -> An
     """Return the sparse (N, 3m + k) derivatives of the signed distances."""
     from scipy import sparse
 
+    # Of the distance n(angle) . q - h, by y and z of the line and by its roll. A turn of one
+    # half-plane acts as the roll does, with the same lever
     angle = swept.section.angles[which]
     turned = angle + line[:, 2]
     lever = np.cos(angle) * q[:, 0] - np.sin(angle) * q[:, 1]

@@ -136,6 +136,8 @@ class Section:
         """Return the (N,) signed distances of points (N, 2), and the half-planes they are from."""
         away = q @ np.nan_to_num(self.normals).T - self.heights
         away[:, ~self.joint.present] = -np.inf
+        # A plate is where both of its half-planes are, the larger distance; the work is where
+        # either plate is, the smaller one
         first, second, third, fourth = away.T
         left, right = np.maximum(first, second), np.maximum(third, fourth)
         on_left = left <= right

@@ -80,7 +80,7 @@ def solve_closed(
 
     Raises:
         StageError: Too few poses, or all the same.
-        CalibrationRefused: The motion leaves something unknown: it says which motion is missing.
+        CalibrationRefused: The motion leaves something unknown; the message has what is missing.
     """
     observations, cell, scanner = given
     problem = problem_of(observations, cell)

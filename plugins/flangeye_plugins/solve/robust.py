@@ -84,7 +84,7 @@ def solve_robust(  # noqa: PLR0913  what it asks the runner for
         StageError: Too few poses, all the same, those of a mirrored camera, or a carrier's pose is
             missing.
         CalibrationRefused: Fewer than half of the poses agree, the motion leaves something unknown
-            (it says which motion is missing), or a marker's size is not the configured one.
+            (the message has the missing motion), or a marker's size is not the configured one.
     """
     standing = cell or cell_of(configuration or DEFAULT, robot, second.model if second else None)
 

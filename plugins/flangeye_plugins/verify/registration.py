@@ -200,7 +200,7 @@ def _limits(reach: float, distance: float) -> list[float]:
 def _converge(
     source: Floats, surface: SampledSurface, motion: Floats, limit: float, still: float
 ) -> tuple[Floats, Floats] | str:
-    """Iterate at one limit; return the motion and the directions (k, 6) it says nothing about."""
+    """Iterate at one limit; return the motion and its unobservable directions (k, 6)."""
     iterations = 200
     for _ in range(iterations):
         jacobian, distances = _equations(source, surface, motion, limit)

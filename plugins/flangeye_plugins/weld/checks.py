@@ -72,7 +72,7 @@ def check_seat(belief: Belief, settings: Following) -> None:
     """Refuse a tip that would not lie where the joint's two walls meet.
 
     Raises:
-        StageError: Why, and what would do.
+        StageError: It would not; the message says why, and which values would do.
     """
     if settings.joint == "butt" and belief.joint is None:
         raise StageError(

@@ -347,7 +347,7 @@ def test_the_published_aubo_recording(ancorasir_folder: Any, scanner: Any) -> No
     for capture in captures[1:]:
         # The flange's face looks at the scanner, and its middle is near the published centre.
         assert np.isfinite(capture.cloud.xyz).all()
-    assert stream.source.notes[-1].startswith("clouds in m (as the layout says): the first has")
+    assert stream.source.notes[-1].startswith("clouds in m (as the layout states): the first has")
 
 
 def test_the_whole_published_folder_says_which_nine_poses_it_skips(

@@ -115,7 +115,7 @@ def test_the_fingerprint_follows_every_input_and_not_the_place(
 def test_poses_can_be_left_out(acquire: Callable[..., Any]) -> None:
     stream = acquire(leave_out=("two", "check"))
     assert [capture.id for capture in stream] == ["one", "three", "four"]
-    assert "left out as the recipe says: two, check" in stream.source.notes
+    assert "left out as the recipe states: two, check" in stream.source.notes
 
 
 def test_a_log_is_an_archive(acquire: Callable[..., Any], captures: Any, tmp_path: Path) -> None:

@@ -80,7 +80,7 @@ def test_the_unit_may_come_from_the_recipe(tmp_path: Path) -> None:
 
 def test_a_unit_said_twice_must_agree(tmp_path: Path) -> None:
     assert refused(tmp_path, HEADING + ROW, unit="m") == (
-        f"{tmp_path}/poses.csv: positions are in mm, but the recipe says unit: m"
+        f"{tmp_path}/poses.csv: positions are in mm, but the recipe states unit: m"
     )
 
 

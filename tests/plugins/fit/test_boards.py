@@ -168,7 +168,7 @@ def test_a_print_in_another_size_is_named_by_depth(kind: str) -> None:
     rejected = fit(capture(board, looking(), depth=True), said)
     assert isinstance(rejected, Rejected)
     told = re.fullmatch(
-        r"by the scanner's depth the target is ([\d.]+) times as large as the recipe says: "
+        r"by the scanner's depth the target has ([\d.]+) times the recipe's size: "
         r"([\d.]+) mm is ([\d.]+) mm; measure the print",
         rejected.reason,
     )

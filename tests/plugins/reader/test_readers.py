@@ -249,7 +249,7 @@ def test_nothing_of_a_convention_is_guessed(values: dict[str, Any], message: str
     [
         (easy_handeye, EasyHandeyeParams(calibration="eye_on_base"),
          samples_text(POSES, "eye_in_hand"),
-         "x.yaml: was sampled for eye_in_hand, but the recipe says eye_on_base"),
+         "x.yaml: was sampled for eye_in_hand, but the recipe states eye_on_base"),
         (easy_handeye, EasyHandeyeParams(calibration="eye_on_base"),
          "samples:\n- robot: {translation: {x: 1, y: 2}}\n  tracking: {}\n",
          "x.yaml: has no column 'robot.translation.z'; known: robot.translation.y, robot.translation.x"),

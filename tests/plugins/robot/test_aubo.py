@@ -90,7 +90,7 @@ def test_a_tool_the_recipe_does_not_know_is_refused_and_one_it_knows_is_taken_of
         open_aubo(host)
     assert str(error.value) == (
         f"aubo-i5 at {host}: the controller's tool is set to X 10.00 mm  Y 0.00 mm  Z 150.00 mm  "
-        "ROLL 0.000 deg  PITCH 0.000 deg  YAW 90.000 deg, the recipe says X 0.00 mm  Y 0.00 mm  "
+        "ROLL 0.000 deg  PITCH 0.000 deg  YAW 90.000 deg, the recipe states X 0.00 mm  Y 0.00 mm  "
         "Z 0.00 mm  ROLL 0.000 deg  PITCH 0.000 deg  YAW 0.000 deg: poses are the flange's, so "
         "set the tool at the pendant, or robot.driver.aubo.tool in the recipe"
     )

@@ -100,7 +100,7 @@ def test_a_tool_the_recipe_does_not_know_is_refused_and_one_it_knows_is_taken_of
         open_ur(host)
     assert str(error.value) == (
         f"ur5e at {host}: the controller's tool is set to X 10.00 mm  Y 0.00 mm  Z 150.00 mm  "
-        "RX 0.00000 rad  RY 0.00000 rad  RZ 1.57080 rad, the recipe says X 0.00 mm  Y 0.00 mm  "
+        "RX 0.00000 rad  RY 0.00000 rad  RZ 1.57080 rad, the recipe states X 0.00 mm  Y 0.00 mm  "
         "Z 0.00 mm  RX 0.00000 rad  RY 0.00000 rad  RZ 0.00000 rad: poses are the flange's, so "
         "set the tool at the pendant, or robot.driver.ur_rtde.tool in the recipe"
     )

@@ -241,7 +241,7 @@ def test_a_frame_unlike_what_the_device_said_is_refused() -> None:
     with pytest.raises(DeviceError) as error:
         layout.coordinates({"Coord3D_ABC32f": np.zeros((4, 9), np.float32)})
     assert str(error.value) == (
-        "scanner.genicam: a frame of 3 x 4 points, but the device says 3 x 2"
+        "scanner.genicam: a frame of 3 x 4 points, but the device states 3 x 2"
     )
     with pytest.raises(DeviceError) as error:
         layout.coordinates({"Mono8": np.zeros((2, 3), np.uint8)})

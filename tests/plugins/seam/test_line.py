@@ -107,7 +107,7 @@ def test_numbers_that_are_none_are_refused(tmp_path, value) -> None:
 def test_a_drawing_in_another_unit_is_refused(tmp_path) -> None:
     path = dxf(tmp_path, ("LINE", 10, 0, 20, 0, 11, 1, 21, 0), header="9 $INSUNITS 70 1")
     with pytest.raises(
-        StageError, match=r"states the unit in \(\$INSUNITS\), the recipe says unit: mm"
+        StageError, match=r"states the unit in \(\$INSUNITS\), the recipe states unit: mm"
     ):
         line_of(path)
 

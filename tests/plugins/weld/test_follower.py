@@ -436,7 +436,7 @@ def test_tip_and_torch_go_on_by_a_tenth_of_a_second_s_way_at_most() -> None:
     )
 
 
-# --- what the finger says -------------------------------------------------------------------------
+# --- what the finger measures -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("side", ["left", "right"])

@@ -348,7 +348,7 @@ def test_a_finger_scatters_across_as_its_file_says_at_least() -> None:
     for seen, across in ((1e-6, 5e-6), (9e-6, 9e-6)):
         found = going(noise=5e-6)
         found.begin(seen)
-        assert found._noise == (across, 6e-5)  # in height as its file says
+        assert found._noise == (across, 6e-5)  # in height as its file states
 
 
 def test_play_is_as_uncertain_as_where_in_it_the_finger_is() -> None:

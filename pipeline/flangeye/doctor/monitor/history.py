@@ -79,7 +79,7 @@ class History:
         path: The file.
         key: Identifies the calibration.
         checks: What was seen.
-        findings: What it said; one for each check that was judged.
+        findings: The verdicts; one for each check that was judged.
     """
 
     path: Path

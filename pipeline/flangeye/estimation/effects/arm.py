@@ -42,8 +42,8 @@ COMMON = "common"
 ACCURACY = 0.3e-3
 """Typical deviation of a joint's zero where no file states it [rad]: the catalogue arms'."""
 QUALITY = 4.0
-"""By how many times an arm may be better or worse than its file says, one sigma: joint accuracy is
-on no data sheet, and arms of one maker differ tenfold."""
+"""By how many times an arm may be better or worse than its file, one sigma: joint accuracy is on no
+data sheet, and arms of one maker differ tenfold."""
 EACH = 1.8
 """By how many times each kind may be larger or smaller beside the arm's quality, one sigma."""
 

@@ -79,7 +79,7 @@ def open_pcd(path: Path) -> PointTable:
         return BinaryTable(path, shape, offset, record, viewpoint)
     if encoding == "binary_compressed":
         return CompressedTable(path, shape, offset, record, viewpoint)
-    refuse(path, f"its header says DATA {encoding}; known: ascii, binary, binary_compressed")
+    refuse(path, f"its header states DATA {encoding}; known: ascii, binary, binary_compressed")
 
 
 def _viewpoint(path: Path, header: Header) -> Viewpoint | None:
@@ -89,7 +89,7 @@ def _viewpoint(path: Path, header: Header) -> Viewpoint | None:
         return None
     numbers = tuple(float(word) for word in words if _is_number(word))
     if len(numbers) != len(words) or len(numbers) != 7 or abs(math.hypot(*numbers[3:]) - 1) > 1e-3:
-        refuse(path, f"its header says VIEWPOINT {' '.join(words)}: no position and quaternion")
+        refuse(path, f"its header states VIEWPOINT {' '.join(words)}: no position and quaternion")
     return Viewpoint(numbers)
 
 
@@ -112,7 +112,7 @@ def _shape(path: Path, header: Header) -> Shape:
     height = count_of(path, "HEIGHT", _words(path, header, "HEIGHT")[0])
     points = count_of(path, "POINTS", (header.get("POINTS") or [str(width * height)])[0])
     if points != width * height:
-        refuse(path, f"its header says {width} x {height} points, and also {points}")
+        refuse(path, f"its header states {width} x {height} points, and also {points}")
     return (height, width) if height > 1 else (width,)
 
 
@@ -134,12 +134,12 @@ def _record(
         )
     for kind, size in zip(kinds, sizes, strict=True):
         if size not in {"F": "48", "I": "1248", "U": "1248"}.get(kind, "") or len(size) != 1:
-            refuse(path, f"its header says TYPE {kind} with SIZE {size}, which PCD does not have")
+            refuse(path, f"its header states TYPE {kind} with SIZE {size}, which PCD does not have")
     if any(counts[axis] != 1 for axis in axes):
         refuse(path, "its header gives x, y and z a COUNT other than 1")
     max_record = 65536
     if sum(int(size) * count for size, count in zip(sizes, counts, strict=True)) > max_record:
-        refuse(path, f"its header says that one point has more than {max_record} bytes")
+        refuse(path, f"its header states that one point has more than {max_record} bytes")
     # Fields may share a name ("_" is padding), so only x, y and z keep theirs.
     names = [f"{i}" for i in range(len(counts))]
     for axis, name in zip(axes, "xyz", strict=True):

@@ -64,7 +64,7 @@ def open_ply(path: Path) -> PointTable:
     orders = {"binary_little_endian": "<", "binary_big_endian": ">"}
     if encoding in orders:
         return _binary(path, offset, elements[: at + 1], orders[encoding])
-    refuse(path, f"its header says format {encoding}; known: ascii, {', '.join(orders)}")
+    refuse(path, f"its header states format {encoding}; known: ascii, {', '.join(orders)}")
 
 
 def _elements(path: Path, lines: list[list[str]]) -> list[_Element]:

@@ -82,7 +82,7 @@ def count_of(path: Path, what: str, text: str) -> int:
     """
     # Counts stay below 2^63
     if not (text.isascii() and text.isdigit() and len(text) <= 18):
-        refuse(path, f"its header says {what} '{text[:24]}', which is not a count")
+        refuse(path, f"its header states {what} '{text[:24]}', which is not a count")
     return int(text)
 
 
@@ -244,7 +244,7 @@ class BinaryTable:
         shape: (N,) or (H, W).
         offset: Byte at which the records begin.
         record: Layout of a record, with fields ``x``, ``y``, ``z``.
-        viewpoint: Where the file says the scanner stood; None where it does not.
+        viewpoint: Where the scanner stood, by the file; None where it does not state that.
     """
 
     path: Path

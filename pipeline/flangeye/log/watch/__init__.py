@@ -313,7 +313,7 @@ def may_look(head: bytes) -> bool:
 
 
 def hidden_address() -> tuple[str, int]:
-    """Return an address of this machine and a port that are free, and that no page can try out."""
+    """Return a free loopback address and port, of so many that a web page cannot guess them."""
     host = str(ipaddress.IPv4Address("127.0.0.0") + secrets.randbelow(1 << 24))
     try:
         found = socket.create_server((host, 0))

@@ -572,7 +572,7 @@ def _angle(numbers: Floats, pose: PoseColumns) -> str:
 
 
 def _direction(pose: PoseColumns, questions: Questions, prefix: str) -> str:
-    """Return which way round poses are: as asked, as the data show, or as a name says."""
+    """Return which way round poses are: as asked, or by the data, or by a name."""
     ways = WAYS[prefix]
     named = ways[is_inverse(pose.frames)] if pose.frames else None
     likely = questions.likely.get(f"{prefix}pose")
@@ -614,7 +614,7 @@ def _rest(table: Table) -> dict[str, Any]:
 
 
 def _time_unit(table: Table, column: Column) -> str | None:
-    """Return the unit of times since 1970 that no name says, by their size; None for seconds."""
+    """Return the unit of times since 1970 by their size, where no name has it; None for seconds."""
     latest = np.nanmax(np.abs(table.numbers([table.index(column)])))
     # Seconds since 1970 are some 1e9 until the year 5000
     return next(

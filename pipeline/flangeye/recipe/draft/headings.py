@@ -1,6 +1,6 @@
 """What the columns of a table are called, and the poses, points and joint angles they hold.
 
-What a name says of the poses that it names: whose they are, and which way round.
+What a name reveals about poses: whose they are, and which way round.
 
 A name of two frames says both: ``gripper2base`` is a pose of the arm, ``camera_T_target``,
 ``T_cam_board`` and ``cHt`` are the target's as the camera sees it.
@@ -43,7 +43,7 @@ _TURNS: Mapping[str, str] = {
 _OPENCV = ("rvec", "rvecs", "tvec", "tvecs")
 """What OpenCV calls the pose of what a camera sees."""
 _POSES: Mapping[int, str | None] = {6: None, 7: "xyzw", 12: "matrix", 16: "matrix"}
-"""Numbers of a list that is a whole pose, and what they are if no name says more."""
+"""Lengths of lists that are whole poses, and what their numbers are unless a name decides."""
 _JOINT = re.compile(
     r"(?:j_?\d|(?:q|a|axis|theta)_?[1-9])(?:_?(?:rad|deg|pos|position))?"
     r"|(?!.*(?:vel|eff|torque|acc|current|temp)).*joint.*"
@@ -196,7 +196,7 @@ class Headings:
         time: Column of the time.
         time_unit: Its unit.
         joints: Columns of joint angles.
-        joint_unit: Their unit, as a name says.
+        joint_unit: Their unit, from a name.
     """
 
     scan: Column | None = None
@@ -470,7 +470,7 @@ def is_inverse(frames: tuple[str, str]) -> bool:
 
 
 def role_in(name: str) -> str | None:
-    """Return ``arm`` or ``target`` by a name; None if it says neither."""
+    """Return ``arm`` or ``target`` by a name; None if it shows neither."""
     frames = frames_in(name.rpartition(":")[2])
     if frames is not None:
         return "target" if "camera" in frames else "arm"

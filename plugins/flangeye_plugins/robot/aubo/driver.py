@@ -63,7 +63,7 @@ def robot_aubo(model: RobotModel, params: AuboParams, reads_only: bool = False) 
     end by themselves after a tenth of a second, and each look at the arm brings the next.
 
     Args:
-        model: The arm; its kinematics are compared with what the controller says.
+        model: The arm; its kinematics are compared with what the controller reports.
         params: See :class:`AuboParams`.
         reads_only: Ask only; closing stops nothing, and the arm may be in any mode.
 

@@ -140,10 +140,10 @@ class Ros2Arm(Listener):
             self._renew()
 
     def stop(self) -> None:
-        """Publish a hold: the controller brakes from where the arm is on its motion.
+        """Publish a trajectory that brakes from the arm's present point on its motion.
 
-        Of a motion that was not renewed for SILENT the last piece has ended, or is about to: a hold
-        at a place where the arm was would set it moving again.
+        Nothing is published where the motion was not renewed for SILENT: its last piece has ended
+        by itself, and a point where the arm was before would set it moving again.
         """
         if self._motion is not None:
             if time.monotonic() - self._renewed <= SILENT:

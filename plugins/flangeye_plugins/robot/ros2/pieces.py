@@ -72,8 +72,8 @@ class DrivenMotion(ABC):
 
     def stop(self) -> list[Point]:
         """Return the piece that brakes from where the arm is on the motion."""
-        # From a stop to its beginning at the controller: it brakes from where the arm is by then
-        # [s]
+        # The stop takes effect at the controller so much later [s]: it brakes from where the arm is
+        # by then
         points = [*self._recent(), self._point(0.03)]
         return [*points, *brake(points[-1], BRISK)] if points[-1].speeds.any() else points
 

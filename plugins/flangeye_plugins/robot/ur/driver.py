@@ -186,7 +186,7 @@ def robot_ur_rtde(model: RobotModel, params: ControllerParams, reads_only: bool 
     the installation, and no other program that writes RTDE registers (fieldbuses do).
 
     Args:
-        model: The arm; its kinematics are compared with what the controller says.
+        model: The arm; its kinematics are compared with what the controller reports.
         params: See :class:`ControllerParams`.
         reads_only: Open RTDE's receiving side alone. The client library starts its program on the
             controller for the other side only; the arm may be in local control, or switched off.

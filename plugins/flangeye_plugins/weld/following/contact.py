@@ -77,7 +77,7 @@ class Felt(NamedTuple):
 
 
 class _Weighed(NamedTuple):
-    """A measurement, and what it says of the modes.
+    """A measurement, and its likelihood in each mode.
 
     Attributes:
         felt: As it was taken.

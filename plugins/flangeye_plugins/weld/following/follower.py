@@ -35,7 +35,7 @@ class Follower:
         task: What it is to follow.
         progress: How far tip and torch have come.
         pressing: How hard the tip is pressed.
-        sensing: What the finger says.
+        sensing: What the finger measures.
         seam: Where the seam is.
         lead: How the torch is led along it.
         welding: How well the torch is known, and whether it welds.
@@ -147,7 +147,7 @@ class Follower:
         over = self.phase in ("done", "stopped") or not self.task.touch
         return OFF if over else self.welding.striking.level(self.now or 0.0)
 
-    # --- what the finger says ---------------------------------------------------------------------
+    # --- what the finger measures -----------------------------------------------------------------
 
     def _begin_cycle(self, pose: ToolPose) -> float:
         """Take the time; return how much has passed since the last cycle [s]."""

@@ -2,7 +2,7 @@
 
 The tip is held by the groove's walls, as in a punch mark, while the arm moves across by ``D`` to
 one side and to the other. With the tip at ``y0`` and the end point at ``P`` the true displacement
-is ``u = y0 - P``; the finger says ``m = c + (1 + g) u + w sign(du/dt)``, of an image whose
+is ``u = y0 - P``; the finger measures ``m = c + (1 + g) u + w sign(du/dt)``, of an image whose
 timestamp is off by ``tau``. Gain error ``g``, the half width ``w`` of play and hysteresis, and
 ``tau`` follow by least squares, ``tau`` and the reversal's length from a grid. Both sides are swept
 with the tool turned a little to the left, then to the right: what that shifts ``c`` by is how far
