@@ -447,6 +447,7 @@ def found_in(
     stated = None if first.params is None else getattr(first.params, "unit", None)
     seen = _seen_by(archive, first, recipe, registry)
     remarks = tuple(_rejected(seen.rejections))
+    # A rejection with a cure of its own is the mistake: no other unit is tried
     if any(remark.fix for remark in remarks):
         return seen.features, remarks, None
     if len(seen.features) < FEWEST_SAMPLES and first.params is not None and stated is not None:
@@ -471,6 +472,7 @@ def _seen_by(archive: Archive, first: Step, recipe: Recipe, registry: Registry) 
     stand_in = BoundPart(
         Part("reader.stand_in", lambda _: _with_stand_in_poses(archive), None, {}, (Archive,)), None
     )
+    # The recipe's steps run as in any run; only the reader of the first is replaced
     params = first.params.model_copy(update={"reader": stand_in}) if first.params else None
     steps = (replace(first, params=params), *recipe.steps[1:])
     runner = Runner(replace(recipe, steps=steps), registry, t.ArchivePath(archive.root))

@@ -137,6 +137,7 @@ def _discs(board: Board, per_square: int) -> Pixels:
     radius = round(board.marker / board.square / 2 * per_square)
     for x, y, _ in board.circle_centres():
         across, down = (x + width / 2) / board.square, (height / 2 - y) / board.square
+        # Pixels have whole numbers at their centres, the print at their edges: half a pixel less
         middle = [round(16 * (place * per_square - 0.5)) for place in (across, down)]
         cv2.circle(page, middle, 16 * radius, 0, -1, cv2.LINE_AA, 4)  # in sixteenths of a pixel
     return page

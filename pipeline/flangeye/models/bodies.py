@@ -120,6 +120,7 @@ class ArmBody(TargetBody):
 
 @lru_cache(maxsize=4)
 def _posed(body: ArmBody, joints: tuple[float, ...]) -> TargetBody:
+    # Links in the flange's frame, where a body on the flange is drawn too
     angles = np.array(joints)
     frames = invert(body.arm.flange(angles)) @ body.arm.frames(angles)
     return TargetBody(

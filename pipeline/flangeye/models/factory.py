@@ -88,6 +88,7 @@ def _from_ros(robot: RobotModel, path: Path) -> RobotModel:
             f"{path}: not a kinematics file of the ROS driver: {error}; it has 'kinematics' with "
             f"{', '.join(LINKS)}, each with {', '.join(PLACE)}"
         ) from None
+    # The origins hold lengths and twists: the nominal ones go, limits and axes stay
     joints = tuple(
         Joint.model_construct(
             **{

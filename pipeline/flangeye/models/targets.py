@@ -74,6 +74,7 @@ def plate_of(robot: RobotModel) -> Flange:
 
 def flange_of(details: FlangeDetails, standard: FlangeStandard) -> Flange:
     """Return the circle of ``standard`` as seen on an arm."""
+    # What shows is the flat face: chamfers make its rim smaller than nominal, its holes larger
     n, pin = standard.threads, details.pin_angle
     # The pin hole lies on a bisector of the threads (ISO 9409-1, clause 4).
     holes = tuple((pin or 0.0) + pi / n + 2 * pi * i / n for i in range(n))

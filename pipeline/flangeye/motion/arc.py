@@ -73,6 +73,7 @@ class ArcedArm(Device):
             self._watch(now)
 
     def _watch(self, now: int) -> None:
+        # None comes from a source that does not measure it: only a clear no counts
         burning = self.arc.burning()
         if burning is not False:
             self._out_ns = now
@@ -105,6 +106,7 @@ class ArcedArm(Device):
         """End the arc at once; the gas flows on for its post-flow time."""
         if self._level == OFF:
             return
+        # After an arc gas shields the bead while it cools; without one there is nothing to shield
         burned, self._level = self._level == BURN, OFF
         self.arc.burn(False)
         after = self._times.gas_after if burned else 0.0
@@ -122,6 +124,7 @@ class ArcedArm(Device):
 
     def stop(self) -> None:
         """End the arc, then brake."""
+        # In this order: an arc above a standing torch burns through the plate
         try:
             with suppress(DeviceError):
                 self.quench()

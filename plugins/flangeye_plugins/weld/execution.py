@@ -235,6 +235,7 @@ def _turn(
     used = tuple(number for number in numbers if number in weld_log.felt)
     felt = [weld_log.felt[number] for number in used]
     pose = cell.tool.pose(state.base_T_flange, state.time_ns * 1e-9)
+    # Before the controller steers by them: a tip that is out of bounds stops the weld
     cell.bounds.check(pose, controller.tip, felt)
     if cell.steered is not None:
         for profile in cell.eyes.looks():

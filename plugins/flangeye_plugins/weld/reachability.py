@@ -173,6 +173,7 @@ class SeamReach:
         """
         lower, upper = self._task.limits.lower, self._task.limits.upper
         outside = (low < lower + ROOM) | (high > upper - ROOM)
+        # From the middle of the joint's way to the middle of its range, in whole turns
         turns = np.round((lower + upper - low - high) / (4 * np.pi))
         return np.where(outside, 2 * np.pi * turns, 0.0)
 
@@ -212,6 +213,7 @@ class SeamReach:
         """Return what a joint turns at most while the seam is followed [rad/s]."""
         task = self._task
         inverse = np.linalg.pinv(self._arm.jacobian(joints))
+        # The norm of a row is the most that its joint turns for a unit velocity in any direction
         up = task.tool.up(self._arm.flange(joints)[:3, :3])
         turning = np.abs(inverse[:, :3] @ up) * task.params.turn_rate
         turning += np.linalg.norm(inverse[:, :3], axis=1) * task.tool.tilting * task.params.speed

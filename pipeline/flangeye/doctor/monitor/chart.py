@@ -73,6 +73,7 @@ def figure(history: History, test: DriftTest) -> Any:
 
 
 def _axis(history: History) -> list[Any]:
+    # Checks of unknown or equal times are placed by their number
     times = [c.time_ns for c in history.checks[: len(history.findings)]]
     if all(times) and len(set(times)) == len(times):
         return [datetime.fromtimestamp(x // 10**9, UTC) for x in times]

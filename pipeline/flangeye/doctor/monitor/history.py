@@ -101,7 +101,7 @@ class History:
         head, _, body = read_regular(path, 1 << 30).partition(b"\n")
         try:
             about = decode_json(head)
-        except (ValueError, RecursionError):
+        except (ValueError, RecursionError):  # of a made file with thousands of brackets
             about = {}
         if about.get("format") != FORMAT:
             raise StageError(f"{path}: is not a history of flangeye monitor, or is damaged")
@@ -179,6 +179,7 @@ def only_user(path: Path) -> Iterator[None]:
     import fcntl  # not on every system, and nothing but this command needs it
 
     patience = 60.0  # for another program that adds a check [s]; judging takes it about a second
+    # A file of its own: each writing replaces the history, and a lock on it with it
     lock, end = path.with_name(f".{path.name}.lock"), time.monotonic() + patience
     try:
         lock.parent.mkdir(parents=True, exist_ok=True)

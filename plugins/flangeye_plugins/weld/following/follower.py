@@ -443,10 +443,12 @@ class Follower:
         if self.phase == "entering" and self._inside and self.seam.bears:
             deflection = self.seam.contact.deflection
         most = settings.lateral_speed
+        # Equation (14): pressed too hard the end point gives way, too softly it goes on to the wall
         across = -self.side * settings.servo_gain * (deflection - self.wanted)
         search = self.sensing.search
         if self.phase == "seeking" and not search.found:
             across = settings.servo_gain * search.step(lateral)
+        # The seam's known slope is fed forward: the servo has only what it is wrong by
         across += pace * self._drifting()
         planar = pace * place.tangent + within(across, most) * place.normal
         climb = pace * self.task.plan.climb(self.tip)

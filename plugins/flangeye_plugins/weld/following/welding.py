@@ -82,6 +82,7 @@ class Welding:
         belief, settings, learned = self._task.belief, self._task.settings, self._sensing.learned
         refined, torch = self._seam.refined, self._progress.torch
         minutes = 0.0 if self._swept is None else (pose.time - self._swept) / 60.0
+        # An error of the finger's gain displaces the tip by that share of its deflection
         gain = (learned.gain_sigma + settings.gain_drift * minutes) * self._pressing.most
         fixed = self._unseen() + (belief.along_sigma * slant) ** 2
         # What the tip is off by is off for the torch too: all but what the tool has turned between.
@@ -170,6 +171,7 @@ class Welding:
             Why the weld must not go on, or nothing.
         """
         task, torch = self._task, self._progress.torch
+        # Gas has flowed for its time when the torch comes to where it is to weld
         if self.begins - torch <= task.belief.arc[0] * task.settings.speed:
             self.striking.gas(now)
         if not self.begins <= torch <= self.ends:

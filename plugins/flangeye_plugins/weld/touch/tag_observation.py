@@ -134,6 +134,8 @@ class TagDetector:
         self._last = rotation, translation
         seen, jacobian = cv2.projectPoints(self._square, rotation, translation, matrix, distortion)
         error = float(np.sqrt(np.mean((seen.reshape(4, 2) - corners) ** 2)))
+        # OpenCV's columns are by rotation, then translation: the lower block of the inverse is of
+        # the translation with the rotation marginalised
         gram = jacobian[:, :6].T @ jacobian[:, :6]
         # A refined corner of a good image has 0.1 px.
         covariance = max(error, 0.1) ** 2 * np.linalg.inv(gram)[3:, 3:]
