@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
+from flangeye.files.recording import OF_A_SIMULATOR
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.load import parse_recipe
 from flangeye.types import CAMERA, Capture, FlangeCloud, PointCloud
-from flangeye_plugins.acquire.opening import SIMULATED
 from tools.folder_archive import write_folder
 
 FOLDER = Path(__file__).parents[1] / "data" / "samples" / "ur5_phoxi-m"
@@ -49,4 +49,4 @@ if __name__ == "__main__":
     for old in FOLDER.glob("*"):
         old.unlink()
     write_folder(FOLDER, captures())
-    (FOLDER / SIMULATED).write_text("Made by a simulator: python -m tools.sample\n")
+    (FOLDER / OF_A_SIMULATOR).write_text("Made by a simulator: python -m tools.sample\n")

@@ -103,6 +103,7 @@ def log_of(text: str | None, seen: list[t.Observation], clouds: bool = False) ->
     return SimpleNamespace(
         path=Path("run.mcap"), text=lambda _: text, observations=lambda: seen,
         has_full_clouds=clouds, captures=lambda: captures, has_recipe=text is not None, models={},
+        source=None,
     )  # fmt: skip
 
 

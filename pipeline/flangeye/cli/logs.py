@@ -209,9 +209,9 @@ def doctor(
     import json
 
     from flangeye.doctor import as_json, as_text
-    from flangeye.doctor.cells import examine_cell
+    from flangeye.doctor.cells import examine_cell, open_cell
     from flangeye.doctor.diagnosis import examine
-    from flangeye.doctor.opening import open_cell, open_session
+    from flangeye.doctor.opening import open_session
     from flangeye.log.read import log_of
     from flangeye.recipe.find import is_recipe
 
@@ -230,7 +230,7 @@ def doctor(
         if cell is None:
             session = open_session(archive, registry, checked)
             say_notes(session.damage)
-        diagnosis = examine_cell(*cell) if cell else examine(session, checks, step)
+        diagnosis = examine_cell(cell) if cell else examine(session, checks, step)
     say(json.dumps(as_json(diagnosis), indent=2) if json_ else as_text(diagnosis))
     if diagnosis.findings or diagnosis.session.damage:
         raise typer.Exit(1)

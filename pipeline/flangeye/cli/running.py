@@ -200,9 +200,9 @@ def _after_verification(recipe: Recipe) -> list[str]:
 def _findings(log: Path, registry: Registry, recipe: Recipe) -> Sequence[Finding]:
     """Return the mistakes that the doctor finds in a run, the one that explains most first."""
     from flangeye.cli.console import of_foreign
-    from flangeye.doctor.cells import examine_cell
+    from flangeye.doctor.cells import examine_cell, open_cell
     from flangeye.doctor.diagnosis import examine
-    from flangeye.doctor.opening import open_cell, open_session
+    from flangeye.doctor.opening import open_session
 
     checks = [registry.part(name) for name in registry.parts if name.startswith("check.")]
     try:
@@ -211,7 +211,7 @@ def _findings(log: Path, registry: Registry, recipe: Recipe) -> Sequence[Finding
             at_work("looking for the mistake", len(checks)) as checked,
         ):
             if cell := open_cell(log, registry, recipe):
-                found = examine_cell(*cell)
+                found = examine_cell(cell)
             else:
                 found = examine(open_session(log, registry, recipe), checks, checked)
     except FlangeyeError:

@@ -29,7 +29,7 @@ from flangeye.files.yaml_lines import parse_yaml
 from flangeye.log.read import RunLog, is_log, log_of, read_run
 from flangeye.maths.geometry import rigid
 from flangeye.models.boards import Kind
-from flangeye.models.cell import Cell, cell_of
+from flangeye.models.cell import cell_of
 from flangeye.models.configuration import DEFAULT, LINK, Configuration
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerData
@@ -132,32 +132,6 @@ def open_session(path: Path, registry: Registry, recipe: Recipe | None = None) -
     if recipe is None:
         return _of_centres(path, registry)
     return _of_recipe(path, registry, recipe)
-
-
-def open_cell(
-    path: Path, registry: Registry, recipe: Recipe | None = None
-) -> tuple[Sequence[t.Observation], Cell, Mapping[str, Any]] | None:
-    """Return a cell's sightings, its graph, and how tables were read; None if it is not a cell.
-
-    Args:
-        path: A run.mcap, or a folder that the recipe's reader knows.
-        registry: The plugins on offer.
-        recipe: Says what stands on what; a log brings its own.
-
-    Raises:
-        StageError: The recordings cannot be read.
-    """
-    log = read_run(log_of(path)) if path.suffix == ".mcap" or is_log(log_of(path)) else None
-    if recipe is None and log and log.has_recipe:
-        recipe = recipe_of_log(log, registry, name=path.name)
-    cell = recipe.context.get(Cell) if recipe else None
-    if recipe is None or cell is None:
-        return None
-    reader = _written(getattr(recipe.steps[0].params, "reader", None))
-    tables = {} if isinstance(reader, str) else reader.get("cell", {})
-    if log:
-        return log.observations(), cell, tables
-    return Runner(recipe, registry, t.ArchivePath(path)).take(None), cell, tables
 
 
 def _of_log(path: Path, registry: Registry, recipe: Recipe | None) -> RecordedSession:

@@ -76,13 +76,15 @@ class Rough:
 
 
 @on_one_thread
-def rough(problem: Problem, freedoms: Mapping[str, Floats] | None = None) -> Rough:
-    """Return an answer.
+def rough(
+    problem: Problem, freedoms: Mapping[str, Floats] | None = None, search: bool = True
+) -> Rough:
+    """Return an answer; see :func:`begin` for ``search``.
 
     Raises:
         CalibrationRefused: Nothing gives a start, or the sightings leave something unknown.
     """
-    places, squares = begin(problem)
+    places, squares = begin(problem, search)
     agree, effects = agreeing(problem, squares), effects_of(problem, None, Asked())
     for _ in range(2):
         model = model_at(problem, places, effects, agree.astype(float))

@@ -46,8 +46,13 @@ GOOD = 25.0
 for the estimate judges again."""
 
 
-def begin(problem: Problem) -> tuple[Places, Floats]:
+def begin(problem: Problem, search: bool = True) -> tuple[Places, Floats]:
     """Return an initial guess of the unknowns, and (N,) squared distances in units of the noise.
+
+    Args:
+        problem: The sightings.
+        search: Whether to search from random places where the closed forms lead to nothing
+            plausible, which takes ten times as long.
 
     Raises:
         CalibrationRefused: Nothing gives a start.
@@ -58,6 +63,8 @@ def begin(problem: Problem) -> tuple[Places, Floats]:
         found = _descended(problem, places)
         if len(problem.ends) == 1 or _plausible(problem, found[1]):
             return found
+    if not search:
+        raise CalibrationRefused("the closed forms give no plausible start")
     elsewhere = _anywhere(problem, rng)
     if places is None or _cost(problem, elsewhere[1]) < _cost(problem, found[1]):
         return elsewhere

@@ -30,6 +30,9 @@ MAX_REACH = 20.0
 SAME_POSE = 1e-6
 """Poses whose entries [m, and of the rotation] differ by less are one pose given twice."""
 
+OF_A_SIMULATOR = "SIMULATED.txt"
+"""A file of this name in an archive says that its recordings are a simulator's."""
+
 
 class Reader(Protocol):
     """How a ``reader`` part is called."""

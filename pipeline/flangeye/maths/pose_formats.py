@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any, Literal, Self
@@ -338,15 +338,55 @@ def convention_of_maker(maker: str | None) -> str | None:
 MATRIX, APART = "matrix", "3x3"
 """Rotations that are not numbers of a convention: 12 or 16 numbers row by row, and 9 behind a
 position."""
-PLAIN = ("xyzw", "wxyz", "vector", *EULER_ORDERS)
+QUATERNIONS = ("xyzw", "wxyz")
+PLAIN = (*QUATERNIONS, "vector", *EULER_ORDERS)
 """Rotations that no maker's name stands for."""
+
+RotationConvention = tuple[str, str | None]
+"""How rotations are written, and in which unit of angle, where that matters."""
+
+
+def is_known(rotation: object) -> bool:
+    """Whether rotations are written as a maker does, or in a plain way, and not as a matrix."""
+    return rotation in (*CONVENTIONS, *PLAIN)
+
+
+def plain_rotation(rotation: str) -> str:
+    """Return how a maker writes rotations; what is not a maker's name stays as it is."""
+    return CONVENTIONS[rotation].rotation if rotation in CONVENTIONS else rotation
+
+
+def other_conventions(rotation: str, angle: str | None) -> Iterator[RotationConvention]:
+    """Yield what as many numbers may be instead, angles in either unit; nothing for a matrix."""
+    if not is_known(rotation):
+        return
+    if plain_rotation(rotation) in QUATERNIONS:
+        yield from ((other, None) for other in QUATERNIONS if other != rotation)
+        return
+    for other in ("vector", *EULER_ORDERS):
+        yield from ((other, unit) for unit in ("rad", "deg") if (other, unit) != (rotation, angle))
+
+
+def spelt(rotation: str, angle: str | None = None) -> str:
+    """Return a convention of rotations in words."""
+    rotation = plain_rotation(rotation)
+    names = {
+        "xyzw": "a quaternion x, y, z, w",
+        "wxyz": "a quaternion w, x, y, z",
+        "vector": "a rotation vector",
+        "ZYX": "KUKA's A, B, C (ZYX about turned axes)",
+        "xyz": "roll, pitch, yaw or Fanuc's W, P, R (xyz about fixed axes)",
+    }
+    about = "turned" if rotation.isupper() else "fixed"
+    name = names.get(rotation, f"angles {rotation} about {about} axes")
+    return f"{name} in {'radians' if angle == 'rad' else 'degrees'}" if angle else name
 
 
 def written(rotation: str, length: LengthUnit, angle: AngleUnit) -> PoseConvention:
     """Return the convention of a rotation, given a maker's name or an order, in given units."""
     known = CONVENTIONS.get(rotation)
     plain = known.rotation if known else rotation
-    labels = ("x", "y", "z", "a", "b", "c", "d")[: 7 if plain in PLAIN[:2] else 6]
+    labels = ("x", "y", "z", "a", "b", "c", "d")[: 7 if plain in QUATERNIONS else 6]
     return PoseConvention(rotation, labels, plain, length, angle)
 
 

@@ -32,6 +32,7 @@ from flangeye.types import (
     Mask,
     Motion,
     Observation,
+    Poses,
     Transform,
 )
 
@@ -148,6 +149,14 @@ class Cell:
         }
         own = {FLANGE: motion.poses} if FLANGE in self.movers else {}
         return replace(motion, others={**own, **motion.others, **placed})
+
+    def reported(self, poses: Mapping[str, Floats], axes: Mapping[str, float]) -> Poses:
+        """Return where each carrier is in its base, by recorded poses (4, 4) and values of axes."""
+        places = dict(poses)
+        for name, mover in self.movers.items():
+            if isinstance(mover, Axis) and name in axes:
+                places[name] = mover.place(axes[name])
+        return {n: Transform(f"{n}_base", n, places[n]) for n in self.movers if n in places}
 
     def joints(self, observations: Sequence[Observation]) -> dict[str, Floats]:
         """Return (N, n) of the arms that reported them at all N observations [rad]."""

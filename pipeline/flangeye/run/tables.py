@@ -12,6 +12,7 @@ import numpy as np
 
 from flangeye.errors import StageError
 from flangeye.files.clouds import write_cloud
+from flangeye.files.recording import OF_A_SIMULATOR
 from flangeye.files.regular import write_whole
 from flangeye.files.yaml_lines import dumped, parse_yaml
 from flangeye.log.read import RunLog
@@ -19,6 +20,7 @@ from flangeye.maths.geometry import quaternion_from_rotation, rotation_log
 from flangeye.models.cell import Axis, Cell
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import Recipe
+from flangeye.result import SIMULATED
 from flangeye.run.folder import recipe_of_log
 from flangeye.types import Observation, PoseFeature, Transform
 
@@ -38,7 +40,7 @@ def write_tables(log: RunLog, folder: Path, registry: Registry) -> list[Path]:
         registry: The plugins, to read the run's recipe with.
 
     Returns:
-        The files, the recipe last.
+        The files, the recipe last; beside them a mark where a simulator made them.
 
     Raises:
         StageError: The run is not of a cell, or it holds no sightings.
@@ -61,6 +63,8 @@ def write_tables(log: RunLog, folder: Path, registry: Registry) -> list[Path]:
     for name, raw in log.models.items():
         files.append(folder / name)
         write_whole(files[-1], raw)
+    if log.source is not None and log.source.simulated:
+        write_whole(folder / OF_A_SIMULATOR, f"{SIMULATED}.\n")
     files.append(folder / "recipe.yaml")
     write_whole(files[-1], _recipe(_text(log, recipe), cell, seen, scans))
     return files

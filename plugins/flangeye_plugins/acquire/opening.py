@@ -16,6 +16,7 @@ from flangeye.files.recording import (
     MAX_REACH,
     MIN_CAPTURES,
     MIN_SPREAD,
+    OF_A_SIMULATOR,
     Archive,
     Recording,
     check_ids,
@@ -45,10 +46,6 @@ from flangeye.units import param
 
 if TYPE_CHECKING:
     from flangeye.maths.kinematics import Arm
-
-
-SIMULATED = "SIMULATED.txt"
-"""A file of this name in an archive says that its recordings are a simulator's."""
 
 
 class OpeningParams(Params):
@@ -120,7 +117,7 @@ def source_of(
     """
     notes = (with_urls(f"archive: {archive.layout}, {archive.root}"), *archive.notes, *told)
     used = digests_of(archive.files) if digests is None else digests
-    simulated = (archive.root / SIMULATED).is_file()
+    simulated = (archive.root / OF_A_SIMULATOR).is_file()
     return Source(fingerprint_of(archive.root, used), notes, simulated=simulated)
 
 
@@ -142,7 +139,7 @@ def _listed(names: Sequence[str]) -> str:
 def poses_of(recording: Recording, cell: Cell | None = None) -> Poses:
     """Return the recording's poses as the values stages see."""
     if cell is not None:
-        return cell_poses(recording, cell)
+        return cell.reported(recording.poses, recording.axes)
     return {
         frame: Transform(BASE2 if frame == FLANGE2 else BASE, frame, m)
         for frame, m in recording.poses.items()
@@ -208,22 +205,6 @@ def log_source(log: RunLog, recordings: Sequence[Recording], cell: Cell | None =
     note = f"archive: {log.path}, a log of flangeye"
     fingerprint = fingerprint_of(log.path.parent, digests_of([log.path]))
     return replace(source, fingerprint=fingerprint, notes=(note, *source.notes))
-
-
-def cell_poses(recording: Recording, cell: Cell) -> Poses:
-    """Return the poses of all carriers of the cell in one recording."""
-    return {
-        name: Transform(f"{name}_base", name, _place(recording, name, cell))
-        for name in cell.movers
-        if name in recording.poses or name in recording.axes
-    }
-
-
-def _place(recording: Recording, name: str, cell: Cell) -> Floats:
-    mover = cell.movers[name]
-    if isinstance(mover, Axis) and name in recording.axes:
-        return mover.place(recording.axes[name])
-    return recording.poses[name]
 
 
 def check_cell(root: Path, recordings: Sequence[Recording], cell: Cell) -> None:

@@ -20,7 +20,15 @@ from flangeye.doctor.diagnosis import (
 )
 from flangeye.estimation.readings import Reading, meant, optical, other_axes
 from flangeye.maths.pose_corrections import inverted, reread, scaled, transposed
-from flangeye.maths.pose_formats import CONVENTIONS, EULER_ORDERS, PLAIN, written
+from flangeye.maths.pose_formats import (
+    EULER_ORDERS,
+    QUATERNIONS,
+    RotationConvention,
+    is_known,
+    other_conventions,
+    plain_rotation,
+    spelt,
+)
 from flangeye_plugins.check.equations import equations_of
 from flangeye_plugins.check.fitting import (
     best_of,
@@ -31,9 +39,6 @@ from flangeye_plugins.check.fitting import (
     named,
     pairs_of,
 )
-
-QUATERNIONS = ("xyzw", "wxyz")
-
 
 _WAYS: Mapping[str, tuple[Change, str]] = {
     "inverted": (
@@ -80,7 +85,7 @@ def _written_otherwise(session: RecordedSession) -> Iterator[Rereading]:
     if session.again is None:
         return
     arm, target = _said(session), _said(session, "target")
-    whose: list[tuple[str, Convention | None, bool, bool]] = [
+    whose: list[tuple[str, RotationConvention | None, bool, bool]] = [
         ("the robot's rotations", arm, True, False),
         ("the markers' rotations", target, False, True),
         ("the rotations of robot and markers", arm if arm == target else None, True, True),
@@ -88,23 +93,19 @@ def _written_otherwise(session: RecordedSession) -> Iterator[Rereading]:
     for name, said, of_arm, of_target in whose:
         if said is None:
             continue
-        for other in _conventions(*said):
+        for other in other_conventions(*said):
             changes = {"rotation": other[0], "angle": other[1]}
             with suppress(StageError):  # the numbers are not poses in it
                 read = session.again(changes if of_arm else {}, changes if of_target else {})
                 if read.ids == session.ids:
-                    yield Rereading(read, name, _spelt(said), _spelt(other))
+                    yield Rereading(read, name, spelt(*said), spelt(*other))
 
 
-Convention = tuple[str, str | None]
-"""Of rotations: how they are written, and in which unit of angle, where that matters."""
-
-
-def _said(session: RecordedSession, of: str | None = None) -> Convention | None:
+def _said(session: RecordedSession, of: str | None = None) -> RotationConvention | None:
     """Return the convention of rotations that the recipe states; None if it states none."""
     stated = _params(session, of)
     rotation = stated.get("rotation")
-    return (str(rotation), stated.get("angle")) if rotation in (*CONVENTIONS, *PLAIN) else None
+    return (str(rotation), stated.get("angle")) if is_known(rotation) else None
 
 
 def _params(session: RecordedSession, of: str | None = None) -> Mapping[str, Any]:
@@ -116,22 +117,6 @@ def _params(session: RecordedSession, of: str | None = None) -> Mapping[str, Any
     return stated if isinstance(stated, Mapping) else {}
 
 
-def _conventions(rotation: str, angle: str | None) -> Iterator[Convention]:
-    """Give what as many numbers may be, in either unit."""
-    if written(rotation, "m", "rad").is_quaternion:
-        yield from ((other, None) for other in QUATERNIONS if other != rotation)
-        return
-    for other in ("vector", *EULER_ORDERS):
-        yield from ((other, unit) for unit in ("rad", "deg") if (other, unit) != (rotation, angle))
-
-
-def _spelt(convention: Convention) -> str:
-    rotation, angle = convention
-    return _name(_plain(rotation)) + {"rad": " in radians", "deg": " in degrees"}.get(
-        angle or "", ""
-    )
-
-
 def _of_arms(session: RecordedSession) -> Iterator[Rereading]:
     for arms in session.arms:
         whose = "the" if session.seconds is None else named(arms, session)
@@ -139,7 +124,12 @@ def _of_arms(session: RecordedSession) -> Iterator[Rereading]:
             reread_session = session.corrected(
                 _rereading(read_as, written_as), arms, robot={"rotation": [read_as, written_as]}
             )
-            yield Rereading(reread_session, f"{whose} rotations", _name(read_as), _name(written_as))
+            yield Rereading(
+                reread_session,
+                f"{whose} rotations",
+                spelt(read_as),
+                spelt(written_as),
+            )
 
 
 def _of_markers(session: RecordedSession) -> Iterator[Rereading]:
@@ -151,11 +141,11 @@ def _of_markers(session: RecordedSession) -> Iterator[Rereading]:
         change = _rereading(read_as, written_as)
         told = {"rotation": [read_as, written_as]}
         alone = _with_markers(session, change).read_with(target=told)
-        yield Rereading(alone, "the markers' rotations", _name(read_as), _name(written_as))
+        yield Rereading(alone, "the markers' rotations", spelt(read_as), spelt(written_as))
         if stated == _stated(session):
             both = _with_markers(session, change).corrected(change, "both", robot=told, target=told)
             whose = "the rotations of robot and markers"
-            yield Rereading(both, whose, _name(read_as), _name(written_as))
+            yield Rereading(both, whose, spelt(read_as), spelt(written_as))
 
 
 def _has_ready_made_markers(session: RecordedSession) -> bool:
@@ -192,28 +182,7 @@ def _readings(stated: str | None) -> Iterator[tuple[str, str]]:
 def _stated(session: RecordedSession, of: str | None = None) -> str | None:
     """Return how the recipe states the arm's rotations are written, or the target's, if it does."""
     said = _said(session, of)
-    return said and _plain(said[0])
-
-
-def _plain(rotation: str) -> str:
-    """Return how a convention writes rotations, or what is not a convention's name."""
-    return CONVENTIONS[rotation].rotation if rotation in CONVENTIONS else rotation
-
-
-def _name(rotation: str) -> str:
-    names = {
-        "xyzw": "a quaternion x, y, z, w",
-        "wxyz": "a quaternion w, x, y, z",
-        "vector": "a rotation vector",
-        "ZYX": "KUKA's A, B, C (ZYX about turned axes)",
-        "xyz": "roll, pitch, yaw or Fanuc's W, P, R (xyz about fixed axes)",
-        "XYZ": "angles XYZ about turned axes",
-        "ZYZ": "angles ZYZ about turned axes",
-    }
-    if rotation in names:
-        return names[rotation]
-    about = "turned" if rotation.isupper() else "fixed"
-    return f"angles {rotation} about {about} axes"
+    return said and plain_rotation(said[0])
 
 
 @part("check.direction")
