@@ -118,7 +118,7 @@ def _reports(project: Project) -> None:
 
 
 def link(project: Project, path: Path) -> None:
-    """Let a file of the folder be opened, in a tab and an origin of its own."""
+    """Show a link that opens a file of the folder, in a tab and an origin of its own."""
     name = path.relative_to(project.folder).as_posix()
     ui.link(name, address_of(project.folder, path), new_tab=True)
 

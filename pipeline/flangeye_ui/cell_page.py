@@ -151,7 +151,7 @@ class Form:
         return choice.classes("w-full")
 
     def _agree(self) -> None:
-        """Let the fields show what the recipe states, and what is wrong with it at each."""
+        """Update the fields to the recipe, each with its mistakes."""
         _, mistakes = self._project.check()
         self._agreeing = True
         for (section, key), choice in self._choices.items():
@@ -352,7 +352,7 @@ class Recordings:
         return ["init", self._folder.value or "FOLDER", "--yes", *answers, "--out", f"{stem}.yaml"]
 
     async def _look(self) -> None:
-        """Let the command look; show what it saw, and what it assumed in boxes to change."""
+        """Run the command on the archive; show what it found, and its assumptions to change."""
         self._line.text = self._project.command(*self._words("recorded"))
         self._button.disable()
         said, drafted = await draft(self._project, self._form, self._words, "recorded")
@@ -457,7 +457,7 @@ class WhatRuns:
         return ["init", "--ros2", "--yes", *options, "--out", f"{stem}.yaml"]
 
     async def _draft(self) -> None:
-        """Let the command write a recipe of a new name, and take it over."""
+        """Run the command to write a recipe of a new name, and make that the cell's recipe."""
         said, drafted = await draft(self._project, self._form, self._words, "running")
         self._told.clear()
         with self._told:

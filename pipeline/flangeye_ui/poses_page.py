@@ -100,7 +100,7 @@ class PosePlanner:
         self._place([f"{1e3 * v:.0f} mm" for v in (event.x, event.y, event.z)])
 
     def _guess(self) -> None:
-        """Let the person say where the scanner stands: drag its ball, type it, or show poses."""
+        """Show the ways to enter the scanner's place: drag its ball, type it, or show poses."""
         given = self._project.steps()[0][1]
         view: Any = given.get("view")
         guessed = self._view() is not None and isinstance(view, dict)
@@ -125,7 +125,7 @@ class PosePlanner:
             self._showing((view.get("shown") or {}).get("joints") or [])
 
     def _showing(self, joints: list[list[Any]]) -> None:
-        """Let the person show three poses that face the scanner, instead of guessing."""
+        """Record three poses at which the flange faces the scanner, instead of a guess."""
         lines = "\n".join(", ".join(map(str, row)) for row in joints)
         with ui.expansion("Or show three poses", value=bool(joints)).classes("w-full"):
             ui.label(

@@ -74,7 +74,7 @@ class Watch:
         self._check.set_enabled(bool(self._new.value))
 
     async def _begin(self) -> None:
-        """Let the command check, and show what it found."""
+        """Run the command that checks, and show what it found."""
         self._check.disable()
         self._bar.say("Looking for the flange in the new scans …")
         said = await asyncio.to_thread(self._project.run_command, self._words)

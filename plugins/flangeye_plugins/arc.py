@@ -31,13 +31,13 @@ class ManualArc(Device):
         self._burns = self._flows = False
 
     def gas(self, on: bool) -> None:
-        """Tell the person to open or close the gas."""
+        """Ask the person to open or close the gas."""
         if on != self._flows:
             self._flows = on
             self._tell("GAS ON" if on else "GAS OFF")
 
     def burn(self, on: bool) -> None:
-        """Tell the person to strike or end the arc."""
+        """Ask the person to strike or end the arc."""
         if on != self._burns:
             self._burns = on
             self._tell("STRIKE THE ARC NOW" if on else "END THE ARC NOW")

@@ -145,7 +145,7 @@ def run(  # noqa: PLR0913  one for each option
 
 @contextmanager
 def _plan_as_json() -> Iterator[None]:
-    """Let a plan that is shown instead of a motion end in JSON: its text, and its rows."""
+    """Turn the plan that is shown instead of a motion into JSON: its text and its rows."""
     try:
         yield
     except NothingMoved as shown:

@@ -413,7 +413,7 @@ def posterior(model: LinearModel, mode: Mode, at_mode: Fit) -> Posterior:
 
 
 def _without(taken: LinearModel, fits: Sequence[Fit]) -> Iterator[Fit]:
-    """Give fits without some of their sightings, each at its sizes."""
+    """Yield fits without some of their sightings, each at its own sizes."""
     # The information of a sighting depends on the noise's sizes alone, which many fits share
     amounts = np.array([each.sizes[taken.factors].prod(axis=1) for each in fits])
     amounts, which = np.unique(amounts, axis=0, return_inverse=True)

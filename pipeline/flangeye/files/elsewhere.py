@@ -86,7 +86,7 @@ def results_at(place: str | None) -> Iterator[Path | None]:
 
 @contextmanager
 def at_hand(path: Path) -> Iterator[None]:
-    """Have a file here while it is read; only those of an archive elsewhere are not."""
+    """Fetch a file of a remote archive while the context lasts; local files stay as they are."""
     stand_in = _of(path)
     if stand_in is None or path not in stand_in.later:
         yield

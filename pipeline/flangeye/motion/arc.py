@@ -1,6 +1,6 @@
 """An arc that burns only while the arm is led: switched in the process that guards the arm.
 
-The guard opens the power source with the arm. What the arm is told carries what the arc is to do: a
+The guard opens the power source with the arm. Commands to the arm carry what the arc is to do: a
 seventh number after the six of the twist. What stops the arm (the guard, for any reason; a program
 that is silent, hangs or is gone) ends the arc with it.
 """

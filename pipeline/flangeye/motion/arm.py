@@ -219,7 +219,7 @@ def _in_process(ours: Connection, theirs: Connection, charge: Charge) -> Iterato
 
 @contextmanager
 def _alarmed(alarm: Connection) -> Iterator[None]:
-    """Let every signal write to the alarm at once, even while a long computation runs.
+    """Write every signal to the alarm at once, even while a long computation runs.
 
     Raises:
         DeviceError: This is not the main thread, which alone hears of signals.
@@ -278,7 +278,7 @@ def _nothing(*_: object) -> None:
 
 @contextmanager
 def keys() -> Iterator[int | None]:
-    """Let single keys be read from the terminal: its file descriptor, or None without one."""
+    """Yield the terminal's file descriptor, set to read single keys; None without a terminal."""
     if not sys.stdin.isatty():
         yield None
         return

@@ -161,7 +161,7 @@ class LedArm(Device):
     flange_T_tool: Transform | None = None
 
     def __init__(self, arm: WatchedArm) -> None:
-        """Lead an arm that is watched."""
+        """Servo an arm that a guard watches."""
         self.name, self.period = arm.name, arm.period
         self._arm, self._state = arm, arm.state
 

@@ -93,7 +93,7 @@ class Reach:
         self.refusals: list[Refusal] = []
 
     def look_from(self, base_T_camera: Floats) -> None:
-        """Let the scanner stand at (4, 4) ``base_T_camera``."""
+        """Set the scanner's pose (4, 4) ``base_T_camera``."""
         self._base_T_camera = base_T_camera
         lean = self._scanner.convergence
         projector = self._scanner.baseline * np.array([np.cos(lean), 0.0, np.sin(lean)])

@@ -93,7 +93,7 @@ class Registry:
     """The stages and parts of installed plugins, and the plugins that failed to load.
 
     Attributes:
-        hooks: The plugins themselves, to be told about runs.
+        hooks: The plugins themselves, whose hooks are called during runs.
         stages: Name -> stage.
         parts: Name -> part.
         broken: Entry point name -> why it could not be loaded.

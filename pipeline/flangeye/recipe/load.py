@@ -396,4 +396,4 @@ class Guide(Protocol):
     def __call__(
         self, recipe: Recipe, motion: MotionAllowed, ask: Callable[[str], None], out: Path
     ) -> str:
-        """Lead the person, write the outcome to ``out`` and return a line about it."""
+        """Guide the person through a procedure, write ``out``; return a line about the outcome."""

@@ -88,7 +88,7 @@ def _text(model: Model) -> str:
 
 @contextmanager
 def carried_files(models: Mapping[str, bytes]) -> Iterator[Path]:
-    """Give the folder in which a log's model files lie while it is read.
+    """Yield a folder with a log's model files, for as long as the context lasts.
 
     Args:
         models: Name -> content, as a log has them; other names are not written.

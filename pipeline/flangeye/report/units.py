@@ -36,7 +36,7 @@ def duration(seconds: float) -> str:
 def figure(name: str, value: float) -> str:
     """Return a verification's figure with its unit, which follows from its name.
 
-    Figures are in SI; counts are whole numbers, and what no name tells stays as it is.
+    Figures are in SI; counts are whole numbers, and figures with unknown names stay as they are.
     """
     words = name.split("_")
     if float(value).is_integer():

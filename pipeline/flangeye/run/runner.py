@@ -162,7 +162,7 @@ class Runner:
                 yield observation
 
     def _finish_acquiring(self) -> None:
-        """Let go of the source at once: a solver that has enough stops the arm."""
+        """Close the source at once, which stops the arm when a solver has enough poses."""
         if self._working is not None:  # here, for the collector may do it in one of its threads
             self._working.close()
         if self._captures is not None:

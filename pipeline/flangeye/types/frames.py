@@ -207,10 +207,10 @@ class TransformEstimate:
             parent frame.
         about: (3,) point in the parent frame at which the translation part is taken [m].
         unobservable: (k, 6) unit directions, in the same order and about the same point, that no
-            measurement tells anything of: the estimate is arbitrary along them, and the covariance
+            measurement depends on: the estimate is arbitrary along them, and the covariance
             is of the rest.
-        shares: (6, 6) of the covariance by what causes it, where the solver says so. What they do
-            not make up is not known of how large each cause is.
+        shares: (6, 6) of the covariance by cause, where the solver gives them. The rest of it comes
+            from the causes' sizes being uncertain.
     """
 
     transform: Transform

@@ -62,7 +62,7 @@ class AuboController(ControlUnit):
     # Motion
 
     def move_joint(self, q: Floats, a: float, v: float) -> int:
-        """Let a move to joint angles (n,) follow; return whether it was taken."""
+        """Append a move to joint angles (n,); return whether it was accepted."""
         if not self._can(q, len(self.arm.speeds), a, v):
             return self._refusal()
         self.note("moveJoint")
@@ -70,7 +70,7 @@ class AuboController(ControlUnit):
         return OK
 
     def move_line(self, pose: Floats, a: float, v: float) -> int:
-        """Let a straight move of the tool to a pose (6,) follow; return whether it was taken."""
+        """Append a straight move of the tool to a pose (6,); return whether it was accepted."""
         if not self._can(pose, 6, a, v):
             return self._refusal()
         self.note("moveLine")

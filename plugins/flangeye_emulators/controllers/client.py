@@ -113,7 +113,7 @@ class EmulatorControl(Device):
         return self.ask("figures")
 
     def fault(self, text: str) -> None:
-        """Let something go wrong: ``NAME[=DURATION][@WHEN]``, for example ``freeze=3 s@moving``."""
+        """Inject a fault: ``NAME[=DURATION][@WHEN]``, for example ``freeze=3 s@moving``."""
         self.ask("fault", fault=text)
 
     def clear(self) -> None:
@@ -144,7 +144,7 @@ class EmulatorControl(Device):
         self.ask("put", joints=[float(angle) for angle in joints])
 
     def unlock_after(self, seconds: float) -> None:
-        """Let a protective stop be unlocked earlier than a real one [s]."""
+        """Set the time until a protective stop can be unlocked [s]; a real arm's is longer."""
         self.ask("unlock-after", seconds=seconds)
 
     def close(self) -> None:

@@ -323,7 +323,7 @@ class Schedule:
         self._waiting: list[tuple[Fault, float | None]] = []
 
     def add(self, fault: Fault, now: float) -> None:
-        """Let a fault happen in its time."""
+        """Inject a fault at its time."""
         due = None if fault.after is None else now + fault.after
         self._waiting.append((fault, due))
 

@@ -100,7 +100,7 @@ class WeldWorld:
         return self._tool.axes(pose, level_R_tool), self._tool.rest(pose, level_R_tool)
 
     def settle(self, reported: ToolPose, level_R_tool: Floats | None = None) -> Floats:
-        """Let the tip come to rest; return its displacement as the tag shows it (3,) [m].
+        """Simulate until the tip rests; return its displacement as the tag shows it (3,) [m].
 
         Args:
             reported: The tool, as arm and files have it.
@@ -292,7 +292,7 @@ class ArmResponse:
         self._speed = np.zeros(4)
 
     def go(self, command: Command) -> None:
-        """Let one cycle pass under a command."""
+        """Simulate one cycle under a command."""
         self._commands.append(np.array([*command.velocity, command.turn]))
         self._speed = self._speed + self._share * (self._commands.popleft() - self._speed)
         step, pose = self._speed * self._period, self.pose

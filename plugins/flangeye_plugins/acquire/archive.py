@@ -80,7 +80,7 @@ class ArchiveParams(OpeningParams):
     camera: CameraParams | None = Field(
         None,
         description="The camera that took the images beside the clouds; not needed where a cloud "
-        "is organised as its image, for then it tells.",
+        "is organised as its image, whose pixels then show it.",
     )
 
 

@@ -229,7 +229,7 @@ def identity(session: RecordedSession) -> Findings:
 
 
 def _reported(session: RecordedSession) -> Iterator[tuple[str, Floats]]:
-    """Give the poses (N, 4, 4) that the controllers reported, and what to call them."""
+    """Yield the poses (N, 4, 4) that the controllers reported, and what to call them."""
     if session.uses_poses:
         yield "robot", session.poses
     if session.links is not None:

@@ -81,7 +81,7 @@ def convention(session: RecordedSession) -> Findings:
 
 
 def _written_otherwise(session: RecordedSession) -> Iterator[Rereading]:
-    """Give the recordings read again, their numbers as written taken in another convention."""
+    """Yield the recordings read again, their written numbers taken in another convention."""
     if session.again is None:
         return
     arm, target = _said(session), _said(session, "target")
@@ -133,7 +133,7 @@ def _of_arms(session: RecordedSession) -> Iterator[Rereading]:
 
 
 def _of_markers(session: RecordedSession) -> Iterator[Rereading]:
-    """Give other readings of ready-made markers' rotations, alone and with the arms'."""
+    """Yield other readings of ready-made markers' rotations, alone and with the arms'."""
     if not _has_ready_made_markers(session):
         return
     stated = _stated(session, "target")
@@ -169,7 +169,7 @@ def _rereading(read_as: str, written_as: str) -> Change:
 
 
 def _readings(stated: str | None) -> Iterator[tuple[str, str]]:
-    """Give (as read, as written): every pair of conventions with as many numbers."""
+    """Yield (as read, as written): every pair of conventions with as many numbers."""
     # What three angles mean on the arms that are sold, and rotation vectors
     common = ("vector", "ZYX", "xyz", "XYZ", "zyx", "ZYZ", "zyz", "ZXZ")
     for read_as in [stated] if stated else [*QUATERNIONS, *common]:
@@ -275,7 +275,7 @@ def _with_negated(session: RecordedSession, axis: str) -> RecordedSession:
 
 
 def _with_exchanged_columns(session: RecordedSession) -> Iterator[tuple[str, str, RecordedSession]]:
-    """Give the recordings read again, two of the columns of a table's positions exchanged."""
+    """Yield the recordings read again, two of the columns of a table's positions exchanged."""
     for whose, of in (("robot", None), ("target", "target")):
         columns = _params(session, of).get("columns")
         if session.again is None or _said(session, of) is None or not isinstance(columns, list):
@@ -307,7 +307,7 @@ def _turned_round(session: RecordedSession) -> Iterator[tuple[RecordedSession, s
 
 
 def _transposed_markers(session: RecordedSession) -> Iterator[tuple[RecordedSession, str, str]]:
-    """Give the session with ready-made markers' matrices transposed, alone and with the arms'."""
+    """Yield the session with ready-made markers' matrices transposed, alone and with the arms'."""
     if not _has_ready_made_markers(session):
         return
     alone = _with_markers(session, transposed)

@@ -73,7 +73,7 @@ def units(session: RecordedSession) -> Findings:
 
 
 def _alternatives(session: RecordedSession) -> Iterator[OtherUnit]:
-    """Give other units of the arms' positions, and of the target's where that is not the same.
+    """Yield other units of the arms' positions, and of the target's where that is not the same.
 
     A link's place follows from the arm's model, in metres: then it is not.
     """
@@ -97,7 +97,7 @@ def _of_arm(session: RecordedSession, arms: Arms, factor: float) -> RecordedSess
 
 
 def _ratios() -> Iterator[tuple[str, str, float]]:
-    """Give (as read, as meant) of a unit, and what lengths are then multiplied with."""
+    """Yield (as read, as meant) of a unit, and the factor that corrects lengths."""
     given = {1.0}
     for said, meant in (
         *(("m", unit) for unit in METRES), *((unit, "m") for unit in METRES),

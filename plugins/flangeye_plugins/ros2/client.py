@@ -302,7 +302,7 @@ class Bridge(Device):
             self._pipe.write(json.dumps(request).encode() + b"\n" + body)
 
     def _listen(self) -> None:
-        """Take in what the bridge says, until it ends."""
+        """Read the bridge's messages until it ends."""
         try:
             while True:
                 said = json.loads(self._pipe.line(None))

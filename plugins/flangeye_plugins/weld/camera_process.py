@@ -161,7 +161,7 @@ class CameraProcess:
         self._thread.join(PATIENCE)
 
     def _end(self) -> None:
-        """Let go of the camera; a client of it that hangs is ended."""
+        """Close the camera process; one that hangs is killed."""
         self._wire.close()
         self._process.join(PATIENCE)
         if self._process.is_alive():

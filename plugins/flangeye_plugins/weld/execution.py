@@ -208,7 +208,7 @@ class WeldClock:
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
-    """Let nothing of this process hold up a cycle for long.
+    """Keep this process from delaying a cycle: no garbage collection, short thread switches.
 
     Garbage is collected before and after, not in between: that takes tens of milliseconds. A cycle
     waits several times, and each time the thread that writes the log, or takes what the camera's

@@ -260,7 +260,7 @@ class AuboRobot(Device):
         ride.renew(rest, left, float(np.abs(state.joint_speeds).max()))
 
     def _arrive(self, move: Callable[[], int]) -> None:
-        """Let the controller make the last bit, and expect it to begin."""
+        """Command the controller's own move over the last bit of the way."""
         # A move that has not begun after this has ended already [s]
         self._begins = time.monotonic() + 0.3
         self._client.command("move", move)

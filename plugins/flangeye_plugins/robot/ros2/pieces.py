@@ -84,7 +84,7 @@ class DrivenMotion(ABC):
 
     @abstractmethod
     def _go_on(self, joints: Floats, seconds: float) -> None:
-        """Let time pass."""
+        """Advance the motion's time."""
 
     @abstractmethod
     def _point(self, after: float) -> Point:

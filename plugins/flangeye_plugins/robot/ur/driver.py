@@ -203,7 +203,7 @@ def robot_ur_rtde(model: RobotModel, params: ControllerParams, reads_only: bool 
     link = ControllerLink(name, params.host, facts.period, patience, reads_only)
     expected = params.tool.flange_T_tool(CONVENTIONS["ur"])
     try:
-        # Which tool is set only the other side tells: a wrong one shows in where the flange is.
+        # Reading alone does not give the tool that is set: a wrong one shows in the flange's pose
         offset = expected if reads_only else POSE.matrix(link.request("tool"))
         require_tool(name, "ur_rtde", offset, expected, CONVENTIONS["ur"])
         # An arm that is not commanded may be silent for a while: nothing depends on it [s]
@@ -343,7 +343,7 @@ class UrRobot(Device):
             time.sleep(self.period)
 
     def _command(self, what: str, **arguments: Any) -> None:
-        """Give a command; the sample under way now does not know of it yet, nor may the next."""
+        """Send a command; the samples on their way do not show it yet, and the next may not."""
         try:
             self._link.request(what, **arguments)
         except DeviceError:

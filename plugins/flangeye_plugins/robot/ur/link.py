@@ -136,7 +136,7 @@ class ControllerLink:
         return self._answer(what, 0.8)
 
     def close(self, hopeless: bool = False) -> None:
-        """Let the process stop arm and program, and end it; safe to call twice.
+        """Have the process stop arm and program, then end it; safe to call twice.
 
         Args:
             hopeless: The controller is not heard any more, so there is nothing to wait for.

@@ -112,7 +112,7 @@ class RefinedPath:
         self._sure.append((s, offset, angle, doubt))
 
     def renew(self, torch: float, steps: int = 4) -> None:
-        """Take in a few places and samples, so many as a control cycle has time for.
+        """Process a few places and samples, as many as a control cycle has time for.
 
         Args:
             torch: Arc length of the torch [m].
@@ -176,7 +176,7 @@ class RefinedPath:
         self._next += 1
 
     def _measure(self, s: float, offset: float) -> None:
-        """Take in a sample at the tip."""
+        """Update the filters by a sample at the tip."""
         row = self._row(self._at)
         cross = self._covariance @ row
         spread = cross @ row + self.noise**2
@@ -216,7 +216,7 @@ class RefinedPath:
         )
 
     def recall(self, samples: Floats) -> None:
-        """Believe samples (K, 5) of an earlier weld of this plan; see :meth:`samples`."""
+        """Add the samples (K, 5) of an earlier weld of this plan; see :meth:`samples`."""
         for s, offset, angle, _, doubt in samples.tolist():
             self.add(s, offset, angle, doubt)
         self.renew(self._start, 4 * len(self._places))

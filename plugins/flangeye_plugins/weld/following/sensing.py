@@ -137,13 +137,13 @@ class Sensing:
         return np.asarray((moved - play) / gain)
 
     def seek(self, touch: Touch, found: Located) -> None:
-        """Take in a touch of the search for the groove."""
+        """Process a touch of the search for the groove."""
         self.felt = found.seam
         compression = float(touch.displacement[2] - self.search.rest[2])
         self.search.feel(touch.displacement, found.deflection, compression)
 
     def sweep(self, pose: ToolPose, touch: Touch, found: Located, noise: float) -> None:
-        """Take in a touch of the sweep; one scatters by ``noise`` [m]."""
+        """Process a touch of the sweep; one scatters by ``noise`` [m]."""
         moved = turned(touch.displacement - self.search.rest, pose.angle)
         along = float(moved[:2] @ self._progress.place.tangent)
         self.smooth(found.seam, noise)
@@ -362,7 +362,7 @@ class SeamEstimate:
             self._go_around()
 
     def _go_around(self) -> None:
-        """Believe that a seam that goes once around is beyond its end where its start was felt."""
+        """Add what was felt at the start of a closed seam again beyond its end."""
         if self._around:
             return
         self._around, task = True, self._task

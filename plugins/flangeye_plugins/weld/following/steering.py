@@ -81,7 +81,7 @@ class Striking:
         self._gas = self._strikes = self._ended = math.inf
 
     def gas(self, now: float) -> None:
-        """Let gas flow from a time on [s]."""
+        """Start the gas at a time [s]."""
         self._gas = min(self._gas, now)
 
     def strike(self, now: float) -> None:

@@ -160,7 +160,7 @@ class Welding:
         )
 
     def _light(self, now: float, raw: float, variance: float) -> str:
-        """Let gas flow, then strike the arc where the bound allows it.
+        """Start the gas, then strike the arc where the bound allows it.
 
         Args:
             now: The time [s].

@@ -43,7 +43,7 @@ class TipDisplacement:
 
 
 class Interpreter:
-    """Knows how the tag moves when the tip does."""
+    """Converts the tag's pose to the tip's displacement, by the finger's calibration."""
 
     def __init__(self, finger: Finger) -> None:
         """Take the finger's calibration.
