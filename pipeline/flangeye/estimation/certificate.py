@@ -189,7 +189,7 @@ class _Dual(NamedTuple):
         return np.asarray(found.x)
 
     def shows(self, multipliers: Floats, share: float) -> bool:
-        """Whether they show that no more than a share of the unit is missing."""
+        """Whether multipliers prove that at most this share of the cost is missing."""
         try:
             np.linalg.cholesky(self.at(multipliers) + share * np.diag(self.bounded))
         except np.linalg.LinAlgError:

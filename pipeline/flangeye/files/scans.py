@@ -301,10 +301,10 @@ def recording_of(name: str, pose: Floats, scans: Sequence[Path]) -> Recording:
 
 
 def with_companion(recording: Recording) -> Recording:
-    """Return a recording with the image of its cloud's name, or the cloud of its image's.
+    """Return a recording of a cloud or image with the other file of the same name, if there is one.
 
     Raises:
-        StageError: There are two.
+        StageError: There are two such files.
     """
     if recording.cloud and not recording.image:
         return replace(recording, image=_beside(recording.cloud, IMAGES))

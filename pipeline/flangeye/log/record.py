@@ -83,7 +83,7 @@ class Recorder:
     """Writes one run to one MCAP file.
 
     Attributes:
-        gathered: Whether anything was recorded that a run would have to take again.
+        gathered: Whether the log holds scans or results worth keeping.
     """
 
     def __init__(self, path: Path, recipe: dict[str, str], full_clouds: bool) -> None:

@@ -64,6 +64,7 @@ def limits_of(section: LimitsSection, robot: RobotModel) -> MotionLimits:
     Raises:
         StageError: They are not for this arm: another number of joints, or an empty range.
     """
+    # The recipe may narrow the model's ranges and never widens them
     lower = np.array([joint.lower for joint in robot.joints])
     upper = np.array([joint.upper for joint in robot.joints])
     if section.joints is not None:

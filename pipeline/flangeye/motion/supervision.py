@@ -180,6 +180,7 @@ class Supervisor:
             )
 
     def _settled(self, state: RobotState, leg: Leg) -> bool:
+        # Both, for a while: an arm may pass its goal, or pause on its way to it
         near = np.abs(state.joints - leg.joints).max() < self.arrived
         if not near or np.abs(state.joint_speeds).max() > STANDING:
             self._stood_ns = 0

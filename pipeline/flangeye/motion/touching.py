@@ -105,6 +105,7 @@ class Toucher:
 
     def _ways(self, number: int, point: Floats, turn: Floats, joints: Floats) -> list[Route]:
         arm, router = Arm(self.model), Router(self.model, self._slowly(), joints)
+        # From the flange's centre to the tip: along the tool, so that it comes down on its point
         along = turn @ (self.tip / np.linalg.norm(self.tip))
         ways = []
         # The tip goes to this distance before a point first, then on along the tool [m]

@@ -143,7 +143,7 @@ def away_from_edges(points: Floats, face: Plane, rings: Rings, flange: Flange) -
 def _feature(
     points: Floats, plane: Plane, face: Plane, rings: Rings, flange: Flange, params: RimParams
 ) -> CircleFeature:
-    """Return the circle, found in ``face``, in ``plane``, with all that is known of it."""
+    """Return the feature of a circle: moved from ``face`` to ``plane``, with its covariances."""
     centre = face.lift(rings.circles.centre)
     centre = centre - plane.heights(centre) * plane.normal
     axes = basis_of_plane(plane.normal)

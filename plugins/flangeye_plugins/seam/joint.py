@@ -300,6 +300,7 @@ def _line(found: Found) -> tuple[Floats, Floats, Floats]:
     origin, axes = found.course.at(s)
     y, z, roll = found.swept.spline.at(s).T
     line = origin + y[:, None] * axes[:, 1] + z[:, None] * axes[:, 2]
+    # Out of the joint, along the bisector of the surfaces that meet at the seam
     turned = roll + found.swept.section.opening
     openings = np.sin(turned)[:, None] * axes[:, 1] + np.cos(turned)[:, None] * axes[:, 2]
     # Of a pixel, what an edge may be off for how pixels there are measured

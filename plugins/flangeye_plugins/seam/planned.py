@@ -109,6 +109,7 @@ def for_the_controller(
 
 def _above(points: Floats, openings: Floats, x: Floats, tool: float) -> Floats:
     """Return (N, 4, 4) flange poses whose tool comes down each opening, its x nearest to (3,)."""
+    # Turns about the tool are free: the one nearest to where the arm was calibrated is taken
     z = -openings / np.linalg.norm(openings, axis=1, keepdims=True)
     along = x - (z @ x)[:, None] * z
     along = along / np.linalg.norm(along, axis=1, keepdims=True)

@@ -32,7 +32,7 @@ class RegistrationLimits:
     Attributes:
         seen: Least share that must have been seen of what the part shows from its broadest side:
             the edge of a plate fits many things.
-        refuted: Largest share of what was looked at that may be missing.
+        refuted: Largest share of the surface in view that may be missing in the scan.
         residual: Largest distance of the scan from the CAD, robust standard deviation [m].
         distinct: By how much the second-best pose must agree less with the scan.
     """

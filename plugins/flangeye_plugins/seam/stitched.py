@@ -157,6 +157,8 @@ class _AsSeveral:
 
     def __call__(self, points_in_base: Floats) -> Floats:
         camera, count = self.answer.camera, len(points_in_base)
+        # An error of the hand-eye pose or of a joint's zero is one number for all places: how it
+        # moves a point is averaged over the places that show the point, then squared
         of_camera = np.zeros((count, 3, 6))
         of_zeros = np.zeros((count, 3, 0 if self.robot is None else len(self.robot.joints)))
         for place, share in zip(self.places, self._shares(points_in_base), strict=True):

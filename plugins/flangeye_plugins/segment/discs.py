@@ -89,7 +89,7 @@ class Patch(NamedTuple):
 def flat_parts(
     pieces: list[SurfacePiece], reach: float, scatter: float, fewest: int
 ) -> list[PlanarPiece]:
-    """Return the flat parts of pieces of surface: one of a piece that is flat as a whole.
+    """Return the flat parts of pieces of surface; a piece that is flat as a whole is one part.
 
     Where a scan is too coarse or too noisy to show the crease, a piece holds a face joined to
     what is around it. The flattest patches of what does not lie on the piece's main plane then

@@ -95,7 +95,7 @@ class CameraProcess:
         self._state = state
 
     def true_torch(self) -> tuple[Floats, Floats] | None:
-        """Return where a simulated torch really was, or None; no image is read any more."""
+        """Stop reading images; return where a simulated torch really was, None for a real one."""
         self._end_watch()
         with suppress(OSError, EOFError):
             self._wire.send("torch")

@@ -148,7 +148,7 @@ def rows_together(
 
 
 def _row_names(table: Table, column: Column | None) -> Sequence[str]:
-    """Return what a table's rows are called, a different name each; empty where they are not."""
+    """Return the names of a table's rows; empty where they have none, or two have the same."""
     if table.names or column is None:
         return table.names
     known = column in table.heading or (isinstance(column, int) and column <= len(table.rows[0][1]))

@@ -80,6 +80,7 @@ def _gain(tag: Floats, tip: Floats) -> Floats:
     moved = np.linalg.svd(tip, compute_uv=False)
     if moved[-1] < 0.1 * moved[0]:
         raise StageError("calibration: the robot did not move the finger along all three axes")
+    # Row vectors: tip = tag @ gain.T
     solution, *_ = np.linalg.lstsq(tag, tip, rcond=None)
     return np.asarray(solution.T)
 
