@@ -22,12 +22,16 @@ from flangeye.maths.pose_corrections import (
 )
 from flangeye.maths.streams import later, passed, pose_at
 from flangeye_plugins.check import CHECKS
+from tests.crossing import crossed
 from tests.doctor.sessions import CARRIED, KINDS, bent, clean, in_motion
 
 CONFIGURATIONS = [(kind, carried) for kind in KINDS for carried in ("target", "camera")]
 SOME = [("flange", "target"), ("marker", "camera"), ("point", "target")]
 INVERTED = "- acquire.archive: {reader: {corrected: {reader: auto, robot: {inverted: true}}}}"
 TURNED = [("flange", "target"), ("marker", "target"), ("point", "camera")]
+
+EITHER = [("target",), ("camera",)]
+ALTERNATING = crossed([(kind,) for kind in KINDS], EITHER)
 
 
 def session_of(kind="flange", carried="target", seed=1, **changes):
@@ -101,7 +105,7 @@ def test_both_in_the_same_wrong_unit() -> None:
     assert "robot: {scale: 0.001}, target: {scale: 0.001}" in finding.fix
 
 
-@pytest.mark.parametrize(("kind", "carried"), CONFIGURATIONS)
+@pytest.mark.parametrize(("kind", "carried"), ALTERNATING)
 def test_the_base_in_the_flange(kind: Any, carried: Any) -> None:
     session = session_of(kind, carried)
     finding = only(session.with_poses(inverted(session.poses)))
@@ -134,8 +138,7 @@ def inverse(session):
     )
 
 
-@pytest.mark.parametrize("carried", ["target", "camera"])
-@pytest.mark.parametrize("seed", [1, 4])
+@pytest.mark.parametrize(("seed", "carried"), crossed([(1,), (4,)], EITHER))
 def test_inverted_markers_are_told_from_another_mounting_by_their_noise(
     carried: str, seed: int
 ) -> None:
@@ -199,11 +202,12 @@ def test_transposed_rotations(kind: str, carried: str) -> None:
     assert "transposed: true" in only(session.with_poses(transposed(session.poses))).fix
 
 
-@pytest.mark.parametrize(("kind", "carried"), TURNED)
 @pytest.mark.parametrize(
-    ("read_as", "written_as"),
-    [("xyzw", "wxyz"), ("wxyz", "xyzw"), ("xyz", "ZYX"), ("ZYX", "xyz"), ("vector", "xyz"),
-     ("ZYX", "vector"), ("XYZ", "ZYX"), ("ZYX", "ZYZ")],
+    ("read_as", "written_as", "kind", "carried"),
+    crossed([
+        ("xyzw", "wxyz"), ("wxyz", "xyzw"), ("xyz", "ZYX"), ("ZYX", "xyz"), ("vector", "xyz"),
+        ("ZYX", "vector"), ("XYZ", "ZYX"), ("ZYX", "ZYZ"),
+    ], TURNED),
 )  # fmt: skip
 def test_rotations_read_in_another_convention(
     kind: str, carried: str, read_as: str, written_as: str
@@ -269,8 +273,7 @@ def test_a_stated_convention_is_the_one_that_is_corrected() -> None:
     assert "rotation: [ZYX, xyz]" in finding.fix
 
 
-@pytest.mark.parametrize(("kind", "carried"), SOME)
-@pytest.mark.parametrize("by", [1, -1, 2])
+@pytest.mark.parametrize(("by", "kind", "carried"), crossed([(1,), (-1,), (2,)], SOME))
 def test_poses_shifted_against_the_scans(kind: str, carried: str, by: int) -> None:
     session = session_of(kind, carried)
     poses, known = shifted(session.poses, by)
@@ -311,7 +314,7 @@ def test_a_time_offset_where_the_arms_stream_was_recorded() -> None:
     assert told == pytest.approx(80, abs=2)
 
 
-@pytest.mark.parametrize(("kind", "carried"), CONFIGURATIONS)
+@pytest.mark.parametrize(("kind", "carried"), ALTERNATING)
 def test_one_gross_outlier(kind: Any, carried: Any) -> None:
     session = changed(session_of(kind, carried), [7], rigid(np.eye(3), np.array([0.01, 0, 0.02])))
     finding = only(session)
@@ -320,7 +323,7 @@ def test_one_gross_outlier(kind: Any, carried: Any) -> None:
     assert finding.fix.endswith("leave_out: ['007']}")
 
 
-@pytest.mark.parametrize(("kind", "carried"), CONFIGURATIONS)
+@pytest.mark.parametrize(("kind", "carried"), ALTERNATING)
 def test_identity_matrices_of_the_robots_driver(kind: Any, carried: Any) -> None:
     session = session_of(kind, carried)
     poses = np.array(session.poses)
@@ -362,7 +365,7 @@ def test_a_detection_that_is_stale() -> None:
     assert finding.name == "repeated detection"
 
 
-@pytest.mark.parametrize(("kind", "carried"), CONFIGURATIONS)
+@pytest.mark.parametrize(("kind", "carried"), ALTERNATING)
 def test_a_target_that_moved_half_way(kind: Any, carried: Any) -> None:
     move = rigid(rotation_exp(np.array([0, 0.01, 0])), np.array([0.004, 0, 0]))
     finding = only(changed(session_of(kind, carried), np.arange(20) >= 11, move))
@@ -379,8 +382,10 @@ def test_the_poses_of_a_tool(kind: str) -> None:
     assert np.allclose(finding.corrected_session.poses, session.poses, atol=3e-4)
 
 
-@pytest.mark.parametrize("carried", ["target", "camera"])
-@pytest.mark.parametrize("axis", [(np.pi, 0, 0), (0, 0, np.pi), (0, 0, np.pi / 2)])
+@pytest.mark.parametrize(
+    ("axis", "carried"),
+    crossed([((np.pi, 0, 0),), ((0, 0, np.pi),), ((0, 0, np.pi / 2),)], EITHER),
+)
 def test_targets_that_were_seen_turned_over(carried: str, axis: tuple[Any, ...]) -> None:
     session = session_of("marker", carried)
     rotations = np.array(session.rotations)
@@ -619,8 +624,7 @@ PARALLEL = [
 ]
 
 
-@pytest.mark.parametrize(("name", "mistake"), PARALLEL)
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize(("name", "mistake", "seed"), crossed(PARALLEL, [(1,), (2,), (3,)]))
 def test_a_mistake_in_poses_that_hardly_turn_is_no_tool(name: Any, mistake: Any, seed: int) -> None:
     """All normals stand alike off any axis there: that alone does not make a tool of it."""
     session = session_of("flange", seed=seed, turn=2e-3)

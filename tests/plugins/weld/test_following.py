@@ -7,6 +7,7 @@ import pytest
 
 from flangeye_emulators.weld_world.groove import Gap
 from flangeye_plugins.weld.settings import Following
+from tests.crossing import crossed
 from tests.plugins.weld.bench import PERIOD, curved, misplaced, planning_error, straight, weld
 
 LIMIT = Following().turn_rate
@@ -39,8 +40,7 @@ def test_a_plan_too_high_and_tilted_is_followed_too() -> None:
     assert abs(done.deviation()).max() < 0.4e-3
 
 
-@pytest.mark.parametrize("side", ["left", "right"])
-@pytest.mark.parametrize("shift", [5e-3, -5e-3])
+@pytest.mark.parametrize(("side", "shift"), crossed([("left",), ("right",)], [(5e-3,), (-5e-3,)]))
 def test_both_ends_of_the_seam_are_felt_and_it_is_welded_between_them(
     shift: float, side: str
 ) -> None:
