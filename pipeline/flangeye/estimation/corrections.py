@@ -86,6 +86,7 @@ def _as_field(found: Estimate, carrier: Carrier) -> Floats:
             rows = _rows(found, carrier, kind)
             if kind not in CORRECTED and rows is not None:
                 rest += columns[:, 3:] @ mean[rows]
+    # The rigid part is in the camera's pose already: left in here it would be corrected twice
     motions = levers(places - field.about).reshape(-1, 6)
     bent = rest.ravel() - motions @ np.linalg.lstsq(motions, rest.ravel(), rcond=1e-9)[0]
     moves = field_effects(field, places).reshape(len(bent), -1)

@@ -134,6 +134,7 @@ def _reading(in_hand: bool, inverse: bool, exchanged: bool, remounted: bool) -> 
 
 def _odds(distance: float, median: float, spread: float) -> float:
     """Return the log odds of a distance [m], by Student's t of its logarithm: any may be odd."""
+    # With three degrees of freedom, -(3 + 1) / 2 log(1 + t^2 / 3)
     off = np.log(max(distance, 1e-3) / median) / spread
     return float(-2.0 * np.log1p(off**2 / 3.0))
 

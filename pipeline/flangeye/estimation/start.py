@@ -472,6 +472,7 @@ def _descended(
             break
         before = cost
         for _ in range(8):
+            # Marquardt's scaling damps radians and metres alike
             scale = np.diag(information) + 1e-12 * np.trace(information) + 1e-12
             step = np.linalg.solve(information + damping * np.diag(scale), right)
             moved = problem.moved(places, step)

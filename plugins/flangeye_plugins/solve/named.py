@@ -88,8 +88,9 @@ def solve_closed(
     require_turns(problem)
     try:
         places = solver(problem)
-    except np.linalg.LinAlgError:
+    except np.linalg.LinAlgError:  # as where all turns are about one axis
         raise CalibrationRefused(f"{method}: its equations have no solution here") from None
+    # A closed form has no noise model: the covariance of its answer is from the mixed model
     options = Options(params.limits)
     return calibrate_at(places, observations, cell, scanner, options, method)
 
