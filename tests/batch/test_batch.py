@@ -1,6 +1,7 @@
 """Whole batches on real dask clusters."""
 
 import csv
+import fcntl
 import importlib.util
 import os
 import re
@@ -54,6 +55,21 @@ def test_every_end_is_a_row_and_costs_only_itself(
     assert (again.known, again.tally.total) == (2, 3)
     third, _ = batch(grid=("steps.3.what=work,refuse",), **more)
     assert (third.known, len(rows(third.out))) == (2, 2)
+
+
+def test_a_folder_in_which_another_batch_runs_is_refused_and_not_touched(
+    batch: Callable[..., Any], tmp_path: Path
+) -> None:
+    running = tmp_path / "busy" / STARTS / "a-session"
+    running.parent.mkdir(parents=True)
+    running.write_bytes(b".")
+    with (tmp_path / "busy" / ".lock").open("ab") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        with pytest.raises(BatchError, match="busy: another batch writes to this folder: wait"):
+            batch(grid=("steps.3.what=work",), out=str(tmp_path / "busy"), workers=1)
+    assert running.read_bytes() == b"."
+    done, _ = batch(grid=("steps.3.what=work",), out=str(tmp_path / "busy"), workers=1)
+    assert done.accepted
 
 
 def test_archives_on_the_command_line(

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -46,7 +46,8 @@ def run_batch(request: Request, registry: Registry, console: Console) -> Batch:
         console: Where progress is shown.
 
     Raises:
-        FlangeyeError: The batch cannot start, or its tables cannot be written.
+        FlangeyeError: The batch cannot start, another one runs in its folder, or its tables cannot
+            be written.
     """
     check_installed()
     software = software_of(registry)
@@ -82,7 +83,7 @@ def run_sessions(
     tally = Tally(columns, tuple(varied), len(missing))
     if missing.any():
         todo = compress(enumerate(sessions), missing)
-        with _client(request, int(missing.sum())) as client:
+        with _client(request, int(missing.sum())) as client, _alone(out):
             _prepare(job, out)
             try:
                 _run(client, job, todo, int(missing.sum()), console)
@@ -102,6 +103,35 @@ def _client(request: Request, todo: int) -> AbstractContextManager[Client]:
     if request.workers is not None:
         raise BatchError("--workers starts workers here, --scheduler uses others; give one")
     return remote_client(request.scheduler, request.tls)
+
+
+@contextmanager
+def _alone(out: str) -> Iterator[None]:
+    """Keep other batches out of a folder while the context lasts: they would empty its sessions.
+
+    Raises:
+        BatchError: Another batch runs in it, or it cannot be made.
+    """
+    if is_url(out):
+        yield
+        return
+    import fcntl  # not on every system
+
+    try:
+        Path(out).mkdir(parents=True, exist_ok=True)
+        lock = (Path(out) / ".lock").open("ab")
+    except OSError as error:
+        raise BatchError(f"{out}: cannot be made: {error.strerror or error}") from None
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise BatchError(
+                f"{out}: another batch writes to this folder: wait for its end, or give --out"
+            ) from None
+        except OSError:
+            pass  # the file system of a cluster may know no locks
+        yield
 
 
 def _prepare(job: Job, out: str) -> None:
