@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flangeye.errors import StageError
+from flangeye.files.documents import KINDS, document_of
 from flangeye.files.regular import read_text
-from flangeye.files.tables.documents import KINDS, document_of
 from flangeye.types import Floats
 
 MATRICES = (

@@ -12,9 +12,9 @@ import numpy as np
 from flangeye.errors import StageError
 from flangeye.files.cameras import CameraFile, cameras_in
 from flangeye.files.clouds import PER_METRE, LengthUnit, check_cloud_file, read_cloud
+from flangeye.files.documents import document_of
 from flangeye.files.images import ImageError, decode_image, is_depth_image
 from flangeye.files.regular import MAX_FILE, read_regular
-from flangeye.files.tables.documents import document_of
 from flangeye.types import CAMERA, Floats, PointCloud
 
 

@@ -1,6 +1,6 @@
 """Tables of poses as people and programs write them: text, documents, arrays, robot programs.
 
-A new kind of file is a function in :mod:`~flangeye.files.tables.documents` and its row there, or a
+A new kind of file is a function in :mod:`~flangeye.files.documents` and its row there, or a
 pattern in :data:`~flangeye.maths.pose_formats.CONVENTIONS`.
 
 Rows of poses, whatever file they are from.
@@ -23,9 +23,9 @@ from pathlib import Path, PurePath
 import numpy as np
 
 from flangeye.errors import StageError
+from flangeye.files.documents import KINDS, document_of, stacked
 from flangeye.files.regular import read_any_text
 from flangeye.files.scans import natural, partners
-from flangeye.files.tables.documents import KINDS, document_of, stacked
 from flangeye.files.tables.table import (
     Cell,
     Column,

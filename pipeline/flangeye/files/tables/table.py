@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flangeye.errors import StageError
+from flangeye.files.documents import MATRICES, TableDocument
 from flangeye.files.recording import MIN_CAPTURES
-from flangeye.files.tables.documents import MATRICES, TableDocument
 from flangeye.files.words import nearest
 from flangeye.types import Floats
 

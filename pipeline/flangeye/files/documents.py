@@ -131,7 +131,7 @@ def _numpy(file: Path) -> TableDocument:
 
 def _matlab(file: Path) -> TableDocument:
     """Return the arrays of a .mat file: its parser, which damage can crash, has its own process."""
-    command = python_command(str(Path(__file__).parents[1] / "matlab_parser.py"))
+    command = python_command(str(Path(__file__).with_name("matlab_parser.py")))
     # Longest .mat file [bytes]
     content = read_regular(file, 1_000_000)
     if content.startswith((b"MATLAB 7.3", b"\x89HDF\r\n")):
