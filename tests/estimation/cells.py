@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from flangeye.maths.frame_graph import Frame
 from flangeye.maths.geometry import (
     hat,
     invert,
@@ -18,7 +17,7 @@ from flangeye.maths.geometry import (
 )
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.streams import joints_at, passed, pose_at, with_joints
-from flangeye.models.cell import cell_of
+from flangeye.models.cell import Frame, cell_of
 from flangeye.models.configuration import ORIGIN, Configuration
 from flangeye.models.loading import load_model
 from flangeye.models.robots import RobotModel

@@ -15,9 +15,9 @@ from flangeye.estimation.estimate import Estimate, estimate
 from flangeye.estimation.graph import Carrier, Problem, Sightings
 from flangeye.estimation.session import Asked, effects_of
 from flangeye.estimation.work import work_of
-from flangeye.maths.frame_graph import Frame
 from flangeye.maths.geometry import hat, kabsch, rigid
 from flangeye.maths.kinematics import Arm
+from flangeye.models.cell import Frame
 from flangeye.models.model import read_model
 from flangeye.models.robots import RobotModel
 from tests.estimation import foreign

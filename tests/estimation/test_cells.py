@@ -9,10 +9,9 @@ import pytest
 
 from flangeye import CalibrationRefused
 from flangeye.estimation.calibrate import Options, calibrate
-from flangeye.maths.frame_graph import Frame, chain
 from flangeye.maths.geometry import invert, rigid, rotation_exp
 from flangeye.maths.kinematics import Arm
-from flangeye.models.cell import Axis, Cell
+from flangeye.models.cell import Axis, Cell, Frame, chain
 from flangeye.models.loading import load_model
 from flangeye.types import CAMERA, TARGET, HandEye, Observation, PoseFeature, Transform
 from tests.estimation.cells import OF_MOST, squares_at

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from flangeye.errors import RecipeError, StageError
-from flangeye.maths.frame_graph import Frame
 from flangeye.maths.kinematics import Arm
-from flangeye.models.cell import Axis, Cell, Link
+from flangeye.models.cell import Axis, Cell, Frame, Link
 from flangeye.models.loading import load_model
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.registry import load_registry

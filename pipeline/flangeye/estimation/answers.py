@@ -26,8 +26,8 @@ from flangeye.estimation.estimate import Estimate, model_at
 from flangeye.estimation.graph import Linear, Problem
 from flangeye.estimation.mixed import shares, spread_of
 from flangeye.estimation.work import Work
-from flangeye.maths.frame_graph import chain, composed
 from flangeye.maths.geometry import hat, invert
+from flangeye.models.cell import chain, composed
 from flangeye.types import ExpectedError, Floats
 
 

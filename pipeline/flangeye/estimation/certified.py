@@ -17,8 +17,8 @@ import numpy as np
 from flangeye.estimation.certificate import Certificate, certify
 from flangeye.estimation.estimate import Estimate
 from flangeye.estimation.lifted import LiftedSightings, Side, families_of
-from flangeye.maths.frame_graph import Frame, chain
 from flangeye.maths.geometry import invert, rotation_exp, rotation_log
+from flangeye.models.cell import Frame, chain
 from flangeye.types import Floats, Indices
 
 OPTIMAL = "globally optimal: nowhere is there an answer that fits the agreeing poses better"

@@ -19,9 +19,9 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from flangeye.maths.frame_graph import Frame, chain, composed
 from flangeye.maths.geometry import hat, invert, rotation_between, rotation_exp, rotation_log
 from flangeye.maths.kinematics import Arm
+from flangeye.models.cell import Frame, chain, composed
 from flangeye.types import Floats, Indices, Mask
 
 Places = Mapping[str, Floats]

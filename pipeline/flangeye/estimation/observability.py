@@ -14,9 +14,9 @@ import numpy as np
 
 from flangeye.errors import CalibrationRefused, StageError
 from flangeye.estimation.graph import Places, Problem
-from flangeye.maths.frame_graph import chain
 from flangeye.maths.geometry import invert, kabsch, levers, rotation_exp, rotation_log, stack_rows
 from flangeye.maths.statistics import chi2_quantile
+from flangeye.models.cell import chain
 from flangeye.types import CAMERA, TARGET, Floats
 
 FINEST_NOISE = 1e-5

@@ -27,10 +27,9 @@ from flangeye.estimation.session import Asked, effects_of
 from flangeye.estimation.sightings import problem_of
 from flangeye.estimation.start import agreeing, begin
 from flangeye.estimation.threads import on_one_thread
-from flangeye.maths.frame_graph import composed
 from flangeye.maths.geometry import hat, invert, stack_rows
 from flangeye.maths.statistics import largest_error_quantile
-from flangeye.models.cell import Cell
+from flangeye.models.cell import Cell, composed
 from flangeye.types import (
     CAMERA,
     TARGET,

@@ -22,7 +22,6 @@ from flangeye.estimation.closed.comanipulation import best_rotations, with_trans
 from flangeye.estimation.closed.motions import motions_of, place_of
 from flangeye.estimation.closed.separable import park_martin
 from flangeye.estimation.graph import Places, Problem, Sightings
-from flangeye.maths.frame_graph import chain
 from flangeye.maths.geometry import (
     basis_of_plane,
     each_applied,
@@ -33,6 +32,7 @@ from flangeye.maths.geometry import (
     rotation_exp,
     stack_rows,
 )
+from flangeye.models.cell import chain
 from flangeye.types import Floats, Indices, Mask
 
 SETS = 80

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from flangeye.errors import RecipeError, StageError
-from flangeye.maths.frame_graph import Frame, chain
-from flangeye.models.cell import Axis, Cell, Link
+from flangeye.models.cell import Axis, Cell, Frame, Link, chain
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.stage import PlaceParams
 from flangeye.recipe.header import (

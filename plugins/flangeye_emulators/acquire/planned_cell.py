@@ -13,9 +13,8 @@ from pydantic import Field
 
 from flangeye.errors import StageError
 from flangeye.estimation.plan import Rough, best_next, foreseen, foreseen_poses, so_far
-from flangeye.maths.frame_graph import Frame, chain, composed
 from flangeye.maths.geometry import invert
-from flangeye.models.cell import Axis, Cell
+from flangeye.models.cell import Axis, Cell, Frame, chain, composed
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.stage import PlaceParams
 from flangeye.types import Floats, Mask, Observation, Poses, Source, Transform, Truth
