@@ -15,9 +15,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
-from flangeye.devices import Device, DeviceError
+from flangeye.devices import Device, DeviceError, find_named, settings_file
 from flangeye.errors import StageError
-from flangeye.files.paths import find_named, settings_file
 from flangeye.files.processes import Pipe, PipeEndedError, busy, python_command
 from flangeye.models.graph import Topic
 from flangeye_plugins.ros2.messages import Type, stamp_of, types

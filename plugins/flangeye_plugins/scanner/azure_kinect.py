@@ -16,9 +16,18 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from flangeye.devices import PATIENCE, DeviceError, FrameDropped, Scan, Scanner
-from flangeye.files.paths import MachineName, RecipeFile, find_named, require_named
-from flangeye.files.paths import settings_file as machine_settings
+from flangeye.devices import (
+    PATIENCE,
+    DeviceError,
+    FrameDropped,
+    MachineName,
+    Scan,
+    Scanner,
+    find_named,
+    require_named,
+)
+from flangeye.devices import settings_file as machine_settings
+from flangeye.files.paths import RecipeFile
 from flangeye.files.processes import Pipe, PipeEndedError, python_command
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import Params, part

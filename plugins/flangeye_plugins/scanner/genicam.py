@@ -15,8 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from flangeye.devices import DeviceError, FrameDropped, Scan, Scanner, load_sdk
-from flangeye.files.paths import MachineName, find_named
+from flangeye.devices import (
+    DeviceError,
+    FrameDropped,
+    MachineName,
+    Scan,
+    Scanner,
+    find_named,
+    load_sdk,
+)
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import part
 from flangeye_plugins.scanner.opened import OpenScanner, SerialParams

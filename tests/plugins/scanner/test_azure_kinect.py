@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye.devices import DeviceError, FrameDropped, Scanner
-from flangeye.files.paths import settings_file
+from flangeye.devices import DeviceError, FrameDropped, Scanner, settings_file
 from flangeye.models.loading import load_model
 from flangeye_plugins.scanner import azure_kinect as driver
 from flangeye_plugins.scanner.azure_kinect import (
