@@ -18,7 +18,7 @@ from flangeye.models.finger import Calibration, Finger
 from flangeye.models.model import read_model
 from flangeye.models.robots import RobotModel
 from flangeye.motion.executor import Executor, led
-from flangeye.motion.limits import MotionLimits, limits_of
+from flangeye.motion.limits import MotionLimits
 from flangeye.plugin.stage import part
 from flangeye.recipe.header import LimitsSection
 from flangeye.recipe.load import Recipe
@@ -91,7 +91,7 @@ def _guided(
             "down, with the tip held; nothing moved: add --move"
         )
     model: RobotModel = recipe.context[RobotModel]
-    limits = limits_of(recipe.context[LimitsSection], model)
+    limits = recipe.context[LimitsSection].for_robot(model)
     with ExitStack() as opened:
         arm = _Arm(driver, model, limits, opened)
         with arm.standing() as robot:

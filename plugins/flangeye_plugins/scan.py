@@ -16,7 +16,7 @@ from flangeye.maths.geometry import invert, rigid, rotation_from_rpy
 from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import RobotModel
 from flangeye.motion.executor import Executor, led
-from flangeye.motion.limits import MotionLimits, limits_of
+from flangeye.motion.limits import MotionLimits
 from flangeye.motion.route import Barred, Route, Router
 from flangeye.recipe.header import LimitsSection
 from flangeye.types import (
@@ -125,7 +125,7 @@ def scan_along(  # noqa: PLR0913  what it asks the runner for
     camera = calibration.camera.transform
     if camera.parent == BASE:
         raise StageError(f"{STAGE}: the scanner stands beside the arm; scan with scan.live")
-    allowed = limits_of(limits, robot)
+    allowed = limits.for_robot(robot)
     if not (motion.allowed or arm.simulated):
         raise NothingMoved(
             f"{STAGE}: would scan from {len(_places(params))} places; nothing moved: add --move"

@@ -6,14 +6,13 @@ import numpy as np
 
 from flangeye.devices import DeviceError, RobotDriver
 from flangeye.models.loading import load_model
-from flangeye.motion.limits import limits_of
 from flangeye.recipe.header import LimitsSection
 from flangeye.types import BASE, FLANGE, Transform
 from flangeye_emulators.robot import SimulatedRobot, SimulatedRobotParams
 
 MODEL = load_model("robots", "ur5e")
 BOX = {"centre": ["0 mm", "0 mm", "400 mm"], "size": ["2 m", "2 m", "1.4 m"]}
-LIMITS = limits_of(LimitsSection.model_validate({"box": BOX}), MODEL)
+LIMITS = LimitsSection.model_validate({"box": BOX}).for_robot(MODEL)
 
 
 class StandIn(SimulatedRobot):

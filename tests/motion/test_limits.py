@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from flangeye.errors import StageError
-from flangeye.motion.limits import limits_of
 from flangeye.recipe.header import LimitsSection
 from tests.motion.stand_in import BOX, LIMITS, MODEL
 
@@ -36,7 +35,7 @@ def test_a_place_outside_the_box_is_named() -> None:
 
 def test_the_joint_nearest_to_its_limit_is_named() -> None:
     ranges = [["-90 deg", "90 deg"]] * 6
-    limits = limits_of(section(joints=ranges), MODEL)
+    limits = section(joints=ranges).for_robot(MODEL)
     joints = np.radians([0.0, 0.0, 88.0, 0.0, 0.0, 0.0])
     assert limits.beyond(joints) is None
     assert limits.beyond(joints, np.radians(5.0)) == (
@@ -52,7 +51,7 @@ def test_the_joint_nearest_to_its_limit_is_named() -> None:
 
 
 def test_the_recipe_narrows_the_arm_and_never_widens_it() -> None:
-    limits = limits_of(section(joints=[["-900 deg", "90 deg"]] * 6), MODEL)
+    limits = section(joints=[["-900 deg", "90 deg"]] * 6).for_robot(MODEL)
     assert limits.lower == pytest.approx([joint.lower for joint in MODEL.joints])
     assert limits.upper == pytest.approx(np.full(6, np.radians(90.0)))
 
@@ -70,7 +69,7 @@ def test_the_recipe_narrows_the_arm_and_never_widens_it() -> None:
 )  # fmt: skip
 def test_limits_for_another_arm_are_refused(joints: Any, line: str) -> None:
     with pytest.raises(StageError) as error:
-        limits_of(section(joints=joints), MODEL)
+        section(joints=joints).for_robot(MODEL)
     assert str(error.value) == line
 
 

@@ -14,7 +14,6 @@ from flangeye.files.yaml_lines import dumped
 from flangeye.log.read import read_run
 from flangeye.maths.geometry import rpy_from_rotation
 from flangeye.models.robots import RobotModel
-from flangeye.motion.limits import limits_of
 from flangeye.motion.touching import Touched, Toucher
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.header import LimitsSection
@@ -75,7 +74,7 @@ def _toucher(recipe: Recipe, tip: Floats, ask: Callable[[str], None]) -> Toucher
             "read; touch with the calibration of a live recipe, or write the step verify.touch "
             "with poses from the pendant ('flangeye stages verify.touch')"
         )
-    return Toucher(driver, robot, limits_of(section, robot), tip, ask)
+    return Toucher(driver, robot, section.for_robot(robot), tip, ask)
 
 
 def _point(option: str, text: str) -> Floats:

@@ -6,9 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flangeye.errors import StageError
-from flangeye.models.robots import RobotModel
-from flangeye.recipe.header import LimitsSection
 from flangeye.types import Floats
 
 
@@ -56,32 +53,3 @@ class MotionLimits:
             f"joint {joint + 1} at {np.degrees(joints[joint]):.0f} deg, "
             f"its limits are {low:.0f} and {high:.0f} deg"
         )
-
-
-def limits_of(section: LimitsSection, robot: RobotModel) -> MotionLimits:
-    """Return the recipe's limits for a robot.
-
-    Raises:
-        StageError: They are not for this arm: another number of joints, or an empty range.
-    """
-    # The recipe may narrow the model's ranges and never widens them
-    lower = np.array([joint.lower for joint in robot.joints])
-    upper = np.array([joint.upper for joint in robot.joints])
-    if section.joints is not None:
-        if len(section.joints) != len(lower):
-            raise StageError(
-                f"robot.limits.joints: {len(section.joints)} ranges, but a {robot.model} has "
-                f"{len(lower)} joints; give one [lower, upper] for each"
-            )
-        lower = np.maximum(lower, [low for low, _ in section.joints])
-        upper = np.minimum(upper, [high for _, high in section.joints])
-    if empty := [i + 1 for i in np.flatnonzero(lower >= upper)]:
-        raise StageError(
-            f"robot.limits.joints: no angle is left for joint {', '.join(map(str, empty))} of a "
-            f"{robot.model}; the lower limit comes first"
-        )
-    centre, size = np.asarray(section.box.centre), np.asarray(section.box.size)
-    return MotionLimits(
-        centre - size / 2, centre + size / 2,
-        section.speed, section.acceleration, section.joint_speed, lower, upper,
-    )  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, ClassVar, Literal
 
+import numpy as np
 from pydantic import (
     Field,
     GetJsonSchemaHandler,
@@ -12,7 +13,10 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema
 
+from flangeye.errors import StageError
 from flangeye.files.clouds import LengthUnit
+from flangeye.models.robots import RobotModel
+from flangeye.motion.limits import MotionLimits
 from flangeye.plugin.stage import BoundPart, Choose, Params, PlaceParams
 from flangeye.units import Acceleration, Angle, AngularSpeed, Length, Speed, param
 
@@ -43,6 +47,34 @@ class LimitsSection(RecipeSection):
     joints: tuple[tuple[Angle, Angle], ...] | None = Field(
         None, description="Lower and upper angle of each joint; the model's own when not given."
     )
+
+    def for_robot(self, robot: RobotModel) -> MotionLimits:
+        """Return these limits, within those of a robot itself.
+
+        Raises:
+            StageError: They are not for this arm: another number of joints, or an empty range.
+        """
+        # The recipe may narrow the model's ranges and never widens them
+        lower = np.array([joint.lower for joint in robot.joints])
+        upper = np.array([joint.upper for joint in robot.joints])
+        if self.joints is not None:
+            if len(self.joints) != len(lower):
+                raise StageError(
+                    f"robot.limits.joints: {len(self.joints)} ranges, but a {robot.model} has "
+                    f"{len(lower)} joints; give one [lower, upper] for each"
+                )
+            lower = np.maximum(lower, [low for low, _ in self.joints])
+            upper = np.minimum(upper, [high for _, high in self.joints])
+        if empty := [i + 1 for i in np.flatnonzero(lower >= upper)]:
+            raise StageError(
+                f"robot.limits.joints: no angle is left for joint {', '.join(map(str, empty))} of "
+                f"a {robot.model}; the lower limit comes first"
+            )
+        centre, size = np.asarray(self.box.centre), np.asarray(self.box.size)
+        return MotionLimits(
+            centre - size / 2, centre + size / 2,
+            self.speed, self.acceleration, self.joint_speed, lower, upper,
+        )  # fmt: skip
 
 
 class NamedSection(RecipeSection):

@@ -33,7 +33,7 @@ from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
 from flangeye.models.targets import Flange
 from flangeye.motion.arm import WatchedArm, watched
-from flangeye.motion.limits import MotionLimits, limits_of
+from flangeye.motion.limits import MotionLimits
 from flangeye.motion.reach import Margins, read_state
 from flangeye.motion.route import Barred, Leg, Route
 from flangeye.motion.supervision import RememberedState
@@ -138,7 +138,7 @@ def acquire_live(  # noqa: PLR0913  what it asks the runner for
         StageError: Fewer than three poses are possible, or a device cannot be opened.
         NothingMoved: Motion was not asked for; the message is the plan.
     """
-    allowed = limits_of(limits, robot)
+    allowed = limits.for_robot(robot)
     # Poses keep 5 deg from the limits of the joints: a pose at a limit cannot be approached.
     margins = Margins(allowed, np.radians(5.0), 0.05)
     base_T_camera = params.view(Arm(robot), scanner)

@@ -14,7 +14,7 @@ from flangeye.models.model import read_model
 from flangeye.models.robots import RobotModel
 from flangeye.motion.arc import with_arc
 from flangeye.motion.executor import Executor, led
-from flangeye.motion.limits import MotionLimits, limits_of
+from flangeye.motion.limits import MotionLimits
 from flangeye.motion.watchdog import LEADING, precedence
 from flangeye.plugin.stage import stage
 from flangeye.recipe.header import LimitsSection
@@ -67,7 +67,7 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
         DeviceError: Arm or finger cannot be opened, or are lost on the way to the seam.
         RunStopped: The operator stopped the arm.
     """
-    allowed = limits_of(limits, model)
+    allowed = limits.for_robot(model)
     planned = _planned(seam, driver, allowed, params)
     params, driver, plan = planned.params, planned.driver, planned.plan
     aside = planned.belief.set_down(params)

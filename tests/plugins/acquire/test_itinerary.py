@@ -6,7 +6,6 @@ import pytest
 from flangeye.maths.geometry import invert, rigid, rotation_exp
 from flangeye.models.loading import load_model
 from flangeye.models.targets import plate_of
-from flangeye.motion.limits import limits_of
 from flangeye.motion.reach import Margins, Reach
 from flangeye.plugin.stage import BoundPart
 from flangeye.recipe.header import LimitsSection
@@ -31,7 +30,7 @@ BASE_T_CAMERA = CameraPose().matrix
 GUESS = BASE_T_CAMERA @ rigid(rotation_exp(np.radians([4.0, -5.0, 0.0])), [0.02, -0.02, 0.03])
 BOX = {"centre": ["0.55 m", "0 m", "0.35 m"], "size": ["0.9 m", "0.9 m", "0.7 m"]}
 MARGINS = Margins(
-    limits_of(LimitsSection.model_validate({"box": BOX}), ROBOT), np.radians(5.0), 0.05
+    LimitsSection.model_validate({"box": BOX}).for_robot(ROBOT), np.radians(5.0), 0.05
 )
 
 

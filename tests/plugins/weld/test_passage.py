@@ -8,7 +8,6 @@ from flangeye.maths.kinematics import Arm
 from flangeye.models.finger import Finger
 from flangeye.models.loading import load_model
 from flangeye.models.model import read_model
-from flangeye.motion.limits import limits_of
 from flangeye.plugin.stage import BoundPart
 from flangeye.recipe.header import LimitsSection
 from flangeye_emulators.finger.sensor import (
@@ -29,7 +28,7 @@ def task_of(name, angle: float = 0.0):
     model = load_model("robots", name)
     seam = planned("v-curved", shift=(-0.1, 0.0, 0.0))
     surface = WorkSurface(seam.points_in_base, seam.openings_in_base)
-    limits = limits_of(LimitsSection.model_validate({"box": BOX}), model)
+    limits = LimitsSection.model_validate({"box": BOX}).for_robot(model)
     settings = WeldTactileParams(sensor=SENSOR)
     start = Start(settings.set_down, angle=angle)
     return Task(model, limits, FINGER, Tool(FINGER, surface), surface.path, settings, start)
