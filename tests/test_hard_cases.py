@@ -25,16 +25,16 @@ from flangeye.files.clouds import read_cloud
 from flangeye.files.paths import bundled
 from flangeye.files.processes import keep_current_folder_out, python_command
 from flangeye.files.regular import open_regular, write_whole
-from flangeye.log import records
-from flangeye.log.read import read_run
 from flangeye.models.model import read_model
 from flangeye.models.robots import RobotModel
 from flangeye.models.workpiece import load_workpiece, read_mesh
 from flangeye.plugin.registry import Registry
-from flangeye.recipe.load import load_recipe
-from flangeye.run.folder import RunFolder
-from flangeye.run.runner import Runner
-from flangeye.run.session import Start, record_run
+from flangeye.workflow.log import records
+from flangeye.workflow.log.read import read_run
+from flangeye.workflow.recipe.load import load_recipe
+from flangeye.workflow.run.folder import RunFolder
+from flangeye.workflow.run.runner import Runner
+from flangeye.workflow.run.session import Start, record_run
 from flangeye_plugins.scanner.azure_kinect import AzureKinectParams, scanner_azure_kinect
 from tests.conftest import TOY_RECIPE, Call, toy_plugins
 from tests.crafted import bomb, only, rewritten

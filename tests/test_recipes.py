@@ -9,15 +9,15 @@ from typing import Any
 import pytest
 
 from flangeye.files.yaml_lines import read_yaml
-from flangeye.log.read import read_run
 from flangeye.models.cell import Cell
 from flangeye.models.configuration import Configuration
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.find import find_recipe, recipe_names
-from flangeye.recipe.load import load_recipe
-from flangeye.recipe.schema import recipe_schema
-from flangeye.run.folder import RunFolder
-from flangeye.run.session import Start, record_run
+from flangeye.workflow.log.read import read_run
+from flangeye.workflow.recipe.find import find_recipe, recipe_names
+from flangeye.workflow.recipe.load import load_recipe
+from flangeye.workflow.recipe.schema import recipe_schema
+from flangeye.workflow.run.folder import RunFolder
+from flangeye.workflow.run.session import Start, record_run
 from tests.conftest import Call
 from tools.kill import KINDS
 from tools.outcomes import outcome, outcomes, run

@@ -8,7 +8,6 @@ import numpy as np
 from pydantic import Field
 
 from flangeye import BoundPart, Choose, Params, StageError, hookimpl, part, stage
-from flangeye.maths.geometry import kabsch, rigid, rotation_from_rpy
 from flangeye.types import (
     BASE,
     CAMERA,
@@ -41,6 +40,7 @@ from flangeye.types import (
     WorkpieceScan,
     by_frame,
 )  # fmt: skip
+from flangeye.types.geometry import kabsch, rigid, rotation_from_rpy
 from flangeye.units import Length, param
 
 BASE_T_CAMERA = Transform(BASE, CAMERA, rigid(rotation_from_rpy(3.0, 0.1, -1.5), [0.6, 0, 1]))

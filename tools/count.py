@@ -1,7 +1,8 @@
 """Size of the code, room by room: ``python -m tools.count``.
 
-A room is a package directly below ``flangeye``, ``flangeye_plugins`` or ``flangeye_emulators``, or
-another distribution as a whole. Everything is read from the syntax tree; nothing is imported.
+A room is a package directly below ``flangeye``, its ``workflow``, ``flangeye_plugins`` or
+``flangeye_emulators``, or another distribution as a whole. Its floors are those of the tallest
+package in it. Everything is read from the syntax tree; nothing is imported.
 """
 
 import argparse
@@ -14,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 ROOTS = ("pipeline", "plugins")
-SPLIT = ("flangeye", "flangeye_plugins", "flangeye_emulators")
+SPLIT = ("flangeye", "flangeye.workflow", "flangeye_plugins", "flangeye_emulators")
 BOUNDS = {"code": 42_000, "options": 450, "constants": 500, "modules": 450}
 CORE_BOUND = 34_000  # code lines without emulators and studies
 APART = ("flangeye_emulators", "flangeye_paper")
@@ -85,14 +86,18 @@ def count(folder):
         room.longest = max(room.longest, module.longest)
         if importers[name] == 1 and module.code < SMALL and not module.is_plugin:
             room.single.append(name)
-    for name, room in rooms.items():
-        room.floors = _floors(name, modules, edges)
+    for name in {n.rpartition(".")[0] for n in modules if "." in n} | set(rooms):
+        room = rooms[room_of(name)]
+        room.floors = max(room.floors, _floors(name, modules, edges))
     return dict(rooms)
 
 
 def room_of(name):
     parts = name.split(".")
-    return ".".join(parts[:2]) if parts[0] in SPLIT else parts[0]
+    depth = 1
+    while depth < len(parts) and ".".join(parts[:depth]) in SPLIT:
+        depth += 1
+    return ".".join(parts[:depth])
 
 
 def table(rooms):
@@ -267,7 +272,7 @@ def _imported(module, modules):
 
 
 def _floors(room, modules, edges):
-    """Longest chain of imports among the modules and packages directly in a room."""
+    """Longest chain of imports among the modules and packages directly in a package."""
     inside = {m for m in modules if m.startswith(room + ".")}
     part = {m: m.removeprefix(room + ".").split(".")[0] for m in inside}
     below: dict[str, set[str]] = {p: set() for p in part.values()}

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from flangeye.files.clouds import write_cloud
-from flangeye.maths.geometry import quaternion_from_rotation
 from flangeye.types import FLANGE2, Capture, Transform
+from flangeye.types.geometry import quaternion_from_rotation
 from flangeye_plugins.reader.folder import SECOND
 
 

@@ -4,8 +4,8 @@ import re
 from pathlib import Path
 
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.find import recipe_names
-from flangeye.recipe.load import load_recipe
+from flangeye.workflow.recipe.find import recipe_names
+from flangeye.workflow.recipe.load import load_recipe
 from tools.outcomes import outcomes
 
 ROOT = Path(__file__).parents[1]

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from flangeye.cli import commands
 from flangeye.cli.console import end_in_words
-from flangeye.maths.geometry import rigid
+from flangeye.types.geometry import rigid
 from tests.estimation import foreign
 
 POSES, ARM, RIGHT = 24, 0.1e-3, 1e-3

@@ -22,13 +22,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from flangeye.batch.cluster import PREFIX
-from flangeye.doctor.monitor.history import History
-from flangeye.doctor.monitor.stored import stored_calibration
 from flangeye.errors import FlangeyeError
 from flangeye.files.processes import python_command
-from flangeye.log.read import read_run
-from tests.doctor.monitor.cell import part_of_sample
+from flangeye.workflow.batch.cluster import PREFIX
+from flangeye.workflow.doctor.monitor.history import History
+from flangeye.workflow.doctor.monitor.stored import stored_calibration
+from flangeye.workflow.log.read import read_run
+from tests.workflow.doctor.monitor.cell import part_of_sample
 
 MARK = "FLANGEYE_KILLED"
 """In the environment of a run and of all that it starts."""

@@ -25,7 +25,7 @@ import typer
 
 from flangeye.errors import FlangeyeError
 from flangeye.files.processes import python_command
-from flangeye.log.read import read_notes
+from flangeye.workflow.log.read import read_notes
 from tests.emulators.controllers.process import Process
 from tools.strokes import guard_of, worker_of
 

@@ -24,10 +24,10 @@ import numpy as np
 import typer
 
 from flangeye import FlangeyeError
-from flangeye.maths.geometry import rotation_log
 from flangeye.models.cell import cell_of
 from flangeye.models.configuration import Configuration
 from flangeye.types import BASE, CAMERA, FLANGE, TARGET, Observation, PoseFeature, Transform
+from flangeye.types.geometry import rotation_log
 from flangeye_plugins.solve.robust import RobustParams, solve_cell
 
 ANGLE_NOISE, POSITION_NOISE = np.radians(0.2), 0.5e-3

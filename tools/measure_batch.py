@@ -22,7 +22,7 @@ from unittest.mock import patch
 import psutil
 
 ROOT = Path(__file__).parents[1]
-SITE = ROOT / "tests" / "batch" / "site"
+SITE = ROOT / "tests" / "workflow" / "batch" / "site"
 for folder in (str(ROOT), str(SITE)):
     if folder not in sys.path:
         sys.path.insert(0, folder)
@@ -30,13 +30,13 @@ os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), str(SITE)])  # of the wor
 
 from rich.console import Console  # noqa: E402
 
-from flangeye.batch import Request, cluster, run_batch, work  # noqa: E402
-from flangeye.batch.cluster import local_client  # noqa: E402
-from flangeye.batch.outcome import SessionOutcome  # noqa: E402
 from flangeye.plugin.registry import load_registry  # noqa: E402
-from flangeye.recipe.load import load_recipe  # noqa: E402
-from flangeye.run.folder import RunFolder  # noqa: E402
-from flangeye.run.session import Start, record_run  # noqa: E402
+from flangeye.workflow.batch import Request, cluster, run_batch, work  # noqa: E402
+from flangeye.workflow.batch.cluster import local_client  # noqa: E402
+from flangeye.workflow.batch.outcome import SessionOutcome  # noqa: E402
+from flangeye.workflow.recipe.load import load_recipe  # noqa: E402
+from flangeye.workflow.run.folder import RunFolder  # noqa: E402
+from flangeye.workflow.run.session import Start, record_run  # noqa: E402
 
 RECIPE = """\
 title: Toy
@@ -72,7 +72,7 @@ class Bench:
         out = self.folder / name
         request = Request(str(recipe), repeat=sessions, out=str(out), report=False)
         begun = time.perf_counter()
-        with patch("flangeye.batch._client", lambda *_: nullcontext(client)):
+        with patch("flangeye.workflow.batch._client", lambda *_: nullcontext(client)):
             done = run_batch(request, self.registry, Console(stderr=True, quiet=True))
         wall = time.perf_counter() - begun
         assert done.accepted and done.tally.total == sessions

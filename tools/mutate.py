@@ -40,14 +40,14 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "fit": ("plugins/flangeye_plugins/fit", "tests/plugins/fit"),
     "segment": ("plugins/flangeye_plugins/segment", "tests/plugins/segment"),
     "verify": ("plugins/flangeye_plugins/verify", "tests/plugins/verify"),
-    "log": ("pipeline/flangeye/log", "tests/log", "tests/test_hard_cases.py"),
-    "monitor": ("pipeline/flangeye/doctor/monitor", "tests/doctor/monitor"),
+    "log": ("pipeline/flangeye/workflow/log", "tests/workflow/log", "tests/test_hard_cases.py"),
+    "monitor": ("pipeline/flangeye/workflow/doctor/monitor", "tests/workflow/doctor/monitor"),
     "export": ("plugins/flangeye_plugins/export", "tests/plugins/export", "tests/cli"),
     "robot": ("plugins/flangeye_plugins/robot", "tests/plugins/robot", "tests/plugins/ros2"),
     "weld": ("plugins/flangeye_plugins/weld", "tests/plugins/weld"),
     "run": (
-        "pipeline/flangeye/run", "tests/run", "tests/plugins/reader/test_cell.py",
-        "tests/cli/test_cell_export.py", "tests/result/test_answers.py",
+        "pipeline/flangeye/workflow/run", "tests/workflow/run", "tests/plugins/reader/test_cell.py",
+        "tests/cli/test_cell_export.py", "tests/workflow/result/test_answers.py",
     ),
 }  # fmt: skip
 """Source, and the folders or files of the tests that have to notice: a room's tests, and those that

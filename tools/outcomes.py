@@ -10,10 +10,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.find import recipe_names
-from flangeye.recipe.load import load_recipe
-from flangeye.run.folder import RunFolder
-from flangeye.run.session import Start, record_run
+from flangeye.workflow.recipe.find import recipe_names
+from flangeye.workflow.recipe.load import load_recipe
+from flangeye.workflow.run.folder import RunFolder
+from flangeye.workflow.run.session import Start, record_run
 
 OUTCOMES = Path(__file__).parents[1] / "recipes" / "configurations" / "outcomes.csv"
 FIELDS = ("recipe", "captures", "used", "held_out_mm", "expected_mm", "true_mm")

@@ -10,10 +10,10 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
 from flangeye.types import Floats
+from flangeye.types.geometry import rigid, rotation_exp
 from flangeye_plugins.weld.touch.pivot import Pivot, pivot
 
 CONE = np.radians(

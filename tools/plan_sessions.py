@@ -22,8 +22,8 @@ from unittest.mock import patch
 
 import numpy as np
 
-from flangeye.batch import cluster
-from flangeye.batch.work import ChunkTold
+from flangeye.workflow.batch import cluster
+from flangeye.workflow.batch.work import ChunkTold
 
 MEASURED = 2000
 """Sessions that do nothing, to measure the scheduler by."""

@@ -39,7 +39,7 @@ def output_of(command: str, picture: Path | None = None) -> str:
 def stamp(quote: str) -> str:
     """Return a hash of all that the picture shows: the run's output, and what draws its report."""
     drawn = ("report.html.j2", "report.css", "report.js", "look.py", "summary.py", "still.py")
-    texts = [(ROOT / "pipeline/flangeye/report" / name).read_text() for name in drawn]
+    texts = [(ROOT / "pipeline/flangeye/workflow/report" / name).read_text() for name in drawn]
     return hashlib.sha256("".join([quote, *texts]).encode()).hexdigest()
 
 

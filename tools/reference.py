@@ -18,8 +18,8 @@ from flangeye.cli import commands
 from flangeye.cli.app import GROUPS
 from flangeye.plugin.registry import load_registry
 from flangeye.plugin.stage import KINDS, PARTS, Plugin
-from flangeye.report.look import DARK, LIGHT, LOGO, MONO, SANS
-from flangeye.result.contract import Result
+from flangeye.workflow.report.look import DARK, LIGHT, LOGO, MONO, SANS
+from flangeye.workflow.result.contract import Result
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:

@@ -8,8 +8,8 @@ import numpy as np
 
 from flangeye.files.recording import OF_A_SIMULATOR
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.load import parse_recipe
 from flangeye.types import CAMERA, Capture, FlangeCloud, PointCloud
+from flangeye.workflow.recipe.load import parse_recipe
 from tools.folder_archive import write_folder
 
 FOLDER = Path(__file__).parents[1] / "data" / "samples" / "ur5_phoxi-m"

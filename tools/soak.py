@@ -10,10 +10,10 @@ from pathlib import Path
 
 import typer
 
-from flangeye.log.read import read_run
-from flangeye.recipe.load import load_recipe
-from flangeye.run.folder import RunFolder
-from flangeye.run.session import Start, record_run
+from flangeye.workflow.log.read import read_run
+from flangeye.workflow.recipe.load import load_recipe
+from flangeye.workflow.run.folder import RunFolder
+from flangeye.workflow.run.session import Start, record_run
 from tests.conftest import TOY_RECIPE, toy_plugins
 
 ALLOWED = 0.05

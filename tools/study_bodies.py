@@ -20,7 +20,6 @@ import numpy as np
 import trimesh
 
 from flangeye.estimation.alike import disambiguated
-from flangeye.maths.geometry import rigid, rotation_exp, rotation_from_rpy, rotation_log
 from flangeye.models.bodies import TargetBody, load_body
 from flangeye.models.cell import cell_of
 from flangeye.models.configuration import ORIGIN, Configuration
@@ -38,6 +37,7 @@ from flangeye.types import (
     Rejected,
     Transform,
 )
+from flangeye.types.geometry import rigid, rotation_exp, rotation_from_rpy, rotation_log
 from flangeye_emulators.world.mesh import (
     MATERIALS,
     Mesh,

@@ -14,10 +14,10 @@ import numpy as np
 from flangeye.estimation.plan import errors_at_work, so_far, work_of_frames
 from flangeye.models.cell import Cell
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.find import recipe_names
-from flangeye.recipe.load import load_recipe
-from flangeye.run.runner import Runner
 from flangeye.types import ArchivePath
+from flangeye.workflow.recipe.find import recipe_names
+from flangeye.workflow.recipe.load import load_recipe
+from flangeye.workflow.run.runner import Runner
 from flangeye_emulators.acquire.planned_cell import CellSessionParams
 
 CELLS = (

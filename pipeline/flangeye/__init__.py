@@ -2,9 +2,9 @@
 
 The names every plugin needs are here. Public are also the rooms ``types``, ``units``, ``devices``,
 ``errors``, ``maths``, ``estimation``, ``models``, ``files``, ``motion``, ``plugin`` and
-``testing``, the modules ``log.read``, ``recipe.header`` and ``result``, and those that hold
-contracts of parts; the rest may change without notice. The last contract in pyproject.toml holds
-plugins to it.
+``testing``, the modules ``workflow.log.read``, ``workflow.recipe.header`` and ``workflow.result``,
+and those that hold contracts of parts; the rest may change without notice. The last contract in
+pyproject.toml holds plugins to it.
 
 A name is imported when it is asked for: a command that answers at once must not wait for what it
 does not use.

@@ -13,10 +13,10 @@ from nicegui import ui
 
 from flangeye.errors import FlangeyeError
 from flangeye.files.regular import read_regular, read_text
-from flangeye.report.look import LIGHT
-from flangeye.report.units import millimetres
-from flangeye.result import status_of
-from flangeye.result.contract import Result
+from flangeye.workflow.report.look import LIGHT
+from flangeye.workflow.report.units import millimetres
+from flangeye.workflow.result import status_of
+from flangeye.workflow.result.contract import Result
 from flangeye_ui.charts import bar_chart
 from flangeye_ui.foreign import address_of
 from flangeye_ui.layout import command_line, mistake, page

@@ -18,7 +18,7 @@ from flangeye.files.yaml_lines import flow, parse_yaml, read_yaml
 from flangeye.models.graph import Running
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import Stage
-from flangeye.recipe.find import find_recipe, recipe_names
+from flangeye.workflow.recipe.find import find_recipe, recipe_names
 from flangeye_ui.layout import ActionBar, command_line, mistake, page, svg
 from flangeye_ui.project import Mistake, Project, at
 from flangeye_ui.scene import drawing_of

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from flangeye.models.workspace import ENOUGH, Coverage
-from flangeye.report.look import LIGHT
+from flangeye.workflow.report.look import LIGHT
 
 
 def residual_chart(

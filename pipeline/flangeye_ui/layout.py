@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from nicegui import ui
 
-from flangeye.report.look import LIGHT, LOGO, css
-from flangeye.result import SIMULATED
+from flangeye.workflow.report.look import LIGHT, LOGO, css
+from flangeye.workflow.result import SIMULATED
 
 if TYPE_CHECKING:
     from flangeye_ui.project import Project

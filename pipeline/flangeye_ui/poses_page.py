@@ -13,8 +13,8 @@ from flangeye.errors import FlangeyeError
 from flangeye.maths.statistics import corners_of
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
-from flangeye.recipe.load import Recipe
-from flangeye.report.still import ready, rods
+from flangeye.workflow.recipe.load import Recipe
+from flangeye.workflow.report.still import ready, rods
 from flangeye_ui.layout import ActionBar, code, command_line, mistake, page, weigh
 from flangeye_ui.project import Project
 from flangeye_ui.scene import Scene3D, base_T_camera_of, box_of

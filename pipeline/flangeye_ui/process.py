@@ -19,15 +19,15 @@ from numpy.typing import NDArray
 
 from flangeye import types as t
 from flangeye.errors import FlangeyeError
-from flangeye.log import foxglove
-from flangeye.log.read import RunLog, logged_image, read_run, take
-from flangeye.log.records import LogMessage
-from flangeye.log.watch import RunView, follow
 from flangeye.plugin.registry import Registry
-from flangeye.recipe.load import Recipe
-from flangeye.run.folder import recipe_of_log
-from flangeye.run.outlook import Outlook, outlook
 from flangeye.types import Floats
+from flangeye.workflow.log import foxglove
+from flangeye.workflow.log.read import RunLog, logged_image, read_run, take
+from flangeye.workflow.log.records import LogMessage
+from flangeye.workflow.log.watch import RunView, follow
+from flangeye.workflow.recipe.load import Recipe
+from flangeye.workflow.run.folder import recipe_of_log
+from flangeye.workflow.run.outlook import Outlook, outlook
 
 
 class RunProcess:

@@ -16,11 +16,11 @@ from typing import Any
 from flangeye.errors import FlangeyeError, RecipeError, StageError
 from flangeye.files.regular import read_regular, read_text, write_whole
 from flangeye.files.yaml_lines import edited, flow, parse_yaml
-from flangeye.log.read import read_run
 from flangeye.plugin.registry import Registry
 from flangeye.plugin.stage import KINDS
-from flangeye.recipe.load import Recipe, load_recipe
-from flangeye.report.facts import Facts, facts_of
+from flangeye.workflow.log.read import read_run
+from flangeye.workflow.recipe.load import Recipe, load_recipe
+from flangeye.workflow.report.facts import Facts, facts_of
 from flangeye_ui.process import RunProcess
 
 

@@ -13,22 +13,22 @@ import numpy as np
 from nicegui import ui
 from pydantic import ValidationError
 
-from flangeye.doctor.diagnosis import Finding, examine
-from flangeye.doctor.opening import open_session
 from flangeye.errors import FlangeyeError, RecipeError
 from flangeye.files.yaml_lines import parse_yaml
 from flangeye.models.robots import RobotModel
-from flangeye.report.cell import found_body
-from flangeye.report.facts import Facts, set_aside_of
-from flangeye.report.look import LIGHT, SERIES
-from flangeye.report.still import scene_of
-from flangeye.report.summary import banner_of, transform_text
-from flangeye.report.units import rounded_mm
-from flangeye.report.weld import weld_drawing
-from flangeye.result.sections import expected_error
-from flangeye.run.outlook import Outlook, outlook_of_log
 from flangeye.types import HandEye
 from flangeye.units import parse_quantity
+from flangeye.workflow.doctor.diagnosis import Finding, examine
+from flangeye.workflow.doctor.opening import open_session
+from flangeye.workflow.report.cell import found_body
+from flangeye.workflow.report.facts import Facts, set_aside_of
+from flangeye.workflow.report.look import LIGHT, SERIES
+from flangeye.workflow.report.still import scene_of
+from flangeye.workflow.report.summary import banner_of, transform_text
+from flangeye.workflow.report.units import rounded_mm
+from flangeye.workflow.report.weld import weld_drawing
+from flangeye.workflow.result.sections import expected_error
+from flangeye.workflow.run.outlook import Outlook, outlook_of_log
 from flangeye_ui.charts import coverage_drawing, residual_chart
 from flangeye_ui.foreign import address_of
 from flangeye_ui.layout import ActionBar, code, command_line, mistake, page, svg, warning

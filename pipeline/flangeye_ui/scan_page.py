@@ -12,7 +12,7 @@ import numpy as np
 from nicegui import Client, ui
 
 from flangeye.errors import StageError
-from flangeye.report.look import LIGHT, SERIES
+from flangeye.workflow.report.look import LIGHT, SERIES
 from flangeye_ui.charts import coverage_drawing, place_chart, residual_chart
 from flangeye_ui.layout import (
     ActionBar,

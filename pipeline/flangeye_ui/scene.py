@@ -16,18 +16,18 @@ from starlette.responses import PlainTextResponse, Response
 
 from flangeye import types as t
 from flangeye.errors import FlangeyeError
-from flangeye.log.read import RunLog
-from flangeye.maths.geometry import basis_of_plane, rigid
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model, model_names
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
 from flangeye.models.urdf import robot_from_urdf
-from flangeye.recipe.load import Recipe
-from flangeye.report.look import LIGHT, SERIES
-from flangeye.report.still import StillScene, frustum, ready, rods, still
-from flangeye.report.units import millimetres
 from flangeye.types import CircleFeature, Feature, Floats
+from flangeye.types.geometry import basis_of_plane, rigid
+from flangeye.workflow.log.read import RunLog
+from flangeye.workflow.recipe.load import Recipe
+from flangeye.workflow.report.look import LIGHT, SERIES
+from flangeye.workflow.report.still import StillScene, frustum, ready, rods, still
+from flangeye.workflow.report.units import millimetres
 from flangeye_ui.project import Project
 
 PUBLISHED = {

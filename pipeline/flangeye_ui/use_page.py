@@ -13,12 +13,12 @@ from flangeye.errors import FlangeyeError
 from flangeye.files.regular import write_whole
 from flangeye.models.configuration import CELL
 from flangeye.plugin.stage import Stage
-from flangeye.report.certificate import render
-from flangeye.report.certificate.budget import Conditions
-from flangeye.report.facts import Facts
-from flangeye.result import calibrated_pose
-from flangeye.result import contract as r
 from flangeye.types import ExportedFile
+from flangeye.workflow.report.certificate import render
+from flangeye.workflow.report.certificate.budget import Conditions
+from flangeye.workflow.report.facts import Facts
+from flangeye.workflow.result import calibrated_pose
+from flangeye.workflow.result import contract as r
 from flangeye_ui.foreign import address_of
 from flangeye_ui.layout import ActionBar, code, command_line, mistake, page
 from flangeye_ui.project import Project

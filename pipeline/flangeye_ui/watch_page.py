@@ -8,10 +8,10 @@ from typing import Any
 
 from nicegui import ui
 
-from flangeye.doctor.monitor.chart import COLOURS, sentence
-from flangeye.doctor.monitor.history import History, history_beside
-from flangeye.doctor.monitor.stored import stored_calibration
 from flangeye.errors import FlangeyeError
+from flangeye.workflow.doctor.monitor.chart import COLOURS, sentence
+from flangeye.workflow.doctor.monitor.history import History, history_beside
+from flangeye.workflow.doctor.monitor.stored import stored_calibration
 from flangeye_ui.archive_page import link
 from flangeye_ui.charts import residual_chart
 from flangeye_ui.layout import ActionBar, command_line, mistake, page

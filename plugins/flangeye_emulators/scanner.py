@@ -11,7 +11,6 @@ from pydantic import Field
 
 from flangeye.devices import PATIENCE, DeviceError, FrameDropped, Scan, Scanner
 from flangeye.errors import FlangeyeError
-from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
 from flangeye.models.robots import RobotModel
@@ -20,6 +19,7 @@ from flangeye.models.targets import plate_of
 from flangeye.models.workpiece import load_workpiece
 from flangeye.plugin.stage import Params, part
 from flangeye.types import BASE, CAMERA, Array, Floats, PointCloud, Transform, Truth
+from flangeye.types.geometry import rigid, rotation_from_rpy
 from flangeye_emulators.controllers.client import EmulatorControl, address_of
 from flangeye_emulators.world import bench
 from flangeye_emulators.world.bench import BenchParams, bench_with

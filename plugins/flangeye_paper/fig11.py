@@ -11,16 +11,7 @@ import numpy as np
 from flangeye.files.arrays import read_npz
 from flangeye.types import Floats
 from flangeye_paper.published import stored_file
-from flangeye_paper.tables import (
-    AXES,
-    Row,
-    columns,
-    dress,
-    legend,
-    read_sessions,
-    sheet,
-    write_csv,
-)
+from flangeye_paper.tables import AXES, Row, columns, dress, legend, read_sessions, sheet, write_csv
 
 ROBOTS = {"aubo": "Aubo i5", "ur5": "UR5", "franka": "Franka"}
 

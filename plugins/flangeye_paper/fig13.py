@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from flangeye import FlangeyeError
-from flangeye.log.read import read_run
-from flangeye.maths.geometry import arc_lengths
 from flangeye.maths.seam_geometry import WeldPlane, torch_deviation
 from flangeye.types import Floats, WeldReport, WorkpieceScan
+from flangeye.types.geometry import arc_lengths
+from flangeye.workflow.log.read import read_run
 from flangeye_paper.tables import Row, SessionRow, dress, legend, read_sessions, sheet, write_csv
 
 WORKPIECES = ("straight", "curved")

@@ -9,9 +9,9 @@ import numpy as np
 from pydantic import Field
 
 from flangeye import BoundPart, Choose, Params, StageError, part, stage
-from flangeye.maths.geometry import rpy_from_rotation
 from flangeye.models.targets import Flange
 from flangeye.types import Floats, HandEye, Observation, PoseError, Transform, Verification, Views
+from flangeye.types.geometry import rpy_from_rotation
 from flangeye.units import param
 from flangeye_paper.open3d_0_7 import IcpFit, IcpStop, Normals, icp
 from flangeye_paper.published import PublishedView

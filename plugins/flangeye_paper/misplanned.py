@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from flangeye import stage
-from flangeye.maths.geometry import arc_lengths, rotation_exp, rows_at
 from flangeye.models.workpiece import load_workpiece
 from flangeye.types import CAMERA, Floats, PointCloud, Seam, Seed, VerifiedHandEye, WorkpieceScan
+from flangeye.types.geometry import arc_lengths, rotation_exp, rows_at
 from flangeye_emulators.world.bench import LaidParams
 
 

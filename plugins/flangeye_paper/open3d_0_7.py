@@ -15,8 +15,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.types import Floats
+from flangeye.types.geometry import rigid, rotation_from_rpy
 
 Normals = Literal["open3d_0_7_normals", "sound"]
 

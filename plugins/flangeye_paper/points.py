@@ -16,8 +16,6 @@ import numpy as np
 from pydantic import Field
 
 from flangeye import Params, stage
-from flangeye.maths.geometry import covariance_at, kabsch_covariance, rigid, rotation_from_rpy
-from flangeye.result import sha256
 from flangeye.types import (
     BASE,
     CAMERA,
@@ -34,7 +32,9 @@ from flangeye.types import (
     Truth,
     by_frame,
 )
+from flangeye.types.geometry import covariance_at, kabsch_covariance, rigid, rotation_from_rpy
 from flangeye.units import Length, param
+from flangeye.workflow.result import sha256
 
 BASE_T_CAMERA = np.array(
     [[0.0, -1.0, 0.0, 0.6], [-1.0, 0.0, 0.0, -0.0125], [0.0, 0.0, -1.0, 1.0], [0.0, 0.0, 0.0, 1.0]]

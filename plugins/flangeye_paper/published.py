@@ -23,7 +23,6 @@ from flangeye import Params, StageError, stage
 from flangeye.files.arrays import read_npz
 from flangeye.files.clouds import PER_METRE, read_cloud
 from flangeye.files.recording import Archive, Recording
-from flangeye.maths.geometry import rigid, rotation_from_rpy, rpy_from_rotation
 from flangeye.types import (
     BASE,
     CAMERA,
@@ -41,6 +40,7 @@ from flangeye.types import (
     VerificationView,
     Views,
 )
+from flangeye.types.geometry import rigid, rotation_from_rpy, rpy_from_rotation
 from flangeye_paper.open3d_0_7 import Normals, normals_of
 from flangeye_plugins.acquire.centres import CentresParams, acquire_centres
 from flangeye_plugins.acquire.opening import archive_path, open_archive

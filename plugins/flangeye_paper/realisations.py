@@ -9,7 +9,6 @@ import numpy as np
 from pydantic import Field
 
 from flangeye import CalibrationRefused, Params, StageError, part, stage
-from flangeye.maths.geometry import kabsch, rigid, rpy_from_rotation
 from flangeye.maths.statistics import rms
 from flangeye.models.targets import Flange
 from flangeye.types import (
@@ -23,6 +22,7 @@ from flangeye.types import (
     Verification,
     Views,
 )
+from flangeye.types.geometry import kabsch, rigid, rpy_from_rotation
 from flangeye_paper.points import (
     BASE_T_CAMERA,
     WORKSPACE,

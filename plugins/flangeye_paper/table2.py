@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flangeye.maths.geometry import rpy_from_rotation
 from flangeye.types import Floats
+from flangeye.types.geometry import rpy_from_rotation
 from flangeye_paper.tables import (
     AXES,
     PRINTED,

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from flangeye import FlangeyeError
-from flangeye.batch.outcome import ACCEPTED
+from flangeye.workflow.batch.outcome import ACCEPTED
 
 Row = Mapping[str, Any]
 

@@ -8,8 +8,8 @@ import numpy as np
 from pydantic import Field
 
 from flangeye import Params, part
-from flangeye.maths.geometry import rotation_log
 from flangeye.types import Floats, PoseError
+from flangeye.types.geometry import rotation_log
 from flangeye.units import Length, param
 
 Place = Literal["work", "camera"]

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from flangeye import StageError, part
-from flangeye.maths.geometry import kabsch, rigid
 from flangeye.models.targets import Flange
 from flangeye.types import Observation, PoseError, Transform, Views
+from flangeye.types.geometry import kabsch, rigid
 from flangeye_plugins.verify.icp import IcpSettings, compare, require_views, shape_of
 
 

@@ -13,16 +13,16 @@ import yaml
 from flangeye.devices import MotionAllowed, Robot, RobotDriver, TactileSensor
 from flangeye.errors import NothingMoved, StageError
 from flangeye.files.regular import write_whole
-from flangeye.maths.geometry import rigid
 from flangeye.models.finger import Calibration, Finger
 from flangeye.models.model import read_model
 from flangeye.models.robots import RobotModel
 from flangeye.motion.executor import Executor, led
 from flangeye.motion.limits import MotionLimits
 from flangeye.plugin.stage import part
-from flangeye.recipe.header import LimitsSection
-from flangeye.recipe.load import Recipe
 from flangeye.types import BASE, FLANGE, Floats, Transform
+from flangeye.types.geometry import rigid
+from flangeye.workflow.recipe.header import LimitsSection
+from flangeye.workflow.recipe.load import Recipe
 from flangeye_plugins.weld.finger_camera import LatestState
 from flangeye_plugins.weld.settings import WeldTactileParams
 from flangeye_plugins.weld.touch.calibration import Held, calibrate

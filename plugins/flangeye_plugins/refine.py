@@ -16,7 +16,6 @@ from flangeye.estimation.effects.arm import known
 from flangeye.estimation.plan import foreseen, foreseen_poses
 from flangeye.estimation.session import Session, session_of
 from flangeye.maths.arm_correction import corrected_view
-from flangeye.maths.geometry import rigid, rotation_log
 from flangeye.maths.kinematics import Arm
 from flangeye.models.cell import cell_of
 from flangeye.models.configuration import DEFAULT, Configuration
@@ -36,6 +35,7 @@ from flangeye.types import (
     TransformEstimate,
     Views,
 )
+from flangeye.types.geometry import rigid, rotation_log
 from flangeye.units import param
 
 

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from flangeye.errors import StageError
-from flangeye.log.read import JournalEntry, read_notes
 from flangeye.models.finger import Finger
 from flangeye.motion.seam_following import Command
 from flangeye.plugin.stage import part
-from flangeye.run.replay import ReplayedStep
+from flangeye.workflow.log.read import JournalEntry, read_notes
+from flangeye.workflow.run.replay import ReplayedStep
 from flangeye_plugins.sensor import piece_of
 from flangeye_plugins.weld.execution import touch_of
 from flangeye_plugins.weld.finger_camera import FingerReader

@@ -12,13 +12,11 @@ from flangeye.devices import KnowsSeams, MotionAllowed, RobotDriver, ScannerDriv
 from flangeye.errors import NothingMoved
 from flangeye.files.clouds import CLOUD_FILES, LengthUnit, read_cloud
 from flangeye.files.scans import natural
-from flangeye.maths.geometry import invert, rigid, rotation_from_rpy
 from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import RobotModel
 from flangeye.motion.executor import Executor, led
 from flangeye.motion.limits import MotionLimits
 from flangeye.motion.route import Barred, Route, Router
-from flangeye.recipe.header import LimitsSection
 from flangeye.types import (
     BASE,
     CAMERA,
@@ -28,7 +26,9 @@ from flangeye.types import (
     VerifiedHandEye,
     WorkpieceScan,
 )
+from flangeye.types.geometry import invert, rigid, rotation_from_rpy
 from flangeye.units import Length, param
+from flangeye.workflow.recipe.header import LimitsSection
 
 
 class FileScanParams(Params):

@@ -18,11 +18,11 @@ from flangeye.files.images import ImageError, decode_image
 from flangeye.files.paths import RecipeFile, RecipePath
 from flangeye.files.regular import MAX_FILE, read_regular
 from flangeye.files.scans import natural
-from flangeye.log.read import read_notes
 from flangeye.models.finger import Finger
 from flangeye.plugin.stage import Params, part
 from flangeye.types import Image, Seed
 from flangeye.units import Duration, param
+from flangeye.workflow.log.read import read_notes
 from flangeye_plugins.weld.touch.tag_observation import ImageRegion, shifted
 
 

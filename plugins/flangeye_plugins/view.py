@@ -8,11 +8,11 @@ import numpy as np
 from pydantic import Field
 
 from flangeye.errors import StageError
-from flangeye.maths.geometry import basis_of_plane, rigid
 from flangeye.maths.kinematics import Arm
 from flangeye.models.scanners import ScannerModel, middle_of_view
 from flangeye.plugin.stage import Params, PlaceParams, part
 from flangeye.types import Floats
+from flangeye.types.geometry import basis_of_plane, rigid
 from flangeye.units import Angle, Length, param
 
 

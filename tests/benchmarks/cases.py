@@ -16,11 +16,11 @@ import numpy as np
 
 from flangeye import types as t
 from flangeye.files.clouds import read_cloud, write_cloud
-from flangeye.maths.geometry import kabsch
 from flangeye.models.configuration import ORIGIN, Configuration
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.find import find_recipe
-from flangeye.recipe.load import Recipe, load_recipe
+from flangeye.types.geometry import kabsch
+from flangeye.workflow.recipe.find import find_recipe
+from flangeye.workflow.recipe.load import Recipe, load_recipe
 from flangeye_plugins.fit.ransac import fit_ransac_circle
 from flangeye_plugins.fit.rim import fit_rim
 from flangeye_plugins.segment.flange import segment_flange
@@ -257,7 +257,7 @@ def read() -> tuple[Work, Work]:
 
 def record() -> tuple[Work, Work]:
     """A full scan into the log beside compressing its bytes."""
-    from flangeye.log.record import Recorder
+    from flangeye.workflow.log.record import Recorder
 
     capture, folder = stages().capture, Path(tempfile.mkdtemp())
     recorder = Recorder(folder / "run.mcap", {}, full_clouds=True)

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from flangeye.maths.geometry import covariance_at, kabsch, rotation_exp, rotation_log
 from flangeye.maths.statistics import chi2_quantile
 from flangeye.models.cell import cell_of
 from flangeye.models.configuration import ORIGIN, Configuration
 from flangeye.models.loading import load_model
 from flangeye.types import CircleFeature, Floats, HandEye, Observation, TransformEstimate
+from flangeye.types.geometry import covariance_at, kabsch, rotation_exp, rotation_log
 from flangeye_emulators.acquire.planned_session import FACING, PlannedSession, plan_session
 from flangeye_emulators.acquire.simulated_session import ScanParams
 from flangeye_emulators.world.raycast import pixels_of

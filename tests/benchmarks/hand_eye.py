@@ -22,8 +22,8 @@ from flangeye.estimation.closed import at_once, separable
 from flangeye.estimation.closed.comanipulation import alternate, random_rotations
 from flangeye.estimation.closed.motions import motions_of
 from flangeye.estimation.sightings import problem_of
-from flangeye.maths.geometry import rotation_log
 from flangeye.models.cell import cell_of
+from flangeye.types.geometry import rotation_log
 from flangeye_plugins.solve.robust import (
     RobustParams,
     solve_robust,

@@ -16,13 +16,13 @@ from pathlib import Path
 
 from rich.console import Console
 
-from flangeye import batch
-from flangeye.batch import Request
-from flangeye.batch.dataset import BLOCK, Dataset, columns_of, row_of
-from flangeye.batch.outcome import SessionOutcome
-from flangeye.batch.plan import plan, software_of
 from flangeye.files.paths import place_at
 from flangeye.plugin.registry import Registry, load_registry
+from flangeye.workflow import batch
+from flangeye.workflow.batch import Request
+from flangeye.workflow.batch.dataset import BLOCK, Dataset, columns_of, row_of
+from flangeye.workflow.batch.outcome import SessionOutcome
+from flangeye.workflow.batch.plan import plan, software_of
 
 OUTCOME = SessionOutcome(
     "verified", None, 75, 76, 1e-4, 9e-5, 2e-4, 1.2e-4, 2.1e-4, 1e-4, 5e-5, 1e-3, 41.7

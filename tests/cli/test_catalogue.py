@@ -11,7 +11,7 @@ from flangeye.cli.app import complete_recipe
 from flangeye.errors import FlangeyeError
 from flangeye.models.loading import load_model, model_names
 from flangeye.plugin.registry import PluginNotFoundError, load_registry
-from flangeye.recipe.load import load_recipe
+from flangeye.workflow.recipe.load import load_recipe
 from tests.conftest import Call
 
 

@@ -10,12 +10,12 @@ import pytest
 from flangeye import StageError
 from flangeye.files.paths import bundled
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.load import load_recipe
-from flangeye.report.certificate import write_certificate
-from flangeye.report.certificate.budget import Conditions, budget_of, shares_of
-from flangeye.result import result_of_camera
-from flangeye.run.folder import RunFolder
-from flangeye.run.session import Start, record_run
+from flangeye.workflow.recipe.load import load_recipe
+from flangeye.workflow.report.certificate import write_certificate
+from flangeye.workflow.report.certificate.budget import Conditions, budget_of, shares_of
+from flangeye.workflow.result import result_of_camera
+from flangeye.workflow.run.folder import RunFolder
+from flangeye.workflow.run.session import Start, record_run
 from tests.conftest import Call
 
 TWO = bundled("recipes") / "configurations" / "two-scanners_marker_most-likely_simulated.yaml"

@@ -14,8 +14,8 @@ from flangeye.cli.console import end_in_words, wrapped, write
 from flangeye.cli.details import print_details
 from flangeye.cli.summary import RunProgress, print_refusal, print_summary
 from flangeye.errors import RecipeError
-from flangeye.result import contract as r
 from flangeye.types import Rejection, Source, Warn
+from flangeye.workflow.result import contract as r
 
 SCALE = {"text": "the target is 1.3 % larger than configured", "fix": "feature.size: 40.52 mm"}
 

@@ -13,7 +13,7 @@ import yaml
 from flangeye import types as t
 from flangeye.cli import touching
 from flangeye.cli.touching import touch_points
-from flangeye.log.read import read_run
+from flangeye.workflow.log.read import read_run
 from flangeye_plugins.verify.touch import TouchParams, verify_touch
 from tests.motion.test_touching import Cell, points
 

@@ -11,9 +11,9 @@ from flangeye.files.paths import bundled
 from flangeye.maths.kinematics import Arm
 from flangeye.models.cell import Cell
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.load import load_recipe
-from flangeye.run.runner import Runner
 from flangeye.types import ArchivePath
+from flangeye.workflow.recipe.load import load_recipe
+from flangeye.workflow.run.runner import Runner
 
 REGISTRY = load_registry()
 

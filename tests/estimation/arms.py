@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flangeye.maths.geometry import invert, rigid, rotation_from_rpy
 from flangeye.maths.kinematics import Arm
 from flangeye.models.configuration import LINK, Configuration
 from flangeye.types import (
@@ -19,6 +18,7 @@ from flangeye.types import (
     Transform,
     by_frame,
 )
+from flangeye.types.geometry import invert, rigid, rotation_from_rpy
 from flangeye_emulators.world.arm import ArmErrors, ImperfectArm
 from tests.estimation.cells import ROBOT, Noise, _feature, answer, errors
 

@@ -6,15 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from flangeye.maths.geometry import (
-    hat,
-    invert,
-    rigid,
-    rotation_exp,
-    rotation_from_quaternion,
-    rotation_from_rpy,
-    rotation_log,
-)
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.streams import joints_at, passed, pose_at, with_joints
 from flangeye.models.cell import Frame, cell_of
@@ -36,6 +27,15 @@ from flangeye.types import (
     Source,
     Transform,
     by_frame,
+)
+from flangeye.types.geometry import (
+    hat,
+    invert,
+    rigid,
+    rotation_exp,
+    rotation_from_quaternion,
+    rotation_from_rpy,
+    rotation_log,
 )
 from flangeye_plugins.solve.robust import RobustParams, solve_cell
 

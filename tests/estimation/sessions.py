@@ -15,11 +15,11 @@ from flangeye.estimation.estimate import Estimate, estimate
 from flangeye.estimation.graph import Carrier, Problem, Sightings
 from flangeye.estimation.session import Asked, effects_of
 from flangeye.estimation.work import work_of
-from flangeye.maths.geometry import hat, kabsch, rigid
 from flangeye.maths.kinematics import Arm
 from flangeye.models.cell import Frame
 from flangeye.models.model import read_model
 from flangeye.models.robots import RobotModel
+from flangeye.types.geometry import hat, kabsch, rigid
 from tests.estimation import foreign
 
 ROBOTS = Path(__file__).parents[2] / "data/robots"

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from flangeye.estimation.lifted import LiftedSightings, Side
-from flangeye.maths.geometry import invert, rigid, rotation_exp, rotation_log
 from flangeye.types import Floats
+from flangeye.types.geometry import invert, rigid, rotation_exp, rotation_log
 
 
 def anywhere(rng: np.random.Generator) -> Floats:

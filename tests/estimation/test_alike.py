@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from flangeye.estimation.alike import ambiguous, disambiguated
-from flangeye.maths.geometry import invert, rigid, rotation_exp
 from flangeye.models.cell import cell_of
 from flangeye.models.configuration import ORIGIN, Configuration
 from flangeye.types import BASE, CAMERA, FLANGE, TARGET, Observation, PoseFeature, Transform
+from flangeye.types.geometry import invert, rigid, rotation_exp
 
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 CAMERA_PLACE = rigid(rotation_exp([2.0, 0.5, -1.0]), np.array([0.6, 0.1, 0.9]))

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from flangeye import CalibrationRefused
-from flangeye.maths.geometry import invert, rigid, rotation_exp
 from flangeye.maths.streams import passed, pose_at, with_joints
 from flangeye.models.cell import Axis, Cell, Frame
 from flangeye.types import CAMERA, TARGET, Motion, Observation, PoseFeature, Transform
+from flangeye.types.geometry import invert, rigid, rotation_exp
 from flangeye_plugins.solve.robust import RobustParams, solve_cell
 from tests.estimation.cells import OF_MOST, moving, squares_at
 

@@ -9,11 +9,11 @@ import pytest
 
 from flangeye import CalibrationRefused
 from flangeye.estimation.calibrate import Options, calibrate
-from flangeye.maths.geometry import invert, rigid, rotation_exp
 from flangeye.maths.kinematics import Arm
 from flangeye.models.cell import Axis, Cell, Frame, chain
 from flangeye.models.loading import load_model
 from flangeye.types import CAMERA, TARGET, HandEye, Observation, PoseFeature, Transform
+from flangeye.types.geometry import invert, rigid, rotation_exp
 from tests.estimation.cells import OF_MOST, squares_at
 
 UR5 = Arm(load_model("robots", "ur5"))

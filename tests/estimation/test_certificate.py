@@ -10,8 +10,8 @@ from flangeye.estimation import certificate, certified
 from flangeye.estimation.certificate import GAP, Certificate, _Dual, certify
 from flangeye.estimation.certified import NOT_CERTIFIED, OPTIMAL
 from flangeye.estimation.lifted import LiftedSightings, squares_of
-from flangeye.maths.geometry import invert
 from flangeye.types import Floats
+from flangeye.types.geometry import invert
 from tests.estimation.cells import CONFIGURATIONS, session, solved
 from tests.estimation.sightings import any_sightings, anywhere, of_three, sighted
 

@@ -14,7 +14,7 @@ from flangeye.estimation.closed.comanipulation import (
     two_steps,
 )
 from flangeye.estimation.closed.motions import motions_of
-from flangeye.maths.geometry import invert, rigid, rotation_exp, rotation_log
+from flangeye.types.geometry import invert, rigid, rotation_exp, rotation_log
 from flangeye_plugins.solve.named import CLOSED_FORMS, ClosedFormParams
 from tests.estimation.arms import REAL, drawn
 from tests.estimation.cells import (

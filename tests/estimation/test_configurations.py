@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.types import TARGET, Observation, PoseFeature
+from flangeye.types.geometry import rigid, rotation_exp
 from tests.estimation.cells import (
     CONFIGURATIONS,
     OF_95_PERCENT,

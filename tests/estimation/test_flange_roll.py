@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from flangeye.estimation.sightings import roll_note, roll_of
-from flangeye.maths.geometry import basis_of_plane, rotation_exp
 from flangeye.types import Floats
+from flangeye.types.geometry import basis_of_plane, rotation_exp
 
 CAMERA = rotation_exp(np.array([2.0, 0.3, -0.4]))
 STILL = np.zeros((3, 3))

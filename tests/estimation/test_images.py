@@ -6,9 +6,9 @@ import pytest
 
 from flangeye import StageError
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.load import load_recipe
-from flangeye.run.runner import Runner
 from flangeye.types import ArchivePath
+from flangeye.workflow.recipe.load import load_recipe
+from flangeye.workflow.run.runner import Runner
 
 HAND = "camera: {position: [60 mm, 0 mm, 40 mm], rpy: [0 deg, 0 deg, 90 deg]}, resolution: 0.5"
 CHARUCO = "fit.charuco: {columns: 7, rows: 5, square: 30 mm, marker: 22 mm}"

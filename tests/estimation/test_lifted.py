@@ -8,8 +8,8 @@ import pytest
 
 from flangeye.estimation.certificate import certify
 from flangeye.estimation.lifted import squares_of
-from flangeye.maths.geometry import invert, rotation_exp
 from flangeye.types import Floats
+from flangeye.types.geometry import invert, rotation_exp
 from tests.estimation.sightings import (
     any_sightings,
     anywhere,

@@ -7,17 +7,10 @@ import numpy as np
 import pytest
 
 from flangeye.files.paths import bundled
-from flangeye.log.read import read_run
-from flangeye.maths.geometry import invert, rigid, rotation_exp
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.streams import joints_at, passed, pose_at, with_joints
 from flangeye.models.cell import Cell
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.load import load_recipe, parse_recipe
-from flangeye.run.folder import RunFolder
-from flangeye.run.runner import Runner
-from flangeye.run.session import Start, record_run
-from flangeye.run.tables import write_tables
 from flangeye.types import (
     CAMERA,
     TARGET,
@@ -28,6 +21,13 @@ from flangeye.types import (
     PoseFeature,
     Transform,
 )
+from flangeye.types.geometry import invert, rigid, rotation_exp
+from flangeye.workflow.log.read import read_run
+from flangeye.workflow.recipe.load import load_recipe, parse_recipe
+from flangeye.workflow.run.folder import RunFolder
+from flangeye.workflow.run.runner import Runner
+from flangeye.workflow.run.session import Start, record_run
+from flangeye.workflow.run.tables import write_tables
 from flangeye_plugins.solve.robust import RobustParams, solve_cell
 from tests.estimation.cells import OF_MOST, ROBOT, squares_at, swinging
 

@@ -25,8 +25,8 @@ from flangeye.estimation.observability import (
     telling,
     weak_moves,
 )
-from flangeye.maths.geometry import kabsch, rigid, rotation_exp
 from flangeye.types import Floats
+from flangeye.types.geometry import kabsch, rigid, rotation_exp
 
 
 def test_centres_that_fit_in_a_mirror_only_are_refused() -> None:

@@ -14,14 +14,14 @@ from flangeye.estimation.plan import (
     so_far,
 )
 from flangeye.files.paths import bundled
-from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.models.cell import Cell
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.load import load_recipe
-from flangeye.run.folder import RunFolder
-from flangeye.run.runner import Runner
-from flangeye.run.session import Start, record_run
 from flangeye.types import ArchivePath, CircleFeature
+from flangeye.types.geometry import rigid, rotation_exp
+from flangeye.workflow.recipe.load import load_recipe
+from flangeye.workflow.run.folder import RunFolder
+from flangeye.workflow.run.runner import Runner
+from flangeye.workflow.run.session import Start, record_run
 
 REGISTRY = load_registry()
 TWO = bundled("recipes") / "configurations" / "two-scanners_marker_most-likely_simulated.yaml"

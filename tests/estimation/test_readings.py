@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from flangeye.estimation.readings import Axes, Pairs, Reading, meant, optical, other_axes
-from flangeye.maths.geometry import invert
 from flangeye.types import Floats
+from flangeye.types.geometry import invert
 from tests.estimation import foreign
 from tests.estimation.sessions import robot
 

@@ -7,7 +7,6 @@ import pytest
 
 from flangeye import CalibrationRefused, StageError
 from flangeye.estimation.calibrate import with_expected_error
-from flangeye.maths.geometry import rigid, rotation_exp, rotation_from_rpy
 from flangeye.models.cell import cell_of
 from flangeye.types import (
     CAMERA,
@@ -17,6 +16,7 @@ from flangeye.types import (
     by_frame,
     warnings_of,
 )
+from flangeye.types.geometry import rigid, rotation_exp, rotation_from_rpy
 from tests.estimation.cells import (
     CONFIGURATIONS,
     ROBOT,

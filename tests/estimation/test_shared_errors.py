@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from flangeye.errors import CalibrationRefused
-from flangeye.maths.geometry import invert, rigid, rotation_exp, rotation_log
 from flangeye.maths.statistics import without_shared
 from flangeye.models.configuration import Configuration
 from flangeye.models.corners import Corners
@@ -27,6 +26,7 @@ from flangeye.types import (
     Transform,
     by_frame,
 )
+from flangeye.types.geometry import invert, rigid, rotation_exp, rotation_log
 from flangeye_plugins.acquire.images import camera_of
 from flangeye_plugins.fit.planar import moved_by_camera, poses_from_pixels
 from flangeye_plugins.verify.holdout import HoldoutParams, verify_holdout

@@ -68,9 +68,9 @@ def _toys():
 @cache
 def sound_log(folder: Path) -> Path:
     """Return a whole log of the toy stages."""
-    from flangeye.recipe.load import load_recipe
-    from flangeye.run.folder import RunFolder
-    from flangeye.run.session import Start, record_run
+    from flangeye.workflow.recipe.load import load_recipe
+    from flangeye.workflow.run.folder import RunFolder
+    from flangeye.workflow.run.session import Start, record_run
     from tests.conftest import TOY_RECIPE
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -82,14 +82,14 @@ def sound_log(folder: Path) -> Path:
 
 
 def _recipes(folder):
-    from flangeye.recipe.find import recipe_names
+    from flangeye.workflow.recipe.find import recipe_names
 
     names = ("ur5_phoxi-m_simulated", "ur5e_phoxi-m_loopback", "aubo-i5_phoxi-s_archive")
     return [recipe_names()[name].read_bytes() for name in names]
 
 
 def _check_recipe(path):
-    from flangeye.recipe.load import load_recipe
+    from flangeye.workflow.recipe.load import load_recipe
 
     load_recipe(path, _registry())
 
@@ -102,8 +102,8 @@ def _overrides(folder):
 
 
 def _check_override(path):
-    from flangeye.recipe.find import find_recipe
-    from flangeye.recipe.load import load_recipe
+    from flangeye.workflow.recipe.find import find_recipe
+    from flangeye.workflow.recipe.load import load_recipe
 
     text = path.read_bytes().decode("utf-8", "replace")
     load_recipe(find_recipe("ur5e_phoxi-m_loopback"), _registry(), [text])
@@ -204,7 +204,7 @@ def _read_log(path):
     from rich.console import Console
 
     from flangeye.cli.details import print_log
-    from flangeye.log.read import read_notes, read_run
+    from flangeye.workflow.log.read import read_notes, read_run
 
     log = read_run(path)
     print_log(Console(file=io.StringIO()), log)
@@ -226,7 +226,7 @@ def _read_rewritten(path):
 
 def _follow(path):
     from flangeye.errors import StageError
-    from flangeye.log.watch import RunView, follow
+    from flangeye.workflow.log.watch import RunView, follow
 
     def wait():
         raise StageError("no more")
@@ -336,7 +336,7 @@ def _read_arrays(path):
 
 def _read_json(path):
     from flangeye.errors import StageError
-    from flangeye.log.read import decode_json
+    from flangeye.workflow.log.read import decode_json
 
     try:
         decode_json(path.read_bytes())
@@ -345,8 +345,8 @@ def _read_json(path):
 
 
 def _histories(folder):
-    from flangeye.doctor.monitor.history import CheckFinding, History, MonitorCheck
     from flangeye.types import BASE, FLANGE, CircleFeature, Observation, Transform, by_frame
+    from flangeye.workflow.doctor.monitor.history import CheckFinding, History, MonitorCheck
 
     def seen(i):
         circle = CircleFeature(
@@ -365,8 +365,8 @@ def _histories(folder):
 
 
 def _read_history(path):
-    from flangeye.doctor.monitor.chart import _axis, sentence
-    from flangeye.doctor.monitor.history import History, as_json
+    from flangeye.workflow.doctor.monitor.chart import _axis, sentence
+    from flangeye.workflow.doctor.monitor.history import History, as_json
 
     history = History.read(path, "a calibration")
     for finding in history.findings:
@@ -530,8 +530,8 @@ def _results(folder):
 
 
 def _read_certified(path):
-    from flangeye.report.certificate import write_certificate
-    from flangeye.report.certificate.budget import Conditions
+    from flangeye.workflow.report.certificate import write_certificate
+    from flangeye.workflow.report.certificate.budget import Conditions
 
     content, source = path.read_bytes(), sound_log(path.parent / "sound")
     changed = rewritten(source, path.with_suffix(".mcap"),
@@ -558,8 +558,8 @@ def _batch_columns():
 
 
 def _read_batch(path):
-    from flangeye.batch.dataset import FOLDER, Dataset
     from flangeye.files.paths import place_at
+    from flangeye.workflow.batch.dataset import FOLDER, Dataset
 
     folder = path.with_suffix("")
     (folder / FOLDER).mkdir(parents=True, exist_ok=True)

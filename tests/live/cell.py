@@ -6,7 +6,7 @@ import sys
 import time
 
 from flangeye.errors import StageError
-from flangeye.log.read import read_run
+from flangeye.workflow.log.read import read_run
 from tests.emulators.controllers.process import Process
 
 START = {"ur5e": "180 -90 90 -90 -90 0 deg", "aubo-i5": "0 0 90 0 90 0 deg"}

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from flangeye.files.clouds import write_cloud
-from flangeye.log.read import read_run
 from flangeye.maths.kinematics import Arm
-from flangeye.maths.pose_formats import CONVENTIONS
 from flangeye.models.loading import load_model
 from flangeye.types import CAMERA, PointCloud
+from flangeye.types.pose_formats import CONVENTIONS
+from flangeye.workflow.log.read import read_run
 from flangeye_emulators.scanner import CellScene, TrueStance
 from flangeye_emulators.world.scanner import CameraPose, scanner_of
 

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from flangeye.maths.geometry import rigid, rotation_from_rpy, rotation_log
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.offset_wrist import Undecomposed
 from flangeye.models.loading import load_model
 from flangeye.models.robots import Joint
+from flangeye.types.geometry import rigid, rotation_from_rpy, rotation_log
 
 ROBOTS = ("ur3e", "ur5", "ur5e", "ur10e", "aubo-i5", "franka-panda")
 ARMS = {name: Arm(load_model("robots", name)) for name in ROBOTS}

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from flangeye import types as t
-from flangeye.log.read import _messages, read_run
-from flangeye.log.record import Recorder
 from flangeye.maths.seam_geometry import distances_to_line, seam_frames, tube_radii, tube_rings
+from flangeye.workflow.log.read import _messages, read_run
+from flangeye.workflow.log.record import Recorder
 
 
 def a_seam():

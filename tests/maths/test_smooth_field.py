@@ -10,8 +10,8 @@ from flangeye.maths.arm_correction import (
     effects,
     field_over,
 )
-from flangeye.maths.geometry import rigid
 from flangeye.types import ArmCorrection
+from flangeye.types.geometry import rigid
 
 RNG = np.random.default_rng(0)
 PLACES = np.array([0.4, -0.5, 0.2]) + RNG.uniform(-0.15, 0.15, (40, 3))

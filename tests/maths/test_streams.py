@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
-from flangeye.maths.geometry import rigid
 from flangeye.maths.streams import joints_at, later, pose_at, with_joints
 from flangeye.models.cell import Axis, Cell
 from flangeye.types import Motion
+from flangeye.types.geometry import rigid
 
 TIMES = np.linspace(-0.2, 0.2, 21)
 POSES = np.array([rigid(np.eye(3), [x, 0.0, 0.0]) for x in TIMES])

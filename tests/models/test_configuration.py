@@ -9,17 +9,11 @@ import pytest
 
 from flangeye import StageError, hookimpl, stage
 from flangeye.errors import RecipeError
-from flangeye.log.read import read_run
-from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.maths.kinematics import Arm
 from flangeye.models.cell import cell_of
 from flangeye.models.configuration import EVERY, Configuration, mapped_and_expected
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.registry import Registry
-from flangeye.recipe.load import parse_recipe
-from flangeye.run.folder import RunFolder
-from flangeye.run.restart import restart_at
-from flangeye.run.session import Start, record_run
 from flangeye.types import (
     BASE,
     BASE2,
@@ -37,6 +31,12 @@ from flangeye.types import (
     Transform,
     by_frame,
 )
+from flangeye.types.geometry import rigid, rotation_exp
+from flangeye.workflow.log.read import read_run
+from flangeye.workflow.recipe.load import parse_recipe
+from flangeye.workflow.run.folder import RunFolder
+from flangeye.workflow.run.restart import restart_at
+from flangeye.workflow.run.session import Start, record_run
 from flangeye_plugins.solve.named import solve_svd
 from tests import toy
 

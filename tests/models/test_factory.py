@@ -12,7 +12,7 @@ from flangeye.models.factory import LINKS, PLACE, as_built
 from flangeye.models.loading import load_model
 from flangeye.motion.clearance import ArmVolume
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.load import load_recipe
+from flangeye.workflow.recipe.load import load_recipe
 
 UR5E = load_model("robots", "ur5e")
 JOINTS = np.radians([[10, -80, 95, -70, -100, 20], [-40, -100, 60, -40, -60, 170]])

@@ -15,14 +15,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flangeye.errors import RecipeError, StageError
-from flangeye.maths.geometry import rotation_from_rpy
 from flangeye.maths.kinematics import Arm
 from flangeye.models.urdf import robot_from_urdf
 from flangeye.models.urdf_meshes import _outermost, capsule_of, fit_capsule, vertices
 from flangeye.motion.clearance import ArmVolume
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.load import describe_recipe, load_recipe
 from flangeye.types import Warn
+from flangeye.types.geometry import rotation_from_rpy
+from flangeye.workflow.recipe.load import describe_recipe, load_recipe
 
 ORIGINS = [  # of a KUKA KR 6 R900 sixx: its maker's table
     ("0 0 0.400", "0 0 -1", 170), ("0.025 0 0", "0 1 0", 120), ("0.455 0 0", "0 1 0", 156),

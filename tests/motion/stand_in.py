@@ -6,8 +6,8 @@ import numpy as np
 
 from flangeye.devices import DeviceError, RobotDriver
 from flangeye.models.loading import load_model
-from flangeye.recipe.header import LimitsSection
 from flangeye.types import BASE, FLANGE, Transform
+from flangeye.workflow.recipe.header import LimitsSection
 from flangeye_emulators.robot import SimulatedRobot, SimulatedRobotParams
 
 MODEL = load_model("robots", "ur5e")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flangeye.errors import StageError
-from flangeye.recipe.header import LimitsSection
+from flangeye.workflow.recipe.header import LimitsSection
 from tests.motion.stand_in import BOX, LIMITS, MODEL
 
 
@@ -90,8 +90,8 @@ LOOPBACK = "ur5e_phoxi-m_loopback"
 def test_limits_are_held_against_what_the_arm_can_do(override: str, said: str) -> None:
     from flangeye.errors import RecipeError
     from flangeye.plugin.registry import load_registry
-    from flangeye.recipe.find import find_recipe
-    from flangeye.recipe.load import load_recipe
+    from flangeye.workflow.recipe.find import find_recipe
+    from flangeye.workflow.recipe.load import load_recipe
 
     with pytest.raises(RecipeError) as error:
         load_recipe(find_recipe(LOOPBACK), load_registry(), [override])

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from flangeye.maths.geometry import angle_between, rotation_from_rpy, rpy_from_rotation
 from flangeye.motion.reach import Site, poses_near, tilted
+from flangeye.types.geometry import angle_between, rotation_from_rpy, rpy_from_rotation
 
 PLACE = np.array([0.5, 0.1, 0.3])
 FACING = rotation_from_rpy(np.pi, 0.0, 0.3)

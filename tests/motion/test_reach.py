@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from flangeye.maths.geometry import invert, rigid, rotation_from_rpy
 from flangeye.maths.kinematics import Arm
 from flangeye.models.bodies import arm_body, load_body
 from flangeye.models.loading import load_model
@@ -16,6 +15,7 @@ from flangeye.models.robots import Volume
 from flangeye.models.urdf import robot_from_urdf
 from flangeye.motion.clearance import ArmVolume
 from flangeye.motion.reach import Margins, Reach, Site, poses_near
+from flangeye.types.geometry import invert, rigid, rotation_from_rpy
 from flangeye.units import SI
 from tests.motion.stand_in import LIMITS, MODEL, turned
 

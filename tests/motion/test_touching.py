@@ -12,11 +12,11 @@ import pytest
 
 from flangeye.devices import DeviceError, RobotDriver
 from flangeye.errors import StageError
-from flangeye.maths.geometry import rigid
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
 from flangeye.motion.limits import MotionLimits
 from flangeye.motion.touching import Toucher
+from flangeye.types.geometry import rigid
 from flangeye_emulators.robot import SimulatedRobot, SimulatedRobotParams
 
 UR5E = load_model("robots", "ur5e")

@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.find import find_recipe
-from flangeye.recipe.load import load_recipe
-from flangeye.run.runner import Runner
 from flangeye.types import ArchivePath
+from flangeye.workflow.recipe.find import find_recipe
+from flangeye.workflow.recipe.load import load_recipe
+from flangeye.workflow.run.runner import Runner
 
 
 @pytest.fixture(scope="session")

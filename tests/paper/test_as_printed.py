@@ -7,11 +7,11 @@ import pytest
 
 from flangeye.devices import RobotDriver
 from flangeye.errors import StageError
-from flangeye.log.record import Recorder
 from flangeye.plugin.registry import load_registry
 from flangeye.plugin.stage import BoundPart
-from flangeye.run.replay import replay_steps
 from flangeye.testing import ControllerConformance
+from flangeye.workflow.log.record import Recorder
+from flangeye.workflow.run.replay import replay_steps
 from flangeye_paper.as_printed import controller_as_printed
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.resuming import task_of

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flangeye.maths.geometry import rigid, rotation_exp
+from flangeye.types.geometry import rigid, rotation_exp
 from flangeye_paper.open3d_0_7 import IcpStop, icp, normals_of
 
 CONVERGED = IcpStop(100, 1e-12)

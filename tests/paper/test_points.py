@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flangeye import StageError
-from flangeye.maths.geometry import kabsch, rigid, rotation_exp
 from flangeye.types import BASE, CAMERA, Transform, Views
+from flangeye.types.geometry import kabsch, rigid, rotation_exp
 from flangeye_paper.points import (
     BASE_T_CAMERA,
     WORKSPACE,

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from flangeye import FlangeyeError
-from flangeye.log.record import Recorder
 from flangeye.types import CAMERA, PointCloud, Seam, WeldReport, WorkpieceScan
+from flangeye.workflow.log.record import Recorder
 from flangeye_paper import fig13
 from flangeye_paper.fig13 import SeenWeld, seen
 from flangeye_paper.misplanned import (

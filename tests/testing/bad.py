@@ -21,7 +21,6 @@ from flangeye.devices import (
     TactileSensor,
     WeldProfile,
 )
-from flangeye.doctor.diagnosis import Finding, RecordedSession
 from flangeye.files.recording import Archive, Recording
 from flangeye.maths.kinematics import Arm
 from flangeye.models.finger import Finger
@@ -30,9 +29,10 @@ from flangeye.models.scanners import ScannerModel
 from flangeye.models.targets import Flange
 from flangeye.motion.reach import Plan, Site
 from flangeye.motion.seam_following import Command, Controller, FollowingTask
-from flangeye.run.replay import ReplayedStep
 from flangeye.testing.solving import reference_solution
 from flangeye.types import FLANGE
+from flangeye.workflow.doctor.diagnosis import Finding, RecordedSession
+from flangeye.workflow.run.replay import ReplayedStep
 from flangeye_emulators.arc import SimulatedArc, SimulatedArcParams
 from flangeye_emulators.robot import SimulatedRobot, SimulatedRobotParams
 from flangeye_plugins.fit.rim import RimParams, fit_rim

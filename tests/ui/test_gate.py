@@ -20,7 +20,7 @@ pytest.importorskip("nicegui", reason="nicegui is not installed")
 
 from flangeye.errors import StageError
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.find import find_recipe
+from flangeye.workflow.recipe.find import find_recipe
 from flangeye_ui.project import MoveCodes, Project
 from tests.ui.conftest import Served, ended, serve
 

@@ -15,7 +15,7 @@ import trimesh
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
 from flangeye.models.robots import RobotModel
-from flangeye.report.still import ready, rods
+from flangeye.workflow.report.still import ready, rods
 from flangeye_ui import scene
 
 

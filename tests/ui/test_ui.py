@@ -34,17 +34,17 @@ from flangeye.errors import StageError
 from flangeye.files.paths import bundled
 from flangeye.maths.pose_corrections import inverted
 from flangeye.plugin.registry import Registry, load_registry
-from flangeye.recipe.find import find_recipe, recipe_names
-from flangeye.report.look import LIGHT, SERIES
+from flangeye.workflow.recipe.find import find_recipe, recipe_names
+from flangeye.workflow.report.look import LIGHT, SERIES
 from flangeye_ui import scan_page, server
 from flangeye_ui.poses_page import plan_in
 from flangeye_ui.process import small, thinned
 from flangeye_ui.project import MoveCodes, Project, _mistake
 from flangeye_ui.scene import base_T_camera_of
 from flangeye_ui.server import require_free
-from tests.doctor.sessions import clean
-from tests.doctor.test_cures import write
 from tests.ui.conftest import Served, ended, serve
+from tests.workflow.doctor.sessions import clean
+from tests.workflow.doctor.test_cures import write
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "how-to" / "page.md"
 PICTURES = DOCUMENT.parents[1] / "images"
@@ -729,8 +729,8 @@ def test_an_image_is_shown_small_in_its_colours() -> None:
 
 
 def test_thinning_a_large_scan_costs_less_than_making_its_message() -> None:
-    from flangeye.log import foxglove
     from flangeye.types import PointCloud
+    from flangeye.workflow.log import foxglove
 
     xyz = np.random.default_rng(0).normal(size=(3_200_000, 3)).astype(np.float32)
     shares = []

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from flangeye.plugin.registry import Registry
-    from flangeye.recipe.load import Recipe
+    from flangeye.workflow.recipe.load import Recipe
 
 GROUPS = {
     "Calibrate": ("init", "check", "run", "ui", "watch"),
@@ -61,7 +61,7 @@ app = typer.Typer(
 
 def complete_recipe(typed: str) -> list[str]:
     """Return the bundled recipes that match a prefix; the shell completes files itself."""
-    from flangeye.recipe.find import recipe_names
+    from flangeye.workflow.recipe.find import recipe_names
 
     return [name for name in recipe_names() if name.startswith(typed)]
 
@@ -112,8 +112,8 @@ def load_plugins() -> Registry:
 
 def read_recipe(name: str, registry: Registry, overrides: Sequence[str] | None = None) -> Recipe:
     """Return a checked recipe by path or name; print its notes."""
-    from flangeye.recipe.find import find_recipe
-    from flangeye.recipe.load import load_recipe
+    from flangeye.workflow.recipe.find import find_recipe
+    from flangeye.workflow.recipe.load import load_recipe
 
     recipe = load_recipe(find_recipe(name), registry, overrides or ())
     say_notes(recipe.notes)

@@ -154,8 +154,8 @@ def check(recipe: RecipeName, overrides: Overrides = None) -> None:
 
     Prints every mistake with its line, or the transforms that will be estimated.
     """
-    from flangeye.recipe.find import find_recipe
-    from flangeye.recipe.load import describe_recipe
+    from flangeye.workflow.recipe.find import find_recipe
+    from flangeye.workflow.recipe.load import describe_recipe
 
     say(describe_recipe(find_recipe(recipe), load_plugins(), overrides or ()))
 
@@ -164,7 +164,7 @@ def check(recipe: RecipeName, overrides: Overrides = None) -> None:
 def recipes() -> None:
     """List the bundled recipes."""
     from flangeye.files.yaml_lines import read_yaml
-    from flangeye.recipe.find import recipe_names
+    from flangeye.workflow.recipe.find import recipe_names
 
     names = recipe_names()
     width = max(map(len, names), default=0)
@@ -211,8 +211,8 @@ def schema(
     import json
 
     from flangeye.files.regular import write_whole
-    from flangeye.recipe.schema import header_line, recipe_schema
-    from flangeye.result.contract import Result
+    from flangeye.workflow.recipe.schema import header_line, recipe_schema
+    from flangeye.workflow.result.contract import Result
 
     document = Result.model_json_schema() if result else recipe_schema(load_plugins())
     text = json.dumps(document, indent=2, ensure_ascii=False)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-    from flangeye.log.read import RunLog
+    from flangeye.workflow.log.read import RunLog
 
 
 def say(text: object, err: bool = False) -> None:
@@ -163,7 +163,7 @@ def require_gathered(log: RunLog) -> None:
 @contextmanager
 def of_foreign(path: Path, what: str) -> Iterator[None]:
     """Report any failure in the context as damage of a log from an unknown source."""
-    from flangeye.log.records import reason_of
+    from flangeye.workflow.log.records import reason_of
 
     try:
         yield

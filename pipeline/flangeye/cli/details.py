@@ -9,9 +9,10 @@ import numpy as np
 
 from flangeye.cli.console import wrapped, write
 from flangeye.files.words import printable
-from flangeye.maths.geometry import rpy_from_rotation
-from flangeye.result import logged_result, status_of
-from flangeye.result.contract import (
+from flangeye.types import records_of
+from flangeye.types.geometry import rpy_from_rotation
+from flangeye.workflow.result import logged_result, status_of
+from flangeye.workflow.result.contract import (
     CorrectionResult,
     HoldoutResult,
     Result,
@@ -19,13 +20,12 @@ from flangeye.result.contract import (
     TruthResult,
     Vector,
 )
-from flangeye.result.sections import expected_error
-from flangeye.types import records_of
+from flangeye.workflow.result.sections import expected_error
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from flangeye.log.read import RunLog
+    from flangeye.workflow.log.read import RunLog
 
 
 def print_details(console: Console, result: Result) -> None:

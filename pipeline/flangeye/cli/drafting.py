@@ -16,8 +16,8 @@ from flangeye.errors import RecipeError
 
 if TYPE_CHECKING:
     from flangeye.plugin.registry import Registry
-    from flangeye.recipe.draft import Draft, Questions
     from flangeye.types import Observation
+    from flangeye.workflow.recipe.draft import Draft, Questions
 
 ANSWERS = {
     "robot": "Robot model, its .urdf or .yaml file, or none.",
@@ -83,8 +83,8 @@ def init(
     Inspects the folder or the running graph and asks for what it does not show.
     """
     from flangeye.files.regular import write_whole
-    from flangeye.recipe.draft import Questions
-    from flangeye.recipe.load import load_recipe
+    from flangeye.workflow.recipe.draft import Questions
+    from flangeye.workflow.recipe.load import load_recipe
 
     if out.exists():
         raise RecipeError(f"{out}: exists already; choose another name with --out")
@@ -115,7 +115,7 @@ def init(
 
 
 def _of_folder(folder: Path, out: Path, questions: Questions, registry: Registry) -> Draft:
-    from flangeye.recipe.draft import draft_recipe, look, mounting_seen
+    from flangeye.workflow.recipe.draft import draft_recipe, look, mounting_seen
 
     survey, given = look(folder), dict(questions.given)
     for line in survey.lines():
@@ -141,9 +141,9 @@ def _seen(
 ) -> list[Observation] | None:
     """Return the first scans that show a drafted recipe's target; None if it does not run."""
     from flangeye.errors import FlangeyeError, NothingSeen
-    from flangeye.recipe.load import parse_recipe
-    from flangeye.run.runner import Runner
     from flangeye.types import ArchivePath
+    from flangeye.workflow.recipe.load import parse_recipe
+    from flangeye.workflow.run.runner import Runner
 
     try:
         # Its paths start at the recipe's folder.
@@ -157,7 +157,7 @@ def _seen(
 
 
 def _of_what_runs(_: Path, out: Path, questions: Questions, registry: Registry) -> Draft:
-    from flangeye.recipe.draft import draft_live
+    from flangeye.workflow.recipe.draft import draft_live
 
     with registry.graph() as graph:
         cell = graph.cell(questions.ask, out.stem)

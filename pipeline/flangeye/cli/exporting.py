@@ -12,10 +12,10 @@ from flangeye.cli.app import LogFile, app, load_plugins
 from flangeye.cli.console import say
 
 if TYPE_CHECKING:
-    from flangeye.log.read import RunLog
     from flangeye.plugin.registry import Registry
     from flangeye.plugin.stage import Stage
     from flangeye.types import CalibratedPose, ExportedFile
+    from flangeye.workflow.log.read import RunLog
 
 
 FORMATS = "'flangeye export --list' names the formats"
@@ -97,7 +97,7 @@ def publish(
 
     The recipe names the frames in its export.ros2_launch step; without one they are ours.
     """
-    from flangeye.run.folder import recipe_of_log
+    from flangeye.workflow.run.folder import recipe_of_log
 
     registry = load_plugins()
     ros2 = "export.ros2_launch"
@@ -115,8 +115,8 @@ def publish(
 
 
 def _write_tables(run: Path, out: Path | None) -> None:
-    from flangeye.log.read import read_run
-    from flangeye.run.tables import write_tables
+    from flangeye.workflow.log.read import read_run
+    from flangeye.workflow.run.tables import write_tables
 
     log = read_run(run)
     *files, recipe = write_tables(log, out or log.path.parent / "tables", load_plugins())
@@ -148,7 +148,7 @@ def _exported(
     run: Path, to: str, values: list[str], anyway: bool, camera: str | None
 ) -> ExportedFile:
     from flangeye.errors import StageError
-    from flangeye.recipe.overrides import params_given
+    from flangeye.workflow.recipe.overrides import params_given
 
     registry = load_plugins()
     name = _format_named(to, registry)
@@ -170,9 +170,9 @@ def _calibrated(
 ) -> tuple[RunLog, CalibratedPose]:
     """Return a run's log and its calibration as a format takes it."""
     from flangeye.errors import StageError
-    from flangeye.log.read import read_run
     from flangeye.models.configuration import CELL
-    from flangeye.result import calibrated_pose, logged_result, require_one
+    from flangeye.workflow.log.read import read_run
+    from flangeye.workflow.result import calibrated_pose, logged_result, require_one
 
     log = read_run(run)
     result = logged_result(log)

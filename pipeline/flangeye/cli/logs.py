@@ -12,8 +12,8 @@ from flangeye.cli.console import at_work, name_damage, of_foreign, require_gathe
 from flangeye.errors import FlangeyeError, RecipeError
 
 if TYPE_CHECKING:
-    from flangeye.log.read import RunLog
-    from flangeye.recipe.load import Recipe
+    from flangeye.workflow.log.read import RunLog
+    from flangeye.workflow.recipe.load import Recipe
 
 
 @app.command()
@@ -43,7 +43,7 @@ def show(
     if replay:
         _replay(log)
         return
-    from flangeye.log.read import read_run
+    from flangeye.workflow.log.read import read_run
 
     read = read_run(log)
     if outlook:
@@ -58,7 +58,7 @@ def show(
 
 
 def _print_outlook(read: RunLog) -> None:
-    from flangeye.run.outlook import outlook_of_log
+    from flangeye.workflow.run.outlook import outlook_of_log
 
     require_gathered(read)
     registry = load_plugins()
@@ -71,7 +71,7 @@ def _print_outlook(read: RunLog) -> None:
 
 
 def _replay(log: Path) -> None:
-    from flangeye.run.replay import replay_steps
+    from flangeye.workflow.run.replay import replay_steps
 
     same = True
     with at_work("repeating"), of_foreign(log, "its decisions cannot be made again"):
@@ -93,8 +93,8 @@ def report(
     ] = None,
 ) -> None:
     """Write the HTML report of a run from its log."""
-    from flangeye.log.read import read_run
-    from flangeye.report import write_report
+    from flangeye.workflow.log.read import read_run
+    from flangeye.workflow.report import write_report
 
     read = read_run(log)
     path = out or read.path.parent / "report.html"
@@ -130,8 +130,8 @@ def certificate(  # noqa: PLR0913  one argument an option
     ] = True,
 ) -> None:
     """Write a certificate after the GUM, to print and sign."""
-    from flangeye.report.certificate import print_pdf, write_certificate
-    from flangeye.report.certificate.budget import Conditions
+    from flangeye.workflow.report.certificate import print_pdf, write_certificate
+    from flangeye.workflow.report.certificate.budget import Conditions
 
     conditions = Conditions(temperature, spread, place, operator)
     with at_work("certificate"):
@@ -151,7 +151,7 @@ def layout(
     """Write a layout for logs in Foxglove or Rerun."""
     from flangeye.errors import StageError
     from flangeye.files.regular import write_whole
-    from flangeye.log.foxglove import foxglove_layout, write_rerun_blueprint
+    from flangeye.workflow.log.foxglove import foxglove_layout, write_rerun_blueprint
 
     if viewer not in ("foxglove", "rerun"):
         raise StageError(f"no layout for '{viewer}'; known: foxglove, rerun")
@@ -184,7 +184,7 @@ def watch(
     """Follow a run live: arm, captures, uncertainty so far."""
     from rich.console import Console
 
-    from flangeye.log.watch import watch_run
+    from flangeye.workflow.log.watch import watch_run
 
     watch_run(run, foxglove, Console(), patience)
 
@@ -208,12 +208,12 @@ def doctor(
     """
     import json
 
-    from flangeye.doctor import as_json, as_text
-    from flangeye.doctor.cells import examine_cell, open_cell
-    from flangeye.doctor.diagnosis import examine
-    from flangeye.doctor.opening import open_session
-    from flangeye.log.read import log_of
-    from flangeye.recipe.find import is_recipe
+    from flangeye.workflow.doctor import as_json, as_text
+    from flangeye.workflow.doctor.cells import examine_cell, open_cell
+    from flangeye.workflow.doctor.diagnosis import examine
+    from flangeye.workflow.doctor.opening import open_session
+    from flangeye.workflow.log.read import log_of
+    from flangeye.workflow.recipe.find import is_recipe
 
     registry = load_plugins()
     if recipe is None and is_recipe(archive) and log_of(archive) == archive:

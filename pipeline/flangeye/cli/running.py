@@ -17,14 +17,14 @@ from flangeye.cli.console import at_work, say
 from flangeye.errors import FlangeyeError, NothingMoved
 
 if TYPE_CHECKING:
-    from flangeye.batch.outcome import Tls
-    from flangeye.doctor.diagnosis import Finding
     from flangeye.plugin.registry import Registry
-    from flangeye.recipe.load import Recipe
-    from flangeye.result.contract import Result
-    from flangeye.run.folder import RunFolder
-    from flangeye.run.restart import FromNothing
-    from flangeye.run.session import Start
+    from flangeye.workflow.batch.outcome import Tls
+    from flangeye.workflow.doctor.diagnosis import Finding
+    from flangeye.workflow.recipe.load import Recipe
+    from flangeye.workflow.result.contract import Result
+    from flangeye.workflow.run.folder import RunFolder
+    from flangeye.workflow.run.restart import FromNothing
+    from flangeye.workflow.run.session import Start
 
 
 RecipeOrNone = Annotated[
@@ -113,9 +113,9 @@ def run(  # noqa: PLR0913  one for each option
     """Run a recipe: a calibration, its log and its report."""
     from flangeye.devices import MotionAllowed
     from flangeye.files.elsewhere import archive_at, results_at
-    from flangeye.run.folder import RunFolder
-    from flangeye.run.session import Start
     from flangeye.types import ArchivePath
+    from flangeye.workflow.run.folder import RunFolder
+    from flangeye.workflow.run.session import Start
 
     _refuse(move and offline, "--move and --offline: an arm that is not asked cannot be moved")
     _refuse(move and json_, "--move and --json: only the plan is printed as JSON")
@@ -166,8 +166,8 @@ def _explain_refusal(
     from rich.console import Console
 
     from flangeye.cli.summary import print_refusal
-    from flangeye.doctor import mended_together
     from flangeye.files.elsewhere import with_urls
+    from flangeye.workflow.doctor import mended_together
 
     wrong = str(result.refused)
     after = _after_verification(recipe)
@@ -200,9 +200,9 @@ def _after_verification(recipe: Recipe) -> list[str]:
 def _findings(log: Path, registry: Registry, recipe: Recipe) -> Sequence[Finding]:
     """Return the mistakes that the doctor finds in a run, the one that explains most first."""
     from flangeye.cli.console import of_foreign
-    from flangeye.doctor.cells import examine_cell, open_cell
-    from flangeye.doctor.diagnosis import examine
-    from flangeye.doctor.opening import open_session
+    from flangeye.workflow.doctor.cells import examine_cell, open_cell
+    from flangeye.workflow.doctor.diagnosis import examine
+    from flangeye.workflow.doctor.opening import open_session
 
     checks = [registry.part(name) for name in registry.parts if name.startswith("check.")]
     try:
@@ -227,7 +227,7 @@ def _recipe_of(
 ) -> tuple[Recipe, FromNothing | None]:
     """Return the checked recipe, by name or from the run to resume, and that run."""
     from flangeye.errors import StageError
-    from flangeye.run.restart import earlier_run
+    from flangeye.workflow.run.restart import earlier_run
 
     resume, retake = going_on
     if (name is None) == (resume is None):
@@ -243,8 +243,8 @@ def _point(
     recipe: Recipe, source: Path | None, at: str | None, leave_out: Sequence[str]
 ) -> FromNothing:
     from flangeye.errors import StageError
-    from flangeye.log.read import read_run
-    from flangeye.run.restart import FromNothing, restart_at
+    from flangeye.workflow.log.read import read_run
+    from flangeye.workflow.run.restart import FromNothing, restart_at
 
     if (source is None) != (at is None):
         raise StageError("--from and --at go together: --from run.mcap --at solve.svd")
@@ -267,7 +267,7 @@ def _record(
     from flangeye.cli.summary import RunProgress, print_summary
     from flangeye.errors import StageError
     from flangeye.files.elsewhere import with_urls
-    from flangeye.run.session import record_run
+    from flangeye.workflow.run.session import record_run
 
     try:
         labels = [step.label for step in recipe.steps]
@@ -289,7 +289,7 @@ def _record(
 def _say_how_to_go_on(recipe: Recipe, called: str, folder: RunFolder, start: Start) -> None:
     """Print where the captures of a failed run are, and the commands that use them."""
     from flangeye.files.elsewhere import with_urls
-    from flangeye.run.restart import restart_hint, resumable
+    from flangeye.workflow.run.restart import restart_hint, resumable
 
     seen = f"flangeye report {quote(str(folder.path))} shows it"
     lines = [
@@ -310,8 +310,8 @@ def _name_mistake(
     from rich.console import Console
 
     from flangeye.cli.summary import print_refusal
-    from flangeye.doctor import mended_together
     from flangeye.files.elsewhere import with_urls
+    from flangeye.workflow.doctor import mended_together
 
     if (read := start.archive.path or recipe.archive) is None:
         return
@@ -323,7 +323,7 @@ def _name_mistake(
 
 
 def _tls(ca: Path | None, cert: Path | None, key: Path | None) -> Tls | None:
-    from flangeye.batch.outcome import BatchError, Tls
+    from flangeye.workflow.batch.outcome import BatchError, Tls
 
     if ca is None and cert is None and key is None:
         return None
@@ -372,7 +372,7 @@ def batch(  # noqa: PLR0913  one argument an option
     """
     from rich.console import Console
 
-    from flangeye.batch import Request, run_batch, summary_text
+    from flangeye.workflow.batch import Request, run_batch, summary_text
 
     request = Request(
         recipe, tuple(archives or ()), tuple(overrides or ()), tuple(grid or ()), repeat, vary,
@@ -407,8 +407,8 @@ def regress(
     """
     from rich.console import Console
 
-    from flangeye.batch.regress import compare, read_manifests
     from flangeye.files.paths import bundled
+    from flangeye.workflow.batch.regress import compare, read_manifests
 
     manifests = read_manifests(folder or bundled("data") / "manifests")
     comparisons = compare(manifests, out, workers, load_plugins(), Console(stderr=True))

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 from flangeye.cli.console import width, wrapped, write
 from flangeye.plugin.hookspecs import hookimpl
-from flangeye.report.units import rounded_mm
-from flangeye.result import status_of
-from flangeye.result.contract import Result
-from flangeye.result.sections import expected_error
 from flangeye.types import Rejection, Source, warnings_of
+from flangeye.workflow.report.units import rounded_mm
+from flangeye.workflow.result import status_of
+from flangeye.workflow.result.contract import Result
+from flangeye.workflow.result.sections import expected_error
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -11,16 +11,16 @@ from flangeye.devices import RobotDriver
 from flangeye.errors import StageError
 from flangeye.files.regular import write_whole
 from flangeye.files.yaml_lines import dumped
-from flangeye.log.read import read_run
-from flangeye.maths.geometry import rpy_from_rotation
 from flangeye.models.robots import RobotModel
 from flangeye.motion.touching import Touched, Toucher
 from flangeye.plugin.registry import Registry
-from flangeye.recipe.header import LimitsSection
-from flangeye.recipe.load import Recipe
-from flangeye.run.folder import recipe_of_log
 from flangeye.types import Floats, FrameMismatchError
+from flangeye.types.geometry import rpy_from_rotation
 from flangeye.units import parse_quantity
+from flangeye.workflow.log.read import read_run
+from flangeye.workflow.recipe.header import LimitsSection
+from flangeye.workflow.recipe.load import Recipe
+from flangeye.workflow.run.folder import recipe_of_log
 
 
 def touch_points(  # noqa: PLR0913  one for each option

@@ -13,10 +13,10 @@ from flangeye.cli.app import Overrides, app, load_plugins
 from flangeye.cli.console import say
 
 if TYPE_CHECKING:
-    from flangeye.doctor.monitor.history import MonitorCheck
-    from flangeye.doctor.monitor.stored import StoredCalibration
     from flangeye.estimation.watch.drift import DriftTest
     from flangeye.plugin.registry import Registry
+    from flangeye.workflow.doctor.monitor.history import MonitorCheck
+    from flangeye.workflow.doctor.monitor.stored import StoredCalibration
 
 Later = Annotated[
     list[Path] | None,
@@ -76,11 +76,11 @@ def monitor(  # noqa: PLR0913  one argument an option
     by the last check: 0 OK, 1 DEGRADED, 2 MOVED or nothing could be checked: a script that stops
     the cell on 2 is safe either way.
     """
-    from flangeye.doctor.monitor.chart import write_chart
-    from flangeye.doctor.monitor.history import History, as_json, history_beside, only_user
-    from flangeye.doctor.monitor.stored import stored_calibration
-    from flangeye.doctor.monitor.watchman import CODES, take, write_state
     from flangeye.errors import StageError
+    from flangeye.workflow.doctor.monitor.chart import write_chart
+    from flangeye.workflow.doctor.monitor.history import History, as_json, history_beside, only_user
+    from flangeye.workflow.doctor.monitor.stored import stored_calibration
+    from flangeye.workflow.doctor.monitor.watchman import CODES, take, write_state
 
     archive = [*(archive or ()), *(more or ())]
     if live == bool(archive):
@@ -121,7 +121,7 @@ def _checks(
     live: tuple[int, bool],
     overrides: Sequence[str],
 ) -> Iterator[MonitorCheck]:
-    from flangeye.doctor.monitor import from_archive, from_arm
+    from flangeye.workflow.doctor.monitor import from_archive, from_arm
 
     for path in archives:
         yield from_archive(path, stored, registry, overrides)
@@ -130,8 +130,8 @@ def _checks(
 
 
 def _opcua_node(opcua: str, security: str | None) -> tuple[str, str]:
-    from flangeye.doctor.monitor.watchman import require_secured
     from flangeye.errors import StageError
+    from flangeye.workflow.doctor.monitor.watchman import require_secured
 
     url, comma, node = opcua.partition(",")
     if not comma:

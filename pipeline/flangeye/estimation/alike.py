@@ -14,9 +14,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from flangeye.maths.geometry import hat, invert, rotation_log
 from flangeye.models.cell import Cell
 from flangeye.types import Floats, Indices, Observation, PoseFeature, Rejected, Transform
+from flangeye.types.geometry import hat, invert, rotation_log
 
 Poses = Sequence[Observation]
 """One capture, once for each pose that explains its scan; the features are ``PoseFeature``."""

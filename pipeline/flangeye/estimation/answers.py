@@ -26,9 +26,9 @@ from flangeye.estimation.estimate import Estimate, model_at
 from flangeye.estimation.graph import Linear, Problem
 from flangeye.estimation.mixed import shares, spread_of
 from flangeye.estimation.work import Work
-from flangeye.maths.geometry import hat, invert
 from flangeye.models.cell import chain, composed
 from flangeye.types import ExpectedError, Floats
+from flangeye.types.geometry import hat, invert
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,7 +31,6 @@ from flangeye.estimation.session import Asked, Session, session_of
 from flangeye.estimation.sightings import roll_note
 from flangeye.estimation.threads import on_one_thread
 from flangeye.estimation.work import Work, work_of
-from flangeye.maths.geometry import adjoint_shift
 from flangeye.models.cell import Cell
 from flangeye.models.configuration import mapped_and_expected
 from flangeye.models.scanners import ScannerModel
@@ -52,6 +51,7 @@ from flangeye.types import (
     TransformEstimate,
     warnings_of,
 )
+from flangeye.types.geometry import adjoint_shift
 
 
 @dataclass(frozen=True)

@@ -30,8 +30,8 @@ from typing import NamedTuple
 import numpy as np
 
 from flangeye.estimation.lifted import Family, LiftedSightings, Squares, squares_of
-from flangeye.maths.geometry import nearest_rotation, rotation_exp
 from flangeye.types import Floats, Indices
+from flangeye.types.geometry import nearest_rotation, rotation_exp
 
 GAP = 1e-3
 """Share of the cost that may be missing."""

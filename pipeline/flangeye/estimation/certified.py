@@ -17,9 +17,9 @@ import numpy as np
 from flangeye.estimation.certificate import Certificate, certify
 from flangeye.estimation.estimate import Estimate
 from flangeye.estimation.lifted import LiftedSightings, Side, families_of
-from flangeye.maths.geometry import invert, rotation_exp, rotation_log
 from flangeye.models.cell import Frame, chain
 from flangeye.types import Floats, Indices
+from flangeye.types.geometry import invert, rotation_exp, rotation_log
 
 OPTIMAL = "globally optimal: nowhere is there an answer that fits the agreeing poses better"
 NOT_CERTIFIED = "not certified as globally optimal"

@@ -11,8 +11,8 @@ from flangeye.estimation.estimate import Estimate
 from flangeye.estimation.graph import Carrier
 from flangeye.maths.arm_correction import effects as field_effects
 from flangeye.maths.arm_correction import field_over
-from flangeye.maths.geometry import levers
 from flangeye.types import ArmCorrection, Floats
+from flangeye.types.geometry import levers
 
 CORRECTED = frozenset({"zeros", "lengths", "twists", "field"})
 """Kinds of errors that a correction has numbers for. Of encoders and sag its field takes what is

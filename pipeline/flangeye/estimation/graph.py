@@ -19,10 +19,10 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from flangeye.maths.geometry import hat, invert, rotation_between, rotation_exp, rotation_log
 from flangeye.maths.kinematics import Arm
 from flangeye.models.cell import Frame, chain, composed
 from flangeye.types import Floats, Indices, Mask
+from flangeye.types.geometry import hat, invert, rotation_between, rotation_exp, rotation_log
 
 Places = Mapping[str, Floats]
 """(4, 4) parent_T_frame of each unknown frame."""

@@ -20,8 +20,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flangeye.maths.geometry import hat, nearest_rotation, rigid, rotation_exp
 from flangeye.types import Floats, Indices, Mask
+from flangeye.types.geometry import hat, nearest_rotation, rigid, rotation_exp
 
 OBSERVABLE = 1e-7
 """Smallest singular value of an observable move, as a share of the largest: a circle's turn about

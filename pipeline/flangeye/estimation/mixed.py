@@ -26,9 +26,9 @@ import numpy as np
 from scipy.linalg import cho_solve, cholesky
 from scipy.linalg.lapack import dpotri
 
-from flangeye.maths.geometry import stack_rows
 from flangeye.maths.statistics import spread_evenly
 from flangeye.types import Floats, Indices
+from flangeye.types.geometry import stack_rows
 
 TELLING = 150
 """Sightings that sizes are found from: more change them by less than their priors' spread."""

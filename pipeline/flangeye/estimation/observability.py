@@ -14,10 +14,10 @@ import numpy as np
 
 from flangeye.errors import CalibrationRefused, StageError
 from flangeye.estimation.graph import Places, Problem
-from flangeye.maths.geometry import invert, kabsch, levers, rotation_exp, rotation_log, stack_rows
 from flangeye.maths.statistics import chi2_quantile
 from flangeye.models.cell import chain
 from flangeye.types import CAMERA, TARGET, Floats
+from flangeye.types.geometry import invert, kabsch, levers, rotation_exp, rotation_log, stack_rows
 
 FINEST_NOISE = 1e-5
 """No scanner and arm together do better than 10 um; keeps exact inputs from seeming observable."""

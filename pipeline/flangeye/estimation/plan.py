@@ -27,7 +27,6 @@ from flangeye.estimation.session import Asked, effects_of
 from flangeye.estimation.sightings import problem_of
 from flangeye.estimation.start import agreeing, begin
 from flangeye.estimation.threads import on_one_thread
-from flangeye.maths.geometry import hat, invert, stack_rows
 from flangeye.maths.statistics import largest_error_quantile
 from flangeye.models.cell import Cell, composed
 from flangeye.types import (
@@ -41,6 +40,7 @@ from flangeye.types import (
     PoseFeature,
     Transform,
 )
+from flangeye.types.geometry import hat, invert, stack_rows
 
 
 @dataclass(frozen=True, eq=False)

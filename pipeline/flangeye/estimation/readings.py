@@ -22,7 +22,6 @@ import numpy as np
 from flangeye.errors import CalibrationRefused, StageError
 from flangeye.estimation.estimate import Estimate
 from flangeye.estimation.session import session_of
-from flangeye.maths.geometry import invert
 from flangeye.models.cell import cell_of
 from flangeye.models.configuration import Configuration
 from flangeye.models.robots import RobotModel
@@ -37,6 +36,7 @@ from flangeye.types import (
     PoseFeature,
     Transform,
 )
+from flangeye.types.geometry import invert
 
 Axes = Literal["opengl", "ros"]
 """A camera's frame with y up and z backward, or with x forward, y left and z up (REP 103)."""

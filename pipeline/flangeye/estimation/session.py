@@ -27,11 +27,11 @@ from flangeye.estimation.observability import (
 from flangeye.estimation.sightings import branches_of, problem_of
 from flangeye.estimation.start import agreeing, begin, distances, size_of
 from flangeye.maths.arm_correction import reached_from
-from flangeye.maths.geometry import rigid
 from flangeye.maths.statistics import MISFIT, chi2_quantile
 from flangeye.models.cell import Cell
 from flangeye.models.scanners import ScannerModel
 from flangeye.types import Floats, Indices, Mask, Note, Observation, PoseFeature, Warn
+from flangeye.types.geometry import rigid
 
 CONFIGURED = (
     "that the recipe's configuration is the cell's (place: unknown, where nobody has measured "

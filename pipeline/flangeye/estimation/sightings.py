@@ -9,13 +9,13 @@ import numpy as np
 from flangeye.errors import StageError
 from flangeye.estimation.graph import Carrier, Problem, Sightings
 from flangeye.maths.arm_correction import reached_from
-from flangeye.maths.geometry import basis_of_plane, hat
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.statistics import SIGMA_OF_MAD
 from flangeye.maths.streams import rates_of
 from flangeye.models.cell import Axis, Cell, Frame, chain
 from flangeye.models.robots import RobotModel
 from flangeye.types import Feature, Floats, Motion, Observation, PoseFeature
+from flangeye.types.geometry import basis_of_plane, hat
 
 REACHED = 5e-3
 """Further from the controller's poses than this [m], the catalogue's arm is another one."""

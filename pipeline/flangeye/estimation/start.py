@@ -22,7 +22,9 @@ from flangeye.estimation.closed.comanipulation import best_rotations, with_trans
 from flangeye.estimation.closed.motions import motions_of, place_of
 from flangeye.estimation.closed.separable import park_martin
 from flangeye.estimation.graph import Places, Problem, Sightings
-from flangeye.maths.geometry import (
+from flangeye.models.cell import chain
+from flangeye.types import Floats, Indices, Mask
+from flangeye.types.geometry import (
     basis_of_plane,
     each_applied,
     invert,
@@ -32,8 +34,6 @@ from flangeye.maths.geometry import (
     rotation_exp,
     stack_rows,
 )
-from flangeye.models.cell import chain
-from flangeye.types import Floats, Indices, Mask
 
 SETS = 80
 """Small sets drawn: with 40 % of the sightings wrong, four are all right once in eight draws."""

@@ -9,10 +9,10 @@ import numpy as np
 from flangeye.estimation.effects.arm import joints_known, known
 from flangeye.estimation.graph import Carrier, Places, Problem, Sightings
 from flangeye.maths.arm_correction import reached_from
-from flangeye.maths.geometry import invert
 from flangeye.maths.statistics import spread_evenly
 from flangeye.models.cell import composed
 from flangeye.types import Box, Floats, Mask
+from flangeye.types.geometry import invert
 
 COUNT = 256
 """New poses: twice as many change the answer by less than a tenth of what is stated."""

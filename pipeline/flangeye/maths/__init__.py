@@ -1,1 +1,1 @@
-"""Geometry, kinematics and statistics that any room may use. Arrays only."""
+"""Kinematics, statistics and fits that any room above may use. Arrays only."""

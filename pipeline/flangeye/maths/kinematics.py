@@ -14,7 +14,6 @@ from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
 
-from flangeye.maths.geometry import basis_of_plane, rigid, rotation_from_rpy
 from flangeye.maths.offset_wrist import (
     ClosedForm,
     OffsetWrist,
@@ -23,6 +22,7 @@ from flangeye.maths.offset_wrist import (
     offset_wrist,
 )
 from flangeye.types import Floats
+from flangeye.types.geometry import basis_of_plane, rigid, rotation_from_rpy
 
 
 class JointAxis(Protocol):

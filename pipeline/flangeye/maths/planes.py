@@ -12,9 +12,9 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from flangeye.maths.geometry import basis_of_plane
 from flangeye.maths.statistics import SIGMA_OF_MAD, median
 from flangeye.types import Floats, Indices, Mask, Singles
+from flangeye.types.geometry import basis_of_plane
 
 T = TypeVar("T", bound=np.generic)
 

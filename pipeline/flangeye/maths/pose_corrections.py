@@ -11,8 +11,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from flangeye.maths.geometry import rows_at
 from flangeye.types import Floats, Mask
+from flangeye.types.geometry import rows_at
 
 
 def scaled(poses: Floats, factor: float | Floats) -> Floats:

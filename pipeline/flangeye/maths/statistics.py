@@ -9,8 +9,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flangeye.maths.geometry import levers, rotation_exp
 from flangeye.types import Feature, Floats, Observation, PoseFeature, Transform
+from flangeye.types.geometry import levers, rotation_exp
 
 T = TypeVar("T", bound=np.floating)
 

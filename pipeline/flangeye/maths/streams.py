@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flangeye.maths.geometry import nearest_rotation, rigid, rotation_log, rows_at
 from flangeye.types import Floats, Motion
+from flangeye.types.geometry import nearest_rotation, rigid, rotation_log, rows_at
 
 STILL_DISTANCE = 0.5e-3
 STILL_ANGLE = np.radians(0.1)

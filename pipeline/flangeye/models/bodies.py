@@ -15,12 +15,12 @@ from flangeye.errors import RecipeError, StageError
 from flangeye.files.clouds import PER_METRE, LengthUnit
 from flangeye.files.paths import bundled
 from flangeye.files.words import nearest
-from flangeye.maths.geometry import each_applied, invert
 from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import RobotModel
 from flangeye.models.urdf_meshes import fit_capsule
 from flangeye.models.workpiece import MESHES, STEP_SUFFIXES, read_mesh
 from flangeye.types import Floats, Indices
+from flangeye.types.geometry import each_applied, invert
 
 SMALLEST, LARGEST = 0.02, 3.0
 """Diagonal of a body that an arm carries and a scanner sees [m]; of the robot's base at most."""

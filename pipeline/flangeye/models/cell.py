@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from flangeye.errors import StageError
-from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.models.configuration import DEFAULT, LINK, Configuration, Ends
 from flangeye.models.robots import RobotModel, SecondRobot
 from flangeye.types import (
@@ -35,6 +34,7 @@ from flangeye.types import (
     Poses,
     Transform,
 )
+from flangeye.types.geometry import rigid, rotation_exp
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,17 +19,8 @@ from functools import cached_property
 
 import numpy as np
 
-from flangeye.maths.geometry import each_applied, rigid, rotation_from_rpy
-from flangeye.types import (
-    BASE,
-    BASE2,
-    CAMERA,
-    FLANGE,
-    FLANGE2,
-    TARGET,
-    Floats,
-    Observation,
-)
+from flangeye.types import BASE, BASE2, CAMERA, FLANGE, FLANGE2, TARGET, Floats, Observation
+from flangeye.types.geometry import each_applied, rigid, rotation_from_rpy
 
 LINK = "link"
 

@@ -18,8 +18,8 @@ from flangeye.errors import RecipeError
 from flangeye.files.regular import read_text
 from flangeye.files.words import reason_of
 from flangeye.files.yaml_lines import MAX_BYTES, read_yaml
-from flangeye.maths.geometry import rotation_from_rpy
 from flangeye.models.robots import Joint, RobotModel, Volume
+from flangeye.types.geometry import rotation_from_rpy
 
 LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 PLACE = ("x", "y", "z", "roll", "pitch", "yaw")

@@ -12,9 +12,9 @@ import numpy as np
 from pydantic import Field, PrivateAttr, field_validator
 
 from flangeye.errors import RecipeError, StageError
-from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.models.model import Model
 from flangeye.types import Floats, Note
+from flangeye.types.geometry import rigid, rotation_from_rpy
 from flangeye.units import SI, Angle, AngularSpeed, JointPosition, Length, param
 
 UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")

@@ -15,16 +15,16 @@ from pydantic import ValidationError
 from flangeye.errors import RecipeError
 from flangeye.files.regular import read_text
 from flangeye.files.words import nearest, require_name
-from flangeye.maths.geometry import (
+from flangeye.models.robots import FlangeDetails, Joint, Placement, RobotModel, Volume
+from flangeye.models.urdf_meshes import capsule_of, mesh_of, numbers_of, require_metres
+from flangeye.types import Floats, Note, Warn
+from flangeye.types.geometry import (
     basis_of_plane,
     invert,
     rigid,
     rotation_from_rpy,
     rpy_from_rotation,
 )
-from flangeye.models.robots import FlangeDetails, Joint, Placement, RobotModel, Volume
-from flangeye.models.urdf_meshes import capsule_of, mesh_of, numbers_of, require_metres
-from flangeye.types import Floats, Note, Warn
 from flangeye.units import SI
 
 MAX_BYTES = 10_000_000

@@ -15,8 +15,8 @@ import numpy as np
 from flangeye.errors import RecipeError
 from flangeye.files.regular import read_regular
 from flangeye.files.words import reason_of
-from flangeye.maths.geometry import basis_of_plane
 from flangeye.types import Floats
+from flangeye.types.geometry import basis_of_plane
 
 
 class MissingMesh(RecipeError):

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flangeye import types as t
-from flangeye.maths.geometry import nearest_rotation, rotation_log
 from flangeye.types import Box, Floats
+from flangeye.types.geometry import nearest_rotation, rotation_log
 
 ENOUGH = np.radians(5.0)
 """A turn by less does not count as one."""

@@ -6,11 +6,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flangeye.maths.geometry import each_applied, invert
 from flangeye.maths.kinematics import Arm
 from flangeye.models.bodies import ArmBody, TargetBody
 from flangeye.models.robots import RobotModel
 from flangeye.types import Floats, Indices, Mask
+from flangeye.types.geometry import each_applied, invert
 
 
 class ArmVolume:

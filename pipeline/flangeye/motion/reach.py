@@ -11,7 +11,6 @@ import numpy as np
 
 from flangeye.devices import DeviceError, RobotDriver, RobotState
 from flangeye.errors import FlangeyeError
-from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.maths.kinematics import Arm
 from flangeye.models.bodies import TargetBody, carrying
 from flangeye.models.robots import RobotModel
@@ -19,6 +18,7 @@ from flangeye.models.scanners import ScannerModel, middle_of_view
 from flangeye.motion.clearance import ArmVolume, BodyView
 from flangeye.motion.limits import MotionLimits
 from flangeye.types import Floats, Mask
+from flangeye.types.geometry import rigid, rotation_from_rpy
 
 
 class Margins(NamedTuple):

@@ -9,7 +9,6 @@ import numpy as np
 
 from flangeye.devices import DeviceError, RobotDriver
 from flangeye.errors import StageError
-from flangeye.maths.geometry import rigid
 from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import RobotModel
 from flangeye.motion.arm import watched
@@ -17,6 +16,7 @@ from flangeye.motion.limits import MotionLimits
 from flangeye.motion.reach import read_state
 from flangeye.motion.route import Barred, Route, Router
 from flangeye.types import Floats
+from flangeye.types.geometry import rigid
 
 SHORT = 0.005
 """It stops this far before the point [m]: a wrong matrix must not drive it into the work."""

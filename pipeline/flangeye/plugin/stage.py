@@ -19,20 +19,14 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    GetCoreSchemaHandler,
-    ValidationError,
-    ValidationInfo,
-)
+from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationError, ValidationInfo
 from pydantic_core import InitErrorDetails, PydanticCustomError, core_schema
 
 from flangeye import types as t
 from flangeye.files.validation import EXPLAINED, sentence
-from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.models.configuration import CELL, EVERY
 from flangeye.models.robots import RobotModel
+from flangeye.types.geometry import rigid, rotation_from_rpy
 from flangeye.units import Angle, Length, param
 
 
@@ -159,10 +153,11 @@ PARTS: Mapping[str, PartKind] = {
         "a scanner that acquire.live can trigger", "flangeye.models.contracts:ScannerPart"
     ),
     "replay": PartKind(
-        "repeats a step's decisions from its log, and compares", "flangeye.run.replay:Repeat"
+        "repeats a step's decisions from its log, and compares",
+        "flangeye.workflow.run.replay:Repeat",
     ),
     "guide": PartKind(
-        "a guided procedure with the devices of a recipe", "flangeye.recipe.load:Guide"
+        "a guided procedure with the devices of a recipe", "flangeye.workflow.recipe.load:Guide"
     ),
     "controller": PartKind(
         "moves tool and torch along a seam in weld.tactile",
@@ -179,7 +174,8 @@ PARTS: Mapping[str, PartKind] = {
         "a welding power source that weld.tactile switches", "flangeye.models.contracts:ArcPart"
     ),
     "check": PartKind(
-        "a mistake in recordings that flangeye doctor can name", "flangeye.doctor.diagnosis:Check"
+        "a mistake in recordings that flangeye doctor can name",
+        "flangeye.workflow.doctor.diagnosis:Check",
     ),
 }
 """The kinds of parts, which steps choose by name in their parameters."""

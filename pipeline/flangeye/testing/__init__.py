@@ -17,8 +17,6 @@ from typing import Any
 import numpy as np
 
 from flangeye import types as t
-from flangeye.doctor.diagnosis import Finding, NotApplicable, RecordedSession
-from flangeye.maths.geometry import rigid, rotation_exp, rotation_from_rpy
 from flangeye.testing.base import (
     Conformance,
     require,
@@ -56,6 +54,8 @@ from flangeye.testing.welding import (
     WeldConformance,
 )
 from flangeye.types import Floats
+from flangeye.types.geometry import rigid, rotation_exp, rotation_from_rpy
+from flangeye.workflow.doctor.diagnosis import Finding, NotApplicable, RecordedSession
 
 AT = np.array([0.05, -0.03, 0.7])
 """Where the work is, in ``camera`` [m]."""

@@ -15,14 +15,14 @@ import numpy as np
 from flangeye import types as t
 from flangeye.devices import MotionAllowed
 from flangeye.errors import FlangeyeError
-from flangeye.log.read import read_run
-from flangeye.log.record import Recorder, adapter, clouds_of
 from flangeye.models.loading import load_model
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerData, ScannerModel
 from flangeye.models.targets import Flange, plate_of
 from flangeye.plugin.registry import Lookup, load_registry
 from flangeye.plugin.stage import KINDS, PARTS, Params, Plugin
+from flangeye.workflow.log.read import read_run
+from flangeye.workflow.log.record import Recorder, adapter, clouds_of
 
 T = TypeVar("T")
 

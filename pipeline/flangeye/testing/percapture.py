@@ -14,7 +14,6 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.models.targets import Flange, Sphere
 from flangeye.testing.base import (
     Conformance,
@@ -40,6 +39,7 @@ from flangeye.types import (
     Transform,
     by_frame,
 )
+from flangeye.types.geometry import rigid, rotation_exp
 
 DEPTH = 0.7
 """Of the flange's centre in ``camera`` [m]."""

@@ -10,7 +10,6 @@ from typing import Any, ClassVar
 import numpy as np
 
 from flangeye import types as t
-from flangeye.maths.geometry import kabsch, kabsch_covariance, rigid, rotation_exp
 from flangeye.testing.base import (
     Conformance,
     require,
@@ -23,6 +22,7 @@ from flangeye.testing.base import (
 )
 from flangeye.testing.percapture import FACING, flange_scene
 from flangeye.types import Floats
+from flangeye.types.geometry import kabsch, kabsch_covariance, rigid, rotation_exp
 
 CAMERA = rigid(rotation_exp(np.array([3.0, 0.2, -0.4])), np.array([0.6, -0.1, 1.2]))
 """``base_T_camera`` of the kit's cell."""

@@ -12,9 +12,6 @@ import numpy as np
 
 from flangeye import types as t
 from flangeye.files.recording import Archive, check_ids
-from flangeye.log.read import read_run
-from flangeye.log.record import Recorder
-from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.maths.kinematics import Arm
 from flangeye.motion.reach import Site
 from flangeye.testing.base import (
@@ -28,6 +25,9 @@ from flangeye.testing.base import (
     require_type,
 )
 from flangeye.types import Floats
+from flangeye.types.geometry import rigid, rotation_exp
+from flangeye.workflow.log.read import read_run
+from flangeye.workflow.log.record import Recorder
 
 REACH = 5.0
 """No arm's flange is farther from its base: a larger number is in millimetres [m]."""

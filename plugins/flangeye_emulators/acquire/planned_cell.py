@@ -13,11 +13,11 @@ from pydantic import Field
 
 from flangeye.errors import StageError
 from flangeye.estimation.plan import Rough, best_next, foreseen, foreseen_poses, so_far
-from flangeye.maths.geometry import invert
 from flangeye.models.cell import Axis, Cell, Frame, chain, composed
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.stage import PlaceParams
 from flangeye.types import Floats, Mask, Observation, Poses, Source, Transform, Truth
+from flangeye.types.geometry import invert
 from flangeye.units import Angle, param
 from flangeye_emulators.acquire.planned_session import (
     UNSEEN,

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flangeye.errors import StageError
-from flangeye.maths.geometry import invert
 from flangeye.maths.kinematics import Arm
 from flangeye.models.configuration import Configuration
 from flangeye.models.robots import RobotModel, SecondRobot
@@ -35,6 +34,7 @@ from flangeye.types import (
     Truth,
     by_frame,
 )
+from flangeye.types.geometry import invert
 from flangeye.units import Angle, Length, param
 from flangeye_emulators.world.arm import ArmErrors, ImperfectArm
 from flangeye_emulators.world.session import (

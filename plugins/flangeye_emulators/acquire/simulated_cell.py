@@ -9,7 +9,6 @@ import numpy as np
 from pydantic import Field
 
 from flangeye.errors import StageError
-from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.maths.kinematics import Arm
 from flangeye.models.cell import Cell
 from flangeye.models.robots import RobotModel
@@ -29,6 +28,7 @@ from flangeye.types import (
     Seed,
     Transform,
 )
+from flangeye.types.geometry import rigid, rotation_exp
 from flangeye_emulators.acquire.planned_cell import (
     CellSessionParams,
     Moments,

@@ -10,13 +10,13 @@ import numpy as np
 from pydantic import Field
 
 from flangeye.errors import StageError
-from flangeye.maths.geometry import invert
 from flangeye.models.boards import Board
 from flangeye.models.configuration import Configuration
 from flangeye.models.robots import RobotModel, SecondRobot
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import stage
 from flangeye.types import CAMERA, Capture, Captures, Floats, Image, PointCloud, Seed
+from flangeye.types.geometry import invert
 from flangeye_emulators.acquire.planned_session import (
     FACING,
     VERSION,

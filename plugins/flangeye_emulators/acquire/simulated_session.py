@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flangeye.maths.geometry import rotation_exp
 from flangeye.maths.kinematics import Arm
 from flangeye.models.configuration import Configuration
 from flangeye.models.robots import RobotModel, SecondRobot
@@ -28,6 +27,7 @@ from flangeye.types import (
     Seed,
     Transform,
 )  # fmt: skip
+from flangeye.types.geometry import rotation_exp
 from flangeye_emulators.acquire.planned_session import (
     FACING,
     FIELD,
@@ -42,10 +42,7 @@ from flangeye_emulators.world.cell import SimulatedCell
 from flangeye_emulators.world.mesh import MATERIALS, flange_mesh
 from flangeye_emulators.world.raycast import SolidBody
 from flangeye_emulators.world.scanner import ScannerQuality, before_camera, scanner_of
-from flangeye_emulators.world.session import (
-    CameraView,
-    seen_from,
-)
+from flangeye_emulators.world.session import CameraView, seen_from
 
 
 class SimulatedMarkerParams(OutlierParams, ViewParams):

@@ -13,14 +13,12 @@ from pydantic import Field
 
 from flangeye.devices import MotionAllowed
 from flangeye.errors import NothingMoved, StageError
-from flangeye.maths.geometry import invert
 from flangeye.models.bodies import TargetBody
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
 from flangeye.models.targets import Flange, Sphere, plate_of
 from flangeye.motion.reach import Plan, PlannedPose, Reach, Site, poses_near
 from flangeye.plugin.stage import BoundPart, Choose
-from flangeye.run.ahead import cores, worked_ahead
 from flangeye.types import (
     BASE,
     CAMERA,
@@ -38,13 +36,10 @@ from flangeye.types import (
     Truth,
     by_frame,
 )  # fmt: skip
+from flangeye.types.geometry import invert
 from flangeye.units import in_mm, param
-from flangeye_emulators.acquire.planned_session import (
-    UNSEEN,
-    VERSION,
-    fingerprint_of,
-    noise_free,
-)
+from flangeye.workflow.run.ahead import cores, worked_ahead
+from flangeye_emulators.acquire.planned_session import UNSEEN, VERSION, fingerprint_of, noise_free
 from flangeye_emulators.world.arm import ArmErrors, ImperfectArm
 from flangeye_emulators.world.cell import SimulatedCell
 from flangeye_emulators.world.raycast import Image, SolidBody

@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from flangeye.maths.pose_formats import CONVENTIONS
 from flangeye.models.graph import EmulatorOptions
 from flangeye.models.robots import RobotModel
 from flangeye.types import Floats
+from flangeye.types.pose_formats import CONVENTIONS
 from flangeye_emulators.controllers.arm import (
     ControlUnit,
     MotionFault,

@@ -12,8 +12,8 @@ from typing import Protocol
 
 import numpy as np
 
-from flangeye.maths.geometry import rigid
 from flangeye.types import Floats
+from flangeye.types.geometry import rigid
 from flangeye_emulators.controllers.poses import (
     JointStance,
     carried,

@@ -1,6 +1,6 @@
 """Poses as controllers write them. Scalar code: it runs in every cycle of 2 ms.
 
-Rotations agree with :mod:`flangeye.maths.geometry` (tested).
+Rotations agree with :mod:`flangeye.types.geometry` (tested).
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flangeye.maths.geometry import rigid
 from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import RobotModel
 from flangeye.types import Floats
+from flangeye.types.geometry import rigid
 
 
 def rotation_matrix(vector: Sequence[float] | Floats) -> Floats:

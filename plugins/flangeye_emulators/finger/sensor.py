@@ -11,21 +11,16 @@ from pydantic import Field
 
 from flangeye.devices import Device, DeviceError, SensorFrame, StateSource, TactileSensor
 from flangeye.errors import StageError
-from flangeye.maths.geometry import rotation_exp, rotation_from_rpy, rotation_log
 from flangeye.models.finger import Finger, FingerGeometry
 from flangeye.models.model import read_model
 from flangeye.models.workpiece import CadSeam, load_workpiece
 from flangeye.motion.seam_following import ToolPose
 from flangeye.plugin.stage import part
 from flangeye.types import Floats, Image, Seed, Transform
+from flangeye.types.geometry import rotation_exp, rotation_from_rpy, rotation_log
 from flangeye.units import Duration, Length, param
 from flangeye_emulators.weld_world.groove import GrooveSection, Tip
-from flangeye_emulators.weld_world.truth import (
-    ToolFile,
-    ToolPath,
-    WeldTruth,
-    WorldPath,
-)
+from flangeye_emulators.weld_world.truth import ToolFile, ToolPath, WeldTruth, WorldPath
 from flangeye_emulators.weld_world.world import Nominal, Shutter, WeldWorld
 from flangeye_emulators.world import bench
 from flangeye_emulators.world.bench import LaidParams

@@ -15,11 +15,11 @@ import numpy as np
 from pydantic import Field
 
 from flangeye.devices import RobotState
-from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.maths.seam_geometry import distances_to_line
 from flangeye.models.workpiece import Workpiece, WorkpiecePath
 from flangeye.plugin.stage import Params
 from flangeye.types import BASE, FLANGE, Floats, Transform
+from flangeye.types.geometry import rigid, rotation_from_rpy
 from flangeye.units import Angle, Length, param
 from flangeye_emulators.world.mesh import MATERIALS, Mesh, box, capsule
 from flangeye_emulators.world.raycast import SolidBody

@@ -7,12 +7,12 @@ from functools import lru_cache
 
 import numpy as np
 
-from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.models.bodies import ArmBody, TargetBody
 from flangeye.models.robots import RobotModel
 from flangeye.models.targets import Flange, Sphere
 from flangeye.motion.clearance import ArmVolume
 from flangeye.types import Floats
+from flangeye.types.geometry import rigid, rotation_from_rpy
 from flangeye_emulators.world.mesh import (
     COARSE,
     MATERIALS,

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flangeye.errors import StageError
-from flangeye.maths.geometry import basis_of_plane
 from flangeye.models.robots import Recess
 from flangeye.models.targets import Flange
 from flangeye.types import Floats
+from flangeye.types.geometry import basis_of_plane
 
 Ints = NDArray[np.int32]
 

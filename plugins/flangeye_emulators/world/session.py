@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flangeye.errors import StageError
-from flangeye.maths.geometry import invert, rigid, rotation_exp, rotation_from_rpy
 from flangeye.maths.kinematics import Arm
 from flangeye.models.configuration import LINK, Configuration
 from flangeye.types import BASE, FLANGE, FLANGE2, Floats
+from flangeye.types.geometry import invert, rigid, rotation_exp, rotation_from_rpy
 from flangeye_emulators.world.arm import ImperfectArm
 
 DRAWS = 4000

@@ -14,14 +14,7 @@ from flangeye import StageError, stage
 from flangeye.files.clouds import PER_METRE, LengthUnit
 from flangeye.files.depth import check_scan, read_scan
 from flangeye.files.elsewhere import is_elsewhere
-from flangeye.files.recording import (
-    Archive,
-    Recording,
-    check_distinct_clouds,
-    digests_of,
-)
-from flangeye.log.read import is_log, read_run
-from flangeye.log.record import adapter
+from flangeye.files.recording import Archive, Recording, check_distinct_clouds, digests_of
 from flangeye.models.cell import Cell
 from flangeye.models.scanners import (
     ScannerData,
@@ -40,6 +33,8 @@ from flangeye.types import (
     PointCloud,
     Transform,
 )
+from flangeye.workflow.log.read import is_log, read_run
+from flangeye.workflow.log.record import adapter
 from flangeye_plugins.acquire.camera import CameraParams, image_of_cloud, read_image
 from flangeye_plugins.acquire.opening import (
     OpeningParams,

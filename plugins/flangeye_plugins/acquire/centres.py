@@ -8,7 +8,6 @@ import numpy as np
 
 from flangeye import StageError, stage
 from flangeye.files.recording import Archive, Recording
-from flangeye.log.read import is_log, read_run
 from flangeye.models.cell import Cell
 from flangeye.models.targets import Flange
 from flangeye.types import (
@@ -23,6 +22,7 @@ from flangeye.types import (
     Transform,
 )
 from flangeye.units import Angle, Length, param
+from flangeye.workflow.log.read import is_log, read_run
 from flangeye_plugins.acquire.opening import (
     OpeningParams,
     archive_path,

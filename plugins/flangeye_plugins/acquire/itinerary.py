@@ -11,7 +11,6 @@ import numpy as np
 
 from flangeye.errors import StageError
 from flangeye.estimation.closed.at_once import shah
-from flangeye.maths.geometry import angle_between, invert, kabsch, rigid
 from flangeye.models.bodies import TargetBody, carrying
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
@@ -20,6 +19,7 @@ from flangeye.motion.reach import Margins, Plan, PlannedPose, Reach, Refusal, Si
 from flangeye.motion.route import Barred, Route, Router
 from flangeye.plugin.stage import BoundPart
 from flangeye.types import Floats, Observation, PoseFeature, Role
+from flangeye.types.geometry import angle_between, invert, kabsch, rigid
 from flangeye.units import in_mm
 
 

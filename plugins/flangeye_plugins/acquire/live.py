@@ -38,7 +38,6 @@ from flangeye.motion.reach import Margins, read_state
 from flangeye.motion.route import Barred, Leg, Route
 from flangeye.motion.supervision import RememberedState
 from flangeye.plugin.stage import BoundPart, Choose, Params, stage
-from flangeye.recipe.header import LimitsSection
 from flangeye.types import (
     BASE,
     FLANGE,
@@ -55,6 +54,7 @@ from flangeye.types import (
     by_frame,
 )
 from flangeye.units import JointPosition, Length, param
+from flangeye.workflow.recipe.header import LimitsSection
 from flangeye_plugins.acquire.itinerary import Itinerary, Stop, itinerary_of
 
 

@@ -25,7 +25,6 @@ from flangeye.files.recording import (
     fingerprint_of,
 )
 from flangeye.files.scans import with_companion
-from flangeye.log.read import RunLog
 from flangeye.maths.pose_corrections import inverted, scaled
 from flangeye.models.cell import Axis, Cell
 from flangeye.types import (
@@ -43,6 +42,7 @@ from flangeye.types import (
     Warn,
 )
 from flangeye.units import param
+from flangeye.workflow.log.read import RunLog
 
 if TYPE_CHECKING:
     from flangeye.maths.kinematics import Arm

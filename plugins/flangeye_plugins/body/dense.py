@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flangeye.maths.geometry import hat, rigid, rotation_exp
 from flangeye.maths.statistics import SIGMA_OF_MAD
 from flangeye.types import Floats, Indices, Singles
+from flangeye.types.geometry import hat, rigid, rotation_exp
 from flangeye_plugins.body.shape import GRAZING, OrientedPoints, Shape
 from flangeye_plugins.body.view import spacing_of, view_of
 

@@ -8,9 +8,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from flangeye.maths.geometry import rotation_exp
 from flangeye.models.bodies import TargetBody
 from flangeye.types import Floats, Indices, Mask
+from flangeye.types.geometry import rotation_exp
 from flangeye_plugins.body.shape import GRAZING, OrientedPoints, Shape, spread_directions
 from flangeye_plugins.body.view import CoarseImage
 

@@ -9,8 +9,8 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flangeye.maths.geometry import basis_of_plane
 from flangeye.types import Floats, Indices, Mask
+from flangeye.types.geometry import basis_of_plane
 
 GRAZING = 0.25
 """Cosine of the incidence beyond which a surface counts as not seen."""

@@ -26,9 +26,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flangeye.doctor.diagnosis import RecordedSession
-from flangeye.maths.geometry import invert, nearest_rotation
 from flangeye.types import Floats, Mask
+from flangeye.types.geometry import invert, nearest_rotation
+from flangeye.workflow.doctor.diagnosis import RecordedSession
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,10 +25,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flangeye.doctor.diagnosis import Arms, Finding, Misfit, RecordedSession
 from flangeye.estimation.readings import Pairs, estimated
-from flangeye.maths.geometry import hat, rotation_exp
 from flangeye.types import Floats, Indices, Mask
+from flangeye.types.geometry import hat, rotation_exp
+from flangeye.workflow.doctor.diagnosis import Arms, Finding, Misfit, RecordedSession
 from flangeye_plugins.check.equations import Equations, VariantUnknowns, equations_of, start_of
 
 TAILS = 4.0

@@ -10,17 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flangeye import part
-from flangeye.doctor.diagnosis import (
+from flangeye.maths.pose_corrections import delaying, shifted, without_tool
+from flangeye.maths.streams import later, pose_at
+from flangeye.types import Floats, Indices, Mask
+from flangeye.types.geometry import rigid, rotation_exp
+from flangeye.workflow.doctor.diagnosis import (
     Arms,
     Finding,
     Findings,
     NotApplicable,
     RecordedSession,
 )
-from flangeye.maths.geometry import rigid, rotation_exp
-from flangeye.maths.pose_corrections import delaying, shifted, without_tool
-from flangeye.maths.streams import later, pose_at
-from flangeye.types import Floats, Indices, Mask
 from flangeye_plugins.check.equations import equations_of
 from flangeye_plugins.check.fitting import (
     Significance,

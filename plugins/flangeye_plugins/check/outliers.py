@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from flangeye import part
-from flangeye.doctor.diagnosis import Finding, Findings, NotApplicable, RecordedSession
-from flangeye.maths.geometry import levers, rotation_exp
 from flangeye.types import Floats
+from flangeye.types.geometry import levers, rotation_exp
+from flangeye.workflow.doctor.diagnosis import Finding, Findings, NotApplicable, RecordedSession
 from flangeye_plugins.check.equations import equations_of
 from flangeye_plugins.check.fitting import (
     Significance,

@@ -10,17 +10,9 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from flangeye import StageError, part
-from flangeye.doctor.diagnosis import (
-    OR_ELSE,
-    Change,
-    Finding,
-    Findings,
-    NotApplicable,
-    RecordedSession,
-)
 from flangeye.estimation.readings import Reading, meant, optical, other_axes
 from flangeye.maths.pose_corrections import inverted, reread, scaled, transposed
-from flangeye.maths.pose_formats import (
+from flangeye.types.pose_formats import (
     EULER_ORDERS,
     QUATERNIONS,
     RotationConvention,
@@ -29,16 +21,16 @@ from flangeye.maths.pose_formats import (
     plain_rotation,
     spelt,
 )
-from flangeye_plugins.check.equations import equations_of
-from flangeye_plugins.check.fitting import (
-    best_of,
-    explained,
-    fit,
-    fit_of,
-    helps,
-    named,
-    pairs_of,
+from flangeye.workflow.doctor.diagnosis import (
+    OR_ELSE,
+    Change,
+    Finding,
+    Findings,
+    NotApplicable,
+    RecordedSession,
 )
+from flangeye_plugins.check.equations import equations_of
+from flangeye_plugins.check.fitting import best_of, explained, fit, fit_of, helps, named, pairs_of
 
 _WAYS: Mapping[str, tuple[Change, str]] = {
     "inverted": (

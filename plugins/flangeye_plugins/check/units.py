@@ -9,15 +9,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flangeye import part
-from flangeye.doctor.diagnosis import (
+from flangeye.maths.pose_corrections import scaled
+from flangeye.types import Floats
+from flangeye.workflow.doctor.diagnosis import (
     Arms,
     Finding,
     Findings,
     NotApplicable,
     RecordedSession,
 )
-from flangeye.maths.pose_corrections import scaled
-from flangeye.types import Floats
 from flangeye_plugins.check.equations import equations_of
 from flangeye_plugins.check.fitting import (
     HELPS,

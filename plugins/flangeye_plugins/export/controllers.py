@@ -20,9 +20,9 @@ import yaml
 
 from flangeye import StageError, stage
 from flangeye.maths.kinematics import altered
-from flangeye.maths.pose_formats import CONVENTIONS, PoseConvention
 from flangeye.models.robots import RobotModel
 from flangeye.types import ArmCorrection, CalibratedPose, ExportedFile, HandEye
+from flangeye.types.pose_formats import CONVENTIONS, PoseConvention
 from flangeye_plugins.export.writing import (
     NamedParams,
     NumberedParams,

@@ -25,9 +25,9 @@ from pydantic import Field
 
 from flangeye import Params, StageError
 from flangeye.files.paths import RecipeFile
-from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.models.urdf import end_of, origin_of, read_urdf
 from flangeye.types import CAMERA, CalibratedPose, ExportedFile, Floats
+from flangeye.types.geometry import rigid, rotation_from_rpy
 from flangeye.units import Angle, Length, param
 from flangeye_plugins.export.writing import (
     FRAME,

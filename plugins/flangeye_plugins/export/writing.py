@@ -10,8 +10,8 @@ import numpy as np
 from pydantic import Field
 
 from flangeye import Params, StageError
-from flangeye.maths.pose_formats import CONVENTIONS, PoseConvention
 from flangeye.types import CalibratedPose, Floats
+from flangeye.types.pose_formats import CONVENTIONS, PoseConvention
 
 NAME = r"^[A-Za-z][A-Za-z0-9_]{0,23}$"
 """An identifier in every controller's language; KUKA's names have 24 characters at most."""

@@ -9,10 +9,10 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from flangeye import stage
-from flangeye.maths.geometry import rotation_log
 from flangeye.models.boards import Board, Dictionary
 from flangeye.models.corners import Corners, find_corners
 from flangeye.types import CAMERA, TARGET, Capture, Image, PoseFeature, Rejected, Transform
+from flangeye.types.geometry import rotation_log
 from flangeye.units import Length, param
 from flangeye_plugins.fit.planar import (
     PlanarPose,

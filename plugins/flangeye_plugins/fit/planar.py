@@ -7,7 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flangeye.maths.geometry import (
+from flangeye.models.corners import Corners
+from flangeye.types import Floats, Image, PointCloud
+from flangeye.types.geometry import (
     adjoint_shift,
     covariance_at,
     hat,
@@ -16,8 +18,6 @@ from flangeye.maths.geometry import (
     rigid,
     rotation_exp,
 )
-from flangeye.models.corners import Corners
-from flangeye.types import Floats, Image, PointCloud
 
 
 class PlanarPose(NamedTuple):

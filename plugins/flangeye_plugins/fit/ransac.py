@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from flangeye import Params, stage
 from flangeye.maths.circles import sectors
-from flangeye.maths.geometry import basis_of_plane
 from flangeye.maths.planes import Plane
 from flangeye.models.targets import Flange
 from flangeye.types import CircleFeature, FlangeCloud, Floats, Rejected, Seed
+from flangeye.types.geometry import basis_of_plane
 from flangeye.units import Length, param
 from flangeye_plugins.fit.circles import disc_face
 from flangeye_plugins.fit.uncertainty import plane_covariance

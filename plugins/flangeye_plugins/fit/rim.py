@@ -8,10 +8,10 @@ import numpy as np
 
 from flangeye import stage
 from flangeye.maths.circles import distances, edge_points, fringe, sectors, vote_centre
-from flangeye.maths.geometry import basis_of_plane
 from flangeye.maths.planes import Plane, chosen, fit_plane, thinned
 from flangeye.models.targets import Flange, roll_angle
 from flangeye.types import CircleFeature, FlangeCloud, Floats, Indices, Mask, Rejected
+from flangeye.types.geometry import basis_of_plane
 from flangeye.units import Length, param
 from flangeye_plugins.fit.circles import (
     Circles,

@@ -9,10 +9,10 @@ from pydantic import Field
 
 from flangeye import stage
 from flangeye.maths.circles import sectors
-from flangeye.maths.geometry import basis_of_plane
 from flangeye.maths.statistics import SIGMA_OF_MAD
 from flangeye.models.targets import Sphere
 from flangeye.types import CircleFeature, FlangeCloud, Floats, Indices, Rejected
+from flangeye.types.geometry import basis_of_plane
 from flangeye_plugins.fit.circles import cauchy_curvature, cauchy_weights
 from flangeye_plugins.fit.uncertainty import STRETCHES, ScannerErrorParams, clustered_covariance
 

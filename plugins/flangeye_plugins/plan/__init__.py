@@ -13,10 +13,10 @@ import numpy as np
 from pydantic import Field
 
 from flangeye.estimation.observability import in_base
-from flangeye.maths.geometry import angle_between, hat, levers, rigid, rotation_from_rpy
 from flangeye.motion.reach import Plan, PlannedPose, Site, tilted
 from flangeye.plugin.stage import Params, part
 from flangeye.types import Box, Floats
+from flangeye.types.geometry import angle_between, hat, levers, rigid, rotation_from_rpy
 from flangeye.units import Angle, Length, param
 
 Point = tuple[Length, Length, Length]

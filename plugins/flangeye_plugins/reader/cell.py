@@ -16,9 +16,7 @@ from pydantic import Field, model_validator
 from flangeye import Params, StageError, part
 from flangeye.files.recording import Archive, NotThisLayout, Recording
 from flangeye.files.tables import Column, Table, files_at
-from flangeye.maths.geometry import rows_at
 from flangeye.maths.pose_corrections import inverted
-from flangeye.maths.pose_formats import ANGLES, LENGTHS
 from flangeye.maths.streams import (
     STILL_ANGLE,
     STILL_DISTANCE,
@@ -28,6 +26,8 @@ from flangeye.maths.streams import (
     with_joints,
 )
 from flangeye.types import Floats, Motion
+from flangeye.types.geometry import rows_at
+from flangeye.types.pose_formats import ANGLES, LENGTHS
 from flangeye.units import param
 from flangeye_plugins.reader.columns import (
     POINT,

@@ -13,7 +13,8 @@ from pydantic import Field, field_validator, model_validator
 from flangeye import Params, StageError
 from flangeye.files.clouds import LengthUnit
 from flangeye.files.tables import Cell, Column, Table, number_of, read_table
-from flangeye.maths.pose_formats import (
+from flangeye.types import Floats
+from flangeye.types.pose_formats import (
     ANGLES,
     APART,
     CONVENTIONS,
@@ -23,8 +24,7 @@ from flangeye.maths.pose_formats import (
     pose_of_numbers,
     written,
 )
-from flangeye.maths.pose_formats import LengthUnit as PoseLength
-from flangeye.types import Floats
+from flangeye.types.pose_formats import LengthUnit as PoseLength
 
 POINT = "point"
 

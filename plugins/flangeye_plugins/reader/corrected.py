@@ -16,10 +16,8 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from flangeye import BoundPart, Choose, Params, StageError, part
-from flangeye.doctor.diagnosis import Arms
 from flangeye.estimation.readings import Axes, optical
 from flangeye.files.recording import Archive, Recording
-from flangeye.maths.geometry import rigid, rows_at
 from flangeye.maths.pose_corrections import (
     delayed,
     inverted,
@@ -29,10 +27,12 @@ from flangeye.maths.pose_corrections import (
     transposed,
     without_tool,
 )
-from flangeye.maths.pose_formats import PLAIN
 from flangeye.maths.streams import later, pose_at
 from flangeye.types import FLANGE, FLANGE2, Floats, Mask
+from flangeye.types.geometry import rigid, rows_at
+from flangeye.types.pose_formats import PLAIN
 from flangeye.units import Duration, Length, param
+from flangeye.workflow.doctor.diagnosis import Arms
 
 
 class PoseMistake(Params):

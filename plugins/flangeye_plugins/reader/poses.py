@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from flangeye import StageError
-from flangeye.maths.geometry import rigid, rotation_exp, rotation_from_quaternion
-from flangeye.maths.pose_formats import MATRIX, NORM_TOLERANCE, pose_of_numbers
 from flangeye.types import Floats
+from flangeye.types.geometry import rigid, rotation_exp, rotation_from_quaternion
+from flangeye.types.pose_formats import MATRIX, NORM_TOLERANCE, pose_of_numbers
 
 Numbers = Sequence[float] | Floats
 

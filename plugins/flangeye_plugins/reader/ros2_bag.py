@@ -20,12 +20,12 @@ from pydantic import Field
 
 from flangeye import Params, StageError, part
 from flangeye.files.recording import Archive, Recording
-from flangeye.maths.geometry import rows_at
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.pose_corrections import inverted
 from flangeye.maths.streams import mean_pose, turning, with_joints
 from flangeye.models.robots import RobotModel, joints_in_order
 from flangeye.types import FLANGE, Floats
+from flangeye.types.geometry import rows_at
 from flangeye.units import param
 from flangeye_plugins.reader.pairing import MatchedPose, PairingParams, Signal, pair
 from flangeye_plugins.reader.ros2_messages import (

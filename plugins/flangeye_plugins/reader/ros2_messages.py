@@ -18,9 +18,9 @@ from flangeye.files.recording import NotThisLayout
 from flangeye.files.regular import open_regular
 from flangeye.files.scans import natural
 from flangeye.files.words import reason_of
-from flangeye.log.records import LogFile
 from flangeye.maths.streams import interpolated
 from flangeye.types import Floats
+from flangeye.workflow.log.records import LogFile
 from flangeye_plugins.reader.poses import pose_from_quaternion
 from flangeye_plugins.ros2.messages import cloud_of, frame_of, pixels_of, stamp_of, types
 

@@ -26,13 +26,13 @@ from flangeye import StageError, part
 from flangeye.files.recording import Archive, NotThisLayout, Recording
 from flangeye.files.scans import Poses, recording_of, scans_of
 from flangeye.files.tables import Column, Table, files_at, number_of, rows_together
-from flangeye.maths.geometry import rows_at
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.pose_corrections import inverted
-from flangeye.maths.pose_formats import LengthUnit as PoseLength
 from flangeye.maths.streams import interpolated, passed, turning
 from flangeye.models.robots import RobotModel
 from flangeye.types import FLANGE, FLANGE2, Floats, Motion
+from flangeye.types.geometry import rows_at
+from flangeye.types.pose_formats import LengthUnit as PoseLength
 from flangeye.units import param
 from flangeye_plugins.reader.columns import (
     POINT,

@@ -19,10 +19,10 @@ from pydantic import Field
 
 from flangeye.devices import GRACE, SILENT, Device, DeviceError, Mode, Robot, RobotState, load_sdk
 from flangeye.files.processes import python_command
-from flangeye.maths.pose_formats import CONVENTIONS
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.stage import part
 from flangeye.types import BASE, FLANGE, TOOL, Floats, Transform
+from flangeye.types.pose_formats import CONVENTIONS
 from flangeye_plugins.robot.tool_check import (
     ControllerParams,
     require_model,

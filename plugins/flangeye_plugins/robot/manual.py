@@ -13,12 +13,12 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from flangeye.devices import Device, DeviceError, Mode, Robot, RobotState
-from flangeye.maths.geometry import rotation_log
 from flangeye.maths.kinematics import Arm
-from flangeye.maths.pose_formats import CONVENTIONS, AngleUnit, LengthUnit, PoseConvention
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.stage import Params, part
 from flangeye.types import BASE, FLANGE, Floats, Transform
+from flangeye.types.geometry import rotation_log
+from flangeye.types.pose_formats import CONVENTIONS, AngleUnit, LengthUnit, PoseConvention
 
 
 class OperatorConsole:

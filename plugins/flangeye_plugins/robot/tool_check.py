@@ -6,12 +6,12 @@ import numpy as np
 from pydantic import Field
 
 from flangeye.devices import DeviceError, RobotState
-from flangeye.maths.geometry import hat
 from flangeye.maths.kinematics import Arm
-from flangeye.maths.pose_formats import PoseConvention
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.stage import Params
 from flangeye.types import Floats
+from flangeye.types.geometry import hat
+from flangeye.types.pose_formats import PoseConvention
 from flangeye.units import Angle, Length, param
 
 

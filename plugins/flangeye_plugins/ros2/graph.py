@@ -16,17 +16,17 @@ import numpy as np
 from flangeye.devices import Device, DeviceError
 from flangeye.errors import StageError
 from flangeye.files.regular import read_text
-from flangeye.maths.geometry import (
-    invert,
-    quaternion_from_rotation,
-    rigid,
-    rotation_from_quaternion,
-)
 from flangeye.maths.kinematics import Arm
 from flangeye.models.graph import Ask, Running, RunningCell, Topic
 from flangeye.models.scanners import ScannerData, detect_unit, median_distance
 from flangeye.models.urdf import MAX_BYTES, NAMED, UrdfArm, arm_of, flange_links, parse_urdf
 from flangeye.types import CAMERA, CalibratedPose, Floats, PointCloud
+from flangeye.types.geometry import (
+    invert,
+    quaternion_from_rotation,
+    rigid,
+    rotation_from_quaternion,
+)
 from flangeye_plugins.ros2.client import MATCHING, Bridge, GraphMessage
 from flangeye_plugins.ros2.messages import (
     PER_METRE,

@@ -7,12 +7,12 @@ from pydantic import Field
 
 from flangeye import CalibrationRefused, StageError, stage
 from flangeye.estimation.effects.scanner import DistortionField
-from flangeye.maths.geometry import covariance_at
 from flangeye.maths.seam_geometry import across
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
 from flangeye.models.workpiece import CadSeam, Workpiece, WorkpiecePath, load_workpiece
 from flangeye.types import Box, Floats, Seam, VerifiedHandEye, WorkpieceScan
+from flangeye.types.geometry import covariance_at
 from flangeye.units import Length, param
 from flangeye_plugins.seam.planned import (
     SPACING,

@@ -10,19 +10,11 @@ from pydantic import Field
 
 from flangeye import CalibrationRefused, Params
 from flangeye.maths.arm_correction import reported_flange
-from flangeye.maths.geometry import arc_lengths, rows_at
 from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
-from flangeye.types import (
-    BASE,
-    Box,
-    Floats,
-    HandEye,
-    PointCloud,
-    Seam,
-    Transform,
-)
+from flangeye.types import BASE, Box, Floats, HandEye, PointCloud, Seam, Transform
+from flangeye.types.geometry import arc_lengths, rows_at
 from flangeye.units import Length, param
 
 SPACING = 2e-3

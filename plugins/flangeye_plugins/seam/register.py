@@ -8,10 +8,10 @@ import numpy as np
 
 from flangeye import CalibrationRefused, StageError
 from flangeye.files.clouds import PER_METRE, LengthUnit
-from flangeye.maths.geometry import invert, rotation_log
 from flangeye.maths.seam_geometry import distances_to_line
 from flangeye.models.workpiece import CadSeam, Workpiece
 from flangeye.types import Floats, Singles
+from flangeye.types.geometry import invert, rotation_log
 from flangeye_plugins.body.dense import BodyFit, fitted
 from flangeye_plugins.body.looks import Looks
 from flangeye_plugins.body.search import BodySearch, around

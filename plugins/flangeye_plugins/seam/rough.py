@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flangeye.maths.geometry import arc_lengths, rows_at
 from flangeye.types import Floats
+from flangeye.types.geometry import arc_lengths, rows_at
 from flangeye_plugins.seam.planned import resampled
 from flangeye_plugins.seam.template import EDGES, FACES, OFFSETS, JointShape, Section
 

@@ -17,19 +17,11 @@ import numpy as np
 
 from flangeye import CalibrationRefused
 from flangeye.maths.arm_correction import corrected_flange
-from flangeye.maths.geometry import covariance_at, levers
 from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
-from flangeye.types import (
-    BASE,
-    CAMERA,
-    Floats,
-    HandEye,
-    ScanPlace,
-    Transform,
-    WorkpieceScan,
-)
+from flangeye.types import BASE, CAMERA, Floats, HandEye, ScanPlace, Transform, WorkpieceScan
+from flangeye.types.geometry import covariance_at, levers
 from flangeye_plugins.seam.planned import scanner_covariance
 from flangeye_plugins.seam.points import normals_of, thinned
 

@@ -10,7 +10,6 @@ import numpy as np
 
 from flangeye import Params, stage
 from flangeye.errors import StageError
-from flangeye.maths.geometry import invert
 from flangeye.models.bodies import LARGEST, SMALLEST, TargetBody
 from flangeye.models.configuration import Configuration
 from flangeye.types import (
@@ -24,6 +23,7 @@ from flangeye.types import (
     Rejected,
     Singles,
 )
+from flangeye.types.geometry import invert
 from flangeye.units import Length, param
 
 if TYPE_CHECKING:

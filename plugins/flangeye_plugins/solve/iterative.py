@@ -11,13 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from flangeye import BoundPart, CalibrationRefused, Choose, Params, stage
-from flangeye.estimation.observability import (
-    FINEST_NOISE,
-    require_poses,
-    robust_sigma,
-    spread_of,
-)
-from flangeye.maths.geometry import kabsch, kabsch_covariance, rigid
+from flangeye.estimation.observability import FINEST_NOISE, require_poses, robust_sigma, spread_of
 from flangeye.maths.statistics import covariance_inflation
 from flangeye.models.targets import Flange
 from flangeye.types import (
@@ -31,6 +25,7 @@ from flangeye.types import (
     TransformEstimate,
     Views,
 )
+from flangeye.types.geometry import kabsch, kabsch_covariance, rigid
 from flangeye.units import Length, param
 from flangeye_plugins.solve.observations import (
     centres_of,

@@ -9,18 +9,9 @@ import numpy as np
 from flangeye import CalibrationRefused, StageError, stage
 from flangeye.estimation.calibrate import Options, calibrate_at
 from flangeye.estimation.closed.at_once import daniilidis, li, shah
-from flangeye.estimation.closed.comanipulation import (
-    FEWEST_KRONECKER,
-    kronecker,
-    two_steps,
-)
+from flangeye.estimation.closed.comanipulation import FEWEST_KRONECKER, kronecker, two_steps
 from flangeye.estimation.closed.motions import Motions, motions_of, place_of
-from flangeye.estimation.closed.separable import (
-    andreff,
-    horaud_dornaika,
-    park_martin,
-    tsai_lenz,
-)
+from flangeye.estimation.closed.separable import andreff, horaud_dornaika, park_martin, tsai_lenz
 from flangeye.estimation.graph import Places, Problem
 from flangeye.estimation.observability import (
     FINEST_NOISE,
@@ -37,7 +28,6 @@ from flangeye.estimation.observability import (
 )
 from flangeye.estimation.sightings import problem_of
 from flangeye.estimation.start import circle_of, start_of_circles
-from flangeye.maths.geometry import invert, kabsch, kabsch_covariance
 from flangeye.maths.statistics import covariance_inflation
 from flangeye.models.cell import Cell, cell_of
 from flangeye.models.configuration import DEFAULT, EVERY, Configuration
@@ -45,6 +35,7 @@ from flangeye.models.robots import RobotModel, SecondRobot
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import Stage
 from flangeye.types import Floats, HandEye, Observation, Observations, TransformEstimate
+from flangeye.types.geometry import invert, kabsch, kabsch_covariance
 from flangeye_plugins.solve.observations import (
     LimitsParams,
     centres_of,

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from flangeye.maths.geometry import rigid
 from flangeye.plugin.stage import Params
 from flangeye.types import (
     BASE,
@@ -18,6 +17,7 @@ from flangeye.types import (
     Transform,
     TransformEstimate,
 )
+from flangeye.types.geometry import rigid
 from flangeye.units import Angle, param
 
 

@@ -8,11 +8,11 @@ import numpy as np
 from pydantic import Field
 
 from flangeye import Params, stage
-from flangeye.doctor.monitor.stored import stored_calibration
 from flangeye.estimation.watch.drift import DriftTest, information_of, verdict
 from flangeye.files.paths import RecipeFile
 from flangeye.types import HandEye, Verification
 from flangeye.units import Length, param
+from flangeye.workflow.doctor.monitor.stored import stored_calibration
 
 
 class DriftParams(Params):

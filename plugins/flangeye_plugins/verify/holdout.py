@@ -11,15 +11,8 @@ from pydantic import Field
 
 from flangeye import CalibrationRefused, Params, StageError, stage
 from flangeye.estimation.readings import Pairs, Reading, meant, other_axes
-from flangeye.maths.geometry import angle_between, invert, rotation_log
 from flangeye.models.cell import Cell, cell_of
-from flangeye.models.configuration import (
-    CELL,
-    DEFAULT,
-    EVERY,
-    Configuration,
-    mapped_and_expected,
-)
+from flangeye.models.configuration import CELL, DEFAULT, EVERY, Configuration, mapped_and_expected
 from flangeye.models.robots import RobotModel, SecondRobot
 from flangeye.types import (
     FLANGE,
@@ -34,6 +27,7 @@ from flangeye.types import (
     Solver,
     Verification,
 )
+from flangeye.types.geometry import angle_between, invert, rotation_log
 from flangeye.units import Length, param
 
 

@@ -14,18 +14,11 @@ from flangeye import Params, StageError, stage
 from flangeye.files.clouds import LengthUnit
 from flangeye.files.paths import RecipeFile
 from flangeye.maths.arm_correction import corrected_view
-from flangeye.maths.geometry import rotation_from_rpy, rotation_log, rpy_from_rotation
 from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import RobotModel
 from flangeye.models.targets import Flange
-from flangeye.types import (
-    HandEye,
-    PoseError,
-    Transform,
-    Verification,
-    VerificationView,
-    Views,
-)
+from flangeye.types import HandEye, PoseError, Transform, Verification, VerificationView, Views
+from flangeye.types.geometry import rotation_from_rpy, rotation_log, rpy_from_rotation
 from flangeye.units import Angle, Length, param
 from flangeye_plugins.verify.registration import (
     Registration,

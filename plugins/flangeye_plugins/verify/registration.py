@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from flangeye import StageError
 from flangeye.files.clouds import LengthUnit, read_cloud
-from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.maths.statistics import rms
 from flangeye.models.targets import Flange
 from flangeye.types import Floats
+from flangeye.types.geometry import rigid, rotation_exp
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,9 +6,9 @@ import numpy as np
 from pydantic import Field
 
 from flangeye import Params, stage
-from flangeye.maths.geometry import covariance_at, rigid, rotation_from_rpy
 from flangeye.maths.statistics import chi2_quantile, rms
 from flangeye.types import Floats, HandEye, StageLog, Verification
+from flangeye.types.geometry import covariance_at, rigid, rotation_from_rpy
 from flangeye.units import Angle, Length, param
 
 

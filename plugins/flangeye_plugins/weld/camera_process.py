@@ -15,14 +15,7 @@ from contextlib import ExitStack, suppress
 from multiprocessing.connection import Connection
 from typing import Any, NamedTuple, Self
 
-from flangeye.devices import (
-    PATIENCE,
-    DeviceError,
-    Profiler,
-    RobotState,
-    TactileSensor,
-    WeldProfile,
-)
+from flangeye.devices import PATIENCE, DeviceError, Profiler, RobotState, TactileSensor, WeldProfile
 from flangeye.errors import FlangeyeError
 from flangeye.files.processes import busy, keep_current_folder_out
 from flangeye.types import Floats

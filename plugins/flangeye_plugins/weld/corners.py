@@ -18,8 +18,8 @@ from typing import NamedTuple
 import numpy as np
 
 from flangeye.errors import StageError
-from flangeye.maths.geometry import arc_lengths, rows_at
 from flangeye.types import Floats, Seam
+from flangeye.types.geometry import arc_lengths, rows_at
 from flangeye_plugins.weld.frame import rolled_out
 from flangeye_plugins.weld.path import CHORD
 from flangeye_plugins.weld.settings import WeldTactileParams

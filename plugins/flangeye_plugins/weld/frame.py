@@ -15,10 +15,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from flangeye.maths.geometry import arc_lengths, rigid, rotation_from_rpy, rows_at
 from flangeye.models.finger import FingerGeometry
 from flangeye.motion.seam_following import Command, ToolPose
 from flangeye.types import BASE, FLANGE, Floats, Transform
+from flangeye.types.geometry import arc_lengths, rigid, rotation_from_rpy, rows_at
 from flangeye_plugins.weld.path import CHORD, Path, Place
 
 

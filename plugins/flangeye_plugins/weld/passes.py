@@ -17,14 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from flangeye.motion.arc import OFF
-from flangeye.motion.seam_following import (
-    STILL,
-    Command,
-    Controller,
-    Phase,
-    ToolPose,
-    Touch,
-)
+from flangeye.motion.seam_following import STILL, Command, Controller, Phase, ToolPose, Touch
 from flangeye.types import Floats
 from flangeye_plugins.weld.following.belief import BAND
 from flangeye_plugins.weld.following.follower import Follower

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flangeye.maths.geometry import arc_lengths, rows_at
 from flangeye.types import Floats
+from flangeye.types.geometry import arc_lengths, rows_at
 
 PATH_SPACING = 0.5e-3
 """Spacing to which a path is resampled [m]; at a radius of 50 mm the chord misses it by 0.6 um."""

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from flangeye.maths.geometry import rows_at
 from flangeye.motion.seam_following import Controller, turned
 from flangeye.types import Floats, Note, Seam, WeldReport
+from flangeye.types.geometry import rows_at
 from flangeye_plugins.weld.frame import LeaningTool, WorkSurface
 from flangeye_plugins.weld.passes import follower_of
 from flangeye_plugins.weld.path import Path

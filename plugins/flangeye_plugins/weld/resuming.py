@@ -15,11 +15,11 @@ import numpy as np
 
 from flangeye.devices import WeldProfile
 from flangeye.errors import StageError
-from flangeye.log.read import JournalEntry, read_notes
 from flangeye.motion.seam_following import Command, Controller, FollowingTask, ToolPose, Touch
 from flangeye.plugin.registry import Lookup, load_registry
 from flangeye.plugin.stage import BoundPart
 from flangeye.types import Floats
+from flangeye.workflow.log.read import JournalEntry, read_notes
 from flangeye_plugins.weld.following.belief import Belief, Learned
 from flangeye_plugins.weld.following.follower import Follower
 from flangeye_plugins.weld.following.steering import SETTLING

@@ -17,16 +17,8 @@ from flangeye.motion.executor import Executor, led
 from flangeye.motion.limits import MotionLimits
 from flangeye.motion.watchdog import LEADING, precedence
 from flangeye.plugin.stage import stage
-from flangeye.recipe.header import LimitsSection
-from flangeye.types import (
-    Note,
-    Seam,
-    Seed,
-    StageLog,
-    VerifiedHandEye,
-    Warn,
-    WeldReport,
-)
+from flangeye.types import Note, Seam, Seed, StageLog, VerifiedHandEye, Warn, WeldReport
+from flangeye.workflow.recipe.header import LimitsSection
 from flangeye_plugins.weld import checks
 from flangeye_plugins.weld.bound import check_bound
 from flangeye_plugins.weld.camera_process import CameraProcess

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flangeye.maths.geometry import rotation_exp, rotation_log
+from flangeye.types.geometry import rotation_exp, rotation_log
 from flangeye_emulators.controllers.poses import (
     carried,
     pose_matrix,

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.models.loading import load_model
 from flangeye.models.scanners import ScannerModel
 from flangeye.models.targets import Flange, plate_of
+from flangeye.types.geometry import rigid, rotation_from_rpy
 from flangeye_emulators.world.mesh import MATERIALS, box, flange_mesh, wrist_mesh
 from flangeye_emulators.world.raycast import RaycastScene, SolidBody
 

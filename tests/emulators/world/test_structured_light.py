@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye.maths.geometry import rigid, rotation_from_rpy
+from flangeye.types.geometry import rigid, rotation_from_rpy
 from flangeye_emulators.world import scanner
 from flangeye_emulators.world.mesh import MATERIALS, box
 from flangeye_emulators.world.raycast import RaycastScene, SolidBody, pixels_of

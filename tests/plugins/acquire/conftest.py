@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.models.loading import load_model
 from flangeye.types import CAMERA, Capture, PointCloud, Transform, by_frame
+from flangeye.types.geometry import rigid, rotation_from_rpy
 from tools.folder_archive import write_folder
 
 

@@ -10,8 +10,8 @@ import pytest
 
 from flangeye import StageError
 from flangeye.files.clouds import read_cloud, write_cloud
-from flangeye.maths.geometry import quaternion_from_rotation, rotation_exp, rotation_from_rpy
 from flangeye.types import ArchivePath, PointCloud
+from flangeye.types.geometry import quaternion_from_rotation, rotation_exp, rotation_from_rpy
 from flangeye_plugins.acquire.archive import ArchiveParams, acquire_archive
 from flangeye_plugins.reader.ancorasir import AncorasirParams, ancorasir
 

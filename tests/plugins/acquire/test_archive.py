@@ -14,8 +14,8 @@ import pytest
 from flangeye import StageError
 from flangeye.files.clouds import write_cloud
 from flangeye.files.depth import read_scan
-from flangeye.log.record import Recorder
 from flangeye.types import ArchivePath, Capture, PointCloud, Source, Transform
+from flangeye.workflow.log.record import Recorder
 from flangeye_plugins.acquire import archive as module
 from flangeye_plugins.acquire.archive import ArchiveParams, acquire_archive
 from flangeye_plugins.acquire.camera import CameraParams

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from flangeye import StageError
-from flangeye.log.record import Recorder
-from flangeye.maths.geometry import kabsch, rigid
 from flangeye.models.loading import load_model
 from flangeye.models.targets import wrist_circle_of
 from flangeye.types import ArchivePath, Source
+from flangeye.types.geometry import kabsch, rigid
 from flangeye.units import SI
+from flangeye.workflow.log.record import Recorder
 from flangeye_plugins.acquire.centres import CentresParams, acquire_centres
 from flangeye_plugins.reader.ancorasir import AncorasirParams
 from flangeye_plugins.reader.ancorasir import ancorasir as reader

@@ -10,9 +10,9 @@ from pydantic import Field
 
 from flangeye import Params, StageError, part
 from flangeye.files.recording import Archive, NotThisLayout, check_ids
-from flangeye.maths.geometry import rotation_exp
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.load import load_recipe
+from flangeye.types.geometry import rotation_exp
+from flangeye.workflow.recipe.load import load_recipe
 from flangeye_plugins.reader.auto import auto
 from flangeye_plugins.reader.folder import FolderParams, folder
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from flangeye import StageError
-from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.models.boards import Board
 from flangeye.models.corners import find_corners
 from flangeye.types import ArchivePath, Image, warnings_of
+from flangeye.types.geometry import rigid, rotation_exp
 from flangeye.units import SI
 from flangeye_emulators.world.board_image import BoardCamera, render_board
 from flangeye_plugins.acquire.images import ImagesParams, SeenBoardParams, acquire_images, lens_of

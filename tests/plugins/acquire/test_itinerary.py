@@ -3,12 +3,10 @@
 import numpy as np
 import pytest
 
-from flangeye.maths.geometry import invert, rigid, rotation_exp
 from flangeye.models.loading import load_model
 from flangeye.models.targets import plate_of
 from flangeye.motion.reach import Margins, Reach
 from flangeye.plugin.stage import BoundPart
-from flangeye.recipe.header import LimitsSection
 from flangeye.types import (
     BASE,
     CAMERA,
@@ -20,6 +18,8 @@ from flangeye.types import (
     Transform,
     by_frame,
 )
+from flangeye.types.geometry import invert, rigid, rotation_exp
+from flangeye.workflow.recipe.header import LimitsSection
 from flangeye_emulators.world.scanner import CameraPose
 from flangeye_plugins.acquire.itinerary import itinerary_of, view_of
 from flangeye_plugins.plan import NextBestParams, next_best

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.motion.supervision import RememberedState
+from flangeye.types.geometry import rigid, rotation_exp
 from flangeye_plugins.acquire.live import Idle, LiveSession, movement, within
 
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from flangeye import StageError
-from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.types import (
     BASE,
     BASE2,
@@ -22,6 +21,7 @@ from flangeye.types import (
     Transform,
     by_frame,
 )
+from flangeye.types.geometry import rigid, rotation_exp
 from flangeye_plugins.acquire.archive import ArchiveParams, acquire_archive
 from flangeye_plugins.reader.auto import auto
 from flangeye_plugins.reader.folder import FolderParams, folder

@@ -9,13 +9,11 @@ import numpy as np
 import pytest
 
 from flangeye.errors import RecipeError, StageError
-from flangeye.maths.geometry import invert, rigid, rotation_from_rpy, rotation_log
 from flangeye.maths.kinematics import Arm
 from flangeye.models.bodies import ArmBody, TargetBody, arm_body
 from flangeye.models.configuration import ORIGIN, Configuration
 from flangeye.models.urdf import robot_from_urdf
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.load import load_recipe, parse_recipe
 from flangeye.types import (
     BASE,
     CAMERA,
@@ -28,6 +26,8 @@ from flangeye.types import (
     Rejected,
     Transform,
 )
+from flangeye.types.geometry import invert, rigid, rotation_from_rpy, rotation_log
+from flangeye.workflow.recipe.load import load_recipe, parse_recipe
 from flangeye_plugins.fit.body import FitBodyParams, fit_body
 from flangeye_plugins.segment.body import SegmentBodyParams, segment_body
 from tests.plugins.seam.raycast import Plate

@@ -10,12 +10,10 @@ import pytest
 import trimesh
 
 from flangeye.errors import RecipeError, StageError
-from flangeye.maths.geometry import hat, rigid, rotation_from_rpy, rotation_log
 from flangeye.models.bodies import TargetBody, load_body
 from flangeye.models.configuration import ORIGIN, Configuration
 from flangeye.models.loading import load_model
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.load import load_recipe, parse_recipe
 from flangeye.types import (
     BASE,
     CAMERA,
@@ -30,6 +28,8 @@ from flangeye.types import (
     Rejected,
     Transform,
 )
+from flangeye.types.geometry import hat, rigid, rotation_from_rpy, rotation_log
+from flangeye.workflow.recipe.load import load_recipe, parse_recipe
 from flangeye_emulators.world.mesh import MATERIALS, Mesh, box
 from flangeye_emulators.world.raycast import RaycastScene, SolidBody
 from flangeye_emulators.world.scanner import scanner_of

@@ -25,9 +25,9 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
 from flangeye import StageError
-from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.testing import ExportConformance
 from flangeye.types import BASE, CAMERA, FLANGE, CalibratedPose, Transform
+from flangeye.types.geometry import rigid, rotation_exp
 from flangeye_plugins.export import EXPORTS
 from flangeye_plugins.export.documents import UrdfParams
 

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from flangeye.maths.geometry import basis_of_plane
 from flangeye.models.loading import load_model
 from flangeye.models.targets import Flange, flange_of, load_standard
 from flangeye.types import CAMERA, FlangeCloud, PointCloud
+from flangeye.types.geometry import basis_of_plane
 
 CENTRE = np.array([0.05, -0.03, 0.7])
 NORMAL = np.array([0.2, -0.1, -1.0]) / np.linalg.norm([0.2, -0.1, -1.0])

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from flangeye.maths.geometry import rigid, rotation_exp, rotation_log
 from flangeye.models.boards import Board, charuco_of, print_of
 from flangeye.models.corners import Corners, board_seen
 from flangeye.types import CAMERA, Capture, Floats, Image, PointCloud, Rejected, Transform, by_frame
+from flangeye.types.geometry import rigid, rotation_exp, rotation_log
 from flangeye.units import SI
 from flangeye_emulators.world.board_image import BoardCamera, Cover, render_board, scan_board
 from flangeye_plugins.fit import boards

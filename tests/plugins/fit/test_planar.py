@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from flangeye.maths.geometry import rigid, rotation_exp, rotation_log
 from flangeye.models.corners import Corners
 from flangeye.types import CAMERA, Image, PointCloud
+from flangeye.types.geometry import rigid, rotation_exp, rotation_log
 from flangeye_plugins.fit.planar import (
     PlanarPose,
     middles_beside_centres,

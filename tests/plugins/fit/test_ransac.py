@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye.maths.geometry import basis_of_plane
 from flangeye.types import CircleFeature, Rejected, Seed
+from flangeye.types.geometry import basis_of_plane
 from flangeye_plugins.fit.ransac import (
     CircleHypotheses,
     RansacCircleParams,

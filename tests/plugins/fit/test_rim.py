@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flangeye.maths.geometry import basis_of_plane, rotation_exp
 from flangeye.models.loading import load_model
 from flangeye.models.targets import wrist_circle_of
 from flangeye.types import CAMERA, CircleFeature, FlangeCloud, PointCloud, Rejected
+from flangeye.types.geometry import basis_of_plane, rotation_exp
 from flangeye.units import SI
 from flangeye_plugins.fit.rim import RimParams, fit_rim
 from tests.plugins.bounds import check_bound

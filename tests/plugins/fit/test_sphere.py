@@ -6,7 +6,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flangeye import StageError
-from flangeye.maths.geometry import basis_of_plane
 from flangeye.models.targets import Sphere
 from flangeye.types import (
     CAMERA,
@@ -17,6 +16,7 @@ from flangeye.types import (
     Transform,
     by_frame,
 )
+from flangeye.types.geometry import basis_of_plane
 from flangeye.units import SI
 from flangeye_plugins.fit.sphere import (
     SphereFit,

@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flangeye.errors import StageError
-from flangeye.maths.geometry import angle_between, rigid, rotation_from_rpy
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
+from flangeye.types.geometry import angle_between, rigid, rotation_from_rpy
 from flangeye_plugins.view import GuessParams, ShownParams, view_guess, view_shown
 
 ARM, SCANNER = Arm(load_model("robots", "ur5e")), load_model("scanners", "phoxi-m")

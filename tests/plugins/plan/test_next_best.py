@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flangeye.maths.geometry import angle_between
 from flangeye.motion.reach import Site
+from flangeye.types.geometry import angle_between
 from flangeye_plugins.plan import NextBestParams, next_best
 from tests.plugins.fixed import fixed
 from tools.study_next_best import compare

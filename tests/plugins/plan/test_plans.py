@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flangeye.maths.geometry import rpy_from_rotation
 from flangeye.models.loading import load_model
 from flangeye.motion.reach import Reach, Site
+from flangeye.types.geometry import rpy_from_rotation
 from flangeye_plugins.plan import GridParams, grid
 
 UP = np.diag([1.0, -1.0, -1.0])

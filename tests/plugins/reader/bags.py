@@ -6,8 +6,8 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from flangeye.maths.geometry import rigid
 from flangeye.maths.streams import interpolated
+from flangeye.types.geometry import rigid
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 T = STORE.types

@@ -11,17 +11,17 @@ from scipy.spatial.transform import Rotation
 
 from flangeye import StageError
 from flangeye.files.yaml_lines import parse_yaml
-from flangeye.log.read import read_run
-from flangeye.maths.geometry import rigid
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.streams import joints_at, pose_at
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.load import load_recipe, parse_recipe
-from flangeye.run.folder import RunFolder
-from flangeye.run.runner import Runner
-from flangeye.run.session import Start, record_run
-from flangeye.run.tables import write_tables
 from flangeye.types import ArchivePath, Source
+from flangeye.types.geometry import rigid
+from flangeye.workflow.log.read import read_run
+from flangeye.workflow.recipe.load import load_recipe, parse_recipe
+from flangeye.workflow.run.folder import RunFolder
+from flangeye.workflow.run.runner import Runner
+from flangeye.workflow.run.session import Start, record_run
+from flangeye.workflow.run.tables import write_tables
 from flangeye_plugins.reader.cell import CellParams, cell
 from tests.estimation.cells import ROBOT, moving, swinging
 

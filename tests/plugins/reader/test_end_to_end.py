@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from flangeye import cli
-from flangeye.maths.geometry import quaternion_from_rotation, rigid, rotation_exp, rotation_log
-from flangeye.maths.pose_formats import PoseConvention
 from flangeye.models.boards import Board
 from flangeye.types import Capture, Transform, by_frame
+from flangeye.types.geometry import quaternion_from_rotation, rigid, rotation_exp, rotation_log
+from flangeye.types.pose_formats import PoseConvention
 from flangeye_emulators.world.board_image import BoardCamera, render_board, scan_board
 from tools.folder_archive import write_folder
 

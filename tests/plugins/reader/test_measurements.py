@@ -11,11 +11,11 @@ from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
 from flangeye import StageError
-from flangeye.maths.geometry import rigid
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.streams import clock_offset, standstills, turning
 from flangeye.models.loading import load_model
 from flangeye.plugin.registry import load_registry
+from flangeye.types.geometry import rigid
 from flangeye_plugins.reader.corrected import CorrectedParams, corrected
 from flangeye_plugins.reader.pairing import _ms
 from flangeye_plugins.reader.samples import visp

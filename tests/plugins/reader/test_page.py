@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.load import parse_recipe
+from flangeye.workflow.recipe.load import parse_recipe
 
 PAGE = Path(__file__).parents[3] / "docs" / "reference" / "readers.md"
 SECTIONS = re.findall(r"^## (\w+)\n.*?```yaml\n(.*?)```", PAGE.read_text("utf-8"), re.M | re.S)

@@ -12,12 +12,12 @@ from pydantic import ValidationError
 from flangeye import StageError
 from flangeye.files.clouds import write_cloud
 from flangeye.files.recording import NotThisLayout
-from flangeye.maths.geometry import quaternion_from_rotation, rigid, rotation_exp
-from flangeye.maths.pose_formats import CONVENTIONS, EULER_ORDERS, PoseConvention
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.load import load_recipe
-from flangeye.run.runner import Runner
 from flangeye.types import ArchivePath, PointCloud
+from flangeye.types.geometry import quaternion_from_rotation, rigid, rotation_exp
+from flangeye.types.pose_formats import CONVENTIONS, EULER_ORDERS, PoseConvention
+from flangeye.workflow.recipe.load import load_recipe
+from flangeye.workflow.run.runner import Runner
 from flangeye_plugins.reader.samples import (
     EasyHandeyeParams,
     ZividSamplesParams,

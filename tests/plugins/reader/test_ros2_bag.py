@@ -16,16 +16,16 @@ from scipy.spatial.transform import Rotation
 from flangeye import StageError
 from flangeye.files.clouds import read_cloud
 from flangeye.files.recording import NotThisLayout
-from flangeye.log import records
-from flangeye.maths.geometry import rigid
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.streams import joints_at
 from flangeye.models.loading import load_model
 from flangeye.models.urdf import robot_from_urdf
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.load import load_recipe, parse_recipe
-from flangeye.run.runner import Runner
 from flangeye.types import ArchivePath
+from flangeye.types.geometry import rigid
+from flangeye.workflow.log import records
+from flangeye.workflow.recipe.load import load_recipe, parse_recipe
+from flangeye.workflow.run.runner import Runner
 from flangeye_plugins.reader.folder import FolderParams, folder
 from flangeye_plugins.reader.ros2_bag import BagParams, ros2_bag
 from flangeye_plugins.reader.ros2_messages import bag_files, messages

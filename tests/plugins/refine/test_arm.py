@@ -8,7 +8,6 @@ import pytest
 
 from flangeye import StageError
 from flangeye.files.yaml_lines import parse_yaml
-from flangeye.maths.geometry import rigid
 from flangeye.maths.kinematics import Arm
 from flangeye.models.cell import cell_of
 from flangeye.models.configuration import DEFAULT
@@ -26,6 +25,7 @@ from flangeye.types import (
     Transform,
     by_frame,
 )
+from flangeye.types.geometry import rigid
 from flangeye_emulators.world.arm import ArmErrors, ImperfectArm
 from flangeye_plugins.export.controllers import export_robot
 from flangeye_plugins.export.writing import NamedParams

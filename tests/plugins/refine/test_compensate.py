@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flangeye import CalibrationRefused, StageError, part
-from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.models.loading import load_model
 from flangeye.models.targets import flange_of, load_standard
 from flangeye.plugin.stage import KINDS, Params
@@ -28,6 +27,7 @@ from flangeye.types import (
     Views,
     by_frame,
 )
+from flangeye.types.geometry import rigid, rotation_exp
 from flangeye_plugins.error import error_icp
 from flangeye_plugins.refine import (
     CompensateParams,

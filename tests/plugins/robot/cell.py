@@ -8,9 +8,9 @@ from contextlib import contextmanager
 import numpy as np
 
 from flangeye.devices import PATIENCE, SILENT
-from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.models.loading import load_model
 from flangeye.types import Transform
+from flangeye.types.geometry import rigid, rotation_exp
 from flangeye_plugins.robot.tool_check import ControllerParams
 from flangeye_plugins.robot.ur.driver import robot_ur_rtde
 

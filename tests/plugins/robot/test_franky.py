@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from flangeye.devices import SILENT, DeviceError, Robot
-from flangeye.maths.geometry import rigid, rotation_exp
+from flangeye.types.geometry import rigid, rotation_exp
 from flangeye_emulators.controllers.arm import SpringSurface
 from flangeye_plugins.robot.franky import (
     FrankyParams,

@@ -13,11 +13,11 @@ import pytest
 from pydantic import ValidationError
 
 from flangeye.devices import DeviceError, MovedByHand, Robot
-from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.maths.kinematics import Arm
-from flangeye.maths.pose_formats import CONVENTIONS, AngleUnit
 from flangeye.models.loading import load_model
 from flangeye.types import Transform
+from flangeye.types.geometry import rigid, rotation_exp
+from flangeye.types.pose_formats import CONVENTIONS, AngleUnit
 from flangeye_emulators.controllers.arm import starting_joints
 from flangeye_plugins.robot.manual import (
     ManualParams,

@@ -8,10 +8,10 @@ import pytest
 
 from flangeye.devices import GRACE, DeviceError, Robot
 from flangeye.errors import StageError
-from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
 from flangeye.types import Transform
+from flangeye.types.geometry import rigid, rotation_exp
 from flangeye_emulators.controllers.arm import SpringSurface
 from flangeye_emulators.controllers.poses import twist_between
 from flangeye_emulators.robot import SimulatedRobotParams, robot_simulated

@@ -11,8 +11,8 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from flangeye.log.read import read_run
-from flangeye.maths.geometry import rigid, rotation_from_quaternion
+from flangeye.types.geometry import rigid, rotation_from_quaternion
+from flangeye.workflow.log.read import read_run
 from tests.plugins.ros2.installed import environment, free_domain
 
 FACING = [180.0, -90.0, 90.0, -90.0, -90.0, 0.0]

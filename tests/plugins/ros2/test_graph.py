@@ -7,11 +7,11 @@ import pytest
 
 from flangeye.devices import DeviceError
 from flangeye.errors import RecipeError
-from flangeye.maths.geometry import quaternion_from_rotation
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
-from flangeye.recipe.draft import Questions, draft_live
 from flangeye.testing import RobotConformance, ScannerConformance
+from flangeye.types.geometry import quaternion_from_rotation
+from flangeye.workflow.recipe.draft import Questions, draft_live
 from flangeye_plugins.robot.ros2.driver import (
     FreedriveParams,
     Ros2RobotParams,

@@ -8,9 +8,9 @@ import time
 import numpy as np
 import pytest
 
-from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
+from flangeye.types.geometry import rigid, rotation_exp
 from tests.plugins.ros2 import installed
 from tests.plugins.ros2.cell import (
     TOWARDS,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from flangeye.maths.geometry import rigid, rotation_from_rpy, rpy_from_rotation
+from flangeye.types.geometry import rigid, rotation_from_rpy, rpy_from_rotation
 
 
 def names_of(model, prefix=""):

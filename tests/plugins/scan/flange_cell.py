@@ -9,7 +9,6 @@ import numpy as np
 
 from flangeye.devices import MotionAllowed, RobotDriver, ScannerDriver
 from flangeye.models.loading import load_model
-from flangeye.recipe.header import LimitsSection
 from flangeye.types import (
     CAMERA,
     FLANGE,
@@ -19,6 +18,7 @@ from flangeye.types import (
     VerifiedHandEye,
     WorkpieceScan,
 )
+from flangeye.workflow.recipe.header import LimitsSection
 from flangeye_emulators.robot import SimulatedRobot, SimulatedRobotParams
 from flangeye_emulators.scanner import MountedParams, scanner_mounted
 from flangeye_plugins.scan import AlongParams, scan_along

@@ -10,8 +10,8 @@ from flangeye import RecipeError, StageError
 from flangeye.devices import Scan, Scanner, ScannerDriver
 from flangeye.files.clouds import write_cloud
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.load import load_recipe, parse_recipe
 from flangeye.types import CAMERA, PointCloud, Seed
+from flangeye.workflow.recipe.load import load_recipe, parse_recipe
 from flangeye_emulators.scan import SimulatedScanParams, scan_simulated
 from flangeye_plugins.scan import FileScanParams, scan_file, scan_live
 from tests.plugins.seam.scenes import BASE_T_CAMERA, scanned

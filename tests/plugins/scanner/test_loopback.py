@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from flangeye.devices import DeviceError, FrameDropped, KnowsTruth, Scanner
-from flangeye.maths.geometry import rigid
 from flangeye.models.loading import load_model
 from flangeye.models.scanners import middle_of_view
 from flangeye.models.targets import plate_of
 from flangeye.motion.reach import Reach
 from flangeye.types import BASE, FLANGE, Capture, Transform, by_frame
+from flangeye.types.geometry import rigid
 from flangeye.units import SI
 from flangeye_emulators.scanner import LoopbackScannerParams, scanner_loopback
 from flangeye_emulators.world.scanner import CameraPose

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from flangeye import CalibrationRefused, StageError
-from flangeye.maths.geometry import rigid, rotation_from_rpy, rotation_log
 from flangeye.maths.seam_geometry import errors_from, tube_radii
 from flangeye.models.loading import load_model
 from flangeye.models.workpiece import load_workpiece
 from flangeye.types import CAMERA, Box, PointCloud, WorkpieceScan
+from flangeye.types.geometry import rigid, rotation_from_rpy, rotation_log
 from flangeye_emulators.scan import SimulatedScanParams
 from flangeye_plugins.seam.cad import CadParams, seam_cad
 from flangeye_plugins.seam.register import Registered, register

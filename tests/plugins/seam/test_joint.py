@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from flangeye import CalibrationRefused, StageError
-from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.maths.seam_geometry import errors_from, tube_radii
 from flangeye.types import (
     CAMERA,
@@ -20,6 +19,7 @@ from flangeye.types import (
     VerifiedHandEye,
     WorkpieceScan,
 )
+from flangeye.types.geometry import rigid, rotation_from_rpy
 from flangeye_plugins.seam.ends import last_in_lanes
 from flangeye_plugins.seam.joint import JointParams, seam_joint
 from tests.plugins.seam.raycast import JOINTS, LENGTH, MM, WIDE, Plate, box, prism, scan_of, seen_by

@@ -11,8 +11,8 @@ from flangeye.maths.arm_correction import corrected_flange, reported_flange
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.load import load_recipe
 from flangeye.types import ArmCorrection, CorrectedArm, Seam
+from flangeye.workflow.recipe.load import load_recipe
 from flangeye_plugins.seam.planned import SeamParams, answer_for, for_the_controller
 from tests.plugins.seam.scenes import hand_eye
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from flangeye import CalibrationRefused
-from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.maths.seam_geometry import errors_from, tube_radii
 from flangeye.types import Seam, VerifiedHandEye
+from flangeye.types.geometry import rigid, rotation_exp
 from flangeye_plugins.seam.cad import CadParams, seam_cad
 from flangeye_plugins.seam.joint import JointParams, seam_joint
 from flangeye_plugins.seam.stitched import seen_in_base

@@ -4,9 +4,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from flangeye.maths.geometry import basis_of_plane
 from flangeye.models.targets import Flange
 from flangeye.types import BASE, CAMERA, FLANGE, Capture, PointCloud, Transform, by_frame
+from flangeye.types.geometry import basis_of_plane
 
 CENTRE = np.array([0.05, -0.04, 0.6])
 ASIDE = np.array([-0.1, 0.08, 0.65])

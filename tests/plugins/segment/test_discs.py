@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from flangeye import StageError
-from flangeye.maths.geometry import basis_of_plane
 from flangeye.maths.planes import Plane
 from flangeye.models.loading import load_model
 from flangeye.models.targets import wrist_circle_of
+from flangeye.types.geometry import basis_of_plane
 from flangeye_plugins.segment import flange as choice
 from flangeye_plugins.segment.discs import (
     Disc,

@@ -9,7 +9,7 @@ import pytest
 from flangeye import types as t
 from flangeye.errors import StageError
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.load import parse_recipe
+from flangeye.workflow.recipe.load import parse_recipe
 from flangeye_plugins.segment.discs import in_box
 from flangeye_plugins.segment.flange import SegmentParams, segment_flange
 from flangeye_plugins.segment.grid import coarse_view

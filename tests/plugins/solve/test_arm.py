@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from flangeye.maths.arm_correction import corrected_flange, follow
-from flangeye.maths.geometry import basis_of_plane, rigid, rotation_exp, rotation_log
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.statistics import chi2_quantile
 from flangeye.models.cell import cell_of
@@ -34,6 +33,7 @@ from flangeye.types import (
     Transform,
     by_frame,
 )
+from flangeye.types.geometry import basis_of_plane, rigid, rotation_exp, rotation_log
 from flangeye_plugins.acquire.archive import ArchiveParams, acquire_archive
 from flangeye_plugins.fit.rim import RimParams, fit_rim
 from flangeye_plugins.reader.ancorasir import AncorasirParams

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from flangeye import CalibrationRefused, StageError
-from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.models.targets import Flange
 from flangeye.plugin.stage import part
 from flangeye.types import (
@@ -22,6 +21,7 @@ from flangeye.types import (
     Views,
     by_frame,
 )
+from flangeye.types.geometry import rigid, rotation_exp
 from flangeye_plugins.cost import (
     AxesParams,
     TranslationParams,

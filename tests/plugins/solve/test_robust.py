@@ -10,13 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flangeye import CalibrationRefused, StageError
-from flangeye.maths.geometry import (
-    basis_of_plane,
-    covariance_at,
-    kabsch_covariance,
-    rigid,
-    rotation_exp,
-)
 from flangeye.maths.statistics import chi2_quantile
 from flangeye.models.cell import cell_of
 from flangeye.models.configuration import DEFAULT
@@ -32,6 +25,13 @@ from flangeye.types import (
     Source,
     Transform,
     by_frame,
+)
+from flangeye.types.geometry import (
+    basis_of_plane,
+    covariance_at,
+    kabsch_covariance,
+    rigid,
+    rotation_exp,
 )
 from flangeye_plugins.solve.named import SvdParams, solve_svd
 from flangeye_plugins.solve.robust import RobustParams, solve_cell, solve_robust

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from flangeye.maths.geometry import kabsch_covariance
 from flangeye.maths.statistics import (
     chi2_quantile,
     corners_of,
@@ -11,6 +10,7 @@ from flangeye.maths.statistics import (
     f_quantile,
     largest_error_quantile,
 )
+from flangeye.types.geometry import kabsch_covariance
 
 
 def test_quantiles_of_the_tables() -> None:

@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flangeye import CalibrationRefused, StageError
-from flangeye.maths.geometry import covariance_at, rotation_exp
 from flangeye.maths.statistics import chi2_quantile
 from flangeye.types import (
     BASE,
@@ -21,6 +20,7 @@ from flangeye.types import (
     Transform,
     by_frame,
 )
+from flangeye.types.geometry import covariance_at, rotation_exp
 from flangeye_plugins.solve.named import SvdParams, solve_svd
 
 TRUTH = rotation_exp(np.array([2.9, 0.4, -0.3])), np.array([0.4, -0.7, 0.9])

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flangeye.log.read import read_run
 from flangeye.types import HandEye, Pair
+from flangeye.workflow.log.read import read_run
 from flangeye_plugins.verify.drift import DriftParams, verify_drift
-from tests.doctor.monitor.cell import calibrate
+from tests.workflow.doctor.monitor.cell import calibrate
 
 
 @pytest.fixture(scope="module")

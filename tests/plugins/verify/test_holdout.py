@@ -8,7 +8,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from flangeye import StageError
-from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.types import (
     BASE,
     FLANGE,
@@ -23,6 +22,7 @@ from flangeye.types import (
     Transform,
     by_frame,
 )
+from flangeye.types.geometry import rigid, rotation_exp
 from flangeye_plugins.solve.named import SvdParams, solve_svd
 from flangeye_plugins.verify.holdout import (
     HoldoutParams,

@@ -10,13 +10,6 @@ from hypothesis import strategies as st
 
 from flangeye import StageError
 from flangeye.files.clouds import read_cloud
-from flangeye.maths.geometry import (
-    rigid,
-    rotation_exp,
-    rotation_from_quaternion,
-    rotation_from_rpy,
-    rotation_log,
-)
 from flangeye.models.loading import load_model
 from flangeye.models.robots import FlangeDetails
 from flangeye.models.targets import Flange, load_standard
@@ -33,6 +26,13 @@ from flangeye.types import (
     TransformEstimate,
     VerificationView,
     Views,
+)
+from flangeye.types.geometry import (
+    rigid,
+    rotation_exp,
+    rotation_from_quaternion,
+    rotation_from_rpy,
+    rotation_log,
 )
 from flangeye_plugins.error import error_holdout, error_icp
 from flangeye_plugins.verify.icp import (

@@ -10,7 +10,7 @@ import pytest
 
 from flangeye import types as t
 from flangeye.errors import StageError
-from flangeye.maths.geometry import rigid, rotation_exp, rotation_from_rpy, rpy_from_rotation
+from flangeye.types.geometry import rigid, rotation_exp, rotation_from_rpy, rpy_from_rotation
 from flangeye.units import SI
 from flangeye_plugins.verify.drift import DriftParams
 from flangeye_plugins.verify.holdout import HoldoutParams

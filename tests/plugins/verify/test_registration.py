@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flangeye.maths.geometry import rigid, rotation_exp, rotation_log
+from flangeye.types.geometry import rigid, rotation_exp, rotation_log
 from flangeye_plugins.verify import registration
 from flangeye_plugins.verify.registration import (
     Registration,

@@ -8,13 +8,13 @@ import numpy as np
 
 from flangeye.devices import MotionAllowed, RobotDriver, StateSource, TactileSensor
 from flangeye.files.paths import bundled
-from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.models.finger import Finger
 from flangeye.models.loading import load_model
 from flangeye.models.workpiece import load_workpiece
 from flangeye.plugin.stage import BoundPart, part
-from flangeye.recipe.header import LimitsSection
 from flangeye.types import Seam, Seed
+from flangeye.types.geometry import rigid, rotation_from_rpy
+from flangeye.workflow.recipe.header import LimitsSection
 from flangeye_emulators.finger.sensor import (
     SimulatedFinger,
     SimulatedFingerParams,

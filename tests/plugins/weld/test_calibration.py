@@ -11,10 +11,10 @@ import pytest
 from flangeye.devices import SensorFrame
 from flangeye.errors import StageError
 from flangeye.files.paths import bundled
-from flangeye.maths.geometry import nearest_rotation, rigid, rotation_exp
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
 from flangeye.types import Floats, Image
+from flangeye.types.geometry import nearest_rotation, rigid, rotation_exp
 from flangeye_plugins.weld.finger_camera import FingerReader
 from flangeye_plugins.weld.touch.calibration import Held, calibrate
 from flangeye_plugins.weld.touch.pivot import pivot

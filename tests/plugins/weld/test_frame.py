@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.models.finger import Finger
 from flangeye.motion.seam_following import STILL
 from flangeye.types import BASE, FLANGE, Transform
+from flangeye.types.geometry import rigid, rotation_exp
 from flangeye_plugins.weld.frame import Tool, WorkSurface, body_from
 from tools.weld_bench import FINGER
 

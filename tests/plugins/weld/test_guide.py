@@ -16,8 +16,8 @@ from flangeye.errors import NothingMoved, StageError
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.find import find_recipe
-from flangeye.recipe.load import load_recipe
+from flangeye.workflow.recipe.find import find_recipe
+from flangeye.workflow.recipe.load import load_recipe
 from flangeye_emulators.finger.sensor import typical_compliance
 from flangeye_emulators.robot import SimulatedRobot, SimulatedRobotParams
 from flangeye_plugins import guide

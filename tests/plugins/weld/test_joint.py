@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from flangeye.errors import StageError
-from flangeye.maths.geometry import rotation_from_rpy
 from flangeye.models.finger import Finger
+from flangeye.types.geometry import rotation_from_rpy
 from flangeye_emulators.weld_world.groove import Groove, GrooveSection, Tip, TipContact
 from flangeye_plugins.weld.checks import check_body, check_seat
 from flangeye_plugins.weld.following.belief import belief_of, body_of

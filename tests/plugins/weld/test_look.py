@@ -9,11 +9,11 @@ from pydantic import ValidationError
 
 from flangeye.devices import DeviceError, WeldProfile
 from flangeye.errors import StageError
-from flangeye.log.record import Recorder
 from flangeye.plugin.registry import Lookup, load_registry
 from flangeye.plugin.stage import BoundPart
-from flangeye.run.replay import replay_steps
 from flangeye.types import Seed
+from flangeye.workflow.log.record import Recorder
+from flangeye.workflow.run.replay import replay_steps
 from flangeye_emulators.finger.profiler import SimulatedProfilerParams, profiler_simulated
 from flangeye_emulators.weld_world.truth import ClockTruth, LookTruth, ToolTruth, WeldTruth
 from flangeye_plugins.weld.camera_process import CameraProcess

@@ -6,12 +6,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flangeye.files.paths import bundled
-from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.maths.seam_geometry import torch_deviation
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
 from flangeye.motion.seam_following import Command, ToolPose, turned
 from flangeye.types import Transform
+from flangeye.types.geometry import rigid, rotation_exp
 from flangeye_emulators.weld_world.groove import Groove, GrooveSection, Tip
 from flangeye_emulators.weld_world.groove import TipContact as Tip3D
 from flangeye_plugins.weld.following.refined import RefinedPath

@@ -9,7 +9,7 @@ from flangeye.models.finger import Finger
 from flangeye.models.loading import load_model
 from flangeye.models.model import read_model
 from flangeye.plugin.stage import BoundPart
-from flangeye.recipe.header import LimitsSection
+from flangeye.workflow.recipe.header import LimitsSection
 from flangeye_emulators.finger.sensor import (
     SimulatedFingerParams,
     sensor_simulated_finger,

@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 
 from flangeye.devices import MotionAllowed, RobotDriver
 from flangeye.errors import StageError
-from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.maths.kinematics import Arm
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.find import find_recipe
-from flangeye.recipe.load import load_recipe
+from flangeye.types.geometry import rigid, rotation_exp
 from flangeye.units import parse_quantity
+from flangeye.workflow.recipe.find import find_recipe
+from flangeye.workflow.recipe.load import load_recipe
 from flangeye_emulators.robot import SimulatedRobot, SimulatedRobotParams
 from flangeye_plugins.guide import ATTITUDES, Pivoted, guide_tool, with_body
 from flangeye_plugins.weld.following.belief import belief_of, body_of

@@ -10,8 +10,8 @@ from flangeye.devices import MotionAllowed, RobotDriver
 from flangeye.maths.seam_geometry import torch_deviation
 from flangeye.plugin.registry import load_registry
 from flangeye.plugin.stage import BoundPart
-from flangeye.recipe.header import LimitsSection
-from flangeye.run.replay import replay_steps
+from flangeye.workflow.recipe.header import LimitsSection
+from flangeye.workflow.run.replay import replay_steps
 from flangeye_emulators.finger.sensor import (
     SimulatedFingerParams,
     sensor_simulated_finger,

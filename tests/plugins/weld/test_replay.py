@@ -10,12 +10,12 @@ import pytest
 
 from flangeye.errors import StageError
 from flangeye.files.paths import bundled
-from flangeye.log.read import read_notes
-from flangeye.log.record import Recorder
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
 from flangeye.plugin.registry import load_registry
-from flangeye.run.replay import replay_steps
+from flangeye.workflow.log.read import read_notes
+from flangeye.workflow.log.record import Recorder
+from flangeye.workflow.run.replay import replay_steps
 from flangeye_plugins.sensor import McapParams, sensor_mcap
 from flangeye_plugins.weld.touch.tag_observation import TagDetector
 from tests.plugins.weld.cell import welded

@@ -9,7 +9,7 @@ from flangeye.errors import StageError
 from flangeye.maths.seam_geometry import torch_deviation
 from flangeye.plugin.registry import load_registry
 from flangeye.plugin.stage import BoundPart
-from flangeye.run.replay import replay_steps
+from flangeye.workflow.run.replay import replay_steps
 from flangeye_emulators.finger.sensor import SimulatedFingerParams, sensor_simulated_finger
 from flangeye_plugins.weld.following.belief import Belief
 from flangeye_plugins.weld.following.follower import Follower

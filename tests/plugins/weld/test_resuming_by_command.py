@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from flangeye.log.read import read_notes
+from flangeye.workflow.log.read import read_notes
 
 SEAM = "ur10e_phoxi-m_weld_simulated"
 

@@ -12,12 +12,12 @@ import yaml
 from numpy.typing import NDArray
 
 from flangeye.files.paths import bundled
-from flangeye.maths.geometry import rigid, rotation_exp, rotation_from_rpy
 from flangeye.maths.seam_geometry import distances_to_line
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
 from flangeye.motion.seam_following import Command
 from flangeye.types import BASE, FLANGE, Seam, Transform
+from flangeye.types.geometry import rigid, rotation_exp, rotation_from_rpy
 from flangeye_emulators.finger.sensor import SimulatedFinger
 from flangeye_emulators.weld_world.truth import ToolFile
 from flangeye_emulators.world import bench

@@ -10,10 +10,10 @@ import pytest
 from flangeye.devices import DeviceError
 from flangeye.errors import StageError
 from flangeye.files.paths import bundled
-from flangeye.maths.geometry import rotation_exp
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
 from flangeye.types import Image
+from flangeye.types.geometry import rotation_exp
 from flangeye_emulators.finger.sensor import FingerCamera, Optics, typical_compliance
 from flangeye_plugins.sensor import (
     ImageFolderParams,

@@ -5,9 +5,9 @@ import numpy as np
 from acme_flangeye.cost import cost_largest_axis
 from acme_flangeye.scanner import scanner_acme
 from flangeye import Params, hookimpl, stage
-from flangeye.maths.geometry import basis_of_plane
 from flangeye.models.targets import Flange
 from flangeye.types import CircleFeature, FlangeCloud, Rejected
+from flangeye.types.geometry import basis_of_plane
 from flangeye.units import Length, param
 
 

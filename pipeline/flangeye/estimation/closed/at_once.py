@@ -6,7 +6,8 @@ import numpy as np
 
 from flangeye.errors import CalibrationRefused
 from flangeye.estimation.closed.motions import Motions
-from flangeye.maths.geometry import (
+from flangeye.types import Floats
+from flangeye.types.geometry import (
     hat,
     invert,
     nearest_rotation,
@@ -15,7 +16,6 @@ from flangeye.maths.geometry import (
     rotation_from_quaternion,
     stack_rows,
 )
-from flangeye.types import Floats
 
 
 def daniilidis(motions: Motions) -> Floats:

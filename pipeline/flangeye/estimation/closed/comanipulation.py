@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from flangeye.errors import CalibrationRefused
 from flangeye.estimation.closed.motions import motions_of, place_of
 from flangeye.estimation.closed.separable import park_martin
-from flangeye.maths.geometry import (
+from flangeye.types import Floats
+from flangeye.types.geometry import (
     invert,
     nearest_rotation,
     rigid,
@@ -21,7 +22,6 @@ from flangeye.maths.geometry import (
     rotation_from_quaternion,
     stack_rows,
 )
-from flangeye.types import Floats
 
 Triple = tuple[Floats, Floats, Floats]
 

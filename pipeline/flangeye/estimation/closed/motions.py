@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from flangeye.errors import CalibrationRefused
-from flangeye.maths.geometry import invert, nearest_rotation, rigid, rotation_log, stack_rows
 from flangeye.types import Floats
+from flangeye.types.geometry import invert, nearest_rotation, rigid, rotation_log, stack_rows
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from flangeye.estimation.closed.motions import Motions, translation_of
-from flangeye.maths.geometry import (
+from flangeye.types import Floats
+from flangeye.types.geometry import (
     hat,
     nearest_rotation,
     rigid,
@@ -13,7 +14,6 @@ from flangeye.maths.geometry import (
     rotation_from_quaternion,
     stack_rows,
 )
-from flangeye.types import Floats
 
 
 def tsai_lenz(motions: Motions) -> Floats:

@@ -18,9 +18,9 @@ from flangeye.estimation.effects.effect import Block, Effect
 from flangeye.estimation.graph import Carrier, Linear, Problem
 from flangeye.maths.arm_correction import effects as field_effects
 from flangeye.maths.arm_correction import field_over
-from flangeye.maths.geometry import hat
 from flangeye.maths.kinematics import Arm
 from flangeye.types import Floats, SmoothField
+from flangeye.types.geometry import hat
 
 KINDS = {
     "zeros": ("joint zeros", 1.0),

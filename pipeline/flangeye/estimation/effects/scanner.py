@@ -16,9 +16,9 @@ import numpy as np
 from flangeye.estimation.effects.effect import Effect
 from flangeye.estimation.graph import Linear, Problem, Sightings
 from flangeye.maths.arm_correction import features, powers
-from flangeye.maths.geometry import levers, stack_rows
 from flangeye.models.scanners import ScannerModel
 from flangeye.types import Floats
+from flangeye.types.geometry import levers, stack_rows
 
 TIMES = 1.1
 """By how many times the file's calibration error may be more or less, one sigma: data sheets state

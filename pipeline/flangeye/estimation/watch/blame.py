@@ -11,9 +11,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from flangeye.estimation.watch.drift import CheckSightings, Information, allowance
-from flangeye.maths.geometry import adjoint_shift, stack_rows
 from flangeye.maths.statistics import MISFIT, chi2_quantile
 from flangeye.types import Floats
+from flangeye.types.geometry import adjoint_shift, stack_rows
 
 LARGEST = 1e-3
 """Standard deviation of what a part may do: [rad] or [m]."""

@@ -31,9 +31,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from flangeye.maths.geometry import hat, levers
 from flangeye.maths.statistics import MISFIT, chi2_quantile, f_quantile
 from flangeye.types import Floats
+from flangeye.types.geometry import hat, levers
 
 NO_NORMAL = 1.0
 """Variance [rad^2] of a tilt that was not measured: no information."""

@@ -20,8 +20,8 @@ from itertools import product
 import numpy as np
 
 from flangeye.maths.arm_correction import RADII, features
-from flangeye.maths.geometry import hat, nearest_rotation, rotation_log
 from flangeye.types import Floats
+from flangeye.types.geometry import hat, nearest_rotation, rotation_log
 
 POWERS = tuple(
     place + turn

@@ -16,12 +16,7 @@ from typing import Literal
 import numpy as np
 
 from flangeye.files.clouds.pcd import Viewpoint, open_pcd
-from flangeye.files.clouds.plain import (
-    STATED,
-    open_npy,
-    open_npz,
-    open_text,
-)
+from flangeye.files.clouds.plain import STATED, open_npy, open_npz, open_text
 from flangeye.files.clouds.ply import open_ply
 from flangeye.files.clouds.table import Points, PointTable, refuse
 from flangeye.files.elsewhere import at_hand

@@ -24,7 +24,7 @@ from flangeye.files.clouds.table import (
     refuse,
     split_header,
 )
-from flangeye.maths.geometry import rotation_from_quaternion
+from flangeye.types.geometry import rotation_from_quaternion
 
 Header = Mapping[str, list[str]]
 

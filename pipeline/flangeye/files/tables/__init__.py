@@ -1,7 +1,7 @@
 """Tables of poses as people and programs write them: text, documents, arrays, robot programs.
 
 A new kind of file is a function in :mod:`~flangeye.files.documents` and its row there, or a
-pattern in :data:`~flangeye.maths.pose_formats.CONVENTIONS`.
+pattern in :data:`~flangeye.types.pose_formats.CONVENTIONS`.
 
 Rows of poses, whatever file they are from.
 
@@ -37,7 +37,7 @@ from flangeye.files.tables.table import (
     rows_of,
 )
 from flangeye.files.words import reason_of
-from flangeye.maths.pose_formats import CONVENTIONS
+from flangeye.types.pose_formats import CONVENTIONS
 
 __all__ = [
     "KINDS",

@@ -15,11 +15,7 @@ from flangeye_emulators.controllers.network import (
 )
 from flangeye_emulators.controllers.server import Server, run_server
 from flangeye_emulators.controllers.ur import rtde
-from flangeye_emulators.controllers.ur.controller import (
-    RefusedError,
-    Runtime,
-    URController,
-)
+from flangeye_emulators.controllers.ur.controller import RefusedError, Runtime, URController
 from flangeye_emulators.controllers.ur.script import run_program, take_program
 
 PORT = 29999

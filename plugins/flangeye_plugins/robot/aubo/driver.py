@@ -11,11 +11,11 @@ import numpy as np
 from pydantic import Field
 
 from flangeye.devices import GRACE, Device, DeviceError, Mode, Robot, RobotState, load_sdk
-from flangeye.maths.geometry import rotation_log
-from flangeye.maths.pose_formats import CONVENTIONS
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.stage import part
 from flangeye.types import BASE, FLANGE, TOOL, Floats, Transform
+from flangeye.types.geometry import rotation_log
+from flangeye.types.pose_formats import CONVENTIONS
 from flangeye_plugins.robot.aubo.client import STANDING, AuboClient, Ride
 from flangeye_plugins.robot.tool_check import (
     ControllerParams,

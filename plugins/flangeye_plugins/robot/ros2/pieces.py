@@ -16,9 +16,9 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from flangeye.devices import GRACE, DeviceError
-from flangeye.maths.geometry import rotation_exp, rotation_log
 from flangeye.maths.kinematics import Arm
 from flangeye.types import Floats
+from flangeye.types.geometry import rotation_exp, rotation_log
 
 AHEAD = 0.1
 """How far a piece leads along the motion before it brakes [s]: three renewals may be late."""

@@ -12,10 +12,10 @@ import numpy as np
 
 from flangeye.devices import Device, DeviceError, Mode, Robot, RobotState, load_sdk
 from flangeye.files.processes import busy
-from flangeye.maths.pose_formats import CONVENTIONS
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.stage import part
 from flangeye.types import BASE, FLANGE, TOOL, Floats, Transform
+from flangeye.types.pose_formats import CONVENTIONS
 from flangeye_plugins.robot.tool_check import (
     ControllerParams,
     require_model,

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from flangeye.errors import StageError
-from flangeye.maths.geometry import nearest_rotation, rotation_exp, rotation_log
 from flangeye.models.finger import Calibration
 from flangeye.types import Floats
+from flangeye.types.geometry import nearest_rotation, rotation_exp, rotation_log
 from flangeye.units import SI
 from flangeye_plugins.weld.touch.tag_observation import TagReading
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from flangeye.errors import StageError
-from flangeye.maths.geometry import nearest_rotation, rotation_exp, rotation_log
 from flangeye.models.finger import Finger
 from flangeye.types import Array, Floats
+from flangeye.types.geometry import nearest_rotation, rotation_exp, rotation_log
 from flangeye_plugins.weld.touch.tag_observation import TagReading
 
 

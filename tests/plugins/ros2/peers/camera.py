@@ -22,11 +22,11 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState, Poin
 from std_msgs.msg import Empty
 from std_srvs.srv import Trigger
 
-from flangeye.maths.geometry import invert, rigid
 from flangeye.maths.kinematics import Arm
 from flangeye.models.boards import Board
 from flangeye.models.loading import load_model
 from flangeye.types import CAMERA, PointCloud
+from flangeye.types.geometry import invert, rigid
 from flangeye_emulators.scanner import CellScene, TrueStance
 from flangeye_emulators.world.board_image import BoardCamera, render_board
 from flangeye_emulators.world.scanner import CameraPose, scanner_of

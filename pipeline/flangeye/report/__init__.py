@@ -1,7 +1,0 @@
-"""One self-contained HTML page about a run, made from its log alone."""
-
-from __future__ import annotations
-
-from flangeye.report.page import write_report
-
-__all__ = ["write_report"]

@@ -1,0 +1,195 @@
+"""The rows of a batch as partitioned Parquet: ``sessions.parquet/``, written by the workers.
+
+Sessions are numbered in the order they are asked for, and ten thousand of them make a block. A
+worker writes the rows of a chunk as one part of their block; when a batch begins and ends, the
+parts of each block are settled into one file: a row a session, in order. So no process ever holds
+more than a block.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye.files.paths import Storage
+from flangeye.files.yaml_lines import parse_value
+from flangeye.workflow.batch.outcome import FINISHED, SessionOutcome
+from flangeye.workflow.batch.plan import BatchSession
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+Row = dict[str, Any]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+Kind = str
+"""``string``, ``int64`` or ``double``, as Arrow calls them."""
+
+FOLDER = "sessions.parquet"
+BLOCK = 10_000
+"""Sessions in a file at most."""
+
+
+def columns_of(varied: Mapping[str, Sequence[str]]) -> dict[str, Kind]:
+    """Return the columns of the table: name -> kind.
+
+    Args:
+        varied: Path in the recipe -> all its values as written. They are numbers when all of them
+            are; ``0.2 mm`` stays text.
+    """
+    names = ("session", "recipe", "archive", *varied, "seed", *SessionOutcome.__dataclass_fields__)
+    return {name: _kind(name, varied) for name in names}
+
+
+def _kind(name: str, varied: Mapping[str, Sequence[str]]) -> Kind:
+    if name in varied:
+        kinds = {type(parse_value(text, name)) for text in varied[name]}
+        return "int64" if kinds == {int} else "double" if kinds <= {int, float} else "string"
+    if name in ("session", "recipe", "archive", "status", "reason", "report"):
+        return "string"
+    return "int64" if name in ("seed", "used", "captures") else "double"
+
+
+def row_of(session: BatchSession, outcome: SessionOutcome, columns: Mapping[str, Kind]) -> Row:
+    """Return a session's row."""
+    varied = {
+        name: text if columns[name] == "string" else parse_value(text, name)
+        for name, text in session.varied.items()
+    }
+    row = {
+        "session": session.id,
+        "recipe": session.recipe.stem,
+        "archive": session.archive,
+        **varied,
+        "seed": session.seed,
+        **vars(outcome),
+    }
+    # Names of files may be no UTF-8; a table's text is
+    return {
+        name: cell.encode("utf-8", "replace").decode() if isinstance(cell, str) else cell
+        for name, cell in row.items()
+    }
+
+
+class Ledger:
+    """The sessions of a batch and the row of each in the tables; 24 bytes a session."""
+
+    def __init__(self, sessions: Iterable[BatchSession]) -> None:
+        self.numbers = np.fromiter((int(s.number, 16) for s in sessions), np.uint64)
+        self._order = np.argsort(self.numbers)
+        self._sorted = self.numbers[self._order]
+
+    def positions(self, ids: Iterable[str]) -> Ints:
+        """Return the rows of sessions by their ids; -1 for sessions that are not in the batch."""
+        numbers = np.fromiter((int(each[-16:], 16) for each in ids), np.uint64)
+        if not len(self.numbers):
+            return np.full(len(numbers), -1)
+        at = np.searchsorted(self._sorted, numbers).clip(max=len(self._sorted) - 1)
+        return np.where(self._sorted[at] == numbers, self._order[at], -1)
+
+
+class Dataset:
+    """The rows of a batch in its folder."""
+
+    def __init__(self, place: Storage, columns: Mapping[str, Kind]) -> None:
+        import pyarrow as pa
+
+        self._place = place
+        self._schema = pa.schema(list(columns.items()))
+
+    def write_part(self, block: int, name: str, rows: Sequence[Row]) -> None:
+        """Write rows of one block under a name that no other chunk has.
+
+        Raises:
+            StageError: They cannot be written.
+        """
+        import pyarrow as pa
+
+        self._write(f"{FOLDER}/{block:06}-{name}.parquet", pa.Table.from_pylist(rows, self._schema))
+
+    def finished(self, ledger: Ledger, report: bool) -> Bools:
+        """Return which sessions have finished, and forget every other row.
+
+        A row that is forgotten costs little: the session's folder has it too.
+
+        Args:
+            ledger: The sessions that are asked for.
+            report: Whether each must have a report.
+        """
+        done = np.zeros(len(ledger.numbers), dtype=bool)
+        for block, parts in self._parts().items():
+            _, at = self._settled(block, parts, ledger, FINISHED, report)
+            done[at] = True
+        return done
+
+    def blocks(self, ledger: Ledger) -> Iterator[pa.Table]:
+        """Yield the rows, settled, in the order in which the sessions are asked for."""
+        for block, parts in self._parts().items():
+            yield self._settled(block, parts, ledger)[0]
+
+    def rows(self, ledger: Ledger) -> Iterator[Row]:
+        """Yield the same, one by one."""
+        for table in self.blocks(ledger):
+            yield from table.to_pylist()
+
+    def _parts(self) -> dict[int, list[str]]:
+        """Return the files of each block."""
+        parts: dict[int, list[str]] = {}
+        for name in self._place.names(FOLDER):
+            number = name.removeprefix(f"{FOLDER}/")[:6]
+            if number.isdecimal():
+                parts.setdefault(int(number), []).append(name)
+        return parts
+
+    def _settled(
+        self,
+        block: int,
+        parts: Sequence[str],
+        ledger: Ledger,
+        statuses: Sequence[str] = (),
+        report: bool = False,
+    ) -> tuple[pa.Table, Ints]:
+        """Return a block's rows that count, and where they stand; leave them as one file."""
+        import pyarrow as pa
+        import pyarrow.compute as pc
+
+        table = pa.concat_tables([self._schema.empty_table(), *map(self._read, parts)])
+        at = ledger.positions(table["session"].to_pylist())
+        counts = (at >= 0) & (at // BLOCK == block)
+        if statuses:
+            counts &= pc.is_in(table["status"], pa.array(statuses)).to_numpy()
+        if report:
+            counts &= table["report"].is_valid().to_numpy()
+        rows = np.flatnonzero(counts)
+        places, first = np.unique(at[rows], return_index=True)
+        kept = table.take(rows[first])
+        whole = f"{FOLDER}/{block:06}.parquet"
+        if len(kept) < len(table) or list(parts) != [whole]:
+            if len(kept):
+                self._write(whole, kept)
+            for part in parts:
+                if part != whole or not len(kept):
+                    self._place.remove(part)
+        return kept, places
+
+    def _read(self, name: str) -> pa.Table:
+        """Return a part; no rows if it is torn, or has other columns."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        try:
+            table = pq.read_table(io.BytesIO(self._place.read(name) or b""))
+        except (pa.ArrowException, OSError):
+            return self._schema.empty_table()
+        return table if table.schema == self._schema else self._schema.empty_table()
+
+    def _write(self, name: str, table: pa.Table) -> None:
+        import pyarrow.parquet as pq
+
+        content = io.BytesIO()
+        pq.write_table(table, content)
+        self._place.write(name, content.getvalue())

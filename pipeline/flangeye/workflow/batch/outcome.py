@@ -1,0 +1,154 @@
+"""One session of a batch: its request, and its outcome as a row of the tables."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+from flangeye.errors import FlangeyeError
+from flangeye.files.paths import Storage
+from flangeye.workflow.result.contract import Result
+
+Status = Literal["verified", "unverified", "refused", "failed", "crashed"]
+STATUSES: tuple[Status, ...] = get_args(Status)
+ACCEPTED, FINISHED = STATUSES[:2], STATUSES[:3]
+
+MARKER = "session.json"
+"""Written last into a session's folder: it is whole, and need not be run again."""
+
+
+@dataclass(frozen=True)
+class SessionOutcome:
+    """The outcome of one session; SI units.
+
+    Attributes:
+        status: How it ended; ``failed`` is a foreseen mistake such as an unreadable archive,
+            ``crashed`` one that is not, or the death of its worker.
+        reason: Why, unless the calibration was accepted.
+        used: Captures used.
+        captures: Captures seen.
+        holdout_rms_m: Error on poses that took no part in the estimate.
+        holdout_median_m: The same, its median.
+        holdout_p95_m: The same, 95 % are below.
+        expected_rms_m: Error to expect at the work.
+        expected_p95_m: The same, 95 % are below.
+        true_rms_m: True error over the workspace, in simulation.
+        true_centre_m: True error at its centre.
+        true_rotation_rad: True error of the rotation.
+        seconds: What the session took on its worker.
+        report: Report of the session, from the batch's folder.
+    """
+
+    status: Status
+    reason: str | None = None
+    used: int | None = None
+    captures: int | None = None
+    holdout_rms_m: float | None = None
+    holdout_median_m: float | None = None
+    holdout_p95_m: float | None = None
+    expected_rms_m: float | None = None
+    expected_p95_m: float | None = None
+    true_rms_m: float | None = None
+    true_centre_m: float | None = None
+    true_rotation_rad: float | None = None
+    seconds: float = 0.0
+    report: str | None = None
+
+
+def outcome_of(result: Result) -> SessionOutcome:
+    """Return the headline figures of a result."""
+    holdout, expected, truth = result.holdout, result.expected_error, result.truth
+    return SessionOutcome(
+        status=result.status,  # type: ignore[arg-type]
+        reason=result.refused,
+        used=sum(o.used for o in result.observations),
+        captures=len(result.observations),
+        holdout_rms_m=holdout.rms if holdout else None,
+        holdout_median_m=holdout.median if holdout else None,
+        holdout_p95_m=holdout.p95 if holdout else None,
+        expected_rms_m=expected.rms if expected else None,
+        expected_p95_m=expected.p95 if expected else None,
+        true_rms_m=truth.rms_over_workspace if truth else None,
+        true_centre_m=truth.error_at_centroid if truth else None,
+        true_rotation_rad=truth.rotation_error if truth else None,
+    )
+
+
+def mark_finished(place: Storage, folder: str, key: str, outcome: SessionOutcome) -> None:
+    """Write the outcome into a session's folder, atomically.
+
+    Raises:
+        StageError: It cannot be written.
+    """
+    text = json.dumps({"key": key, **asdict(outcome)}, indent=2) + "\n"
+    place.write(f"{folder}/{MARKER}", text.encode())
+
+
+def finished_outcome(place: Storage, folder: str, key: str, report: bool) -> SessionOutcome | None:
+    """Return the outcome that :func:`mark_finished` stored; None if the session has to run.
+
+    Args:
+        place: The batch's folder.
+        folder: The session's in it.
+        key: The session's key; anything else there is of another session.
+        report: Whether a report is wanted.
+    """
+    try:
+        data = json.loads(place.read(f"{folder}/{MARKER}") or b"")
+        if data.pop("key") != key or (report and not data["report"]):
+            return None
+        return SessionOutcome(**data)
+    except (ValueError, TypeError, KeyError, AttributeError):
+        return None  # not there, or not ours
+
+
+class BatchError(FlangeyeError):
+    """The batch cannot start; nothing has run."""
+
+
+@dataclass(frozen=True)
+class Tls:
+    """Files for an encrypted connection in which both sides are known.
+
+    Attributes:
+        ca: Certificate of the authority that signed the others, PEM.
+        cert: Our certificate, PEM.
+        key: Its private key, PEM: who has it may run code on every worker.
+    """
+
+    ca: Path
+    cert: Path
+    key: Path
+
+
+@dataclass(frozen=True)
+class Request:
+    """A batch as requested on the command line.
+
+    Attributes:
+        recipe: File, or name of a bundled recipe.
+        archives: Recordings to run on, paths or URLs; none for recipes that simulate.
+        overrides: ``PATH=VALUE``, the same in every session.
+        grid: ``PATH=a,b,c``: every combination is run.
+        repeat: How many seeds, counted up from the recipe's; None for the recipe's alone.
+        vary: What ``repeat`` counts up; only ``seed`` can be.
+        workers: Worker processes on this machine; None for one per core.
+        scheduler: Address of a running dask scheduler, instead of workers here.
+        tls: Certificates by which scheduler and client authenticate each other.
+        out: Folder of the batch, by path or URL; None for ``batches/<recipe>``.
+        report: Make each session's ``report.html``.
+    """
+
+    recipe: str
+    archives: tuple[str, ...] = ()
+    overrides: tuple[str, ...] = ()
+    grid: tuple[str, ...] = ()
+    repeat: int | None = None
+    vary: str = "seed"
+    workers: int | None = None
+    scheduler: str | None = None
+    tls: Tls | None = None
+    out: str | None = None
+    report: bool = True

@@ -1,0 +1,116 @@
+"""``flangeye doctor``: find mistakes in recordings and the line that mends each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import takewhile
+from typing import Any
+
+import numpy as np
+
+from flangeye.workflow.doctor.diagnosis import Diagnosis, Finding, Misfit
+
+
+def as_text(diagnosis: Diagnosis) -> str:
+    """Return the findings as text, a few lines each."""
+    session = diagnosis.session
+    head = f"{int(session.seen.sum())} of {len(session)} samples have a target in them"
+    lines = [f"{head}; {len(diagnosis.checks)} checks", *_idle(diagnosis)]
+    for number, finding in enumerate(diagnosis.findings, 1):
+        lines += ["", f"{number}. {finding.name}: {finding.what}", *_details(finding)]
+    for note in diagnosis.notes:
+        lines += ["", f"note: {note.name}: {note.what}", *fix_lines(note, "   ")]
+    if not diagnosis.findings:
+        lines += ["", "nothing found"]
+    return "\n".join(lines)
+
+
+def _idle(diagnosis: Diagnosis) -> list[str]:
+    """Return a line for each reason why checks do not apply, with their names."""
+    reasons: dict[str, list[str]] = {}
+    for name, why in diagnosis.idle.items():
+        reasons.setdefault(why, []).append(name.partition(".")[2])
+    return [f"not applicable: {', '.join(names)} ({why})" for why, names in reasons.items()]
+
+
+def _details(finding: Finding) -> list[str]:
+    lines = []
+    if finding.samples:
+        listed = 8  # of more samples, the rest is counted
+        shown = ", ".join(finding.samples[:listed])
+        more = len(finding.samples) - listed
+        lines.append(f"   samples: {shown}" + (f" and {more} more" if more > 0 else ""))
+    if evidence := evidence_of(finding):
+        lines.append(f"   evidence: {evidence}")
+    return [*lines, *fix_lines(finding, "   ")]
+
+
+def evidence_of(finding: Finding) -> str:
+    """Return what a correction makes of errors and likelihood; empty if it was not computed."""
+    if finding.before is None or finding.after is None:
+        return ""
+    error = f"error {_error(finding.before)} before, {_error(finding.after)} after"
+    # `gain` is a natural logarithm; the line shows a power of ten
+    times = finding.gain / np.log(10.0)
+    likelier = f"; 10^{times:.0f} times likelier" if 1 <= times < np.inf else ""
+    return f"{error}{likelier}; by chance {_chance(finding.probability)}"
+
+
+def mended_together(findings: Sequence[Finding]) -> tuple[str, str, list[str]]:
+    """Return what is wrong, how it is known, and what to do, as one answer to several findings.
+
+    Each was found with those before it mended, so the last line of a section of the recipe mends
+    them all. A first mistake that no line mends stands alone.
+    """
+    together = list(takewhile(lambda finding: finding.lines, findings)) or [findings[0]]
+    lines = {finding.fix.split(": ")[0]: finding.fix for finding in together}
+    wrong = "; and ".join(finding.what for finding in together)
+    known = "; then ".join(filter(None, map(evidence_of, together)))
+    steps = ["\n  ".join(sorted(lines.values()))] if len(lines) > 1 else together[-1].choices
+    return wrong, known and f"tried with that mended: {known}", steps
+
+
+def fix_lines(finding: Finding, indent: str) -> list[str]:
+    """Return the fixes, one line for each choice; empty if there is none."""
+    if not finding.fix:
+        return []
+    first, *others = finding.choices
+    return [f"{indent}fix: {first}", *(f"{indent}or:  {other}" for other in others)]
+
+
+def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
+    """Return the findings as plain data, SI units."""
+    return {
+        "damage": list(diagnosis.session.damage),
+        "samples": len(diagnosis.session),
+        "seen": int(diagnosis.session.seen.sum()),
+        "checks": list(diagnosis.checks),
+        "not_applicable": dict(diagnosis.idle),
+        "findings": [_plain(finding) for finding in diagnosis.findings],
+        "notes": [_plain(note) for note in diagnosis.notes],
+    }
+
+
+def _plain(finding: Finding) -> dict[str, Any]:
+    return {
+        "name": finding.name,
+        "what": finding.what,
+        "samples": list(finding.samples),
+        "error_before": _errors(finding.before),
+        "error_after": _errors(finding.after),
+        "probability": finding.probability,
+        "fix": finding.fix,
+    }
+
+
+def _errors(misfit: Misfit | None) -> dict[str, float | None] | None:
+    return None if misfit is None else misfit._asdict()
+
+
+def _error(misfit: Misfit) -> str:
+    position = f"{misfit.position * 1e3:.4g} mm"
+    return position if misfit.angle is None else f"{position}, {np.degrees(misfit.angle):.3g} deg"
+
+
+def _chance(probability: float) -> str:
+    return "less than 1e-15" if probability < 1e-15 else f"{probability:.1e}"

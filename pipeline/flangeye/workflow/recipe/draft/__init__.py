@@ -1,0 +1,116 @@
+"""``flangeye init``: draft a valid recipe from a folder of recordings or a running cell."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flangeye.errors import RecipeError
+from flangeye.models.graph import RunningCell
+from flangeye.models.loading import load_model
+from flangeye.models.scanners import ScannerModel, middle_of_view
+from flangeye.types import Floats
+from flangeye.types.geometry import basis_of_plane, rpy_from_rotation
+from flangeye.units import in_mm, parse_quantity
+from flangeye.workflow.recipe.draft.recipe import (
+    PLATE,
+    Draft,
+    draft_recipe,
+    mounting_seen,
+    printed_target,
+    steps_of,
+    yaml_of,
+)
+from flangeye.workflow.recipe.draft.survey import Questions, look
+
+__all__ = ["Draft", "Questions", "draft_live", "draft_recipe", "look", "mounting_seen"]
+
+
+def draft_live(cell: RunningCell, questions: Questions, out: Path) -> Draft:
+    """Return a recipe for a running arm whose flange, or what it carries, faces a camera beside it.
+
+    Args:
+        cell: What runs.
+        questions: For what cannot be seen: the plate, the printed target of a camera of images, the
+            camera's model, where it stands, and the box that the flange may move in.
+        out: Where the recipe will be; the files it names are beside it.
+
+    Raises:
+        RecipeError: An answer is missing, or is none.
+    """
+    plate = questions.ask("plate", "which plate the flange is ('flangeye standards')", PLATE)
+    name = questions.ask("scanner", "which scanner ('flangeye scanners')", None, "realsense-d435")
+    scanner = load_model("scanners", name)
+    if not isinstance(scanner, ScannerModel):
+        raise RecipeError(f"--scanner {name}: its file lacks what planning needs: what it sees")
+    target: dict[str, Any] = {"flange": {}}
+    carried: dict[str, Any] = {}
+    if cell.pixels is not None:
+        target = printed_target(
+            [("the camera", cell.pixels)] if cell.pixels.size else [], questions
+        )
+        carried = {"configuration": {"name": "eye-on-base", "place": "unknown"}}
+    robot = {**cell.robot, "limits": {"box": _box(cell.flange, questions)}}
+    first = {"view": {"guess": _view(cell, scanner, questions)}}
+    data = {
+        "title": f"Calibration of {name} beside the arm",
+        "robot": robot,
+        "scanner": {"model": name, **cell.scanner},
+        "feature": {"standard": plate},
+        **carried,
+        "steps": [{"acquire.live": first}, *steps_of(target), *cell.steps],
+    }
+    return Draft(yaml_of(data), (), {out.with_name(n): text for n, text in cell.files.items()})
+
+
+def _box(flange: Floats, questions: Questions) -> dict[str, Any]:
+    """Return the box that the flange's centre stays in."""
+    question = "box that the flange may move in, centre and size in the base"
+    # [m]: poses about one half of a metre apart tell a camera's turn to a hundredth of a
+    # degree
+    side = 0.6
+    default = f"{in_mm(flange[:3, 3])}; {in_mm(np.full(3, side))}"
+    answer = questions.ask("box", question, default)
+    centre, _, size = answer.partition(";")
+    return {"centre": _lengths("box", centre), "size": _lengths("box", size)}
+
+
+def _view(cell: RunningCell, scanner: ScannerModel, questions: Questions) -> dict[str, Any]:
+    """Return where the camera roughly stands: as the graph has it, else as is answered.
+
+    Of its direction nothing is asked: it looks at where the flange is now.
+    """
+    if cell.camera is None:
+        eye, why = middle_of_view(scanner, cell.flange), "the flange faces it now"
+    else:
+        eye, why = cell.camera[:3, 3], "the graph has it"
+    questions.likely["view"] = in_mm(eye), why
+    answer = questions.ask("view", "roughly where the scanner stands in the base", None)
+    position = _lengths("view", answer)
+    if cell.camera is not None and answer == in_mm(eye):
+        turn = cell.camera[:3, :3]
+    else:
+        turn = _looking(np.array([parse_quantity(x, "length") for x in position]), cell.flange)
+    angles = np.degrees(rpy_from_rotation(turn))
+    return {"position": position, "rpy": [f"{angle:.1f} deg" for angle in angles]}
+
+
+def _looking(eye: Floats, flange: Floats) -> Floats:
+    """Return axes (3, 3) with z from a place to the flange; about z they do not matter."""
+    x, y, ahead = basis_of_plane(flange[:3, 3] - eye)
+    return np.stack([x, y, ahead], axis=1)
+
+
+def _lengths(flag: str, text: str) -> list[str]:
+    """Return three lengths as a recipe has them; one unit at the end is that of all."""
+    numbers = [part.strip() for part in text.split(",")]
+    unit = numbers[-1].lstrip("-+.0123456789 ")
+    found = [n if n.endswith("m") else f"{n} {unit}" for n in numbers]
+    try:
+        if len([parse_quantity(n, "length") for n in found]) == 3:
+            return found
+    except ValueError:
+        pass
+    raise RecipeError(f"--{flag} '{text.strip()}': write three lengths, as 620 mm, 0 mm, 980 mm")

@@ -1,0 +1,479 @@
+"""What the columns of a table are called, and the poses, points and joint angles they hold.
+
+What a name reveals about poses: whose they are, and which way round.
+
+A name of two frames says both: ``gripper2base`` is a pose of the arm, ``camera_T_target``,
+``T_cam_board`` and ``cHt`` are the target's as the camera sees it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+from flangeye.files.tables import Cell, Column, Table, number_of
+from flangeye.models.robots import joints_in_order
+from flangeye.types.pose_formats import ANGLES, CONVENTIONS, LENGTHS
+
+JOINTS = ("joints",)
+"""In place of a rotation: joint angles."""
+_PLACES = (
+    "position",
+    "pos",
+    "translation",
+    "translations",
+    "trans",
+    "tvec",
+    "tvecs",
+    "location",
+    "origin",
+    "t",
+    "p",
+    "xyz",
+)
+_TURNS: Mapping[str, str] = {
+    "orientation": "q", "ori": "q", "quaternion": "q", "quat": "q", "q": "q",
+    "rotation": "r", "rotations": "r", "rot": "r", "r": "r", "euler": "r", "angles": "r",
+    "angle": "r", "winkel": "r",
+    "rvec": "v", "rvecs": "v", "rotvec": "v", "rodrigues": "v", "rpy": "e",
+}  # fmt: skip
+"""Names of rotations, and what the names of their columns begin with."""
+_OPENCV = ("rvec", "rvecs", "tvec", "tvecs")
+"""What OpenCV calls the pose of what a camera sees."""
+_POSES: Mapping[int, str | None] = {6: None, 7: "xyzw", 12: "matrix", 16: "matrix"}
+"""Lengths of lists that are whole poses, and what their numbers are unless a name decides."""
+_JOINT = re.compile(
+    r"(?:j_?\d|(?:q|a|axis|theta)_?[1-9])(?:_?(?:rad|deg|pos|position))?"
+    r"|(?!.*(?:vel|eff|torque|acc|current|temp)).*joint.*"
+)
+
+
+SEEN = re.compile(
+    r"target|mark|cam|board|tag|aruco|pattern|checker|chess|fiducial|cent(er|re)|seen|sphere|object|"
+    r"optical|track|detect"
+)
+"""In the name of what a camera measured."""
+
+_ARM = re.compile(
+    r"robot|arm|joint|gripper|flange|(?<!eye.in.)hand(?!.?eye)|tool|tcp|effector|"
+    r"(?<![a-z])(?:ee|rob)(?![a-z])"
+)
+
+_FRAMES: Mapping[str, str] = {
+    name: frame
+    for frame, names in {
+        "base": "b base robotbase",
+        "flange": "f g e h flange gripper hand ee eef effector endeffector end tool tcp robot",
+        "camera": "c cam camera sensor scanner",
+        "target": "o t m target object obj board marker tag pattern checkerboard chessboard",
+        "world": "w world",
+    }.items()
+    for name in names.split()
+}
+_ENTRY = re.compile(r"(?:r|m|t|rot|mat)([0-3])([0-3])")
+"""Entry of a matrix in row and column: ``r11``, ``m03``."""
+_TO = re.compile(r"(?<![a-zA-Z])([a-zA-Z]+)(?:2|_to_|To)([a-zA-Z]+)")
+_IN = re.compile(r"(?<![a-zA-Z])([a-z]+)_?[TH]_?([a-z]+)(?![a-zA-Z])")
+_OF = re.compile(r"(?<![a-zA-Z])[TH]_([a-z]+)_([a-z]+)")
+
+
+def _rotations() -> dict[tuple[str, ...], tuple[str, ...]]:
+    """Return the conventions of each set of names that makers give the columns of a rotation."""
+    found: dict[tuple[str, ...], tuple[str, ...]] = {}
+    for name, convention in CONVENTIONS.items():
+        labels = tuple(label.lower() for label in convention.labels[3:])
+        same = next((known for known in found if set(known) == set(labels)), labels)
+        if same == labels:
+            found[labels] = (*found.get(labels, ()), name)
+    return found | {
+        ("q0", "q1", "q2", "q3"): ("quaternion_wxyz", "quaternion_xyzw"),
+        ("rx", "ry", "rz", "rw"): ("quaternion_xyzw",), ("vx", "vy", "vz"): ("vector",),
+        ("ex", "ey", "ez"): ("xyz",), ("alpha", "beta", "gamma"): ("ZYX", "xyz", "XYZ", "ZYZ"),
+    }  # fmt: skip
+
+
+ROTATIONS = _rotations()
+"""Names of a rotation's columns in the order of its conventions, and those conventions."""
+
+
+@dataclass(frozen=True)
+class PoseColumns:
+    """Columns that hold a pose, a point or joint angles, inferred from names and numbers.
+
+    Attributes:
+        table: Where.
+        columns: Names or numbers from 1; position first, then the rotation.
+        rotations: What the rotation may be written as; one where it is known, ``point`` for none,
+            :data:`JOINTS` for joint angles.
+        called: What names it: the columns' common name; empty where they have none.
+        length: Unit of the position that a name states.
+        angle: The same for angles.
+        guess: Text of what was concluded from the numbers alone; empty if names decide.
+        parent_first: Whether base_to_tool names the tool's pose in the base, as ROS does.
+    """
+
+    table: Table
+    columns: tuple[Column, ...]
+    rotations: tuple[str, ...]
+    called: str = ""
+    length: str | None = None
+    angle: str | None = None
+    guess: str = ""
+    parent_first: bool = False
+
+    @property
+    def name(self) -> str:
+        """How people call it: the file, and behind a colon the columns' name."""
+        return ":".join(filter(None, (self.table.name, self.called)))
+
+    @property
+    def is_pose(self) -> bool:
+        """Whether it is a whole pose."""
+        return self.rotations not in (("point",), JOINTS)
+
+    @property
+    def may_be_joints(self) -> bool:
+        """Whether the columns are joint angles, or unnamed numbers that may be."""
+        numbers = [column for column in self.columns if isinstance(column, int)]
+        nameless = len(numbers) == len(self.columns) == 6 and numbers == sorted(numbers)
+        return self.rotations == JOINTS or (nameless and not self.rotations)
+
+    @property
+    def role(self) -> str | None:
+        """``arm`` or ``target``, from the names of columns, program or file; None if unknown."""
+        if self.table.convention is not None and not self._is_echo:
+            return "arm"
+        opencv = "target" if self.called.lower() in _OPENCV else None
+        of_columns = role_in(self.called)
+        names = [self.table.name.rpartition(":")[2], *re.split(r"[/:]", self.table.name)[::-1]]
+        of_file = next((role for name in names if (role := role_in(name))), None)
+        return of_columns or of_file or opencv
+
+    @property
+    def frames(self) -> tuple[str, str] | None:
+        """Frames A and B of A_T_B, from a name; None if no name has them."""
+        names = (self.called, *re.split(r"[/:]", self.table.name)[::-1])
+        found = next((found for name in names if (found := frames_in(name))), None)
+        if self.parent_first and found:
+            return found[::-1]
+        # ROS's tf_echo prints the pose of the frame that is named last, base_to_tool0 or base2tool0
+        return found[::-1] if found and self._is_echo and _TO.search(self.table.name) else found
+
+    @property
+    def _is_echo(self) -> bool:
+        convention = self.table.convention
+        return convention is not None and not CONVENTIONS[convention].makers
+
+
+def as_joints(pose: PoseColumns) -> PoseColumns:
+    """Return the same columns as joint angles."""
+    return replace(pose, rotations=JOINTS)
+
+
+@dataclass
+class Group:
+    """Columns whose headings share a name before the axis, such as ``tcp_x`` and ``tcp_y``."""
+
+    columns: dict[str, Column] = field(default_factory=dict)
+    words: str = ""
+    rotation: Column | None = None
+    whole: Column | None = None
+    many: int = 0
+    length: str | None = None
+    angle: str | None = None
+    ordered: bool = True
+
+
+@dataclass(frozen=True)
+class Headings:
+    """What a table's heading names beside poses: times, scans, joints.
+
+    Attributes:
+        scan: Column of the scans' names.
+        index: Column of whole numbers that count the rows, or that call them.
+        time: Column of the time.
+        time_unit: Its unit.
+        joints: Columns of joint angles.
+        joint_unit: Their unit, from a name.
+    """
+
+    scan: Column | None = None
+    index: Column | None = None
+    time: Column | None = None
+    time_unit: str | None = None
+    joints: tuple[Column, ...] = ()
+    joint_unit: str | None = None
+
+
+def poses_by_name(table: Table) -> tuple[list[PoseColumns], Headings]:
+    """Return the poses and points in a table with a heading, and its other named columns."""
+    groups, rest = _grouped(table)
+    found = [_pose(table, group) for group in groups.values()]
+    return [pose for pose in found if pose is not None], rest
+
+
+def _grouped(table: Table) -> tuple[dict[str, Group], Headings]:
+    rest = Headings()
+    groups: dict[str, Group] = {}
+    sizes = list_sizes(table.heading)
+    seen: Counter[str] = Counter()
+    for index, name in enumerate(table.heading):
+        listed, size = list_name(name), sizes[list_name(name)] if list_name(name) else 0
+        nth = seen[listed]
+        seen[listed] += bool(listed)
+        joint = _JOINT.fullmatch(name.lower().replace(" ", "_").rpartition(".")[2])
+        joint = joint or _JOINT.fullmatch(name.lower())
+        joint = joint or re.fullmatch(r"(.*\.)?q", listed.lower()) if size > 4 else joint
+        order = "wxyz" if "wxyz" in listed.lower() else "xyzw"
+        words = _of_list(listed, order[nth]) if size in (3, 4) else _words(listed if size else name)
+        if number_of(_first(table, index)) is None:
+            scans = ("cloud", "scan", "file", "filename", "image", "img", "name", "path")
+            if (words and words[-1].lower() in scans) or _is_file(table, index):
+                rest = replace(rest, scan=name)
+        elif _is_index(table, index, words):
+            rest = replace(rest, index=name or index + 1)
+        elif joint and not _is_quaternion(table, name):
+            unit = next((u for u in ANGLES if u == words[-1].lower()), None)
+            rest = replace(rest, joints=(*rest.joints, name), joint_unit=unit)
+        elif size in (*_POSES, 9):
+            if nth == 0:
+                _put_list(groups, words, listed, size)
+        elif words and not size > 4:
+            time, unit = _time(words)
+            if time and rest.time is None:
+                rest = replace(rest, time=name, time_unit=unit)
+            else:
+                plain = [each for each in words if each.lower() not in ("xyzw", "wxyz")]
+                stated = len(plain) < len(words)
+                _put(groups, name, plain, listed=size == 4, ordered=stated or size != 4)
+    joints = rest.joints if len(rest.joints) > 3 else ()
+    return groups, replace(rest, joints=joints_in_order(map(str, joints)) or joints)
+
+
+def _is_index(table: Table, index: int, words: Sequence[str]) -> bool:
+    """Return whether a column is called as one that numbers rows or scans, and does so."""
+    called = (
+        "id", "index", "idx", "i", "no", "nr", "num", "number", "n", "count", "row", "sample",
+        "frame", "shot", "capture", "scan", "image", "img", "cloud", "pose", "position", "point",
+        "file", "name",
+    )  # fmt: skip
+    return (words[-1].lower() in called if words else index == 0) and table.numbers_rows(index)
+
+
+def _first(table: Table, index: int) -> Cell:
+    """Return the first cell of a column that is not empty: a target may not be seen at first."""
+    cells = (cells[index] for _, cells in table.rows if index < len(cells))
+    return next((cell for cell in cells if cell not in ("", " ")), "")
+
+
+def _is_file(table: Table, index: int) -> bool:
+    cell = str(_first(table, index))
+    folder = table.files[0].parent
+    return bool(cell) and len(cell) < 200 and (folder / cell).is_file()
+
+
+def _is_quaternion(table: Table, name: str) -> bool:
+    """Return whether q1 is of a quaternion, q1 to q4 as ABB has it, or q0 to q3."""
+    called = {each.lower() for each in table.heading if re.fullmatch(r"q\d", each.lower())}
+    return name.lower() in called and "".join(sorted(called)) in ("q1q2q3q4", "q0q1q2q3")
+
+
+def list_sizes(names: Sequence[str]) -> Counter[str]:
+    """Return how many of the columns are entries of each list: 16 of ``pose`` in ``pose.3.3``."""
+    return Counter(listed for name in names if (listed := list_name(name)))
+
+
+def list_name(name: str) -> str:
+    """Return the list that a column is an entry of; empty if it is none."""
+    match = re.fullmatch(r"(.+?)((?:\.\d+)+)", name)
+    return match[1] if match else ""
+
+
+def _of_list(listed: str, axis: str) -> list[str]:
+    """Return the words of a list's entry, the unit last: ``translation_mm`` has ``x_mm``."""
+    words = _words(listed)
+    unit = words.pop() if len(words) > 1 and words[-1].lower() in (*LENGTHS, *ANGLES) else ""
+    return [*words, axis, *filter(None, [unit])]
+
+
+def _words(name: str) -> list[str]:
+    """Return the words of a column's name; R of ``R_gripper2base`` is one."""
+    words = [w for w in re.split(r"[^0-9a-zA-Z°]+", name.replace("°", "deg")) if w]
+    for pair, one in {
+        ("rotation", "vec"): "rotvec",
+        ("rotation", "vector"): "rotvec",
+        ("rot", "vec"): "rotvec",
+        ("translation", "vec"): "tvec",
+        ("translation", "vector"): "tvec",
+        ("trans", "vec"): "tvec",
+        ("rpy", "angles"): "rpy",
+        ("euler", "angles"): "euler",
+        ("euler", "xyz"): "euler",
+        ("axis", "angle"): "rotvec",
+        ("rot", "quat"): "quat",
+        ("rotation", "quaternion"): "quat",
+        ("rotation", "matrix"): "rotation",
+        ("rot", "mat"): "rotation",
+    }.items():
+        for i in range(len(words) - 1):
+            if tuple(w.lower() for w in words[i : i + 2]) == pair:
+                words[i : i + 2] = [one]
+    return words
+
+
+def _time(words: Sequence[str]) -> tuple[bool, str | None]:
+    words = [word.lower() for word in words]
+    unit = words[-1] if words[-1] in ("s", "ms", "us", "ns") and len(words) > 1 else None
+    called = [word for word in words if word != unit]
+    return called[-1] in ("time", "timestamp", "stamp", "secs", "sec", "t"), unit
+
+
+def _put(
+    groups: dict[str, Group], name: str, words: list[str], listed: bool, ordered: bool
+) -> None:
+    """Put a column where it belongs: ``robot_x_mm`` is the x of ``robot``, in millimetres.
+
+    Four listed numbers are a quaternion, whatever they are called.
+    """
+    last = words[-1].lower()
+    unit = words.pop().lower() if last in (*LENGTHS, *ANGLES) and len(words) > 1 else None
+    if _is_axis(words[0]) and not _is_axis(words[-1]):  # ``x_robot``
+        words = [*words[1:], words[0]]
+    axis, before = words[-1].lower(), words[:-1]
+    if len(axis) == 2 and axis[0] in "pt" and axis[1] in "xyz":
+        axis = axis[1]
+    plain = axis in ("x", "y", "z", "w")
+    # Behind a name of its own (orientation.roll) only a whole word is no part of the pose's name
+    whole = [word for word in _TURNS if len(word) > 1]
+    part, before = _without(before, (*_PLACES, *_TURNS) if plain else whole)
+    axis = ("q" if listed else _TURNS.get(part, "") if plain else "") + axis
+    called = "_".join(before) or (part if part in _OPENCV else "")
+    group = groups.setdefault("" if called in _OPENCV else called, Group())
+    group.words = group.words or called
+    group.columns.setdefault(axis, name)
+    group.ordered &= ordered
+    if axis in ("x", "y", "z") and unit in LENGTHS:
+        group.length = unit
+    elif unit in ANGLES:
+        group.angle = unit
+
+
+def _is_axis(word: str) -> bool:
+    """Return whether a word calls one number of a pose: an axis, an angle, an entry of a matrix."""
+    axes = {*"xyz", *(label for labels in ROTATIONS for label in labels)}
+    return word.lower() in axes or _ENTRY.fullmatch(word.lower()) is not None
+
+
+def _without(words: list[str], parts: Sequence[str]) -> tuple[str, list[str]]:
+    """Return which part of a pose the last or the first word says, and the others."""
+    for at in (len(words) - 1, 0):
+        if words and words[at].lower() in parts:
+            return words[at].lower(), words[:at] + words[at + 1 :]
+    return "", words
+
+
+def _put_list(groups: dict[str, Group], words: list[str], listed: str, size: int) -> None:
+    if size == 9:
+        _, before = _without(words, tuple(_TURNS))
+        group = groups.setdefault("_".join(before), Group(words="_".join(before)))
+        group.rotation = listed
+    else:
+        group = groups.setdefault("_".join(words), Group(words="_".join(words)))
+        group.whole, group.many = listed, size
+
+
+def _pose(table: Table, group: Group) -> PoseColumns | None:
+    """Return what a group of columns holds; None where it has no position."""
+    stated = (group.words, group.length, group.angle)
+    if group.whole is not None:
+        usual = _POSES[group.many]
+        rotations = (usual,) if usual and group.many != 7 else ("xyzw", "wxyz") if usual else ()
+        if group.many == 6 and table.convention:
+            rotations = (table.convention,)
+        return PoseColumns(table, (group.whole,), rotations, *stated)
+    entries = _matrix_entries(group)
+    if len(entries) in (12, 16):
+        return PoseColumns(table, entries, ("matrix",), *stated)
+    apart = {letter: cells for letter, cells in _counted(group).items() if len(cells) in (3, 9)}
+    if sorted(map(len, apart.values())) == [3, 9]:  # r1 to r9 and t1 to t3
+        turn, place = sorted(apart.values(), key=len, reverse=True)
+        return PoseColumns(table, (*place, *turn), ("3x3",), *stated)
+    if not {*"xyz"} <= set(group.columns):
+        return None
+    place = tuple(group.columns[axis] for axis in "xyz")
+    if group.rotation is not None:
+        return PoseColumns(table, (*place, group.rotation), ("3x3",), *stated)
+    if len(entries) == 9:
+        return PoseColumns(table, (*place, *entries), ("3x3",), *stated)
+    fitting = [names for names in ROTATIONS if set(names) <= set(group.columns)]
+    names = max(fitting, key=len, default=None)
+    if names is None:
+        return PoseColumns(table, place, ("point",), *stated)
+    known = (table.convention,) if table.convention else ROTATIONS[names]
+    if not group.ordered and names == ("qx", "qy", "qz", "qw"):
+        known = ("quaternion_xyzw", "quaternion_wxyz")
+    return PoseColumns(table, (*place, *(group.columns[n] for n in names)), known, *stated)
+
+
+def _matrix_entries(group: Group) -> tuple[Column, ...]:
+    """Return the columns that are named as the entries of a matrix, row by row.
+
+    They are called by row and column, ``r11``, or counted: ``m0`` to ``m15``.
+    """
+    counted = [cells for cells in _counted(group).values() if len(cells) in (12, 16)]
+    if len(counted) == 1:
+        return counted[0]
+    named = {m.groups(): column for name, column in group.columns.items()
+             if (m := _ENTRY.fullmatch(name))}  # fmt: skip
+    return tuple(named[at] for at in sorted(named))
+
+
+def _counted(group: Group) -> dict[str, tuple[Column, ...]]:
+    """Return the columns that a letter and a number call, by the letter, where none is missing."""
+    found: dict[str, dict[int, Column]] = {}
+    for name, column in group.columns.items():
+        if match := re.fullmatch(r"([a-z]+)(\d+)", name):
+            found.setdefault(match[1], {})[int(match[2])] = column
+    return {
+        letter: tuple(columns[at] for at in sorted(columns))
+        for letter, columns in found.items()
+        if max(columns) - min(columns) < len(columns)
+    }
+
+
+def frames_in(name: str) -> tuple[str, str] | None:
+    """Return frames A and B of A_T_B in a name; None if it has none."""
+    to = _TO.search(name)
+    match = to or _IN.search(name) or _OF.search(name)
+    if match is None:
+        return None
+    first, second = (_FRAMES.get(word.lower()) for word in match.groups())
+    if first is None or second is None:
+        return None
+    pair = (second, first) if to else (first, second)
+    of_arms = {"base", "flange"}, {"world", "flange"}
+    of_sights = {"camera", "target"}, {"camera", "world"}
+    return pair if set(pair) in (*of_arms, *of_sights) else None
+
+
+def named_parent_first(*poses: PoseColumns) -> bool:
+    """Return whether poses would all be inverse if base_to_tool meant what base2tool does."""
+    named = all(_TO.search(pose.name) for pose in poses)
+    return named and all(pose.frames and is_inverse(pose.frames) for pose in poses)
+
+
+def is_inverse(frames: tuple[str, str]) -> bool:
+    """Return whether a pose is flange_T_base or target_T_camera."""
+    return frames[0] == "flange" or frames[1] == "camera"
+
+
+def role_in(name: str) -> str | None:
+    """Return ``arm`` or ``target`` by a name; None if it shows neither."""
+    frames = frames_in(name.rpartition(":")[2])
+    if frames is not None:
+        return "target" if "camera" in frames else "arm"
+    found = {"target": SEEN.search(name.lower()), "arm": _ARM.search(name.lower())}
+    roles = [role for role, match in found.items() if match]
+    return roles[0] if len(roles) == 1 else None

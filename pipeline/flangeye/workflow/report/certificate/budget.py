@@ -1,0 +1,334 @@
+r"""The uncertainty of a point that the calibration maps, contribution by contribution.
+
+The calibration's own uncertainty is that of six correlated quantities, a rotation
+:math:`\varphi` and a translation :math:`\tau` about the point :math:`q` of ``result.json``. A
+point :math:`p` is moved by :math:`\varphi \times (p - q) + \tau`, so the sensitivities are
+:math:`-[p - q]_\times` and one. Whoever *uses* the matrix adds what happens anew at every point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import product
+from typing import Literal
+
+import numpy as np
+
+from flangeye.errors import StageError
+from flangeye.maths.statistics import corners_of
+from flangeye.models.scanners import ScannerModel
+from flangeye.types import Floats
+from flangeye.types.geometry import levers
+from flangeye.workflow.result.contract import Result, TransformResult
+
+
+def propagated(sensitivities: Floats, standard: Floats, correlation: Floats) -> Floats:
+    """Return the (m, m) covariance of m results of n inputs (GUM, equation 13).
+
+    Args:
+        sensitivities: (m, n) derivatives of the results by the inputs.
+        standard: (n,) standard uncertainties of the inputs.
+        correlation: (n, n) of the inputs.
+    """
+    scaled = np.asarray(sensitivities) * standard
+    return np.asarray(scaled @ correlation @ scaled.T)
+
+
+def correlation_of(covariance: Floats) -> tuple[Floats, Floats]:
+    """Return standard uncertainties (n,) and correlations (n, n) of a covariance (n, n)."""
+    standard = np.sqrt(np.diag(covariance))
+    safe = np.where(standard > 0, standard, 1.0)
+    correlation = covariance / np.outer(safe, safe)
+    np.fill_diagonal(correlation, 1.0)
+    return standard, np.asarray(correlation)
+
+
+def effective_freedom(contributions: Floats, freedoms: Floats) -> float:
+    """Return the degrees of freedom of a sum of independent parts (Welch-Satterthwaite, G.2b).
+
+    Args:
+        contributions: (n,) standard uncertainties of the parts, in the unit of the result.
+        freedoms: (n,) degrees of freedom of each; infinite where it is known.
+    """
+    fourth = float(np.sum(np.asarray(contributions) ** 4 / freedoms))
+    total = float(np.sum(np.asarray(contributions) ** 2))
+    return total**2 / fourth if fourth > 0 else float("inf")
+
+
+def coverage_factor(freedom: float, probability: float = 0.95) -> float:
+    """Return k with which k times the standard uncertainty holds ``probability`` (Student's t)."""
+    from scipy.special import ndtri, stdtrit
+
+    upper = 0.5 * (1.0 + probability)
+    return float(ndtri(upper) if np.isinf(freedom) else stdtrit(freedom, upper))
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """Conditions that a person states, for they are not measured.
+
+    Attributes:
+        temperature: Temperature of the air [°C], or None.
+        spread: Between the coldest and the warmest moment of use [K], or None.
+        place: Where it was done.
+        operator: Who did it.
+    """
+
+    temperature: float | None = None
+    spread: float | None = None
+    place: str = ""
+    operator: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Contribution:
+    """One row of a budget.
+
+    Attributes:
+        name: The input quantity.
+        kind: How it was evaluated: A from a series of measurements, B otherwise.
+        standard: Its standard uncertainty [rad or m].
+        unit: ``rad`` or ``m``.
+        sensitivity: (3,) derivative of the point's coordinates by it.
+        freedom: Degrees of freedom; infinite where it is taken as known.
+        evidence: Where the figure comes from.
+        bound: Whether no such error was seen: ``standard`` is then the size that could stay unseen.
+    """
+
+    name: str
+    kind: Literal["A", "B"]
+    standard: float
+    unit: Literal["rad", "m"]
+    sensitivity: Floats
+    freedom: float
+    evidence: str
+    bound: bool = False
+
+    @property
+    def size(self) -> float:
+        """How far it alone moves the point, one standard uncertainty [m]."""
+        return float(np.linalg.norm(self.sensitivity) * self.standard)
+
+
+@dataclass(frozen=True, eq=False)
+class Budget:
+    """Uncertainty budget of one point.
+
+    Attributes:
+        point: (3,) in the parent frame [m].
+        contributions: The input quantities.
+        correlation: (n, n) among them.
+    """
+
+    point: Floats
+    contributions: Sequence[Contribution]
+    correlation: Floats
+
+    @cached_property
+    def covariance(self) -> Floats:
+        """(3, 3) of the point [m^2]."""
+        sensitivities = np.stack([c.sensitivity for c in self.contributions], axis=1)
+        return propagated(sensitivities, self._standard, self.correlation)
+
+    @property
+    def standard(self) -> Floats:
+        """(3,) combined standard uncertainty along x, y, z [m]."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    @property
+    def freedom(self) -> Floats:
+        """(3,) effective degrees of freedom along x, y, z."""
+        freedoms = np.array([c.freedom for c in self.contributions])
+        rows = np.stack([c.sensitivity * c.standard for c in self.contributions], axis=1)
+        return np.array([effective_freedom(row, freedoms) for row in rows])
+
+    @property
+    def coverage(self) -> Floats:
+        """(3,) coverage factors k for 95 % along x, y, z."""
+        return np.array([coverage_factor(f, 0.95) for f in self.freedom])
+
+    @property
+    def expanded(self) -> Floats:
+        """(3,) expanded uncertainties along x, y, z [m]."""
+        return np.asarray(self.coverage * self.standard)
+
+    @property
+    def correlated(self) -> list[tuple[str, str, float]]:
+        """Pairs of contributions correlated by more than 0.3, largest first."""
+        names = [c.name for c in self.contributions]
+        pairs = zip(*np.triu_indices(len(names), 1), strict=True)
+        found = [(names[i], names[j], float(self.correlation[i, j])) for i, j in pairs]
+        # Correlations larger than this are named
+        return sorted((x for x in found if abs(x[2]) >= 0.3), key=lambda x: -abs(x[2]))
+
+    @property
+    def _standard(self) -> Floats:
+        return np.array([c.standard for c in self.contributions])
+
+
+def budget_of(result: Result) -> Budget:
+    """Return the budget of the calibration alone, at the least certain corner of the work.
+
+    Raises:
+        StageError: The run gave no calibration, or nothing says where the work is.
+    """
+    _, estimate = _estimate_of(result)
+    point = _worst_corner(result, estimate)
+    standard, correlation = correlation_of(np.array(estimate.covariance))
+    sensitivities = levers(point - np.array(estimate.about)).T
+    evidence = _evidence(result)
+    causes = product((("Rotation about", "rad"), ("Translation along", "m")), "xyz")
+    return Budget(
+        point,
+        [
+            Contribution(f"{what} {axis}", "A", u, unit, c, np.inf, evidence)  # type: ignore[arg-type]
+            for ((what, unit), axis), c, u in zip(
+                causes, sensitivities, standard.tolist(), strict=True
+            )
+        ],
+        correlation,
+    )
+
+
+def use_budget_of(
+    result: Result, scanner: ScannerModel | None, conditions: Conditions = Conditions()
+) -> Budget:
+    """Return the budget of one point that is scanned and then driven to."""
+    calibration = budget_of(result)
+    parts = [
+        *_of_calibration(calibration),
+        *_of_one_pose(result),
+        *(_each_axis(*_distortion(scanner)) if scanner else ()),
+        *(
+            _each_axis(*_expansion(calibration.point, conditions.spread))
+            if conditions.spread
+            else ()
+        ),
+    ]
+    correlation = np.eye(len(parts))
+    correlation[:3, :3] = correlation_of(calibration.covariance)[1]
+    return Budget(calibration.point, parts, correlation)
+
+
+@dataclass(frozen=True)
+class Share:
+    """How much of the calibration's variance at the work one cause explains.
+
+    Attributes:
+        cause: The cause.
+        standard: Its part, one standard uncertainty [m].
+        evidence: Where the figure comes from.
+    """
+
+    cause: str
+    standard: float
+    evidence: str
+
+
+def shares_of(result: Result) -> list[Share]:
+    """Return the calibration's uncertainty by cause, largest first.
+
+    Their squares add up to that of the budget: each cause's posterior variance by the estimator's
+    own model, and the uncertainty of the causes' own sizes.
+    """
+    _, estimate = _estimate_of(result)
+    motions = levers(_worst_corner(result, estimate) - np.array(estimate.about))
+
+    def variance(covariance: Sequence[Sequence[float]]) -> float:
+        return float(np.trace(motions @ np.array(covariance) @ motions.T))
+
+    whole = variance(estimate.covariance)
+    if not estimate.shares:
+        return [Share("all causes", np.sqrt(max(whole, 0.0)), _evidence(result))]
+    used = sum(o.used for o in result.observations)
+    told = {cause: max(variance(share), 0.0) for cause, share in estimate.shares.items()}
+    least = 0.01  # a cause with a smaller share of the variance is counted among the others
+    rows = {cause: v for cause, v in told.items() if v >= least * whole}
+    small, rest = sum(told.values()) - sum(rows.values()), whole - sum(told.values())
+    shares = [Share(cause, np.sqrt(v), f"posterior of {used} poses") for cause, v in rows.items()]
+    if small > 0:
+        each = f"{len(told) - len(rows)} causes of less than {least:.0%} of the variance each"
+        shares.append(Share("others", np.sqrt(small), each))
+    if rest > 0:
+        few = "how large each cause is, is estimated from few poses"
+        shares.append(Share("sizes of these causes", np.sqrt(rest), few))
+    return sorted(shares, key=lambda share: -share.standard)
+
+
+def _standard_error(variance: float, count: int) -> float:
+    """Return the standard error of a variance estimated from ``count`` Gaussian values."""
+    return variance * float(np.sqrt(2 / max(count, 1)))
+
+
+def _estimate_of(result: Result) -> tuple[str, TransformResult]:
+    found = next(iter(result.transforms.items()), None)
+    if found is None:
+        why = f": {result.refused}" if result.refused else ""
+        raise StageError(f"the run gave no calibration, so there is nothing to certify{why}")
+    return found
+
+
+def _worst_corner(result: Result, estimate: TransformResult) -> Floats:
+    if result.workspace is None:
+        raise StageError("nothing says where the work is: give the recipe a 'workspace'")
+    box = result.workspace
+    corners = corners_of(np.array(box.centre), np.array(box.size))
+    motions = levers(corners - np.array(estimate.about))
+    variances = np.einsum("nia,ab,nib->n", motions, np.array(estimate.covariance), motions)
+    return np.asarray(corners[int(variances.argmax())])
+
+
+def _evidence(result: Result) -> str:
+    used = sum(o.used for o in result.observations)
+    return f"{result.method or 'solver'}, {used} poses; covariance in result.json"
+
+
+def _of_calibration(budget: Budget) -> list[Contribution]:
+    return [
+        Contribution(f"Calibration, {axis}", "A", float(u), "m", unit, np.inf, "the table above")
+        for axis, u, unit in zip("xyz", budget.standard, np.eye(3), strict=True)
+    ]
+
+
+def _of_one_pose(result: Result) -> list[Contribution]:
+    """Return what one scan at one pose adds, from the errors on poses held out."""
+    held, box = result.holdout, result.workspace
+    if held is None or box is None:
+        return []
+    poses = held.figures.get("poses", 0.0) - held.figures.get("outliers", 0.0)
+    _, estimate = _estimate_of(result)
+    corners = corners_of(np.array(box.centre), np.array(box.size))
+    motions = levers(corners - np.array(estimate.about))
+    own = np.einsum("nia,ab,nib->n", motions, np.array(estimate.covariance), motions).mean()
+    hidden = _standard_error(held.rms**2, int(3 * poses))
+    beyond = held.rms**2 - float(own)
+    standard = np.sqrt(max(beyond, hidden) / 3)
+    evidence = f"held-out error {held.rms * 1e3:.3f} mm rms beyond the calibration's own"
+    rows = _each_axis("Arm and scan at one pose", "A", standard, evidence, 3 * poses)
+    return [replace(row, bound=beyond < hidden) for row in rows]
+
+
+def _distortion(scanner: ScannerModel) -> tuple[str, Literal["B"], float, str]:
+    error = scanner.calibration_error
+    evidence = f"{scanner.maker} {scanner.model}: {error * 1e3:g} mm rms over the volume"
+    return "Scanner's smooth distortion", "B", error / np.sqrt(3), evidence
+
+
+def _expansion(point: Floats, spread: float) -> tuple[str, Literal["B"], float, str]:
+    # Of aluminium, of which most arms are made, per kelvin: larger than that of steel
+    expansion = 23e-6
+    half = expansion * float(np.linalg.norm(point)) * spread / 2
+    evidence = f"{spread:g} K between extremes, {expansion * 1e6:g} µm/(m K), rectangular"
+    return "Arm's thermal expansion", "B", half / np.sqrt(3) / np.sqrt(3), evidence
+
+
+def _each_axis(
+    name: str, kind: Literal["A", "B"], standard: float, evidence: str, freedom: float = np.inf
+) -> list[Contribution]:
+    """Return a contribution of equal size and independent along x, y and z."""
+    return [
+        Contribution(f"{name}, {axis}", kind, float(standard), "m", unit, freedom or 1.0, evidence)
+        for axis, unit in zip("xyz", np.eye(3), strict=True)
+    ]

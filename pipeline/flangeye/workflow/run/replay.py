@@ -1,0 +1,56 @@
+"""Decisions made again from the log of the step that made them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+from flangeye.errors import StageError
+from flangeye.plugin.registry import PluginNotFoundError, Registry
+from flangeye.workflow.log.read import log_of, read_notes
+
+
+@dataclass(frozen=True)
+class ReplayedStep:
+    """How decisions made again compare with those in the log.
+
+    Attributes:
+        what: Text of what was decided.
+        same: Whether they are the same.
+        figures: How far they differ, by name with its unit.
+    """
+
+    what: str
+    same: bool
+    figures: Mapping[str, float] = field(default_factory=dict)
+
+
+class Repeat(Protocol):
+    """How a ``replay`` part is called."""
+
+    def __call__(self, log: Path, step: str) -> ReplayedStep:
+        """Return how the decisions of ``step``, made again from its log, compare."""
+
+
+def replay_steps(log: Path, registry: Registry) -> Iterator[tuple[str, ReplayedStep]]:
+    """Yield each step of a log that can be decided again, and how that compares.
+
+    A step ``weld.tactile`` can, where a plugin offers a part ``replay.tactile``.
+
+    Raises:
+        StageError: The file cannot be read, or there is no such step in it.
+    """
+    log = log_of(log)
+    steps = dict.fromkeys(note.step for note in read_notes(log))
+    found = False
+    for step in steps:
+        try:
+            part = registry.part(f"replay.{step.rpartition('.')[2]}")
+        except PluginNotFoundError:
+            continue
+        found = True
+        yield step, part(log, step)
+    if not found:
+        raise StageError(f"{log}: holds no step whose decisions can be made again")

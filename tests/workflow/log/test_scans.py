@@ -1,0 +1,65 @@
+"""A whole scan in the log: bit for bit, in fewer bytes than zstandard alone reaches."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zstandard
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from flangeye import types as t
+from flangeye.workflow.log.read import read_run
+from flangeye.workflow.log.record import Recorder
+from flangeye.workflow.log.records import BLOCK, pack, unpack
+
+
+def scan(rows=300, columns=400):
+    """Return a tilted plane as a scanner sees it, with noise and a hole."""
+    x, y = np.meshgrid(np.linspace(-0.3, 0.3, columns), np.linspace(-0.2, 0.2, rows))
+    z = 0.9 + 0.1 * x + 5e-5 * np.random.default_rng(0).standard_normal(x.shape)
+    xyz = np.stack([x * z, y * z, z], axis=-1).astype(np.float32)
+    xyz[50:90, 100:200] = np.nan
+    return xyz
+
+
+@settings(max_examples=40)
+@given(arrays.arrays(np.uint32, st.integers(0, 40)), st.sampled_from([0, 1, BLOCK - 1, BLOCK]))
+def test_every_bit_comes_back(bits: Any, more: Any) -> None:
+    flat = np.resize(bits, 3 * (len(bits) + more)).astype(np.uint32).view(np.float32)
+    points = flat.reshape(-1, 3)
+    assert unpack(pack(points), points.shape).tobytes() == points.tobytes()
+
+
+def test_it_is_smaller_than_the_points_by_zstandard() -> None:
+    xyz = scan()
+    assert len(pack(xyz)) < 0.8 * len(zstandard.compress(xyz.tobytes()))
+
+
+@pytest.mark.parametrize("shape", [(5, 3), (6, 3), (10**9, 3), (5, 4)])
+def test_points_of_another_number_or_damaged_are_none(shape: tuple[Any, ...]) -> None:
+    packed = pack(np.zeros((4, 3), np.float32))
+    assert unpack(packed, shape) is None
+    assert unpack(packed[:-3], (4, 3)) is None
+    assert unpack(b"nothing of the kind", (4, 3)) is None
+
+
+def test_viewers_see_the_scan_thinned_and_runs_have_all_of_it(tmp_path: Path) -> None:
+    from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+    from mcap.reader import make_reader
+
+    xyz = scan()
+    pose = t.by_frame(t.Transform(t.BASE, t.FLANGE, np.eye(4)))
+    recorder = Recorder(tmp_path / "r.mcap", {"recipe.yaml": "title: T"}, full_clouds=True)
+    recorder.flangeye_run_started(t.Source("hash"), 1)
+    recorder.flangeye_captured("0.acquire", t.Capture("a", t.PointCloud(t.CAMERA, xyz), pose), 0.1)
+    recorder.flangeye_run_finished({})
+    with (tmp_path / "r.mcap").open("rb") as file:
+        ((_, _, message),) = make_reader(file).iter_messages(topics=["/capture/cloud"])
+    shown = PointCloud.FromString(message.data)
+    assert [field.name for field in shown.fields] == ["x", "y", "z"]
+    assert 10_000 < len(shown.data) / shown.point_stride <= 40_000
+    (capture,) = read_run(tmp_path / "r.mcap").captures()
+    assert capture.cloud.xyz.tobytes() == xyz.tobytes() and capture.cloud.xyz.shape == xyz.shape
