@@ -40,7 +40,14 @@ from flangeye_plugins.fit.body import FitBodyParams, fit_body
 from flangeye_plugins.segment.body import SegmentBodyParams, _passes, segment_body
 from tools.study_bodies import SCANNER, as_made, scene, trial
 
-GRIPPER = load_body("gripper", None, Path())
+
+@cache
+def shipped(name: str) -> TargetBody:
+    """A body of the project; what a search prepares of it is kept with it."""
+    return load_body(name, None, Path())
+
+
+GRIPPER = shipped("gripper")
 POSE = rigid(rotation_from_rpy(2.5, 0.6, 0.8), np.array([0.03, -0.02, 0.75]))
 
 
@@ -165,7 +172,7 @@ def test_an_earlier_sighting_that_was_wrong_does_no_harm() -> None:
 
 
 def test_a_body_that_is_not_there_is_refused() -> None:
-    absent = found(scan(load_body("torch", None, Path())))
+    absent = found(scan(shipped("torch")))
     assert isinstance(absent, Rejected)
     assert "gripper" in absent.reason
 
@@ -181,7 +188,7 @@ def test_a_body_that_is_not_there_is_refused() -> None:
     ids=["mirrored", "inches", "centimetres", "30 % too large"],
 )
 def test_a_model_that_is_not_the_body_is_refused(change, why) -> None:
-    torch = load_body("torch", None, Path())
+    torch = shipped("torch")
     wrong = TargetBody("torch", np.ascontiguousarray(torch.vertices @ change), torch.triangles)
     assert why in found(scan(torch), wrong).reason
 
@@ -333,7 +340,7 @@ def test_a_mesh_of_ones_own_goes_with_the_run(tmp_path: Path) -> None:
 def test_a_fit_that_rests_on_other_edges_is_refused() -> None:
     """A ring plate laid 1.4 mm aside, where its surfaces fit as well."""
     rng = np.random.default_rng(23)
-    plate = load_body("ring-plate", None, Path())
+    plate = shipped("ring-plate")
     bodies, _ = scene(rng, as_made(plate, rng))
     points = scanner_of(SCANNER, 0.35, 1.0, rng).scan(RaycastScene(bodies), rng).reshape(-1, 3)
     points, looks = points[np.isfinite(points[:, 2])].astype(np.float32), prepared(plate)
@@ -365,7 +372,7 @@ def test_where_the_carrier_goes_on_beyond_a_bodys_foot_is_no_end_of_it() -> None
 def among_others(name, seed):
     """A scan of a body among other things, the body, and its pose."""
     rng = np.random.default_rng(seed)
-    body = load_body(name, None, Path())
+    body = shipped(name)
     bodies, pose = scene(rng, as_made(body, rng))
     xyz = scanner_of(SCANNER, 0.35, 1.0, rng).scan(RaycastScene(bodies), rng)
     return Capture("0000", PointCloud(CAMERA, xyz), {}), body, pose
