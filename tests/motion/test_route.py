@@ -59,7 +59,7 @@ def test_a_short_way_takes_its_ramps_alone() -> None:
     (leg,) = way.legs
     assert leg.speed**2 / leg.acceleration > 0.01  # it never comes to its speed
     shortest = 2 * np.sqrt(0.01 / leg.acceleration)
-    assert 0.5 * shortest <= way.seconds <= shortest
+    assert way.seconds == pytest.approx(shortest)
 
 
 def test_a_way_is_checked_from_its_start_to_its_end_every_two_degrees() -> None:

@@ -112,7 +112,7 @@ class Router:
         # Of the leading joint [rad/s^2]: a slow default, below what any arm here can do
         joint_acceleration = np.radians(60.0)
         acceleration = min(joint_acceleration, limits.acceleration / max(lever, 1e-6))
-        # Both ramps together take one ramp longer than cruising all the way; a short move is over
-        # before it has reached its speed
-        ramp = min(speed / acceleration, np.sqrt(turn / acceleration))
-        return Leg(goal, speed, acceleration, turn / speed + ramp)
+        # Both ramps together take one ramp longer than cruising all the way; a short move comes to
+        # rest again before it has reached its speed
+        fastest = max(min(speed, np.sqrt(turn * acceleration)), 1e-9)
+        return Leg(goal, speed, acceleration, turn / fastest + fastest / acceleration)

@@ -7,7 +7,26 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flangeye.files.yaml_lines import parse_value
 from flangeye.types.geometry import rigid, rotation_exp
+from flangeye.workflow.doctor.diagnosis import as_yaml
+
+WORDS = [
+    "null",
+    "true",
+    "no",
+    "5 mm",
+    "-1.2 m",
+    "a b",
+    ".",
+    "~",
+    "1e3",
+    "12",
+    "0x1",
+    "x: y",
+    "it's",
+    "",
+]
 
 RECIPE = """\
 title: Poses of a camera in the hand
@@ -91,3 +110,9 @@ def test_what_the_run_set_aside_is_named_and_coarse_decimals_are_said(
     said = "positions of the arm are whole multiples of 1 mm, and the recipe asks for 1 mm; if they"
     assert f"note: rounded: {said} were rounded, that alone is 0.5 mm" in out
     assert "fix: write positions with 4 or more decimals of a metre" in out
+
+
+@pytest.mark.parametrize("word", WORDS)
+def test_a_line_is_read_back_as_what_it_states(word: str) -> None:
+    value = {"on": word, "path": [word, None, True, 1, -0.5, {"unit": word}]}
+    assert parse_value(as_yaml(value), "a line") == value

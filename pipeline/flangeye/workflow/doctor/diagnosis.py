@@ -294,13 +294,14 @@ def as_yaml(value: Any) -> str:
         return f"{{{inside}}}"
     if isinstance(value, (list, tuple)):
         return f"[{', '.join(map(as_yaml, value))}]"
-    text = str(value).lower() if isinstance(value, bool) else str(value)
-    plain = (
-        not isinstance(value, str)
-        or re.fullmatch(r"[A-Za-z_][\w.-]*(?: [\w.-]+)*", text)
-        or re.fullmatch(r"-?[\d.]+ [A-Za-z]+", text)
-    )
-    return text if plain else f"'{text}'"
+    if value is None:
+        return "null"
+    if not isinstance(value, str):
+        return str(value).lower() if isinstance(value, bool) else str(value)
+    plain = re.fullmatch(r"[A-Za-z_][\w.-]*(?: [\w.-]+)*|-?[\d.]+ [A-Za-z]+", value)
+    if plain and parse_value(value, value) == value:
+        return value
+    return "'{}'".format(value.replace("'", "''"))
 
 
 class Check(Protocol):
