@@ -46,7 +46,7 @@ def test_what_is_told_to_the_controller_brings_the_tool_to_the_seam() -> None:
     assert corrected_flange(commanded, None, CORRECTION, arm) == pytest.approx(wanted, abs=1e-8)
     first = (commanded @ [0, 0, 0.15, 1])[:3]
     assert told.points_in_base[0] == pytest.approx(first, abs=1e-6)
-    assert "the arm's error is taken off" in told.notes[-1]
+    assert "the arm's estimated error taken off" in told.notes[-1]
 
 
 def test_the_arm_as_reported_needs_nothing() -> None:
