@@ -77,6 +77,18 @@ def test_ok_then_moved_since_when_and_which_part_and_it_stays_moved(
     assert again.exit_code == 2 and json.loads(again.stdout)["since_check"] == 15
 
 
+def test_a_camera_that_was_put_back_still_moved(cell: Path, tmp_path: Path) -> None:
+    history = tmp_path / "h.jsonl"
+    assert monitor(cell, history, *(f"ok-{i:02}" for i in range(5))).exit_code == 0
+    assert monitor(cell, history, "moved-0", "moved-1", "moved-2").exit_code == 2
+    back = monitor(cell, history, *(f"ok-{i:02}" for i in range(5, 16)))
+    assert back.exit_code == 2
+    told = [json.loads(line) for line in back.stdout.splitlines()]
+    assert {each["state"] for each in told} == {"MOVED"}
+    assert {each["since_check"] for each in told} == {5}
+    assert told[-1]["shift_mm"] < 0.3  # the shift is the mean since then
+
+
 def test_the_chart_of_one_check_has_one_time(cell: Path, tmp_path: Path) -> None:
     monitor(cell, tmp_path / "h.jsonl", "ok-00")
     history = History.read(tmp_path / "h.jsonl", stored_calibration(cell / "calibration").key)
