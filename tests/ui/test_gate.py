@@ -358,7 +358,7 @@ def test_a_code_is_not_good_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_pages_that_lie_in_a_folder_hold_themselves_to_it() -> None:
-    root = Path(__file__).parents[2] / "pipeline" / "flangeye"
+    root = Path(__file__).parents[2] / "pipeline" / "flangeye" / "workflow"
     for path in ("report/certificate/certificate.html.j2", "report/report.html.j2",
                  "batch/summary.html.j2", "doctor/monitor/chart.html.j2"):  # fmt: skip
         assert "Content-Security-Policy\" content=\"default-src 'none'" in (root / path).read_text()
