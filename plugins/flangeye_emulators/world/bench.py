@@ -14,7 +14,7 @@ from weakref import WeakSet, ref
 import numpy as np
 from pydantic import Field
 
-from flangeye.devices import RobotState
+from flangeye.devices import DeviceError, RobotState
 from flangeye.maths.seam_geometry import distances_to_line
 from flangeye.models.workpiece import Workpiece, WorkpiecePath
 from flangeye.plugin.stage import Params
@@ -160,7 +160,10 @@ def true_flange(reported: RobotState) -> Transform:
     An arm that is not simulated here is where it reports.
     """
     for arm in _ARMS:
-        state = arm.state()
+        try:
+            state = arm.state()
+        except DeviceError:  # of another session, gone by now: it reported nothing
+            continue
         same = len(state.joints) == len(reported.joints) and state.time_ns == reported.time_ns
         if same and np.array_equal(state.joints, reported.joints):
             return Transform(BASE, FLANGE, arm.true_flange())
