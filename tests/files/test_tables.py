@@ -123,7 +123,7 @@ def test_the_positions_of_a_program_are_rows(tmp_path: Path, columns: str) -> No
     [
         ("t.json", "[1", "t.json: is not JSON: Expecting ',' delimiter"),
         ("t.json", "[" * 100_000, "t.json: is not JSON: maximum recursion depth exceeded"),
-        ("t.json", "7", "t.json: expected a list of records, or one under each scan's name"),
+        ("t.json", "7", "t.json: expected arrays of poses, a list of records, or a record under each scan's name"),
         ("t.jsonl", '{"x": 1}\n{"x":\n', "t.jsonl:2: is not JSON: Expecting value"),
         ("t.yaml", "a: [1", "t.yaml:1: not valid YAML"),
         ("t.yaml", "# " + "x" * 1_000_000, "t.yaml: is larger than 1000000 bytes; write it as"),

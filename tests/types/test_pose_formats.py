@@ -65,6 +65,8 @@ def test_angles_are_those_of_scipy_locked_or_not(order: str, middle: float) -> N
         ("kuka", [30, 20, 10], about("z", 30) @ about("y", 20) @ about("x", 10)),
         ("fanuc", [10, 20, 30], about("z", 30) @ about("y", 20) @ about("x", 10)),
         ("yaskawa", [10, 20, 30], about("z", 30) @ about("y", 20) @ about("x", 10)),
+        ("mitsubishi", [10, 20, 30], about("z", 30) @ about("y", 20) @ about("x", 10)),
+        ("epson", [30, 20, 10], about("z", 30) @ about("y", 20) @ about("x", 10)),
         ("staubli", [10, 20, 30], about("x", 10) @ about("y", 20) @ about("z", 30)),
         ("kawasaki", [10, 20, 30], about("z", 10) @ about("y", 20) @ about("z", 30)),
         ("rpy", np.radians([10, 20, 30]), about("z", 30) @ about("y", 20) @ about("x", 10)),

@@ -42,9 +42,10 @@ def _numbers(name: str, value: Any) -> Iterator[tuple[str, Any]]:
         yield name, value
     elif kind == "O" and value.size and len({np.shape(each) for each in value.flat}) == 1:
         yield from _numbers(name, np.stack(list(value.flat)))  # a cell array of matrices
-    elif kind == "V" and value.dtype.names and value.size == 1:
-        for field in value.dtype.names:
-            yield from _numbers(f"{name}.{field}", value[field].item())
+    elif kind == "V" and value.dtype.names:
+        for field in value.dtype.names:  # of an array of structures, each has one row
+            of = value[field]
+            yield from _numbers(f"{name}.{field}", of.item() if of.size == 1 else of)
 
 
 if __name__ == "__main__":

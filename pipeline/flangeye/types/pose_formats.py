@@ -300,6 +300,15 @@ CONVENTIONS: Mapping[str, PoseConvention] = {
     "yaskawa": PoseConvention(
         "Yaskawa", ("X", "Y", "Z", "RX", "RY", "RZ"), "xyz", "mm", "deg", ("Yaskawa",)
     ),
+    # Mitsubishi's MELFA BASIC: P1=(X,Y,Z,A,B,C)(FL1,FL2), about fixed axes.
+    "mitsubishi": PoseConvention(
+        "Mitsubishi", ("X", "Y", "Z", "A", "B", "C"), "xyz", "mm", "deg", ("Mitsubishi",),
+        rf"=\s*\({_list_of(6)}[^()]*\)\s*\(",
+    ),
+    # Epson RC+: U, V, W about Z, Y, X, turned axes.
+    "epson": PoseConvention(
+        "Epson", ("X", "Y", "Z", "U", "V", "W"), "ZYX", "mm", "deg", ("Epson",)
+    ),
     # Staubli VAL 3 reference, data type trsf: Rx, Ry, Rz about turned axes.
     "staubli": PoseConvention(
         "Staubli", ("X", "Y", "Z", "RX", "RY", "RZ"), "XYZ", "mm", "deg", ("Stäubli", "Staubli")

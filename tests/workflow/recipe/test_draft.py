@@ -585,8 +585,8 @@ def two_poses_of_nobody(folder):
         (odd_heading, ["--columns", "u,v,ww,4,5,6"],
          "rec/log.csv: has no column 'ww'; known: w"),
         (angles_of_nobody, [], "not known: rotation convention of columns rx, ry, rz of log.csv (ur, "
-         "kuka, fanuc, abb, yaskawa, staubli, kawasaki, doosan, halcon, rpy, quaternion_xyzw, "
-         "quaternion_wxyz, vector, xyz, ZYX, …); add --rotation vector, or --rotation xyz for roll, "
+         "kuka, fanuc, abb, yaskawa, mitsubishi, epson, staubli, kawasaki, doosan, halcon, rpy, "
+         "quaternion_xyzw, quaternion_wxyz, vector, xyz, ZYX, …); add --rotation vector, or --rotation xyz for roll, "
          "pitch, yaw; or name the arm with --robot: its maker decides"),
         (images, [], "not known: which printed target is seen; add --target 'charuco: "
          "{columns: 8, rows: 6, square: 30 mm, marker: 22 mm}'"),

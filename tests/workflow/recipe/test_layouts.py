@@ -452,6 +452,114 @@ def named_as_in_ros(f, j, a, s):
     ]))  # fmt: skip
 
 
+def one_below_the_other(f, j, a, s):
+    rows = [f"{i},{who},{text([row])}" for i in range(COUNT)
+            for who, (row,) in (("robot", quaternion(a[[i]])), ("marker", quaternion(s[[i]])))]  # fmt: skip
+    (f / "poses.csv").write_text("pose,frame,x,y,z,qx,qy,qz,qw\n" + "".join(rows))
+
+
+def below_by_time(f, j, a, s):
+    rows = [f"{100 + 2 * i};{who};{text([row], ';')}" for who, poses in (("tcp", a), ("tag", s))
+            for i, row in enumerate(euler(poses, "ZYX")[:, [0, 1, 2, 5, 4, 3]])]  # fmt: skip
+    (f / "log.csv").write_text(
+        "timestamp;type;x_mm;y_mm;z_mm;rx_deg;ry_deg;rz_deg\n" + "".join(rows)
+    )
+
+
+def counted_vectors(f, j, a, s):
+    axes = ",".join(f"Robot {axis}" for axis in ("X (mm)", "Y (mm)", "Z (mm)", "Rx", "Ry", "Rz"))
+    seen = "tvec_0,tvec_1,tvec_2,rvec_0,rvec_1,rvec_2"
+    (f / "r.csv").write_text(f"{axes},{seen}\n" + text(np.hstack([vector(a, 1e3), vector(s, 1e3)])))
+
+
+def recorder_of_ur(f, j, a, s):
+    names = [f"actual_{of}_{i}" for of in ("q", "TCP_pose") for i in range(6)]
+    times = 2.0 * np.arange(COUNT)[:, None]
+    rows = text(np.hstack([times, j, vector(a)]), " ")
+    (f / "robot_data.csv").write_text(f"timestamp {' '.join(names)}\n{rows}")
+    rows = text(np.hstack([times + 0.01, vector(s)]), " ")
+    (f / "charuco.csv").write_text(f"timestamp t_x t_y t_z rvec_x rvec_y rvec_z\n{rows}")
+
+
+def benchmark_of_poses(f, j, a, s):
+    seen = {str(i): [{"cam_R_m2c": pose[:3, :3].ravel().tolist(), "obj_id": 1,
+                      "cam_t_m2c": (1e3 * pose[:3, 3]).tolist()}]
+            for i, pose in enumerate(s)}  # fmt: skip
+    (f / "scene_gt.json").write_text(json.dumps(seen))
+    (f / "robot.json").write_text(json.dumps({str(i): pose.tolist() for i, pose in enumerate(a)}))
+
+
+def lists_in_cells(f, j, a, s):
+    cells = zip(vector(a).tolist(), vector(s).tolist(), strict=True)
+    rows = [f'img{i}.png,"{arm}","{seen}"\n' for i, (arm, seen) in enumerate(cells)]
+    (f / "poses.csv").write_text("image,robot_pose,marker_pose\n" + "".join(rows))
+
+
+def entries_by_two_numbers(f, j, a, s):
+    names = [f"{of}_{i}_{k}" for of in ("robot", "cam") for i in range(4) for k in range(4)]
+    rows = text(np.hstack([a.reshape(-1, 16), s.reshape(-1, 16)]))
+    (f / "all.csv").write_text(f"{','.join(names)}\n{rows}")
+
+
+def entries_in_brackets(f, j, a, s):
+    of = ("T_base_tcp", "T_cam_tag")
+    names = [f"{name}[{i},{k}]" for name in of for i in range(3) for k in range(4)]
+    rows = text(np.hstack([a[:, :3].reshape(-1, 12), s[:, :3].reshape(-1, 12)]), ";")
+    (f / "all.csv").write_text(f"{';'.join(names)}\n{rows}")
+
+
+def remarks_behind(f, j, a, s):
+    for name, poses in (("robot", a), ("marker", s)):
+        lines = text(quaternion(poses), " ").splitlines()
+        (f / f"{name}.txt").write_text("".join(f"{x}   # pose {i}\n" for i, x in enumerate(lines)))
+
+
+def kinova(f, j, a, s):
+    arm = euler(a, "ZYX", 1.0)[:, [0, 1, 2, 5, 4, 3]].tolist()
+    names = ("x", "y", "z", "theta_x", "theta_y", "theta_z")
+    (f / "log.json").write_text(json.dumps({"measurements": [
+        {"tool_pose": dict(zip(names, row, strict=True)),
+         "aruco": {"tvec": seen[:3], "rvec": seen[3:]}}
+        for row, seen in zip(arm, vector(s).tolist(), strict=True)
+    ]}))  # fmt: skip
+
+
+def matlab_structures(f, j, a, s):
+    samples = np.zeros(COUNT, dtype=[("robot", object), ("cam", object)])
+    samples["robot"], samples["cam"] = list(a), list(s)
+    savemat(f / "samples.mat", {"samples": samples})
+
+
+def names_of_abb(f, j, a, s):
+    for name, poses in (("robot", a), ("camera_target", s)):
+        rows = quaternion(poses)[:, [0, 1, 2, 6, 3, 4, 5]] * [1e3, 1e3, 1e3, 1, 1, 1, 1]
+        heading = "trans.x,trans.y,trans.z,rot.q1,rot.q2,rot.q3,rot.q4"
+        (f / f"{name}.csv").write_text(f"{heading}\n{text(rows)}")
+
+
+def melfa(f, j, a, s):
+    rows = text(euler(a, "ZYX")[:, [0, 1, 2, 5, 4, 3]]).splitlines()
+    (f / "melfa.txt").write_text("".join(f"P{i}=({row})(7,0)\n" for i, row in enumerate(rows)))
+    (f / "board.csv").write_text("tx,ty,tz,rx,ry,rz\n" + text(vector(s)))
+
+
+def epson(f, j, a, s):
+    (f / "epson.csv").write_text("X,Y,Z,U,V,W\n" + text(euler(a, "ZYX")))
+    (f / "vision.csv").write_text("X,Y,Z,RX,RY,RZ\n" + text(vector(s, 1e3)))
+
+
+def topic_as_csv(f, j, a, s):
+    for name, frame, poses in (("robot", "base_link", a), ("aruco", "camera", s)):
+        lines = text(quaternion(poses)).splitlines()
+        rows = [f"{1700 + 2 * i},5000,{frame},{line}\n" for i, line in enumerate(lines)]
+        (f / f"{name}.csv").write_text("".join(rows))
+
+
+def names_of_visp(f, j, a, s):
+    for name, poses in (("fMe", a), ("cMo", s)):
+        (f / f"{name}.txt").write_text(text(poses.reshape(-1, 16), " "))
+
+
 LAYOUTS: dict[str, Callable[..., None]] = {
     "two blocks of rows in one text, arm above marker": blocks,
     "the same without a line between them": halves,
@@ -512,6 +620,22 @@ LAYOUTS: dict[str, Callable[..., None]] = {
     "the number of rows in the first line": count_first,
     "one text, `robot 0` above a matrix, then `marker 0`, `robot 1`, …": in_turn,
     "`base_to_ee` and `cam_to_tag`, as ROS names poses": named_as_in_ros,
+    "one below the other, a column says `robot` or `marker`": one_below_the_other,
+    "the same, first all `tcp`, then all `tag`, with times": below_by_time,
+    "headings Robot X (mm), …, tvec_0, rvec_0, …": counted_vectors,
+    "`actual_TCP_pose_0`, … of UR's recorder, and a table of the target": recorder_of_ur,
+    "`scene_gt.json` of BOP's data sets, `cam_R_m2c`, `cam_t_m2c`": benchmark_of_poses,
+    'a list in a cell, `"[0.4, -0.1, …]"`': lists_in_cells,
+    "headings robot_0_0, robot_0_1, … of matrices": entries_by_two_numbers,
+    "headings T_base_tcp[0,0], T_base_tcp[0,1], …": entries_in_brackets,
+    "a remark behind each row, `# pose 3`": remarks_behind,
+    "`tool_pose.theta_x`, as Kinova calls its angles": kinova,
+    "MATLAB, an array of structures": matlab_structures,
+    "headings trans.x, …, rot.q1, … rot.q4": names_of_abb,
+    "Mitsubishi's positions, `P1=(…)(7,0)`": melfa,
+    "Epson's X, Y, Z, U, V, W": epson,
+    "`ros2 topic echo --csv`, a stamp and a frame before the pose": topic_as_csv,
+    "`fMe.txt` and `cMo.txt`, as ViSP names poses": names_of_visp,
 }
 """What is in the folder, and how it is written."""
 

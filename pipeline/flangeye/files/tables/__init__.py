@@ -6,8 +6,9 @@ pattern in :data:`~flangeye.types.pose_formats.CONVENTIONS`.
 Rows of poses, whatever file they are from.
 
 ``poses.csv`` names a file; ``robot/*.txt`` files with a row each; ``log.txt:2`` the second block
-of rows of a text, ``log.txt:2/2`` the second half of its rows; ``poses.npz:arm`` the arrays of a
-document that have as many entries as ``arm``. Several names are tables side by side.
+of rows of a text, ``log.txt:2/2`` the second half of its rows; ``log.csv:marker`` those rows that
+have a cell ``marker``; ``poses.npz:arm`` the arrays of a document that have as many entries as
+``arm``. Several names are tables side by side.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from flangeye.files.tables.table import (
     Row,
     Rows,
     Table,
+    entry_of_list,
     number_of,
     record_of,
     rows_of,
@@ -45,6 +47,7 @@ __all__ = [
     "Column",
     "Table",
     "document_of",
+    "entry_of_list",
     "files_at",
     "number_of",
     "read_table",
@@ -213,7 +216,10 @@ def _part(file: Path, found: Sequence[Rows], part: str) -> Rows:
     for rows in found:
         if part and part in (rows.part, *rows.part.split(",")):
             return rows
-    if part and len(found) == 1 and found[0].part == "":
+    if len(found) == 1 and found[0].part == "":
+        named = [row for row in found[0].rows if part in row[1]]
+        if named:
+            return found[0]._replace(rows=named, names=())
         raise StageError(f"{file}: has one table only, not '{part}'; write {file.name}")
     known = ", ".join(f"{file.name}:{rows.part.split(',')[0]}" for rows in found)
     what = f"has no part '{part}'" if part else f"holds {len(found)} tables"
@@ -290,7 +296,7 @@ def text_rows(file: Path, text: str) -> list[Rows]:
     heading. Blank lines and titles part blocks of three rows and more, and so do comments between
     blocks of one length. Matrices that stand line by line are a row each.
     """
-    blocks = [_with_matrices(block) for block in _blocks(file, text.splitlines())]
+    blocks = [_with_matrices(_unfolded(block)) for block in _blocks(file, text.splitlines())]
     merged = _in_turn(blocks) or _merged(blocks)
     names = [block.title for block in merged]
     distinct = len(set(names)) == len(names) > 1 and all(names)
@@ -317,10 +323,11 @@ def _blocks(file: Path, lines: Sequence[str]) -> Iterator[TextBlock]:
     block = TextBlock(after_blank=True, marked=split.mark != " ")
     for n, line in _unbroken(lines):
         comment = bool(_COMMENT.match(line))
-        plain = _COMMENT.sub("", line)
+        # What stands behind the numbers of a line is a remark
+        plain = _COMMENT.sub("", re.sub(r"^([-+.\d][^#]*?)\s+(?:#|//).*", r"\1", line))
         cells = split(plain) if plain else ()
         counts = split.wide and len(cells) < 3  # rows, or what stands below: robot 7
-        numbers = any(number_of(cell) is not None for cell in cells)
+        numbers = any(number_of(cell) is not None or _list_in(cell) for cell in cells)
         if numbers and not comment and not counts:
             block.rows.append((f"{file}:{n}", cells))
             continue
@@ -349,6 +356,32 @@ def _unbroken(lines: Sequence[str]) -> Iterator[tuple[int, str]]:
         if not open_list or n - first == 16 or n == len(lines):
             yield first, begun
             begun = ""
+
+
+def _list_in(cell: Cell) -> tuple[str, ...]:
+    """Return the numbers of a list that stands in one cell; empty where none does."""
+    text = str(cell).strip()
+    words = re.split(r"[\s,;\[\]()]+", text.strip("[]() ")) if text[:1] in ("[", "(") else []
+    return tuple(words) if words[2:] and all(number_of(word) is not None for word in words) else ()
+
+
+def _unfolded(block: TextBlock) -> TextBlock:
+    """Return a block with a column for each number of the lists that stand in its cells."""
+    sizes = [len(_list_in(cell)) for cell in block.rows[0][1]]
+    if any(sizes):
+        for at, (where, cells) in enumerate(block.rows):
+            parts = (_list_in(cell) or (cell,) for cell in cells)
+            # A cell that is empty is as many empty ones
+            full = (part * (size or 1) if len(part) == 1 else part
+                    for part, size in zip(parts, sizes, strict=False))  # fmt: skip
+            block.rows[at] = where, tuple(cell for part in full for cell in part)
+        if len(block.heading) == len(sizes):
+            block.heading = tuple(
+                f"{name}.{i}" if size else name
+                for name, size in zip(block.heading, sizes, strict=True)
+                for i in range(size or 1)
+            )
+    return block
 
 
 def _with_matrices(block: TextBlock) -> TextBlock:

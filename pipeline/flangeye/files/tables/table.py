@@ -87,7 +87,7 @@ class Table:
         raise StageError(f"{self.file}: has no column '{column}'; {known}")
 
     def indices(self, columns: Sequence[Column]) -> list[int]:
-        """Return the indices of columns, from 0; ``pose`` also means all of ``pose.0``, ``pose.1``.
+        """Return the indices of columns, from 0; ``pose`` also means ``pose.0``, ``pose.1``, ….
 
         Raises:
             StageError: There is none of a name; names the nearest.
@@ -116,8 +116,8 @@ class Table:
         """Return the columns of a list's entries, in their order."""
         if column in self.heading:
             return []
-        entry = re.compile(re.escape(str(column)) + r"(\.\d+)+")
-        return [i for i, name in enumerate(self.heading) if entry.fullmatch(name)]
+        entries = enumerate(map(entry_of_list, self.heading))
+        return [i for i, entry in entries if entry and entry[0] == column]
 
     def _row(self, row: int, columns: Sequence[int], empty: bool) -> list[float]:
         where, cells = self.rows[row]
@@ -131,6 +131,12 @@ class Table:
             if number is None:
                 raise StageError(f"{where}: '{cells[column]}' is not a number")
         return [number for number in found if number is not None]
+
+
+def entry_of_list(name: str) -> tuple[str, str] | None:
+    """Return the list of a column and which entry it is: pose.3.3, tvec_0, T[1,2]; else None."""
+    match = re.fullmatch(r"(.+?)((?:\.\d+)+|(?:_\d+)+|(?:\[\d+(?:, ?\d+)*\])+)", name)
+    return match and (match[1], match[2])
 
 
 def number_of(cell: Cell) -> float | None:
@@ -174,7 +180,9 @@ def rows_of(file: Path, document: TableDocument) -> list[Rows]:
         found = _numbered(file, data) or _side_by_side(document.where, data) or _named(file, data)
         if found:
             return found
-    raise StageError(f"{file}: expected a list of records, or one under each scan's name")
+    raise StageError(
+        f"{file}: expected arrays of poses, a list of records, or a record under each scan's name"
+    )
 
 
 def _numbered(file: Path, data: Mapping[str, Any]) -> list[Rows]:
@@ -204,7 +212,7 @@ def _called(stem: str) -> str:
 
 def _is_record(value: Any) -> bool:
     """Return whether a value is what one pose has: a mapping, a matrix, or a row of numbers."""
-    if isinstance(value, Mapping):
+    if isinstance(value, Mapping) or (_are_records(value) and len(value) == 1):
         return True
     shape = _shape(value)
     # Three or four numbers are a part of a pose, six and more a whole one

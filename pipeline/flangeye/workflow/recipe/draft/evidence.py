@@ -36,7 +36,10 @@ def poses_by_number(table: Table) -> tuple[list[PoseColumns], Headings]:
     """Return the poses in a table without column names; a running index is left out."""
     columns = [i for i, cell in enumerate(table.rows[0][1]) if number_of(cell) is not None]
     texts = [i for i in range(len(table.rows[0][1])) if i not in columns]
-    rest = Headings(scan=texts[0] + 1 if len(texts) == 1 else None)
+    names = [i for i in texts if len(set(table.texts(i))) == len(table.rows)]
+    rest = Headings(scan=names[0] + 1 if len(names) == len(texts) == 1 else None)
+    if texts and not names and max(texts) > columns[0]:
+        columns = [i for i in columns if i > max(texts)]  # a stamp, a frame, then the pose
     if len({len(cells) for _, cells in table.rows}) > 1 or not columns:
         return [], rest
     numbers = table.numbers(columns, empty=True)

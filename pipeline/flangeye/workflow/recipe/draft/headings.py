@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from flangeye.files.tables import Cell, Column, Table, number_of
+from flangeye.files.tables import Cell, Column, Table, entry_of_list, number_of
 from flangeye.models.robots import joints_in_order
 from flangeye.types.pose_formats import ANGLES, CONVENTIONS, LENGTHS
 
@@ -36,7 +36,7 @@ _PLACES = (
 _TURNS: Mapping[str, str] = {
     "orientation": "q", "ori": "q", "quaternion": "q", "quat": "q", "q": "q",
     "rotation": "r", "rotations": "r", "rot": "r", "r": "r", "euler": "r", "angles": "r",
-    "angle": "r", "winkel": "r",
+    "angle": "r", "winkel": "r", "theta": "r",
     "rvec": "v", "rvecs": "v", "rotvec": "v", "rodrigues": "v", "rpy": "e",
 }  # fmt: skip
 """Names of rotations, and what the names of their columns begin with."""
@@ -52,7 +52,7 @@ _JOINT = re.compile(
 
 SEEN = re.compile(
     r"target|mark|cam|board|tag|aruco|pattern|checker|chess|fiducial|cent(er|re)|seen|sphere|object|"
-    r"optical|track|detect"
+    r"optical|track|detect|vision"
 )
 """In the name of what a camera measured."""
 
@@ -75,7 +75,7 @@ _FRAMES: Mapping[str, str] = {
 _ENTRY = re.compile(r"(?:r|m|t|rot|mat)([0-3])([0-3])")
 """Entry of a matrix in row and column: ``r11``, ``m03``."""
 _TO = re.compile(r"(?<![a-zA-Z])([a-zA-Z]+)(?:2|_to_|To)([a-zA-Z]+)")
-_IN = re.compile(r"(?<![a-zA-Z])([a-z]+)_?[TH]_?([a-z]+)(?![a-zA-Z])")
+_IN = re.compile(r"(?<![a-zA-Z])([a-z]+)_?[THM]_?([a-z]+)(?![a-zA-Z])")
 _OF = re.compile(r"(?<![a-zA-Z])[TH]_([a-z]+)_([a-z]+)")
 
 
@@ -217,15 +217,16 @@ def poses_by_name(table: Table) -> tuple[list[PoseColumns], Headings]:
 def _grouped(table: Table) -> tuple[dict[str, Group], Headings]:
     rest = Headings()
     groups: dict[str, Group] = {}
-    sizes = list_sizes(table.heading)
+    lists = lists_in(table.heading)
+    sizes = Counter(lists.values())
     seen: Counter[str] = Counter()
     for index, name in enumerate(table.heading):
-        listed, size = list_name(name), sizes[list_name(name)] if list_name(name) else 0
-        nth = seen[listed]
+        listed = lists.get(name, "")
+        size, nth = sizes[listed], seen[listed]
         seen[listed] += bool(listed)
         joint = _JOINT.fullmatch(name.lower().replace(" ", "_").rpartition(".")[2])
         joint = joint or _JOINT.fullmatch(name.lower())
-        joint = joint or re.fullmatch(r"(.*\.)?q", listed.lower()) if size > 4 else joint
+        joint = joint or re.fullmatch(r"(.*[._])?q", listed.lower()) if size > 4 else joint
         order = "wxyz" if "wxyz" in listed.lower() else "xyzw"
         words = _of_list(listed, order[nth]) if size in (3, 4) else _words(listed if size else name)
         if number_of(_first(table, index)) is None:
@@ -276,19 +277,24 @@ def _is_file(table: Table, index: int) -> bool:
 
 def _is_quaternion(table: Table, name: str) -> bool:
     """Return whether q1 is of a quaternion, q1 to q4 as ABB has it, or q0 to q3."""
-    called = {each.lower() for each in table.heading if re.fullmatch(r"q\d", each.lower())}
-    return name.lower() in called and "".join(sorted(called)) in ("q1q2q3q4", "q0q1q2q3")
+    alike = re.compile(re.escape(name.lower()[:-1]) + r"\d")
+    called = sorted(each[-1] for each in table.heading if alike.fullmatch(each.lower()))
+    return name.lower()[-2:-1] == "q" and "".join(called) in ("1234", "0123")
 
 
-def list_sizes(names: Sequence[str]) -> Counter[str]:
-    """Return how many of the columns are entries of each list: 16 of ``pose`` in ``pose.3.3``."""
-    return Counter(listed for name in names if (listed := list_name(name)))
+def lists_in(names: Sequence[str]) -> dict[str, str]:
+    """Return the list of each column that is an entry of one: ``pose`` of ``pose.3.3``.
 
-
-def list_name(name: str) -> str:
-    """Return the list that a column is an entry of; empty if it is none."""
-    match = re.fullmatch(r"(.+?)((?:\.\d+)+)", name)
-    return match[1] if match else ""
+    Columns of text that are counted are one too, where they are as many as a pose, or a part of
+    one, has numbers: ``tvec`` of ``tvec_0`` or ``tvec[0]``.
+    """
+    found = {name: entry for name in names if (entry := entry_of_list(name))}
+    sizes = Counter(listed for listed, _ in found.values())
+    return {
+        name: listed
+        for name, (listed, entry) in found.items()
+        if entry[0] == "." or sizes[listed] in (3, 4, 9, *_POSES)
+    }
 
 
 def _of_list(listed: str, axis: str) -> list[str]:

@@ -162,7 +162,7 @@ def _missing(survey: FolderSurvey, reason: StageError) -> str:
         how = "; flangeye init takes such lines as --reader '{…}' and --robot NAME"
         return f"{reason}{how if lines else ''}"
     # Files of arrays that hold nothing else
-    for path in survey.of((".mat", ".npz")):
+    for path in survey.of((".mat", ".npz", ".npy")):
         try:
             tables_in(path.parent, path.name)
         except StageError as error:
@@ -177,7 +177,9 @@ def _missing(survey: FolderSurvey, reason: StageError) -> str:
             f"for each, {scans[0].name},412.1,-33.0,501.7,2.91,0.12,-0.03"
         )
     # Tables that other programs keep; some of them can hold code
-    closed = survey.of((".parquet", ".feather", ".pkl", ".pickle", ".xlsx", ".xls", ".ods"))
+    closed = survey.of(
+        (".parquet", ".feather", ".pkl", ".pickle", ".xlsx", ".xls", ".ods", ".h5", ".hdf5")
+    )
     if closed:
         return f"{survey.folder}: {closed[0].name} is a table that is not read; save it as .csv"
     some = 6  # names that a line shows

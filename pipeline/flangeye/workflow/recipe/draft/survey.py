@@ -17,7 +17,7 @@ from flangeye.files.recording import MIN_CAPTURES
 from flangeye.files.regular import is_pointer
 from flangeye.files.scans import CLOUDS, IMAGES, natural, texts_of_points
 from flangeye.files.tables import KINDS, Table, number_of, read_table, tables_in
-from flangeye.workflow.recipe.draft.headings import list_name, list_sizes
+from flangeye.workflow.recipe.draft.headings import lists_in, role_in
 
 Prompt = Callable[[str, str | None], str]
 """Asks a person; takes the question and the default, returns the answer."""
@@ -262,7 +262,17 @@ def _tables(folder: Path, place: str, files: int) -> list[Table]:
         found = [read_table(folder, place)] if files > 1 else tables_in(folder, place)
     except FlangeyeError:
         return []
-    return [t for t in found if _holds_numbers(t) and (files < 2 or len(t.rows) == files)]
+    apart = [part for table in found for part in _by_whom(folder, table) or [table]]
+    return [t for t in apart if _holds_numbers(t) and (files < 2 or len(t.rows) == files)]
+
+
+def _by_whom(folder: Path, table: Table) -> list[Table]:
+    """Return the rows of the arm and those of the target, where a column says whose each row is."""
+    for column in range(len(table.heading)):
+        called = [str(name) for name in dict.fromkeys(table.texts(column))]
+        if {role_in(name) for name in called} >= {"arm", "target"}:
+            return [read_table(folder, f"{table.name}:{name}") for name in called if role_in(name)]
+    return []
 
 
 def _holds_numbers(table: Table) -> bool:
@@ -310,8 +320,9 @@ def _key(name: str) -> tuple[str, str] | None:
 
 
 def _of_table(table: Table) -> str:
-    sizes = list_sizes(table.heading)
-    names = dict.fromkeys(list_name(name) or name for name in table.heading)
+    lists = lists_in(table.heading)
+    sizes = Counter(lists.values())
+    names = dict.fromkeys(lists.get(name, name) for name in table.heading)
     shown = [f"{name} ({sizes[name]} numbers)" if name in sizes else name for name in names]
     heading = ", ".join(shown) or f"no heading, {len(table.rows[0][1])} columns"
     return f"{table.name}, {len(table.rows)} rows: {heading}"
