@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import mmap
 import os
 import queue
 import subprocess
@@ -32,6 +33,18 @@ def busy() -> str:
         f"; this computer is busy (load {load:.1f} on {cores} cores): end other programs, "
         "then start again"
     )
+
+
+def require_memory(what: str, megabytes: int = 256) -> None:
+    """Require that the process can be given so much more memory; none of it is used.
+
+    Raises:
+        MemoryError: It cannot; the message begins with ``what``.
+    """
+    try:
+        mmap.mmap(-1, megabytes << 20).close()
+    except OSError as error:
+        raise MemoryError(f"{what}; fewer than {megabytes} MB are left") from error
 
 
 class PipeEndedError(Exception):

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import pluggy
 
 from flangeye.errors import FlangeyeError
+from flangeye.files.processes import require_memory
 from flangeye.files.words import nearest
 from flangeye.models.robots import RobotModel
 from flangeye.plugin import hookspecs
@@ -78,9 +79,9 @@ class Offered(MutableMapping[str, Kind]):
         try:
             found = getattr(importlib.import_module(module), attribute)
         except Exception as error:  # a vendor's import may fail in any way
-            raise PluginNotFoundError(
-                f"'{name}' cannot be imported from {place} ({type(error).__name__}: {error})"
-            ) from error
+            failed = f"'{name}' cannot be imported from {place} ({type(error).__name__}: {error})"
+            require_memory(failed)
+            raise PluginNotFoundError(failed) from error
         plugins: tuple[object, ...] = found if isinstance(found, tuple) else (found,)
         for plugin in plugins:
             if isinstance(plugin, self._sort) and plugin.name == name:

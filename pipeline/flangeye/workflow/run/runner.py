@@ -15,11 +15,13 @@ from functools import partial
 from itertools import chain, islice
 from typing import Any
 
+import numpy as np
 import pluggy
 
 from flangeye import types as t
 from flangeye.devices import MotionAllowed
 from flangeye.errors import CalibrationRefused, FlangeyeError, NothingSeen, StageError
+from flangeye.files.processes import require_memory
 from flangeye.models.cell import cell_in
 from flangeye.models.configuration import CELL
 from flangeye.models.scanners import ScannerModel
@@ -68,6 +70,7 @@ class Runner:
         Raises:
             StageError: A step cannot do its work with the input it was given.
         """
+        _take_buffers()
         truths = Truths()  # nothing that a stage can reach from its arguments holds them
         try:
             try:
@@ -462,6 +465,18 @@ class Runner:
         )
 
 
+def _take_buffers() -> None:
+    """Let both OpenBLAS, NumPy's and SciPy's, take their 32 MB while there is memory for them.
+
+    They keep them. Where there is none they would try again without an end, or end the process.
+    """
+    from scipy.linalg import cholesky
+
+    require_memory("linear algebra needs buffers", 72)
+    np.linalg.cholesky(np.eye(2))
+    cholesky(np.eye(2))
+
+
 def _given(step: Step, need: Any, value: Any) -> Any:
     """Return what a stage asked for; what it cannot do without must be there."""
     if value is None and bare(need) is need:
@@ -492,7 +507,8 @@ def _guarded(step: Step, arguments: dict[str, Any]) -> Any:
     except (FlangeyeError, MemoryError):
         raise
     except Exception as error:
+        failed = f"{step.label}: failed with {type(error).__name__}: {error}"
+        require_memory(failed)  # as libraries that cannot be loaded, and threads, fail otherwise
         raise StageError(
-            f"{step.label}: failed with {type(error).__name__}: {error}; this is a mistake in the "
-            "plugin (FLANGEYE_DEBUG=1 shows where)"
+            f"{failed}; this is a mistake in the plugin (FLANGEYE_DEBUG=1 shows where)"
         ) from error
