@@ -1,13 +1,12 @@
 """flangeye: hand-eye calibration from the robot's own flange.
 
-The names every plugin needs are here. Public are also the rooms ``types``, ``units``, ``devices``,
-``errors``, ``maths``, ``estimation``, ``models``, ``files``, ``motion``, ``plugin`` and
-``testing``, the modules ``workflow.log.read``, ``workflow.recipe.header`` and ``workflow.result``,
-and those that hold contracts of parts; the rest may change without notice. The last contract in
-pyproject.toml holds plugins to it.
+This package has the names that every plugin needs. Also public are the packages ``types``,
+``units``, ``devices``, ``errors``, ``maths``, ``estimation``, ``models``, ``files``, ``motion``,
+``plugin`` and ``testing``, the modules ``workflow.log.read``, ``workflow.recipe.header`` and
+``workflow.result``, and those that hold contracts of parts; the rest may change without notice. The
+last contract in pyproject.toml holds plugins to it.
 
-A name is imported when it is asked for: a command that answers at once must not wait for what it
-does not use.
+A name is imported at its first use, so that ``--help`` loads no numerical library.
 """
 
 import importlib

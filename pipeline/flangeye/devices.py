@@ -4,15 +4,15 @@ A driver is a part (``robot.NAME``, ``scanner.NAME``, ``sensor.NAME``): a functi
 recipe's model and its own parameters and returns an open device. It imports its SDK when it is
 called and raises :class:`DeviceError` in one line where SDK, device or permission is missing.
 
-No method of a driver moves anything by itself, waits for a motion to end, or blocks for longer
-than :data:`PATIENCE`: whoever commands a motion watches it (``flangeye.motion``), so that
-every arm stops for the same reasons. SI units; a twist is (linear, angular), about the flange's
-origin, along the base's axes.
+No method of a driver moves anything by itself, waits for a motion to end, or blocks for longer than
+:data:`PATIENCE`: the caller watches the motion (``flangeye.motion``), so that every arm stops for
+the same reasons. SI units; a twist is (linear, angular), about the flange's origin, along the
+base's axes.
 
-Silence alone stops an arm: a motion goes on while :meth:`Robot.state` is called at least every
-:data:`SILENT`, and the driver ends it otherwise, whichever process is stopped, starved or dead. So
-no driver leaves a controller with a command that outlasts its own silence. Times are those of
-``time.monotonic_ns``, which every process of a machine shares and which nobody sets.
+A motion goes on only while :meth:`Robot.state` is called at least every :data:`SILENT`; otherwise
+the driver ends it. This holds whichever process is stopped, starved or dead, so no driver gives a
+controller a command that outlasts :data:`SILENT`. Times are those of ``time.monotonic_ns``, which
+every process of a machine shares and which nobody sets.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class DeviceError(StageError):
 
 
 class FrameDropped(DeviceError):
-    """A scanner lives, but lost this one exposure: expose again, or leave the pose out."""
+    """A scanner lost this one exposure but still works: expose again, or leave the pose out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ class RobotState:
         base_T_flange: Pose of the flange, any tool offset of the controller taken off.
         joints: (n,) angles [rad].
         joint_speeds: (n,) [rad/s].
-        time_ns: When the controller sampled it, by ``time.monotonic_ns``.
+        time_ns: When the controller sampled the arm, by ``time.monotonic_ns``.
         mode: What the controller is able to do; anything but ready and moving is a safety fault.
         force: (6,) force and torque on the flange in the base's axes [N, N m], if it is measured.
         message: Text of the controller about a mode that is not ready.
@@ -99,7 +99,7 @@ class Robot(Device, Protocol):
 
     Attributes:
         name: Model and address, as messages show it: ``ur5e at 192.168.1.10``.
-        period: Between two of the controller's cycles [s].
+        period: Duration of the controller's cycle [s].
         flange_T_tool: The tool offset set in the controller; None where it cannot be read.
     """
 
@@ -110,15 +110,15 @@ class Robot(Device, Protocol):
     def state(self) -> RobotState:
         """Return the newest sample; raise DeviceError when it is older than 100 ms.
 
-        It is also the proof that the motion is watched: one that was not read for SILENT ends,
-        and is not taken up again.
+        The call also shows that the motion is watched: without a call for SILENT the motion ends
+        and is not resumed.
         """
 
     def move_joints(self, joints: Floats, speed: float, acceleration: float) -> None:
         """Start a move to joint angles (n,) [rad]; speed of the fastest joint [rad/s].
 
-        The mode is ``moving`` from here on until the move has ended, so nobody takes an arm that
-        has not begun for one that has arrived.
+        The mode is ``moving`` from this call until the move has ended, so an arm that has not
+        started is never taken for one that has arrived.
         """
 
     def move_linear(self, base_T_flange: Transform, speed: float, acceleration: float) -> None:
@@ -144,8 +144,8 @@ class Robot(Device, Protocol):
 class MovedByHand(Protocol):
     """Additional interface of a robot that a person moves by hand.
 
-    A move then takes as long as it takes, leads past nothing that was planned, and ends near the
-    pose asked for, not at it: when the mode is ready again, the state says where.
+    A move then has no fixed duration or path, and ends near the requested pose, not at it. When the
+    mode is ready again, the state has the pose reached.
 
     Attributes:
         by_hand: Always true.
@@ -162,7 +162,7 @@ class Scan:
         cloud: In ``camera`` [m].
         started_ns: When the exposure began, by ``time.monotonic_ns``.
         ended_ns: When it ended.
-        image: What a camera in the scanner saw, if it has one and was asked.
+        image: Image of the scanner's camera, if it has one and an image was requested.
     """
 
     cloud: PointCloud
@@ -177,7 +177,7 @@ class Scanner(Device, Protocol):
 
     Attributes:
         name: Model and serial number, as messages show it.
-        facts: What the device itself says: unit, layout, size, firmware, …; logged.
+        facts: What the device reports about itself (unit, layout, size, firmware, …); logged.
     """
 
     name: str
@@ -186,10 +186,10 @@ class Scanner(Device, Protocol):
     def expose(self) -> Callable[[], Scan]:
         """Take the exposure; return when it has ended and the arm may move on.
 
-        Calling what it returns waits for the data, a few seconds at most, and gives the scan.
-        Both may raise; what it returns is called once, and before the next exposure. Only where
-        a person has to act, as with a watched folder, does it take longer than PATIENCE; ``close``
-        from another thread ends that wait.
+        The returned function waits for the data, a few seconds at most, and returns the scan. Both
+        may raise. The function is called once, before the next exposure. It takes longer than
+        PATIENCE only where a person has to act, as with a watched folder; ``close`` from another
+        thread ends that wait.
 
         Raises:
             FrameDropped: This exposure gave nothing; the scanner is still there.
@@ -209,14 +209,14 @@ class HearsLoss(Protocol):
 class Overhears(Protocol):
     """Additional interface of a scanner that receives scans which others triggered.
 
-    Where others move the arm, their program may trigger the scanner as well.
+    A foreign robot program that moves the arm may trigger the scanner as well.
     """
 
     def overhear(self, since_ns: int) -> Callable[[], Scan]:
         """Return the newest scan since a given time, or the next one; see ``Scanner.expose``.
 
         Raises:
-            FrameDropped: Nobody took one in time.
+            FrameDropped: No scan was taken in time.
             DeviceError: The scanner is lost.
         """
 
@@ -226,7 +226,7 @@ class KnowsTruth(Protocol):
     """The truth of a simulated scanner, to score it; no stage can ask for it.
 
     Attributes:
-        truth: Where it really stands.
+        truth: True pose of the scanner.
     """
 
     truth: Truth
@@ -245,14 +245,14 @@ class KnowsSeams(Protocol):
     """The truth of a simulated scanner, to score a plan; no planning stage sees it.
 
     Attributes:
-        true_seams: By name, (N, 3) in ``base`` [m].
+        true_seams: Points of each seam by name, (N, 3) in ``base`` [m].
     """
 
     true_seams: Mapping[str, Array]
 
 
 class StateSource(Protocol):
-    """Source of the arm's pose and its time, all that a tactile sensor needs of the arm."""
+    """Source of the arm's pose with its time: all that a tactile sensor needs from the arm."""
 
     def state(self) -> RobotState:
         """Return the newest sample."""
@@ -263,7 +263,7 @@ class SensorFrame:
     """One image of a tactile sensor.
 
     Attributes:
-        image: What its camera saw.
+        image: The camera's image.
         time_ns: Middle of the exposure, on the robot's clock.
     """
 
@@ -278,7 +278,7 @@ class TactileSensor(Device, Protocol):
     Attributes:
         name: Shown in messages and reports.
         camera_matrix: (3, 3) [px].
-        distortion: (k,) OpenCV's coefficients; empty for none.
+        distortion: (k,) OpenCV's distortion coefficients; empty for none.
     """
 
     name: str
@@ -298,8 +298,8 @@ class WeldProfile:
     """One measurement of the bead behind the torch.
 
     Attributes:
-        offset: How far the bead's middle is to the left of the joint, seen along the weld [m].
-        sigma: Standard deviation of that [m].
+        offset: Distance of the bead's middle to the left of the joint, seen along the weld [m].
+        sigma: Standard deviation of the offset [m].
         time_ns: When the profile was taken, on the robot's clock.
     """
 
@@ -323,7 +323,7 @@ class Profiler(Device, Protocol):
     def profile(self) -> WeldProfile | None:
         """Return the newest profile not yet returned, or None; never waits.
 
-        A profile in which no bead and joint can be recognised gives no look.
+        A profile without a recognisable bead and joint is skipped.
 
         Raises:
             DeviceError: The sensor is lost.
@@ -363,14 +363,14 @@ class RobotDriver:
     Attributes:
         name: Name of the part.
         open: Connects; raises DeviceError where it cannot.
-        read: Connects to read the arm's state and for nothing else: starts no program on the
-            controller and commands nothing. None where the driver has no way to.
-        in_this_process: Whether it must run in the process that owns the terminal, because it
-            talks to a person.
-        passive: Whether it commands nothing: others move the arm, a scan is taken where it stands,
-            and no permission is needed.
-        simulated: Whether its arm moves nothing, so that no permission is needed and experiments
-            that must not run on an arm may.
+        read: Connects to read the arm's state only: starts no program on the controller and
+            commands nothing. None if the driver cannot do that.
+        in_this_process: Whether the driver must run in the process that owns the terminal, because
+            it asks the operator questions.
+        passive: Whether the driver commands nothing: a foreign program moves the arm, and no
+            permission is needed.
+        simulated: Whether the arm is simulated: no permission is needed, and experiments forbidden
+            on a real arm are allowed.
     """
 
     name: str
@@ -400,8 +400,8 @@ class MotionAllowed:
 
     Attributes:
         allowed: Whether the arm may be moved.
-        offline: Whether it is not even to be read (``--offline``).
-        plan_only: Whether nothing is wanted but the plan (``--json``); of a simulated arm as well,
+        offline: Whether the arm must not even be read (``--offline``).
+        plan_only: Whether only the plan is wanted (``--json``); holds for a simulated arm too,
             which otherwise needs no permission.
     """
 
@@ -414,12 +414,13 @@ def load_sdk(module: str, driver: str, install: str) -> Any:
     """Return the module ``module``.
 
     Args:
-        module: What to import.
-        driver: Who needs it, for example ``scanner.realsense``.
-        install: What brings it, for example ``pip install 'flangeye[realsense]'``.
+        module: Name of the module.
+        driver: Driver that needs it, for example ``scanner.realsense``.
+        install: Command that installs it, for example ``pip install 'flangeye[realsense]'``.
 
     Raises:
-        DeviceError: It is not there, or does not load; with the reason and the install hint.
+        DeviceError: The module is missing or does not load; gives the reason and the install
+            command.
     """
     try:
         return importlib.import_module(module)
@@ -445,12 +446,12 @@ MachineName = Annotated[str, BeforeValidator(_name)]
 
 
 def settings_file() -> Path:
-    """Return where the user names programs and libraries; it need not exist."""
+    """Return the settings file where the user names programs and libraries; it need not exist."""
     return user_config_path("flangeye") / "machine.toml"
 
 
 def find_named(kind: Kind, name: str) -> Path | None:
-    """Return the file that this machine's settings give a name; None without one.
+    """Return the file to which this machine's settings map a name; None if they do not.
 
     Raises:
         DeviceError: The settings cannot be read, or the entry is not the absolute path of a file.
@@ -468,10 +469,11 @@ def find_named(kind: Kind, name: str) -> Path | None:
 
 
 def require_named(kind: Kind, name: str, asker: str) -> Path:
-    """Return the file that this machine's user gave a name.
+    """Return the file to which this machine's settings map a name.
 
     Raises:
-        DeviceError: There is none; the message says where to name it, and what there is.
+        DeviceError: The settings do not have the name; the message says where to add it, and which
+            names they have.
     """
     path = find_named(kind, name)
     if path is None:

@@ -27,7 +27,7 @@ class NothingSeen(StageError):
 
 
 class CalibrationRefused(FlangeyeError):
-    """The input was valid, but no answer is reliable; the message says why and what is missing."""
+    """Valid input gives no reliable calibration; the message says why and what is missing."""
 
     exit_code = 1
 
@@ -39,10 +39,10 @@ class RunStopped(FlangeyeError):
 
 
 class NothingMoved(FlangeyeError):
-    """Motion was not allowed: the message is the plan. Nothing is wrong.
+    """Motion was not allowed, so the message is the plan of motion; this is no failure.
 
     Attributes:
-        plan: The same for programs, as JSON has it; None where the stage has only words.
+        plan: The plan as data for JSON; None if the stage gives only text.
     """
 
     exit_code = 0

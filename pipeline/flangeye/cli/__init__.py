@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def main() -> None:
-    """Run the command line; every foreseen mistake is one line and an exit code."""
+    """Run the command line; an expected error is printed as one line and gives an exit code."""
     # Captures are worked on side by side and matrices are small: more threads in one product only
     # wait for each other, which costs a run twice its seconds. Read when numpy is imported
     for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -29,7 +29,7 @@ def _command() -> None:
 
 
 def commands() -> Typer:
-    """Return every command: importing their modules declares them."""
+    """Return the application with every command; importing a command's module declares it."""
     from flangeye.cli.app import app
 
     for name in ["catalogue", "drafting", "exporting", "hardware", "logs", "running", "watching"]:

@@ -100,7 +100,7 @@ def _options(
         ),
     ] = False,
 ) -> None:
-    """Nothing but what stands before a command."""
+    """Handle the options that stand before a command."""
 
 
 def load_plugins() -> Registry:

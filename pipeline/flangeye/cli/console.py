@@ -63,7 +63,7 @@ def say_notes(notes: Sequence[str]) -> None:
 def at_work(what: str, steps: int | None = None) -> Iterator[Callable[[], None]]:
     """Show a progress bar on a terminal, with the time left if the number of steps is known.
 
-    Yields what is called after each step; after the last one a further round begins.
+    Yields a function to call after each step. A call after the last step starts a new round.
     """
     if not sys.stderr.isatty():
         yield lambda: None
@@ -86,7 +86,7 @@ def at_work(what: str, steps: int | None = None) -> Iterator[Callable[[], None]]
 
 
 def end_in_words(command: Callable[[], object]) -> None:
-    """Run the command line; every foreseen mistake is one line and an exit code."""
+    """Run the command line; an expected error is printed as one line and gives an exit code."""
     keep_current_folder_out()
     # Ours are not plugins of pydantic; it would look for one in every installed distribution.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
@@ -114,7 +114,7 @@ def end_in_words(command: Callable[[], object]) -> None:
 
 
 def _open_streams() -> None:
-    """Make sure that there is something to write to, in any locale, whoever closed it."""
+    """Make sure that both output streams are open and can encode any text."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:
@@ -124,7 +124,7 @@ def _open_streams() -> None:
 
 
 def _discard_output() -> None:
-    """Forget what could not be written, or the interpreter would try again at its end."""
+    """Discard unwritten output, or the interpreter would try to write it again at exit."""
     with suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 

@@ -104,7 +104,7 @@ def _truth(truth: TruthResult) -> list[str]:
 
 
 def _over(held: HoldoutResult) -> str:
-    """Return what the held-out figures are over, and that of all poses where it differs."""
+    """Return which poses the held-out figures cover, and the figure of all poses if it differs."""
     outliers = int(held.figures.get("outliers", 0))
     if not outliers:
         return f"{held.folds} folds over all poses"

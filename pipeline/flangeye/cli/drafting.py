@@ -80,7 +80,7 @@ def init(
 ) -> None:
     """Write a recipe for recordings, or for ROS 2 (--ros2).
 
-    Inspects the folder or the running graph and asks for what it does not show.
+    Inspects the folder or the running graph, and asks for what these do not show.
     """
     from flangeye.files.regular import write_whole
     from flangeye.workflow.recipe.draft import Questions

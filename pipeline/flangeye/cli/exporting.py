@@ -95,7 +95,7 @@ def publish(
 ) -> None:
     """Keep a calibration on the ROS 2 graph (tf_static).
 
-    The recipe names the frames in its export.ros2_launch step; without one they are ours.
+    Frame names come from the recipe's export.ros2_launch step, or are flangeye's defaults.
     """
     from flangeye.workflow.run.folder import recipe_of_log
 
@@ -125,10 +125,10 @@ def _write_tables(run: Path, out: Path | None) -> None:
 
 
 def _format_named(to: str, registry: Registry) -> str:
-    """Return the format of that name, or the only one that mentions it: ``urscript`` is ``ur``.
+    """Return the export format of that name, or the only match: ``urscript`` is ``ur``.
 
     Raises:
-        StageError: There is none, or there are several.
+        StageError: No format has the name, or several mention it.
     """
     from flangeye.errors import StageError
     from flangeye.files.words import nearest

@@ -1,4 +1,4 @@
-"""Devices: calibrate a finger, be a controller."""
+"""Commands for devices: calibrate a finger, touch points, emulate a controller."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def tactile_calibrate(
 
 
 def _asker(yes: bool) -> Callable[[str], None]:
-    """Return what says a text and, unless everything is confirmed, waits for Enter."""
+    """Return a function that prints a text and waits for Enter, unless ``yes`` is set."""
 
     def wait(text: str) -> None:
         say(text)

@@ -237,7 +237,7 @@ def doctor(
 
 
 def _archive_of(recipe: Recipe) -> Path:
-    """Return what a recipe reads.
+    """Return the archive that a recipe reads.
 
     Raises:
         RecipeError: Its first step reads no archive.

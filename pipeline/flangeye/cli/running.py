@@ -225,7 +225,7 @@ def _recipe_of(
     registry: Registry,
     overrides: Sequence[str],
 ) -> tuple[Recipe, FromNothing | None]:
-    """Return the checked recipe, by name or from the run to resume, and that run."""
+    """Return the checked recipe, by name or from the run to resume, and the run to resume."""
     from flangeye.errors import StageError
     from flangeye.workflow.run.restart import earlier_run
 

@@ -25,11 +25,11 @@ def print_summary(
     """Print the result of a run on one screen.
 
     Args:
-        console: Where to.
-        result: Of the run.
+        console: Console to print on.
+        result: Result of the run.
         run: The run's folder, as a command takes it.
         formats: How many formats ``flangeye export`` writes.
-        said: Warnings that were printed before.
+        said: Warnings that were already printed.
     """
     used = sum(o.used for o in result.observations)
     write(console, wrapped(console, result.title), "bold")
@@ -129,14 +129,14 @@ class RunProgress:
     """Shows captures, then the steps that run once; a hook implementation like any other.
 
     Attributes:
-        said: The warnings of the source, which are printed as the run starts.
+        said: Warnings about the source, printed as the run starts.
     """
 
     def __init__(self, console: Console, steps: Iterable[str], opening: bool = False) -> None:
         """Make a bar.
 
         Args:
-            console: Where to.
+            console: Console to print on.
             steps: Labels of the recipe's steps.
             opening: Whether to show it while recordings are opened; a cell that is opened may
                 ask its person something first.
@@ -191,7 +191,7 @@ class RunProgress:
     def flangeye_stage_finished(
         self, step: str, capture: str | None, value: Any, seconds: float
     ) -> None:
-        """Learn which steps run for each capture, and count those that run once."""
+        """Note which steps run for each capture, and count those that run once."""
         if step in self._once and capture is not None:
             del self._once[: self._once.index(step) + 1]
         elif step in self._once:

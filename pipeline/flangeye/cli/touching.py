@@ -38,8 +38,8 @@ def touch_points(  # noqa: PLR0913  one for each option
         run: The calibration's run.
         registry: The plugins.
         given: Points in the camera and the tip in the flange, as text with units.
-        move: Let the arm go near each.
-        ask: Shows a person a sentence and returns when it is done.
+        move: Whether the arm moves near each point.
+        ask: Function that shows an instruction and returns when it is carried out.
         out: File for the step.
         overrides: Changes to the calibration's recipe: another address of the arm.
 
@@ -97,7 +97,7 @@ def _touched_line(number: int, touched: Touched) -> str:
 
 
 def _step(seen: Floats, tip: Floats, touched: Sequence[Touched]) -> str:
-    """Return the step ``verify.touch`` of what was touched, as a line of a recipe."""
+    """Return the step ``verify.touch`` with the touched points, as a line of a recipe."""
     touches = [
         {
             "seen": _lengths(point),

@@ -1,11 +1,11 @@
 """Choose the target's pose among several that fit a scan equally well, by the arm's motion.
 
-What holds for one capture holds for all: ``X C = W P``, with the camera ``X`` and the target ``P``
-in what carries them, the pose ``C`` in the scan, and ``W`` between the carriers, as controllers
-report it. Where ``P`` is known each pose in a scan gives a camera; where it is not, the target
-turned by the same angle between two captures in scans and by the controllers. True poses agree so
-with those of every other capture, and false ones only while the arm turns about the axis, and moves
-along it, that true and false poses differ by.
+Every capture satisfies ``X C = W P``: ``X`` and ``P`` are the poses of camera and target in their
+carriers, ``C`` is the target's pose in the scan, and ``W`` is the pose between the carriers that
+the controllers report. If ``P`` is known, each pose in a scan gives a camera pose. If not, the
+target's rotation angle between two captures must be the same in the scans and by the controllers.
+True poses of all captures agree in this. False poses agree only while the arm merely turns about,
+and moves along, the axis by which false and true poses differ.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ def disambiguated(
     """Return for each capture the pose that the others support; None if it stays ambiguous.
 
     Args:
-        cell: Who carries whom.
-        sure: Captures that one pose explains.
-        held: The others.
-        last: Whether no capture is left to come. Then, where the target's place is to be found and
-            no capture is sure, the first capture's best pose is called the target's.
+        cell: The frames and their carriers.
+        sure: Captures with one possible pose.
+        held: Captures with several possible poses.
+        last: Whether no capture follows. If then the target's place is unknown and no capture is
+            sure, the first capture's best pose defines the target's.
     """
     told = _supported(cell, sure, held)
     if last and held and not (sure or any(told)) and cell.frames[held[0][0].target].place is None:
@@ -41,7 +41,7 @@ def disambiguated(
 
 
 def ambiguous(poses: Poses) -> Rejected:
-    """Return why a capture is set aside that several poses explain: how they differ, what to do."""
+    """Return the rejection of a capture that several poses explain: how they differ, what to do."""
     one, other, *_ = (feature.camera_T_target.matrix for feature in _features(poses))
     turn = rotation_log((invert(one) @ other)[:3, :3])
     angle = float(np.linalg.norm(turn))
@@ -72,7 +72,7 @@ def _supported(cell: Cell, sure: Poses, held: Sequence[Poses]) -> list[Observati
 
 
 def _apart(cell: Cell, every: Poses) -> Floats:
-    """Return (M, M) squared distances between poses, in variances; NaN between other ends."""
+    """Return (M, M) squared Mahalanobis distances of poses; NaN for other cameras or targets."""
     unknown = cell.unknown_frames
     at_once = [Transform(cell.frames[n].parent, n, np.eye(4)) for n in unknown]
     ends = cell.ends(dict(zip(cell.unknowns, at_once, strict=True)), every)
@@ -92,7 +92,7 @@ def _features(poses: Poses) -> list[PoseFeature]:
 
 
 def _off_place(k: int, carried: Floats, seen: Floats, spread: Floats) -> Floats:
-    """Return (M,): a target from where the cameras of the others would see it."""
+    """Return (M,) distances of a target from where the other captures' cameras predict it."""
     there = seen @ invert(carried) @ carried[k]
     turn = rotation_log(there[:, :3, :3] @ seen[k, :3, :3].T)
     off = np.concatenate([turn, there[:, :3, 3] - seen[k, :3, 3]], axis=1)
@@ -104,7 +104,7 @@ def _off_place(k: int, carried: Floats, seen: Floats, spread: Floats) -> Floats:
 
 
 def _off_angle(k: int, carried: Floats, seen: Floats, spread: Floats) -> Floats:
-    """Return (M,): by how much less or more the target turned in scans than controllers report."""
+    """Return (M,) differences of the target's rotation angle, scans against controllers."""
     # X C = W P: a turn of C and that of W between two captures are the same but for their frames,
     # so their angles agree whatever the unknown X and P are
     told, found = (
@@ -116,10 +116,10 @@ def _off_angle(k: int, carried: Floats, seen: Floats, spread: Floats) -> Floats:
 
 
 def _costs(nearest: Floats, starts: Indices) -> Floats:
-    """Return (M,) how unlikely poses are, as logarithms, by distances (M, N) to N captures.
+    """Return (M,) negative log-likelihoods of poses, by their distances (M, N) to N captures.
 
-    Distances have long tails, for any one of the arm's poses may be wrong, and the scale that the
-    session shows, for arms err by more than scans.
+    Distances have long tails, since any of the arm's poses may be wrong. Their scale is the
+    session's, since arms err by more than scans.
     """
     known = np.isfinite(nearest).any(axis=1)
     typical = np.full(len(nearest), np.inf)

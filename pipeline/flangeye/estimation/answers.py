@@ -1,16 +1,16 @@
-r"""The answers that people ask for: each a linear functional of the posterior.
+r"""The two answers, true and as reported: each a linear functional of the posterior.
 
-*True*: where the places are, with the arm's own errors in their covariance. *As reported*: the
-places for the arm as its controller reports it. Commands are sent in reported coordinates, so the
-best camera pose is the rigid map onto those: with d the arm's displacement over poses of the work
-and b its least-squares rigid part,
+*True*: the true places, with the arm's errors in their covariance. *As reported*: the places that
+fit the poses as the controller reports them. Commands are sent in reported coordinates, so the best
+camera pose is the rigid map onto those: with d the arm's displacement over poses of the work and b
+its least-squares rigid part,
 
 .. math:: p_{reported} = p + A\,\delta, \qquad b = \arg\min \sum_{work} |d - b|^2
 
-over positions and turns, these at a short lever: with the work in a line only they determine the
-turn about it.
+over positions and rotations. Rotations have a short lever; they alone determine the turn about the
+line if the work is a line.
 
-What is common to all poses cancels, so that it is known far better than the true pose.
+Errors common to all poses cancel, so this answer is known far better than the true pose.
 """
 
 from __future__ import annotations
@@ -36,9 +36,10 @@ class Answer:
     """Estimated transforms, with the arm taken as it reports itself or as it truly is.
 
     Attributes:
-        mean: (P,) moves of the places from those of the estimate.
-        covariance: (P, P) of them.
-        shares: (P, P) of it by cause; the rest comes from the causes' sizes being uncertain.
+        mean: (P,) moves of the places from their estimates.
+        covariance: (P, P) covariance of these moves.
+        shares: (P, P) part of the covariance by cause; the rest is from the uncertain sizes of the
+            causes.
     """
 
     mean: Floats
@@ -46,7 +47,7 @@ class Answer:
     shares: Mapping[str, Floats]
 
     def at(self, mean: Floats) -> Answer:
-        """Return other moves (P,), with the covariance about them."""
+        """Return the answer at other moves (P,), with the covariance about those."""
         off = mean - self.mean
         return replace(self, mean=mean, covariance=self.covariance + np.outer(off, off))
 
@@ -69,7 +70,7 @@ def functional(found: Estimate, a: Floats) -> Answer:
 
 
 def moves(found: Estimate, a: Floats) -> Floats:
-    """Return (P,) the mean of that answer."""
+    """Return the (P,) mean of the linear answer p + A delta."""
     p, mean = found.posterior.model.p, found.posterior.mean
     return np.asarray(mean[:p] + a.mean(axis=0) @ mean[p:])
 
@@ -84,7 +85,7 @@ def as_reported(found: Estimate, work: Work) -> Answer:
 
     Args:
         found: The posterior.
-        work: Where commands are sent: each box that may be meant has an answer of its own.
+        work: Where commands are sent; each possible work box has an answer of its own.
     """
     return functional(found, commanded(found, work))
 
@@ -96,12 +97,12 @@ def commanded(found: Estimate, work: Work) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class _Commands:
-    """What the effects' numbers do wherever commands may be sent.
+    """How the effects' parameters move the places, at all poses where commands may be sent.
 
     Attributes:
         found: The posterior.
-        work: Sightings as they would be there.
-        boxes: (B, W) one for those that are in each box that may be meant.
+        work: W predicted sightings over the work.
+        boxes: (B, W) 1 for the sightings in each possible work box.
     """
 
     found: Estimate
@@ -109,7 +110,7 @@ class _Commands:
     boxes: Floats
 
     def answer(self) -> Floats:
-        """Return (B, P, K): what the effects' numbers add to the places, right over each box."""
+        """Return (B, P, K): how the effects' parameters move the places, fitted over each box."""
         world, out = self._world, [np.zeros((len(self.boxes), 0, self._of_arm.shape[2]))]
         for name in self.found.problem.unknown:
             carried = any(c.frame in chain(self.work.frames, name) for c in self.work.carriers)
@@ -125,12 +126,12 @@ class _Commands:
 
     @cached_property
     def _of_arm(self) -> Floats:
-        """(W, 6, K) how the arms' errors move what is seen."""
+        """(W, 6, K) how the arms' errors move the sighted targets."""
         return self._columns(self._linear, "of_arm")
 
     @cached_property
     def _of_camera(self) -> Floats:
-        """(W, 6, K) how a camera's errors move what is seen."""
+        """(W, 6, K) how a camera's errors move the sighted targets."""
         return self._columns(self._linear, "of_camera")
 
     def _columns(self, linear: Linear, whose: Literal["of_arm", "of_camera"]) -> Floats:
@@ -145,7 +146,7 @@ class _Commands:
 
     @cached_property
     def _rigid_parts(self) -> dict[str, Floats]:
-        """(B, 6, K) the rigid motion of what each carrier moves, about its arm base's origin."""
+        """(B, 6, K) rigid motion of each carrier's frame, about its arm base's origin."""
         still, out = np.zeros((len(self.work.seen), 6, 6)), {}
         for carrier in self.work.carriers:
             blocks = {c.frame: still + np.eye(6) * (c is carrier) for c in self.work.carriers}
@@ -157,7 +158,7 @@ class _Commands:
         return out
 
     def _explained(self, by: Floats, moved: Floats) -> Floats:
-        """Return (B, 6, K) the least-squares amounts, over each box, of (W, 6, 6) in (W, 6, K)."""
+        """Return (B, 6, K) least-squares coefficients, over each box, of (W, 6, 6) in (W, 6, K)."""
         # Turns count like what they do so far from the flange [m]: enough to determine the turn
         # about a line where the work is in one, and no more, for the work is at positions
         weight = np.repeat([0.02, 1.0], 3)[:, None]
@@ -167,7 +168,7 @@ class _Commands:
 
     @property
     def _world(self) -> Floats:
-        """(B, 6, K) by how much reported coordinates of the root are turned and shifted."""
+        """(B, 6, K) rotation and shift of the root's reported coordinates."""
         parts = []
         for carrier in self.work.carriers:
             path = chain(self.work.frames, carrier.frame)[:-1]
@@ -184,7 +185,7 @@ class _Commands:
         )
 
     def _fixed(self, name: str, world: Floats) -> Floats:
-        """Return (B, 6, K) of a place that no arm moves: the rigid part, from its own origin."""
+        """Return the (B, 6, K) rigid part of a place that no arm moves, about its own origin."""
         known, work = self.found.places, self.work
         frames = {n: replace(f, place=known.get(n, f.place)) for n, f in work.frames.items()}
         parent = np.eye(4)
@@ -201,19 +202,19 @@ class _Commands:
         return np.asarray(shift @ adjoint(invert(parent)) @ gauge)
 
     def _carried(self, name: str, world: Floats) -> Floats:
-        """Return (B, 6, K) of a place that an arm moves: what explains its displacements best.
+        """Return the (B, 6, K) motion that explains the displacements of a place on an arm best.
 
-        A camera in hand is to see everything where reported coordinates have it.
+        A camera in hand must see everything where reported coordinates have it.
         """
         by = self._linear.blocks[name]
         of_world = self._explained(by, self._seen_of_world(name))
         return self._explained(by, self._of_arm) + of_world @ world
 
     def _seen_of_world(self, name: str) -> Floats:
-        """Return (W, 6, 6) how a twist of reported root coordinates moves what is seen.
+        """Return (W, 6, 6): how a twist of reported root coordinates moves the sighted targets.
 
-        A fixed point y has reported coordinates y - b(y). Before a camera in hand the target stays
-        where it is, so the camera's pose has to take up b; before a fixed camera a target in hand
+        A fixed point y has reported coordinates y - b(y). With a camera in hand the target is
+        fixed, so the camera's pose takes up b; with a fixed camera the target's pose in the hand
         does.
         """
         work, frames = self.work, {}
@@ -249,11 +250,11 @@ class Foreseen:
     """Predicted sightings at new poses of the work, for F components of the mixture.
 
     Attributes:
-        rows: (W, 3, P + K) how places and effects move what is predicted [m].
-        chances: (F,) they sum to one.
-        means: (F, W, 3) what is expected [m].
-        drawn: (F, 8, W, 3) errors about that, drawn [m].
-        squares: (F,) the mean square of those errors, exactly [m^2].
+        rows: (W, 3, P + K) derivatives of the predicted positions by places and effects [m].
+        chances: (F,) weights of the components; they sum to one.
+        means: (F, W, 3) expected errors [m].
+        drawn: (F, 8, W, 3) errors drawn about the means [m].
+        squares: (F,) the exact mean square of the errors [m^2].
     """
 
     rows: Floats
@@ -266,8 +267,8 @@ class Foreseen:
 def foreseen(found: Estimate, work: Work) -> Foreseen:
     """Return the prediction of sightings at new poses of the work.
 
-    Of the pose's own error, of what the arm does beyond the rigid part, and of the noise of a
-    sighting: what errors of poses held out consist of.
+    It covers what errors of held-out poses consist of: the calibration's error, the arm's non-rigid
+    error, and the noise of a sighting.
     """
     known, rng, at = found.posterior, np.random.default_rng(0), work.poses
     model = model_at(at, found.places, found.effects, np.ones(len(at.seen)), of_session=False)
@@ -292,9 +293,9 @@ def expected_error(
     """Return the predictive spread of an answer at new poses of the work.
 
     Args:
-        there: What is to be expected.
+        there: The predicted sightings.
         answer: (P,) moves of the places.
-        put_right: (K,) what is corrected of the arms' errors, in numbers of the effects.
+        put_right: (K,) correction of the arms' errors, as parameters of the effects.
     """
     numbers = np.broadcast_to(put_right, there.rows.shape[2] - len(answer))
     bias = there.means - there.rows @ np.concatenate([answer, numbers])

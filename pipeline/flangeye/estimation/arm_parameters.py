@@ -27,12 +27,12 @@ class ArmParameters:
     """The n joints' parameters, each (n, 4): zero [rad], a [m], d [m] and alpha [rad].
 
     Attributes:
-        values: To add to those of the arm's model.
-        deviations: Standard deviations of these.
-        sizes: Estimated standard deviation of each in arms like this one.
+        values: Corrections to add to the arm model's parameters.
+        deviations: Standard deviations of the corrections.
+        sizes: Estimated standard deviation of each parameter in arms of this quality.
         alone: (4n, 4n) covariance from the poses alone, in units of the sizes.
-        ways: How many ways to the poses fit alike, where no joint angles were recorded; infinity
-            for an arm of more joints than a pose has coordinates.
+        ways: Number of inverse-kinematics branches that fit equally well if no joint angles were
+            recorded; infinity for an arm with more than six joints.
     """
 
     values: Floats
@@ -56,7 +56,7 @@ class ArmParameters:
 def parameters_of(session: Session) -> ArmParameters:
     """Return the estimated parameters, with covariance, of the arm that moves the flange.
 
-    What all likely ways to the poses agree on, where no joint angles were recorded.
+    Without recorded joint angles, it is what all likely inverse-kinematics branches agree on.
 
     Raises:
         StageError: The arm's model does not reach its poses.
@@ -83,7 +83,7 @@ def parameters_of(session: Session) -> ArmParameters:
 
 
 def _ways(session: Session, carrier: Carrier) -> list[Estimate]:
-    """Return the estimate by each way in which an arm may have come to its poses."""
+    """Return the estimate for each inverse-kinematics branch that reaches the poses."""
     found = session.found
     if carrier.arm in session.cell.joints(session.observations):
         return [found]
@@ -109,7 +109,7 @@ def _of_one_way(found: Estimate, arm: str) -> ArmParameters:
 
 
 def _loosely(found: Estimate, of_size: Indices) -> Floats:
-    """Return (P + K, P + K) what is known where the arm's parameters may be off by far more."""
+    """Return the (P + K, P + K) information with a far wider prior on the arm's parameters."""
     sizes = found.posterior.mode.sizes.copy()
     # Each other parameter may be off by a hundred times its own size: identified by the poses,
     # not by what is expected
@@ -118,7 +118,7 @@ def _loosely(found: Estimate, of_size: Indices) -> Floats:
 
 
 def _columns(found: Estimate, arm: str) -> tuple[Indices, Indices]:
-    """Return (n, 4) at which column of the unknowns each parameter is, and which size it has."""
+    """Return (n, 4) the column of each parameter among the unknowns, and the index of its size."""
     first = found.posterior.model.p + np.cumsum([0, *found.counts])
     kinds = ("zeros", "lengths", "twists")
     at = {e.kind: k for k, e in enumerate(found.effects) if e.cause == arm and e.kind in kinds}
@@ -139,9 +139,9 @@ def most_telling_poses(
     """Return the most informative further sightings, and the covariance with them.
 
     Args:
-        session: What was seen.
-        known: The arm's parameters as estimated from it.
-        candidates: As they would be, with joints.
+        session: The sightings so far.
+        known: The arm's parameters as estimated from the session.
+        candidates: Possible further sightings, with joint angles.
         count: How many to choose.
     """
     found = session.found

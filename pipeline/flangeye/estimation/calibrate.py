@@ -56,14 +56,14 @@ from flangeye.types.geometry import adjoint_shift
 
 @dataclass(frozen=True)
 class Options:
-    """How a calibration is judged; see the parameters of ``solve.robust``.
+    """Options of the calibration; see the parameters of ``solve.robust``.
 
     Attributes:
         limits: Largest standard deviations of a rotation [rad] and of a translation [m].
-        mark: Whether translations that the motion cannot show are marked instead of refused.
+        mark: Whether unobservable translations are marked instead of refused.
         certify: Whether to try to prove the answer globally optimal.
-        work: Where the error to expect is taken; None for where the session was.
-        asked: What is to be found.
+        work: Where the expected error is evaluated; None for the session's own region.
+        asked: Which unknowns to estimate.
     """
 
     limits: tuple[float, float] = (float(np.radians(2)), 20e-3)
@@ -84,14 +84,14 @@ def calibrate(
     """Return every unknown of a cell with its covariance, and the error to expect at the work.
 
     Args:
-        observations: What was seen.
-        cell: What stands on what; ``cell_of`` makes it of a configuration.
-        scanner: The scanner's model, where it is known.
-        options: How it is judged.
+        observations: The sightings.
+        cell: The graph of frames; ``cell_of`` makes it from a configuration.
+        scanner: The scanner's model, if it is known.
+        options: Options of the calibration.
         method: Name of the stage.
 
     Raises:
-        StageError: Too few sightings, all the same, or the pose of something that moves is missing.
+        StageError: Too few sightings, all the same, or the pose of a moving frame is missing.
         CalibrationRefused: The sightings fit only when mirrored, fewer than half of them agree, the
             motion leaves something unknown (the message says which motion is missing), or a
             marker's size is not the configured one.
@@ -101,7 +101,7 @@ def calibrate(
 
 
 def answered(session: Session, options: Options, method: str) -> HandEye:
-    """Return the calibration of a session; the second half of :func:`calibrate`.
+    """Return the calibration of a session that has been estimated.
 
     Raises:
         CalibrationRefused: The motion leaves something unknown.
@@ -156,15 +156,15 @@ def calibrate_at(
 ) -> HandEye:
     """Return the calibration with places from another method, and the model's covariance.
 
-    Every observation took part. Its covariance is about these places: it holds what the likeliest
-    ones are away from them.
+    Every observation takes part. The covariance is about the given places, so it includes their
+    distance from the most likely ones.
 
     Args:
         places: (4, 4) of each unknown.
-        observations: As of :func:`calibrate`, and so the rest.
-        cell: What stands on what.
-        scanner: The scanner's model, where it is known.
-        options: How it is judged.
+        observations: The sightings.
+        cell: The graph of frames.
+        scanner: The scanner's model, if it is known.
+        options: Options of the calibration.
         method: Name of the stage.
 
     Raises:
@@ -192,7 +192,8 @@ def with_expected_error(
 ) -> HandEye:
     """Return a calibration by any method with its expected error at the work, and warnings.
 
-    As it was, where the model refuses its observations or has unknowns that the method leaves out.
+    The calibration is unchanged if the model refuses its observations, or has unknowns that the
+    method does not estimate.
     """
     found = {x.transform.name: x.transform.matrix for x in calibration.transforms.values()}
     observations = [pair.observation for pair in calibration.pairs]
@@ -205,7 +206,7 @@ def with_expected_error(
 
 
 def _at_best(session: Session) -> Session:
-    """Return the session where the certificate leads, if that fits better, and say so."""
+    """Return the session at the better answer that the certificate found, if any, with a note."""
     found = session.found
     start = verdict_of(answer_of(found)).better
     if start is None:
@@ -219,8 +220,8 @@ def _at_best(session: Session) -> Session:
 def _weak(session: Session, options: Options) -> Floats:
     """Return the null space (P, k) of the information about the places; see ``unobservable``.
 
-    With as much noise as the sightings show, and no less than a camera and an arm have; of the arm
-    as it is reported.
+    The noise is as large as the sightings show, and at least that of a camera and an arm; the arm
+    is taken as reported.
     """
     found = session.found
     model, sizes = found.posterior.model, found.posterior.mode.sizes.copy()
@@ -271,9 +272,9 @@ def _corrected(session: Session, answer: Answer, weak: Floats) -> CorrectedArm |
 
 
 def _estimates(session: Session, answer: Answer, weak: Floats) -> list[TransformEstimate]:
-    """Return the unknowns, the cameras' first, each with its covariance where it matters.
+    """Return the unknowns, cameras first, each with its covariance.
 
-    A camera's about the middle of what it saw; another's about its own origin.
+    A camera's covariance is about the middle of its sightings, any other's about its own origin.
     """
     problem, found = session.found.problem, session.found
     moved = _without(problem, problem.moved(found.places, answer.mean), weak)
@@ -325,8 +326,8 @@ def _estimate(
     Args:
         transform: The value.
         covariance: (6, 6), rotation and translation, this at the child's origin.
-        shares: (6, 6) of it, likewise.
-        about: (3,) in the parent [m].
+        shares: (6, 6) parts of the covariance by cause.
+        about: (3,) point in the parent [m].
         free: (6, k) unobservable moves, taken like the covariance.
     """
     shift = adjoint_shift(about - transform.translation)
@@ -344,7 +345,7 @@ def _estimate(
 
 
 def _shared(found: Estimate) -> Floats:
-    """Return how much there is of each error that the features share [standard deviations]."""
+    """Return the amount of each error that the features share [standard deviations]."""
     means = [mean for _, mean, _ in found.numbers("shared")]
     return np.concatenate(means) if means else np.zeros(0)
 
@@ -387,7 +388,7 @@ def _sees_flange(cell: Cell) -> bool:
 
 
 def _notes(session: Session, weak: Floats, options: Options) -> list[Note]:
-    """Return what is for the record."""
+    """Return the notes for the record."""
     found, cell = session.found, session.cell
     turn, shift = _noise_beyond(found)
     notes: list[Note] = [

@@ -39,13 +39,13 @@ GAP = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Certificate:
-    """Result of :func:`certify`: a local minimum, and a bound on any better one.
+    """Result of :func:`certify`: a local minimum, and a bound on the cost of any better one.
 
     Attributes:
-        places: (K, 4, 4) at the bottom of the valley.
-        cost: What their squared errors come to.
-        missing: By how much another answer may be better, at most.
-        optimal: Whether that is next to nothing.
+        places: (K, 4, 4) at the local minimum.
+        cost: Their sum of squared errors.
+        missing: Largest possible decrease of the cost by any other answer.
+        optimal: Whether that decrease is negligible.
         better: (K, 4, 4) that cost less than ``places``, if such were found.
     """
 
@@ -78,7 +78,7 @@ def certify(sightings: LiftedSightings, places: Floats) -> Certificate:
 
 
 def _across(features: Floats) -> Floats:
-    """Return the (n, n) projector onto what is across (m, n) features."""
+    """Return the (n, n) projector onto the complement of (m, n) features."""
     _, sizes, ways = np.linalg.svd(features, full_matrices=False)
     along = ways[sizes > 1e-6 * sizes[0]]
     return np.asarray(np.eye(features.shape[1]) - along.T @ along)
@@ -107,14 +107,14 @@ def _rotation(entries: Floats) -> Floats:
 
 
 class _Block(NamedTuple):
-    """Where a family's features stand, and what their products span, as products of either's."""
+    """A family's feature indices, and bases of the space that products of its features span."""
 
     at: Indices
     first: Floats
     others: Floats
 
     def naught(self, matrix: Floats) -> Floats:
-        """Return the projection of a matrix onto those whose quadratic vanishes for all places."""
+        """Project a matrix onto the matrices whose quadratic form vanishes for all places."""
         size = len(matrix) // 10
         pairs = matrix.reshape(10, size, 10, size).swapaxes(1, 2).reshape(100, -1)
         told = self.first @ (self.first.T @ pairs @ self.others) @ self.others.T
@@ -122,12 +122,12 @@ class _Block(NamedTuple):
 
 
 class _Dual(NamedTuple):
-    """The matrices L that have a quadratic's values for all places.
+    """The matrices L whose quadratic form has the same value for all places.
 
     Attributes:
-        bare: (n, n) one of them.
-        blocks: In which they differ.
-        bounded: (n,) of features of rotations alone: one by the square of their length.
+        bare: (n, n) one such matrix.
+        blocks: The blocks in which the matrices differ.
+        bounded: (n,) inverse squared length of each feature that has rotations alone.
     """
 
     bare: Floats
@@ -136,7 +136,7 @@ class _Dual(NamedTuple):
 
     @classmethod
     def of(cls, bare: Floats, families: Sequence[Family]) -> _Dual:
-        """Return those of a quadratic, of the features of some families."""
+        """Return the matrices of a quadratic form over the features of some families."""
         bounded = np.ones(len(bare))
         for family in families:
             for other in family.after:
@@ -148,7 +148,7 @@ class _Dual(NamedTuple):
         return cls(bare, blocks, bounded / length)
 
     def at(self, multipliers: Floats) -> Floats:
-        """Return one of the matrices."""
+        """Return the matrix L at given multipliers."""
         out, start = self.bare.copy(), 0
         for block in self.blocks:
             end = start + len(block.at) ** 2
@@ -158,7 +158,7 @@ class _Dual(NamedTuple):
         return out
 
     def parts(self, matrix: Floats) -> Floats:
-        """Return by how much multipliers move along a matrix."""
+        """Return the multipliers' derivative along a matrix."""
         parts = (block.naught(matrix[np.ix_(block.at, block.at)]) for block in self.blocks)
         return np.concatenate([part.ravel() for part in parts])
 
@@ -167,8 +167,8 @@ class _Dual(NamedTuple):
 
         Args:
             still: (n, n) projector across the directions in which the matrix has to vanish.
-            tries: Steps at most.
-            start: Multipliers to begin with; without them none.
+            tries: Largest number of steps.
+            start: Initial multipliers; zero by default.
         """
         from scipy.optimize import minimize
 
@@ -189,7 +189,7 @@ class _Dual(NamedTuple):
         return np.asarray(found.x)
 
     def shows(self, multipliers: Floats, share: float) -> bool:
-        """Whether multipliers prove that at most this share of the cost is missing."""
+        """Whether multipliers prove a relative gap of at most ``share``."""
         try:
             np.linalg.cholesky(self.at(multipliers) + share * np.diag(self.bounded))
         except np.linalg.LinAlgError:
@@ -219,20 +219,20 @@ def _nearest(matrix: Floats) -> Floats:
 
 @cache
 def _of_first() -> Floats:
-    """Return (100, 35) what products of a one and a rotation's entries span."""
+    """Return a (100, 35) basis of the products of 1 and a rotation's entries."""
     # 55 products of ten features, less 11 by R R' = R' R = 1 and 9 by rows being cross products
     return _spanned(_any_places(1, 100)[:, :10])
 
 
 @cache
 def _of_others(count: int) -> Floats:
-    """Return ((1 + 12 C)^2, m) what products of a one and the entries of C places span."""
+    """Return a ((1 + 12 C)^2, m) basis of the products of 1 and the entries of C places."""
     spanned = 1 + 70 * count + 144 * (count * (count - 1) // 2)
     return _spanned(_any_places(count, 2 * spanned))
 
 
 def _any_places(count: int, draws: int) -> Floats:
-    """Return (draws, 1 + 12 C) of a one and the entries of C places each."""
+    """Return (draws, 1 + 12 C): 1 and the entries of C random places in each row."""
     rng = np.random.default_rng(0)
     places = rng.standard_normal((draws, count, 12))
     turns = rotation_exp(rng.uniform(-np.pi, np.pi, (draws * count, 3)))

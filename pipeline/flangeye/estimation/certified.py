@@ -1,4 +1,4 @@
-"""Certify that an answer is the global optimum, for any graph of frames.
+"""Certify that a calibration is the global optimum, for any graph of frames.
 
 A sighting is an equation ``C M = T``, with C the places from a root to the camera and T those to
 the target. A certificate (:mod:`flangeye.estimation.certificate`) takes at most two unknown places
@@ -29,8 +29,8 @@ class CertificateVerdict(NamedTuple):
     """Whether an answer is certified as optimal, and a better one if found.
 
     Attributes:
-        note: In words.
-        better: (4, 4) of the unknown frames that fit better, as far as such were found.
+        note: The verdict in words.
+        better: (4, 4) poses of the unknown frames that fit better, if such were found.
     """
 
     note: str
@@ -49,14 +49,15 @@ class CertifiedAnswer:
     """The answer for N sightings that agree.
 
     Attributes:
-        frames: By name; those to be found have no place, what moves has one at each time.
-        ends: (N,) each one's camera and target.
-        times: (N,) index of the places of what moves.
+        frames: Frames by name; an unknown frame has no place, a moving frame one for each time.
+        ends: (N,) camera and target of each sighting.
+        times: (N,) index into the places of moving frames.
         places: (4, 4) of the K unknown frames.
-        covariances: (6, 6) of them.
-        errors: (N, 6) what takes predicted targets to measured ones, in ``camera``.
-        weights: (N, 6, 6) inverse covariances of them.
-        freedoms: (N,) how many numbers were measured: 6, 5 with a normal, 3.
+        covariances: (6, 6) of these places.
+        errors: (N, 6) twists from predicted to measured targets, in ``camera``.
+        weights: (N, 6, 6) inverse covariances of the errors.
+        freedoms: (N,) how many numbers were measured: 6 of a pose, 5 of a circle with its normal, 3
+            of a centre.
     """
 
     frames: Mapping[str, Frame]
@@ -69,15 +70,15 @@ class CertifiedAnswer:
     freedoms: Floats
 
     def of_pair(self, ends: tuple[str, str]) -> Indices:
-        """Return (M,) the sightings of one target by one camera."""
+        """Return the indices (M,) of the sightings of one target by one camera."""
         return np.flatnonzero([each == ends for each in self.ends])
 
     def ways(self, ends: tuple[str, str], root: str = "") -> tuple[list[PathStep], list[PathStep]]:
-        """Return the paths to a camera and to a target, from the frame where they part.
+        """Return the paths to a camera and to a target, from their last common frame.
 
         Args:
             ends: The camera and the target.
-            root: From where on one looks at the graph; by default from its own root.
+            root: Frame taken as the graph's root; its own root by default.
         """
         first, second = (self._way(root, end) for end in ends)
         shared = sum(1 for a, b in zip(first, second, strict=False) if a == b)
@@ -92,7 +93,7 @@ class CertifiedAnswer:
     def unknown(
         self, ends: tuple[str, str], root: str = ""
     ) -> tuple[list[PathStep], list[PathStep]]:
-        """Return the unknown ones of those."""
+        """Return the unknown frames on the paths to a camera and to a target."""
         first, second = ([s for s in w if s.name in self.places] for w in self.ways(ends, root))
         return first, second
 
@@ -131,7 +132,7 @@ def answer_of(found: Estimate) -> CertifiedAnswer:
 
 
 def verdict_of(answer: CertifiedAnswer) -> CertificateVerdict:
-    """Return whether any answer fits the inlying sightings better than the one found."""
+    """Return whether the answer is proven optimal for the inlying sightings, or a better one."""
     root = _seen_from(answer)
     if root is None:
         return CertificateVerdict(_not_certifiable(answer))
@@ -197,7 +198,7 @@ def _not_certifiable(answer: CertifiedAnswer) -> str:
 
 
 def _seen_from(answer: CertifiedAnswer) -> str | None:
-    """Return the frame from which errors are a quadratic of fewest features; None if there is none.
+    """Return the root frame with the smallest certificate; None if there is none.
 
     The root is an empty name.
     """
@@ -207,7 +208,7 @@ def _seen_from(answer: CertifiedAnswer) -> str | None:
 
 
 def _size(answer: CertifiedAnswer, root: str) -> int:
-    """Return how many features errors are a quadratic of; none where they are not."""
+    """Return the number of features of the certificate; 0 if the errors are not quadratic."""
     ways = [way for ends in dict.fromkeys(answer.ends) for way in answer.unknown(ends, root)]
     index = {name: i for i, name in enumerate(answer.places)}
     pairs = {(index[way[0].name], index[way[1].name]) for way in ways if len(way) == 2}
@@ -218,7 +219,7 @@ def _size(answer: CertifiedAnswer, root: str) -> int:
 
 
 def _turned(places: Mapping[str, Floats], root: str, answer: CertifiedAnswer) -> dict[str, Floats]:
-    """Return places, those that lead the other way from a root as their inverses."""
+    """Return places by name; those against the direction from the root are inverted."""
     back = chain(answer.frames, root)
     return {name: invert(place) if name in back else place for name, place in places.items()}
 
@@ -259,7 +260,7 @@ def _of_pair(answer: CertifiedAnswer, ends: tuple[str, str], root: str) -> Lifte
 
 
 def _side(answer: CertifiedAnswer, way: Sequence[PathStep], times: Indices) -> Side:
-    """Return a way as one side of sightings: of two unknown places at most."""
+    """Return a path as one side of the equations: it has at most two unknown places."""
     index = {name: i for i, name in enumerate(answer.places)}
     still = np.tile(np.eye(4), (len(times), 1, 1))
     known, unknown = [still], list[int]()
@@ -276,7 +277,7 @@ def _side(answer: CertifiedAnswer, way: Sequence[PathStep], times: Indices) -> S
 
 
 def _measured(predicted: Floats, errors: Floats) -> Floats:
-    """Return (M, 4, 4) what was measured; of a circle the turn about its z is as predicted."""
+    """Return the (M, 4, 4) measured poses; a circle's turn about its z is as predicted."""
     out = predicted.copy()
     out[:, :3, :3] = rotation_exp(errors[:, :3]) @ predicted[:, :3, :3]
     out[:, :3, 3] += errors[:, 3:]

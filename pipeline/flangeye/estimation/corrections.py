@@ -1,4 +1,4 @@
-"""Arm errors as a correction that a controller or a robot's file can take."""
+"""Estimated arm errors as corrections for a controller or a robot model file."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ not rigid over the work; the rigid part stays in the camera's pose."""
 
 
 def put_right(found: Estimate) -> Floats:
-    """Return (K,) the part of the effects' values that a correction removes.
+    """Return the (K,) part of the effects' values that a correction removes.
 
-    Those that it has numbers for, and in its smooth error what else displaces the flange at the
-    session's poses.
+    That is the parameters of the correction. Its smooth error takes up the other displacements of
+    the flange at the session's poses.
     """
     kept = np.repeat([e.of_arm and e.kind in CORRECTED for e in found.effects], found.counts)
     out = np.where(kept, found.posterior.mean[found.posterior.model.p :], 0.0)
@@ -45,7 +45,7 @@ def _flanges(found: Estimate) -> list[Carrier]:
 
 
 def _rows(found: Estimate, carrier: Carrier, kind: str) -> slice | None:
-    """Return where an arm's numbers of a kind are; None where it has none."""
+    """Return the slice of an arm's parameters of one kind; None if it has none."""
     ends = np.cumsum([0, *found.counts])
     for k, effect in enumerate(found.effects):
         if effect.kind == kind and effect.cause == carrier.arm:
@@ -74,9 +74,9 @@ def _places(found: Estimate, carrier: Carrier) -> Floats:
 
 
 def _as_field(found: Estimate, carrier: Carrier) -> Floats:
-    """Return the weights of the smooth error that displace the flange as other kinds do.
+    """Return the weights with which the smooth error displaces the flange as other kinds do.
 
-    At the session's poses, by least squares; what is rigid of it stays in the camera's pose.
+    They fit at the session's poses by least squares; the rigid part stays in the camera's pose.
     """
     places = _places(found, carrier)
     field, rest = field_over(places), np.zeros((len(places), 3))

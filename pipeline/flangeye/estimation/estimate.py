@@ -1,8 +1,7 @@
 """From a problem and a first guess to the joint posterior of places and effects.
 
-Outliers are sightings that all the others, with every effect that may be wrong, do not predict: a
-smooth error of an arm is none. The sizes are found for those that agree, in turn, until the same
-agree.
+An outlier is a sighting that the others do not predict with all effects estimated, so a smooth arm
+error makes none. Sizes and inliers are estimated in turn until the inliers stay the same.
 """
 
 from __future__ import annotations
@@ -35,12 +34,13 @@ class Estimate:
     """The estimate from all sightings, with its covariance.
 
     Attributes:
-        problem: What was given.
-        effects: What may be wrong.
-        places: (4, 4) of each unknown, linearised about: the posterior mean.
+        problem: The estimation problem.
+        effects: The possible errors.
+        places: (4, 4) of each unknown at the posterior mean, the point of linearisation.
         posterior: Posterior of the corrections to poses and effect parameters.
         inliers: (N,) which sightings took part.
-        squares: (N,) squared distances of each from what the others predict, over its rank.
+        squares: (N,) squared Mahalanobis distance of each from the others' prediction, over its
+            rank.
     """
 
     problem: Problem
@@ -56,7 +56,7 @@ class Estimate:
         return self.posterior.mode
 
     def numbers(self, kind: str) -> list[tuple[Effect, Floats, Floats]]:
-        """Return the effects of a kind, each with the mean and covariance of its numbers."""
+        """Return the effects of one kind, each with the mean and covariance of its parameters."""
         out, at = [], self.posterior.model.p
         for effect, count in zip(self.effects, self.counts, strict=True):
             rows = slice(at, at + count)
@@ -83,7 +83,7 @@ class Estimate:
 
     @property
     def counts(self) -> list[int]:
-        """How many numbers each effect has."""
+        """Number of parameters of each effect."""
         sizes = self.posterior.model.sizes.effect
         return [int((sizes == k).sum()) for k in range(len(self.effects))]
 
@@ -122,9 +122,9 @@ def model_at(
     """Return the linear model near some places.
 
     Args:
-        problem: What is given.
+        problem: The estimation problem.
         places: (4, 4) of each unknown.
-        effects: What may be wrong.
+        effects: The possible errors.
         shares: (N,) weights of the sightings.
         of_session: Whether the sightings are those of the session, and not new ones.
     """
@@ -152,7 +152,7 @@ def model_at(
 def _design(
     problem: Problem, linear: Linear, effects: Sequence[Effect], of_session: bool
 ) -> tuple[Floats, list[int]]:
-    """Return (N, 6, P + K) of places and effects, and how many numbers each effect has."""
+    """Return the (N, 6, P + K) design of places and effects, and each effect's parameter count."""
     q = problem.seen.projectors
     places = [np.zeros((len(q), 6, 0)), *(q @ linear.blocks[name] for name in problem.unknown)]
     blocks = [q @ effect.block(problem, linear) for effect in effects]
@@ -162,9 +162,9 @@ def _design(
 
 
 def _between(covariances: Floats, parts: Floats) -> tuple[list[Floats], Indices]:
-    """Return (N, 6, 6) what covariances are the sum of, by each two of (D, N, 6, 6) parts, (., 2).
+    """Split (N, 6, 6) covariances by pairs of (D, N, 6, 6) parts; return the pairs (., 2) too.
 
-    With D the parts, each so many times as large, D C D has their products as factors.
+    With D the sum of the scaled parts, D C D has the products of two scales as factors.
     """
     pairs = list(combinations_with_replacement(range(len(parts)), 2))
     each = [parts[j] @ covariances @ parts[k] / (1 + (j == k)) for j, k in pairs]
@@ -172,7 +172,7 @@ def _between(covariances: Floats, parts: Floats) -> tuple[list[Floats], Indices]
 
 
 def _parts(seen: Sightings) -> Floats:
-    """Return (D, N, 6, 6) projectors onto turns and shifts; of whole poses along and across apart.
+    """Return (D, N, 6, 6) projectors onto turns and shifts; of poses, along and across the view.
 
     Circles and centres are fitted to points in space, and their covariances know the line of sight;
     a whole pose needs sizes of its own along it.
@@ -189,18 +189,18 @@ def _parts(seen: Sightings) -> Floats:
 
 
 def _further(count: int) -> Floats:
-    """Return (2, N, 6, 6) of turns and of shifts alone."""
+    """Return the (2, N, 6, 6) projectors onto turns and onto shifts."""
     each = np.kron(np.eye(2)[:, :, None] * np.eye(2), np.eye(3))
     return np.asarray(np.repeat(each[:, None], count, axis=1))
 
 
 def estimate(problem: Problem, start: Places, effects: Sequence[Effect], agree: Mask) -> Estimate:
-    """Return the posterior of all that is unknown.
+    """Return the joint posterior of all unknown places and effects.
 
     Args:
-        problem: What is given.
+        problem: The estimation problem.
         start: (4, 4) of each unknown, near the answer.
-        effects: What may be wrong.
+        effects: The possible errors.
         agree: (N,) which sightings agree with the start.
     """
     places, inliers = start, agree

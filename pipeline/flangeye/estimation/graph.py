@@ -8,7 +8,7 @@ sighting of a target by a camera closes a loop:
 
 One camera and one arm are such a graph as well: there is no other model of a cell. A frame moves by
 (rotation, translation): R' = Exp(phi) R about its own origin in its parent's axes, t' = t + tau. A
-residual is what takes the predicted target in the camera to the measured one, in the same way.
+residual is the (rotation, translation) from the predicted target in the camera to the measured one.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ class Sightings:
     Attributes:
         times: (N,) index of the reported poses.
         pairs: (N,) which camera saw which target, an index of ``Problem.ends``.
-        rotations: (N, 3, 3) camera_R_target; of a circle the turn about z means nothing, of a
-            centre all of it.
+        rotations: (N, 3, 3) camera_R_target; the turn of a circle about z, and all rotation of a
+            centre, has no meaning.
         centres: (N, 3) in ``camera`` [m].
-        covariances: (N, 6, 6) own noise, order (rotation, translation), in ``camera``.
-        projectors: (N, 6, 6) onto what was measured: of rank 6 for a pose, 5 with a normal, 3 for
-            a centre.
-        offsets: (N, 3) what was seen, in the target's frame [m].
-        by_depth: (N,) whether a scanner measured it by depth, and not a camera in an image.
-        shared: (N, 6, k) what one deviation of each error that all features of a camera share, such
-            as of its intrinsics, does to the feature.
+        covariances: (N, 6, 6) noise of the features, order (rotation, translation), in ``camera``.
+        projectors: (N, 6, 6) onto the measured directions: rank 6 for a pose, 5 with a normal, 3
+            for a centre.
+        offsets: (N, 3) seen point, in the target's frame [m].
+        by_depth: (N,) whether a scanner measured the feature by depth, not a camera in an image.
+        shared: (N, 6, k) shift of the feature by one standard deviation of each error that all
+            features of a camera share, such as its intrinsics.
     """
 
     times: Indices
@@ -83,15 +83,15 @@ class Carrier:
     """A frame that a controller moves: a flange or link of an arm, or a rail or positioner.
 
     Attributes:
-        frame: What it moves.
-        arm: Which arm moves it: carriers of one arm share its errors.
-        kinematics: The arm's; None where they are not known, or for a rail.
-        joints: (T, n) at each time [rad]; None where nothing is known of them.
-        accuracy: Median of the deviation of a joint's zero, by the robot's file [rad].
-        link: Which link it is; None for the flange.
-        rates: (T, 6) its twists per second at each time, in its base at its origin; None where
-            its motion was not recorded.
-        axis: Whether it is a rail or a positioner.
+        frame: Name of the moved frame.
+        arm: Arm that moves it; carriers of one arm share its errors.
+        kinematics: The arm's kinematics; None if unknown, or for a rail.
+        joints: (T, n) joint angles at each time [rad]; None if unknown.
+        accuracy: Median deviation of a joint's zero, from the robot's file [rad].
+        link: Name of the link; None for the flange.
+        rates: (T, 6) twist rate at each time [rad/s, m/s], in the base, about the frame's origin;
+            None if its motion was not recorded.
+        axis: Whether the carrier is a rail or a positioner.
     """
 
     frame: str
@@ -122,16 +122,16 @@ class Problem:
 
     @property
     def unknown(self) -> list[str]:
-        """Frames whose places are to be estimated."""
+        """Names of frames whose places are to be estimated."""
         return [name for name, frame in self.frames.items() if frame.place is None]
 
     @property
     def moving(self) -> list[str]:
-        """Frames whose places were reported at each time."""
+        """Names of frames whose places were reported at each time."""
         return [n for n, f in self.frames.items() if f.place is not None and f.place.ndim == 3]
 
     def where(self, chosen: Mask | NDArray[np.intp]) -> Problem:
-        """Return the problem of some of the sightings."""
+        """Return the problem with a subset of the sightings."""
         return replace(self, seen=self.seen.where(chosen))
 
     def at(self, times: Indices) -> Problem:
@@ -150,17 +150,17 @@ class Problem:
         return replace(self, frames=frames, carriers=carriers, seen=seen)
 
     def of_pair(self, k: int) -> Problem:
-        """Return the problem of the sightings of one camera and one target."""
+        """Return the problem with the sightings of one camera and one target."""
         return self.where(self.seen.pairs == k)
 
     def without_normals(self, which: Mask) -> Problem:
-        """Return the problem with only the centres of some circles."""
+        """Return the problem with some circles reduced to their centres."""
         projectors = self.seen.projectors.copy()
         projectors[which, :3, :3] = 0.0
         return replace(self, seen=replace(self.seen, projectors=projectors))
 
     def placed(self, places: Places) -> Problem:
-        """Return the problem with some of its unknown places known."""
+        """Return the problem with some unknown places fixed at given values."""
         frames = {n: replace(f, place=places.get(n, f.place)) for n, f in self.frames.items()}
         return replace(self, frames=frames)
 
@@ -248,7 +248,7 @@ def _residuals(
 def _blocks(
     frames: Mapping[str, Frame], ends: tuple[str, str], offsets: Floats, moved: Sequence[str]
 ) -> dict[str, Floats]:
-    """Return (N, 6, 6) of the frames on the way: how each turns and moves what is seen."""
+    """Return (N, 6, 6) derivatives of the prediction by each frame between camera and target."""
     camera, target = (composed(frames, end) for end in ends)
     back = np.swapaxes(camera[..., :3, :3], -1, -2)
     tip = (target[..., :3, :3] @ offsets[..., None])[..., 0] + target[..., :3, 3]

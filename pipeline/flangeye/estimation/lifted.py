@@ -7,8 +7,8 @@ covariance, are then a quadratic ``r' Q r``, with ``r`` a one and all features. 
 after it; no place may be U here and V there. Without a U the features are V's rotation alone.
 Translations that stand in no product follow from the rest.
 
-An error is the turn and shift that take one side to the other, in the frame of both. Far from the
-answer a turn counts as its sine does, and what that misses as ``1 - cos``, with the mean weight.
+An error is the turn and shift from one side to the other, in their common frame. Far from the
+answer a turn counts by its sine, and the rest by ``1 - cos`` with the mean weight.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ class Side:
 
     Attributes:
         a: (N, 4, 4) before U.
-        u: (N,) which of the unknowns U is; their number, where it is none of them.
-        b: (N, 4, 4) between them.
-        v: (N,) which V is.
-        c: (N, 4, 4) after it.
+        u: (N,) index of the unknown U; K if there is none.
+        b: (N, 4, 4) between U and V.
+        v: (N,) index of the unknown V; K if there is none.
+        c: (N, 4, 4) after V.
     """
 
     a: Floats
@@ -47,7 +47,7 @@ class Side:
     c: Floats
 
     def about(self, places: Floats) -> Side:
-        """Return the same side with unknowns relative to places (K, 4, 4)."""
+        """Return the same side with its unknowns as changes from places (K, 4, 4)."""
         every = np.concatenate([places, np.eye(4)[None]])
         return Side(self.a @ every[self.u], self.u, self.b @ every[self.v], self.v, self.c)
 
@@ -58,7 +58,7 @@ class Side:
 
     @property
     def unknowns(self) -> Indices:
-        """Return (N, 2) which they are."""
+        """Return (N, 2) the indices of U and V."""
         return np.stack([self.u, self.v], axis=1)
 
     def where(self, which: Mask) -> Side:
@@ -68,14 +68,14 @@ class Side:
 
 @dataclass(frozen=True, eq=False)
 class LiftedSightings:
-    """N sightings as equations, whose two sides are the same place.
+    """N sightings as equations: camera side equals target side.
 
     Attributes:
-        camera: To the camera, and what it saw.
-        target: To the target.
+        camera: Side that leads over the camera and the measured pose.
+        target: Side that leads to the target.
         weights: (N, 6, 6) of squared errors, turns [1/rad^2] before shifts [1/m^2].
-        freedoms: (N,) how many numbers were measured: 6 of a pose, 5 of a circle with its normal,
-            which is its z, 3 of a centre.
+        freedoms: (N,) how many numbers were measured: 6 of a pose, 5 of a circle with its normal
+            (its z), 3 of a centre.
     """
 
     camera: Side
@@ -88,11 +88,11 @@ class Family(NamedTuple):
     """An unknown, the unknowns multiplied with it, and the indices of their features.
 
     Attributes:
-        first: Which of the unknowns it is.
-        after: Which these C others are.
-        at: (10, 1 + 12 C) where products of a one and the first's rotation with a one and the
-            entries of the others stand among the features; the one is the first of all.
-        shift: (3,) where the first's translation stands, after all features: from the end.
+        first: Index of the unknown.
+        after: Indices of the C unknowns multiplied with it.
+        at: (10, 1 + 12 C) feature indices of the products of (1, the first's rotation) with (1, the
+            entries of the others); feature 0 is the constant 1.
+        shift: (3,) indices of the first's translation, which follows all features, from the end.
     """
 
     first: int
@@ -101,7 +101,7 @@ class Family(NamedTuple):
     shift: Indices
 
     def columns(self, u: int, v: int) -> Indices:
-        """Return the indices of v's entries and a one (13,), or of the products with u (169,)."""
+        """Return feature indices of v's entries and 1 (13,), or of their products with u (169,)."""
         if v == self.first:
             return np.concatenate([self.at[1:, 0], self.shift, [0]])
         last = self.of(v)
@@ -125,7 +125,7 @@ class Family(NamedTuple):
 
 
 def families_of(pairs: Collection[tuple[int, int]], count: int) -> tuple[list[Family], int]:
-    """Return the families of K unknowns, given the pairs in products; and their features."""
+    """Return the families of K unknowns by their multiplied pairs, and the number of features."""
     firsts = {v: u for u, v in pairs}
     out, size, shifts = list[Family](), 1, 3 * (count - len(firsts))
     for k in sorted({*range(count)} - firsts.keys()):
@@ -139,12 +139,12 @@ def families_of(pairs: Collection[tuple[int, int]], count: int) -> tuple[list[Fa
 
 @dataclass(frozen=True, eq=False)
 class Squares:
-    """The squares of all errors as a quadratic of n features, about some places.
+    """The sum of squared errors as a quadratic form of n features, about given places.
 
     Attributes:
-        quadratic: (n, n), at the best translations of those F places that are first.
-        shifts: (3 F, n) these translations by the features.
-        families: F of them.
+        quadratic: (n, n) form at the best translations of the families' first places.
+        shifts: (3 F, n) derivatives of these translations by the features.
+        families: The F families.
     """
 
     quadratic: Floats
@@ -164,7 +164,7 @@ class Squares:
         return max(float(at @ self.quadratic @ at), 0.0)
 
     def moves(self, places: Floats) -> Floats:
-        """Return (n, 6 K) by how much features change with turns and shifts of places."""
+        """Return the (n, 6 K) derivatives of the features by turns and shifts of places."""
         out = np.zeros((len(self.quadratic), len(places), 6))
         for family in self.families:
             u, v = family.factors(places)
@@ -189,9 +189,9 @@ class Squares:
         return np.asarray(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T)
 
     def alike(self, places: Floats) -> Floats:
-        """Return features (m, n) of other places with the same cost as a minimum.
+        """Return the features (m, n) of other places with the same cost as a minimum.
 
-        A circle may be turned about itself, and what is seen as a point about any axis.
+        A circle may turn about its axis, and a point about any axis.
         """
         moves = self.moves(places)
         able = np.flatnonzero(np.abs(moves).max(axis=0))
@@ -207,7 +207,7 @@ class Squares:
         return np.array([self.features(p) for p in (places, *others) if self.cost(p) <= most])
 
     def descend(self, places: Floats) -> Floats:
-        """Return the places (K, 4, 4) at the bottom of their valley (Gauss-Newton)."""
+        """Return the places (K, 4, 4) at the nearest local minimum (Gauss-Newton)."""
         for _ in range(50):
             slopes, errors = self.root @ self.moves(places), self.root @ self.features(places)
             step = -np.asarray(np.linalg.lstsq(slopes, errors, rcond=OBSERVABLE)[0]).reshape(-1, 6)
@@ -224,7 +224,7 @@ def _moved(places: Floats, step: Floats) -> Floats:
 
 
 def _moves(place: Floats) -> Floats:
-    """Return (6, 12) by how much a place's entries change with its turns and shifts."""
+    """Return the (6, 12) derivatives of a place's entries by its turns and shifts."""
     out = np.zeros((6, 12))
     out[:3, :9] = (hat(np.eye(3)) @ place[:3, :3]).reshape(3, 9)
     out[3:, 9:] = np.eye(3)
@@ -252,7 +252,7 @@ def squares_of(sightings: LiftedSightings, places: Floats) -> Squares:
 
 
 def _linear(side: Side, families: Sequence[Family]) -> tuple[Floats, Indices]:
-    """Return (N, 12, m) entries of one side by m features or translations, and which these are."""
+    """Return (N, 12, m) entries of one side by m features or translations, and their indices."""
     u, v = (int(each) for each in side.unknowns[0])
     family = next((f for f in families if v in (f.first, *f.after)), None)
     if family is not None and u == family.first:
@@ -265,7 +265,7 @@ def _linear(side: Side, families: Sequence[Family]) -> tuple[Floats, Indices]:
 
 
 def _entries(before: Floats, after: Floats) -> Floats:
-    """Return (N, 12, 13): entries of ``before V after``, by those of V and a one.
+    """Return (N, 12, 13): entries of ``before V after`` by V's entries and 1.
 
     Nine of the rotation, row by row, and three of the translation.
     """
@@ -278,7 +278,7 @@ def _entries(before: Floats, after: Floats) -> Floats:
 
 
 def _by_both(before: Floats, entries: Floats) -> Floats:
-    """Return (N, 12, 169): entries of ``before U W``, by U's and a one times W's (N, 12, 13)."""
+    """Return (N, 12, 169): entries of ``before U W`` by products of (U's entries, 1) with W's."""
     out, turns = np.zeros((len(before), 12, 13, 13)), before[:, :3, :3]
     turned = np.einsum("nij,nlks->nikjls", turns, entries[:, :9].reshape(-1, 3, 3, 13))
     out[:, :9, :9] = turned.reshape(-1, 9, 9, 13)
@@ -288,7 +288,7 @@ def _by_both(before: Floats, entries: Floats) -> Floats:
 
 
 def _of_entries(s: LiftedSightings, turned: Floats) -> Floats:
-    """Return (N, 12, 12) weights of the entries by which one side differs from the other.
+    """Return the (N, 12, 12) weights of the difference of both sides' entries.
 
     Args:
         s: The sightings.
@@ -311,7 +311,7 @@ def _of_entries(s: LiftedSightings, turned: Floats) -> Floats:
 
 
 def _without_shifts(whole: Floats, size: int) -> tuple[Floats, Floats]:
-    """Return the quadratic of the features at the best translations, and these by the features."""
+    """Return the quadratic form at the best translations, and their derivatives by the features."""
     across = whole[:size, size:]
     shifts = -np.linalg.pinv(whole[size:, size:], rcond=1e-12, hermitian=True) @ across.T
     quadratic = whole[:size, :size] + across @ shifts

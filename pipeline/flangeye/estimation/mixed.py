@@ -5,14 +5,14 @@ The N sightings leave residuals of six numbers each (rotation before translation
 .. math:: r = G\,p + \sum_k E_k \delta_k + e,
     \qquad \delta_k \sim N(0, s_k^2 I), \quad e \sim N(0, R)
 
-where p moves the unknown places and each effect E_k is something that can be wrong with the cell.
-The noise is R = D C D + sum_m t_m^2 T_m: the features' own covariances C, scaled by D for turns and
-for shifts, along the line of sight and across it, and what else scatters from sighting to sighting.
-Sizes s_k, D and t_m
-maximise the restricted likelihood (REML, Patterson & Thompson 1971) times their priors, and are
-then integrated over by importance sampling about that mode, for a dozen sightings do not determine
-them. Henderson's mixed-model equations give p and delta at every set of sizes by one Cholesky
-factorisation of as many unknowns as places and effects have: the cost is linear in N. Arrays only.
+where p moves the unknown places and each effect E_k is a possible error of the cell. The noise is R
+= D C D + sum_m t_m^2 T_m: the features' own covariances C, scaled by D for turns and for shifts,
+along the line of sight and across it, and other noise T_m that varies from sighting to sighting.
+Sizes s_k, D and t_m maximise the restricted likelihood (REML, Patterson & Thompson 1971) times
+their priors, and are then integrated over by importance sampling about that mode, for a dozen
+sightings do not determine them. Henderson's mixed-model equations give p and delta at every set of
+sizes by one Cholesky factorisation of as many unknowns as places and effects have: the cost is
+linear in N. Arrays only.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ class Sizes:
     """Prior of the logarithms of all sizes: log s = centre + mix @ z, with z standard normal.
 
     Attributes:
-        centre: (S,) medians' logarithms: of the effects [their units], of the parts of D, and of
-            what else scatters [their units].
-        mix: (S, Z) what each standard normal number does to them: effects that share a cause, such
-            as all errors of one arm, share a column.
-        effect: (K,) which size each column of the effects' design has.
+        centre: (S,) logarithms of the median sizes: of the effects [their units], of the parts of
+            D, and of the other noise [their units].
+        mix: (S, Z) factors of the standard normal numbers; effects that share a cause, such as all
+            errors of one arm, share a column.
+        effect: (K,) index of the size of each column of the effects' design.
     """
 
     centre: Floats
@@ -51,7 +51,7 @@ class Sizes:
     effect: np.ndarray
 
     def at(self, z: Floats) -> Floats:
-        """Return (S,) sizes."""
+        """Return the (S,) sizes at standard normal values (Z,)."""
         return np.asarray(np.exp(self.centre + self.mix @ z))
 
 
@@ -61,16 +61,16 @@ class LinearModel:
 
     Attributes:
         residuals: (N, 6) measured minus predicted, in ``camera`` [rad, m].
-        design: (N, 6, P + K) how the unknown places move what is predicted, and how the effects do,
-            an effect of size one.
+        design: (N, 6, P + K) derivatives of the prediction by the places and by the effects at size
+            1.
         p: P, the number of unknowns of the places.
-        causes: (C, N, 6, 6) what the noise is the sum of, each of size one: what scatters from
-            sighting to sighting, turns and shifts of any sighting first; then the features' own
-            covariances between each two of their parts.
-        factors: (C, 2) the two sizes whose product each of those is times.
-        still: (N, 6, 6) the noise that has no size: the identity across what was not measured.
-        projectors: (N, 6, 6) onto what was measured.
-        sizes: Their prior.
+        causes: (C, N, 6, 6) summands of the noise covariance at size 1: first the noise from
+            sighting to sighting (turns and shifts of any sighting), then the features' covariances
+            between each two of their parts.
+        factors: (C, 2) indices of the two sizes whose product scales each summand.
+        still: (N, 6, 6) noise without a size: the identity in unmeasured directions.
+        projectors: (N, 6, 6) onto the measured directions.
+        sizes: Prior of the sizes.
         shares: (N,) weight of each sighting, from 0 (an outlier) to 1.
     """
 
@@ -96,7 +96,7 @@ class LinearModel:
         return np.asarray(both * self.shares[:, None, None] / 2)
 
     def where(self, rows: Indices) -> LinearModel:
-        """Return the model of some of the sightings."""
+        """Return the model of a subset of the sightings."""
         each = ("residuals", "design", "still", "projectors", "shares")
         some = {name: getattr(self, name)[rows] for name in each}
         return replace(self, causes=self.causes[:, rows], **some)
@@ -119,12 +119,12 @@ class Fit:
 
     Attributes:
         sizes: (S,) the sizes.
-        information: (P + K, P + K) of the sightings about places and effects.
-        right: (P + K,) of the normal equations.
+        information: (P + K, P + K) information of the sightings about places and effects.
+        right: (P + K,) right side of the normal equations.
         root: (P + K, P + K) lower Cholesky factor of the information with the effects' prior.
-        cost: -2 log of the restricted likelihood, but for a constant.
-        gradient: (S,) of it by the logarithm of each size.
-        curvature: (S, S) of it likewise.
+        cost: -2 log of the restricted likelihood, up to a constant.
+        gradient: (S,) of the cost by the logarithm of each size.
+        curvature: (S, S) of the cost by the same logarithms.
     """
 
     sizes: Floats
@@ -154,10 +154,10 @@ class Whitened(NamedTuple):
     """The whitened sightings at given variance components.
 
     Attributes:
-        whitening: (N, 6, 6) roots of the inverse covariances of the noise, each by its share.
+        whitening: (N, 6, 6) roots of the inverse noise covariances, weighted by the shares.
         rows: (6 N, P + K) the design in units of the noise.
-        errors: (6 N,) the residuals likewise.
-        log_noise: log det of the noise.
+        errors: (6 N,) the residuals in units of the noise.
+        log_noise: log det of the noise covariance.
     """
 
     whitening: Floats
@@ -179,7 +179,7 @@ def whitened(model: LinearModel, sizes: Floats) -> Whitened:
 def fit(model: LinearModel, sizes: Floats, with_slopes: bool = False) -> Fit:
     """Solve Henderson's mixed-model equations at (S,) sizes, with the restricted likelihood.
 
-    With its gradient and curvature by the sizes it takes five times as long.
+    Computing the gradient and curvature by the sizes too takes five times as long.
 
     Raises:
         numpy.linalg.LinAlgError: The equations are not positive definite.
@@ -220,7 +220,7 @@ def _solved(model: LinearModel, sizes: Floats, information: Floats, right: Float
 def marginal(model: LinearModel, sizes: Floats) -> Floats:
     """Return the information (P, P) about the places, the effects marginalised.
 
-    By the Schur complement, exact along unobservable moves too; the inverse of a covariance is not.
+    The Schur complement is exact along unobservable moves too; the inverse of a covariance is not.
     """
     rows, p = whitened(model, sizes).rows, model.p
     whole = rows.T @ rows
@@ -231,13 +231,13 @@ def marginal(model: LinearModel, sizes: Floats) -> Floats:
 def _with_slopes(model: LinearModel, found: Fit, known: Whitened, left: Floats) -> Fit:
     r"""Return the fit with the derivatives of its cost by the logarithms x of the sizes.
 
-    With P what projects onto the residuals, :math:`P = V^{-1} - V^{-1} G (G'V^{-1}G)^{-1} G'V^{-1}`
-    of all that scatters, V, whose derivatives are V_i, they are
+    With V the covariance of the residuals, V_i its derivatives, and :math:`P = V^{-1} - V^{-1} G
+    (G'V^{-1}G)^{-1} G'V^{-1}`, they are
 
     .. math:: tr(P V_i) - y'P V_i P y, \qquad
         tr(P V_{ij}) - y'P V_{ij} P y - tr(P V_i P V_j) + 2 y'P V_i P V_j P y
 
-    In Henderson's terms, of an effect P E = W H C / s^2, with C the covariance of all unknowns.
+    In Henderson's terms P E = W H C / s^2 for an effect E, with C the covariance of all unknowns.
     """
     sizes, effect, p = found.sizes, model.sizes.effect, model.p
     count, n = len(sizes), len(model.residuals)
@@ -286,11 +286,11 @@ class Posterior:
     """Joint posterior of places and effects: a mixture of Gaussians over the sizes.
 
     Attributes:
-        model: What was seen.
+        model: The linearised sightings.
         mode: The fit at the most likely sizes.
-        fits: One for each draw of the sizes.
+        fits: One fit for each draw of the sizes.
         chances: (F,) weights of the draws; they sum to one.
-        cost: -2 log of the restricted likelihood times the sizes' prior at the mode, but for a
+        cost: -2 log of the restricted likelihood times the sizes' prior at the mode, up to a
             constant.
     """
 
@@ -324,11 +324,11 @@ class Posterior:
 def shares(known: Posterior, rows: Floats) -> tuple[Floats, Floats]:
     """Return the covariance of (A, P + K) rows of the unknowns, split by cause.
 
-    The error of Henderson's solution is V (Lambda delta - H'W e), so that of each effect is
-    V_k V_k' / s_k^2; the noise has the rest of V.
+    The error of Henderson's solution is V (Lambda delta - H'W e), so the share of effect k is V_k
+    V_k' / s_k^2; the rest of V is from the noise.
 
     Returns:
-        (E, A, A) of each effect, and (A, A) of the noise.
+        Covariances (E, A, A) from each effect, and (A, A) from the noise.
     """
     effect, p = known.model.sizes.effect, known.model.p
     moved = np.array([rows @ each.covariance for each in known.fits])
@@ -344,8 +344,8 @@ class Mode(NamedTuple):
     """The most likely sizes.
 
     Attributes:
-        z: (Z,) these, as standard normal values.
-        spread: (Z, Z) the root of their covariance by the curvature there.
+        z: (Z,) the sizes as standard normal values.
+        spread: (Z, Z) root of the covariance of z, from the curvature at the mode.
     """
 
     z: Floats
@@ -353,7 +353,7 @@ class Mode(NamedTuple):
 
 
 def mode_of(model: LinearModel, start: Floats | None = None) -> Mode:
-    """Return the most likely sizes, from a start or those expected beforehand."""
+    """Return the most likely sizes, searched from a start or from the prior medians."""
     prior, model = model.sizes, model.telling()
     z = np.zeros(prior.mix.shape[1]) if start is None else start
     here = fit(model, prior.at(z), with_slopes=True)
@@ -379,7 +379,7 @@ def mode_of(model: LinearModel, start: Floats | None = None) -> Mode:
 
 
 def _better(model: LinearModel, z: Floats, here: Fit, step: Floats) -> tuple[Floats, Fit] | None:
-    """Return sizes that are likelier along a step, with their fit; None where none is found."""
+    """Return likelier sizes along a step, with their fit; None if none are found."""
     for part in 0.5 ** np.arange(10):
         at = z + part * step
         there = fit(model, model.sizes.at(at), with_slopes=True)
@@ -389,7 +389,7 @@ def _better(model: LinearModel, z: Floats, here: Fit, step: Floats) -> tuple[Flo
 
 
 def posterior(model: LinearModel, mode: Mode, at_mode: Fit) -> Posterior:
-    """Return the joint posterior, the sizes integrated over about their mode and its fit."""
+    """Return the joint posterior, with the sizes marginalised by sampling about their mode."""
     (z, spread), some, prior = mode, model.telling(), model.sizes
     fits, logs = [], []
     # Half of them mirrored: beside 2,048 draws they state the error of 16 poses equally large,
@@ -438,8 +438,8 @@ def _draws(count: int, samples: int) -> Floats:
 def left_out(model: LinearModel, found: Fit) -> tuple[Floats, Floats]:
     """Return each sighting's leave-one-out residual (N, 6) and its covariance (N, 6, 6).
 
-    In closed form (the leave-one-out residual of Cook & Weisberg 1982): a sighting that took part
-    has drawn the fit towards itself by H V H'W, which is taken back.
+    This is the closed form of Cook & Weisberg (1982): a sighting that took part pulls the fit
+    towards itself by H V H'W, which is removed.
     """
     left = model.residuals - model.design @ found.mean
     leverage = spread_of(model.design, found.covariance)

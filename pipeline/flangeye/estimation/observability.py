@@ -1,7 +1,7 @@
 """Whether the motion determines every unknown; if not, which motion is missing. Arrays only.
 
-One analysis for all: the moves of the unknowns that the information leaves less well known than
-their limits (:func:`weak_moves`). What is refused because of them says which motion would help.
+Unknowns are weak along moves whose standard deviation exceeds a limit (:func:`weak_moves`). The
+refusal of a weak calibration says which motion would help.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ class WeakMoves:
     """Moves of the unknowns that are known less well than they have to be, the weakest first.
 
     Attributes:
-        moves: (P, k), each as long as its limit.
-        excess: (k,) how many times their limit their standard deviation is; at least 1.
+        moves: (P, k) weak directions, each scaled to its limit.
+        excess: (k,) ratio of each move's standard deviation to its limit; at least 1.
     """
 
     moves: Floats
@@ -69,12 +69,12 @@ def telling(
 ) -> tuple[list[Motion], WeakMoves]:
     """Return motions, chosen greedily, that make the weak moves observable, and what stays weak.
 
-    Greedy: each time the motion that makes the weak moves known best.
+    Each step chooses the motion that determines the weak moves best.
 
     Args:
-        information: (P, P) so far.
+        information: (P, P) Fisher information so far.
         limits: (P,) largest standard deviation of each unknown [rad, m].
-        further: (P, P) that each motion would add.
+        further: (P, P) information that each motion would add.
     """
     chosen: list[Motion] = []
     weak = weak_moves(information, limits)
@@ -173,10 +173,10 @@ def require_same_units(centres: Floats, tcps: Floats) -> None:
 
 
 def require_right_handed(centres: Floats, tcps: Floats) -> None:
-    """Refuse centres that only fit the TCPs in a mirror, both (N, 3).
+    """Refuse centres (N, 3) that fit the TCPs (N, 3) only when mirrored.
 
     Raises:
-        CalibrationRefused: Gives both residuals.
+        CalibrationRefused: The mirrored fit is far better; the message gives both residuals.
     """
     straight = _fit_rms(centres, tcps)
     mirrored = _fit_rms(centres * [1.0, 1.0, -1.0], tcps)
@@ -295,7 +295,7 @@ def fewest(problem: Problem) -> int:
 def meaningless(problem: Problem) -> Floats:
     """Return (P, k) unit moves that are unobservable by definition: turns of round targets.
 
-    Of a target that was seen as a circle its turn about its own axis; as a centre, every turn.
+    A circle's turn about its own axis is unobservable, and so is every turn of a centre.
     """
     columns = []
     for i, name in enumerate(problem.unknown):
@@ -324,14 +324,14 @@ def unobservable(
     Args:
         problem: The sightings that agree.
         places: (4, 4) of each unknown.
-        information: (P, P) of the places, the effects left to themselves.
+        information: (P, P) of the places, with the effects marginalised.
         limits: Largest standard deviations of a rotation [rad] and of a translation [m].
-        mark: Whether translations that are not known are marked instead of refused.
-        freedoms: (6, k) unit twists that what moves can do, by frame.
+        mark: Whether unobservable translations are marked instead of refused.
+        freedoms: (6, k) unit twists of the possible motions, by frame.
 
     Raises:
-        CalibrationRefused: There are some, and they are not translations that may be marked; names
-            the motion that is missing.
+        CalibrationRefused: The null space has more than translations that may be marked; the
+            message names the missing motion.
     """
     scale = np.tile(np.repeat(limits, 3), len(problem.unknown))
     basis = _meaningful(problem, places)
@@ -363,7 +363,7 @@ def _meaningful(problem: Problem, places: Places) -> Floats:
 
 
 def _turned(problem: Problem, places: Places, moves: Floats) -> Floats:
-    """Return moves given in the unknowns' own axes in those of their parents."""
+    """Rotate moves from the axes of the unknown frames to those of their parents."""
     out = np.zeros_like(moves)
     for i, name in enumerate(problem.unknown):
         at = slice(6 * i, 6 * i + 3)
@@ -435,12 +435,12 @@ def require_turns(problem: Problem) -> None:
 
 
 def _is_configuration(problem: Problem) -> bool:
-    """Whether it is one camera and one target of a configuration, and no cell of own names."""
+    """Whether the cell is a standard configuration of one camera and one target."""
     return list(problem.ends) == [(CAMERA, TARGET)]
 
 
 def _arms(problem: Problem) -> list[tuple[str, Floats]]:
-    """Return each arm's name and (N, 4, 4) poses: one of camera and target against each other."""
+    """Return each arm's name and (N, 4, 4) poses, of one arm between target and camera."""
     camera, target = (
         [n for n in chain(problem.frames, end) if n in problem.moving] for end in problem.ends[0]
     )
@@ -487,7 +487,7 @@ def _named(problem: Problem, weak: WeakMoves, scale: Floats) -> list[str]:
 
 
 def _asked(problem: Problem, motions: Sequence[Move]) -> list[str]:
-    """Return what to move: the turns of each thing, and its shifts."""
+    """Return in words which turns and shifts of which frames to make."""
     axes: dict[tuple[str, bool], list[str]] = {}
     for name, twist in motions:
         turns = any(twist[:3])

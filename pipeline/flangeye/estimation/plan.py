@@ -1,8 +1,8 @@
-"""Choose a cell's most informative next sighting, and when to stop, by its covariance.
+"""Choose a cell's most informative next sighting by the expected covariance.
 
 A sighting of one target by one camera informs about every frame between them and, through their
-correlation, about all others. A candidate is worth the expected decrease of the error at the work
-of all unknowns, in closed form: with J its rows, whitened, and C the covariance of all,
+correlation, about all others. A candidate's value is the expected decrease of all unknowns' error
+at the work, in closed form. With J its whitened rows and C the covariance of all unknowns,
 
     C' = C - C J^T (1 + J C J^T)^-1 J C
 
@@ -45,14 +45,14 @@ from flangeye.types.geometry import hat, invert, stack_rows
 
 @dataclass(frozen=True, eq=False)
 class Rough:
-    """An answer at the sizes that are expected beforehand: quick, for planners and doctors.
+    """A quick estimate with all sizes at their prior medians, for planning and diagnosis.
 
     Attributes:
-        problem: What was given.
+        problem: The estimation problem.
         places: (4, 4) of each unknown.
-        effects: What may be wrong.
-        model: Near the places.
-        fit: There.
+        effects: The possible errors.
+        model: The linear model at the places.
+        fit: The fit of that model.
         inliers: (N,) which sightings agree.
     """
 
@@ -78,10 +78,11 @@ class Rough:
 def rough(
     problem: Problem, freedoms: Mapping[str, Floats] | None = None, search: bool = True
 ) -> Rough:
-    """Return an answer; see :func:`begin` for ``search``.
+    """Return a quick estimate; see :func:`begin` for ``search``.
 
     Raises:
-        CalibrationRefused: Nothing gives a start, or the sightings leave something unknown.
+        CalibrationRefused: No initial guess is found, or the sightings leave an unknown
+            unobservable.
     """
     places, squares = begin(problem, search)
     agree, effects = agreeing(problem, squares), effects_of(problem, None, Asked())
@@ -123,7 +124,7 @@ def _blocks(found: Rough) -> list[Floats]:
 def work_of_frames(found: Rough, cell: Cell, seen: Sequence[Observation]) -> Mapping[str, Floats]:
     """Return points (k, 3) at which each unknown frame must be accurate, in its parent [m].
 
-    A camera where it saw something; what else there is about its origin.
+    The points of a camera are where it saw targets; those of other frames are about the origin.
     """
     # About the origin of what is not a camera, errors count so far off [m]
     corners = 0.1 * np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
@@ -143,11 +144,10 @@ def most_telling(
     Args:
         rows: (M, 6, U) of M candidates, whitened.
         covariance: (U, U) of all unknowns before.
-        levers: (A, U) what counts.
+        levers: (A, U) linear functions whose summed variance is minimised.
         count: How many to choose; all candidates, if there are fewer.
 
-    Returns:
-        Their indices, and the covariance (U, U) with them.
+        Returns: Indices of the chosen candidates, and the covariance (U, U) with them.
     """
     chosen: list[int] = []
     for _ in range(min(count, len(rows))):
@@ -169,9 +169,9 @@ def best_next(
     """Return the candidate that is expected to reduce the error at the work most.
 
     Args:
-        candidates: M sightings as they would be, by what is known so far.
-        found: What is known so far, from ``seen``.
-        cell: What stands on what.
+        candidates: M predicted sightings.
+        found: The estimate from ``seen``.
+        cell: The graph of frames.
         seen: The sightings so far.
     """
     rows, _ = whitened(candidates, found, cell)
@@ -183,10 +183,10 @@ def foreseen(moments: Sequence[Observation], places: Places, cell: Cell) -> list
     """Return M sightings of one target by one camera, as predicted from the estimate so far.
 
     Args:
-        moments: Where the controllers would have what moves, the camera, the target, and by a
-            feature anywhere what such a sighting measures, and how well.
-        places: (4, 4) of each unknown, by what is known so far.
-        cell: What stands on what.
+        moments: Observations with the carriers' poses, the camera and the target. The feature's
+            value is ignored; its kind and covariance are used.
+        places: (4, 4) of each unknown, as estimated so far.
+        cell: The graph of frames.
     """
     poses = foreseen_poses(moments, places, cell)
     return [
@@ -206,7 +206,7 @@ def foreseen_poses(moments: Sequence[Observation], places: Places, cell: Cell) -
 
 
 def _moved(like: Feature, pose: Floats) -> Feature:
-    """Return what is measured of a target at another pose (4, 4)."""
+    """Return a feature of the same kind at another target pose (4, 4)."""
     if isinstance(like, PoseFeature):
         return replace(like, camera_T_target=Transform(CAMERA, TARGET, pose))
     if like.normal is None or like.normal_covariance is None:
@@ -219,7 +219,7 @@ def _moved(like: Feature, pose: Floats) -> Feature:
 def whitened(
     sightings: Sequence[Observation], found: Rough | Estimate, cell: Cell
 ) -> tuple[Floats, Floats]:
-    """Return (M, 6, P + K) rows of sightings, and (M, 6) their errors, of unit covariance."""
+    """Return the whitened (M, 6, P + K) rows of sightings and their (M, 6) errors."""
     problem = problem_of(sightings, cell)
     model = model_at(problem, found.places, found.effects, np.ones(len(sightings)))
     values, vectors = np.linalg.eigh(model.weights(found.fit.sizes))
@@ -228,7 +228,7 @@ def whitened(
 
 
 def _levers(found: Rough, cell: Cell, seen: Sequence[Observation]) -> Floats:
-    """Return (A, P + K): how the work of all frames moves with all of them, each counting alike."""
+    """Return (A, P + K) equally weighted derivatives of all frames' work points."""
     blocks, work = [], work_of_frames(found, cell, seen)
     for i, (name, points) in enumerate(work.items()):
         block = np.zeros((len(points), 3, len(found.fit.mean)))

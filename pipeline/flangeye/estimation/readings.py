@@ -1,15 +1,15 @@
-r"""Which of several readings of an arm's and a marker's poses is meant, where all fit alike.
+r"""Find which reading of arm and marker poses (inverted, exchanged) is meant if all fit alike.
 
-With the arm's poses :math:`P`, what it carries at :math:`C` from its flange and what stands at
-:math:`S` in its base, every sample satisfies :math:`P C = S M`, :math:`M` being what was seen, the
-standing frame to the carried one. The same numbers also satisfy
+Every sample satisfies :math:`P C = S M`: :math:`P` is the arm's pose, :math:`C` the carried frame
+in the flange, :math:`S` the fixed frame in the base, and :math:`M` the measured pose from the fixed
+frame to the carried one. The same numbers also satisfy
 
 .. math:: P^{-1} S = C M^{-1}, \quad M C^{-1} = S^{-1} P, \quad M^{-1} S^{-1} = C^{-1} P^{-1}:
 
-both inverted, exchanged, and both; and in each the camera may stand or be carried. The residuals
-of the eight differ little. They differ in where things then are, and in which errors are
-left: a marker's position is measured better than its turn times its distance, and an arm errs by
-its joints.
+both inverted, exchanged, or both at once; and in each the camera may be fixed or carried. The
+residuals of these eight readings differ little. What differs is where camera and target then are,
+and the pattern of the residuals: a marker's position is measured better than its rotation times its
+distance, and an arm's errors come from its joints.
 """
 
 from __future__ import annotations
@@ -43,14 +43,14 @@ Axes = Literal["opengl", "ros"]
 
 
 def optical(axes: Axes) -> Floats:
-    """Return (3, 3) that turns a camera's frame into x right, y down, z forward."""
+    """Return the (3, 3) rotation from a camera's frame to x right, y down, z forward."""
     if axes == "opengl":
         return np.diag([1.0, -1.0, -1.0])
     return np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
 
 class Pairs(NamedTuple):
-    """N poses (N, 4, 4) of an arm and of a marker in the camera, and whether it carries that."""
+    """N poses (N, 4, 4) of an arm and of a marker in the camera; whether the camera is in hand."""
 
     robot: Floats
     marker: Floats
@@ -58,7 +58,7 @@ class Pairs(NamedTuple):
 
 
 class Reading(NamedTuple):
-    """What has to be changed of poses as they were read, in this order."""
+    """Changes to apply to poses as they were read, in this order."""
 
     exchanged: bool = False
     robot_inverted: bool = False
@@ -66,7 +66,7 @@ class Reading(NamedTuple):
     remounted: bool = False
 
     def of(self, pairs: Pairs) -> Pairs:
-        """Return the poses so read."""
+        """Return the poses with these changes."""
         robot, marker, in_hand = pairs
         if self.exchanged:
             robot, marker = marker, robot
@@ -75,7 +75,7 @@ class Reading(NamedTuple):
         return Pairs(robot, marker, in_hand != self.remounted)
 
     def mistake(self, in_hand: bool) -> str:
-        """Return what is wrong, in words; the camera is now carried, or not."""
+        """Return the mistake in words; ``in_hand`` says whether the camera is now carried."""
         both = self.robot_inverted and self.marker_inverted
         words = [
             "the tables of robot and markers are exchanged" if self.exchanged else "",
@@ -93,11 +93,11 @@ def meant(pairs: Pairs, carried: float, standing: float, robot: RobotModel | Non
     """Return the readings that may be meant, likeliest first; several if the data do not decide.
 
     Args:
-        pairs: As they were read; one calibration fits them. Centres are turned by NaN, and are
-            neither inverted nor exchanged.
-        carried: Distance from the flange of what the arm then carries [m].
-        standing: Distance from the base of what then stands [m].
-        robot: The arm's model, where one is known.
+        pairs: Poses as they were read; one calibration fits them. Centres have NaN rotations, and
+            are neither inverted nor exchanged.
+        carried: Distance of the carried frame from the flange [m].
+        standing: Distance of the fixed frame from the base [m].
+        robot: The arm's model, if it is known.
     """
     # Median distance [m] and spread of its logarithm, from the flange of what an arm carries, and
     # from its base of what stands: as tools and cells are, with room for either to be odd
@@ -126,23 +126,23 @@ def meant(pairs: Pairs, carried: float, standing: float, robot: RobotModel | Non
 
 
 def _reading(in_hand: bool, inverse: bool, exchanged: bool, remounted: bool) -> Reading:
-    """Return what makes of the loop as read one of the eight."""
+    """Return the changes that lead from the loop as read to one of the eight readings."""
     if exchanged:
         return Reading(True, inverse != in_hand, inverse != (in_hand != remounted), remounted)
     return Reading(False, inverse, inverse != remounted, remounted)
 
 
 def _odds(distance: float, median: float, spread: float) -> float:
-    """Return the log odds of a distance [m], by Student's t of its logarithm: any may be odd."""
+    """Return the log odds of a distance [m]: its logarithm has a Student's t distribution."""
     # With three degrees of freedom, -(3 + 1) / 2 log(1 + t^2 / 3)
     off = np.log(max(distance, 1e-3) / median) / spread
     return float(-2.0 * np.log1p(off**2 / 3.0))
 
 
 def _seen(places: Floats) -> float:
-    """Return the log odds of what a camera sees at places (N, 3), in the axes that fit best.
+    """Return the log odds that a camera sees targets at places (N, 3), in the best-fitting axes.
 
-    A picture reaches 20 to 35 degrees from its axis; beyond 60 all angles are as unlikely.
+    A camera's half angle of view is 20 to 35 degrees; beyond 60 all angles are equally unlikely.
     """
     off = [
         _off_axis(places),
@@ -160,7 +160,7 @@ def _off_axis(places: Floats) -> float:
 
 
 def other_axes(places: Floats) -> Axes | None:
-    """Return in which axes places (N, 3) lie before a camera, where they do not as they are."""
+    """Return camera axes in which places (N, 3) lie in view; None if they do as they are."""
     off = {name: _off_axis(places @ optical(name).T) for name in get_args(Axes)}
     name: Axes = min(off, key=off.__getitem__)
     before = np.radians(40)  # as far from its axis as a wide camera sees

@@ -45,9 +45,9 @@ class Asked:
     """Options of a solver that change the model.
 
     Attributes:
-        normals: Whether circles' normals count.
-        size_unknown: Whether the sizes of markers are found from the arm's motion.
-        size_limit: Share by which a marker's size may differ from the configured one.
+        normals: Whether the normals of circles are used.
+        size_unknown: Whether the sizes of markers are estimated from the arm's motion.
+        size_limit: Largest relative difference of a marker's size from the configured one.
     """
 
     normals: bool = True
@@ -60,13 +60,13 @@ class Session:
     """Observations of a cell with the estimate from them.
 
     Attributes:
-        observations: As they are when clocks and sizes that were found are put right.
-        cell: What stands on what.
-        scanner: The scanner's model, where it is known.
-        asked: What is to be found.
+        observations: Observations, with estimated clock delays and marker sizes corrected.
+        cell: The graph of frames.
+        scanner: The scanner's model, if it is known.
+        asked: Options that change the model.
         found: The posterior.
-        notes: For the person.
-        tool_offset: (3,) of the seen circle in the frame that carries it, where its mount or the
+        notes: Notes for the report.
+        tool_offset: (3,) estimated offset of the seen circle in its carrier, if its mount or the
             controller's tool frame is not as configured [m].
     """
 
@@ -79,7 +79,7 @@ class Session:
     tool_offset: Floats = field(default_factory=lambda: np.zeros(3))
 
     def noted(self, *notes: Note) -> Session:
-        """Return it with more notes."""
+        """Return the session with more notes."""
         return replace(self, notes=(*self.notes, *notes))
 
     def again(self, observations: Sequence[Observation]) -> Session:
@@ -98,7 +98,7 @@ class Session:
         """Return the estimate without some observations, in closed form.
 
         Raises:
-            StageError: Too few are left.
+            StageError: Too few observations are left.
         """
         found = self.found.without(rows)
         _require_enough(found.problem.where(found.inliers))
@@ -114,9 +114,9 @@ def session_of(
     """Return the estimate from a cell's observations.
 
     Raises:
-        StageError: Too few sightings, all the same, or the pose of something that moves is missing.
-        CalibrationRefused: They fit only when mirrored, fewer than half of them agree, nothing
-            gives a start, a clock is off by more than was recorded, or a marker's size is not the
+        StageError: Too few sightings, all the same, or the pose of a moving frame is missing.
+        CalibrationRefused: The sightings fit only when mirrored, fewer than half agree, no initial
+            guess is found, a clock delay exceeds the recorded motion, or a marker's size is not the
             configured one.
     """
     problem = problem_of(observations, cell, asked.normals)
@@ -159,7 +159,7 @@ def _require_enough(problem: Problem) -> None:
 
 
 def _begun(problem: Problem) -> tuple[Problem, Places, Mask, tuple[Note, ...]]:
-    """Return places that most sightings agree on, and which do, less normals of another frame."""
+    """Return the problem, places that most sightings agree on, which sightings do, and notes."""
     placed = all(problem.frames[target].place is not None for _, target in problem.ends)
     circles = problem.seen.ranks == 5
     spread = spread_of(problem.seen.centres)
@@ -189,7 +189,7 @@ def _begun(problem: Problem) -> tuple[Problem, Places, Mask, tuple[Note, ...]]:
 
 
 def _require_agreement(problem: Problem, places: Places, agree: Mask) -> None:
-    """Refuse sightings that agree no better than scans would that belong to other poses."""
+    """Refuse sightings that agree no better than scans paired with wrong poses."""
     shift, turn = _spread(problem, places, agree)
     if _plausible(problem, shift, turn):
         return
@@ -210,7 +210,7 @@ def _require_agreement(problem: Problem, places: Places, agree: Mask) -> None:
 
 
 def _spread(problem: Problem, places: Places, agree: Mask) -> tuple[float, float]:
-    """Return how well the sightings agree: [m] and [rad], rms over those that do."""
+    """Return the rms residuals of the agreeing sightings [m] and [rad]."""
     r = problem.residuals(places)[agree]
     shift, turn = (np.sqrt((r[:, at] ** 2).sum(axis=1).mean()) for at in (slice(3, 6), slice(3)))
     return float(shift), float(turn)
@@ -229,7 +229,7 @@ def _require_right_handed(problem: Problem, places: Places) -> None:
     """Refuse sightings that agree far better in a mirror.
 
     Raises:
-        CalibrationRefused: Gives both residuals.
+        CalibrationRefused: The mirrored fit is far better; the message gives both residuals.
     """
     # Rotations as S R S, S the mirror, which is a rotation again; S R alone is not
     flip, s = np.array([1.0, 1.0, -1.0]), problem.seen
@@ -265,9 +265,9 @@ def _require_majority(found: Estimate) -> None:
 
 
 def _on_branches(problem: Problem, places: Places, agree: Mask) -> tuple[Problem, tuple[Note, ...]]:
-    """Return the problem with the joints of every arm, on the branch that makes it likeliest.
+    """Return the problem with every arm's joint angles, on the most likely branch.
 
-    Where an arm's model does not reach its poses, its joints are not known.
+    If an arm's model does not reach its poses, its joint angles stay unknown.
     """
     notes: list[Note] = []
     for carrier in problem.carriers:
@@ -283,7 +283,7 @@ def _on_branches(problem: Problem, places: Places, agree: Mask) -> tuple[Problem
 
 
 def _likeliest(problem: Problem, carrier: Carrier, places: Places, agree: Mask) -> Floats | None:
-    """Return an arm's joints (T, n) on the branch that some sightings make likeliest."""
+    """Return an arm's joint angles (T, n) on the branch that is most likely by some sightings."""
     if carrier.joints is not None:
         return next(branches_of(problem, carrier), None)
     kept = problem.seen.times[agree]
@@ -307,7 +307,7 @@ def _with_joints(problem: Problem, arm: str, joints: Floats | None) -> Problem:
 
 
 def _cost(problem: Problem, places: Places) -> float:
-    """Return -2 log of the restricted likelihood at the sizes that are expected beforehand."""
+    """Return -2 log of the restricted likelihood at the prior medians of the sizes."""
     effects = [effect for effect in effects_of(problem, None, Asked()) if effect.lasting]
     model = model_at(problem, places, effects, np.ones(len(problem.seen)))
     return fit(model, model.sizes.at(np.zeros(model.sizes.mix.shape[1]))).cost
@@ -317,7 +317,7 @@ def _cost(problem: Problem, places: Places) -> float:
 
 
 def _with_bad_normals_left_out(session: Session) -> Session:
-    """Return the session with the centres of circles whose normals alone disagree."""
+    """Return the session with circles reduced to centres where only the normals disagree."""
     found = session.found
     out = ~found.inliers & (found.problem.seen.ranks == 5)
     if not out.any():
@@ -332,10 +332,10 @@ def _with_bad_normals_left_out(session: Session) -> Session:
 
 
 def _on_one_clock(session: Session) -> Session:
-    """Return the session with the arms where they were when cameras saw them.
+    """Return the session with estimated clock delays applied to the arms' poses.
 
     Raises:
-        CalibrationRefused: A clock is further off than what was recorded about each capture.
+        CalibrationRefused: A clock delay exceeds the motion recorded about each capture.
     """
     total: dict[str, float] = {}
     moved = session
@@ -367,7 +367,7 @@ def _on_one_clock(session: Session) -> Session:
 
 
 def _with_size(session: Session, factor: float) -> Session:
-    """Return the session with the markers scaled to the size that the arm's motion shows."""
+    """Return the session with the markers scaled to the size estimated from the arm's motion."""
     if not session.asked.size_unknown:
         _require_size(session)
         return session
@@ -393,7 +393,7 @@ def _with_size(session: Session, factor: float) -> Session:
 
 
 def _resized(observations: Sequence[Observation], factor: float) -> list[Observation]:
-    """Return observations with all poses of targets so many times as far from the camera."""
+    """Return observations with the targets' distances from the camera multiplied by a factor."""
     scale, out = np.repeat([1.0, factor], 3), []
     for o in observations:
         if isinstance(o.feature, PoseFeature):
@@ -447,10 +447,10 @@ def _require_size(session: Session) -> None:
 
 
 def _size_far_off(session: Session) -> float | None:
-    """Return the size of a marker with which the arm is not as bad as it seems; None without one.
+    """Return the factor of the marker size that removes an implausibly large arm error, else None.
 
-    An arm that may be very bad explains a marker of twice the size as well, and nothing is then
-    known of the camera.
+    A very wide prior on the arm's error also explains a marker of twice the size, and then leaves
+    the camera's pose unknown.
     """
     found, observations = session.found, session.observations
     # Beyond six deviations a marker's share of its size is none that can be linearised
@@ -481,10 +481,10 @@ def _unseen_tool(known: float) -> Warn:
 
 
 def _with_offset(session: Session) -> Session:
-    """Return the session with the circle where the poses show it, if that is not as configured.
+    """Return the session with the circle's estimated offset, if it contradicts the configuration.
 
-    The tool frame of the controller, or what the circle is mounted on, is then not the recipe's: a
-    mistake of millimetres, where the offset of a sound circle is a fraction of one.
+    The controller's tool frame or the circle's mount then differs from the recipe by millimetres;
+    the offset of a correct circle is a fraction of one.
     """
     found = session.found
     wrong = wrong_offset(found.problem, found.effects)

@@ -22,17 +22,17 @@ REACHED = 5e-3
 
 
 def problem_of(observations: Sequence[Observation], cell: Cell, normals: bool = True) -> Problem:
-    """Return N observations as a problem of N sightings, each at a time of its own.
+    """Return N observations as a problem of N sightings, each at its own time.
 
-    Where an arm's joints were not recorded they are unknown here; see ``branches_of``.
+    Joint angles that were not recorded stay unknown; see ``branches_of``.
 
     Args:
-        observations: What was measured.
-        cell: What stands on what.
-        normals: Whether the normals of circles count.
+        observations: The measurements.
+        cell: The graph of frames.
+        normals: Whether the normals of circles are used.
 
     Raises:
-        StageError: There is none, or one lacks the pose of what moves.
+        StageError: There is no observation, or one lacks the pose of a moving frame.
     """
     if not observations:
         raise StageError("no pose to solve with: every capture was rejected, see the reasons above")
@@ -74,7 +74,7 @@ def _by_depth(feature: Feature) -> bool:
 
 
 def _shared(observations: Sequence[Observation]) -> Floats:
-    """Return (N, 6, k) how each of k errors that all share moves what was seen, in ``camera``."""
+    """Return (N, 6, k) shifts of the features by each of k shared errors, in ``camera``."""
     each = [o.feature.shared if isinstance(o.feature, PoseFeature) else None for o in observations]
     moves = {i: moved for i, moved in enumerate(each) if moved is not None}
     out = np.zeros((len(each), 6, max((m.shape[1] for m in moves.values()), default=0)))
@@ -86,7 +86,7 @@ def _shared(observations: Sequence[Observation]) -> Floats:
 def _carriers(
     observations: Sequence[Observation], cell: Cell, frames: Mapping[str, Frame]
 ) -> list[Carrier]:
-    """Return what moves a camera or a target."""
+    """Return the carriers of cameras and targets."""
     ends = {end for o in observations for end in (o.camera, o.target)}
     used = {frame for end in ends for frame in chain(frames, end)}
     joints, motions = cell.joints(observations), _motions(observations, cell)
@@ -116,8 +116,8 @@ def _motions(observations: Sequence[Observation], cell: Cell) -> list[Motion] | 
 def branches_of(problem: Problem, carrier: Carrier) -> Iterator[Floats]:
     """Yield candidate joint angles (T, n) of an arm at its poses, one IK branch each [rad].
 
-    Those recorded are the only ones, if they reach the poses. Nothing where the model is another
-    arm's, or unknown.
+    Recorded joint angles are the only candidate, if they reach the poses. There is none if the
+    arm's model is unknown or does not reach the poses.
     """
     arm, poses = carrier.kinematics, np.asarray(problem.frames[carrier.frame].place)
     if arm is None:
@@ -140,14 +140,14 @@ def roll_note(
 ) -> str:
     """Return a note on the flange roll, or that it is not observable.
 
-    It is the rotation of the bolt pattern about the flange's axis. Centres and normals do not show
-    it, so the camera's pose does not depend on it; a seam found in the flange's frame, or a
-    registration of its whole shape, does.
+    The roll is the rotation of the bolt pattern about the flange's axis. Centres and normals do not
+    show it, so the camera's pose does not depend on it. A seam found in the flange's frame, or a
+    registration of the flange's shape, does.
 
     Args:
-        observations: The poses that agree.
-        base_R_camera: (3, 3) what they agree on.
-        covariance: (3, 3) of its rotation [rad^2].
+        observations: The inlying observations.
+        base_R_camera: (3, 3) the estimated rotation.
+        covariance: (3, 3) of that rotation [rad^2].
     """
     turns = roll_of(observations, base_R_camera)
     # Fewer have no scatter that means anything

@@ -1,12 +1,12 @@
 r"""Robust initial guess: places that most sightings agree on, without any prior guess.
 
-The loop of one camera and one target is a circle of unknown places U and of what is known K:
+The loop of one camera and one target is a product of unknown places U and known places K:
 
 .. math:: U_1 K_1 U_2 K_2 \cdots = 1
 
-Up to three unknowns have closed forms. A loop is solved from all its sightings and from small sets
-of them drawn at random; that answer is taken which most of them agree with. Its places are then
-known in the next loop. Where no loop leads on, descents begin at random places.
+Up to three unknowns have closed forms. A loop is solved from all its sightings and from small
+random subsets, and the answer with the most agreement is taken. Its places are then known in the
+next loop. If no further loop can be solved, descents start from random places.
 """
 
 from __future__ import annotations
@@ -51,11 +51,11 @@ def begin(problem: Problem, search: bool = True) -> tuple[Places, Floats]:
 
     Args:
         problem: The sightings.
-        search: Whether to search from random places where the closed forms lead to nothing
-            plausible, which takes ten times as long.
+        search: Whether to search from random places if the closed forms give nothing plausible,
+            which takes ten times as long.
 
     Raises:
-        CalibrationRefused: Nothing gives a start.
+        CalibrationRefused: No initial guess is found.
     """
     rng = np.random.default_rng(0)
     places = _grown(problem, rng)
@@ -77,18 +77,18 @@ def agreeing(problem: Problem, squares: Floats) -> Mask:
 
 
 def _plausible(problem: Problem, squares: Floats) -> bool:
-    """Whether the better half of every pair agrees to what no two frames mixed up would: 1 %."""
+    """Whether the better half of every pair agrees to 1 %, which mixed-up frames would not."""
     middles = _middles(problem, squares) * NOISE[1] ** 2
     extent = problem.seen.centres.var(axis=0).sum()
     return bool(middles.max() < 0.01 * max(extent, 1e-4))
 
 
 def size_of(problem: Problem) -> float:
-    """Return about the ratio of the target's true size to the stated one; 1 without poses.
+    """Return a rough ratio of the target's true size to the stated one; 1 without poses.
 
-    Rotations do not depend on it, and once they are known the loop's translations are linear in the
-    places and the size (Andreff et al. 2001). Of small sets of poses that is taken which explains
-    the better half of all poses best. Of loops of two unknown places.
+    Rotations do not depend on the size; with known rotations the loop's translations are linear in
+    the places and the size (Andreff et al. 2001). Of small random subsets, the one that explains
+    the better half of all poses best is taken. Only loops of two unknown places are used.
     """
     (names, known), rng = circle_of(problem), np.random.default_rng(0)
     n, least, size = len(problem.seen), np.inf, 1.0
@@ -109,9 +109,9 @@ def size_of(problem: Problem) -> float:
 
 
 def _sized_translations(carried: Floats, seen: Floats, turn: Floats) -> tuple[Floats, Floats]:
-    """Return (N, 3, 7) equations of the two unknown shifts and the size, and (N, 3) their sides.
+    """Return (N, 3, 7) equations of two unknown shifts and the size, and (N, 3) right sides.
 
-    Of the loop ``G X M = Z``, whose M has its translation so many times as long.
+    They belong to the loop ``G X M = Z``, with the translation of M times the size.
     """
     turns, still = carried[:, :3, :3], np.broadcast_to(-np.eye(3), (len(seen), 3, 3))
     sized = turns @ (seen[:, :3, 3] @ turn.T)[..., None]
@@ -122,7 +122,7 @@ def _sized_translations(carried: Floats, seen: Floats, turn: Floats) -> tuple[Fl
 
 
 def _grown(problem: Problem, rng: np.random.Generator) -> dict[str, Floats] | None:
-    """Return the places, loop by loop, those of fewest unknowns first; None where none leads on."""
+    """Solve loop by loop, fewest unknowns first; return the places, or None if stuck."""
     known: dict[str, Floats] = {}
     left = set(range(len(problem.ends)))
     while len(known) < len(problem.unknown):
@@ -142,13 +142,14 @@ def _grown(problem: Problem, rng: np.random.Generator) -> dict[str, Floats] | No
 
 
 class _Loop(NamedTuple):
-    """What one camera saw of one target.
+    """The sightings of one target by one camera, with the paths to both.
 
     Attributes:
         problem: Problem of these sightings only; all other poses are known.
-        seen: They.
-        camera: Known (N, 4, 4) and unknown names, in turn, from the root to the camera.
-        target: Likewise to the target.
+        seen: These sightings.
+        camera: Known poses (N, 4, 4) and names of unknown frames, in order from the root to the
+            camera.
+        target: The same from the root to the target.
     """
 
     problem: Problem
@@ -194,9 +195,9 @@ def _way(problem: Problem, end: str, shared: int) -> list[Floats | str]:
 def _solved(loop: _Loop, rng: np.random.Generator) -> dict[str, Floats] | None:
     """Return the places that most sightings of a loop agree with.
 
-    The better half alone does not decide: where an arm stood still in half of the sightings, places
-    that fit those are many, and only the others say which is right. So it gives the scale, and
-    squares beyond that count alike (MSAC, Torr & Zisserman 2000).
+    The better half of the sightings only gives the scale; larger squares are truncated (MSAC, Torr
+    & Zisserman 2000). That half must not decide alone: if an arm stood still in half of the
+    sightings, many places fit those.
     """
     form = _form_of(loop)
     if form is None or len(loop.seen) < form.fewest:
@@ -231,7 +232,7 @@ def distances(problem: Problem, places: Places) -> Floats:
 
 
 class _Form(NamedTuple):
-    """A closed form: how many sightings it needs, and the places by some of them."""
+    """A closed form: how many sightings it needs, and a function from sightings to places."""
 
     fewest: int
     solve: Callable[[Indices, np.random.Generator], dict[str, Floats]]
@@ -254,7 +255,7 @@ def _form_of(loop: _Loop) -> _Form | None:
 def circle_of(problem: Problem) -> tuple[list[tuple[str, bool]], list[Floats]]:
     """Return the unknowns along the loop of one camera and one target, and the known poses between.
 
-    Each name with whether its inverse stands there, and the (N, 4, 4) that follow each.
+    Each name comes with whether it is inverted; the (N, 4, 4) poses follow the unknowns in order.
     """
     return _circle(_loop_of(problem, 0, {}))
 
@@ -263,7 +264,7 @@ def start_of_circles(problem: Problem) -> dict[str, Floats]:
     """Return the unknowns of one camera and one circle by the closed form of all sightings.
 
     Raises:
-        CalibrationRefused: There is no closed form of them.
+        CalibrationRefused: The loop has no closed form.
     """
     loop = _loop_of(problem, 0, {})
     form = _form_of(loop)
@@ -280,7 +281,7 @@ def start_of_circles(problem: Problem) -> dict[str, Floats]:
 
 
 def _of_poses(loop: _Loop, rows: Indices, rng: np.random.Generator) -> dict[str, Floats]:
-    """Return the unknowns of whole poses: round the circle, each with what is known after it."""
+    """Return the unknowns of a loop whose sightings are whole poses."""
     names, known = _circle(loop)
     k = [each[rows] for each in known]
     if len(names) == 1:
@@ -298,7 +299,7 @@ def _of_poses(loop: _Loop, rows: Indices, rng: np.random.Generator) -> dict[str,
 
 
 def _circle(loop: _Loop) -> tuple[list[tuple[str, bool]], list[Floats]]:
-    """Return the unknowns round the loop, and whether inverted, and what is known after each."""
+    """Return the loop's unknowns with whether each is inverted, and the known pose after each."""
     back = [x if isinstance(x, str) else invert(x) for x in reversed(loop.target)]
     names: list[tuple[str, bool]] = [(x, False) for x in loop.camera if isinstance(x, str)]
     names += [(x, True) for x in back if isinstance(x, str)]
@@ -324,7 +325,7 @@ def _of_two_arms(
 
 
 def _of_points(loop: _Loop, rows: Indices) -> dict[str, Floats]:
-    """Return the one unknown of circles or centres: it takes points onto where they are seen."""
+    """Return the one unknown of circles or centres, by a rigid fit of points to seen points."""
     name, s = loop.unknown[0], loop.seen
     on_camera = len(loop.camera) > 1
     moved, other = (loop.camera, loop.target) if on_camera else (loop.target, loop.camera)
@@ -352,8 +353,8 @@ def _of_points(loop: _Loop, rows: Indices) -> dict[str, Floats]:
 def _linear(loop: _Loop, rows: Indices) -> dict[str, Floats]:
     """Return camera and another place from centres, and normals where all have one.
 
-    ``A (R_X c + t_X)`` is the target's centre, or where the second base has it: linear in the
-    entries of R_X, t_X, and of the centre and axis in the target's carrier, or of R_Y, t_Y. The
+    ``A (R_X c + t_X)`` is the target's centre. It is linear in the entries of R_X and t_X, and in
+    those of the target's centre and axis in its carrier, or of R_Y and t_Y of a second base. The
     rotations are then made orthonormal and the translations fitted again.
     """
     s = loop.seen.where(rows)
@@ -446,10 +447,10 @@ def _drawn(rng: np.random.Generator) -> Floats:
 def _descended(
     problem: Problem, places: Places, turns_alone: bool = False
 ) -> tuple[Places, Floats]:
-    """Return where a start leads, and the squares there; the far hardly count.
+    """Return the places to which a start descends, and the squares there; outliers hardly count.
 
-    Weights of Geman & McClure (1987), as wide as each pair's median, so that they narrow as the fit
-    improves; steps of Levenberg & Marquardt.
+    Weights are those of Geman & McClure (1987) with each pair's median as scale, so they narrow as
+    the fit improves. Steps are Levenberg-Marquardt.
     """
     s, q = problem.seen, problem.seen.projectors.copy()
     if turns_alone:
@@ -487,7 +488,7 @@ def _descended(
 
 
 def _middles(problem: Problem, squares: Floats) -> Floats:
-    """Return (N,) the median over the sightings of the same pair: each pair has outliers alone."""
+    """Return (N,) the median square of the sightings of the same camera and target."""
     out, pairs = np.zeros(len(squares)), problem.seen.pairs
     for k in range(len(problem.ends)):
         if (pairs == k).any():

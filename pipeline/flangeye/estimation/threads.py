@@ -1,4 +1,4 @@
-"""Linear algebra on one thread: small matrices on many take twenty times the processor's time."""
+"""Run linear algebra on one thread: small matrices on many threads take 20 times the CPU time."""
 
 from __future__ import annotations
 

@@ -23,10 +23,9 @@ class Work:
     """Where commands are sent.
 
     Attributes:
-        poses: Sightings as they would be at new poses, where the error to expect is taken.
-        around: The same all over the widest box that may be meant.
-        boxes: (B, W) which of those are in each box that may be meant, where the answer is to be
-            right.
+        poses: Predicted sightings at new poses, at which the expected error is evaluated.
+        around: Predicted sightings all over the widest possible work box.
+        boxes: (B, W) which sightings of ``around`` are in each possible work box.
     """
 
     poses: Problem
@@ -37,14 +36,14 @@ class Work:
 def work_of(problem: Problem, places: Places, box: Box | None = None) -> Work:
     """Return simulated sightings over the work, of the same targets by the same cameras.
 
-    The boxes are filled evenly, the flange turned as in the session, as far as the arm gets there
-    near the session's poses: these are too few to say what an arm does between them. Of several
-    arms, or of one whose joints are not known, all is at poses of the session.
+    The session's poses are too few to show the arm's error between them. So the boxes are filled
+    evenly, with the flange oriented as in the session, where the arm reaches. With several arms, or
+    unknown joint angles, the poses are those of the session.
 
     Args:
         problem: The session's sightings that agree.
         places: (4, 4) of each unknown.
-        box: Where the flange is to be, along the axes of the root; None for where the session was,
+        box: Where the flange works, along the axes of the root; None for the session's region,
             known from its poses to one spacing between neighbours.
     """
     n = len(problem.seen)
@@ -76,16 +75,16 @@ def _foreseen(work: Problem, places: Places) -> Problem:
 
 
 def _inside(work: Problem, box: Floats) -> Mask:
-    """Return (W,) which sightings have the flange in a box (2, 3); all, where none have."""
+    """Return (W,) which sightings have the flange in a box (2, 3); all if none have."""
     places = np.asarray(work.frames[work.carriers[0].frame].place)[work.seen.times, :3, 3]
     inside = np.asarray(((places >= box[0]) & (places <= box[1])).all(axis=1))
     return inside if inside.any() else ~inside
 
 
 def _in_box(problem: Problem, carrier: Carrier, box: Floats) -> Problem:
-    """Return the session's sightings with the flange evenly in a box (2, 3), where it gets there.
+    """Return the session's sightings with the flange spread evenly over a box (2, 3), if reachable.
 
-    As they are, where it gets nowhere.
+    The sightings are unchanged if the arm reaches no pose in the box.
     """
     evenly = spread_evenly(COUNT, 4)
     like = (evenly[:, 3] * len(problem.seen)).astype(int)
@@ -108,7 +107,7 @@ def _in_box(problem: Problem, carrier: Carrier, box: Floats) -> Problem:
 
 
 def _predicted(problem: Problem, places: Places) -> Sightings:
-    """Return a problem's sightings as they are predicted, each with its noise turned along."""
+    """Return a problem's predicted sightings, each with its noise rotated accordingly."""
     s, count = problem.seen, len(problem.seen)
     frames = {
         name: replace(frame, place=np.asarray(places.get(name, frame.place)))

@@ -20,7 +20,7 @@ def read_npy(path: Path, shape: tuple[int | None, ...]) -> Floats:
 
     Args:
         path: The file.
-        shape: What it must have; None is any length.
+        shape: Required shape; None is any length.
 
     Raises:
         StageError: It is missing, damaged, or of another shape.
@@ -43,7 +43,7 @@ def read_npz(path: Path, name: str, shape: tuple[int | None, ...]) -> Floats:
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """Return the arrays of an .npz file by name; the array of a .npy file has an empty name.
 
-    What else an .npz file holds, a text beside its arrays, is left out.
+    Entries of an .npz file that are not arrays are left out.
 
     Raises:
         StageError: It is missing or damaged.
@@ -55,7 +55,7 @@ def read_table(path: Path, width: int, rows: slice = slice(None)) -> Floats:
     """Return the rows of ``width`` numbers of a text file, as (n, width).
 
     Raises:
-        StageError: It is missing, or a row holds something else.
+        StageError: The file is missing, or a row is not ``width`` numbers.
     """
     lines = read_text(path).splitlines()
     numbered = [(i, line.split()) for i, line in enumerate(lines, 1) if line.strip()][rows]

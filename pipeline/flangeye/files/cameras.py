@@ -1,7 +1,7 @@
 """Read a camera's calibration from the files of common programs.
 
 ``camera_info`` of ROS, OpenCV's storage, kalibr's camchain, COLMAP's ``cameras.txt``, RealSense's
-and Zivid's intrinsics, arrays of NumPy, and text with labels: each by its own names.
+and Zivid's intrinsics, arrays of NumPy, and text with labels.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ class CameraFile(NamedTuple):
         path: The file.
         matrix: (3, 3) [px].
         distortion: (k,) OpenCV's coefficients.
-        others: How many more cameras the file holds.
-        lens_of: Name of the file that the distortion is from, where it has one of its own.
+        others: Number of further cameras in the file.
+        lens_of: Name of the file with the distortion, if that is another file.
     """
 
     path: Path
@@ -81,7 +81,7 @@ def camera_in(path: Path) -> CameraFile | None:
     """Return the camera calibration in a file; None if it holds none.
 
     Raises:
-        StageError: Its lens is of another model than OpenCV's.
+        StageError: The lens model is not OpenCV's.
     """
     try:
         data = _document(path)
@@ -139,7 +139,7 @@ def _labelled(lines: Iterable[str]) -> dict[str, Any]:
 
 
 def _with_lens_beside(camera: CameraFile) -> CameraFile:
-    """Return a matrix with the distortion that the one file called ``dist…`` beside it holds."""
+    """Return a camera with the distortion from the only file ``dist…`` in its folder."""
     beside = [p for p in camera.path.parent.iterdir() if p.stem.lower().startswith("dist")]
     if len(beside) != 1:
         return camera
@@ -191,7 +191,7 @@ def _one_by_one(values: Mapping[str, Any]) -> Floats | None:
 
 
 def _named(values: Mapping[str, Any], behind: Iterable[str]) -> Floats | None:
-    """Return the matrix under a name of its own, with one of these endings."""
+    """Return the matrix whose name has one of these endings; None if there is none."""
     for name in (f"{name}{which}" for name in MATRICES for which in behind):
         value = values.get(name)
         if isinstance(value, Mapping):
@@ -230,7 +230,7 @@ def _distortion(values: Mapping[str, Any]) -> Floats:
 
 
 def _in_order(values: Mapping[str, Any]) -> list[Any]:
-    """Return coefficients that are named one by one, those of OpenCV's longer model too."""
+    """Return distortion coefficients that have one name each, such as ``k1``, in OpenCV's order."""
     count = len(ORDER) if any(values.get(name) for name in ORDER[5:]) else 5
     return [values.get(name, 0.0) for name in ORDER[:count]]
 
@@ -275,7 +275,7 @@ def _colmap(path: Path, lines: list[str]) -> CameraFile | None:
 
 
 def _checked(path: Path, matrix: Floats, lens: Iterable[float]) -> CameraFile | None:
-    """Return a calibration; None where the matrix is not a camera's."""
+    """Return a calibration; None if the matrix is not a camera matrix."""
     coefficients = np.asarray(lens, dtype=np.float64).ravel()
     # OpenCV's longest row of coefficients
     most_coefficients = 14

@@ -49,7 +49,7 @@ def check_scan(path: Path) -> int:
 
 
 def _depths(path: Path) -> tuple[Floats, CameraFile]:
-    """Return (H, W) depths along z in the file's own unit, 0 or less where nothing was seen."""
+    """Return (H, W) depths along z in the file's own unit; 0 or less where no surface was seen."""
     import cv2
 
     try:
@@ -104,7 +104,7 @@ def _scale_of(path: Path) -> float:
 
 @lru_cache(maxsize=2)
 def _rays(shape: tuple[int, ...], matrix: bytes, distortion: bytes) -> Floats:
-    """Return (H, W, 3) the points at a depth of one; the matrix and OpenCV's lens as bytes."""
+    """Return (H, W, 3) points at depth 1; camera matrix and distortion are given as bytes."""
     import cv2
 
     rows, columns = np.mgrid[: shape[0], : shape[1]]

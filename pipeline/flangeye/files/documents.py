@@ -69,7 +69,7 @@ def _loaded(where: str, text: str) -> Any:
 
 
 def _toml(file: Path) -> TableDocument | None:
-    """Return the sections of a file, ``[12]`` above ``pose = [...]``; None where it has others."""
+    """Return the sections of a TOML file, ``[12]`` above ``pose = [...]``; None for other texts."""
     try:
         return TableDocument(tomllib.loads(read_text(file)), lambda at: f"{file}: record {at + 1}")
     except tomllib.TOMLDecodeError:
@@ -100,7 +100,7 @@ def _yaml(file: Path) -> TableDocument:
 
 
 def _xml(file: Path) -> TableDocument:
-    """Return what cv2.FileStorage wrote; entities, which can expand to any length, are refused."""
+    """Return the content of an OpenCV XML file; entities are refused, since they can expand."""
     text = read_text(file)
     if "<!" in re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL):
         raise StageError(f"{file}: declares a document type or entities, which are not read")
@@ -130,7 +130,7 @@ def _numpy(file: Path) -> TableDocument:
 
 
 def _matlab(file: Path) -> TableDocument:
-    """Return the arrays of a .mat file: its parser, which damage can crash, has its own process."""
+    """Return the arrays of a .mat file, parsed in another process: damage can crash the parser."""
     command = python_command(str(Path(__file__).with_name("matlab_parser.py")))
     # Longest .mat file [bytes]
     content = read_regular(file, 1_000_000)
@@ -190,7 +190,7 @@ def _plain(value: Any) -> Any:
 
 
 def stacked(rows: Floats) -> Floats | None:
-    """Return (N, r, c) matrices that stand below each other in (N r, c); None where none do."""
+    """Return (N, r, c) matrices stacked in the rows of (N r, c); None if it is no such stack."""
     for lines, width in MATRICES:
         if rows.ndim != 2 or rows.shape[1] != width or not len(rows) or len(rows) % lines:
             continue

@@ -81,7 +81,7 @@ def _entities(groups: list[Group]) -> Iterator[Entity]:
 
 
 def _line(name: str, groups: list[Group]) -> Floats:
-    """Return an entity as a polyline (N, 3); N is zero of what is not a line."""
+    """Return an entity as a polyline (N, 3); N is 0 for an entity without lines."""
     of = {code: value for code, value in reversed(groups) if code != 0}
     if name == "LINE":
         return np.array([[float(of.get(c + k, "0")) for c in (10, 20, 30)] for k in (0, 1)])
@@ -96,7 +96,7 @@ def _line(name: str, groups: list[Group]) -> Floats:
 
 
 def _upright(path: Path, name: str, groups: list[Group], line: Floats) -> Floats:
-    """Return a flat entity's line in the drawing's axes; of a mirrored one, as from below."""
+    """Return a flat entity's line in the drawing's axes; a mirrored one is seen from below."""
     up = float(next((v for c, v in groups if c == 230), "1"))
     if name == "LINE" or not len(line) or abs(up - 1) < 1e-6:
         return line

@@ -1,7 +1,7 @@
 """Remote archives and results, by URL: scans are fetched one at a time and not kept.
 
-The rest of the program knows paths alone. For an archive by URL a folder is made here that has
-every file by its name: the small ones whole, scans and images empty until they are read.
+The rest of the program uses paths only. An archive by URL gets a local folder with every file by
+its name: small files whole, scans and images empty until they are read.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def is_url(place: str) -> bool:
 
 
 def is_this_machine(host: str) -> bool:
-    """Return whether a host's name or address is of this machine, and no other reaches it."""
+    """Return whether a host name or address is this machine's loopback."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -36,7 +36,8 @@ def archive_at(place: str | None) -> Iterator[Path | None]:
     """Yield an archive's path; for a URL, that of a local folder that mirrors it on demand.
 
     Raises:
-        StageError: Nothing is there, it cannot be reached, or the URL is of another kind.
+        StageError: The archive does not exist, cannot be reached, or its kind of URL is not
+            supported.
     """
     if place is None or not is_url(place):
         yield None if place is None else Path(place)
@@ -57,10 +58,10 @@ def archive_at(place: str | None) -> Iterator[Path | None]:
 
 @contextmanager
 def results_at(place: str | None) -> Iterator[Path | None]:
-    """Yield the folder to write results to; for a URL they are sent there at the end.
+    """Yield the folder to write results to; results for a URL are sent at the end.
 
     Raises:
-        StageError: There are files already, or it cannot be reached.
+        StageError: The place already has files, or cannot be reached.
     """
     if place is None or not is_url(place):
         yield None if place is None else Path(place)
@@ -125,11 +126,11 @@ def print_of(url: str) -> str:
 
 
 class _StandIn:
-    """A folder here that stands for one elsewhere.
+    """A local folder that mirrors a remote one.
 
     Attributes:
-        url: The one elsewhere.
-        later: File here -> what the store says of it, for those that are not fetched yet.
+        url: URL of the remote folder.
+        later: Local file -> the store's entry, for files that are not fetched yet.
     """
 
     def __init__(self, url: str, root: Path) -> None:
@@ -164,7 +165,7 @@ class _StandIn:
                 self.fetch(path)
 
     def fetch(self, path: Path) -> None:
-        """Bring a file here."""
+        """Fetch a file."""
         with reaching(with_urls(str(path))):
             self._system.get_file(self._names[path], str(path))
 
@@ -193,7 +194,7 @@ def system_of(url: str) -> tuple[Any, str]:
     """Return the file system of a URL and the path in it.
 
     Raises:
-        StageError: The URL is of another kind, or what opens it is not installed.
+        StageError: The kind of URL is not supported, or its library is not installed.
     """
     protocols = ("s3", "gs", "az", "https", "zip")  # none of them runs anything
     for each in url.split("::"):
@@ -223,7 +224,7 @@ def reaching(url: str) -> Iterator[None]:
     """Turn any error of a remote store into one line.
 
     Raises:
-        StageError: Something did.
+        StageError: The store raised an error.
     """
     try:
         yield

@@ -24,7 +24,7 @@ PNG = b"\x89PNG\r\n\x1a\n"
 
 
 class ImageError(ValueError):
-    """The bytes are not an image, damaged, or of a size that no camera has."""
+    """The bytes are no image, are damaged, or state a size that no camera has."""
 
 
 def decode_image(raw: bytes, flags: int) -> NDArray[Any]:
@@ -32,7 +32,7 @@ def decode_image(raw: bytes, flags: int) -> NDArray[Any]:
 
     Args:
         raw: A PNG, JPEG, BMP or TIFF file.
-        flags: OpenCV's, such as ``cv2.IMREAD_GRAYSCALE``.
+        flags: OpenCV's flags, such as ``cv2.IMREAD_GRAYSCALE``.
 
     Raises:
         ImageError: The bytes are damaged, not an image, or larger than ``MAX_PIXELS``.
@@ -55,7 +55,7 @@ def decode_image(raw: bytes, flags: int) -> NDArray[Any]:
 
 
 def _stated_pixels(raw: bytes) -> int:
-    """Return how many pixels a PNG's or BMP's header states; OpenCV fills them before it looks."""
+    """Return how many pixels a PNG's or BMP's header states; OpenCV allocates these first."""
     if raw.startswith(PNG) and len(raw) >= 24:
         width, height = struct.unpack_from(">II", raw, 16)
     elif raw[:2] == b"BM" and len(raw) >= 26:
@@ -66,7 +66,7 @@ def _stated_pixels(raw: bytes) -> int:
 
 
 def _is_cut_png(raw: bytes) -> bool:
-    """Return whether a PNG's chunk states more bytes than there are; OpenCV makes room for them."""
+    """Return whether a PNG's chunk states more bytes than the file has; OpenCV allocates these."""
     at, kind = len(PNG), b""
     while raw.startswith(PNG) and kind != b"IEND" and at + 8 <= len(raw):
         length, kind = struct.unpack_from(">I4s", raw, at)
@@ -77,7 +77,7 @@ def _is_cut_png(raw: bytes) -> bool:
 def is_depth_image(path: Path) -> bool:
     """Return whether a file is a depth image: by its name or its folder's, and its header.
 
-    An image of 16 bits that is not called depth may be that of a camera.
+    A 16-bit image without such a name may be a camera's.
     """
     folder = path.parent.name.lower()
     called = folder.startswith("depth") or folder.endswith("depth") or "depth" in path.stem.lower()

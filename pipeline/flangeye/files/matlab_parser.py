@@ -14,7 +14,7 @@ from typing import Any
 
 
 def main() -> None:
-    """Parse, and write the arrays of numbers, those in structures too."""
+    """Convert a .mat file: write its arrays of numbers, those in structures too."""
     memory = 4 << 30  # libraries reserve much that they never use [bytes]
     resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -34,7 +34,7 @@ def main() -> None:
 
 
 def _numbers(name: str, value: Any) -> Iterator[tuple[str, Any]]:
-    """Yield an array of numbers with its name; of a structure each, behind a dot."""
+    """Yield each array of numbers with its name; in a structure as ``name.field``."""
     import numpy as np
 
     kind = getattr(getattr(value, "dtype", None), "kind", "")

@@ -1,4 +1,4 @@
-"""Files that a parameter names, and folders that lie here or in a storage elsewhere."""
+"""Files named by a parameter, and local or remote folders."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ def bundled_file(
 
     Args:
         kind: Kind of file, as messages name it: ``workpiece``.
-        folder: Where those that come with the project are: ``workpieces``.
-        own: How the names of one's own files end; ``.yml`` is taken too.
+        folder: Folder of the bundled files: ``workpieces``.
+        own: Ending of the user's own files; ``.yml`` is accepted too.
     """
     allowed = f"a {' or '.join(own)} file"
 
@@ -98,24 +98,24 @@ class Storage(Protocol):
         """Return a file's content; None if it does not exist."""
 
     def write(self, name: str, content: bytes) -> None:
-        """Write a file, and the folders above it: readers find the old one or the new one.
+        """Write a file atomically, and create its folders.
 
         Raises:
             StageError: It cannot be written.
         """
 
     def draft(self, name: str) -> AbstractContextManager[Path]:
-        """Yield the path of a file to be written, which becomes the one of that name at the end.
+        """Yield a temporary path to write; the file gets its name at the end.
 
         Raises:
             StageError: It cannot be written.
         """
 
     def names(self, folder: str) -> list[str]:
-        """Return the files of a folder as names from here, sorted; none if it is not there."""
+        """Return a folder's sorted file names, relative to the store; empty if it is missing."""
 
     def remove(self, name: str) -> None:
-        """Remove a file, or a folder with all that is in it, if it is there."""
+        """Remove a file, or a folder with its content, if it exists."""
 
 
 def place_at(at: str) -> Storage:

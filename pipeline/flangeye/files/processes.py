@@ -57,7 +57,7 @@ class Pipe:
     def __init__(
         self, command: Sequence[str], environment: Mapping[str, str] | None = None
     ) -> None:
-        """Start it, with this process's environment unless another is given.
+        """Start the command, by default with this process's environment.
 
         Raises:
             OSError: There is no such program.
@@ -95,8 +95,8 @@ class Pipe:
         """Return the next line, without its end.
 
         Raises:
-            TimeoutError: It did not come within ``patience`` [s]; None waits for ever.
-            PipeEndedError: It never will.
+            TimeoutError: No line came within ``patience`` [s]; None waits for ever.
+            PipeEndedError: The process has ended.
         """
         while b"\n" not in self._rest:
             self._more(patience)
@@ -117,7 +117,7 @@ class Pipe:
         """End the process; safe to call twice.
 
         Args:
-            patience: How long it may take to end by itself when its input has ended [s].
+            patience: Longest wait for the process to end after its input is closed [s].
         """
         with contextlib.suppress(OSError, subprocess.TimeoutExpired):
             self._in.close()

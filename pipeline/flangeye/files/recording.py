@@ -38,7 +38,7 @@ class Reader(Protocol):
     """How a ``reader`` part is called."""
 
     def __call__(self, path: Path) -> Archive:
-        """Return what the path holds; raise :class:`NotThisLayout` where it is something else."""
+        """Return the archive at a path; raise :class:`NotThisLayout` if it has another layout."""
 
 
 class NotThisLayout(StageError):
@@ -51,19 +51,20 @@ class Recording:
 
     Attributes:
         id: Unique within the archive.
-        poses: (4, 4) each, by the frame it places (flange, flange2, …), translation in [m].
+        poses: (4, 4) pose of each moving frame by name (flange, flange2, …), translation in [m].
         cloud: The scan's file; None when the archive has none for this pose.
         centre_in_camera: (3,) ready-made circle centre [m], if the archive has one.
         joints: (n,) joint angles [rad], if known.
-        role: ``verification`` keeps it from every solver.
-        time_ns: When it was taken, 0 if not known.
+        role: ``verification`` hides the recording from every solver.
+        time_ns: Time of the capture, 0 if unknown.
         image: The camera's image; None when the archive has none for this pose.
         camera_T_target: (4, 4) ready-made pose of a marker [m], if the archive has one.
-        camera: (3, 3) camera matrix of the image [px] and OpenCV's distortion, if it has them.
-        axes: For a cell, where each rail and positioner was [m or rad].
-        seen_by: Which camera of a cell looked.
-        saw: Which target of a cell it saw.
-        motion: How the (first) arm's flange passed, where that was recorded and it moved.
+        camera: (3, 3) camera matrix of the image [px] and OpenCV's distortion, if the archive has
+            them.
+        axes: For a cell, position of each rail and positioner [m or rad].
+        seen_by: The camera, for a cell.
+        saw: The target, for a cell.
+        motion: Trajectory of the (first) arm's flange around the capture, if recorded in motion.
         arm_joints: For a cell, (n,) joint angles of each arm that has them [rad].
     """
 
@@ -99,12 +100,12 @@ class Archive:
     """The recordings that a reader found.
 
     Attributes:
-        layout: How notes call the layout, for example ``ancorasir aubo``.
+        layout: Name of the layout in notes, for example ``ancorasir aubo``.
         root: Folder that all files lie in.
         recordings: One per pose, in the archive's order.
         files: Files the poses and centres were read from.
-        cloud_unit: Unit of the clouds where the layout fixes it, else None.
-        notes: What is to be done, and what is for the record.
+        cloud_unit: Unit of the clouds if the layout fixes it, else None.
+        notes: Warnings and records about the archive.
     """
 
     layout: str
@@ -116,7 +117,7 @@ class Archive:
 
 
 def check_ids(archive: Archive) -> None:
-    """Refuse an archive without poses, or with two of one name.
+    """Refuse an archive without poses, or with two poses of one name.
 
     Raises:
         StageError: There is no pose, or two share a name.
@@ -146,8 +147,8 @@ def check_poses(
             and all poses may be at one place.
 
     Raises:
-        StageError: A pose out of any arm's reach, one given twice, too few to calibrate with, or
-            all of those at one place.
+        StageError: A pose is out of any arm's reach or given twice; or the calibration poses are
+            too few, or all at one place.
     """
     for recording in recordings:
         distance = float(np.linalg.norm(recording.base_T_flange[:3, 3]))
@@ -172,7 +173,7 @@ def _check_distinct(root: Path, recordings: Sequence[Recording]) -> None:
 
 
 def _repeated(names: Sequence[str], same: Indices, pose: Floats) -> str:
-    """Return the message for repeated poses; if most are equal, the driver made them up."""
+    """Return the message for repeated poses; if most are equal, the driver did not read them."""
     if len(same) > max(2, len(names) / 2):
         made_up = "the identity" if np.abs(pose - np.eye(4)).max() < SAME_POSE else "the same"
         told = f"{len(same)} of {len(names)} robot poses are {made_up}"
@@ -226,7 +227,7 @@ def fingerprint_of(root: Path, digests: dict[Path, str]) -> str:
 
 
 def _name_below(root: Path, path: Path) -> str:
-    """Return a name that is the same wherever the archive, or what was taken out of it, lies."""
+    """Return a file's name relative to the archive's root: it is the same on any machine."""
     return os.path.relpath(path, root) if path.is_relative_to(root) else path.name
 
 

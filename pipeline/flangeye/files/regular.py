@@ -21,15 +21,15 @@ _POINTER = b"version https://git-lfs.github.com/spec/"
 
 
 def open_regular(path: Path, error: type[FlangeyeError] = StageError) -> BinaryIO:
-    """Open a regular file, or a link to one, for reading; never waits, as a FIFO would make one.
+    """Open a regular file, or a link to one, for reading; never blocks as on a FIFO.
 
     Args:
         path: The file.
-        error: What to raise.
+        error: Type of the error to raise.
 
     Raises:
-        FlangeyeError: Of the given sort: it does not exist, cannot be read, is a folder, a device,
-            a FIFO or a socket, or stands in for a file that Git LFS keeps elsewhere.
+        FlangeyeError: The file does not exist, cannot be read, is a folder, a device, a FIFO or a
+            socket, or is a Git LFS pointer.
     """
     file = _opened(path, error)
     if _stands_in(file):
@@ -39,7 +39,7 @@ def open_regular(path: Path, error: type[FlangeyeError] = StageError) -> BinaryI
 
 
 def is_pointer(path: Path) -> bool:
-    """Return whether a file stands in for one that Git LFS keeps elsewhere."""
+    """Return whether a file is a Git LFS pointer, not the content."""
     try:
         with _opened(path, StageError) as file:
             return _stands_in(file)
@@ -126,13 +126,12 @@ def write_whole(path: Path, content: str | bytes, error: type[FlangeyeError] = S
     """Write a file atomically: after a crash it is the old one or the new one, never a part.
 
     Args:
-        path: The file, whose folder is made where there is none; what is not a regular file, such
-            as ``/dev/stdout``, is written as it is.
+        path: The file; its folder is created. A device such as ``/dev/stdout`` is written directly.
         content: UTF-8 text, or bytes.
-        error: What to raise.
+        error: Type of the error to raise.
 
     Raises:
-        FlangeyeError: Of the given sort: it cannot be written.
+        FlangeyeError: The file cannot be written.
     """
     raw = content.encode("utf-8", "replace") if isinstance(content, str) else content
     try:

@@ -39,17 +39,16 @@ def numbers_of(names: Sequence[str]) -> list[tuple[int, ...]]:
 def partners(
     where: str, poses: Sequence[str], others: Sequence[str], what: str = "scans"
 ) -> tuple[list[int], str]:
-    """Return for each pose which of the others belongs to it, and a note of how they were paired.
+    """Return the index of each pose's partner, and a note on how they were paired.
 
     Args:
-        where: What messages begin with.
+        where: Prefix of messages.
         poses: Names of the poses, without endings.
-        others: Names of the scans, or of what was measured at the poses.
-        what: What messages call the others.
+        others: Names of the scans, or of the measurements.
+        what: Word for the others in messages.
 
     Raises:
-        StageError: Neither the sets of names nor those of the numbers in them are equal, or two
-            have one number.
+        StageError: Neither the names nor the numbers in them match one to one.
     """
     if set(poses) == set(others) and len(set(poses)) == len(poses) == len(others):
         return [others.index(name) for name in poses], f"paired by name: {_example(poses, poses)}"
@@ -71,13 +70,13 @@ def in_order(where: str, count: int, what: str, names: Sequence[str]) -> str:
     """Return the note that rows without names were paired with scans in their natural order.
 
     Args:
-        where: What messages begin with.
-        count: How many rows there are.
-        what: What stands in a row, in the plural: poses.
+        where: Prefix of messages.
+        count: Number of rows.
+        what: Plural word for the rows in messages: poses.
         names: Names of the scans, in their order.
 
     Raises:
-        StageError: There are not as many.
+        StageError: The number of scans differs from the number of rows.
     """
     numbers = [key[0] for key in numbers_of(names) if len(key) == 1]
     span = range(min(numbers), max(numbers) + 1) if len(numbers) == len(names) > 0 else range(0)
@@ -103,7 +102,7 @@ def _differing(
     theirs: tuple[Sequence[str], Sequence[str]],
     what: str,
 ) -> str:
-    """Return how names differ: each side's, and those of it without a partner."""
+    """Return a text with the names of each side, and those without a partner."""
     (poses, lone), (others, other_lone) = ours, theirs
     count = f"{len(poses)} poses ({poses[0]}, …) and {len(others)} {what} ({others[0]}, …)"
     if not lone and not other_lone:
@@ -130,7 +129,7 @@ def scans_in(folder: Path, stem: str = "*") -> list[Path]:
     Texts are scans where :func:`texts_of_points` says so.
 
     Raises:
-        StageError: There are only scans that their maker alone can read.
+        StageError: All scans are in a proprietary format.
     """
     files = sorted(folder.glob(f"{stem}.*"), key=lambda p: (natural(p.stem), p.suffix))
     points = texts_of_points(files)
@@ -144,7 +143,7 @@ def scans_in(folder: Path, stem: str = "*") -> list[Path]:
 def texts_of_points(files: Iterable[Path]) -> set[Path]:
     """Return the texts and archives of arrays that hold a cloud each.
 
-    They are three or more, named alike but for a number.
+    They are at least three files whose names differ in a number only.
     """
     alike: dict[str, list[Path]] = defaultdict(list)
     for path in files:
@@ -155,7 +154,7 @@ def texts_of_points(files: Iterable[Path]) -> set[Path]:
 
 
 def _holds_points(path: Path) -> bool:
-    """Return whether a file holds more points than one capture has poses or a camera numbers."""
+    """Return whether a file has enough rows for a cloud: more than a pose or a camera has."""
     try:
         if path.suffix.lower() == ".npz":
             return math.prod(open_npz(path).shape) > 100
@@ -171,13 +170,13 @@ def _holds_points(path: Path) -> bool:
 
 @dataclass(frozen=True)
 class Poses:
-    """The poses that scans are looked for.
+    """The poses for which scans are sought.
 
     Attributes:
-        where: The file or pattern they are from, which messages begin with.
-        count: How many there are.
-        files: The file of each, where each has its own; else empty.
-        names: What each is called, where they have names; else empty.
+        where: The poses' file or pattern, the prefix of messages.
+        count: Number of poses.
+        files: The file of each pose, if each has its own; else empty.
+        names: Name of each pose, if they have names; else empty.
     """
 
     where: str
@@ -196,17 +195,17 @@ def scans_of(
 ) -> tuple[list[list[Path]], list[str]]:
     """Return the scans of each pose, and notes of how they were paired.
 
-    The scans lie in the folder, in folders in it (``images/``, ``clouds/``), or in a folder for
-    each pose. Those with names are paired by the name or the number in common, rows of a table by
-    their order.
+    The scans are in the folder, in subfolders (``images/``, ``clouds/``), or in a folder for each
+    pose. Named poses are paired by a common name or number, rows of a table by order.
 
     Args:
-        folder: Where the scans are.
-        poses: What they belong to.
-        taken: Files that hold poses, and are not scans.
+        folder: Folder of the scans.
+        poses: The poses.
+        taken: Files with poses, which are not scans.
 
     Raises:
-        StageError: The names differ, there are not as many, or two folders hold scans for all.
+        StageError: Names or numbers of scans and poses differ, or two folders have scans for all
+            poses.
     """
     if poses.apart:
         lone = next((file for file in poses.files if not scans_in(file.parent)), None)
@@ -235,7 +234,7 @@ def _scans_by_stem(folder: Path, taken: Collection[Path]) -> dict[str, list[Path
 
 
 def _paired(poses: Poses, scans: dict[str, list[Path]]) -> tuple[list[list[Path]], list[str]]:
-    """Return the scans of each pose: of one name, or a cloud and an image of one number."""
+    """Return the scans of each pose, paired by name, or by number for a cloud and an image."""
     kinds = [
         {stem: [p for p in found if is_cloud(p) is kind] for stem, found in scans.items()}
         for kind in (True, False)
@@ -261,7 +260,7 @@ def _by_name(poses: Poses, scans: dict[str, list[Path]]) -> tuple[list[list[Path
 def _together(
     where: Path, found: Sequence[tuple[list[list[Path]], list[str]]]
 ) -> tuple[list[list[Path]], list[str]]:
-    """Return the clouds of one place with the images of another."""
+    """Merge the clouds of one folder with the images of another."""
     scans = [list(chain.from_iterable(each)) for each in zip(*(s for s, _ in found), strict=True)]
     twice = next((paths for paths in scans if len(_kinds(paths)) < len(paths)), None)
     if twice is not None:
@@ -286,7 +285,7 @@ def recording_of(name: str, pose: Floats, scans: Sequence[Path]) -> Recording:
     """Return a pose with its cloud, its image, or both.
 
     Raises:
-        StageError: It has two of one sort, or a file is neither.
+        StageError: A pose has two clouds or two images, or a file is neither.
     """
     clouds = [p for p in scans if is_cloud(p)]
     images = [p for p in scans if p.suffix.lower() in IMAGES and p not in clouds]

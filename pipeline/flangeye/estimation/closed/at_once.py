@@ -24,7 +24,7 @@ def daniilidis(motions: Motions) -> Floats:
     The unit dual quaternion in the two-dimensional null space of all motions' screw equations.
 
     Raises:
-        CalibrationRefused: No member of that space is one.
+        CalibrationRefused: That null space has no unit dual quaternion.
     """
     rows = stack_rows(_screw_rows(motions))
     u, v = np.linalg.eigh(rows.T @ rows)[1][:, :2].T

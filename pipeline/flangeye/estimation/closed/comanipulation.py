@@ -53,8 +53,8 @@ def kronecker(a: Floats, b: Floats, c: Floats) -> Triple:
 def best_rotations(given: Triple, rng: np.random.Generator) -> Triple:
     """Return the rotations X, Y, Z (3, 3) with the least error over many random starts.
 
-    All starts alternate for a few rounds together, and the best of them go on by Gauss and Newton,
-    which takes a hundredth of the steps near the end.
+    All starts alternate for a few rounds; the best ones continue by Gauss-Newton, which needs a
+    hundredth of the steps near the end.
 
     Args:
         given: Rotations of A, B, C, each (N, 3, 3).
@@ -67,7 +67,7 @@ def best_rotations(given: Triple, rng: np.random.Generator) -> Triple:
 
 
 def _settled(given: Triple, near: Triple) -> Triple:
-    """Return the best of rotations (K, 3, 3) after a few steps of Gauss and Newton, each (3, 3)."""
+    """Return the best of rotations (K, 3, 3) after a few Gauss-Newton steps, each (3, 3)."""
     (a, b, c), (x, y, z) = given, near
     steps = 10  # of Newton's
     for step in range(steps + 1):
@@ -97,8 +97,8 @@ def alternate(given: Triple, starts: Triple, rounds: int = 3000) -> tuple[Triple
 
     Args:
         given: Rotations of A, B, C, each (N, 3, 3).
-        starts: Rotations to begin with, each (..., 3, 3).
-        rounds: Steps at most.
+        starts: Initial rotations, each (..., 3, 3).
+        rounds: Largest number of steps.
     """
     a, b, c = given
     form = np.einsum("nij,nkl,nmp->jkimpl", a, b, c).reshape(9, 9, 9)
@@ -119,7 +119,7 @@ def alternate(given: Triple, starts: Triple, rounds: int = 3000) -> tuple[Triple
 
 
 def _third(form: Floats, first: Floats, second: Floats) -> Floats:
-    """Return the (..., 3, 3) on which a form (81, 9) that is linear in three depends, given two."""
+    """Return (..., 3, 3): a trilinear form (81, 9) contracted with two of its arguments."""
     shape = first.shape
     products = first.reshape(-1, 9, 1) * second.reshape(-1, 1, 9)
     return np.asarray((products.reshape(-1, 81) @ form).reshape(shape))

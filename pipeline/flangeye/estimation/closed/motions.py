@@ -1,9 +1,8 @@
 """Relative motions between poses, for closed forms of AX = XB.
 
-One arm, whoever carries camera and target: with ``G = carrier_T_target_carrier`` of the
-controllers, turned round, and ``M = camera_T_target`` measured, ``G X M`` is the same at every
-pose (it is the target's place Z). Two poses i, j therefore give ``A X = X B`` with
-``A = inv(G_j) G_i`` and ``B = M_j inv(M_i)``.
+With ``G = target_carrier_T_camera_carrier`` reported and ``M = camera_T_target`` measured, ``G X
+M`` is the same at every pose: the target's place Z. This holds for a camera in hand and for a fixed
+one. Two poses i, j therefore give ``A X = X B`` with ``A = inv(G_j) G_i`` and ``B = M_j inv(M_i)``.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@ r"""Errors of an arm's geometry: joint zeros, encoders, sag, link lengths and tw
 
 An arm's controller reports f(q) by nominal parameters; the flange really is at the twist
 :math:`D(q)\,\delta` from there. Each kind's typical size is a ratio to that of the joint zeros
-(``Carrier.accuracy``), for makers machine, weigh and encode with one care: all kinds of one arm
-share its quality, and each is a little better or worse beside it.
+(``Carrier.accuracy``), since a maker's tolerances go together: all kinds of one arm share its
+quality, and each varies a little around it.
 """
 
 from __future__ import annotations
@@ -86,10 +86,10 @@ class Scatter:
     """Noise that a cause adds to each sighting, independent from pose to pose.
 
     Attributes:
-        covariances: Gives (N, 6, 6) of sightings, of size one.
-        size: Prior median of its size.
-        factor: By how many times that size is uncertain, one sigma.
-        cause: Whose quality it shares; empty for none.
+        covariances: Function that returns the (N, 6, 6) covariances at size 1.
+        size: Prior median of the size.
+        factor: Uncertainty of the size as a factor, one sigma.
+        cause: Cause whose quality it shares; empty for none.
     """
 
     covariances: Callable[[Problem, Linear], Floats]
@@ -101,8 +101,8 @@ class Scatter:
 def arm_scatters(problem: Problem) -> list[Scatter]:
     """Return the arms' noise from pose to pose.
 
-    Backlash depends on how the arm came to a pose. Where its joints are not known, what they do is
-    not known to be smooth either, but by where the flange is.
+    Backlash depends on the direction of approach. With unknown joint angles, errors that are smooth
+    in the joints count as noise too, unless they are smooth in the flange's position.
     """
     out = []
     for arm, accuracy in {c.arm: c.accuracy or ACCURACY for c in problem.carriers}.items():
@@ -120,7 +120,7 @@ def arm_scatters(problem: Problem) -> list[Scatter]:
 
 
 def _joints_of_all_known(problem: Problem, arm: str) -> bool:
-    """Whether the joints of all that an arm carries are known."""
+    """Whether the joint angles of everything that an arm carries are known."""
     carriers = [c for c in problem.carriers if c.arm == arm]
     return all(joints_known(c) for c in carriers)
 
@@ -139,7 +139,7 @@ def _backlash(arm: str) -> Callable[[Problem, Linear], Floats]:
 
 
 def _anew(arm: str, rows: slice) -> Callable[[Problem, Linear], Floats]:
-    """Turns or shifts of what an arm carries, those the more the farther the target is from it."""
+    """Return an arm's noise: shifts of its carriers, or turns with the target as lever."""
 
     def covariances(problem: Problem, linear: Linear) -> Floats:
         moved = [linear.blocks[c.frame][:, :, rows] for c in problem.carriers if c.arm == arm]
@@ -149,7 +149,7 @@ def _anew(arm: str, rows: slice) -> Callable[[Problem, Linear], Floats]:
 
 
 def _of_carriers(arm: str, kind: str) -> Block:
-    """Return the block of twists (T, 6, K) that all carriers of one arm have at each time."""
+    """Return the design block of the twists (T, 6, K) of one arm's carriers."""
 
     def block(problem: Problem, linear: Linear) -> Floats:
         moved = [c for c in problem.carriers if c.arm == arm]
@@ -160,7 +160,7 @@ def _of_carriers(arm: str, kind: str) -> Block:
 
 
 def _in_common(arm: str, at_base: bool, rows: slice) -> Block:
-    """Return the block of a turn or a shift of all the flange's poses, at the base or in it."""
+    """Return the design block of a turn or shift common to all poses, at the base or the flange."""
 
     def block(problem: Problem, linear: Linear) -> Floats:
         out = np.zeros((len(problem.seen), 6, 3))
@@ -178,7 +178,7 @@ def _in_common(arm: str, at_base: bool, rows: slice) -> Block:
 
 
 def _by_place(arm: str, field: SmoothField) -> Block:
-    """Return the block of a smooth displacement of what the arm moves, by where it is reported."""
+    """Return the design block of a displacement that is smooth in the reported position."""
 
     def block(problem: Problem, linear: Linear) -> Floats:
         moved = [c for c in problem.carriers if c.arm == arm]
@@ -211,9 +211,9 @@ def displacements(carrier: Carrier) -> dict[str, Floats]:
 
 
 def _levers(arm: Arm, joints: Floats) -> Floats:
-    """Return (T, n) the horizontal lever about each joint of what hangs on it [m].
+    """Return (T, n) the horizontal lever of the load about each joint [m].
 
-    Its weight is taken to be spread evenly over the links' origins beyond the joint.
+    The load is spread evenly over the origins of the links beyond the joint.
     """
     origins, (axes, places) = arm.frames(joints)[..., :3, 3], arm.axes(joints)
     beyond = [origins[:, i + 1 :].mean(axis=1) - places[:, i] for i in range(arm.n)]
@@ -226,7 +226,7 @@ def known(carrier: Carrier) -> tuple[Arm, Floats]:
     """Return kinematics and joints of a carrier that has both.
 
     Raises:
-        ValueError: It lacks one of them.
+        ValueError: The carrier lacks one of them.
     """
     if carrier.kinematics is None or carrier.joints is None:
         raise ValueError(f"the joints or the kinematics of {carrier.arm} are not known")

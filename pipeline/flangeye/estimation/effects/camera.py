@@ -65,9 +65,9 @@ def _focal(camera: str) -> Block:
 
 
 def _smoothed(problem: Problem, linear: Linear, whose: Mask) -> Floats:
-    """Return (N, 3) where centres are predicted, on the whole as far away as they were measured.
+    """Return (N, 3) predicted centres, scaled to the measured mean distance.
 
-    A share of what was measured itself would take its noise away, and all of it at a size of none.
+    A scale of the measured centres themselves would shrink their noise as well.
     """
     measured = problem.seen.centres
     predicted = measured - linear.residuals[:, 3:]

@@ -15,7 +15,7 @@ from flangeye.types import FLANGE, Floats, Observation
 
 
 def clock_effects(problem: Problem) -> list[Effect]:
-    """Return the delay of each camera [s]: by how much its sightings are later than their poses."""
+    """Return the effect of each camera's delay [s] behind the poses."""
     if not problem.carriers or any(c.rates is None for c in problem.carriers):
         return []
     cameras = list(dict.fromkeys(camera for camera, _ in problem.ends))
@@ -43,12 +43,12 @@ def _delay(camera: str) -> Block:
 def delayed(
     observations: Sequence[Observation], cell: Cell, delays: Mapping[str, float]
 ) -> list[Observation] | None:
-    """Return the observations with the arm where it was a delay later; None beyond the record.
+    """Return the observations with the arm poses a delay later; None beyond the recorded motion.
 
     Args:
-        observations: With how everything passed.
-        cell: What stands on what.
-        delays: By camera [s].
+        observations: Observations with the arms' recorded motion.
+        cell: The graph of frames.
+        delays: Delay by camera [s].
     """
     moved = []
     for o in observations:

@@ -17,15 +17,16 @@ class Effect:
     """One error source of a cell.
 
     Attributes:
-        name: For the person, as in "joint zeros".
-        block: Its design, of sightings at any poses: those measured, or those of the work.
+        name: Name shown to the user, such as "joint zeros".
+        block: Function that returns its design at any sightings: measured ones or those of the
+            work.
         size: Prior median of the standard deviation of each number, in its unit.
-        factor: By how many times that size is uncertain, one sigma (log-normal).
-        cause: Effects of one cause (an arm) have a common quality as well; empty for none.
-        of_arm: Whether it displaces an arm against what its controller reports.
-        lasting: Whether it is at new poses as it was at those of the session.
+        factor: Uncertainty of the size as a factor, one sigma (log-normal).
+        cause: Cause, such as an arm, whose effects share a quality; empty for none.
+        of_arm: Whether it displaces an arm from the reported pose.
+        lasting: Whether it stays the same after the session.
         kind: Which part of a correction its numbers are (``zeros``, ``lengths``, ``field``...).
-        of_camera: Whether the answer as reported takes its rigid part into the camera's place.
+        of_camera: Whether the reported answer moves its rigid part into the camera's place.
     """
 
     name: str

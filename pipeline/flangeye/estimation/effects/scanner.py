@@ -1,9 +1,9 @@
 r"""Errors of a depth scanner that are the same at every pose: a smooth distortion, rounded edges.
 
-Poses held out do not show them, for they err alike; only the size is known, by the scanner's model.
-The distortion is a field of :mod:`flangeye.maths.arm_correction` over the view (right, down, depth,
-each from -1 to 1), without the rigid motion nearest to it over the whole volume: that part is where
-the camera is.
+Held-out poses do not show these errors, since they have them as well; only their size is known,
+from the scanner's model. The distortion is a field of :mod:`flangeye.maths.arm_correction` over the
+view (right, down, depth, each from -1 to 1), without the rigid motion nearest to it over the whole
+volume: that part is where the camera is.
 """
 
 from __future__ import annotations
@@ -55,11 +55,11 @@ def _distortion(scanner: ScannerModel, seen: Sightings) -> Effect:
 
 
 def _edges(problem: Problem, linear: Linear) -> Floats:
-    """Return (N, 6, 1): by how much centres move towards the camera's side of a tilted face.
+    """Return (N, 6, 1): the shift of centres towards the camera's side of a tilted face.
 
-    Where the wall behind an edge is in view a scanner rounds the edge off; on the other side it
-    breaks off. So a centre lies too far from the camera's side, by the more the more the face is
-    tilted. Only tilted views determine how far away a circle of unknown place is.
+    A scanner rounds an edge off if the wall behind it is in view, and cuts it off on the other
+    side. So a tilted circle's centre lies too far from the camera's side, in proportion to the
+    tilt. Only tilted views determine the distance of a circle of unknown place.
     """
     s = problem.seen
     out = np.zeros((len(s), 6, 1))
@@ -68,7 +68,7 @@ def _edges(problem: Problem, linear: Linear) -> Floats:
 
 
 def _along(s: Sightings) -> Floats:
-    """Return (N, 3) the direction to the camera, in the face, as long as the face is tilted."""
+    """Return (N, 3) the direction to the camera projected onto the face: as long as its tilt."""
     normals = s.rotations[:, :, 2]
     far = np.linalg.norm(s.centres, axis=1)
     to_camera = -s.centres / np.where(far > 0, far, 1.0)[:, None]
@@ -76,7 +76,7 @@ def _along(s: Sightings) -> Floats:
 
 
 def _edge_size(s: Sightings) -> float:
-    """Return what the fits state of their centres in the face, as if all of it were this [m]."""
+    """Return the fits' stated deviation of centres in the face, taken as edge rounding [m]."""
     rows = s.by_depth & (s.ranks == 5)
     tilts = (_along(s)[rows] ** 2).sum()
     # All face the camera to a milliradian: seen alike
@@ -95,7 +95,7 @@ class DistortionField:
 
     @property
     def _depths(self) -> tuple[float, float]:
-        """Middle of the range, and half of it [m]."""
+        """Middle and half width of the range of depths [m]."""
         near, far = self.scanner.range
         return (near + far) / 2, (far - near) / 2
 

@@ -1,4 +1,4 @@
-"""Errors that all sightings of one target share: of its size, of its circle, of its face."""
+"""Errors that all sightings of one target share: of its circle and its face."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ def wrong_offset(problem: Problem, effects: Sequence[Effect]) -> list[Effect] | 
 
 
 def offset_shown_to(problem: Problem, places: Places) -> float:
-    """Return the standard deviation of a circle's offset in its flange, if it were free [m].
+    """Return the standard deviation of a circle's offset in its flange with a flat prior [m].
 
     A constant offset d moves the circle by R_i d at pose i. Where all R_i are alike, it cannot be
     distinguished from a shift of the camera.
 
     Returns:
-        Along the direction that the poses show least; 0 where the residuals are no noise.
+        The deviation in the least observable direction; 0 if the residuals are not noise.
     """
     linear, shown = problem.linearised(places), np.zeros((3, 3))
     for pair in np.unique(problem.seen.pairs):

@@ -1,7 +1,7 @@
 """Which part of a cell has changed: scanner, flange or arm. Arrays only.
 
-A scanner, an arm's zeros and a tool explain residuals by different patterns. The marginal
-likelihoods of the three are compared, each with a Gaussian prior of its parameters.
+A moved scanner, a changed joint zero and a moved flange leave different residual patterns. The
+marginal likelihoods of the three are compared, each with a Gaussian prior of its parameters.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ def blame(
 ) -> Mapping[str, float]:
     """Return each part's probability of having caused a change, likeliest first.
 
-    The scanner turned, shifted or both, the flange replaced (so that the circle is elsewhere on
-    it), and, where the arm's kinematics are known, one joint or the arm re-mastered.
+    Causes are: the scanner turned, shifted or both; the flange replaced, so that the circle has
+    moved on it; and, if the arm's kinematics are known, one joint or the whole arm re-mastered.
 
     Args:
         before: Estimate of the camera motion and the arm's error weights before the change.

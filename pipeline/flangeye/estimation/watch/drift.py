@@ -1,26 +1,26 @@
 r"""Whether a calibration still holds: a sequential likelihood-ratio test. Arrays only.
 
 A camera that was at :math:`T` and is now at :math:`\exp(\xi) T` leaves, at a target that the arm
-carries to :math:`b` and the camera sees at :math:`c`, the residual
-:math:`r = T c - b = -J \xi + \varepsilon`. Each *check* is one to a few such sightings, reduced to
-an information matrix :math:`H` and a vector :math:`g = -\sum J^\top W r`. What the cell does with
-the hours of the day is one more unknown of each check, with a known variance, and marginalised.
-What the arm does wrong alike at every visit (``pose_error``) is one unknown of all checks and of
-the calibration: its weights stand behind :math:`\xi` in one vector :math:`z`.
+carries to :math:`b` and the camera sees at :math:`c`, the residual :math:`r = T c - b = -J \xi +
+\varepsilon`. Each *check* is one to a few such sightings, reduced to an information matrix
+:math:`H` and a vector :math:`g = -\sum J^\top W r`. The cell's motion within a day is one more
+unknown of each check, with a known variance, and is marginalised. The arm's repeatable pose error
+(``pose_error``) is one unknown of all checks and of the calibration: its weights follow :math:`\xi`
+in one vector :math:`z`.
 
-**Steps.** The last :math:`w` checks, with :math:`H` and :math:`g`, are held against those before,
-which start from the calibration's own sightings and estimate :math:`z` as :math:`m` with
-information :math:`B`. A motion of the camera between them has the information and the score
+**Steps.** The last :math:`w` checks, with :math:`H` and :math:`g`, are compared with the earlier
+ones. These begin with the calibration's own sightings and estimate :math:`z` as :math:`m` with
+information :math:`B`. A motion of the camera between both has the information and the score
 
 .. math:: I = P^\top (H - H (H + B)^{-1} H) P, \quad s = P^\top (1 - H (H + B)^{-1}) (g - H m)
 
-where :math:`P` takes the motion's six, and :math:`s^\top I^{+} s` is the generalised likelihood
-ratio of a step (Willsky & Jones 1976), largest over a window (Lai 1995). Its threshold is the
-quantile of an F distribution, for the scatter is learned from the checks before, at the false-alarm
-rate divided by the number of windows: by Bonferroni's inequality no more false alarms come a check.
+where :math:`P` selects the six numbers of the motion, and :math:`s^\top I^{+} s` is the generalised
+likelihood ratio of a step (Willsky & Jones 1976), largest over a window (Lai 1995). Its threshold
+is a quantile of an F distribution, since the scatter is estimated from the earlier checks. The
+level is the false-alarm rate divided by the number of windows (Bonferroni).
 
-**Slow drift.** The mean of the last checks is held against the calibration with the first checks;
-what counts is how far it surely moves a point of the work.
+**Slow drift.** The mean of the last checks is compared with the calibration and the first checks.
+The criterion is the significant part of the shift of a point of the work.
 """
 
 from __future__ import annotations
@@ -48,12 +48,14 @@ class CheckSightings:
 
     Attributes:
         residuals: (N, 5) of the centre in base [m], and of the normal across the flange's axis.
-        effects: (N, 5, 6 + K) their derivative by a motion of the camera about ``about``, then by
-            K weights of the arm's error, which are the same at every check.
-        covariances: (N, 5, 5) with nothing moved, the scan's and the arm's beyond those weights.
+        effects: (N, 5, 6 + K) derivatives of the residuals by a motion of the camera about
+            ``about``, then by K weights of the arm's error, which are the same at every check.
+        covariances: (N, 5, 5) noise of the residuals: of the scan, and of the arm beyond those
+            weights.
         flanges: (N, 3, 3) base_R_flange.
-        joints: (N, 5, n) their derivative by the arm's joints; None where those are not known.
-        check: (N,) which check each belongs to, from 0, in order.
+        joints: (N, 5, n) derivatives of the residuals by the arm's joints; None if these are
+            unknown.
+        check: (N,) index of each sighting's check, from 0, in order.
     """
 
     residuals: Floats
@@ -64,7 +66,7 @@ class CheckSightings:
     check: NDArray[np.intp]
 
     def of(self, first: int, last: int) -> CheckSightings:
-        """Return those of the checks from ``first`` up to, not with, ``last``."""
+        """Return the sightings of the checks from ``first`` to before ``last``."""
         kept = (self.check >= first) & (self.check < last)
         joints = None if self.joints is None else self.joints[kept]
         return CheckSightings(
@@ -75,15 +77,15 @@ class CheckSightings:
 
 @dataclass(frozen=True)
 class DriftTest:
-    """How the test is set.
+    """Settings of the drift test.
 
     Attributes:
         false_alarms: Probability of a false alarm at one check.
-        daily: Standard deviation of what the cell does within days, at the work [m].
-        seasonal: Standard deviation of what it does within a year [m].
-        window: Largest number of checks in which a step is looked for.
-        reference: How many checks before them it is held against.
-        settled: Checks of which a mean is taken for slow drift.
+        daily: Standard deviation of the cell's motion within a day, at the work [m].
+        seasonal: Standard deviation of its motion within a year [m].
+        window: Largest number of last checks searched for a step.
+        reference: Number of earlier checks they are compared with.
+        settled: Number of checks averaged for slow drift.
         limit: Slow drift of the work that counts as moved [m]; half of it, as degraded.
     """
 
@@ -102,11 +104,11 @@ class DriftVerdict:
 
     Attributes:
         state: OK, DEGRADED or MOVED.
-        motion: (6,) of the camera since, about ``about`` (rotation [rad], translation [m]).
-        covariance: (6, 6) of it.
-        shift: How far the motion moves the point of the work it moves most [m].
+        motion: (6,) motion of the camera, about ``about`` (rotation [rad], translation [m]).
+        covariance: (6, 6) of the motion.
+        shift: Largest shift of a point of the work by the motion [m].
         since: Index of the first check after the change; None while there is none.
-        statistic: The test's, over its threshold: above one something moved.
+        statistic: Test statistic over its threshold; above 1 something moved.
     """
 
     state: State
@@ -136,7 +138,7 @@ class Information:
         return cls(matrix, matrix @ np.broadcast_to(mean, len(matrix)))
 
     def loosened(self, deviation: float) -> Information:
-        """Return it after an unknown camera motion of ``deviation`` [m]; see ``allowance``."""
+        """Return the information after an unknown camera motion; see ``allowance``."""
         covariance = self.covariance
         covariance[:6, :6] += allowance(deviation)
         return Information.of_covariance(covariance, self.mean)
@@ -146,22 +148,22 @@ class Information:
         return Information(self.matrix[first:last].sum(0), self.vector[first:last].sum(0))
 
     def plus(self, other: Information) -> Information:
-        """Return both together."""
+        """Return the sum of two informations."""
         return Information(self.matrix + other.matrix, self.vector + other.vector)
 
     @property
     def covariance(self) -> Floats:
-        """(6 + K, 6 + K); zero along what no sighting shows, which pinv does not invert."""
+        """(6 + K, 6 + K) covariance; zero along directions that no sighting shows, by pinv."""
         return np.asarray(np.linalg.pinv(self.matrix, hermitian=True))
 
     @property
     def mean(self) -> Floats:
-        """(6 + K,) the motion, and the weights."""
+        """(6 + K,) the motion and the weights."""
         return np.asarray(self.covariance @ self.vector)
 
 
 def allowance(deviation: float) -> Floats:
-    """Return the (6, 6) covariance of a motion that moves the work by ``deviation`` [m] an axis."""
+    """Return the (6, 6) covariance of a motion that moves the work by ``deviation`` [m]."""
     # The work is about a metre across: what moves its edge by a length turns it by length / 0.5 m
     return np.diag([(deviation / 0.5) ** 2] * 3 + [deviation**2] * 3)
 
@@ -171,8 +173,8 @@ class Prior:
     """Prior of the camera's motion and of the arm's error, before the first check.
 
     Attributes:
-        information: That of the calibration on the camera's motion since and on the arm's error.
-        freedom: Degrees of freedom from which the size of the arm's error is known.
+        information: The calibration's information on the camera's motion and the arm's error.
+        freedom: Degrees of freedom of the estimated size of the arm's error.
     """
 
     information: Information
@@ -206,7 +208,7 @@ def prior_of(sightings: CheckSightings, variances: Floats) -> Prior:
 
     Args:
         sightings: With the calibration's scans and the arm's noise in their covariances.
-        variances: (6 + K,) before them, of the camera's motion and of the arm's weights.
+        variances: (6 + K,) prior variances of the camera's motion and the arm's weights.
     """
     told = _unmarginalised(sightings).summed(0, 1)
     start = Information.of_covariance(np.diag(variances))
@@ -216,13 +218,13 @@ def prior_of(sightings: CheckSightings, variances: Floats) -> Prior:
 
 
 def verdict(checks: Information, prior: Prior, corners: Floats, test: DriftTest) -> DriftVerdict:
-    """Judge the last of the checks; every change found is its first.
+    """Judge the last of the checks.
 
     Args:
         checks: The n checks in order.
         prior: The calibration's information.
-        corners: (8, 3) of the work, from ``about`` [m].
-        test: How it is set.
+        corners: (8, 3) corners of the work, from ``about`` [m].
+        test: Settings of the test.
     """
     n = len(checks.matrix)
     # A step is held against a calibration that the seasons may have moved. Slow drift is that
@@ -264,12 +266,12 @@ def misfits(sightings: CheckSightings, before: Information, test: DriftTest) -> 
 
 
 def largest_shift(motion: Floats, corners: Floats) -> float:
-    """Return by how much a motion (6,) moves the work's corner that it moves most [m]."""
+    """Return the largest shift of a corner of the work by a motion (6,) [m]."""
     return float(np.linalg.norm(np.cross(motion[:3], corners) + motion[3:], axis=1).max())
 
 
 def _deviation(motion: Floats, covariance: Floats, corners: Floats) -> float:
-    """Return the standard deviation of :func:`largest_shift`, along that shift [m]."""
+    """Return the standard deviation of the largest shift, along that shift [m]."""
     shifts = np.cross(motion[:3], corners) + motion[3:]
     lengths = np.linalg.norm(shifts, axis=1)
     worst = int(lengths.argmax())
@@ -282,7 +284,7 @@ def _windows(n: int, test: DriftTest) -> range:
 
 
 def _step(checks: Information, start: Prior, first: int, test: DriftTest) -> tuple[float, int]:
-    """Return the likelihood ratio of a step at check ``first``, over its threshold; and it."""
+    """Return a step's likelihood ratio over its threshold, and the check ``first``."""
     low = max(first - test.reference, 0)
     before = start.information.plus(checks.summed(low, first))
     after = checks.summed(first, len(checks.matrix))
@@ -305,7 +307,7 @@ def _change(after: Information, before: Information) -> Information:
 
 
 def _surprise(change: Information) -> tuple[Floats, Floats]:
-    """Return the squared distances (...) of a motion from none, and ranks."""
+    """Return the squared Mahalanobis distances (...) of a motion from zero, and their ranks."""
     values, axes = np.linalg.eigh(change.matrix)
     # Axes that few scans do not show have eigenvalues of rounding alone: their ratio is noise
     seen = values > 1e-9 * values[..., -1:]
@@ -321,10 +323,10 @@ def _scatter(
     freedom: float,
     fewest: int = 10,
 ) -> tuple[float, float]:
-    """Return by what factor checks scatter more than they say, and its degrees of freedom.
+    """Return the ratio of the checks' scatter to the stated one, and its degrees of freedom.
 
-    The median, so that one bad check does not hide the next; never below a quarter. With few checks
-    it is unknown: the factor is 1, and the degrees of freedom are the calibration's.
+    The ratio is a median, so that one bad check does not hide the next, and at least a quarter.
+    With few checks it is 1, with the calibration's degrees of freedom.
     """
     n = span[1] - span[0]
     if n < fewest:
@@ -348,7 +350,7 @@ def _slow(checks: Information, prior: Prior, test: DriftTest) -> tuple[Floats, F
 
 
 def _began(checks: Information, corners: Floats, prior: Prior, test: DriftTest) -> int:
-    """Return the check at which a slow drift had gone a quarter of its limit, for good."""
+    """Return the check after which a slow drift stays above a quarter of its limit."""
     shifts = []
     for n in range(test.settled, len(checks.matrix) + 1):
         motion, _ = _slow(Information(checks.matrix[:n], checks.vector[:n]), prior, test)
@@ -371,13 +373,13 @@ def sightings_of(  # noqa: PLR0913  one argument a measured quantity
 
     Args:
         pose: (4, 4) base_T_camera.
-        about: (3,) where motions are taken [m].
+        about: (3,) reference point of motions [m].
         centres: (N, 3) in camera [m].
         normals: (N, 3) in camera; NaN where none was measured.
         covariances: (N, 5, 5) in base, tilts across the flange's axis last.
-        expected: (N, 4, 4) the frame of the circle in base, where the arm is believed to have it.
+        expected: (N, 4, 4) expected pose of the circle in base, by the arm.
         jacobians: (N, 6, n) of the circle's centre (rotation, translation), or None.
-        check: (N,) which check each belongs to.
+        check: (N,) index of each sighting's check.
     """
     turn, axes = pose[:3, :3], expected[:, :3, 2]
     across = expected[:, :3, :2].transpose(0, 2, 1)

@@ -1,15 +1,15 @@
 r"""An arm's pose error over its workspace, estimated from one calibration. Arrays only.
 
-An arm's joint zeros, lengths and encoders make errors that repeat: the same pose is wrong by the
-same, a pose nearby by nearly the same. So the error of a pose is a sum over few smooth functions of
-place and orientation, with weights :math:`w`, and independent noise beyond:
+An arm's joint zeros, lengths and encoders make repeatable errors that change smoothly with the
+pose. The error of a pose is a sum of few smooth functions of position and orientation, with weights
+:math:`w`, plus independent noise:
 
 .. math:: e(u) = \sum_k f_k(u) w_k + \varepsilon, \quad w_k \sim N(0, s^2), \quad
     \varepsilon \sim N(0, n^2)
 
 with the features of :mod:`flangeye.maths.arm_correction`, to second order in place and first in
-orientation. The sizes :math:`s` and :math:`n`, of places and of tilts, are those that make the
-calibration's residuals likeliest while the camera is free.
+orientation. The sizes :math:`s` and :math:`n`, of positions and of tilts, maximise the likelihood
+of the calibration's residuals with a free camera pose.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ class ArmPoseErrors:
     """The errors of an arm's poses, with their sizes.
 
     Attributes:
-        middle: (4, 4) pose about which they are smooth.
-        lengths: (6,) over which they change: of place [m], then of orientation [rad].
-        smooth: Standard deviations of the weights, of a place [m] and of an orientation [rad].
-        noise: Standard deviations beyond, of a centre [m] and of a tilt [rad].
+        middle: (4, 4) pose in the middle of the workspace.
+        lengths: (6,) correlation lengths: of position [m], then of orientation [rad].
+        smooth: Standard deviations of the weights, of a position [m] and of an orientation [rad].
+        noise: Standard deviations of the noise, of a centre [m] and of a tilt [rad].
     """
 
     middle: Floats
@@ -62,12 +62,12 @@ class ArmPoseErrors:
 
     @property
     def variances(self) -> Floats:
-        """(K,) of the weights."""
+        """(K,) prior variances of the weights."""
         return np.repeat(np.square(self.smooth), 3 * len(POWERS))
 
     @property
     def with_camera(self) -> Floats:
-        """(6 + K,) variances of a motion of the camera, not known [rad^2, m^2], and weights."""
+        """(6 + K,) variances of a free motion of the camera [rad^2, m^2], and of the weights."""
         return np.concatenate([np.ones(6), self.variances])
 
     @property
@@ -81,7 +81,7 @@ def pose_error_of(residuals: Floats, effects: Floats, own: Floats, poses: Floats
 
     Args:
         residuals: (N, 5) of centre [m] and tilt [rad].
-        effects: (N, 5, 6) their derivative by a motion of the camera, which is free.
+        effects: (N, 5, 6) derivatives of the residuals by a free motion of the camera.
         own: (N, 5, 5) covariances of the scans alone.
         poses: (N, 4, 4) of the circle in ``base``.
     """
@@ -120,7 +120,7 @@ def _sized(bare: ArmPoseErrors, logs: Floats) -> ArmPoseErrors:
 
 
 def _unlikelihood(design: Floats, residuals: Floats, own: Floats, error: ArmPoseErrors) -> float:
-    """Return minus twice the log of the marginal likelihood, but for a constant."""
+    """Return -2 log of the marginal likelihood, up to a constant."""
     # Woodbury's identity and the determinant lemma: no matrix is larger than 6 + K. The camera's
     # variance of 1 rad^2 and 1 m^2 leaves it free, which makes the likelihood a restricted one
     noise = own + error.beyond

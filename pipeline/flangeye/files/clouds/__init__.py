@@ -1,9 +1,9 @@
 """Point cloud files: PCD, PLY, NumPy arrays and plain text, read strictly and without surprises.
 
-A file is refused, never repaired: its header is held against its size before anything is
-allocated, so a header that promises a billion points costs nothing. Points that are not finite
-are kept, as missing points, so that organised clouds keep their grid; a file of nothing but
-missing points is a valid file.
+A damaged file is refused, never repaired. Its header is checked against its size before memory is
+allocated, so a header that states a billion points costs nothing. Points that are not finite are
+kept, as missing points, so that organised clouds keep their grid; a file of nothing but missing
+points is a valid file.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from flangeye.types import CAMERA, PointCloud
 def mark_missing(xyz: Points) -> str:
     """Set the values by which scanners mark missing points to NaN, in place.
 
-    A point that is repeated is none where it is the scanner's own origin, or farther than all
-    others; so are points of one depth that is :data:`FARTHER` than all others.
+    A repeated point is missing if it is the scanner's origin, or farther than all others. Points of
+    one depth are missing if that depth is :data:`FARTHER` than all others.
 
     Args:
         xyz: (N, 3) in the file's own unit.
 
     Returns:
-        Sentence about what was taken for missing, and how often; empty where nothing was.
+        Sentence about which points were taken as missing, and how many; empty if none were.
     """
     some = xyz[:: max(1, len(xyz) // 4096)]
     some = some[np.isfinite(some).all(axis=1)]
@@ -104,7 +104,7 @@ def read_cloud(
 
     Args:
         path: A file with one of :data:`CLOUD_FILES`.
-        unit: Unit of the file's coordinates, where its heading does not state one.
+        unit: Unit of the file's coordinates, if its heading states none.
         told: Called with each note about the file: numbers that stand for missing points, and a
             VIEWPOINT that is not the identity.
         from_viewpoint: Whether to turn the points into the frame of the file's VIEWPOINT.
@@ -136,7 +136,7 @@ def check_cloud_file(path: Path) -> int:
     """Return the number of points in a file, after checking its header against its size.
 
     Raises:
-        StageError: As :func:`read_cloud`; only damage inside the data is left to be found there.
+        StageError: As :func:`read_cloud`, except for damage inside the data.
     """
     return math.prod(_open(path).shape)
 

@@ -45,8 +45,8 @@ WIDEST = 16
 def open_npy(path: Path) -> PointTable:
     """Return the points of an array.
 
-    It is (N, 3) or (H, W, 3), of more columns the first three, or (3, N) or (3, H, W), or has
-    records with x, y and z.
+    The array is (N, 3) or (H, W, 3), (3, N) or (3, H, W), or has records with x, y and z; further
+    columns are ignored.
 
     Raises:
         StageError: It is not such an array.
@@ -65,11 +65,11 @@ def open_npy(path: Path) -> PointTable:
 def open_npz(path: Path) -> LoadedTable:
     """Return the points of an archive of arrays.
 
-    They are its arrays x, y and z, or the array (N, 3) or (H, W, 3) that is called as clouds are,
-    or that is the only one of three, four or six numbers a point.
+    They are its arrays x, y and z, or an array (N, 3) or (H, W, 3). The array has a usual name for
+    clouds, or is the only one with three, four or six numbers a point.
 
     Raises:
-        StageError: It holds no such array, or several that none is called so.
+        StageError: The archive has no such array, or several without a usual name.
     """
     read_head(path)
     arrays = {name.lower(): array for name, array in load_npz(path).items()}
@@ -107,7 +107,7 @@ def load_npy(path: Path) -> NDArray[Any]:
 
 
 def load_npz(path: Path, only: str | None = None) -> dict[str, NDArray[Any]]:
-    """Return the arrays of numbers of an .npz file by name, or ``only`` the one so called.
+    """Return the arrays of numbers of an .npz file by name, or ``only`` the one of that name.
 
     Raises:
         StageError: It is missing or damaged, or an array is too large.
@@ -178,7 +178,7 @@ def _shape_in(
 ) -> tuple[Shape, tuple[str, ...]]:
     """Return the shape that a header states, and the names of the fields of records.
 
-    The shape is held against the size of the whole [bytes].
+    The shape is checked against the size of the whole [bytes].
     """
     try:
         shape, kind = _header(file)
@@ -253,7 +253,7 @@ class LoadedTable:
     xyz: NDArray[Any]
 
     def check(self) -> None:
-        """It was read whole when it was opened."""
+        """Do nothing: the file was read whole when it was opened."""
 
     def decode(self) -> Points:
         """Return the points."""
@@ -264,13 +264,13 @@ class LoadedTable:
 def open_text(path: Path) -> TextTable:
     """Return the points of a table as text: x, y, z first, or wherever a heading names them.
 
-    Values are separated by blanks, tabs, commas or semicolons; where those are not commas,
-    decimals may stand behind one. Lines behind ``#``, ``//`` or ``%`` are remarks; the last one
+    Values are separated by blanks, tabs, commas or semicolons; unless commas separate values, they
+    may be decimal commas. Lines that begin with ``#``, ``//`` or ``%`` are remarks; the last one
     above the points may be the heading. A first row with one whole number is the count of points
-    (``.pts``). A unit that the heading states, ``x_mm`` or ``X [mm]``, is that of the file.
+    (``.pts``). The heading may state the unit: ``x_mm`` or ``X [mm]``.
 
     Raises:
-        StageError: Its first row is neither three numbers or more nor a heading.
+        StageError: The first row is neither a heading nor three or more numbers.
     """
     head = read_head(path)
     offset = len(BOM_UTF8) if head.startswith(BOM_UTF8) else 0
@@ -315,7 +315,7 @@ def _heading(cells: list[str]) -> list[tuple[str, str]]:
 
 
 def _cells(line: str) -> tuple[list[str], str | None, bool]:
-    """Return the values of a row, what separates them, and whether decimals are behind a comma."""
+    """Return the values of a row, their separator, and whether it has decimal commas."""
     row = line.lstrip("#/% ").strip()
     delimiter = next((mark for mark in ";\t," if mark in row), None)
     comma = (delimiter != "," and "," in row) or (delimiter == "," and _has_decimal_commas(row))

@@ -50,7 +50,7 @@ def split_header(path: Path, last: bytes, sort: str) -> tuple[list[list[str]], i
         The lines, and the byte at which the points begin.
 
     Raises:
-        StageError: The file is missing or empty, or no line begins so: it is not of this sort.
+        StageError: The file is missing or empty, or no line begins so, so it is not of this format.
     """
     lines: list[list[str]] = []
     offset = 0
@@ -75,10 +75,10 @@ def axes_of(path: Path, names: Iterable[str]) -> tuple[int, int, int]:
 
 
 def count_of(path: Path, what: str, text: str) -> int:
-    """Return a count a header states.
+    """Return a count that a header states.
 
     Raises:
-        StageError: It is not a whole number from 0 on, of a size a file can have.
+        StageError: The count is not a whole number from 0 on, or exceeds any file.
     """
     # Counts stay below 2^63
     if not (text.isascii() and text.isdigit() and len(text) <= 18):
@@ -168,8 +168,8 @@ class TextTable:
         rows: Rows in all, points and others.
         delimiter: What separates values, white space if None.
         unit: Unit of the coordinates, where a heading states it; else empty.
-        comma: Whether decimals are behind a comma.
-        remarks: Whether lines between the rows are remarks.
+        comma: Whether decimals follow a comma.
+        remarks: Whether remarks stand between the rows.
         viewpoint: As for :class:`BinaryTable`.
     """
 
@@ -214,7 +214,7 @@ class TextTable:
         return np.ascontiguousarray(values[:, list(self.axes)])
 
     def _as_numbers(self, text: Iterable[str]) -> Iterator[str]:
-        """Yield rows as NumPy reads them: decimals behind a point, ``nan`` in an empty cell."""
+        """Yield rows in NumPy's format: decimal points, and ``nan`` for an empty cell."""
         mark = self.delimiter
         for row in filter(is_row, text):
             read = row.replace(",", ".") if self.comma else row
@@ -244,7 +244,7 @@ class BinaryTable:
         shape: (N,) or (H, W).
         offset: Byte at which the records begin.
         record: Layout of a record, with fields ``x``, ``y``, ``z``.
-        viewpoint: Where the scanner stood, by the file; None where it does not state that.
+        viewpoint: The scanner's pose by the file; None if it states none.
     """
 
     path: Path
@@ -254,7 +254,7 @@ class BinaryTable:
     viewpoint: Any = None
 
     def check(self) -> None:
-        """Compare bytes; more than the records need is padding, which writers leave."""
+        """Check that the file has the bytes of all records; further bytes are padding."""
         promised = math.prod(self.shape)
         found = max(0, self.path.stat().st_size - self.offset)
         if found < promised * self.record.itemsize:
@@ -285,7 +285,7 @@ class CompressedTable:
         path: The file.
         shape: (N,) or (H, W).
         offset: Byte at which the two sizes and the stream begin.
-        record: Layout one point would have, with fields ``x``, ``y``, ``z``.
+        record: Layout of one point, with fields ``x``, ``y``, ``z``.
         viewpoint: As for :class:`BinaryTable`.
     """
 
