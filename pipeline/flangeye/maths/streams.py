@@ -79,13 +79,13 @@ def passed(
     at: float,
     others: Mapping[str, tuple[Floats, Floats]] | None = None,
 ) -> Motion:
-    """Return how the stream's flange passed a moment ``at`` that lies in the stream.
+    """Return the flange's motion about a moment ``at`` of the stream.
 
     Args:
-        times: The stream's.
-        poses: The stream's.
+        times: Times of the stream.
+        poses: Poses of the stream.
         at: The moment [s].
-        others: Times and poses of what else moves, by frame.
+        others: Times and poses of other moving frames, by name.
     """
     steps = PASSED_STEP * np.arange(-10, 11, dtype=np.float64)
     more = others or {}
@@ -163,7 +163,7 @@ def clock_offset(
         second: The same of the second, in any unit.
 
     Returns:
-        Offset [s] and correlation: 0 and 0 where nothing clear was found.
+        Offset [s] and correlation; both 0 if no clear offset was found.
     """
     step = float(min(np.median(np.diff(first[0])), np.median(np.diff(second[0])), 0.05))
     most = 1_000_000  # steps; times in a unit that was not stated may span centuries
@@ -186,7 +186,7 @@ def clock_offset(
 def _correlation(
     wanted: Floats, grid: Floats, signal: tuple[Floats, Floats], shift: float
 ) -> float:
-    """Return how alike two signals are once the second is moved by ``shift``, -1 to 1."""
+    """Return the correlation (-1 to 1) of two signals with the second moved by ``shift``."""
     inside = (grid >= signal[0][0] + shift) & (grid <= signal[0][-1] + shift)
     if inside.sum() < 10:
         return 0.0

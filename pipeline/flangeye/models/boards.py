@@ -1,7 +1,7 @@
 """Flat printed targets: the places of their corners, and their images.
 
 The frame ``target`` has its origin in the middle of the board, x to the right, y up and z towards
-whoever looks at it. Lengths are those of the print [m].
+the viewer. Lengths are those of the print [m].
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Board:
         square: Edge of a square, or of the marker [m].
         marker: Edge of a ChArUco board's markers [m].
         dictionary: Family of the markers, one of :data:`DICTIONARIES`.
-        marker_id: Which marker, where it is one alone.
+        marker_id: Number of the marker, for a single marker.
     """
 
     kind: Kind

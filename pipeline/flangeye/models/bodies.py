@@ -1,4 +1,4 @@
-"""A body of known shape that a scan is searched for: a gripper, a torch, a plate, by its CAD."""
+"""A body of known shape to find in a scan: a gripper, a torch, a plate, by its CAD."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class TargetBody:
         name: Shown in messages and reports.
         vertices: (V, 3) [m].
         triangles: (T, 3) indices of vertices.
-        note: How its unit was judged; empty where it was stated.
+        note: Note on how the unit was inferred; empty if it was stated.
     """
 
     name: str
@@ -67,7 +67,7 @@ class TargetBody:
         return np.asarray(ends[np.argsort(-length, kind="stable")[:most]])
 
     def as_ply(self) -> str:
-        """Return it as an ASCII PLY file in metres, to 0.1 um."""
+        """Return the body as an ASCII PLY file in metres, to 0.1 um."""
         head = (
             f"ply\nformat ascii 1.0\nelement vertex {len(self.vertices)}\n"
             "property float x\nproperty float y\nproperty float z\n"
@@ -98,7 +98,7 @@ class ArmBody(TargetBody):
         """Return the arm at joint angles (n,) [rad], drawn in its flange's frame.
 
         Raises:
-            StageError: They are not known.
+            StageError: The joint angles are unknown.
         """
         if joints is None or len(joints) != self.arm.n:
             raise StageError(
@@ -137,7 +137,7 @@ def arm_body(robot: RobotModel | None, links: Mapping[int, str], near: Path) -> 
         near: Folder of the recipe.
 
     Raises:
-        RecipeError: There is no arm, or nothing is known of how it looks.
+        RecipeError: The recipe has no arm, or the arm's surface is unknown.
     """
     if robot is None:
         raise RecipeError(f"body: {ARM} is the arm itself; name it, robot: {{urdf: arm.urdf}}")
@@ -210,7 +210,7 @@ def load_body(name: str, unit: LengthUnit | None, near: Path) -> TargetBody:
 
 
 def _unit_of(path: Path, vertices: Floats, unit: LengthUnit | None) -> tuple[LengthUnit, str]:
-    """Return the unit of a mesh, and how it was judged; empty where it was stated."""
+    """Return the unit of a mesh, and how it was inferred; empty if it was stated."""
     across = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     sizes = {each: across / PER_METRE[each] for each in PER_METRE}
     fitting = [each for each, size in sizes.items() if SMALLEST <= size <= LARGEST]

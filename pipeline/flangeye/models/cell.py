@@ -1,7 +1,7 @@
-"""A cell: any number of arms, rails, positioners, cameras and targets, and who carries whom.
+"""A cell as a tree of frames: arms, rails, positioners, cameras and targets.
 
-What moves has two frames: ``NAME_base``, which stands somewhere, and ``NAME``, which its controller
-places in that base: an arm's flange, a rail's carriage, a positioner's plate. Cameras and targets
+A moving device has two frames: a fixed ``NAME_base``, and ``NAME``, whose pose in that base its
+controller reports: an arm's flange, a rail's carriage, a positioner's plate. Cameras and targets
 stand on these, on a link of an arm (``NAME_link3``), whose place in the arm's base follows from its
 joints, or on the root of the cell, ``base``.
 """
@@ -43,8 +43,8 @@ class Frame:
 
     Attributes:
         parent: Its parent frame.
-        place: (4, 4) parent_T_frame where it is known and still; (M, 4, 4) where it is measured at
-            M times; None where it is still and to be found.
+        place: parent_T_frame: (4, 4) if fixed and known; (M, 4, 4) if measured at M times; None if
+            fixed and unknown.
     """
 
     parent: str
@@ -131,11 +131,11 @@ class Link:
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """Who carries whom in a cell.
+    """The frames of a cell, its carriers, cameras and targets.
 
     Attributes:
         frames: By name. The place of what moves is None here: observations have it.
-        movers: What moves which frame; None for an arm of which no model is known.
+        movers: The arm or axis that moves a frame; None for an arm without a model.
         cameras: Frames of cameras, in the recipe's order.
         targets: Frames of targets.
         links: By frame, the links that carry something. Their places are None, too: they follow
@@ -197,7 +197,7 @@ class Cell:
         return replace(motion, others={**own, **motion.others, **placed})
 
     def reported(self, poses: Mapping[str, Floats], axes: Mapping[str, float]) -> Poses:
-        """Return where each carrier is in its base, by recorded poses (4, 4) and values of axes."""
+        """Return each carrier's pose in its base, from recorded poses (4, 4) and axis values."""
         places = dict(poses)
         for name, mover in self.movers.items():
             if isinstance(mover, Axis) and name in axes:
@@ -279,8 +279,8 @@ class Cell:
     ) -> list[Observation]:
         """Return observations with every flange where a calibration's correction has it.
 
-        What the calibration found of all poses alike comes off what was seen. Without a
-        correction they are the observations as they are.
+        The errors that all poses share are also removed from the features. Without a correction the
+        observations are unchanged.
         """
         from flangeye.maths.arm_correction import corrected_observation
         from flangeye.maths.kinematics import Arm
@@ -297,7 +297,7 @@ class Cell:
     def ends(
         self, transforms: Mapping[str, Transform], observations: Sequence[Observation]
     ) -> Ends:
-        """Return where camera and target of each observation are.
+        """Return the poses of each observation's camera and target.
 
         Args:
             transforms: The unknowns, by name.
@@ -370,7 +370,7 @@ def cell_of(
     Args:
         configuration: Who carries camera and target.
         robot: The arm's model, where it is known.
-        second: That of the arm that carries the target before another's camera.
+        second: Model of a second arm that carries the target.
     """
     frames = {FLANGE: Frame(BASE), CAMERA: Frame(configuration.camera)}
     movers: dict[str, RobotModel | Axis | None] = {FLANGE: robot}

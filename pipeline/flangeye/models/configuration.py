@@ -1,4 +1,4 @@
-"""Mountings: who carries the camera and the target, and so which transforms are unknown.
+"""Mountings of camera and target, and the transforms that each leaves unknown.
 
 All configurations are one loop of frames, read from the robot's base:
 
@@ -51,8 +51,8 @@ class Configuration:
         name: One of :data:`CARRIERS`.
         camera: Frame that carries the camera.
         target: Frame that carries the target.
-        stands: Where the target stands in that frame: position [m], and roll, pitch and yaw [rad];
-            None where it is to be found.
+        stands: The target's pose in its carrier: position [m], and roll, pitch and yaw [rad]; None
+            if unknown.
     """
 
     name: str = "eye-on-base"
@@ -110,7 +110,7 @@ def _pose_of(carrier: str) -> str | None:
 
 @dataclass(frozen=True, eq=False)
 class Ends:
-    """Where N observations have their two ends, by the controllers and the transforms.
+    """Poses of camera and target at N observations, from the controllers and the transforms.
 
     Attributes:
         camera: (N, 4, 4) of the camera, in ``base``.

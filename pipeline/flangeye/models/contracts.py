@@ -78,7 +78,7 @@ class ProfilerPart(Protocol):
     """``profiler``: opens a profile sensor behind the torch."""
 
     def __call__(self, robot: StateSource, sensor: TactileSensor, seed: Seed) -> Profiler:
-        """Return the open profile sensor; ``sensor`` is the finger's, open, whose world it shares.
+        """Return the open profile sensor; ``sensor`` is the finger's open sensor.
 
-        A real one needs nothing of the finger's sensor; a simulated one sees what that stands in.
+        A real profile sensor ignores the finger's sensor; a simulated one shares its world.
         """

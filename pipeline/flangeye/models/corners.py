@@ -50,8 +50,8 @@ def find_corners(board: Board, image: Image, thorough: bool = True) -> Corners |
     """Find a board's corners in an image.
 
     Args:
-        board: What to look for.
-        image: Where.
+        board: The board to find.
+        image: The image to search.
         thorough: Whether a checkerboard that is not found is looked for in every way; a large
             image without one takes seconds then.
     """
@@ -68,7 +68,7 @@ class SeenBoard(NamedTuple):
     Attributes:
         kind: Which kind of board.
         params: What the image shows of its parameters: columns, rows, dictionary, id.
-        what: The same as text.
+        what: The board's parameters as text.
     """
 
     kind: Kind
@@ -341,7 +341,7 @@ def corners_of_square(grey: NDArray[np.uint8], rough: Floats, image: Image) -> F
 
 
 def _straight(pixels: Floats, image: Image) -> Floats:
-    """Return where pixels (N, 2) would be without the lens's distortion."""
+    """Return pixels (N, 2) with the lens's distortion removed."""
     import cv2
 
     if not (len(pixels) and image.distortion.any()):
@@ -352,7 +352,7 @@ def _straight(pixels: Floats, image: Image) -> Floats:
 
 
 def _bent(pixels: Floats, image: Image) -> Floats:
-    """Return where the lens has what would be at pixels (N, 2) without its distortion."""
+    """Return undistorted pixels (N, 2) with the lens's distortion applied."""
     import cv2
 
     if not image.distortion.any():

@@ -33,7 +33,7 @@ def as_built(robot: RobotModel, path: Path) -> RobotModel:
         path: ``calibration.conf``, or the ROS driver's kinematics ``.yaml``.
 
     Raises:
-        RecipeError: It is none of a UR, cannot be read, or is of another arm.
+        RecipeError: The file is not a UR's, cannot be read, or belongs to another arm.
     """
     if robot.maker != "Universal Robots" or robot.convention != "standard":
         raise RecipeError(f"{path}: a factory calibration is a UR's; {robot.model} has none")

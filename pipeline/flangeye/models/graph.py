@@ -55,9 +55,9 @@ class RunningCell:
         robot: The section of the arm, without limits.
         scanner: The section of the camera, without its model.
         flange: base_T_flange (4, 4) now [m].
-        camera: base_T_camera (4, 4) [m], where the graph has it.
-        pixels: What a camera of images alone sees now, (H, W) or (H, W, 3), empty where nothing
-            came; None for one of clouds or depths.
+        camera: base_T_camera (4, 4) [m], if the graph has it.
+        pixels: Present image of a camera without depth, (H, W) or (H, W, 3), empty if none arrived;
+            None for a camera of clouds or depths.
         files: Texts of the files that the sections name, by name.
         steps: Steps to add at the recipe's end.
         seen: Lines of text about what runs.
@@ -97,8 +97,8 @@ class Graph(Device, Protocol):
         """Return the arm and the camera that run.
 
         Args:
-            ask: For what cannot be seen.
-            name: What to call the files.
+            ask: Callback for what the graph does not show.
+            name: Base name of the files.
 
         Raises:
             FlangeyeError: There is no arm or no camera; the message says what there is.
@@ -109,7 +109,7 @@ class Graph(Device, Protocol):
 
         Args:
             pose: Pose of one camera, or of a whole cell.
-            frames: Our name of a frame -> the graph's.
+            frames: Frame name in flangeye -> frame name in the graph.
 
         Returns:
             A line for each transform.
@@ -135,10 +135,10 @@ class EmulatorOptions:
         host: Address it listens on.
         joints: Angles it starts at [rad]; None for a pose of its own choice.
         floor: Height of a horizontal surface the tool can touch [m]; None for no surface.
-        faults: What shall go wrong, in the words of the controller.
+        faults: Faults to simulate, by the controller's names for them.
         seed: Draws errors of the joints' zeros, as large as the robot's ``joint_accuracy``; None
             for an arm that stands exactly where it reports.
-        with_input: Whether it ends when its standard input does.
+        with_input: Whether the emulator ends when its standard input is closed.
     """
 
     robot: RobotModel
@@ -156,7 +156,7 @@ class Emulator:
 
     Attributes:
         name: Shown in messages and reports.
-        maker: Whose arms it controls, as ``data/robots/*.yaml`` spells it.
+        maker: Maker of the arms it controls, as ``data/robots/*.yaml`` spells it.
         serve: Runs it until the process receives a signal to end.
     """
 

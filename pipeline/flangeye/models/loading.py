@@ -21,7 +21,7 @@ from flangeye.models.targets import load_standard
 
 
 def load_model(kind: Literal["robots", "scanners"], name: str, near: Path | None = None) -> Any:
-    """Return the robot or scanner ``name``: a bundled model, or a path to one's own file.
+    """Return the robot or scanner ``name``: a bundled model, or a path to a user's file.
 
     A scanner's file with no more than a name and a range is a :class:`ScannerData`; with more, it
     has all that a simulation needs.
@@ -126,7 +126,7 @@ def _write(path: Path, data: Mapping[str, Any]) -> None:
 
 
 def require_new(path: Path) -> None:
-    """Refuse to write a model's file there, before anything is asked for it.
+    """Refuse a path to which no model file can be written, before asking for values.
 
     Raises:
         RecipeError: The file exists, or does not end as a model's file does.

@@ -160,7 +160,7 @@ class RobotModel(Model):
     def meshes(self) -> list[tuple[int, Any]]:
         """Return the arm's visible meshes: a trimesh [m] and the number of its moving frame.
 
-        Nothing of an arm that is not given by a URDF, or whose meshes are not there.
+        The list is empty for an arm without a URDF or whose mesh files are missing.
         """
         try:
             return list(self._bodies.meshes()) if self._bodies else []
@@ -181,7 +181,8 @@ class RobotModel(Model):
         """Return the capsules that bound the arm, without which no move is planned.
 
         Raises:
-            StageError: They are not known; the message says why, and what to write.
+            StageError: The capsules are unknown; the message says why, and what to write in the
+                file.
         """
         filled = self.filled()
         if filled.volumes_missing:

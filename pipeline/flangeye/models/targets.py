@@ -62,7 +62,7 @@ def plate_of(robot: RobotModel) -> Flange:
     """Return the plate that an arm's own file names.
 
     Raises:
-        RecipeError: It names none.
+        RecipeError: The arm's file names no plate.
     """
     if robot.flange.standard is None:
         raise RecipeError(
@@ -112,8 +112,8 @@ class Sphere(BaseModel):
     """A calibration sphere. All SI.
 
     Attributes:
-        size: Radius of the sphere, None where it is to be found.
-        centre_in_flange: Its centre in the frame that carries it, mostly ``flange``.
+        size: Radius of the sphere; None if it is estimated.
+        centre_in_flange: Its centre in the carrying frame, usually ``flange``.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
@@ -190,7 +190,7 @@ class HoleMatch(NamedTuple):
 
     Attributes:
         angle: From the first axis to the flange's x axis, about the normal [rad], in (-pi, pi].
-        score: How much emptier the pattern's holes are than the rest of the ring, at most 1.
+        score: Emptiness of the pattern's holes less that of the rest of the ring, at most 1.
         rival: The best score elsewhere.
     """
 
@@ -202,12 +202,12 @@ class HoleMatch(NamedTuple):
 def match_holes(flat: Floats, flange: Flange) -> HoleMatch | None:
     """Return the angle of the hole pattern in a face, or None if no pattern is recognised.
 
-    The face is empty where a hole is. How empty a ring about the pitch circle is, by angle, is
+    The face has no points in a hole. The emptiness of a ring about the pitch circle, by angle, is
     compared with the known pattern at every rotation.
 
     Args:
         flat: (N, 2) points of the face about its centre, in the axes of ``basis_of_plane`` [m].
-        flange: Whose pattern to look for; one without holes has none.
+        flange: Flange whose pattern is sought; a flange without holes has none.
     """
     if not flange.holes:
         return None

@@ -199,7 +199,7 @@ class UrdfBodies:
     def meshes(self) -> Iterator[tuple[int, Any]]:
         """Yield the shape of each link as a trimesh in its moving frame, and the frame's number.
 
-        Collision meshes first: they have a twentieth of the triangles of what is meant to be seen.
+        Collision meshes are preferred: they have a twentieth of the visual meshes' triangles.
 
         Raises:
             RecipeError: A mesh is missing or wrong.
@@ -215,7 +215,7 @@ class UrdfBodies:
                     yield index, mesh.apply_transform(pose @ origin_of(self.urdf.path, body))
 
     def without(self) -> list[str]:
-        """Return the moved links that have no body, nor has any link fixed to them."""
+        """Return the moved links without a body of their own or on a link fixed to them."""
         bodies: dict[int, list[str]] = {}
         for link, index, _ in self.links():
             of = self.urdf.links.get(link)

@@ -197,7 +197,7 @@ class Capsule(NamedTuple):
     Attributes:
         start: (3,) one end of the segment [m].
         end: (3,) the other.
-        radius: Round it [m].
+        radius: Radius about the segment [m].
     """
 
     start: Floats

@@ -81,10 +81,10 @@ def workspace_of(source: t.Source, given: t.Box | None, pairs: Sequence[t.Pair])
 
 
 def work_of(calibration: t.HandEye, source: t.Source, given: t.Box | None) -> t.Box | None:
-    """Return where the work is, in the frame that carries the camera.
+    """Return the box of the work, in the frame that carries the camera.
 
-    That of :func:`workspace_of` where it is the base; where the robot moves the camera, and in a
-    cell, the box around what it looked at.
+    For a camera on the base it is the box of :func:`workspace_of`. For a camera on the robot, and
+    in a cell, it is the box around the seen targets.
     """
     camera = calibration.camera.transform
     if camera.parent == t.BASE and (given or source.workspace or camera.child == t.CAMERA):

@@ -1,8 +1,8 @@
 """An arc that burns only while the arm is led: switched in the process that guards the arm.
 
 The guard opens the power source with the arm. Commands to the arm carry what the arc is to do: a
-seventh number after the six of the twist. What stops the arm (the guard, for any reason; a program
-that is silent, hangs or is gone) ends the arc with it.
+seventh number after the six of the twist. Every stop of the arm also ends the arc: by the guard, or
+because the program is silent, hangs or has ended.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class ArcedArm(Device):
         self._flows_until: int | None = None
 
     def __getattr__(self, name: str) -> Any:
-        """Return what else the arm has: its name, its period."""
+        """Return any other attribute of the arm, such as its name or period."""
         return getattr(self._robot, name)
 
     def state(self) -> RobotState:
@@ -59,7 +59,7 @@ class ArcedArm(Device):
         return self._robot.state()
 
     def wait_cycle(self) -> None:
-        """Wait for the arm's next cycle, and see to gas and arc.
+        """Wait for the arm's next cycle, and check gas and arc.
 
         Raises:
             DeviceError: The arm is lost, or the arc went out or was not established.

@@ -52,7 +52,7 @@ class WatchedArm:
 
     Attributes:
         name: Shown in messages and reports.
-        period: Between two of the controller's cycles [s].
+        period: Duration of the controller's cycle [s].
     """
 
     def __init__(self, wire: Connection, told: Told, patience: float | None = OPENING) -> None:
@@ -164,7 +164,7 @@ def watched(
         driver: Opens the arm. It runs in the guard's process, or, where the driver has to talk
             to the person, in a thread of this one.
         model: The arm's model.
-        limits: What the arm must keep to.
+        limits: The arm's motion limits.
         told: Called with the arm's state several times during the motion.
 
     Raises:

@@ -17,7 +17,7 @@ class ArmVolume:
     """The capsules that bound an arm."""
 
     def __init__(self, robot: RobotModel) -> None:
-        """Take them from the catalogue.
+        """Take the capsules from the arm's model.
 
         Raises:
             StageError: The space that the arm fills is not known, so no clearance can be checked.
@@ -56,7 +56,7 @@ class ArmVolume:
         return bool((segment_distance(axes, segment) > self.radii + room).all())
 
     def hides(self, axes: Floats, sight: Floats) -> Mask:
-        """Return (S,) which lines of sight (S, 2, 3) a link before the flange's own crosses."""
+        """Return (S,) which lines of sight (S, 2, 3) are crossed by a link other than the last."""
         before = self._before
         gaps = segment_distance(axes[before, None], sight[None])
         return np.asarray((gaps < self.radii[before, None]).any(axis=0))
@@ -72,14 +72,14 @@ class ArmVolume:
 
 
 class BodyView:
-    """What of a body on an arm, or of the arm itself, is seen at its joint angles.
+    """Visibility of a body on an arm, or of the arm itself, at given joint angles.
 
     Attributes:
         is_arm: Whether it is the arm itself.
     """
 
     def __init__(self, body: TargetBody, arm: Arm) -> None:
-        """Spread points over the body's surface, and prepare what may hide them."""
+        """Spread points over the body's surface, and prepare the occluding parts."""
         import open3d as o3d
         import trimesh
 

@@ -25,8 +25,8 @@ class Margins(NamedTuple):
     """Safety margins of poses to limits, singularities and collisions.
 
     Attributes:
-        limits: What it must keep to.
-        joints: Room to the joints' limits [rad].
+        limits: The arm's motion limits.
+        joints: Margin to the joints' limits [rad].
         singularity: Smallest singular value of the Jacobian, lengths in units of the reach.
     """
 
@@ -39,8 +39,8 @@ class Refusal(NamedTuple):
     """A pose of the flange that is impossible.
 
     Attributes:
-        place: (3,) of the flange, in ``base`` [m].
-        reason: Why.
+        place: (3,) position of the flange, in ``base`` [m].
+        reason: Why the pose is impossible.
     """
 
     place: Floats
@@ -53,7 +53,7 @@ class Reach:
     Attributes:
         arm: Its kinematics.
         shown: (3,) axis of the flange that faces the scanner: z, or where a body is broadest.
-        refusals: The poses that were asked for and are impossible.
+        refusals: Requested poses that are impossible.
         home: (n,) joint angles of the pose that faces the scanner best; see :meth:`facing` [rad].
     """
 
@@ -69,11 +69,11 @@ class Reach:
 
         Args:
             robot: The arm.
-            scanner: What looks at it.
-            base_T_camera: (4, 4) where that stands.
-            target: Radius of the disc that has to be in view [m]; or the body, on the flange or the
-                arm itself, of which enough has to be.
-            margins: What a real arm has to keep to besides.
+            scanner: The scanner.
+            base_T_camera: (4, 4) pose of the scanner.
+            target: Radius of the disc that must be in view [m]; or the body, on the flange or the
+                arm itself, of which enough must be in view.
+            margins: Safety margins of a real arm.
 
         Raises:
             StageError: The space that the arm fills is not known, so no clearance can be checked.
@@ -108,10 +108,9 @@ class Reach:
     def facing(self, centre: Floats) -> Floats | None:
         """Return the rotation (3, 3) of a flange at ``centre`` that faces along the view.
 
-        Its z is against the camera's, or the side of it where the body is seen most; about that
-        axis the flange turns to where the arm moves best, or, where it is known where the arm
-        stands, to the nearest posture in which it moves well. The joints of that pose become the
-        home that later poses stay near to.
+        Its z is opposite to the camera's; a body instead shows its broadest side. About that axis
+        the flange turns to the best manipulability, or to the nearest good posture if the arm's
+        present one is known. The joints of that pose become the home that later poses stay near to.
         """
         found = [
             (float(self.arm.manipulability(joints)) * self._seen(joints)[0], pose[:3, :3], joints)
@@ -310,13 +309,13 @@ class Site:
     """Arm, scanner and obstacles that a plan is made for.
 
     Attributes:
-        centre: (3,) in ``base``, where to work when the recipe does not say [m].
-        eye: (3,) in ``base``, where the scanner stands [m].
+        centre: (3,) in ``base``, middle of the work if the recipe gives none [m].
+        eye: (3,) in ``base``, position of the scanner [m].
         facing: Gives the rotation (3, 3) of a flange at a point (3,) that faces the scanner, or
             None where the arm cannot show it.
         joints: Gives the joint angles for a flange pose (4, 4), or None where the arm cannot or
             must not go.
-        lost: Gives the indices, in order of their visit, of the poses that were of no use.
+        lost: Gives the indices, in visiting order, of the poses that gave no capture.
         shown: Gives the axis (3,) of the flange that faces the scanner where the target does.
     """
 
@@ -329,7 +328,7 @@ class Site:
 
 
 class PlannedPose(NamedTuple):
-    """Where to send the flange: (4, 4) ``base_T_flange``, and (n,) joint angles that do it.
+    """A pose to visit: (4, 4) ``base_T_flange``, and (n,) joint angles that reach it.
 
     ``why`` is a text that says what the pose is good for, where the plan knows.
     """
@@ -344,7 +343,7 @@ class Plan(NamedTuple):
 
     Attributes:
         poses: In the order of their visit; a plan may choose each when it is asked for.
-        wanted: How many there would be if the arm could go everywhere.
+        wanted: Number of poses if the arm could reach them all.
         centre: (3,) of the box they were wanted in, in ``base`` [m].
         size: (3,) edges of that box [m].
     """
@@ -374,10 +373,10 @@ def poses_near(
     Args:
         place: (3,) in ``base`` [m].
         count: How many.
-        site: What the arm can do there.
+        site: The arm's reachable poses.
         rng: Draws them.
-        spread: How near they are, (3,) or alike along each axis [m], and their largest roll,
-            pitch and yaw [rad].
+        spread: Largest distance from the point, (3,) or equal along each axis [m], and largest
+            roll, pitch and yaw [rad].
     """
     found: list[PlannedPose] = []
     facing, (near, tilt) = site.facing(place), spread

@@ -25,10 +25,10 @@ class Leg(NamedTuple):
     """A move straight in joint angles.
 
     Attributes:
-        joints: (n,) where it ends [rad].
+        joints: (n,) joint angles at its end [rad].
         speed: Speed of the leading joint [rad/s].
         acceleration: Acceleration of the leading joint [rad/s^2].
-        seconds: What it takes.
+        seconds: Duration [s].
     """
 
     joints: Floats

@@ -27,9 +27,9 @@ class Touched:
     """A point that was touched.
 
     Attributes:
-        predicted: (3,) where the calibration has it, in ``base`` [m].
-        actual: (3,) where the tip was, by the arm [m].
-        base_T_flange: (4, 4) the arm's pose then.
+        predicted: (3,) point by the calibration, in ``base`` [m].
+        actual: (3,) position of the tip by the arm [m].
+        base_T_flange: (4, 4) pose of the flange at contact.
     """
 
     predicted: Floats
@@ -48,10 +48,10 @@ class Toucher:
 
     Attributes:
         driver: Opens the arm.
-        model: Its model.
-        limits: What it must keep to; it keeps to :data:`SLOW` besides.
+        model: The arm's model.
+        limits: The arm's motion limits; its speed is :data:`SLOW` at most.
         tip: (3,) in the flange [m].
-        ask: Shows a person a sentence and returns when it is done.
+        ask: Function that shows an instruction and returns when it is carried out.
     """
 
     driver: RobotDriver
@@ -63,8 +63,8 @@ class Toucher:
     def touch(self, points: Floats, move: bool) -> Iterator[Touched]:
         """Drive the tip to points (N, 3) in ``base``; yield each contact.
 
-        With ``move`` the arm goes to :data:`SHORT` before each, in the orientation that it has.
-        It is let go of before the person is asked to jog, and is only read afterwards.
+        With ``move`` the arm goes to :data:`SHORT` before each, in the orientation that it has. The
+        arm is released before the person is asked to jog, and only read afterwards.
 
         Raises:
             StageError: No collision-free path leads to a point; the message names the obstacle.
@@ -82,7 +82,7 @@ class Toucher:
         return np.asarray(flange[:3, :3] @ self.tip + flange[:3, 3])
 
     def _require_near(self, number: int, point: Floats) -> None:
-        """Refuse an arm that does not stand where it was sent once it was let go of."""
+        """Refuse an arm that is not at its goal after it was released."""
         tip = self._tip_at(read_state(self.driver)[1].base_T_flange.matrix)
         away = float(np.linalg.norm(tip - point))
         if away > 2 * SHORT:

@@ -68,7 +68,7 @@ class Charge(NamedTuple):
     Attributes:
         open: Opens the arm.
         model: The arm's model.
-        limits: What it must keep to.
+        limits: The arm's motion limits.
         alarm: File descriptor on which any byte stops the arm, or None.
         keyboard: File descriptor on which a space stops the arm, or None.
     """

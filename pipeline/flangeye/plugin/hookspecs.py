@@ -24,8 +24,8 @@ hookimpl = pluggy.HookimplMarker(NAME)
 def flangeye_stages() -> Iterable[Stage] | Mapping[str, str]:  # type: ignore[empty-body]
     """Return the stages this plugin offers to recipes.
 
-    Or where they are, ``{"fit.hull": "acme.hull:fit_hull"}``: a module is then imported when a
-    recipe uses what is in it, and no other command waits for it.
+    A mapping of import paths, ``{"fit.hull": "acme.hull:fit_hull"}``, imports a module only when a
+    recipe uses it.
     """
 
 

@@ -66,7 +66,7 @@ class Offered(MutableMapping[str, Kind]):
         """Return the plugin ``name``.
 
         Raises:
-            KeyError: None of this name is offered.
+            KeyError: No plugin offers this name.
             PluginNotFoundError: It cannot be imported, or its entry point names nothing.
         """
         held = self._held[name]
@@ -99,7 +99,7 @@ class Registry:
         parts: Name -> part.
         broken: Entry point name -> why it could not be loaded.
         owners: Stage or part name -> entry point that offers it.
-        installed: Entry point name -> the package it comes from, None where unknown.
+        installed: Entry point name -> its package; None if unknown.
     """
 
     hooks: pluggy.PluginManager
@@ -133,7 +133,7 @@ class Registry:
         """Return a network of nodes, joined.
 
         Raises:
-            FlangeyeError: It is not there.
+            FlangeyeError: No plugin offers a network of this name.
         """
         offered: dict[str, Callable[[], Graph]] = {}
         for each in self.hooks.hook.flangeye_graphs():
@@ -227,7 +227,7 @@ class Lookup:
         registry: The parts on offer.
         folder: Where relative paths start.
         robot: The recipe's arm.
-        needs_files: Whether the files that are named have to be there; a log's may be gone.
+        needs_files: Whether named files must exist; those of a log may be gone.
     """
 
     registry: Registry

@@ -67,9 +67,9 @@ class Contract:
     """The inputs and outputs that all stages of a kind must have.
 
     Attributes:
-        takes: Types of the value the kind works on, of which it needs one; none for the first.
-        gives: Types it may return.
-        opens: What later steps may ask for once such a step has run.
+        takes: Types of the input, of which a stage takes one; none for the first step.
+        gives: Types a stage may return.
+        opens: Types that later steps may take once such a step has run.
         meaning: One line shown in messages and reports.
         several: Whether a recipe may have more than one step of the kind.
     """
@@ -125,8 +125,8 @@ class PartKind:
 
     Attributes:
         meaning: One line shown in messages and reports.
-        contract: ``module:Protocol`` that says how such a part is called and what it gives. It is
-            named rather than imported, because it stands beside the types it is about.
+        contract: ``module:Protocol`` with the part's arguments and result. It is a name, not an
+            import: the Protocol stands beside its types.
     """
 
     meaning: str
@@ -219,7 +219,7 @@ class Plugin:
         return self.function(*args, **kwargs)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Travel to another process by name: what carries the function's name is the plugin."""
+        """Pickle the plugin by its name: the module attribute of that name is the plugin itself."""
         return _at, (self.function.__module__, self.function.__qualname__)
 
 
@@ -244,8 +244,8 @@ class Part(Plugin):
     """A function chosen by name inside a step's parameters.
 
     Attributes:
-        simulated: A robot part whose arm moves nothing, and whose time is not this computer's.
-        interactive: A robot part that talks to a person at the terminal; nothing it does is urgent.
+        simulated: A robot part with a simulated arm and simulated time.
+        interactive: A robot part that asks a person at the terminal; nothing it does is urgent.
         passive: A robot part that commands nothing: others move the arm, no permission is needed.
         simulation_only: A controller part that is known to diverge; a real arm is refused with it.
     """
@@ -294,7 +294,7 @@ class BoundPart:
         return self.part.function(*args, **kwargs, **extra)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Travel to another process without the parts on offer here."""
+        """Pickle the part without the other offered parts."""
         return BoundPart, (self.part, self.params)
 
     def to_yaml(self) -> dict[str, Any]:
@@ -325,7 +325,7 @@ class Choose:
 
     Attributes:
         kind: The parts' kind.
-        words: What may stand there instead of a part, and is kept as it is.
+        words: Words accepted instead of a part, and kept unchanged.
     """
 
     kind: str
@@ -429,8 +429,8 @@ def part(
 
     Args:
         name: ``kind.name``.
-        simulated: For a robot: its arm moves nothing, and its time is not this computer's.
-        interactive: For a robot: it talks to a person at the terminal.
+        simulated: For a robot: arm and time are simulated.
+        interactive: For a robot: it asks a person at the terminal.
         passive: For a robot: it commands nothing, others move the arm.
         simulation_only: For a controller: it is known to diverge and must not move a real arm.
 
@@ -490,7 +490,7 @@ def _check_contract(declared: Stage) -> None:
 
 
 def _check_call(declared: Part, kind: PartKind) -> None:
-    """Hold a part's signature against the Protocol of its kind; untyped arguments pass."""
+    """Check a part's signature against the Protocol of its kind; untyped arguments pass."""
     contract = _at(*kind.contract.split(":"))
     wanted = get_type_hints(contract.__call__)
     gives = _alternatives(wanted.pop("return", type(None)))

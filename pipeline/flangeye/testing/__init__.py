@@ -128,7 +128,7 @@ class ReplayConformance(Conformance):
     kind = "replay"
 
     def test_a_log_that_is_none_is_refused(self) -> None:
-        """In one line."""
+        """A file that is no log is refused with a one-line error."""
         missing = Path("no/such/run.mcap")
         require_refusal(lambda: self.call({}, missing, "0.none"), t.Rejected, str(missing))
 
@@ -160,11 +160,11 @@ class CostConformance(Conformance):
         require_repeats(lambda: self.cost(error))
 
     def test_no_error_costs_nothing(self) -> None:
-        """Zero at zero."""
+        """The cost of no error is zero."""
         require(abs(self.cost(pose_error(np.zeros(3)))) < 1e-12, "no error has a cost")
 
     def test_an_error_costs_something(self) -> None:
-        """Finite and positive in a general direction."""
+        """The cost of an error in a general direction is finite and positive."""
         cost = self.cost(pose_error(np.array([1e-3, 2e-3, -1e-3])))
         require(np.isfinite(cost) and cost > 0, f"an error of 2 mm costs {cost}")
 
@@ -174,7 +174,7 @@ class CostConformance(Conformance):
         require(costs[0] < costs[1] < costs[2], f"1, 2, 4 times the error cost {costs}")
 
     def test_an_error_and_its_mirror_cost_the_same(self) -> None:
-        """There is no good side to be off on."""
+        """An error and its opposite have the same cost."""
         shift = np.array([1e-3, 2e-3, -1e-3])
         here, there = self.cost(pose_error(shift)), self.cost(pose_error(-shift))
         require(
@@ -197,19 +197,19 @@ class ErrorConformance(Conformance):
         require_repeats(lambda: self.measured(CAMERA, observed(work_points())))
 
     def test_the_true_pose_has_next_to_no_error(self) -> None:
-        """Only the noise remains."""
+        """The true pose has no error beyond the noise."""
         off = np.linalg.norm(self.measured(CAMERA, observed(work_points())).displacement())
         require(off < 0.1e-3, f"the true pose is said to be {1e3 * off:.3f} mm off")
 
     def test_a_candidate_that_is_off_is_off_by_so_much(self) -> None:
-        """3 mm, at the work, in metres."""
+        """A candidate that is 3 mm off has an error of 0.003 m at the work."""
         candidate = CAMERA.copy()
         candidate[:3, 3] += [1e-3, -2e-3, 2e-3]
         off = np.linalg.norm(self.measured(candidate, observed(work_points())).displacement())
         require(abs(off - 3e-3) < 0.1e-3, f"3 mm are said to be {1e3 * off:.3f} mm")
 
     def test_too_little_is_refused(self) -> None:
-        """No pose kept."""
+        """Without kept poses the part refuses or returns None."""
         require_refusal(lambda: self.measured(CAMERA, []), type(None), "no pose kept")
 
     def test_it_measures_in_the_cameras_frame(self) -> None:
@@ -234,7 +234,7 @@ class ExportConformance(Conformance):
         return file
 
     def test_it_writes_a_file(self) -> None:
-        """With a plain name and text, wherever the camera is."""
+        """The stage writes a file with a plain name and text, wherever the camera is mounted."""
         for carrier in (t.BASE, t.FLANGE):
             file = self.file(carrier)
             require(isinstance(file, t.ExportedFile), "gave something else than an ExportedFile")
@@ -243,12 +243,12 @@ class ExportConformance(Conformance):
             require(plain, f"'{file.name}' is not a plain file name")
 
     def test_the_pose_is_in_it(self) -> None:
-        """Another pose, another text; the same pose, the same text."""
+        """Different poses give different texts; equal poses give equal texts."""
         require(self.file() == self.file(), "two calls with equal input differ")
         require(self.file().text != self.file(yaw=0.4).text, "two poses give one text")
 
     def test_its_remarks_are_in_it(self) -> None:
-        """Above all that a calibration was refused."""
+        """The file has the pose's remarks, above all that a calibration was refused."""
         text = self.file().text
         missing = [line for line in REMARKS if line not in text]
         require(not missing, f"the file does not say '{missing[0] if missing else ''}'")
