@@ -39,7 +39,7 @@ class CentreSet(NamedTuple):
 
     Attributes:
         name: Shown in messages and reports.
-        stored: Whose stored results belong to these centres.
+        stored: Name of the stored results that belong to these centres.
     """
 
     name: str

@@ -120,7 +120,7 @@ def icp(
     Args:
         source: (N, 3).
         target: (M, 3), in the same unit.
-        normals: (M, 3) of the target.
+        normals: (M, 3) normals of the target.
         distance: Pairs further apart do not match.
         stop: When it ends.
     """

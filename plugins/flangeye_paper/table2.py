@@ -31,9 +31,9 @@ class Trials(NamedTuple):
     """Calibrations of one kind.
 
     Attributes:
-        target: What was looked at.
+        target: The seen target.
         pairs: Poses of each.
-        narrow: Whether the poses hardly differed.
+        narrow: Whether the poses covered a small range only.
         errors: (N, 6) at the camera's origin, mm and deg.
         workspace: (N,) rms over the workspace [mm].
         refused: How many gave no answer.

@@ -48,7 +48,7 @@ class OpenCVCamera(Device):
     Attributes:
         name: Shown in messages and reports.
         camera_matrix: (3, 3) [px].
-        distortion: (k,) OpenCV's coefficients.
+        distortion: (k,) OpenCV's distortion coefficients.
     """
 
     def __init__(self, finger: Finger, params: OpenCVParams) -> None:
@@ -154,7 +154,7 @@ class RecordedImages(Device):
     Attributes:
         name: Shown in messages and reports.
         camera_matrix: (3, 3) [px].
-        distortion: (k,) OpenCV's coefficients.
+        distortion: (k,) OpenCV's distortion coefficients.
     """
 
     def __init__(

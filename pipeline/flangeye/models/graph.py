@@ -131,7 +131,7 @@ class EmulatorOptions:
     """Options of an emulated controller.
 
     Attributes:
-        robot: Which arm.
+        robot: Model of the arm.
         host: Address it listens on.
         joints: Angles it starts at [rad]; None for a pose of its own choice.
         floor: Height of a horizontal surface the tool can touch [m]; None for no surface.

@@ -175,7 +175,7 @@ def numbers_of(
         element: What has it; None is as without it.
         name: Of the attribute.
         default: Its text where there is none.
-        count: How many they are.
+        count: How many numbers the attribute has.
 
     Raises:
         RecipeError: They are others, or not finite.

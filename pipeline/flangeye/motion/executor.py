@@ -31,7 +31,7 @@ class Executor:
     Attributes:
         robot: The arm.
         told: Called with each state of the arm.
-        limits: What it must keep to.
+        limits: The arm's motion limits.
     """
 
     def __init__(

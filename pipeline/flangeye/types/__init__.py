@@ -283,7 +283,7 @@ class Seam:
         half_width: From the root's plane to a shoulder [m], or None where it is not known.
         source: What it was planned from, as text.
         figures: How well that went, in SI units, by name.
-        notes: What is to be done, and what is for the record.
+        notes: Warnings and records.
         cloud: The part of the scan around it, in ``base``, for pictures only.
     """
 
@@ -341,7 +341,7 @@ class WeldReport:
         phases: K names of what the controller was doing.
         figures: By name, in SI units.
         loop: How the loop kept time, by name, in SI units; differs from run to run.
-        notes: What is to be done, and what is for the record.
+        notes: Warnings and records.
         sigma: (K,) standard deviation of the torch's place across the seam [m], or empty.
         bound: (K,) what its distance from the seam does not exceed [m], or empty.
         band: (K,) the same for 95 % of the seam [m], or empty.

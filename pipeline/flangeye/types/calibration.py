@@ -20,7 +20,7 @@ class Pair:
     """One observation after solving.
 
     Attributes:
-        observation: What went in.
+        observation: The observation used.
         residual: (3,) measured centre, mapped to ``base``, minus where the arm as its controller
             reports it has the TCP or the target [m].
         used: Whether it took part in the estimate.
@@ -135,7 +135,7 @@ class HandEye:
             the arm as its controller reports it.
         pairs: Every observation the solver pulled.
         method: Stage that solved it.
-        notes: What is to be done, and what is for the record.
+        notes: Warnings and records.
         correction: What it found wrong with the arm and this pose holds with and without.
         others: The configuration's other unknowns, such as ``base_T_target``.
         corrected: Where another pose is the best for the corrected arm: that pose, with its

@@ -152,12 +152,12 @@ class Observation(Placed):
 
     Attributes:
         id: Id of the capture.
-        feature: What was measured.
-        poses: What the controllers reported, by frame.
+        feature: The measured feature.
+        poses: Poses reported by the controllers, by frame.
         joints: (n,) joint angles [rad], when known.
         camera: Frame of the camera that saw it; a cell has several.
-        target: Frame of what it saw.
-        motion: How the flange passed it, where that was recorded and it moved.
+        target: Frame of the seen target.
+        motion: The flange's motion about the capture, if it was recorded in motion.
         arm_joints: (n,) joint angles of each arm of a cell whose joints are known [rad], by its
             frame.
     """

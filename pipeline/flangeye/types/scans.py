@@ -54,14 +54,14 @@ class Capture(Placed):
     Attributes:
         id: Unique within a run.
         cloud: The scan, in ``camera``; without points where only an image was taken.
-        poses: What the controllers reported, by frame.
+        poses: Poses reported by the controllers, by frame.
         joints: (n,) joint angles [rad], when known.
         time_ns: When the exposure ended.
         role: ``verification`` captures are kept from every solver.
-        image: What a camera in the scanner saw, in the same frame, if one looked.
+        image: Image of a camera in the scanner, in the same frame, if there is one.
         camera: Frame of the scanner that took it; a cell has several.
-        target: Frame of what it looked at.
-        motion: How the flange passed, where that was recorded and it moved.
+        target: Frame of the seen target.
+        motion: The flange's motion about the capture, if it was recorded in motion.
         arm_joints: (n,) joint angles of each arm of a cell whose joints are known [rad], by its
             frame.
     """
@@ -139,8 +139,8 @@ class WorkpieceScan:
     Attributes:
         cloud: In ``camera``; of several places the clouds one after the other, each in ``camera``
             as it stood there.
-        source: Where it comes from, as text.
-        notes: What is to be done, and what is for the record.
+        source: Description of the source.
+        notes: Warnings and records.
         truth: Simulation only: the true seams by name, (N, 3) in ``base`` [m]. The runner keeps it
             from the stages that plan and weld.
         places: Where the arm stood for each cloud; empty where the scanner stands beside the arm.

@@ -50,7 +50,7 @@ class Captures(Stream[Capture | Rejection]):
     A source that knows a capture to be useless gives its ``Rejection`` in its place.
 
     Attributes:
-        outcomes: What became of each capture, by id: its observation, or None if it was set aside
+        outcomes: Outcome of each capture, by id: its observation, or None if it was set aside
             or kept for verifying. A source that chooses its next pose may look here.
         look: Simulation only: scans other things with the same scanner, see :data:`Look`.
         recorded: Whether pulling a capture moves nothing, as of an archive or a simulation: the
@@ -107,7 +107,7 @@ class Truth:
     """The truth of a simulated cell. No stage can request it.
 
     Attributes:
-        camera: Where the camera is, in the frame that carries it.
+        camera: The camera's pose in the frame that carries it.
         others: The other unknowns of the configuration.
         unseen: What a scanner without noise would see at poses that took no part: where the
             flange (the target) really is, beside what the controllers report. They show what a
@@ -126,7 +126,7 @@ class Source:
     Attributes:
         fingerprint: Hash of everything the captures are made from.
         notes: What was skipped, detected or converted.
-        workspace: Where the work is; the box of the flange's centres when not given.
+        workspace: Box of the work; by default the box of the flange's centres.
         truth: Simulation only.
         simulated: Whether captures come from a simulator; then nothing that is made of them may be
             called verified without that word.

@@ -70,10 +70,10 @@ class PlannedCell:
     """A session that was planned.
 
     Attributes:
-        moments: What may be seen.
-        scheduled: What is, unless it is chosen as it goes.
+        moments: Possible sightings.
+        scheduled: Sightings of the schedule, unless they are chosen during the session.
         source: Where it comes from, with the truth.
-        view: What the cameras see.
+        view: Fields of view of the cameras.
         chooses: Whether each sighting is chosen by what was seen so far.
     """
 
@@ -177,7 +177,7 @@ class Moments:
     """The poses at N moments: as controllers report them, and as they truly are.
 
     Attributes:
-        cell: What stands on what.
+        cell: The graph of frames.
         reported: (N, 4, 4) by what moves.
         actual: All frames with their true places.
         joints: (N, n) by arm, as reported [rad]; none where they are not.

@@ -62,7 +62,7 @@ class SimulatedFinger(Device):
     Attributes:
         name: Shown in messages and reports.
         camera_matrix: (3, 3) [px].
-        distortion: (k,) OpenCV's coefficients.
+        distortion: (k,) OpenCV's distortion coefficients.
         world: What is true. A stage must not look.
         tool: Where the tool truly is in the plane of the groove. A stage must not look.
     """

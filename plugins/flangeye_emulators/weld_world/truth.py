@@ -91,7 +91,7 @@ class FingerTruth:
         axial: Stiffness along, as a share of the world file's.
         gain: The tag shows displacements larger by this share.
         drift: Change of the gain in 60 s, as it warms.
-        rest: What the tag shows of an undeformed finger.
+        rest: Pose of the tag on an undeformed finger.
         play: The tip moves by this before the tag does.
         hysteresis: Share of a displacement that lags.
         creep: Share by which a displacement grows in time, 10 s.

@@ -61,7 +61,7 @@ class WeldWorld:
     Attributes:
         groove: The true one.
         tip: (3,) where the tip is, in the plane of the work [m].
-        torch: (3,) where the torch is [m].
+        torch: (3,) position of the torch [m].
         torch_s: Its arc length on the true seam [m].
         off: How far the torch is to the left of the seam, where the seam is now [m].
     """
@@ -76,8 +76,8 @@ class WeldWorld:
         """Prepare a world.
 
         Args:
-            nominal: What the files state.
-            truth: What is true.
+            nominal: Values that the files state.
+            truth: True values of the world.
             seed: Seed of its random values.
             rolled_out: Returns where a torch (3,) is when the work's surface is rolled out, from
                 where it is in the plane that touches the surface at the tip (3,): its arguments

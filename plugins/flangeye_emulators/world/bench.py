@@ -77,8 +77,8 @@ def bench_with(
     """Return the bodies of the scene, in ``base``.
 
     Args:
-        workpiece: What is to be welded.
-        base_T_part: (4, 4) where it lies; the bench is right below it.
+        workpiece: The workpiece to weld.
+        base_T_part: (4, 4) pose of the workpiece; the bench is directly below it.
         covered: Share of the workpiece, from its end with the largest x, under a sheet.
         rng: Draws the things that lie about, some of them against the workpiece.
     """

@@ -25,7 +25,7 @@ class BoardCamera:
     Attributes:
         camera_matrix: (3, 3) [px].
         size: Width and height [px].
-        distortion: (k,) OpenCV's coefficients.
+        distortion: (k,) OpenCV's distortion coefficients.
         blur: Standard deviation of the lens's blur [px].
         noise: Standard deviation of a pixel's grey value.
         shade: Share of the light that is missing at the darker side of each image.
@@ -73,7 +73,7 @@ def render_board(
         camera_T_target: (4, 4) its pose [m].
         camera: Lens and sensor.
         rng: Draws the noise, and from where it is darker.
-        cover: What lies over it, if anything.
+        cover: Occlusion of the board, if any.
     """
     import cv2
 

@@ -53,7 +53,7 @@ class SimulatedCell:
 
     Attributes:
         robot: The arm.
-        flange: What it carries.
+        flange: The flange on the arm.
         centre: (3,) middle of the workspace [m].
         size: (3,) of the workspace [m].
         sphere: What the flange carries besides, if anything.

@@ -316,7 +316,7 @@ class StructuredLight:
         """Set up the scanner.
 
         Args:
-            scanner: From the catalogue.
+            scanner: The scanner's model.
             resolution: Scale of the image's columns and rows.
             noise: Scale of the temporal noise and of the distortion; 0 gives exact depths.
             rng: Draws the distortion.
@@ -338,7 +338,7 @@ class StructuredLight:
         """Return the organised scan, (H, W, 3) in ``camera`` [m], NaN where nothing was measured.
 
         Args:
-            scene: What stands before the scanner, in ``camera``.
+            scene: Objects before the scanner, in ``camera``.
             rng: Draws this scan's noise.
         """
         hits = scene.look(self.pixels)
@@ -391,10 +391,10 @@ class StructuredLight:
         """Return what is seen in some rows.
 
         Args:
-            scene: What stands before the scanner.
-            hits: What the camera's rays meet there.
+            scene: Objects before the scanner.
+            hits: Hits of the camera's rays on the scene.
             to_light: (H, W) product of the surface's normal and the projector's position.
-            rows: Which rows.
+            rows: Rows of the image.
         """
         depth, slant, body = hits.depth[rows], hits.slant[rows], hits.body[rows]
         x, y, z = self._beams(hits.depth, rows)
@@ -477,7 +477,7 @@ class TimeOfFlight:
         """Return the organised scan, (H, W, 3) in ``camera`` [m], NaN where nothing was measured.
 
         Args:
-            scene: What stands before the camera, in ``camera``.
+            scene: Objects before the camera, in ``camera``.
             rng: Draws this scan's noise.
         """
         hits = scene.look(self.pixels)

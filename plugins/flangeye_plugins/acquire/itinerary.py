@@ -28,8 +28,8 @@ class Stop(NamedTuple):
 
     Attributes:
         id: Identifier of the capture taken there.
-        role: What it is for.
-        pose: Where, and the joints that do it.
+        role: Purpose of the capture.
+        pose: The flange's pose, and the joint angles that reach it.
     """
 
     id: str
@@ -41,7 +41,7 @@ class Itinerary:
     """The stops of a session: those for verifying first, then the plan's.
 
     Attributes:
-        outcomes: What became of the captures so far, by id; plans that choose as they go look here.
+        outcomes: Outcomes of the captures so far, by id; adaptive plans read them.
         centre: (3,) middle of the work, in ``base`` [m].
         size: (3,) of the work [m].
         total: How many stops there are at most.

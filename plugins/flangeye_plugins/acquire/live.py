@@ -261,12 +261,12 @@ class LiveSession:
     Attributes:
         itinerary: The stops.
         arm: Goes there.
-        scanner: What looks at the flange.
+        scanner: The scanner.
         moved: A scan during which the flange moved by more is set aside [m].
         done: Captures that were taken before.
         stage_log: Hears where the arm goes next, and why there.
         passive: Whether another program moves the arm, so that nothing is planned here.
-        idle: How long the arm had nothing to do.
+        idle: Time in which the arm had nothing to do.
     """
 
     itinerary: Itinerary

@@ -112,7 +112,7 @@ def source_of(
 
     Args:
         archive: The archive; its notes come first.
-        told: Further lines for the person.
+        told: Further notes for the user.
         digests: Digests of all files that are used; of the archive's own if not given.
     """
     notes = (with_urls(f"archive: {archive.layout}, {archive.root}"), *archive.notes, *told)
@@ -170,10 +170,10 @@ def check_usable(
     """Refuse recordings that no calibration of one camera, or of a cell, can be made from.
 
     Args:
-        root: What messages begin with.
-        recordings: Those that are to be used, verification included.
+        root: Prefix of messages.
+        recordings: Recordings to use, verification included.
         cell: The recipe's, where it has one.
-        whole: Whether the target's whole pose was seen: then turning alone is motion too.
+        whole: Whether the target's full pose was seen; rotation alone is then enough motion.
         fewest: Captures there have to be.
 
     Raises:

@@ -31,7 +31,7 @@ def circle_residuals(circles: Circles, points: Floats, ring: NDArray[np.intp]) -
     Args:
         circles: The circles.
         points: (N, 2) [m].
-        ring: (N,) which circle each point belongs to.
+        ring: (N,) index of each point's circle.
     """
     offsets = points - circles.centre
     return np.asarray(distances(offsets) - circles.radii[ring])
@@ -49,7 +49,7 @@ def fit_concentric(
 
     Args:
         points: (N, 2) edge points [m].
-        ring: (N,) which circle each point belongs to.
+        ring: (N,) index of each point's circle.
         start: Where to begin.
         scale: Distance at which a point's weight is a half [m].
         within: The last step [m].

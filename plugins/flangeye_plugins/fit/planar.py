@@ -57,7 +57,7 @@ def poses_from_pixels(corners: Corners, image: Image, expected: float) -> list[P
     are taken to their own least squares.
 
     Args:
-        corners: In the image and on the target.
+        corners: Corners in the image and on the target.
         image: With the camera's matrix and distortion.
         expected: Standard deviation of a corner's coordinate known beforehand [px].
     """
@@ -125,7 +125,7 @@ def moved_by_camera(corners: Corners, image: Image, pose: Floats) -> Floats:
     takes back by least squares. Of a camera that counts as known there are no errors, k = 0.
 
     Args:
-        corners: In the image and on the target.
+        corners: Corners in the image and on the target.
         image: With the camera and its covariance.
         pose: (4, 4) ``camera_T_target`` [m].
     """

@@ -224,7 +224,7 @@ def _replaced(
         recordings: Those to calibrate with are changed.
         change: Gives poses (N, 4, 4), or joints (N, n), of other moments.
         kept: (N,) which of them have one.
-        arms: Whose.
+        arms: Names of the arms.
     """
     calibration = [r for r in recordings if r.role == "calibration"]
     changed = calibration

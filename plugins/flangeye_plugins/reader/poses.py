@@ -18,7 +18,7 @@ def pose_from_quaternion(where: str, position: Numbers, xyzw: Numbers) -> Floats
     """Return the pose of a position [m] and a unit quaternion xyzw.
 
     Args:
-        where: What messages begin with: the file and the pose's name.
+        where: Prefix of messages: the file and the pose's name.
         position: (3,) [m].
         xyzw: (4,).
 

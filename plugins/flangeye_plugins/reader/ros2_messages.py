@@ -33,7 +33,7 @@ class Raw:
 
     Attributes:
         file: The bag's file.
-        topic: Its topic.
+        topic: Name of the topic.
         received: When it was recorded [s].
         data: CDR.
         decode: Gives the message.
@@ -202,7 +202,7 @@ def save_image(path: Path, message: Any) -> Path:
     """Write a ``sensor_msgs/Image`` or ``CompressedImage`` as a file and return it.
 
     Raises:
-        StageError: Its encoding is not known.
+        StageError: The image's encoding is not known.
         ImageError: It is compressed, and damaged.
     """
     import cv2

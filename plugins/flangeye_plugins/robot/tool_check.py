@@ -45,13 +45,13 @@ def require_tool(
 
     Args:
         name: Name of the robot.
-        driver: Its driver.
-        offset: (4, 4) the controller's.
-        expected: (4, 4) the recipe's.
+        driver: The arm's driver.
+        offset: (4, 4) tool offset of the controller.
+        expected: (4, 4) tool offset of the recipe.
         shown: How the pendant shows it.
 
     Raises:
-        DeviceError: They differ.
+        DeviceError: The two tool offsets differ.
     """
     # Largest difference of two tool offsets [m, rad]; pendants show 0.01 mm
     if _differ(offset, expected, (1e-4, 1e-3)):

@@ -152,7 +152,7 @@ class Bridge(Device):
         """Return the newest message of a topic that is followed.
 
         Raises:
-            DeviceError: The bridge is gone.
+            DeviceError: The bridge has ended.
         """
         self._require_bridge({"topic": topic})
         return self._newest.get(topic)

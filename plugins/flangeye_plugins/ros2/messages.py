@@ -182,7 +182,7 @@ def values_of(message: Any) -> NDArray[Any]:
     """Return the pixels of a ``sensor_msgs/Image``: (H, W) or (H, W, channels), unconverted.
 
     Raises:
-        StageError: Its encoding is not known.
+        StageError: The image's encoding is not known.
     """
     if message.encoding not in PIXELS:
         known = ", ".join(PIXELS)
@@ -202,7 +202,7 @@ def pixels_of(message: Any) -> Any:
     Those of a ``CompressedImage`` are grey.
 
     Raises:
-        StageError: Its encoding is not known.
+        StageError: The image's encoding is not known.
         ImageError: It is compressed, and damaged.
     """
     if hasattr(message, "format"):

@@ -23,8 +23,8 @@ class SurfacePiece(NamedTuple):
 
     Attributes:
         points: (n, 3) [m].
-        at: (n,) where in the view each point is.
-        columns: How many the view has.
+        at: (n,) pixel of each point in the view.
+        columns: Number of columns of the view.
         side: Points along the side of a square patch, some ten.
     """
 
@@ -46,7 +46,7 @@ class PlanarPiece(NamedTuple):
         plane: The plane, its normal towards the scanner.
         points: (k, 3) what lies on it, thinned: a table has a hundred times the points its width
             needs [m].
-        at: (m,) where in the view all of it is.
+        at: (m,) pixels of the whole piece in the view.
     """
 
     plane: Plane
@@ -64,10 +64,10 @@ class Patch(NamedTuple):
     """A flat patch of a curved surface, from which a plane is proposed.
 
     Attributes:
-        piece: Whose patch it is.
-        rough: Its plane.
-        members: Which of the piece's points it holds.
-        rest: Which of them may belong to a part with its plane.
+        piece: Piece that the patch belongs to.
+        rough: Rough plane of the patch.
+        members: Indices of its points in the piece.
+        rest: Indices of points that may belong to a part with its plane.
     """
 
     piece: SurfacePiece
@@ -233,7 +233,7 @@ def of_size(part: PlanarPiece, cell: tuple[int, int], pitch: float, flange: Flan
         part: The part.
         cell: Row and column of the view in the middle of it.
         pitch: Typical distance of neighbours there [m].
-        flange: What to look for.
+        flange: The flange to find.
     """
     points = part.points.astype(np.float64)
     across = width(part.plane.flatten(points))
@@ -250,12 +250,12 @@ def compare(
     """Return a disc of the right size, with the reason why it is not the flange, if any.
 
     Args:
-        disc: From :func:`of_size`.
+        disc: A disc from :func:`of_size`.
         around: (N, 3) all points in its plane near it, edges included [m].
         nearby: (M, 3) all points near it, before and behind its plane too [m].
         pitch: Typical distance of neighbours there [m].
-        flange: What to look for.
-        limits: What it must fulfil.
+        flange: The flange to find.
+        limits: Limits that a disc must satisfy.
     """
     start = disc.plane.flatten(disc.centre[None])[0]
     centre, shares = ring_shares(disc.plane.flatten(around), start, pitch, flange)
@@ -401,7 +401,7 @@ def ring_shares(
         flat: (N, 2) points in the disc's plane [m].
         start: (2,) a point inside the disc [m].
         pitch: Typical distance of neighbours [m].
-        flange: Whose rim and bore.
+        flange: Flange with the rim and bore.
     """
     rim = flat[edge_points(flat, start, 2 * SECTORS)]
     votes = [(rim, flange.rim)]
@@ -425,7 +425,7 @@ def crop(xyz: Singles, view: Grid, disc: Disc, radius: float, margin: float) -> 
     Args:
         xyz: (N, 3) or (H, W, 3) the scan [m].
         view: Its coarse view; of an organised scan, only the part about the disc is touched.
-        disc: Where.
+        disc: The disc.
         radius: Radius of the disc [m].
         margin: How far off its plane and outside its circle points are kept; off the plane four
             times its noise, if that is more [m].

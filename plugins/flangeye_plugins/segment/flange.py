@@ -197,7 +197,7 @@ def choose(
     Args:
         discs: All flat parts of the scene.
         cut: Gives a disc's points at full resolution; asked for discs that fit.
-        flange: What to look for.
+        flange: The flange to find.
     """
     fitting = _distinct([disc for disc in discs if disc.flaw is None], flange.rim)
     if not fitting:

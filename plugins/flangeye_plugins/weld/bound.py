@@ -36,10 +36,10 @@ class Predicted(NamedTuple):
 
     Attributes:
         s: Arc lengths [m].
-        fixed: Torch, arm, heat, creep: nothing at the weld measures them.
+        fixed: Variance from torch, arm, heat and creep, which nothing measures during the weld.
         askew: The torch's distance from the tip, where the tool stands askew.
-        tip: The tip on the tool, where this turns.
-        felt: The finger's drift, and the weave.
+        tip: Variance from the tip's position on the tool, while the tool turns.
+        felt: Variance from the finger's drift and the weave.
     """
 
     s: Floats

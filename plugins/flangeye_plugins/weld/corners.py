@@ -29,9 +29,9 @@ class Corner(NamedTuple):
     """A corner of a polyline.
 
     Attributes:
-        point: Its number.
+        point: Index of the corner's point.
         along: Arc length there [m].
-        turn: To the left [rad].
+        turn: Angle of the turn, positive to the left [rad].
     """
 
     point: int

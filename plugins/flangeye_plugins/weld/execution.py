@@ -41,7 +41,7 @@ class Bounds:
         Args:
             pose: Pose of the tool.
             progress: Arc length of the tip's progress on the plan [m].
-            felt: What is new.
+            felt: New measurement.
 
         Raises:
             DeviceError: Which bound was passed.
@@ -78,7 +78,7 @@ class WeldCell:
         drive: The arm.
         eyes: Read the finger.
         tool: Translates between flange and plane.
-        bounds: What the tip must keep to.
+        bounds: Limits of the tip.
         steered: Takes each profile that a look behind the torch gives, where there is one.
         gas_after: Where there is a power source: for how long gas flows after its arc [s].
     """

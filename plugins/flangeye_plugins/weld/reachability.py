@@ -34,13 +34,13 @@ class Task:
 
     Attributes:
         model: The arm.
-        limits: What it must keep to.
-        finger: What it carries.
+        limits: The arm's motion limits.
+        finger: The finger on the arm.
         tool: Translates between flange and plane.
         plan: The seam.
         params: Speeds and clearances.
         start: Where the weld begins.
-        aside: How far to the left of the plan the tip is set down [m].
+        aside: Distance to the left of the plan at which the tip is set down [m].
     """
 
     model: RobotModel

@@ -106,15 +106,15 @@ class Planned:
         seam: The leg that is welded.
         surface: Surface of the workpiece.
         plan: The seam, rolled out.
-        finger: What the arm carries.
-        body: How it stands.
+        finger: The finger on the arm.
+        body: Posture of the tool.
         tool: Translates between flange and plane.
-        belief: What is known of all that.
-        params: What was asked for.
-        start: Where it begins.
+        belief: Prior knowledge of tool, finger and joint.
+        params: Parameters of the step.
+        start: Start of the weld on its plan.
         driver: The arm's, with the power source.
         gas_after: For how long gas flows after the arc [s]; None without one.
-        kept: What a weld that is resumed has left.
+        kept: State left by the weld that is resumed.
     """
 
     seam: Seam

@@ -41,9 +41,9 @@ def run_batch(request: Request, registry: Registry, console: Console) -> Batch:
     The tables are written whatever ends the batch, with the sessions that came so far.
 
     Args:
-        request: What to run.
+        request: The batch to run.
         registry: The plugins of this process; every worker loads its own.
-        console: Where progress is shown.
+        console: Console for the progress.
 
     Raises:
         FlangeyeError: The batch cannot start, another one runs in its folder, or its tables cannot
@@ -67,12 +67,12 @@ def run_sessions(
     """Do as :func:`run_batch` with sessions that are already planned, of any recipes.
 
     Args:
-        request: How to run them.
+        request: How to run the sessions.
         out: The batch's folder, path or URL.
         sessions: Gone through up to three times, and not held.
         varied: Path in the recipe -> all its values, for what differs between them.
-        software: What they were planned with.
-        console: Where progress is shown.
+        software: Versions of the software that planned the sessions.
+        console: Console for the progress.
     """
     columns = columns_of(varied)
     at = out if is_url(out) else str(Path(out).absolute())

@@ -302,9 +302,9 @@ def run_all(
 
     Args:
         client: Of the scheduler.
-        job: What all have in common.
+        job: Settings that all sessions share.
         sessions: Where each stands among all that are asked for, and what it is.
-        count: How many they are.
+        count: Number of sessions.
 
     Raises:
         StageError: Rows cannot be written.

@@ -105,7 +105,7 @@ class Dataset:
         """Write rows of one block under a name that no other chunk has.
 
         Raises:
-            StageError: They cannot be written.
+            StageError: The rows cannot be written.
         """
         import pyarrow as pa
 

@@ -50,10 +50,10 @@ class TableCell:
     """One place of the table.
 
     Attributes:
-        text: What people read.
-        number: What it is sorted by; None for text.
-        link: Where it leads, if anywhere.
-        kind: The column.
+        text: Text shown.
+        number: Value to sort by; None for text.
+        link: Target of the cell's link; empty without one.
+        kind: Kind of the column.
     """
 
     text: str
@@ -147,8 +147,8 @@ class Figure:
     Attributes:
         column: Its name.
         title: Shown in messages and reports.
-        unit: What it is shown in.
-        scale: From SI to that unit.
+        unit: Unit in which it is shown.
+        scale: Factor from SI to that unit.
     """
 
     column: str

@@ -197,7 +197,7 @@ class Variant:
     """The recipe and parameters that sessions share; they differ in seed and archive only.
 
     Attributes:
-        overrides: All of them.
+        overrides: All overrides.
         varied: Path in the recipe -> value as written, for what differs between variants.
         common: Hash of all that decides their results.
         seeds: Seeds of its sessions.
@@ -327,7 +327,7 @@ def variants(request: Request) -> Iterator[dict[str, str]]:
     """Yield every combination of the grid: path in the recipe -> value as written.
 
     Args:
-        request: What was asked for.
+        request: The requested batch.
 
     Raises:
         BatchError: The grid or the repetition is not well written.

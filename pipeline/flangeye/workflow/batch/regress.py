@@ -61,7 +61,7 @@ def compare(
         out: Folder of the batch; what finished there with the same software is not run again.
         workers: Processes; None for one a core.
         registry: The plugins.
-        console: Where progress is shown.
+        console: Console for the progress.
 
     Raises:
         FlangeyeError: The batch cannot start, another one uses its folder, or a manifest's recipe

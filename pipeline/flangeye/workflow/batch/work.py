@@ -62,7 +62,7 @@ class Job:
     Attributes:
         out: The batch's folder, the same path or URL on every worker.
         report: Make each session's report.
-        software: What the batch was planned with.
+        software: Versions of the software that planned the batch.
         columns: Columns of the rows.
         start: Random name of this start, so that its parts of the table differ from others'.
     """
@@ -94,7 +94,7 @@ class ChunkTold:
     Attributes:
         counts: Status -> sessions.
         bad: Some of those without a calibration: id and outcome.
-        seconds: What it took on its worker.
+        seconds: Duration on its worker [s].
     """
 
     counts: Counter[Status]
@@ -118,7 +118,7 @@ def write_rows(job: Job, chunk: Chunk, outcomes: Sequence[SessionOutcome]) -> Ch
     """Write the rows of a chunk.
 
     Raises:
-        StageError: They cannot be written.
+        StageError: The rows cannot be written.
     """
     pairs = list(zip(chunk.sessions, outcomes, strict=True))
     rows = [row_of(session, outcome, job.columns) for session, outcome in pairs]

@@ -60,9 +60,9 @@ class Suspicion(NamedTuple):
     """A mistake that may have been made.
 
     Attributes:
-        name: In a word or two.
-        what: In a sentence.
-        changes: What the recipe says without it.
+        name: Short name of the mistake.
+        what: The mistake in a sentence.
+        changes: Parameters of the recipe that correct it.
     """
 
     name: str
@@ -76,7 +76,7 @@ class CellSession:
 
     Attributes:
         observations: Every sighting.
-        cell: What the recipe says stands on what.
+        cell: Graph of frames by the recipe.
         recipe: Read with the parts of ``registry``.
         registry: The plugins on offer.
         tables: Folder of the tables that ``reader.cell`` reads; None where the sightings come from

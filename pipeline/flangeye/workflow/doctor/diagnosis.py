@@ -56,7 +56,7 @@ class RecordedSession:
         seconds: (N, 4, 4) base2_T_flange2 [m], where a second arm carries the target, else None.
         place: (4, 4) of the target in the flange or base that has it, where that is known [m].
         robot: The arm's model, where the recipe names one.
-        motions: N of them, how the flange passed each; None where not recorded for all of them.
+        motions: N motions of the flange about each sample; None unless all were recorded.
         reach: Nearest and farthest distance that the scanner sees [m].
         reader: The archive's reader, as the recipe writes it.
         acquire: Name of the recipe's first step.
@@ -172,7 +172,7 @@ class RecordedSession:
 
         Args:
             change: Gives an arm's poses (N, 4, 4) as they should be.
-            arms: Whose.
+            arms: Names of the arms.
             correction: Options to add to the reader, which make the same change.
         """
         poses = self.poses if arms == "second" else change(self.poses)
@@ -316,7 +316,7 @@ class Diagnosis:
     """All findings of the checks.
 
     Attributes:
-        session: What they looked at.
+        session: The examined session.
         findings: In the order they were found, each with those before it mended.
         notes: What is not a mistake, but worth knowing.
         checks: Names of the checks.

@@ -76,7 +76,7 @@ class Entry:
     Attributes:
         step: Its label, such as ``2.fit.rim``.
         capture: The capture's id, for steps that run once per capture.
-        seconds: What it took.
+        seconds: Duration [s].
         type: Name of the value's type.
         value: The value, or plain data when its type is not ours.
     """

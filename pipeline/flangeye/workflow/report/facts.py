@@ -35,7 +35,7 @@ class Facts:
     """One run, finished or not.
 
     Attributes:
-        log: What was logged.
+        log: The run's log.
         result: The run's own result, or what the log allows to say.
         recipe: The resolved recipe, or an empty text.
     """

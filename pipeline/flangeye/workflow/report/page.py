@@ -203,7 +203,7 @@ class ImageView:
         corners: Where each corner was detected, x and y [px].
         misses: (x1, y1, x2, y2) of the line for each corner [px].
         radius: Radius of the circles about the corners [px].
-        summary: What it shows in words.
+        summary: The figure's content in words.
     """
 
     id: str

@@ -31,7 +31,7 @@ class StillScene:
     Attributes:
         robot: The arm, drawn from its capsules.
         joints: Its joint values [rad or m]; None draws it ready to scan.
-        scanner: What sees it.
+        scanner: The scanner.
         base_T_camera: (4, 4) pose of the camera; None where unknown.
         box: Centre and size of the box that the arm keeps to [m].
         poses: Places of the flange [m], and whether each is taken.

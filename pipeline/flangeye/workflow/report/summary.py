@@ -24,7 +24,7 @@ class Banner:
         kind: verified, unverified, refused or incomplete; also a CSS class.
         label: One or two words.
         figures: Expected error, limit, and whether it is simulated.
-        sentence: What the verdict means, or its reason.
+        sentence: Meaning of the verdict, or its reason.
     """
 
     kind: str
@@ -76,10 +76,10 @@ class KeyFigure:
     """One number of a tile or of the evidence.
 
     Attributes:
-        name: What it is.
+        name: Name of the figure.
         value: The number.
-        unit: Its unit, or nothing.
-        note: What it is taken over.
+        unit: Unit of the figure; empty without one.
+        note: Samples that the figure covers.
     """
 
     name: str

@@ -41,7 +41,7 @@ class WeldDrawing:
 
     Attributes:
         report: The weld.
-        summary: In words.
+        summary: The figure's content in words.
         paths: In the plane of the work.
         offsets: From the plan, along it.
         deviation: Distance of the torch from the seam as felt, and in a simulation as it is.
@@ -220,7 +220,7 @@ class SeamView:
     Attributes:
         space: The seam on the cloud, for plotly.
         profile: Its tube along its length, for plotly.
-        summary: What it is, in words.
+        summary: The figure's content in words.
         facts: Name and value.
     """
 

@@ -192,7 +192,7 @@ def truth_result(
 
     Args:
         calibration: The estimate.
-        truth: What the simulation knows.
+        truth: True values from the simulation.
         box: The workspace.
         cell: What stands on what; needed where truth has poses that took no part.
     """

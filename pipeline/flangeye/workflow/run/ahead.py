@@ -22,7 +22,7 @@ class Done:
     Attributes:
         value: What it gave; None if it raised.
         error: What it raised.
-        seconds: What it took.
+        seconds: Duration [s].
     """
 
     value: Any

@@ -25,16 +25,16 @@ class Outcome:
     """The outcome of a run, filled in step by step.
 
     Attributes:
-        source: Where the captures came from.
+        source: Source of the captures.
         calibration: What the solver gave; a ``VerifiedHandEye`` when every verification passed.
-        verifications: By step label.
+        verifications: Results of verification, by step label.
         rejections: Captures set aside before solving.
         refused: Why the calibration was refused.
         seen: The observations that reached the solver.
         scan: The scan of the workpiece.
-        seam: What was planned from it.
-        weld: What the torch did.
-        exports: What export steps wrote.
+        seam: The planned seam.
+        weld: Record of the weld.
+        exports: Files that export steps wrote.
     """
 
     source: t.Source
@@ -148,8 +148,8 @@ class Stopwatch:
     """Exclusive time per label: the outer step's clock stops while an inner step runs.
 
     Attributes:
-        seconds: By label.
-        calls: By label.
+        seconds: Duration of each step by label [s].
+        calls: Number of calls of each step by label.
         idle: By label, share of the time in which an arm had nothing to do; None without an arm.
     """
 

@@ -66,7 +66,7 @@ def outlook(
     Args:
         recipe: The run's recipe.
         registry: The registry it was checked with.
-        seen: What was fitted so far.
+        seen: Observations so far.
         source: Where it comes from.
     """
     # The truth of a simulation is no business of the solver's.

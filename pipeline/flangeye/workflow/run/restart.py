@@ -331,9 +331,9 @@ def restart_hint(recipe: Recipe, called: str, log: Path) -> str:
     """Return the command that reruns from a log with other parameters.
 
     Args:
-        recipe: What was run.
-        called: How it was called: a name, or a path.
-        log: What it left.
+        recipe: The recipe of the run.
+        called: Name or path by which the recipe was given.
+        log: The run's log.
     """
     later = [step.stage for step in recipe.steps if step.stage.kind != "acquire"]
     whole = recipe.header.log.clouds == "full"

@@ -65,7 +65,7 @@ class Runner:
         """Run the recipe and return its result.
 
         Args:
-            start: What is there already: nothing, a log, or a run that ended early.
+            start: Starting point: nothing, a log, or a run that ended early.
 
         Raises:
             StageError: A step cannot do its work with the input it was given.

@@ -27,7 +27,7 @@ class Start:
 
     Attributes:
         archive: Recordings to run on, if any.
-        point: What is there already: nothing, a log, or a run that ended early.
+        point: Starting point: nothing, a log, or a run that ended early.
         motion: Whether the arm may be moved.
     """
 
@@ -51,8 +51,8 @@ def record_run(
     Args:
         recipe: The checked recipe.
         registry: The registry it was checked with.
-        folder: Where everything goes; empty.
-        start: What it starts from.
+        folder: Empty folder for the output.
+        start: Starting point of the run.
         report: Make ``report.html``, which costs a tenth of a second and 2.4 MB.
         library: A copy of plotly.js that several reports share, if they do.
 

@@ -28,7 +28,7 @@ class URController(ControlUnit):
     """A control box with its arm.
 
     Attributes:
-        robot: Which arm.
+        robot: Model of the arm.
         box: Which generation of control box.
         registers: The general-purpose registers.
         robot_mode: Power and brakes.

@@ -30,16 +30,16 @@ class Follower:
     """Follows a seam by touch; see :class:`flangeye.motion.seam_following.Controller`.
 
     Attributes:
-        phase: What it is doing.
+        phase: Present phase.
         reason: Why it stopped.
-        task: What it is to follow.
-        progress: How far tip and torch have come.
-        pressing: How hard the tip is pressed.
-        sensing: What the finger measures.
-        seam: Where the seam is.
-        lead: How the torch is led along it.
-        welding: How well the torch is known, and whether it welds.
-        arm: How late the arm is.
+        task: The seam to follow.
+        progress: Progress of tip and torch.
+        pressing: Pressing force of the tip.
+        sensing: Measurements of the finger.
+        seam: Estimate of the seam.
+        lead: Motion of the torch along the seam.
+        welding: Uncertainty of the torch, and whether it welds.
+        arm: Delay of the arm.
         now: The time [s]; None before the first cycle.
     """
 

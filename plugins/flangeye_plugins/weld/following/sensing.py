@@ -63,7 +63,7 @@ class Sensing:
     Attributes:
         search: Finds the groove.
         probing: Sweeps the seated tip.
-        learned: What the sweep found of finger, clock and arm.
+        learned: Calibration of finger, clock and arm from the sweep.
         felt: The seam at the tip, smoothed; None before anything was felt.
         seen: Time of the newest touch [s].
         heard: When it came [s].
@@ -268,7 +268,7 @@ class SeamEstimate:
         """Begin the path with the last touches of the sweep.
 
         Args:
-            found: What the sweep found.
+            found: Calibration from the sweep.
             height_noise: Standard deviation of one measured height [m].
             swept: Those touches.
             torch: Arc length of the torch [m].
@@ -292,7 +292,7 @@ class SeamEstimate:
         """Begin the path with the measurements of the sweep and of the way back to the start.
 
         Args:
-            found: What the sweep found.
+            found: Calibration from the sweep.
             torch: Arc length of the torch [m].
             lost: Whether no wall holds the tip any more.
         """
@@ -343,7 +343,7 @@ class SeamEstimate:
         Args:
             time: Time of the touch [s].
             found: Where the tip was.
-            learned: What the sweep found.
+            learned: Calibration from the sweep.
             side: Side of the wall that is pressed.
         """
         s, seam = found.s, found.seam

@@ -204,7 +204,7 @@ class TorchLead:
         Args:
             now: The time [s].
             coming: Arc length of the torch, where the arm will be [m].
-            arm: How late the arm is.
+            arm: Delay of the arm.
         """
         if self._swings is None and coming >= self._from:
             self._swings = now + arm.dead_time

@@ -19,7 +19,7 @@ class ResumePoint:
     Attributes:
         samples: (K, 5) what was felt; see :meth:`RefinedPath.samples`.
         torch: Arc length of the torch's progress [m].
-        learned: What the sweep found.
+        learned: Calibration from the sweep.
         traced: (K, 3) how high the tool was, where there are later passes; see ``passes.Traced``.
         number: Which pass was stopped, the root's is 0.
     """
@@ -52,7 +52,7 @@ class WeldTask:
 
     Attributes:
         plan: The planned seam.
-        belief: What is known of tool, finger and joint.
+        belief: Prior knowledge of tool, finger and joint.
         settings: Gains and limits.
         touch: Follow by touch; otherwise the plan alone, for comparison.
         before: What an earlier weld has left that is gone on with.

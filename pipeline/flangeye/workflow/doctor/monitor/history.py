@@ -34,7 +34,7 @@ class MonitorCheck:
     """The measurements of one check.
 
     Attributes:
-        source: Where it came from, as text.
+        source: Description of the source.
         seen: The sightings of the flange.
         time_ns: When; 0 where that is not known.
     """
@@ -49,7 +49,7 @@ class CheckFinding:
     """The verdict of one check.
 
     Attributes:
-        check: Its number, from 0.
+        check: Index of the check, from 0.
         state: OK, DEGRADED or MOVED.
         shift: How far the work is off by it, at its worst corner [m].
         motion: (6,) as a motion of the camera (rotation [rad], translation [m]).
@@ -78,7 +78,7 @@ class History:
     Attributes:
         path: The file.
         key: Identifies the calibration.
-        checks: What was seen.
+        checks: Sightings of all checks.
         findings: The verdicts; one for each check that was judged.
     """
 

@@ -32,9 +32,9 @@ class StoredCalibration:
     """A calibration of an earlier run.
 
     Attributes:
-        path: Its log.
-        log: What that holds.
-        calibration: What the solver gave.
+        path: Path of the log.
+        log: Content of the log.
+        calibration: The solver's result.
     """
 
     path: Path
@@ -107,7 +107,7 @@ class StoredCalibration:
 
         Args:
             seen: The N sightings.
-            check: (N,) which check each belongs to.
+            check: (N,) index of each sighting's check.
         """
         bare, circles = self._bare(seen, check)
         effects = np.concatenate([bare.effects, self.pose_error.effects(circles)], axis=2)

@@ -86,7 +86,7 @@ def judge(stored: StoredCalibration, history: History, test: DriftTest) -> Check
     Args:
         stored: The calibration.
         history: Every check, of which the last has no finding yet.
-        test: How the test is set.
+        test: Settings of the test.
     """
     sightings = stored.sightings(*history.sightings())
     checks = information_of(sightings, test.daily)

@@ -43,7 +43,7 @@ def write_certificate(
     Args:
         run: The run's folder or its ``run.mcap``.
         path: The file; by default ``certificate.html`` beside the log.
-        conditions: What the person says of the place.
+        conditions: Conditions of the place, as stated by the user.
         camera: For a cell, the camera that is certified.
 
     Raises:

@@ -93,7 +93,7 @@ class Contribution:
         unit: ``rad`` or ``m``.
         sensitivity: (3,) derivative of the point's coordinates by it.
         freedom: Degrees of freedom; infinite where it is taken as known.
-        evidence: Where the figure comes from.
+        evidence: Source of the figure.
         bound: Whether no such error was seen: ``standard`` is then the size that could stay unseen.
     """
 
@@ -219,7 +219,7 @@ class Share:
     Attributes:
         cause: The cause.
         standard: Its part, one standard uncertainty [m].
-        evidence: Where the figure comes from.
+        evidence: Source of the figure.
     """
 
     cause: str
