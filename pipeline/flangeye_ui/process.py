@@ -38,7 +38,7 @@ class RunProcess:
         moves: Whether it may move an arm.
         view: What its log has said so far.
         log: The same as values, clouds of whole scans aside.
-        outlook: What its poses so far are worth; None before the first was judged.
+        outlook: Expected quality from its poses so far; None before the first was judged.
         cloud: (N, 3) the newest scan, thinned, in the camera [m]; and the flange in it.
         places: (3,) of the flange in the base [m], by capture.
         shots: A small picture of each scan with its flange, by capture, as a data URL.
@@ -123,7 +123,7 @@ class RunProcess:
         time.sleep(0.05)
 
     def _mark(self, message: LogMessage) -> None:
-        """Keep where the flange has been, and hear of what was fitted."""
+        """Record the flange's places and the fitted captures."""
         if message.channel.topic == "/capture":
             self._capture = json.loads(message.data)["id"]
             if self.view.arm:

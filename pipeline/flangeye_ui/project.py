@@ -232,7 +232,7 @@ class Project:
             code: From the terminal, which lets the run move an arm; without one nothing moves.
 
         Raises:
-            StageError: The code is not that of this command and page.
+            StageError: The code does not belong to this command and page.
         """
         if code is not None:
             self.codes.spend(code, words, owner)

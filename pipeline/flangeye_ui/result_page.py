@@ -266,7 +266,7 @@ def _by_pose(facts: Facts) -> None:
 
 
 def _warnings(project: Project, facts: Facts) -> None:
-    """Show what whoever uses the matrix has to know, and the button that mends it."""
+    """Show warnings for users of the matrix, each with the button that corrects it."""
     for each in facts.result.warnings:
         warning(each.text)
         code(each.fix)

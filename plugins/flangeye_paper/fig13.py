@@ -56,7 +56,7 @@ class SeenWeld:
 
     @property
     def recovery(self) -> float:
-        """How far the tip went until the torch was near the seam for good [m]."""
+        """Way of the tip until the torch stays near the seam [m]."""
         _, off = self._seen(self.torch)
         tip, _ = self._seen(self.report.robot)
         # A torch this near to the seam is back on it [m]

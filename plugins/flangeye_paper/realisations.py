@@ -45,7 +45,7 @@ class RealisationsParams(Params):
 
 @dataclass(frozen=True, eq=False)
 class RealisationOutcome:
-    """What one realisation came to.
+    """Result of one realisation.
 
     Attributes:
         error: (6,) x, y, z [m], roll, pitch, yaw [rad] in ``camera``, at its origin.

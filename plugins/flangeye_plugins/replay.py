@@ -1,4 +1,4 @@
-"""A weld decided again, from the images and poses in its log."""
+"""Replay of a weld's decisions, from the images and poses in its log."""
 
 from __future__ import annotations
 

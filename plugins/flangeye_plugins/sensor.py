@@ -244,7 +244,7 @@ def image_of(pixels: NDArray[np.uint8], finger: Finger) -> Image:
     """Return pixels (H, W) as an image of the finger's camera.
 
     Raises:
-        DeviceError: They are of another size.
+        DeviceError: The images have another size.
     """
     size, wanted = pixels.shape[1::-1], (finger.camera.width, finger.camera.height)
     if size != wanted:

@@ -177,7 +177,7 @@ def test_scans_of_other_poses_are_refused() -> None:
     ]
     told = refusal(replace(made, observations=shuffled))
     assert "check that each scan belongs to its robot pose" in told
-    assert "(place: unknown, where nobody has measured where the target is mounted)" in told
+    assert "(write place: unknown if the target's mounting was not measured)" in told
 
 
 def test_noise_that_is_not_stated_is_found() -> None:

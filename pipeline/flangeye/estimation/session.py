@@ -34,8 +34,8 @@ from flangeye.types import Floats, Indices, Mask, Note, Observation, PoseFeature
 from flangeye.types.geometry import rigid
 
 CONFIGURED = (
-    "that the recipe's configuration is the cell's (place: unknown, where nobody has measured "
-    "where the target is mounted)"
+    "that the recipe's configuration is the cell's (write place: unknown if the target's mounting "
+    "was not measured)"
 )
 """What to look at, where poses agree with no one answer."""
 

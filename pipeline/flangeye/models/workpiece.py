@@ -48,7 +48,7 @@ class SeamLine(Model):
     name: str
     points: tuple[Vector, ...] = Field(min_length=2, description="Along the root, in order.")
     opening: Vector | tuple[Vector, ...] = Field(
-        description="Out of the groove, towards the torch; of any length. One, or one a point."
+        description="Direction out of the groove, towards the torch: one for all, or one a point."
     )
     half_angle: Angle | None = Field(None, description="Between a wall and the opening.")
     half_width: Length | None = Field(None, description="From the root to a shoulder, sideways.")

@@ -85,7 +85,7 @@ class DriverConformance(Conformance):
             device.close()
 
     def test_a_device_that_is_not_there_is_one_line(self) -> None:
-        """Which, why, and what to do; within PATIENCE."""
+        """A missing device raises within PATIENCE: which device, why, and what to do."""
         if self.unreachable is None:
             return
         began = time.monotonic()
@@ -407,7 +407,7 @@ def _fastest(state: RobotState) -> float:
 
 
 class _Standing:
-    """An arm that stands, on this computer's clock."""
+    """An arm at rest, on this computer's clock."""
 
     def state(self) -> RobotState:
         pose = t.Transform(t.BASE, t.FLANGE, np.eye(4))

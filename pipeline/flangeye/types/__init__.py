@@ -327,12 +327,12 @@ class WeldReport:
         completed: Whether the torch came to the seam's end.
         reason: Why it did not; empty when it did.
         planned: (N, 3) the plan [m].
-        refined: (M, 3) the seam as the tip felt it; M may be zero [m].
+        refined: (M, 3) the seam measured by the tip; M may be zero [m].
         openings: (N, 3) unit vectors out of the work there: deviations are taken across them.
         time: (K,) since the weld began [s].
-        tip: (K, 3) where the finger's tip was [m].
+        tip: (K, 3) position of the finger's tip [m].
         torch: (K, 3) [m].
-        robot: (K, 3) where the tip would have been, undeformed: what was commanded [m].
+        robot: (K, 3) commanded position: that of an undeformed tip [m].
         deflection: (K,) of the tip against the wall, as measured [m].
         wanted: (K,) what was asked of it [m].
         speed: (K,) of the robot's end point along the plane [m/s].

@@ -84,7 +84,7 @@ class ArmCorrection:
 
     @property
     def of_arm(self) -> bool:
-        """Whether it corrects the arm, and not only where on the flange the circle is."""
+        """Whether it corrects the arm, not only the circle's place on the flange."""
         return self.joint_offsets is not None or self.field is not None
 
 
@@ -189,7 +189,7 @@ class HandEye:
 
     @property
     def base_T_camera(self) -> TransformEstimate:
-        """The camera's pose in the robot's base, for users of nothing else."""
+        """The camera's pose in the robot's base; only for a camera fixed there."""
         if self.camera.transform.parent != BASE:
             raise FrameMismatchError(
                 f"the calibration is {self.camera.transform.name}, and base_T_camera is needed"
@@ -231,7 +231,7 @@ class Verification:
 
     Attributes:
         passed: Whether the calibration may be used.
-        reason: One line: the figure and the limit it was held against.
+        reason: One line: the figure and its limit.
         figures: Named results in SI units.
         errors: Per-pose errors on poses that took no part [m], by observation id.
     """

@@ -171,7 +171,7 @@ class Placed:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Where a flange was shortly before and after a capture, from a stream of its poses.
+    """A flange's motion shortly before and after a capture, from a stream of its poses.
 
     Attributes:
         times: (K,) from the time of the capture's own pose, rising [s].

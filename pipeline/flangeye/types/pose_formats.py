@@ -1,4 +1,4 @@
-"""Pose conventions of controllers, files and people: a pose as a row of numbers.
+"""Pose conventions of controllers and files: a pose as a row of numbers.
 
 A pose is a (4, 4) ``parent_T_child`` in metres here and nowhere else. Outside it is a position and
 a rotation vector, a quaternion, or three angles about axes in some order. The sources of each
@@ -86,7 +86,7 @@ class PoseConvention:
 
     @property
     def count(self) -> int:
-        """How many numbers a pose has."""
+        """Number of values in a pose."""
         return 7 if self.is_quaternion else 6
 
     @property

@@ -30,7 +30,7 @@ def address_of(host: str) -> str:
 
 
 class EmulatorTruth(NamedTuple):
-    """Where the arm really is.
+    """True state of the emulated arm.
 
     Attributes:
         base_T_flange: (4, 4)

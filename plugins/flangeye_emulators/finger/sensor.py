@@ -252,7 +252,7 @@ class Compliance:
     rotation: Floats
 
     def tag(self, displacement: Floats) -> tuple[Floats, Floats]:
-        """Return the tag's rotation (3, 3) and translation (3,) for one of the tip (3,) [m]."""
+        """Return the tag's rotation (3, 3) and translation (3,) for a tip displacement (3,) [m]."""
         size = float(np.linalg.norm(displacement)) / 2e-3
         moved = self.share * displacement * (1.0 - self.stiffening * size**2)
         lean = self.tilt * np.array([-displacement[1], displacement[0], 0.0])

@@ -60,11 +60,11 @@ def square_butt(gap: float, radius: float) -> GrooveSection:
 
 @dataclass(frozen=True, eq=False)
 class Relief:
-    """How a groove differs from place to place; everything every :data:`TICK` along the seam.
+    """Variation of a groove along the seam, sampled every :data:`TICK`.
 
     Attributes:
         fill: How far the tip is lifted: tack welds, spatter; less at a root gap [m].
-        aside: How far it is pushed to the left: spatter [m].
+        aside: Shift of the tip to the left by spatter [m].
         half_angle: More than the section's [rad].
     """
 
@@ -157,7 +157,7 @@ class TipContact:
 
         Args:
             rest: In the plane of the work [m].
-            moved: How far the seam has moved to the left [m].
+            moved: Shift of the seam to the left [m].
             plane_R_tool: (3, 3) the finger's axes; upright when not given.
         """
         root = self._groove.root

@@ -38,7 +38,7 @@ GRAIN = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Nominal:
-    """What the files state; the world differs from it.
+    """Nominal values that the files state; the true world differs from them.
 
     Attributes:
         seam: The CAD's, in the plane of the work.
@@ -56,14 +56,14 @@ class Nominal:
 
 
 class WeldWorld:
-    """Arm, tool, finger, workpiece and heat, as they are.
+    """The true arm, tool, finger, workpiece and heat.
 
     Attributes:
         groove: The true one.
         tip: (3,) where the tip is, in the plane of the work [m].
         torch: (3,) position of the torch [m].
         torch_s: Its arc length on the true seam [m].
-        off: How far the torch is to the left of the seam, where the seam is now [m].
+        off: Distance of the torch to the left of the seam's present position [m].
     """
 
     def __init__(

@@ -90,7 +90,7 @@ def pixels_of(scanner: ScannerModel, resolution: float = 1.0) -> Pixels:
 
 
 class _Met(NamedTuple):
-    """What rays (...) meet.
+    """Hits of rays (...).
 
     Attributes:
         depth: (...) distances, in units of the directions' lengths; infinite where nothing is met.

@@ -61,7 +61,7 @@ class CameraView:
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """Where things are, truly: X, Y and Z of the loop, each (4, 4)."""
+    """True places X, Y and Z of the loop, each (4, 4)."""
 
     x: Floats
     y: Floats

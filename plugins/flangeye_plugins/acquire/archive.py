@@ -51,7 +51,7 @@ StatedUnit = Literal["auto", "m", "mm", "in"]
 
 
 class ArchiveParams(OpeningParams):
-    """Which archive, in which unit, and how strictly."""
+    """Parameters: the archive, its unit, and how strictly it is checked."""
 
     unit: StatedUnit = Field(
         "auto",

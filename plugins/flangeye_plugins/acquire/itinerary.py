@@ -99,7 +99,7 @@ class Itinerary:
             self._look_again()
 
     def _look_again(self) -> None:
-        """Plan on from where the scanner stands by what was seen so far: it was guessed."""
+        """Plan again from the scanner's estimated pose, which was a guess before."""
         base_T_camera = view_of([seen for seen in self.outcomes.values() if seen])
         if base_T_camera is not None:
             self._reach.look_from(base_T_camera)
@@ -167,7 +167,7 @@ class Itinerary:
 
 
 def view_of(seen: Sequence[Observation]) -> Floats | None:
-    """Return where a scanner stands, base_T_camera (4, 4), to plan by; None where it is not clear.
+    """Return a scanner's pose base_T_camera (4, 4) for planning; None if it is unknown.
 
     Args:
         seen: Circles, or else poses of a target that is anywhere on the flange.

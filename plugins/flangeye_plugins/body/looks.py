@@ -31,7 +31,7 @@ LISTED = 160
 
 
 class Looks(Shape):
-    """A body's shape, and what of it is seen from where."""
+    """A body's shape, and its visible part from each direction."""
 
     # Points for it that outweigh one that is seen through, or a face that goes on beyond its
     # end.

@@ -125,7 +125,7 @@ def _at_other_times(
 
 @part("check.clock")
 def clock(session: RecordedSession) -> Findings:
-    """The poses were taken some time before or after the scans, while the arm moved."""
+    """Find poses that were taken before or after the scans while the arm moved."""
     session.require_samples()
     times = session.times
     if not np.isfinite(times).all() or (np.diff(times) <= 0).any():
@@ -246,7 +246,7 @@ def _is_identity(session: RecordedSession) -> Mask:
 
 @part("check.repeated")
 def repeated(session: RecordedSession) -> Findings:
-    """A pose or a detection was repeated although the arm had moved."""
+    """Find a pose or detection that was repeated although the arm had moved."""
     reported = [poses[:, :3].reshape(len(poses), 12) for _, poses in _reported(session)]
     yield from _repeats(session, np.concatenate(reported, axis=1), session.centres, "robot pose")
     places = np.concatenate([poses[:, :3, 3] for _, poses in _reported(session)], axis=1)

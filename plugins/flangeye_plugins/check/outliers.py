@@ -75,7 +75,7 @@ def _dimensions(null: VariantFits) -> Floats:
 
 @part("check.flips")
 def flips(session: RecordedSession) -> Findings:
-    """Some targets were seen turned over, as a symmetric or frontal one may be."""
+    """Find targets that were detected turned over, as symmetric or frontal ones may be."""
     session.require_samples()
     if not np.isfinite(session.rotations).any():
         raise NotApplicable("no marker's whole pose was measured")

@@ -1,4 +1,4 @@
-"""Rotations that were written one way and read another; poses given the other way round."""
+"""Find rotations read in a wrong convention, and inverted poses."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ def clustered_covariance(
     Args:
         jacobian: (N, p) derivative of the residuals.
         residual: (N,) at the solution.
-        weights: (N,) what each residual counted.
+        weights: (N,) weight of each residual.
         cluster: (N,) number of the cluster each residual belongs to, from zero.
         curvature: (N,) derivative of ``weights * residual``, where the weights follow the
             residuals; the weights if not given.

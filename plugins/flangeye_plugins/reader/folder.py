@@ -145,7 +145,7 @@ Triple = tuple[float, float, float]
 
 
 class ArmPose(BaseModel):
-    """Where an arm's flange was."""
+    """Pose of an arm's flange."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, defer_build=True)
 

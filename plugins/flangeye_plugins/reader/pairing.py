@@ -29,7 +29,7 @@ Signal = tuple[Floats, Floats]
 
 
 class PairingParams(Params):
-    """How the two are brought together."""
+    """Parameters for pairing poses with measurements."""
 
     clock_offset: Duration | None = Field(
         None,

@@ -48,7 +48,7 @@ def require_tool(
         driver: The arm's driver.
         offset: (4, 4) tool offset of the controller.
         expected: (4, 4) tool offset of the recipe.
-        shown: How the pendant shows it.
+        shown: Format in which the pendant shows the offset.
 
     Raises:
         DeviceError: The two tool offsets differ.

@@ -1,4 +1,4 @@
-"""Where surfaces of a scan end: a plate across the seam, a seam along it."""
+"""Find where surfaces of a scan end: a plate across the seam, a seam along it."""
 
 from __future__ import annotations
 

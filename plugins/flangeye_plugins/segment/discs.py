@@ -44,8 +44,8 @@ class PlanarPiece(NamedTuple):
 
     Attributes:
         plane: The plane, its normal towards the scanner.
-        points: (k, 3) what lies on it, thinned: a table has a hundred times the points its width
-            needs [m].
+        points: (k, 3) points on the plane, thinned, since a table has a hundred times the points
+            its width needs [m].
         at: (m,) pixels of the whole piece in the view.
     """
 

@@ -66,7 +66,7 @@ class SearchState:
 
     Attributes:
         pool: The poses of the best answer so far, the oldest first.
-        cost: Its cost [m]; infinite while no answer could be measured.
+        cost: Cost of the answer [m]; infinite until one could be measured.
         history: The cost after the first pool and after each pose tried.
         losers: Pose id -> why it is not in the pool.
     """

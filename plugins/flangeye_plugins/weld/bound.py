@@ -37,7 +37,7 @@ class Predicted(NamedTuple):
     Attributes:
         s: Arc lengths [m].
         fixed: Variance from torch, arm, heat and creep, which nothing measures during the weld.
-        askew: The torch's distance from the tip, where the tool stands askew.
+        askew: Variance from the distance of torch and tip, while the tool is turned off the seam.
         tip: Variance from the tip's position on the tool, while the tool turns.
         felt: Variance from the finger's drift and the weave.
     """

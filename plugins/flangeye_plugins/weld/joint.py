@@ -55,7 +55,7 @@ class WeldJoint:
 def joint_of(
     kind: JointKind, half_angle: float | None, side: float, radius: float, gap: float
 ) -> WeldJoint | None:
-    """Return the joint that is planned; None where nothing is known of it.
+    """Return the planned joint; None if nothing is known of it.
 
     Args:
         kind: What joint it is.

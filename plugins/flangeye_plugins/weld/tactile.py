@@ -164,7 +164,7 @@ def _planned(
 
 
 def _kept(planned: Planned, follower: Follower | None) -> tuple[Note, ...]:
-    """Keep what a weld by touch has found, for the next one; say where, or why not."""
+    """Store what a weld by touch has learned for the next one; return where, or why not."""
     path = planned.params.prior
     if path is None or follower is None:
         return ()

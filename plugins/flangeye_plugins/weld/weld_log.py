@@ -33,7 +33,7 @@ class Cycle(NamedTuple):
         torch: Arc length of the torch's progress.
         wanted: Deflection asked of the tip.
         sigma: Standard deviation of the torch's place across the seam.
-        bound: What its distance from the seam does not exceed.
+        bound: Upper bound of the torch's distance from the seam.
         band: The same for 95 % of the seam.
         arc: Commanded state of gas and arc: 0 off, 1 gas, 2 arc.
         computing: Processor time that the cycle took, besides reading images [s].
@@ -66,7 +66,7 @@ class WeldLog:
     Attributes:
         cycles: All so far.
         sights: How many images were read.
-        felt: Number of an image -> what was felt in it.
+        felt: Number of an image -> its measurement.
     """
 
     def __init__(self, stage_log: StageLog, beside: bool) -> None:

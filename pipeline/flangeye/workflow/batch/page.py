@@ -47,7 +47,7 @@ COLOURS = (
 
 @dataclass(frozen=True)
 class TableCell:
-    """One place of the table.
+    """One cell of the table.
 
     Attributes:
         text: Text shown.

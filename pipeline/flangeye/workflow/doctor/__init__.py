@@ -15,7 +15,8 @@ def as_text(diagnosis: Diagnosis) -> str:
     """Return the findings as text, a few lines each."""
     session = diagnosis.session
     head = f"{int(session.seen.sum())} of {len(session)} samples have a target in them"
-    lines = [f"{head}; {len(diagnosis.checks)} checks", *_idle(diagnosis)]
+    checks = len(diagnosis.checks)
+    lines = [f"{head}; {checks} check{'s' * (checks != 1)}", *_idle(diagnosis)]
     for number, finding in enumerate(diagnosis.findings, 1):
         lines += ["", f"{number}. {finding.name}: {finding.what}", *_details(finding)]
     for note in diagnosis.notes:

@@ -44,7 +44,7 @@ Value = TypeVar("Value")
 
 
 class _CaptureFacts(TypedDict):
-    """What ``/capture`` says."""
+    """Content of a ``/capture`` message."""
 
     id: str
     poses: dict[str, t.Transform]
@@ -63,7 +63,7 @@ class _CaptureFacts(TypedDict):
 
 
 class _StepFacts(TypedDict):
-    """What a message of a step says of itself."""
+    """Facts about a step from its message."""
 
     capture: str | None
     seconds: float

@@ -48,7 +48,7 @@ class Outlook:
 
     @property
     def better(self) -> list[str]:
-        """Which motions would make it better."""
+        """Motions that would improve the calibration."""
         return self.coverage.lacking() if self.coverage else []
 
 

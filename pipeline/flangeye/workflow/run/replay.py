@@ -14,7 +14,7 @@ from flangeye.workflow.log.read import log_of, read_notes
 
 @dataclass(frozen=True)
 class ReplayedStep:
-    """How decisions made again compare with those in the log.
+    """Comparison of repeated decisions with those in the log.
 
     Attributes:
         what: Text of what was decided.

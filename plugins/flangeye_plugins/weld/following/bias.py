@@ -31,7 +31,7 @@ CONTRADICTIONS = 5
 
 
 class Trail:
-    """Where the torch was measured to be when it passed, by arc length and by time."""
+    """Measured positions of the torch as it passed, by arc length and by time."""
 
     def __init__(self) -> None:
         self._times: list[float] = []
@@ -43,8 +43,8 @@ class Trail:
 
         Args:
             time: [s].
-            s: Its arc length [m].
-            raw: How far to the left of the refined path it is measured to be [m].
+            s: Arc length of the torch [m].
+            raw: Measured distance of the torch to the left of the refined path [m].
             variance: Variance of the offset that the tip measured there, at the torch [m^2].
         """
         # A place every 0.2 mm is enough: what is looked at is hardly smaller.

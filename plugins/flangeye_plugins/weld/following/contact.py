@@ -26,7 +26,7 @@ from flangeye.types import Floats
 
 
 class Mode(IntEnum):
-    """How the tip touches: between the walls, up the pressed one, up the other, or not at all."""
+    """Contact of the tip: between the walls, up the pressed one, up the other, or none."""
 
     SEATED, PRESSED, OTHER, FREE = range(4)
 
@@ -171,7 +171,7 @@ class Contact:
         self._newest.clear()
 
     def settled(self, until: float) -> Iterator[tuple[Felt, float]]:
-        """Yield measurements up to a time [s] that count, each with its extra variance [m^2]."""
+        """Yield valid measurements up to a time [s], each with its extra variance [m^2]."""
         # Backward pass: `since` is how likely each mode makes all that was measured later
         since, off = np.ones(4), []
         for weighed in reversed(self._newest):

@@ -138,7 +138,7 @@ class Follower:
 
     @property
     def arc_from(self) -> float | None:
-        """Where the torch first was within ``max_error``, and so may weld, by arc length [m]."""
+        """Arc length at which the torch first was within ``max_error``, and so may weld [m]."""
         return self.welding.arc_from
 
     @property
@@ -158,7 +158,7 @@ class Follower:
         return elapsed
 
     def _feel(self, touch: Touch) -> None:
-        """Take a measurement, with the pose the tool had when its image was taken (13)."""
+        """Take a measurement, with the tool's pose at its image's time; equation (13)."""
         sensing = self.sensing
         taken = sensing.take(touch, self.now or 0.0)
         if taken is None:
@@ -472,7 +472,7 @@ class Follower:
         return self.tip >= (self.seam.start or 0.0) + INSIDE
 
     def _drifting(self) -> float:
-        """Return how fast the seam leaves the plan to the left, per length of it, at the tip."""
+        """Return the slope of the seam against the plan at the tip, positive to the left."""
         refined = self.seam.refined
         if self.phase != "following" or refined.empty or self.seam.backs:
             return 0.0

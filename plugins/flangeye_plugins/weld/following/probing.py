@@ -166,7 +166,7 @@ class Probing:
         return None
 
     def _fit(self, felt: Floats, cycles: Floats) -> tuple[Learned, str]:
-        """Return what explains the sweep, and whether the tip climbs."""
+        """Fit finger and clock to the sweep; return the fit, and whether the tip climbs."""
         noise = max(_scatter(felt[:, 1]), self._noise[0])
         late = np.arange(-0.12, 0.121, 0.01)  # timestamps, or early, by up to 120 ms
         reversals = 1e-3 * np.array([0.02, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.6, 1.0])

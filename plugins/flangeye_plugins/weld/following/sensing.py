@@ -40,7 +40,7 @@ class SeamReading:
 
 
 class Located(NamedTuple):
-    """Where the tip was.
+    """Position of the tip at one measurement.
 
     Attributes:
         s: Arc length of the plan [m].
@@ -213,12 +213,12 @@ class _Sample(NamedTuple):
 
 
 class SeamEstimate:
-    """How the tip touches, and where the seam therefore is.
+    """The tip's contact, and the seam estimated from it.
 
     Attributes:
         refined: The seam as felt so far.
         contact: The state of the tip's contact.
-        start: Where the seam begins, as the tip felt, by arc length; None where it did not [m].
+        start: Arc length of the seam's start as felt by the tip; None if not felt [m].
         end: Where it ends, likewise.
         lost: When no wall held the tip any more, and where it was then [s, m]; None while one does.
     """
@@ -342,7 +342,7 @@ class SeamEstimate:
 
         Args:
             time: Time of the touch [s].
-            found: Where the tip was.
+            found: Position of the tip at the touch.
             learned: Calibration from the sweep.
             side: Side of the wall that is pressed.
         """

@@ -101,5 +101,5 @@ class WeldTask:
 
     @property
     def margin(self) -> float:
-        """How far beyond the plan tip and torch may come [m]."""
+        """Largest distance of tip and torch beyond the plan [m]."""
         return self.belief.distance + self.settings.ending + self.ends - self.plan.length

@@ -22,7 +22,7 @@ class Welding:
 
     Attributes:
         sigma: Standard deviation of the torch's place across the seam [m].
-        bound: What the torch's distance from the seam does not exceed [m].
+        bound: Upper bound of the torch's distance from the seam [m].
         band: The same for 95 % of the seam [m].
         arc_from: Where the arc begins, the torch being within ``max_error``; None before [m].
         bias: What a look behind the torch says of errors that nothing else measures.
@@ -189,7 +189,7 @@ class Welding:
         return ""
 
     def _ahead(self, variance: float) -> tuple[float, float]:
-        """Return where the seam that was felt is known least, and the torch's bound there [m].
+        """Return where the felt seam is least certain, and the torch's bound there [m].
 
         Args:
             variance: Variance of the torch's place where it is now [m^2].

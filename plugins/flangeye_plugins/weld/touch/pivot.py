@@ -1,4 +1,4 @@
-"""Where a point of the tool is in the flange, from poses in which it was at one place. Arrays only.
+"""Pivot calibration: a tool point in the flange from poses with the point at one place.
 
 With the point ``p`` in the flange and the mark ``q`` in base, every pose gives ``R p + t = q``; the
 differences to their mean are free of ``q``: ``(R_i - mean R) p = mean t - t_i``. A point along an
@@ -24,10 +24,10 @@ class Pivot:
     """A point of the tool.
 
     Attributes:
-        point: (3,) in the flange [m].
-        covariance: (3, 3) of it [m^2].
-        mark: (3,) where it was, in base [m].
-        rms: What the poses leave unexplained, along an axis [m].
+        point: (3,) tool point in the flange [m].
+        covariance: (3, 3) of the point [m^2].
+        mark: (3,) the fixed place, in base [m].
+        rms: Residual along one axis, rms [m].
     """
 
     point: Floats

@@ -434,8 +434,8 @@ def _within_reach(arm: PoseColumns, robot: RobotModel | None) -> PoseColumns:
 def _neither(arm: PoseColumns, robot: RobotModel | None) -> str:
     named = f" nor as joint angles of {robot.model}" if robot else f"; joint angles? {NAME_THE_ARM}"
     return (
-        f"{arm.table.file}: {len(arm.columns)} numbers a row, which as poses in any usual "
-        f"convention do not turn as the target does{named}; or say --rotation (kuka, vector, …)"
+        f"{arm.table.file}: {len(arm.columns)} numbers a row; in no usual convention of "
+        f"poses do they turn as the target does{named}; or say --rotation (kuka, vector, …)"
     )
 
 

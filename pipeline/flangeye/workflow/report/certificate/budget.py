@@ -108,7 +108,7 @@ class Contribution:
 
     @property
     def size(self) -> float:
-        """How far it alone moves the point, one standard uncertainty [m]."""
+        """Shift of the point by this contribution, one standard uncertainty [m]."""
         return float(np.linalg.norm(self.sensitivity) * self.standard)
 
 
