@@ -100,6 +100,12 @@ def test_all_that_moves_stays_above_the_table(links: Any, above: bool) -> None:
     assert volume.above(axes, 0.3) is above
 
 
+@pytest.mark.parametrize(("room", "away"), [(0.0, True), (0.049, True), (0.051, False)])
+def test_every_link_keeps_its_distance_from_what_stands_there(room: float, away: bool) -> None:
+    volume, axes = of_capsules((1, 0.9, 0.0), (6, 0.1, 0.0))
+    assert volume.away(axes, np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]), room) is away
+
+
 def test_segments_on_one_line_and_points_have_their_distance_too() -> None:
     first = np.array(
         [[[0, 0, 0], [1, 0, 0]], [[0, 0, 0], [1, 0, 0]], [[2, 0, 0], [2, 0, 0]]], float
