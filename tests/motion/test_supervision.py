@@ -172,7 +172,7 @@ def test_three_tenths_of_a_second_on_the_way_without_a_move_and_no_longer() -> N
     halfway, watch = turned(AT_HOME.joints, j2=0.2), sent()
     ready = at(1.0, halfway)
     watch.judge(ready)
-    watch.judge(replace(ready, time_ns=ready.time_ns + 299_000_000))
+    watch.judge(replace(ready, time_ns=ready.time_ns + 300_000_000))
     moving_on = replace(ready, time_ns=ready.time_ns + 301_000_000, mode="moving")
     watch.judge(moving_on)
     watch.judge(at(1.31, halfway))

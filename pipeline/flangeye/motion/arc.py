@@ -109,7 +109,7 @@ class ArcedArm(Device):
         # After an arc gas shields the bead while it cools; without one there is nothing to shield
         burned, self._level = self._level == BURN, OFF
         self.arc.burn(False)
-        after = self._times.gas_after if burned else 0.0
+        after = self._times.gas_after * burned
         self._flows_until = self._robot.state().time_ns + round(after * 1e9)
 
     def move_joints(self, joints: Floats, speed: float, acceleration: float) -> None:

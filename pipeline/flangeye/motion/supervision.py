@@ -172,8 +172,8 @@ class Supervisor:
             self._ready_ns = 0
             return
         self._ready_ns = self._ready_ns or state.time_ns
-        # So long ready before the goal, its controller has ended the move [s]
-        if (state.time_ns - self._ready_ns) * 1e-9 > 0.3:
+        # So long ready before the goal, its controller has ended the move [ns]
+        if state.time_ns - self._ready_ns > 300_000_000:
             raise SafetyFault(
                 f"the arm ended its move {np.degrees(short):.1f} deg before the goal: its "
                 f"controller did, or this machine was too busy to watch it for {SILENT} s"

@@ -1,9 +1,12 @@
 """robot.franky: the real library as far as it goes, then a stand-in for its connection."""
 
+import re
 import socket
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import nullcontext
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +19,7 @@ from flangeye_plugins.robot.franky import (
     FrankyParams,
     FrankyRobot,
     opened,
+    require_answer,
     robot_franky,
 )
 from tests.emulators.controllers.process import free_address
@@ -68,6 +72,29 @@ def test_a_silent_host_on_which_the_real_library_hangs_is_one_line_too() -> None
         f"franka-panda at {host}: cannot connect (nothing within 2.5 s): is FCI active in Desk, "
         "is this its address, is this computer in its network?"
     )
+
+
+@pytest.mark.parametrize(
+    ("does", "why"),
+    [
+        ("pass", ""),
+        ("raise RuntimeError('no\\n answer')", "cannot connect (no answer)"),
+        ("os._exit(3)", "cannot connect (the library ended with 3)"),
+        ("os._exit(1)", "cannot connect (the library ended with 1)"),
+        ("os.abort()", "cannot connect (the library ended with -6)"),
+    ],
+)
+def test_a_connection_is_made_where_the_library_makes_it_and_says_nothing(
+    does: str, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "franky.py").write_text(
+        "import os\nfrom types import SimpleNamespace\n"
+        "RealtimeConfig = SimpleNamespace(Enforce=True, Ignore=False)\n"
+        f"def Robot(host, realtime_config):\n    {does}\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    with pytest.raises(DeviceError, match=re.escape(f"franka: {why}:")) if why else nullcontext():
+        require_answer("franka", "10.0.0.1", realtime=False)
 
 
 def test_a_missing_library_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
