@@ -1,4 +1,4 @@
-"""Interfaces of robots, scanners and tactile sensors, and what a machine names for their drivers.
+"""Interfaces of robots, scanners and tactile sensors, and files named in a machine's settings.
 
 A driver is a part (``robot.NAME``, ``scanner.NAME``, ``sensor.NAME``): a function that takes the
 recipe's model and its own parameters and returns an open device. It imports its SDK when it is

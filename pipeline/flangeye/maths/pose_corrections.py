@@ -16,7 +16,7 @@ from flangeye.types.geometry import rows_at
 
 
 def scaled(poses: Floats, factor: float | Floats) -> Floats:
-    """Return the poses with their positions times ``factor``: other units, or one of each axis."""
+    """Return the poses with their positions times ``factor``, one for all axes or one per axis."""
     out = np.array(poses)
     out[..., :3, 3] *= factor
     return out

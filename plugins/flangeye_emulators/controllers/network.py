@@ -291,7 +291,7 @@ class Kind(NamedTuple):
 
 
 def parse_fault(text: str, kinds: dict[str, Kind]) -> Fault:
-    """Read ``NAME[=DURATION][@WHEN]``, such as ``freeze=3 s@moving``; WHEN is a duration too.
+    """Read ``NAME[=DURATION][@WHEN]``, such as ``freeze=3 s@moving``.
 
     Raises:
         StageError: There is no such fault, or a duration is wrong; the message says what there is.

@@ -38,8 +38,8 @@ class PlanParams(Params):
     facing: Angle = param(
         "35 deg",
         gt=0,
-        description="Largest angle between the view and the flange's normal, or where a body is "
-        "the target, the axis of the flange that it is shown along.",
+        description="Largest angle between the view and the flange's normal; for a body, the "
+        "flange's axis along which the body is shown.",
     )
 
 

@@ -105,7 +105,7 @@ def message(kind: str, **fields: Any) -> Any:
 
 
 def positions_of(message: Any) -> dict[str, float]:
-    """Return joint -> position of a ``sensor_msgs/JointState``; of one of speeds alone nothing.
+    """Return joint -> position of a ``sensor_msgs/JointState``; empty if it has no positions.
 
     Raises:
         StageError: It has fewer positions than names.

@@ -60,8 +60,8 @@ def seam_cad(
     """Register the workpiece's CAD to the scan and map its seam into the base.
 
     Figures: ``seen``, ``refuted`` and ``second`` as in :class:`Registered`; ``residual`` of the
-    scan from the CAD, and ``registration``, the largest standard deviation of a point of
-    the seam before the hand-eye pose comes in [m]; ``points`` and ``edges`` the fit rests on.
+    scan from the CAD, and ``registration``, the largest standard deviation of a seam point in the
+    scanner's frame [m]; ``points`` and ``edges``, the numbers used by the fit.
 
     Raises:
         StageError: The CAD cannot be read, has no such seam, or is in another unit.

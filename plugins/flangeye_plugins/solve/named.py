@@ -110,7 +110,7 @@ def by_both(method: Callable[[Floats, Floats], tuple[Floats, Floats]]) -> Closed
 def by_three(
     method: Callable[[Floats, Floats, Floats], tuple[Floats, Floats, Floats]], needed: int
 ) -> ClosedForm:
-    """Return AXB = YCZ as a closed form that needs so many poses."""
+    """Return a method for AXB = YCZ as a closed form that needs ``needed`` poses."""
 
     def closed(problem: Problem) -> Places:
         if len(problem.unknown) != 3 or not (problem.seen.ranks == 6).all():

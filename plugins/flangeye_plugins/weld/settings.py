@@ -216,7 +216,7 @@ class WeldTactileParams(Following):
     )
     leg: int | None = Field(
         None, ge=1,
-        description="Of a plan with sharp corners, which leg between them this step welds.",
+        description="Number of the leg between sharp corners of the plan that this step welds.",
     )  # fmt: skip
     corner_radius: Length | None = param(
         None,

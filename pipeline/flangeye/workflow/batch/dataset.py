@@ -132,7 +132,7 @@ class Dataset:
             yield self._settled(block, parts, ledger)[0]
 
     def rows(self, ledger: Ledger) -> Iterator[Row]:
-        """Yield the same, one by one."""
+        """Yield the rows one by one."""
         for table in self.blocks(ledger):
             yield from table.to_pylist()
 

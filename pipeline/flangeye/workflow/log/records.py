@@ -127,7 +127,7 @@ class LogFile:
         """Yield the messages up to the log's end or its first unreadable part.
 
         Args:
-            file: Stands at the log's first byte; may wait for more.
+            file: The log, open at its first byte; a read may wait for more.
             size: Size of the file, where it is known [bytes]: no record is longer.
 
         Raises:

@@ -205,9 +205,9 @@ class SetAside:
     """The captures that were not used, with their reasons.
 
     Attributes:
-        rows: One each.
-        counts: (how many, stage, why), most frequent first; of reasons that differ in numbers
-            alone the first.
+        rows: One row for each capture.
+        counts: (how many, stage, why), most frequent first; reasons that differ only in numbers are
+            merged.
         early: Set aside before the solver.
         late: Set aside by the solver.
     """

@@ -210,7 +210,7 @@ class Commander:
             self._control.stopScript()
 
     def give_up(self) -> None:
-        """End the process, after a last try to stop the arm; its watchdog is the one after."""
+        """End the process after a last try to stop the arm; then the watchdog stops it."""
         last_try = threading.Thread(target=self.end, daemon=True)
         last_try.start()
         # Longest time for stopping the arm before the process ends [s]

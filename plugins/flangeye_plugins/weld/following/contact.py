@@ -1,15 +1,15 @@
-"""Whether the tip is where the seam is: one hidden Markov model of how it touches the joint.
+"""Estimate the tip's contact with the joint by a hidden Markov model.
 
-A tip is seated between the walls, up the wall that it is pressed to on one side or the other, or
-free: then it goes with the arm. Each measurement is weighed against where the seam so far leads:
+A tip is seated between the walls, up the pressed wall, up the other wall, or free and moving with
+the arm. Each measurement is compared with the extrapolated seam:
 
-* seated, it is there, and as high as before, or lifted straight up by a tack weld;
-* up a wall, it is aside by ``flat`` for what it rose, by about :data:`RISE`;
-* free, it is hardly deflected, at any height.
+* seated, the tip is on the seam, at its former height or lifted by a tack weld;
+* up a wall, the tip has risen by about :data:`RISE` and is aside by ``flat`` times that;
+* free, the tip is hardly deflected, at any height.
 
-A wall is climbed where the tip is pressed aside by more, for what presses it down, than it was
-seen to stand in the sweep at the start. What is felt counts a little later, by what was felt since
-(a forward-backward pass over the newest): what it may be off by is its ``doubt``.
+The tip climbs a wall if its ratio of side force to preload exceeds the largest one at which the
+initial sweep saw it stay seated. A measurement is used after a short delay, smoothed by a
+forward-backward pass over the newest ones; ``doubt`` is its remaining uncertainty.
 """
 
 from __future__ import annotations

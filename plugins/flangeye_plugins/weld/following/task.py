@@ -55,8 +55,8 @@ class WeldTask:
         belief: Prior knowledge of tool, finger and joint.
         settings: Gains and limits.
         touch: Follow by touch; otherwise the plan alone, for comparison.
-        before: What an earlier weld has left that is gone on with.
-        given: Where it begins, if that is not where the plan does.
+        before: State of the earlier weld that is resumed; None for a new weld.
+        given: Start of the weld, if it is not the plan's.
     """
 
     plan: Path
