@@ -120,7 +120,7 @@ def read_cloud(
         xyz = table.decode()
     xyz = xyz if xyz.flags.writeable else xyz.copy()
     missing = mark_missing(xyz)
-    viewpoint: Viewpoint | None = getattr(table, "viewpoint", None)
+    viewpoint: Viewpoint | None = table.viewpoint
     if viewpoint is not None and from_viewpoint:
         xyz = viewpoint.seen_from(xyz)
     for note in (missing, viewpoint.note(from_viewpoint) if viewpoint else ""):

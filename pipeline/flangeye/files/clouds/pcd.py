@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -74,11 +74,11 @@ def open_pcd(path: Path) -> PointTable:
     if encoding == "ascii":
         x, y, z = (sum(counts[:axis]) for axis in axes)
         n, width = math.prod(shape), sum(counts)
-        return replace(TextTable(path, shape, offset, width, (x, y, z), 0, n), viewpoint=viewpoint)
+        return TextTable(path, shape, offset, width, (x, y, z), 0, n, viewpoint=viewpoint)
     if encoding == "binary":
-        return BinaryTable(path, shape, offset, record, viewpoint)
+        return BinaryTable(path, shape, offset, record, viewpoint=viewpoint)
     if encoding == "binary_compressed":
-        return CompressedTable(path, shape, offset, record, viewpoint)
+        return CompressedTable(path, shape, offset, record, viewpoint=viewpoint)
     refuse(path, f"its header states DATA {encoding}; known: ascii, binary, binary_compressed")
 
 

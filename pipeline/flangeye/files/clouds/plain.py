@@ -208,23 +208,16 @@ def _header(file: IO[bytes]) -> tuple[Shape, np.dtype[Any]]:
 
 
 @dataclass(frozen=True)
-class NpyTable:
+class NpyTable(PointTable):
     """An array of points.
 
     Attributes:
-        path: The file.
-        shape: (N,) or (H, W).
         fields: Names of a record's fields; empty for plain numbers.
         axes_first: Whether x, y and z are the first index and not the last.
     """
 
-    path: Path
-    shape: Shape
     fields: tuple[str, ...] = ()
     axes_first: bool = False
-
-    def check(self) -> None:
-        """Do nothing: the size was checked when the file was opened."""
 
     def decode(self) -> Points:
         """Load the array."""
@@ -239,21 +232,14 @@ class NpyTable:
 
 
 @dataclass(frozen=True)
-class LoadedTable:
+class LoadedTable(PointTable):
     """Points that had to be loaded to be found.
 
     Attributes:
-        path: The file.
-        shape: (N,) or (H, W).
         xyz: (N, 3).
     """
 
-    path: Path
-    shape: Shape
     xyz: NDArray[Any]
-
-    def check(self) -> None:
-        """Do nothing: the file was read whole when it was opened."""
 
     def decode(self) -> Points:
         """Return the points."""

@@ -6,11 +6,11 @@ import io
 import math
 import os
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from io import TextIOWrapper
 from itertools import islice
 from pathlib import Path
-from typing import Any, NoReturn, Protocol
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -140,27 +140,33 @@ Shape = tuple[int, ...]
 Points = NDArray[np.float32]
 
 
-class PointTable(Protocol):
-    """Where and how a file stores its points, as its header states."""
-
-    @property
-    def shape(self) -> Shape:
-        """(N,) or (H, W)."""
-
-    def check(self) -> None:
-        """Raise StageError if the file is too short for what its header promises."""
-
-    def decode(self) -> Points:
-        """Return (N, 3) float32, in the file's own unit; a missing point is NaN."""
-
-
 @dataclass(frozen=True)
-class TextTable:
-    """One point a row, as text.
+class PointTable:
+    """Where and how a file stores its points, as its header states.
 
     Attributes:
         path: The file.
         shape: (N,) or (H, W).
+        viewpoint: The scanner's pose by the file; None if it states none.
+    """
+
+    path: Path
+    shape: Shape
+    viewpoint: Any = field(default=None, kw_only=True)
+
+    def check(self) -> None:
+        """Raise StageError if the file is too short, where that was not seen when it was opened."""
+
+    def decode(self) -> Points:
+        """Return (N, 3) float32, in the file's own unit; a missing point is NaN."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class TextTable(PointTable):
+    """One point a row, as text.
+
+    Attributes:
         offset: Byte at which the rows begin.
         width: Values in a row.
         axes: Where x, y and z are in a row.
@@ -170,11 +176,8 @@ class TextTable:
         unit: Unit of the coordinates, where a heading states it; else empty.
         comma: Whether decimals follow a comma.
         remarks: Whether remarks stand between the rows.
-        viewpoint: As for :class:`BinaryTable`.
     """
 
-    path: Path
-    shape: Shape
     offset: int
     width: int
     axes: tuple[int, int, int]
@@ -184,7 +187,6 @@ class TextTable:
     unit: str = ""
     comma: bool = False
     remarks: bool = False
-    viewpoint: Any = None
 
     def check(self) -> None:
         """Count the rows, and the values of the last one."""
@@ -236,22 +238,16 @@ class TextTable:
 
 
 @dataclass(frozen=True)
-class BinaryTable:
+class BinaryTable(PointTable):
     """One record a point.
 
     Attributes:
-        path: The file.
-        shape: (N,) or (H, W).
         offset: Byte at which the records begin.
         record: Layout of a record, with fields ``x``, ``y``, ``z``.
-        viewpoint: The scanner's pose by the file; None if it states none.
     """
 
-    path: Path
-    shape: Shape
     offset: int
     record: np.dtype[np.void]
-    viewpoint: Any = None
 
     def check(self) -> None:
         """Check that the file has the bytes of all records; further bytes are padding."""
@@ -278,22 +274,16 @@ class BinaryTable:
 
 
 @dataclass(frozen=True)
-class CompressedTable:
+class CompressedTable(PointTable):
     """Columns one after the other, LZF-compressed (PCL's ``binary_compressed``).
 
     Attributes:
-        path: The file.
-        shape: (N,) or (H, W).
         offset: Byte at which the two sizes and the stream begin.
         record: Layout of one point, with fields ``x``, ``y``, ``z``.
-        viewpoint: As for :class:`BinaryTable`.
     """
 
-    path: Path
-    shape: Shape
     offset: int
     record: np.dtype[np.void]
-    viewpoint: Any = None
 
     def check(self) -> None:
         """Check the two stated sizes against the header and the file."""
