@@ -303,12 +303,8 @@ class _View:
     grain: Image
 
 
-class StructuredLight:
-    """One scanner, with the distortion it happens to have.
-
-    The depth noise grows with the square of the depth and with one over the cosine of incidence,
-    as the deviations from the plane in published scans do, and neighbouring pixels share it.
-    """
+class DepthCamera:
+    """What both sorts of scanner have, and the distortion that one of them happens to have."""
 
     def __init__(
         self, scanner: ScannerModel, resolution: float, noise: float, rng: np.random.Generator
@@ -326,13 +322,28 @@ class StructuredLight:
         self.noise = noise
         self._middle = np.float32((scanner.near + scanner.far) / 2)
         self._grain = scanner.noise_grain * resolution
+        self._distortion = Distortion(scanner, self.pixels, noise * scanner.calibration_error, rng)
+        self._length = np.linalg.norm(self.pixels.directions, axis=-1)
+
+
+class StructuredLight(DepthCamera):
+    """One scanner with a projector.
+
+    The depth noise grows with the square of the depth and with one over the cosine of incidence,
+    as the deviations from the plane in published scans do, and neighbouring pixels share it.
+    """
+
+    def __init__(
+        self, scanner: ScannerModel, resolution: float, noise: float, rng: np.random.Generator
+    ) -> None:
+        """Set up camera and projector."""
+        super().__init__(scanner, resolution, noise, rng)
         # Eight pixels beyond what is lost, a step has no part in any error.
         self._reach = int(np.ceil(scanner.edge_loss)) + 8
-        self._distortion = Distortion(scanner, self.pixels, noise * scanner.calibration_error, rng)
         lean = scanner.convergence
         # The camera leans towards the projector, which therefore stands a little before it.
         self.projector = scanner.baseline * np.array([np.cos(lean), 0.0, np.sin(lean)])
-        self._inverse_length: Image = 1 / np.linalg.norm(self.pixels.directions, axis=-1)
+        self._inverse_length: Image = 1 / self._length
 
     def scan(self, scene: RaycastScene, rng: np.random.Generator) -> Image:
         """Return the organised scan, (H, W, 3) in ``camera`` [m], NaN where nothing was measured.
@@ -458,20 +469,8 @@ def _highlight(cosines: Image, between: Image) -> Image:
     return np.asarray(np.exp(-((np.arccos(halfway) / float(np.radians(6.0))) ** 2)))
 
 
-class TimeOfFlight:
-    """One camera, with the distortion it happens to have. Interface as ``StructuredLight``."""
-
-    def __init__(
-        self, scanner: ScannerModel, resolution: float, noise: float, rng: np.random.Generator
-    ) -> None:
-        """Set up the camera; the arguments are those of ``StructuredLight``."""
-        self.scanner = scanner
-        self.pixels = pixels_of(scanner, resolution)
-        self.noise = noise
-        self._middle = np.float32((scanner.near + scanner.far) / 2)
-        self._grain = scanner.noise_grain * resolution
-        self._distortion = Distortion(scanner, self.pixels, noise * scanner.calibration_error, rng)
-        self._length = np.linalg.norm(self.pixels.directions, axis=-1)
+class TimeOfFlight(DepthCamera):
+    """One camera that measures how long light takes."""
 
     def scan(self, scene: RaycastScene, rng: np.random.Generator) -> Image:
         """Return the organised scan, (H, W, 3) in ``camera`` [m], NaN where nothing was measured.
