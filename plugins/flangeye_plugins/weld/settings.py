@@ -235,20 +235,15 @@ class WeldTactileParams(Following):
     )
 
     @model_validator(mode="after")
-    def _arc_is_led_by_touch(self) -> Self:
-        """Refuse an arc where no bound says when it may burn."""
-        if self.arc is not None and self.mode != "tactile":
-            raise ValueError("'arc' goes with mode: tactile only: leave out one of them")
-        return self
+    def _follows_by_touch(self) -> Self:
+        """Refuse an arc and a look where no bound says when the torch may weld.
 
-    @model_validator(mode="after")
-    def _look_has_one_pass(self) -> Self:
-        """Refuse a look behind the torch where what it sees cannot be made up for."""
-        if self.look is None:
-            return self
-        if self.mode != "tactile":
-            raise ValueError("'look' goes with mode: tactile only: leave out one of them")
+        A look makes up for what it sees of one pass that does not weave.
+        """
+        for name in ("arc", "look"):
+            if getattr(self, name) is not None and self.mode != "tactile":
+                raise ValueError(f"'{name}' goes with mode: tactile only: leave out one of them")
         for name in ("passes", "weave_width"):
-            if getattr(self, name):
+            if self.look is not None and getattr(self, name):
                 raise ValueError(f"'look' is for one pass that does not weave: leave out '{name}'")
         return self
