@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import cache
 from pathlib import Path
@@ -45,28 +45,24 @@ RecipeFile = Annotated[RecipePath, AfterValidator(_there)]
 """The same of a file that has to be there before a recipe runs."""
 
 
-def bundled_file(
-    kind: str, folder: str, own: Sequence[str] = (".yaml",)
-) -> Callable[[Any, ValidationInfo], Path]:
+def bundled_file(kind: str, folder: str) -> Callable[[Any, ValidationInfo], Path]:
     """Return a validator for a parameter that names a bundled file of ``data/FOLDER`` or one's own.
 
     Args:
         kind: Kind of file, as messages name it: ``workpiece``.
         folder: Folder of the bundled files: ``workpieces``.
-        own: Ending of the user's own files; ``.yml`` is accepted too.
     """
-    allowed = f"a {' or '.join(own)} file"
 
     def found(value: Any, info: ValidationInfo) -> Path:
         if not isinstance(value, (str, Path)):
-            raise ValueError(f"a {kind} is a name or a path to {allowed}")
-        if str(value).endswith((*own, ".yml")):
+            raise ValueError(f"a {kind} is a name or a path to a .yaml file")
+        if str(value).endswith((".yaml", ".yml")):
             return _there(_beside_recipe(value, info), info)
         path = bundled("data") / folder / f"{value}.yaml"
         if not path.is_file():
             known = sorted(p.stem for p in path.parent.glob("*.yaml"))
             near = nearest(str(value), known, n=2) or known
-            raise ValueError(f"no {kind} '{value}'; known: {', '.join(near)}, or {allowed}")
+            raise ValueError(f"no {kind} '{value}'; known: {', '.join(near)}, or a .yaml file")
         return path
 
     return found

@@ -83,10 +83,8 @@ def corners_of(centre: Floats, size: Floats) -> Floats:
     return np.asarray(centre + signs * size)
 
 
-def largest_error_quantile(
-    covariance: Floats, about: Floats, corners: Floats, probability: float = 0.95
-) -> float:
-    """Return the quantile of the largest error anywhere in a box, at ``probability`` [m].
+def largest_error_quantile(covariance: Floats, about: Floats, corners: Floats) -> float:
+    """Return the 95 % quantile of the largest error anywhere in a box [m].
 
     The error of a small pose error is an affine function of the place, so its length is largest
     in a corner. The distribution of the largest corner has no closed form: it is drawn, always
@@ -96,7 +94,6 @@ def largest_error_quantile(
         covariance: (6, 6), order (rotation, translation), translation about ``about``.
         about: (3,) in base [m].
         corners: (8, 3) in base [m].
-        probability: Share of the draws below the result.
     """
     variances, axes = np.linalg.eigh(covariance)
     root = axes * np.sqrt(np.clip(variances, 0.0, None))
@@ -104,7 +101,7 @@ def largest_error_quantile(
     draws = np.random.default_rng(0).standard_normal((samples, 6)) @ root.T
     errors = (draws @ levers(corners - about).reshape(-1, 6).T).reshape(samples, -1, 3)
     squares = np.einsum("sci,sci->sc", errors, errors).max(axis=1)
-    return float(np.sqrt(np.quantile(squares, probability)))
+    return float(np.sqrt(np.quantile(squares, 0.95)))
 
 
 def without_shared(observation: Observation, found: Floats) -> Observation:

@@ -223,16 +223,15 @@ def basis_of_plane(normal: Floats) -> Floats:
     return np.array([[a, b, c], [y * c - z * b, z * a - x * c, x * b - y * a], [x, y, z]])
 
 
-def kabsch(source: Floats, target: Floats, weights: Floats | None = None) -> tuple[Floats, Floats]:
-    """Return R (3, 3), t (3,) minimising sum w |R source + t - target|^2, for (N, 3) points.
+def kabsch(source: Floats, target: Floats) -> tuple[Floats, Floats]:
+    """Return R (3, 3), t (3,) minimising sum |R source + t - target|^2, for (N, 3) points.
 
     Umeyama (1991) with scale one: the paper's equations (8) to (10), with the sign taken from
     det(U) det(V), which also holds for coplanar points, where det of the covariance is zero.
     """
-    w = np.ones(len(source)) if weights is None else np.asarray(weights, dtype=np.float64)
-    w = w / w.sum()
-    mean_s, mean_t = w @ source, w @ target
-    cross = (target - mean_t).T @ (w[:, None] * (source - mean_s))
+    share = np.ones(len(source)) / len(source)
+    mean_s, mean_t = share @ source, share @ target
+    cross = (target - mean_t).T @ (share[:, None] * (source - mean_s))
     u, _, vt = np.linalg.svd(cross)
     sign = np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)])
     rotation = u @ sign @ vt

@@ -180,14 +180,14 @@ class Sensing:
 class Track:
     """The recent poses, to find the tool's pose at the time of an image."""
 
-    def __init__(self, seconds: float = 1.0) -> None:
+    def __init__(self) -> None:
         self._poses: deque[ToolPose] = deque()
-        self._seconds = seconds
 
     def add(self, pose: ToolPose) -> None:
         """Remember a pose, and forget the oldest."""
         self._poses.append(pose)
-        while pose.time - self._poses[0].time > self._seconds:
+        # Images come later than they were taken by a fraction of this [s]
+        while pose.time - self._poses[0].time > 1.0:
             self._poses.popleft()
 
     def at(self, time: float) -> ToolPose | None:
