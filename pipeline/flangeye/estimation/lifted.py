@@ -62,7 +62,7 @@ class Side:
         return np.stack([self.u, self.v], axis=1)
 
     def where(self, which: Mask) -> Side:
-        """Return a subset of the sightings."""
+        """Return the side for a subset of the sightings."""
         return Side(*(getattr(self, f.name)[which] for f in fields(self)))
 
 

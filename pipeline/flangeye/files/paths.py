@@ -46,7 +46,7 @@ RecipeFile = Annotated[RecipePath, AfterValidator(_there)]
 
 
 def bundled_file(kind: str, folder: str) -> Callable[[Any, ValidationInfo], Path]:
-    """Return a validator for a parameter that names a bundled file of ``data/FOLDER`` or one's own.
+    """Return a validator for a parameter that names a bundled file of ``data/FOLDER`` or a user's.
 
     Args:
         kind: Kind of file, as messages name it: ``workpiece``.

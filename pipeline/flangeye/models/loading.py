@@ -79,7 +79,7 @@ def write_robot(path: Path, robot: RobotModel) -> str:
 def robot_of_joints(
     name: str, maker: str, convention: str, joints: Sequence[str], standard: str | None
 ) -> RobotModel:
-    """Return an arm of joints as text, ``d: 89.159 mm, alpha: 90 deg``, base to flange.
+    """Return an arm from joints as text, ``d: 89.159 mm, alpha: 90 deg``, base to flange.
 
     Raises:
         RecipeError: A joint is not of that form; the message says which.

@@ -99,7 +99,7 @@ def robot_from_urdf(
         base: Link that is the controller's base frame; found by its name if not given.
         flange: Link at the plate's face, z outwards; found by its name if not given.
         standard: Designation of the plate.
-        packages: Where the packages are that meshes are named by.
+        packages: Folder of each package that mesh names refer to.
 
     Raises:
         RecipeError: It is not a URDF, or its base or flange link is ambiguous.
@@ -176,7 +176,7 @@ class UrdfBodies:
         urdf: The file.
         base_T_first: (4, 4) pose of the chain's first link in the base [m].
         chain: The joints from there to the flange.
-        packages: Where the packages are that meshes are named by.
+        packages: Folder of each package that mesh names refer to.
     """
 
     urdf: Urdf

@@ -24,9 +24,9 @@ from flangeye.types import Floats, Transform
 class Executor:
     """An open arm under watch.
 
-    A real arm is owned and watched by a guard in a process of its own
-    (:func:`led`), which stops it where this process hangs or dies. The same
-    watch runs here, in the loop: in simulated time it is the only one.
+    A real arm is owned and watched by a guard in a process of its own (:func:`led`), which stops it
+    if this process hangs or dies. The same checks run in this process, in the control loop; in
+    simulated time these are the only ones.
 
     Attributes:
         robot: The arm.
@@ -135,7 +135,7 @@ def led(driver: RobotDriver, model: RobotModel, limits: MotionLimits) -> Iterato
     Args:
         driver: Opens the arm, in the guard's process.
         model: The arm's model.
-        limits: What the arm must keep to.
+        limits: The arm's motion limits.
 
     Raises:
         DeviceError: The arm cannot be opened, or must not be moved.

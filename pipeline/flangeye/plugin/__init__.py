@@ -1,1 +1,1 @@
-"""The door for plugins: stages, parts, their contracts, hooks, and the registry that finds them."""
+"""Interface for plugins: stages, parts, their contracts, hooks, and the registry."""
