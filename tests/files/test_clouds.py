@@ -463,6 +463,7 @@ TABLES_OF_POINTS = {
     "brackets.csv": lambda f, p: f.write_text("X [mm];Y [mm];Z [mm]\n"
                                               + lines_of(1e3 * p, "{};{};{}").replace(".", ",")),
     "counted.pts": lambda f, p: f.write_text(f"{len(p)}\n" + lines_of(p)),
+    "titled.xyz": lambda f, p: f.write_text(f"{len(p)}\na flange\n" + lines_of(p)),
     "comma.csv": lambda f, p: f.write_text(lines_of(p, "{:f};{:f};{:f}").replace(".", ",")),
     "axes_first.npy": lambda f, p: np.save(f, p.T),
     "image.npy": lambda f, p: np.save(f, p.T.reshape(3, 2, 20)),

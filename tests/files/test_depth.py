@@ -41,6 +41,8 @@ def slope() -> Any:
         ("depth/7.png", slope(), {}, "mm"),
         ("7_Depth.png", slope(), {"depth_scale": 0.001}, "m"),
         ("depth/7.tiff", (slope() / 1000).astype(np.float32), {}, "m"),
+        ("frame_7.npy", slope(), {}, "mm"),
+        ("depth/7.npy", slope() / 1000, {}, "m"),
     ],
 )
 def test_points_project_to_their_pixels(
@@ -48,7 +50,10 @@ def test_points_project_to_their_pixels(
 ) -> None:
     path = tmp_path / name
     path.parent.mkdir(exist_ok=True)
-    cv2.imwrite(str(path), written)
+    if path.suffix == ".npy":
+        np.save(path, written)
+    else:
+        cv2.imwrite(str(path), written)
     camera_file(tmp_path, **more)
     told: list[str] = []
     cloud = read_scan(path, unit, told.append)

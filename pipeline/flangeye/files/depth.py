@@ -12,6 +12,7 @@ import numpy as np
 from flangeye.errors import StageError
 from flangeye.files.cameras import CameraFile, cameras_in
 from flangeye.files.clouds import PER_METRE, LengthUnit, check_cloud_file, read_cloud
+from flangeye.files.clouds.plain import load_npy
 from flangeye.files.documents import document_of
 from flangeye.files.images import ImageError, decode_image, is_depth_image
 from flangeye.files.regular import MAX_FILE, read_regular
@@ -52,11 +53,14 @@ def _depths(path: Path) -> tuple[Floats, CameraFile]:
     """Return (H, W) depths along z in the file's own unit; 0 or less where no surface was seen."""
     import cv2
 
-    try:
-        pixels = decode_image(read_regular(path, MAX_FILE), cv2.IMREAD_UNCHANGED)
-    except ImageError as error:
-        raise StageError(f"{path}: {error}") from None
-    if pixels.ndim != 2 or pixels.dtype not in (np.uint16, np.float32):
+    if path.suffix.lower() == ".npy":
+        pixels = load_npy(path)
+    else:
+        try:
+            pixels = decode_image(read_regular(path, MAX_FILE), cv2.IMREAD_UNCHANGED)
+        except ImageError as error:
+            raise StageError(f"{path}: {error}") from None
+    if pixels.ndim != 2 or pixels.dtype not in (np.uint16, np.float32, np.float64):
         raise StageError(
             f"{path}: is not a depth image: those have one channel, of 16 bits or of floats"
         )

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flangeye.errors import StageError
+from flangeye.files.clouds.plain import npy_shape
 from flangeye.files.regular import open_regular
 
 MAX_PIXELS = 1 << 26
@@ -77,8 +79,16 @@ def _is_cut_png(raw: bytes) -> bool:
 def is_depth_image(path: Path) -> bool:
     """Return whether a file is a depth image: by its name or its folder's, and its header.
 
-    A 16-bit image without such a name may be a camera's.
+    A 16-bit image without such a name may be a camera's. An array of rows and columns is a depth
+    image whatever its name.
     """
+    if path.suffix.lower() == ".npy" and path.is_file():
+        try:
+            shape = npy_shape(path)
+        except StageError:
+            return False
+        # A table of points or poses has fewer columns
+        return len(shape) == 2 and min(shape) > 16
     folder = path.parent.name.lower()
     called = folder.startswith("depth") or folder.endswith("depth") or "depth" in path.stem.lower()
     ending = path.suffix.lower()

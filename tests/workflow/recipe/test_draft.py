@@ -605,6 +605,8 @@ def two_poses_of_nobody(folder):
          "rec/demo.bag: is a ROS 1 bag; convert it: pip install rosbags && rosbags-convert --src "
          "rec/demo.bag --dst rec/demo; then flangeye init rec again"),
         (meshes, [], "rec/scan_0.stl: is a mesh, not a scan; sample it to points as .ply: "),
+        (lambda folder: (folder / "s.zip").write_text("x"), [],
+         "rec/s.zip: is an archive; unpack it: unzip rec/s.zip -d rec/s; then flangeye init rec"),
         (lambda folder: (folder / "scan.e57").write_text("x"), [],
          "rec/scan.e57: is an E57 scan, which is not read; save it as .ply"),
         (deep, [], "rec: its files stand in folders of folders, as a/1/robot.csv; name the folder "

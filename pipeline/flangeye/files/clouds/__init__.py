@@ -85,11 +85,16 @@ CONVERSIONS: Mapping[str, str] = {
         for endings, what, step in (
             ((".e57",), "an E57 scan, which is not read; save it", ""),
             ((".las", ".laz"), "a LAS scan, which is not read; save it", ""),
+            ((".off", ".vtk", ".ptx"), "a cloud or mesh that is not read; save it", ""),
             ((".stl", ".obj"), "a mesh, not a scan; sample it to points",
              "-SAMPLE_MESH POINTS 1000000 "),
         )
         for ending in endings
     },
+    ".exr": "is a depth image that is not read; save it as .tiff or .npy",
+    ".pfm": "is a depth image that is not read; save it as .tiff or .npy",
+    ".gz": "is compressed; unpack all of them: gunzip *.gz",
+    ".zip": "is an archive; unpack it: unzip {file} -d {stem}",
 }  # fmt: skip
 """Ending -> what such a file is, and the command that turns it into one that can be read."""
 
@@ -162,7 +167,7 @@ def write_cloud(path: Path, cloud: PointCloud, unit: LengthUnit = "m") -> None:
 def _open(path: Path) -> PointTable:
     opener, other = CLOUD_FILES.get(path.suffix.lower()), CONVERSIONS.get(path.suffix.lower())
     if other is not None:
-        refuse(path, other.format(file=path))
+        refuse(path, other.format(file=path, stem=path.with_suffix("")))
     if opener is None:
         refuse(path, f"'{path.suffix}' is not a point cloud; known: {', '.join(CLOUD_FILES)}")
     table = opener(path)

@@ -96,13 +96,22 @@ def _may_be_points(shape: Shape) -> bool:
     return (len(shape) == 2 or (len(shape) == 3 and shape[1] > 4)) and shape[-1] in (3, 4, 6)
 
 
+def npy_shape(path: Path) -> Shape:
+    """Return the shape of the array of numbers in a .npy file.
+
+    Raises:
+        StageError: It is missing, truncated, or not an array of numbers.
+    """
+    return _npy_header(path)[0]
+
+
 def load_npy(path: Path) -> NDArray[Any]:
     """Return a NumPy array of numbers; pickled objects are never loaded.
 
     Raises:
         StageError: It is missing, truncated, or not an array of numbers.
     """
-    _npy_header(path)
+    npy_shape(path)
     return np.asarray(np.load(path, allow_pickle=False))
 
 
@@ -268,7 +277,9 @@ def open_text(path: Path) -> TextTable:
     skipped = 0
     if len(lines) > 1 and lines[0].strip().isdigit():  # how many points follow, as .pts has
         skipped, count = 1, count_of(path, "points", lines[0].strip())
-        if rows - 1 != count:
+        if rows - 2 == count and not any(map(str.isdigit, lines[1])):  # a line of words
+            skipped = 2
+        elif rows - 1 != count:
             refuse(path, f"its first row promises {count} points, but it has {rows - 1}")
     cells, delimiter, comma = _cells(lines[skipped])
     heading = _heading(cells)

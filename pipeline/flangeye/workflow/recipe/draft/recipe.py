@@ -198,7 +198,13 @@ def _convertible(survey: FolderSurvey, count: int) -> RecipeError | None:
         "is a ROS 1 bag; convert it: pip install rosbags && rosbags-convert --src {file} "
         "--dst {stem}"
     )
-    for suffix, way in {".bag": bag, **CONVERSIONS}.items():
+    # Beside poses; alone it is taken for them
+    cloud = (
+        "holds no poses; if it holds a cloud, write it with MATLAB: pcwrite(pointCloud(xyz), "
+        "'{stem}.ply')"
+    )
+    ways = {".bag": bag, **CONVERSIONS, **({".mat": cloud} if survey.tables else {})}
+    for suffix, way in ways.items():
         others = survey.of((suffix,))
         if len(others) >= count:
             named = way.format(file=others[0], stem=others[0].with_suffix(""))
