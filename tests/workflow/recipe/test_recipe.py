@@ -398,4 +398,6 @@ def test_ten_times_as_many_mistakes_take_ten_times_as_long(
         assert len(mistakes(text, toy_registry)) == count
         return time.process_time() - begun
 
-    assert taken(8000) < 25 * taken(800)
+    # The least of three: a collection of garbage falls into one of them
+    few, many = (min(taken(count) for _ in range(3)) for count in (800, 8000))
+    assert many < 25 * few
