@@ -85,15 +85,15 @@ def check_seat(belief: Belief, settings: Following) -> None:
         deflection, preload = belief.remedy(settings, SEATING)
         raise StageError(
             "weld.tactile: the tip would climb the wall: the preload holds it with "
-            f"{holding:.2f} times what the deflection pushes with, {SEATING} is asked for; lower "
+            f"{holding:.2f} times the force of the deflection, and {SEATING} is needed; lower "
             f"'deflection' to {deflection * 1e3:.2f} mm or raise "
             f"'preload' to {preload * 1e3:.1f} mm"
         )
     reaching = belief.reaching(settings)
     if not belief.two_walls and reaching < SEATING:
         raise StageError(
-            "weld.tactile: friction may hold the tip off the wall: the deflection pushes with "
-            f"{reaching:.2f} times what the plate holds it with, {SEATING} is asked for; raise "
+            "weld.tactile: friction may hold the tip off the wall: the deflection pushes "
+            f"with {reaching:.2f} times the plate's friction, and {SEATING} is needed; raise "
             "'deflection', lower 'preload', or lean the tool less ('work_angle')"
         )
 
