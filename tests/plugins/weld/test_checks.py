@@ -90,7 +90,9 @@ def test_the_preload_holds_the_tip_with_fourteen_tenths_of_the_push(
     if not told:
         check_seat(belief, asked)
         return
-    with pytest.raises(StageError, match=f"holds it with {share:.2f} times what the deflection"):
+    with pytest.raises(
+        StageError, match=f"holds it with {share:.2f} times the force of the deflection"
+    ):
         check_seat(belief, asked)
 
 
@@ -288,7 +290,7 @@ def test_on_one_wall_the_deflection_outweighs_friction_by_fourteen_tenths(
     if not told:
         check_seat(belief, asked)
     else:
-        with pytest.raises(StageError, match=f"pushes with {share:.2f} times what the plate"):
+        with pytest.raises(StageError, match=f"pushes with {share:.2f} times the plate.s friction"):
             check_seat(belief, asked)
     check_seat(Belief(0.04, 1000.0, axial, torch_sigma=0.0), asked)
     two = Belief(0.04, torch_sigma=0.0)
