@@ -143,3 +143,10 @@ def test_files_of_one_pattern_have_the_same_columns(tmp_path: Path) -> None:
     (tmp_path / "2.json").write_text('{"y": 1}')
     with pytest.raises(StageError, match=r"2\.json: its columns are not those of 1\.json"):
         read_table(tmp_path, "*.json")
+
+
+@pytest.mark.parametrize("end", ["x", "# remark"])
+def test_a_line_of_blanks_is_read_in_linear_time(tmp_path: Path, end: str) -> None:
+    (tmp_path / "a.txt").write_text("1 2 3" + " " * 400_000 + end + "\n4 5 6\n7 8 9\n")
+    rows = read_table(tmp_path, "a.txt").rows  # in quadratic time it would take 20 minutes
+    assert [cells[:3] for _, cells in rows] == [tuple("123"), tuple("456"), tuple("789")]

@@ -491,7 +491,7 @@ def benchmark_of_poses(f, j, a, s):
 
 def lists_in_cells(f, j, a, s):
     cells = zip(vector(a).tolist(), vector(s).tolist(), strict=True)
-    rows = [f'img{i}.png,"{arm}","{seen}"\n' for i, (arm, seen) in enumerate(cells)]
+    rows = [f'img{i}.png,"{arm}","{seen if i else ""}"\n' for i, (arm, seen) in enumerate(cells)]
     (f / "poses.csv").write_text("image,robot_pose,marker_pose\n" + "".join(rows))
 
 

@@ -56,7 +56,7 @@ __all__ = [
 ]
 
 
-_COMMENT = re.compile(r"\s*(?:[#%]|//)[#%/ ]*")
+_COMMENT = re.compile(r"(?<!\s)\s*(?:[#%]|//)[#%/ ]*")
 """What a line of comment begins with."""
 
 
@@ -324,7 +324,8 @@ def _blocks(file: Path, lines: Sequence[str]) -> Iterator[TextBlock]:
     for n, line in _unbroken(lines):
         comment = bool(_COMMENT.match(line))
         # What stands behind the numbers of a line is a remark
-        plain = _COMMENT.sub("", re.sub(r"^([-+.\d][^#]*?)\s+(?:#|//).*", r"\1", line))
+        words = re.split(r"\s(?:#|//)", line)[0] if re.match(r"[-+.\d]", line) else line
+        plain = _COMMENT.sub("", words)
         cells = split(plain) if plain else ()
         counts = split.wide and len(cells) < 3  # rows, or what stands below: robot 7
         numbers = any(number_of(cell) is not None or _list_in(cell) for cell in cells)
@@ -367,7 +368,8 @@ def _list_in(cell: Cell) -> tuple[str, ...]:
 
 def _unfolded(block: TextBlock) -> TextBlock:
     """Return a block with a column for each number of the lists that stand in its cells."""
-    sizes = [len(_list_in(cell)) for cell in block.rows[0][1]]
+    columns = zip(*(cells for _, cells in block.rows), strict=False)
+    sizes = [max(len(_list_in(cell)) for cell in column) for column in columns]
     if any(sizes):
         for at, (where, cells) in enumerate(block.rows):
             parts = (_list_in(cell) or (cell,) for cell in cells)

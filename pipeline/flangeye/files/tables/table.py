@@ -135,7 +135,7 @@ class Table:
 
 def entry_of_list(name: str) -> tuple[str, str] | None:
     """Return the list of a column and which entry it is: pose.3.3, tvec_0, T[1,2]; else None."""
-    match = re.fullmatch(r"(.+?)((?:\.\d+)+|(?:_\d+)+|(?:\[\d+(?:, ?\d+)*\])+)", name)
+    match = re.fullmatch(r"(.{1,99}?)((?:\.\d+)+|(?:_\d+)+|(?:\[\d+(?:, ?\d+)*\])+)", name)
     return match and (match[1], match[2])
 
 

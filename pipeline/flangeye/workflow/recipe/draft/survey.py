@@ -270,7 +270,8 @@ def _by_whom(folder: Path, table: Table) -> list[Table]:
     """Return the rows of the arm and those of the target, where a column says whose each row is."""
     for column in range(len(table.heading)):
         called = [str(name) for name in dict.fromkeys(table.texts(column))]
-        if {role_in(name) for name in called} >= {"arm", "target"}:
+        few = len(called) * MIN_CAPTURES <= len(table.rows)
+        if few and {role_in(name) for name in called} >= {"arm", "target"}:
             return [read_table(folder, f"{table.name}:{name}") for name in called if role_in(name)]
     return []
 
