@@ -304,7 +304,7 @@ class _View:
 
 
 class DepthCamera:
-    """What both sorts of scanner have, and the distortion that one of them happens to have."""
+    """What all simulated scanners share: pixels, noise, and the unit's own distortion."""
 
     def __init__(
         self, scanner: ScannerModel, resolution: float, noise: float, rng: np.random.Generator

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from io import TextIOWrapper
@@ -141,7 +142,7 @@ Points = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
-class PointTable:
+class PointTable(ABC):
     """Where and how a file stores its points, as its header states.
 
     Attributes:
@@ -154,12 +155,12 @@ class PointTable:
     shape: Shape
     viewpoint: Any = field(default=None, kw_only=True)
 
-    def check(self) -> None:
+    def check(self) -> None:  # noqa: B027  some have nothing left to check
         """Raise StageError if the file is too short, where that was not seen when it was opened."""
 
+    @abstractmethod
     def decode(self) -> Points:
         """Return (N, 3) float32, in the file's own unit; a missing point is NaN."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True)

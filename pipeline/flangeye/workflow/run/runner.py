@@ -466,9 +466,9 @@ class Runner:
 
 
 def _take_buffers() -> None:
-    """Let both OpenBLAS, NumPy's and SciPy's, take their 32 MB while there is memory for them.
+    """Make NumPy's and SciPy's OpenBLAS allocate their buffers of 32 MB, which they keep.
 
-    They keep them. Where there is none they would try again without an end, or end the process.
+    An OpenBLAS that gets no buffer later retries without end, or ends the process.
     """
     from scipy.linalg import cholesky
 
