@@ -1,1 +1,1 @@
-"""``weld.*``: follow a seam by touch, with the torch behind; a ``controller.*`` part steers."""
+"""``weld.*`` stages: a finger follows the seam by touch, and the torch welds behind it."""

@@ -1,10 +1,11 @@
 """Predict the torch's error bound along the whole plan, before anything moves.
 
-The variance of the torch across the seam, at each place of the plan, is the follower's own sum, as
-far as it is known beforehand: what the files state of torch, arm and heat; the torch's distance to
-the tip where the tool stands askew; the tip on the tool, of which only what the tool turns between
-feeling a place and welding it counts; the drift of the finger's gain; the weave. What only touch
-can show (play, noise, a gap) comes on top.
+The variance of the torch across the seam is summed at each place of the plan, as the follower sums
+it during the weld. It has the terms that are known beforehand: torch, arm and heat (from the
+files); the distance from torch to tip, where the tool is at an angle to the seam; the tip's
+position on the tool, times the angle by which the tool turns between feeling a place and welding
+it; the drift of the finger's gain; the weave. Play, noise and gaps are known only from touch and
+come on top.
 """
 
 from __future__ import annotations
@@ -28,16 +29,17 @@ REMEDIES = {
     "tip": ("tip_sigma, as the tool turns there", "measure it: flangeye tactile tool"),
     "felt": ("gain_drift and the weave", "weld faster, or lower 'deflection'"),
 }
-"""Of each part: what it is, and what lessens it."""
+"""For each part of the variance: what it consists of, and how to reduce it."""
 
 
 class Predicted(NamedTuple):
-    """Variances of the torch's position across the seam at K places, (K,) each [m^2].
+    """Parts of the variance of the torch's position across the seam, (K,) each [m^2].
 
     Attributes:
-        s: Arc lengths [m].
+        s: Arc lengths of the K places [m].
         fixed: Variance from torch, arm, heat and creep, which nothing measures during the weld.
-        askew: Variance from the distance of torch and tip, while the tool is turned off the seam.
+        askew: Variance from the distance of torch and tip, where the tool is at an angle to the
+            seam.
         tip: Variance from the tip's position on the tool, while the tool turns.
         felt: Variance from the finger's drift and the weave.
     """
@@ -50,11 +52,11 @@ class Predicted(NamedTuple):
 
     @property
     def variance(self) -> Floats:
-        """(K,) sum of all parts."""
+        """Total variance (K,) [m^2]."""
         return self.fixed + self.askew + self.tip + self.felt
 
     def largest(self, at: int) -> str:
-        """Return the name of the largest part at one of the places."""
+        """Return the name of the largest part at the place with this index."""
         return max(REMEDIES, key=lambda name: float(getattr(self, name)[at]))
 
 
@@ -85,10 +87,10 @@ def predicted(plan: Path, belief: Belief, settings: Following) -> Predicted:
 
 
 def check_bound(plan: Path, belief: Belief, settings: Following) -> None:
-    """Refuse a weld whose bound cannot hold along its whole plan.
+    """Refuse a weld whose predicted error bound exceeds ``max_error`` anywhere on the plan.
 
     Raises:
-        StageError: Where, what is largest there, and what would do.
+        StageError: The message names the worst place, the largest part there and a remedy.
     """
     found = predicted(plan, belief, settings)
     worst = int(np.argmax(found.variance))
@@ -104,10 +106,11 @@ def check_bound(plan: Path, belief: Belief, settings: Following) -> None:
 
 
 def _stances(plan: Path, s: Floats, distance: float, aside: float) -> tuple[Floats, Floats]:
-    """Return the sine of the tool to the seam (K,) at arc lengths, and what the tool turns (K,).
+    """Return the sine of the angle between tool and seam (K,), and the tool's turn (K,).
 
-    That is the chord of the angle by which it turns between the tip's and the torch's passing. The
-    torch is on the plan, the undeformed tip ``aside`` to the left of it [m].
+    The turn is the chord of the angle through which the tool rotates after the tip has passed a
+    place and before the torch does. The torch is on the plan at arc lengths ``s``; the undeformed
+    tip is ``aside`` to the left of the plan [m].
     """
     here, tangents = plan.evaluate(s)
     there, along = plan.evaluate(plan.other_end(s, distance))

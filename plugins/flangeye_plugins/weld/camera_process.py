@@ -1,8 +1,8 @@
 """Runs the finger's camera in its own process, beside the control loop.
 
-There its images are taken and read, and drawn where it is simulated: none of that keeps a cycle
-waiting, and a camera's client that crashes takes no weld with it. The process answers one question
-after the other, so that nothing ever queues up; a thread of the program asks them.
+The process takes and reads the images (a simulated camera also renders them there), so no control
+cycle waits for an image, and a crash of the camera's driver does not end the weld's process. It
+answers one request at a time, sent by a thread of the main process, so requests never queue up.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from flangeye_plugins.weld.finger_camera import (
 
 
 class Seeing(NamedTuple):
-    """The open camera and profiler of the process.
+    """The devices that are open in the camera process.
 
     Attributes:
-        latest: Where the arm is.
-        reader: Reads the camera's images.
+        latest: Newest state of the arm.
+        reader: Measures the tip's displacement in images.
         sensor: The camera.
-        look: Behind the torch, if there is one.
+        look: The profile sensor behind the torch; None without one.
     """
 
     latest: LatestState
@@ -45,16 +45,17 @@ class Seeing(NamedTuple):
 
 
 class CameraProcess:
-    """Runs a finger's camera in another process, so that the loop never waits for an image.
+    """Runs a finger's camera in another process, so that the control loop never waits for an image.
 
-    A look behind the torch is read there too.
+    The profile sensor behind the torch, if there is one, is read there too.
 
     Attributes:
-        behind: How far behind the torch that is [m], once it is open; None where there is none.
+        behind: Distance of the profile behind the torch [m], known once the sensor is open; None
+            without a sensor.
     """
 
     def __init__(self, job: CameraJob) -> None:
-        """Prepare for a camera; it is opened when the context begins."""
+        """Prepare for a camera; entering the context opens it."""
         self._wire, self._theirs = multiprocessing.Pipe()
         self._process = multiprocessing.get_context("spawn").Process(
             target=camera_process, args=(self._theirs, job), name="finger", daemon=True
@@ -68,7 +69,7 @@ class CameraProcess:
         self._thread = threading.Thread(target=self._watch, name="finger", daemon=True)
 
     def seen(self) -> list[TagObservation]:
-        """Return new readings; raise DeviceError if the camera is lost."""
+        """Return the measurements since the last call; raise DeviceError if the camera is lost."""
         if self._error is not None:
             raise self._error
         sights: list[TagObservation] = []
@@ -77,18 +78,18 @@ class CameraProcess:
         return sights
 
     def looks(self) -> list[WeldProfile]:
-        """Return new profiles from behind the torch."""
+        """Return the bead profiles since the last call."""
         looks: list[WeldProfile] = []
         while not self._looks.empty():
             looks.append(self._looks.get())
         return looks
 
     def tell(self, state: RobotState) -> None:
-        """Take the arm's newest sample; the thread passes it on."""
+        """Store the arm's newest state, which the thread passes to the camera process."""
         self._state = state
 
     def true_torch(self) -> tuple[Floats, Floats] | None:
-        """Stop reading images; return where a simulated torch really was, None for a real one."""
+        """Stop reading images; return the true path of a simulated torch, None for a real one."""
         self._end_watch()
         with suppress(OSError, EOFError):
             self._wire.send("torch")
@@ -101,7 +102,7 @@ class CameraProcess:
         """Open the camera.
 
         Raises:
-            DeviceError: It cannot be opened, or not in time.
+            DeviceError: The camera cannot be opened, or not in time.
         """
         keep_current_folder_out()
         self._process.start()
@@ -154,7 +155,7 @@ class CameraProcess:
         self._thread.join(PATIENCE)
 
     def _end(self) -> None:
-        """Close the camera process; one that hangs is killed."""
+        """Close the camera process; kill it if it hangs."""
         self._wire.close()
         self._process.join(PATIENCE)
         if self._process.is_alive():
@@ -164,8 +165,8 @@ class CameraProcess:
 
 def camera_process(wire: Connection, job: CameraJob) -> None:
     """Open the camera and answer requests; main function of the camera process."""
-    for told in (signal.SIGINT, signal.SIGTSTP):
-        signal.signal(told, signal.SIG_IGN)  # the program gets it too, and ends this process
+    for number in (signal.SIGINT, signal.SIGTSTP):
+        signal.signal(number, signal.SIG_IGN)  # the program gets it too, and ends this process
     latest = LatestState(job.state)
     with (
         suppress(EOFError, BrokenPipeError, ConnectionResetError),  # the program is gone
@@ -175,12 +176,12 @@ def camera_process(wire: Connection, job: CameraJob) -> None:
         try:
             reader = FingerReader(job.finger)
             sensor = opened.enter_context(job.camera(latest))
-            name = "the look behind the torch"
+            name = "the profile sensor behind the torch"
             look = job.profiler(latest, sensor)
             if look is not None:
                 opened.enter_context(look)
         except Exception as error:
-            wire.send(_told(name, error))
+            wire.send(_device_error(name, error))
             return
         wire.send(None if look is None else look.behind)
         seeing = Seeing(latest, reader, sensor, look)
@@ -189,7 +190,11 @@ def camera_process(wire: Connection, job: CameraJob) -> None:
 
 
 def _answer(question: Any, seeing: Seeing) -> Any:
-    """Return the torch's pose; or, given the arm's pose, the sighting or why there is none."""
+    """Return the answer to one request of the main process.
+
+    The answer to the arm's state is the next measurement or bead profile, None if there is neither
+    yet, or the error. The answer to "torch" is the true path of a simulated torch.
+    """
     if question == "torch":
         return torch_of(seeing.sensor)
     seeing.latest.tell(question)
@@ -203,11 +208,11 @@ def _answer(question: Any, seeing: Seeing) -> Any:
         name = seeing.look.name
         return seeing.look.profile()
     except Exception as error:
-        return _told(name, error)
+        return _device_error(name, error)
 
 
-def _told(name: str, error: Exception) -> DeviceError:
-    """Return what a camera's client did wrong; it may fail in any way."""
+def _device_error(name: str, error: Exception) -> DeviceError:
+    """Return any exception of a camera's driver as a DeviceError."""
     if isinstance(error, FlangeyeError):
         return DeviceError(str(error))
     return DeviceError(f"{name}: failed with {type(error).__name__}: {error}")

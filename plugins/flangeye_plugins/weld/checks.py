@@ -1,4 +1,4 @@
-"""Checks of a weld before anything moves; every refusal says what to change."""
+"""Checks of a weld before anything moves; every error message says what to change."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from flangeye_plugins.weld.settings import Following, Mode
 from flangeye_plugins.weld.touch.tag_observation import TagDetector
 
 SEATING = 1.4
-"""The preload holds the tip in the groove by so much more than the deflection pushes it out."""
+"""Smallest allowed ratio of the force into the joint to the force that lifts the tip."""
 
 
 def check_finger(finger: Finger, settings: Following) -> None:
-    """Refuse a deflection or force beyond the finger's limits, or a tag out of view.
+    """Refuse a deflection or force beyond the finger's limits, or a tag that OpenCV does not know.
 
     Raises:
-        StageError: Which, and what is allowed.
+        StageError: The message names the value and its limit.
     """
     TagDetector(finger)
     asked = max(settings.deflection, settings.preload)
@@ -45,7 +45,7 @@ def check_finger(finger: Finger, settings: Following) -> None:
 
 
 def check_controller(mode: Mode, driver: RobotDriver) -> None:
-    """Refuse a controller that is declared to run on a simulated arm only with any other.
+    """Refuse a simulation-only controller on a real arm.
 
     Raises:
         StageError: The driver does not declare that its arm is simulated.
@@ -58,10 +58,10 @@ def check_controller(mode: Mode, driver: RobotDriver) -> None:
 
 
 def check_tool(body: LeaningTool, belief: Belief, settings: Following) -> None:
-    """Refuse a tool that cannot hold its tip, reach the seam or swing as asked.
+    """Refuse a tool that cannot hold its tip in the joint, reach the seam or weave as configured.
 
     Raises:
-        StageError: Which, and what would do.
+        StageError: The message names the failed check and the remedy.
     """
     check_seat(belief, settings)
     check_body(body, belief, settings)
@@ -69,10 +69,10 @@ def check_tool(body: LeaningTool, belief: Belief, settings: Following) -> None:
 
 
 def check_seat(belief: Belief, settings: Following) -> None:
-    """Refuse a tip that would not lie where the joint's two walls meet.
+    """Refuse settings with which the tip would not stay where the joint's two walls meet.
 
     Raises:
-        StageError: It would not; the message says why, and which values would do.
+        StageError: The message says why, and which values would hold the tip.
     """
     if settings.joint == "butt" and belief.joint is None:
         raise StageError(
@@ -99,10 +99,10 @@ def check_seat(belief: Belief, settings: Following) -> None:
 
 
 def check_body(body: LeaningTool, belief: Belief, settings: Following) -> None:
-    """Refuse a tool that leans so that its torch is far above the seam, or below it.
+    """Refuse a lean of the tool that puts the torch too far above or below the seam.
 
     Raises:
-        StageError: How far, and what would do.
+        StageError: The message gives the height and the remedy.
     """
     above = float(body.torch[2]) + (belief.joint.seat(belief.radius)[1] if belief.joint else 0.0)
     if abs(above) > settings.torch_height:
@@ -114,10 +114,10 @@ def check_body(body: LeaningTool, belief: Belief, settings: Following) -> None:
 
 
 def check_weave(distance: float, settings: Following) -> None:
-    """Refuse a weave for which the tool would have to turn faster than it may.
+    """Refuse a weave that needs a faster rotation of the tool than ``turn_rate``.
 
     Raises:
-        StageError: How fast, and what would do.
+        StageError: The message gives the needed speed and the remedy.
     """
     weave = Weave(settings.weave_width, settings.weave_frequency)
     asked, allowed = weave.fastest / distance, Steering.usual * settings.turn_rate
@@ -135,7 +135,7 @@ def check_seam(seam: Seam, surface: WorkSurface, distance: float, settings: Foll
     """Refuse a seam that this tool cannot follow.
 
     Raises:
-        StageError: Too short, bent, curved, or uncertain.
+        StageError: The seam is too short, too sharply curved or too uncertain.
     """
     plan = surface.path
     used = settings.set_down + settings.ending
@@ -181,10 +181,10 @@ def tool_angles(plan: Path, distance: float) -> Floats:
 
 
 def check_speeds(finger: Finger, settings: Following, limits: MotionLimits) -> None:
-    """Refuse speeds beyond the recipe's limits.
+    """Refuse speeds of flange or joints beyond the recipe's limits.
 
     Raises:
-        StageError: Which, and what is allowed.
+        StageError: The message names the speed and its limit.
     """
     fastest = flange_speed(finger, settings)
     if fastest > limits.speed:

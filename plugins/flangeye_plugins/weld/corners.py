@@ -1,13 +1,13 @@
-"""Sharp corners of a plan: each leg between them is a weld of its own, or the corners are rounded.
+"""Sharp corners of a plan: each leg between two is welded on its own, or the corners are rounded.
 
-At a corner the torch stops: the weld of one leg ends, the tool is lifted, turned, and set down for
-the next. The finger goes ahead of the torch, straight beyond the end of its leg, and the torch
-comes from behind the start of the next: for both there is room only where the upright plate of a
+Without rounding the torch stops at a corner: the weld of one leg ends, and the tool is lifted,
+turned and set down for the next. The finger runs ahead of the torch, straight beyond the end of its
+leg, and the torch starts behind the next leg. Both have room only where the upright plate of a
 fillet or lap joint ends at the corner.
 
-Tip and torch may go round instead, to either side: the plan's corner becomes an arc, and what the
-tip feels says how far the seam is from that. The tip stays pressed against its wall, also where
-this ends at the corner and another begins, or turns into the way.
+With ``corner_radius`` tip and torch go round the corner, to either side: an arc replaces the plan's
+corner, and touch measures the seam's offset from that arc. The tip stays pressed against the wall,
+whether the next wall turns away from it or towards it.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def corners_of(points: Floats) -> list[Corner]:
 
 
 def _turn(planar: Floats, along: Floats, s: float) -> float:
-    """Return by how much a polyline turns to the left at an arc length; nothing at its ends."""
+    """Return a polyline's turn to the left at an arc length [rad]; 0 near its ends."""
     if not CHORD <= s <= along[-1] - CHORD:
         return 0.0
     before, here, after = rows_at(s + np.array([-CHORD, 0.0, CHORD]), along, planar)
@@ -68,8 +68,8 @@ def leg_of(seam: Seam, params: WeldTactileParams) -> Seam:
     """Return the leg of a plan to weld: the whole plan if it has no corner to stop at.
 
     Raises:
-        StageError: It has corners and no leg is chosen, or the other way round, or the tool has no
-            room beyond one of the leg's ends, or for an arc.
+        StageError: The plan has corners but neither leg nor radius is set, or both are, or the leg
+            does not exist, or there is no room for the tool at a corner or for the arc.
     """
     corners = corners_of(rolled_out(seam.points_in_base, seam.openings_in_base))
     if params.corner_radius is not None:
@@ -101,7 +101,7 @@ def leg_of(seam: Seam, params: WeldTactileParams) -> Seam:
 
 
 def _rounded(seam: Seam, corners: list[Corner], params: WeldTactileParams, radius: float) -> Seam:
-    """Return a plan with an arc of a radius [m] in the place of each corner."""
+    """Return the plan with each corner replaced by an arc of this radius [m]."""
     if params.leg is not None:
         raise StageError("weld.tactile: corner_radius leaves no legs; leave out one of the two")
     points = seam.points_in_base
@@ -133,9 +133,10 @@ def _rounded(seam: Seam, corners: list[Corner], params: WeldTactileParams, radiu
 def _arc(
     points: Floats, along: Floats, here: float, cut: float, turn: float
 ) -> tuple[Floats, Floats]:
-    """Return the arc (K, 3) between the legs of a corner, and its arc lengths (K,) on the plan.
+    """Return the arc (K, 3) that rounds a corner, and its arc lengths (K,) on the plan.
 
-    A rational quadratic curve of this weight is a circle's (Piegl and Tiller 1997, 7.3).
+    A rational quadratic Bezier curve with weight cos(turn / 2) is a circular arc (Piegl and Tiller
+    1997, section 7.3).
     """
     first, corner, last = rows_at(here + cut * np.array([-1.0, 0.0, 1.0]), along, points)
     t = np.linspace(0.0, 1.0, 40)[:, None]

@@ -1,4 +1,4 @@
-"""The way to the seam, and the control loop along it with its limits on the tip."""
+"""Drive to the seam, then run the control loop along it within limits on the tip."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ class Bounds:
         self._finger, self._plan = finger, plan
 
     def check(self, pose: ToolPose, progress: float, felt: Iterable[TipDisplacement]) -> None:
-        """Raise if the tip is off the plan or pressed harder than allowed.
+        """Raise if the tip is too far off the plan, or pressed harder than allowed.
 
         Args:
             pose: Pose of the tool.
             progress: Arc length of the tip's progress on the plan [m].
-            felt: New measurement.
+            felt: New measurements.
 
         Raises:
-            DeviceError: Which bound was passed.
+            DeviceError: The message names the exceeded limit.
         """
         place = self._plan.at(progress)
         astray = abs(float((pose.position[:2] - place.point) @ place.normal))
@@ -75,12 +75,12 @@ class WeldCell:
     """The devices of a weld.
 
     Attributes:
-        drive: The arm.
-        eyes: Read the finger.
-        tool: Translates between flange and plane.
+        drive: Controls the arm.
+        eyes: Reads the finger's camera.
+        tool: Converts between the flange's pose in base and the tool's pose in the seam's plane.
         bounds: Limits of the tip.
-        steered: Takes each profile that a look behind the torch gives, where there is one.
-        gas_after: Where there is a power source: for how long gas flows after its arc [s].
+        steered: Receives each bead profile from behind the torch; None without a profile sensor.
+        gas_after: Post-flow time of the gas [s]; None without a power source.
     """
 
     drive: Executor
@@ -92,12 +92,12 @@ class WeldCell:
 
 
 def approach(cell: WeldCell, passage: SeamReach, weld_log: WeldLog, mode: Mode) -> None:
-    """Bring the tip above the planned start, the tool along the seam.
+    """Move the tip above the planned start, with the tool aligned with the seam.
 
     Raises:
-        StageError: The finger is not seen, is deformed though nothing should touch it, or there is
-            no free way.
-        DeviceError: The arm was stopped on the way: the reason.
+        StageError: The tag is not seen, the finger is deformed before contact, or there is no
+            collision-free path.
+        DeviceError: The arm was stopped on the way.
     """
     here = cell.drive.tick()
     route = passage.to_start(np.asarray(here.joints))
@@ -109,7 +109,7 @@ def approach(cell: WeldCell, passage: SeamReach, weld_log: WeldLog, mode: Mode) 
 
 
 def _watch(cell: WeldCell, weld_log: WeldLog) -> None:
-    """Look at the finger for a while; nothing moves."""
+    """Check the finger's images for a while, with the arm at rest."""
     began = cell.drive.tick().time_ns
     felt: list[Floats] = []
     seen = 0
@@ -137,7 +137,7 @@ def _watch(cell: WeldCell, weld_log: WeldLog) -> None:
 def follow(cell: WeldCell, controller: Controller, weld_log: WeldLog, longest: float) -> str:
     """Follow the seam; return why it ended early, or an empty text at its end.
 
-    Whatever happens the arm is commanded to stop, and the log holds all up to then.
+    The arm is commanded to stop in every case, also on an exception, and the log is complete.
     """
     began: float | None = None
     cell.drive.lead()
@@ -161,7 +161,7 @@ def follow(cell: WeldCell, controller: Controller, weld_log: WeldLog, longest: f
 
 
 def _let_gas_flow(cell: WeldCell) -> None:
-    """Wait by the bead while gas flows on; who owns the power source closes its valve."""
+    """Hold the torch at the bead's end during the gas post-flow; the power source ends the flow."""
     if not cell.gas_after:
         return
     until = cell.drive.tick().time_ns + round(cell.gas_after * 1e9)
@@ -170,10 +170,10 @@ def _let_gas_flow(cell: WeldCell) -> None:
 
 
 class WeldClock:
-    """How long a cycle takes: by this computer's clock, and by this thread's processor time.
+    """Measures a control cycle's duration in wall-clock time and in this thread's processor time.
 
     Attributes:
-        period: Between the starts of the last two cycles [s].
+        period: Time between the starts of the last two cycles [s].
     """
 
     def __init__(self) -> None:
@@ -202,17 +202,17 @@ class WeldClock:
 
     @property
     def answering(self) -> float:
-        """This computer's time since the cycle began, waiting for a core included [s]."""
+        """Wall-clock time since the cycle began [s], including waits for a processor core."""
         return time.perf_counter() - self._started - self._waited
 
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
-    """Keep this process from delaying a cycle: no garbage collection, short thread switches.
+    """Return a context without garbage collection and with short thread-switch intervals.
 
-    Garbage is collected before and after, not in between: that takes tens of milliseconds. A cycle
-    waits several times, and each time the thread that writes the log, or takes what the camera's
-    process has seen, may keep the interpreter for a switch interval: a short one.
+    A garbage collection takes tens of milliseconds, so it runs before and after the weld only. Each
+    time a cycle waits, another thread (the log's writer, the camera's reader) may hold the
+    interpreter lock for one switch interval; a short interval keeps that delay small.
     """
     enabled, interval = gc.isenabled(), sys.getswitchinterval()
     gc.collect()
@@ -229,7 +229,7 @@ def undisturbed() -> Iterator[None]:
 def _turn(
     cell: WeldCell, controller: Controller, weld_log: WeldLog, state: RobotState, clock: WeldClock
 ) -> None:
-    """One cycle: read, decide, command, log."""
+    """Run one control cycle: read, decide, command, log."""
     with clock.aside():  # in simulated time images are read, and logged, right here
         numbers = [weld_log.saw(sight) for sight in cell.eyes.seen()]
     used = tuple(number for number in numbers if number in weld_log.felt)
@@ -252,7 +252,7 @@ def _turn(
 
 
 def touch_of(feeling: TipDisplacement) -> Touch:
-    """Return a measurement as the controller takes it."""
+    """Return a measurement in the controller's input format."""
     return Touch(feeling.time_ns * 1e-9, feeling.displacement)
 
 
@@ -264,7 +264,7 @@ def cycle_of(
     arc: float,
     took: tuple[float, float, float],
 ) -> Cycle:
-    """Return the record of a cycle."""
+    """Return the log record of a cycle."""
     x, y, z = pose.position.tolist()
     vx, vy, vz = command.velocity.tolist()
     return Cycle(

@@ -1,4 +1,4 @@
-"""Turns the finger's images into measurements of the tip, beside the control loop."""
+"""Converts the finger's images into measurements of the tip, in the control loop or beside it."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from flangeye_plugins.weld.touch.tip_displacement import Interpreter, TipDisplac
 
 
 class TagObservation(NamedTuple):
-    """One image and its measurement.
+    """One image of the finger and the tip displacement measured in it.
 
     Attributes:
         time_ns: Middle of its exposure.
-        piece: The part of it that was read.
-        feeling: None where there is no tag in it, or none to be trusted.
+        piece: The crop of the image that was read.
+        feeling: The displacement; None if no tag was found or the detection is unreliable.
     """
 
     time_ns: int
@@ -40,7 +40,7 @@ class TagObservation(NamedTuple):
 
 
 class FingerReader:
-    """From an image to a feeling."""
+    """Measures the tip's displacement in images."""
 
     def __init__(self, finger: Finger) -> None:
         """Prepare for a calibrated finger; see :class:`Interpreter`."""
@@ -61,7 +61,7 @@ class FingerReader:
         return self._observation(piece, frame.time_ns, reading)
 
     def reread(self, piece: ImageRegion, time_ns: int) -> TagObservation:
-        """Return the measurement in a logged crop of an image."""
+        """Return the measurement from a logged crop of an image."""
         return self._observation(piece, time_ns, self._detector.find(piece.image))
 
     def _observation(
@@ -74,28 +74,28 @@ class FingerReader:
 
 
 class LatestState:
-    """The newest sample of the arm, for a sensor that asks for it."""
+    """Holds the arm's newest state, for a simulated sensor that needs it."""
 
     def __init__(self, state: RobotState) -> None:
         self._state = state
 
     def state(self) -> RobotState:
-        """Return the newest sample that the loop has taken."""
+        """Return the newest state that was stored."""
         return self._state
 
     def tell(self, state: RobotState) -> None:
-        """Take a sample."""
+        """Store a new state."""
         self._state = state
 
 
 class CameraJob(NamedTuple):
-    """Opens a finger's camera, in this process or another.
+    """All that is needed to open a finger's camera, in this process or another.
 
     Attributes:
-        sensor: Opens it, given finger, arm and seed.
+        sensor: Opens the camera, given finger, arm and seed.
         finger: The finger, calibrated.
         state: Current state of the arm.
-        seed: For what is simulated.
+        seed: Seed of a simulated sensor.
         look: Opens a profile sensor behind the torch, if there is one.
     """
 
@@ -106,17 +106,17 @@ class CameraJob(NamedTuple):
     look: BoundPart | None = None
 
     def camera(self, robot: StateSource) -> TactileSensor:
-        """Open the camera, which may ask ``robot`` where it is."""
+        """Open the camera; a simulated one reads the arm's pose from ``robot``."""
         sensor: TactileSensor = self.sensor(self.finger, robot, self.seed)
         return sensor
 
     def profiler(self, robot: StateSource, camera: TactileSensor) -> Profiler | None:
-        """Open the profiler behind the torch, if there is one, beside the open camera."""
+        """Open the profile sensor behind the torch; return None if there is none."""
         return None if self.look is None else self.look(robot, camera, self.seed)
 
 
 class FingerCameraReader(Protocol):
-    """Gives all measurements since the last cycle, oldest first."""
+    """Interface: gives all measurements since the last cycle, oldest first."""
 
     @property
     def behind(self) -> float | None:
@@ -130,14 +130,14 @@ class FingerCameraReader(Protocol):
         """
 
     def seen(self) -> list[TagObservation]:
-        """Return new sights; never waits.
+        """Return new measurements; never waits.
 
         Raises:
             DeviceError: The camera is lost.
         """
 
     def tell(self, state: RobotState) -> None:
-        """Take the arm's newest sample, for a sensor that asks for it; never waits."""
+        """Store the arm's newest state, for a simulated sensor; never waits."""
 
     def true_torch(self) -> tuple[Floats, Floats] | None:
         """Return the true path of a simulated torch after the weld; else None."""
@@ -148,13 +148,13 @@ class FingerCameraReader(Protocol):
 
 
 class SteppedReader:
-    """Reads in the loop itself: in simulated time nothing is late by being computed."""
+    """Reads the camera within the control loop: in simulated time computing causes no delay."""
 
     def __init__(self, job: CameraJob) -> None:
         """Open the camera.
 
         Raises:
-            StageError: It cannot be opened.
+            StageError: The camera cannot be opened.
         """
         self._latest = LatestState(job.state)
         self._reader, self._sensor = FingerReader(job.finger), job.camera(self._latest)
@@ -180,11 +180,11 @@ class SteppedReader:
         return [] if frame is None else [self._reader.read(frame)]
 
     def tell(self, state: RobotState) -> None:
-        """Take the arm's newest sample."""
+        """Store the arm's newest state."""
         self._latest.tell(state)
 
     def true_torch(self) -> tuple[Floats, Floats] | None:
-        """Return where a simulated torch really was, or None."""
+        """Return the true path of a simulated torch; None for a real one."""
         return torch_of(self._sensor)
 
     def __enter__(self) -> Self:
@@ -197,5 +197,5 @@ class SteppedReader:
 
 
 def torch_of(sensor: TactileSensor) -> tuple[Floats, Floats] | None:
-    """Return where the torch of a simulated sensor really was; of any other, None."""
+    """Return the true path of a simulated sensor's torch: times [s] and positions; else None."""
     return sensor.true_torch() if isinstance(sensor, KnowsTorch) else None

@@ -1,8 +1,8 @@
 """The work surface along a seam, and the tool's orientation on it.
 
-A seam may climb, bend and twist. It is followed as if its surface were rolled out flat: as long as
-it is, with its curvature in the surface (the geodesic one), its openings all upwards. What happens
-beside it is the same in both, to the first order of its distance.
+A seam may climb, bend and twist. The controller works in a plane into which the work surface is
+rolled out: arc length and geodesic curvature of the seam are kept, and its openings all point
+upwards. Positions beside the seam agree to first order in their distance from it.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from flangeye_plugins.weld.path import CHORD, Path, Place
 
 @dataclass(frozen=True, eq=False)
 class LeaningTool:
-    """A tool that leans by its work and travel angle.
+    """A tool in its orientation along the seam, given by work and travel angle.
 
     Attributes:
-        level_R_tool: (3, 3) the tool's axes in level ones.
-        torch: (3,) from the tip to the torch, in level axes [m]; its second number is zero.
+        level_R_tool: (3, 3) rotation from the tool's axes to level axes (x along the seam, z up).
+        torch: (3,) vector from the tip to the torch in level axes [m]; its y is zero.
     """
 
     level_R_tool: Floats
@@ -36,22 +36,22 @@ class LeaningTool:
 
     @property
     def distance(self) -> float:
-        """From the torch to the tip, seen from above [m]."""
+        """Horizontal distance from the torch to the tip [m]."""
         return -float(self.torch[0])
 
 
 def leaning(work: float, travel: float) -> Floats:
-    """Return the rotation (3, 3) of a tool that leans aside and forwards.
+    """Return the rotation (3, 3) of a tool that leans by a work and a travel angle.
 
     Args:
-        work: Its upper end leans to the right by this [rad].
-        travel: Its upper end leans forwards by this [rad].
+        work: Lean of the tool's upper end to the right [rad].
+        travel: Lean of the tool's upper end forwards [rad].
     """
     return np.asarray(rotation_from_rpy(work, 0.0, 0.0) @ rotation_from_rpy(0.0, travel, 0.0))
 
 
 def body_from(torch: Floats, work: float, travel: float) -> LeaningTool:
-    """Return a leaning tool whose torch is at (3,) from its tip, in the tool's axes [m]."""
+    """Return a leaning tool, given the torch relative to the tip (3,) in the tool's axes [m]."""
     leans = leaning(work, travel)
     x, y, _ = (leans @ torch).tolist()
     turn = rotation_from_rpy(0.0, 0.0, -float(np.arctan2(-y, -x)))
@@ -59,16 +59,16 @@ def body_from(torch: Floats, work: float, travel: float) -> LeaningTool:
 
 
 TOGETHER = 1e-3
-"""A seam whose ends are nearer to each other goes once around [m]."""
+"""A seam whose ends are closer together than this is a closed one [m]."""
 
 
 class Stand(NamedTuple):
-    """Where something is on the surface.
+    """A place on the seam, in base and in the plane.
 
     Attributes:
-        point: (3,) of the seam beside it, in base [m].
-        axes: (3, 3) columns there, in base: along the seam, to its left, out of the work.
-        place: The same place rolled out.
+        point: (3,) point of the seam in base [m].
+        axes: (3, 3) axes in base, as columns: along the seam, to its left, out of the work.
+        place: The same place in the plane.
     """
 
     point: Floats
@@ -76,7 +76,7 @@ class Stand(NamedTuple):
     place: Place
 
     def rolled(self, vectors: Floats) -> Floats:
-        """Return vectors (3,) in base as they are in the plane."""
+        """Convert a vector (3,) in base to the plane."""
         along, left, up = (vectors @ self.axes).tolist()
         tx, ty = self.place.tangent.tolist()
         return np.array([along * tx - left * ty, along * ty + left * tx, up])
@@ -91,17 +91,17 @@ class Stand(NamedTuple):
 class WorkSurface:
     """The surface along a seam, and the plane into which it is rolled out.
 
-    The plane's x leads along the seam as a whole, its z out of the work. A seam whose ends meet
-    goes once around: the plane goes on beyond both, by a turn.
+    The plane's x points along the seam as a whole, its z out of the work. A closed seam is
+    continued by one more turn beyond both ends.
 
     Attributes:
-        points: (N, 3) of the seam in the plane, all of height zero [m]; of one that goes once
-            around with a turn more at each end.
+        points: (N, 3) points of the seam in the plane, all of height zero [m]; a closed seam has
+            one more turn at each end.
         path: The seam in the plane.
     """
 
     def __init__(self, points: Floats, openings: Floats) -> None:
-        """Take the surface through (N, 3) points of a seam and across its openings (N, 3)."""
+        """Construct the surface from a seam's points (N, 3) [m] and openings (N, 3) in base."""
         points, openings, wraps = _gone_around(points, openings)
         self.points = rolled_out(points, openings)
         self.path = Path(self.points, wraps)
@@ -109,7 +109,7 @@ class WorkSurface:
         ticks = self.path.step * np.arange(len(self.path.points), dtype=np.float64)
         line = rows_at(ticks, along, points)
         ahead = np.gradient(line, self.path.step, axis=0)
-        # A scanned opening scatters from place to place: the mean over a chord counts.
+        # Scanned openings are noisy: they are averaged over a chord.
         width = max(1, round(CHORD / self.path.step))
         up = uniform_filter1d(rows_at(ticks, along, openings), width, 0, mode="nearest")
         self._rows: Floats = np.hstack([line, ahead, up])
@@ -120,7 +120,7 @@ class WorkSurface:
     def line(self, s: Floats) -> tuple[Floats, Floats]:
         """Return points (K, 3) at arc lengths (K,), and axes (K, 3, 3) there, as columns.
 
-        An open seam goes on straight beyond both ends.
+        An open seam is continued straight beyond both ends.
         """
         path = self.path
         inside = np.clip(s, path.first, path.last)
@@ -136,7 +136,7 @@ class WorkSurface:
         return row[:, :3] + beyond * ahead, axes
 
     def at(self, s: float) -> Stand:
-        """Return the place at an arc length [m]."""
+        """Return the place on the seam at an arc length [m]."""
         x, y, z, tx, ty, tz, ux, uy, uz = self._at(s)
         nx, ny, nz = uy * tz - uz * ty, uz * tx - ux * tz, ux * ty - uy * tx
         norm = math.hypot(nx, ny, nz)
@@ -146,8 +146,8 @@ class WorkSurface:
         return Stand(np.array([x, y, z]), axes, self.path.at(s))
 
     def _at(self, s: float) -> list[float]:
-        """Return point, direction and opening (9,) at an arc length."""
-        # Called several times a cycle: plain floats are ten times faster than arrays of one.
+        """Return point, unit tangent and opening (9,) in base at an arc length."""
+        # Called several times a cycle: plain floats are ten times faster than small arrays.
         path = self.path
         inside = path.first if s < path.first else path.last if s > path.last else s
         share = (inside - path.first) / path.step
@@ -161,14 +161,17 @@ class WorkSurface:
         return [x + beyond * tx, y + beyond * ty, z + beyond * tz, tx, ty, tz, *up]
 
     def foot(self, point: Floats, near: float | None = None) -> float:
-        """Return the arc length nearest to a point (3,) in base, near another one if given [m]."""
+        """Return the arc length of the seam's point closest to a point (3,) in base [m].
+
+        The search starts at ``near`` if given; otherwise the whole seam is searched.
+        """
         px, py, pz = point.tolist()
-        # Beyond a curve's centre a foot runs away.
+        # Beyond a curve's centre the iteration below diverges: search the whole seam instead.
         far = 30e-3
         if near is None or math.dist((px, py, pz), self._at(near)[:3]) > far:
             before = round(-self.path.first / self.path.step)
             away = np.linalg.norm(point - self._rows[before:, :3], axis=1)
-            # Of a seam that goes once around its start.
+            # argmax returns the first of several candidates: on a closed seam the one at its start
             near = float(np.argmax(away < away.min() + 1e-3)) * self.path.step
         for _ in range(3):
             x, y, z, tx, ty, tz, *_ = self._at(near)
@@ -186,10 +189,10 @@ class WorkSurface:
         return off
 
     def height(self, point: Floats) -> float:
-        """Return the height of a point (3,) in base above the seam next to it [m].
+        """Return the height of a point (3,) in base above the closest point of the seam [m].
 
-        Along the opening there or along all of them, whichever is more: one that leans says
-        nothing of what is far from it.
+        It is measured along the opening there and along the mean opening; the larger value counts,
+        because a leaning opening is misleading far from the seam.
         """
         stand = self.at(self.foot(point))
         off = point - stand.point
@@ -197,11 +200,11 @@ class WorkSurface:
         return max(float(off @ stand.axes[:, 2]), float(off @ whole / math.sqrt(whole @ whole)))
 
     def unrolled(self, points: Floats, near: Floats) -> Floats:
-        """Return points (K, 3) of the plane, in base.
+        """Convert points (K, 3) in the plane to base.
 
         Args:
             points: Points in the plane [m]; on a closed seam the plane may overlap itself.
-            near: (K,) about where beside the seam they are, by arc length [m].
+            near: (K,) approximate arc lengths of the points [m].
         """
         pairs = zip(points.tolist(), near.tolist(), strict=True)
         return np.array([self._unrolled(point, s) for point, s in pairs]).reshape(-1, 3)
@@ -219,7 +222,11 @@ class WorkSurface:
         return [at + beyond * a + (a * along + up * pz + b * left) for at, a, b, up in axes]
 
     def _beside(self, s: float) -> tuple[float, ...]:
-        """Return point and tangent in the plane, how far s is beyond an end, and the row (9,)."""
+        """Return the seam at an arc length, in the plane and in base (14 numbers).
+
+        They are point and tangent in the plane, the distance beyond an end, and point, tangent and
+        opening in base.
+        """
         path = self.path
         inside = min(max(s, path.first), path.last)
         tick = (inside - path.first) / path.step
@@ -232,10 +239,10 @@ class WorkSurface:
         return x + beyond * tx, y + beyond * ty, tx, ty, beyond, *row
 
     def bending(self, distance: float) -> float:
-        """Return how far a tool leans from the openings at its tip or torch, at most [rad].
+        """Return the largest angle between the tool and the openings at its tip and torch [rad].
 
         Args:
-            distance: From the torch to the tip, both on the seam [m].
+            distance: Distance from the torch to the tip, both on the seam [m].
         """
         s = np.arange(distance, self.path.length, 1e-3)
         ups, behind = self.standing(s, distance)
@@ -243,10 +250,10 @@ class WorkSurface:
         return float(np.arccos(np.clip(np.concatenate(cosines), -1.0, 1.0)).max(initial=0.0))
 
     def standing(self, s: Floats, distance: float) -> tuple[Floats, Floats]:
-        """Return the tool's axis with its tip at arc lengths (K,): (K, 3) upwards, in base.
+        """Return the tool's upward axis (K, 3) in base and the torch's arc lengths (K,).
 
-        Its torch is on the seam ``distance`` behind the tip, at the arc lengths (K,) that come
-        second; about that line it stands as the opening does at the tip.
+        The tip is on the seam at arc lengths ``s``, the torch on the seam ``distance`` behind it.
+        Upwards is the opening at the tip, made perpendicular to the line from torch to tip.
         """
         tip, axes = self.line(s)
         behind = s - distance
@@ -259,12 +266,12 @@ class WorkSurface:
 
 
 def _gone_around(points: Floats, openings: Floats) -> tuple[Floats, Floats, float]:
-    """Return a seam and its openings with a turn more at each end, if it goes once around.
+    """Return a seam and its openings, extended by one turn at each end if the seam is closed.
 
-    A weld begins anywhere on it, and goes on over its start.
+    A weld on a closed seam may begin anywhere and continues over its start.
 
     Returns:
-        The points and openings (M, 3), and how far they go on at each end [m].
+        The points and openings (M, 3), and the length of the extension at each end [m].
     """
     if np.linalg.norm(points[-1] - points[0]) >= TOGETHER:
         return points, openings, 0.0
@@ -276,7 +283,7 @@ def _gone_around(points: Floats, openings: Floats) -> tuple[Floats, Floats, floa
 
 
 def rolled_out(points: Floats, openings: Floats) -> Floats:
-    """Return the points (N, 3) of a seam in the plane: as far apart, turning as in the surface."""
+    """Return a seam's points in the plane (N, 3), with the distances and turns of the surface."""
     steps = np.diff(points, axis=0)
     lengths = np.linalg.norm(steps, axis=1)
     moves = np.flatnonzero(lengths > 0.0)
@@ -298,12 +305,12 @@ def rolled_out(points: Floats, openings: Floats) -> Floats:
 
 
 class Tool:
-    """Translates between the flange in the base and the tool in the plane."""
+    """Converts between the flange's pose in base and the tool's pose in the plane."""
 
     def __init__(
         self, finger: FingerGeometry, surface: WorkSurface, body: LeaningTool | None = None
     ) -> None:
-        """Take a tool that stands upright, or as its ``body`` does."""
+        """Construct the conversion for a leaning ``body``; None is an upright tool."""
         body = body or body_from(finger.torch_from_tip, 0.0, 0.0)
         self._surface, self._distance = surface, body.distance
         self._tip = np.array(finger.tip)
@@ -312,13 +319,13 @@ class Tool:
         self._torch = self._tip + self._flange_R_level @ body.torch
         self._angle: float | None = None
         self._s: float | None = None
-        # The tip goes on beyond the seam's end.
+        # The tip runs on beyond the seam's end, until the torch reaches it.
         self._ticks = np.arange(-CHORD, surface.path.last + body.distance + CHORD, CHORD / 4)
         self._ups, _ = surface.standing(self._ticks, body.distance)
         self._tilts = np.gradient(self._ups, CHORD / 4, axis=0)
 
     def pose(self, base_T_flange: Transform, time: float) -> ToolPose:
-        """Return the tool in the plane, its angle continuous with the last one."""
+        """Return the tool's pose in the plane; its angle is continuous with the last call's."""
         rotation, surface = base_T_flange.rotation, self._surface
         tip = rotation @ self._tip + base_T_flange.translation
         self._s = surface.foot(tip, self._s)
@@ -333,12 +340,12 @@ class Tool:
         return ToolPose(time, position, angle)
 
     def up(self, base_R_flange: Floats) -> Floats:
-        """Return the tool's level z (3,) in base, for an attitude of the flange (3, 3)."""
+        """Return the tool's upward axis (3,) in base, given the flange's rotation (3, 3)."""
         return np.asarray(base_R_flange @ self._flange_R_level[:, 2])
 
     @property
     def tilting(self) -> float:
-        """By how much it tilts on the way, at most [rad/m]."""
+        """Largest tilt of the tool per distance along the seam [rad/m]."""
         return float(np.linalg.norm(self._tilts, axis=1).max())
 
     def lowest(self, base_T_flange: Floats) -> float:
@@ -352,7 +359,7 @@ class Tool:
         return min(self._surface.height(point) for point in in_base)
 
     def twist(self, command: Command, base_T_flange: Transform) -> Floats:
-        """Return the flange's twist (6,), along the base's axes, that carries out a command."""
+        """Return the flange's twist (6,) in base axes that carries out a command [m/s, rad/s]."""
         rotation, surface = base_T_flange.rotation, self._surface
         tip = rotation @ self._tip
         s = surface.foot(tip + base_T_flange.translation, self._s)
@@ -360,19 +367,19 @@ class Tool:
         velocity = stand.unrolled(command.velocity)
         up, tilt = self._standing(s)
         going = float(velocity @ stand.axes[:, 0])
-        # The turn asked for, about the surface's normal; what rights the tool within a second; and
-        # what keeps it upright as the surface tilts. The flange's origin then has v - w x r, r
-        # being the tip from there
+        # Sum of the commanded turn about the surface's normal, a correction of the tool's tilt with
+        # gain 1/s, and the feed-forward of the surface's tilt. The flange's origin moves with v - w
+        # x r, where r is the vector from there to the tip
         angular = command.turn * up + _cross(self.up(rotation), up) + going * _cross(up, tilt)
         return np.concatenate([velocity - _cross(angular, tip), angular])
 
     def base_T_flange(self, position: Floats, angle: float, near: float) -> Transform:
-        """Return where the flange is with the tip at (3,) in the plane, the tool at an angle.
+        """Return the flange's pose in base for a pose of the tool in the plane.
 
         Args:
-            position: Position of the tip [m].
+            position: (3,) position of the tip in the plane [m].
             angle: Angle of the tool in the plane [rad].
-            near: About where beside the seam that is, by arc length [m].
+            near: Approximate arc length of the tip [m].
         """
         surface = self._surface
         tip = surface.unrolled(position[None], np.array([near]))[0]
@@ -387,14 +394,14 @@ class Tool:
         return Transform(BASE, FLANGE, rigid(rotation, tip - rotation @ self._tip))
 
     def in_plane(self, base_T_flange: Transform) -> Floats:
-        """Return the tool's axes (3, 3) as they are in the plane."""
+        """Return the tool's axes in the plane, as columns (3, 3)."""
         rotation = base_T_flange.rotation
         tip = rotation @ self._tip + base_T_flange.translation
         stand = self._surface.at(self._surface.foot(tip, self._s))
         return np.stack([stand.rolled(axis) for axis in (rotation @ self._flange_R_tool).T], axis=1)
 
     def _standing(self, s: float) -> tuple[Floats, Floats]:
-        """Return how the tool is to stand with its tip at an arc length: upwards, and its slope."""
+        """Return the tool's nominal upward axis (3,) at an arc length, and its derivative [1/m]."""
         share = (s - self._ticks[0]) / (self._ticks[1] - self._ticks[0])
         share = min(max(share, 0.0), len(self._ticks) - 1.001)
         index = int(share)
@@ -404,7 +411,7 @@ class Tool:
 
 
 def _cross(first: Floats, second: Floats) -> Floats:
-    """Return the cross product of two (3,), several times faster than NumPy's for any shape."""
+    """Return the cross product of two vectors (3,); several times faster than NumPy's."""
     return np.array(_crossed(first.tolist(), second.tolist()))
 
 

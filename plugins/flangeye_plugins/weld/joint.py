@@ -1,8 +1,8 @@
-"""Cross-section of a joint: where a ball rests between two walls, and what keeps it there.
+"""Cross-section of a joint: where the ball of the tip rests between two walls.
 
 Seen along the seam the left wall leans by ``left`` from the plane's normal, the right one by
-``right``; a ball that touches both has its centre on their bisector. Where the two differ (a fillet
-or a lap joint under an upright tool: 0 and 90 degrees) the ball is beside the seam.
+``right``. A ball that touches both has its centre on their bisector. If the two angles differ (0
+and 90 degrees in a fillet or lap joint under an upright tool), the ball rests beside the seam.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ class WeldJoint:
     """Two walls that meet at the seam.
 
     Attributes:
-        half_angle: Between each wall and their bisector [rad].
+        half_angle: Angle between each wall and their bisector [rad].
         lean: Lean of the bisector from the plane's normal, to the left [rad].
     """
 
@@ -33,19 +33,19 @@ class WeldJoint:
 
     @property
     def right(self) -> float:
-        """The right wall's angle from the plane's normal [rad]."""
+        """Angle of the right wall from the plane's normal [rad]."""
         return self.half_angle - self.lean
 
     def seat(self, radius: float) -> tuple[float, float]:
-        """Return the centre of a seated ball of a radius: to the left of the seam, and above it.
+        """Return the centre of a seated ball: offset to the left of the seam, and height [m].
 
-        Both [m]: the point of the bisector that is one radius away from either wall.
+        It is the point of the bisector that is one radius from either wall.
         """
         away = radius / math.sin(self.half_angle)
         return away * math.sin(self.lean), away * math.cos(self.lean)
 
     def seat_slope(self, radius: float) -> float:
-        """Derivative of the seat's lateral position with respect to a wall's tilt [m/rad]."""
+        """Return the derivative of the seat's lateral position by a wall's tilt [m/rad]."""
         across, _ = self.seat(radius)
         # Half of the wall's angle turns the bisector, half of it opens the walls.
         turned = radius * math.cos(self.lean) / math.sin(self.half_angle)
@@ -55,14 +55,14 @@ class WeldJoint:
 def joint_of(
     kind: JointKind, half_angle: float | None, side: float, radius: float, gap: float
 ) -> WeldJoint | None:
-    """Return the planned joint; None if nothing is known of it.
+    """Return the planned joint; None if its walls are unknown.
 
     Args:
-        kind: What joint it is.
+        kind: Type of the joint.
         half_angle: Angle of the walls from the plan's opening [rad], if the plan has it.
-        side: 1 where the left wall is pressed, -1 for the right one.
+        side: Side of the pressed wall: 1 left, -1 right.
         radius: Radius of the tip's ball [m].
-        gap: Between the plates of a square butt joint [m].
+        gap: Gap between the plates of a square butt joint [m].
     """
     if half_angle is not None:
         return WeldJoint(half_angle)
@@ -76,9 +76,9 @@ def joint_of(
 
 
 def edges_half_angle(gap: float, radius: float) -> float:
-    """Return the half angle [rad] of the groove that holds a ball like two square edges.
+    """Return the half angle [rad] of a groove that holds a ball as two square edges do.
 
-    Climbing out, the ball turns about an edge: at first at a right angle to the line from the edge
-    to its centre, whose sine to the normal is ``gap / 2 radius``.
+    A ball that climbs out rotates about one edge. It starts perpendicular to the line from the edge
+    to its centre, whose angle to the normal has the sine ``gap / (2 radius)``.
     """
     return math.pi / 2 - math.asin(gap / (2.0 * radius))

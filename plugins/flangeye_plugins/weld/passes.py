@@ -1,11 +1,12 @@
 """Passes after the root pass: the torch follows the refined path again, offset and higher.
 
-The root pass is found by touch. After it nothing is touched: the tool stands along the path, its
-tip above what was welded, and the torch is steered by
+The root pass follows the seam by touch. Later passes touch nothing: the tool is aligned with the
+path, its tip above the bead, and the torch is steered by
 
     V_t = v t + k (q - P_t),    V_r = V_t + L w n_d,    w = v curvature + k (heading - angle)
 
-with q the refined path, moved by the pass's offsets; the second is equation (A) of the README.
+where q is the refined path, displaced by the pass's offsets; the second is equation (A) of the
+README.
 """
 
 from __future__ import annotations
@@ -29,31 +30,31 @@ from flangeye_plugins.weld.path import PATH_SPACING, Path, Place
 from flangeye_plugins.weld.settings import PassParams
 
 GAIN = 2.0
-"""How fast a pass takes back an error of place or heading [1/s]."""
+"""Gain of a pass on errors of position and heading [1/s]."""
 
 
 class Traced:
     """Result of the root pass: the seam with its variance, and the tool's height.
 
     Attributes:
-        rows: For each piece of the root pass: the torch's arc length, the end point's height and
-            the torch's standard deviation [m].
+        rows: Along the root pass: the torch's arc length, the end point's height and the torch's
+            standard deviation [m].
     """
 
     def __init__(self, root: Follower, plan: Path, before: Floats) -> None:
-        """Begin; ``before`` (K, 3) is what the resumed weld had felt."""
+        """Start with the rows ``before`` (K, 3) of a resumed weld, or none."""
         self._root, self._plan = root, plan
         self.rows: list[tuple[float, ...]] = [tuple(row) for row in before.tolist()]
         self._along, self._sigma = before[:, 0], before[:, 2]
 
     def note(self, height: float) -> None:
-        """Remember a cycle of the root pass, in which the end point was so high [m]."""
+        """Store a cycle of the root pass with the end point's height [m]."""
         root = self._root
         if not self.rows or root.torch >= self.rows[-1][0] + PATH_SPACING:
             self.rows.append((root.torch, height, root.sigma))
 
     def path(self, chosen: PassParams) -> Path:
-        """Return the torch's path of a pass; its height is that of the tool's end point."""
+        """Return the torch's path in a pass; its height is the tool's end point's."""
         s = np.arange(0.0, self._plan.length + PATH_SPACING / 2, PATH_SPACING)
         frames = [self._root.seam.refined.frame(x) for x in s.tolist()]
         planar = np.array([point + chosen.across * normal for point, normal in frames])
@@ -61,24 +62,24 @@ class Traced:
         return Path(np.column_stack([planar, np.interp(s, self._along, height) + chosen.up]))
 
     def sigma(self, s: float) -> float:
-        """Return the standard deviation of the seam at an arc length of the root pass [m]."""
+        """Return the root pass's standard deviation of the torch at an arc length [m]."""
         return float(np.interp(s, self._along, self._sigma))
 
 
 class Passes:
-    """The root pass by touch, then further passes along the seam it found.
+    """Controller of several passes: the root pass by touch, later ones along the felt seam.
 
     Attributes:
-        root: The root pass.
-        number: Which pass it is, the root's is 0.
-        aim: How far to the left of the seam the torch is to be [m].
+        root: Controller of the root pass.
+        number: Number of the present pass; 0 is the root pass.
+        aim: Present target of the torch, to the left of the seam [m].
     """
 
     def __init__(
         self,
         root: Follower,
     ) -> None:
-        """Follow the root first, then its task's later passes; or go on in the one resumed."""
+        """Start with the root pass, or with the pass in which a resumed weld stopped."""
         task, before = root.task, root.task.before
         plan, belief, settings = task.plan, task.belief, task.settings
         self.root, self.number = root, 0
@@ -94,7 +95,7 @@ class Passes:
             self._go_on(before)
 
     def _go_on(self, before: ResumePoint) -> None:
-        """Begin in a later pass, where the arc is to burn again."""
+        """Start in the later pass that is resumed."""
         root = self.root
         root.sensing.learned, root.welding.arc_from = before.learned, root.task.start.torch
         root.seam.refined.noise = before.learned.noise
@@ -104,7 +105,7 @@ class Passes:
         self._start = self.torch = root.task.start.torch
 
     def _learned(self) -> None:
-        """Take over the arm's delay as the root pass has found it."""
+        """Use the arm's delay as identified in the root pass."""
         learned = self.root.sensing.learned
         self._response.dead_time, self._response.lag = learned.dead_time, learned.lag
 
@@ -128,7 +129,7 @@ class Passes:
 
     @property
     def arc_from(self) -> float | None:
-        """Where the torch first was within ``max_error`` in the root pass, by arc length [m]."""
+        """Arc length at which the arc was struck in the root pass [m]; None before."""
         return self.root.arc_from
 
     @property
@@ -139,7 +140,7 @@ class Passes:
         return self._striking.level(self._now) if self.phase == "passing" else OFF
 
     def step(self, pose: ToolPose, touches: Sequence[Touch]) -> Command:
-        """Return the command for this cycle; ``touches`` are the measurements not yet given."""
+        """Return the command for this cycle, given the measurements since the last one."""
         if not self.number:
             return self._root_step(pose, touches)
         coming, self._now = self._response.ahead(pose), pose.time
@@ -161,7 +162,7 @@ class Passes:
         return self._settings.passes[self.number - 1]
 
     def _next_pass(self, height: float) -> None:
-        """Go back for the next pass, from a height of the end point; after the last it is done."""
+        """Start the return to the next pass from this height [m]; end after the last."""
         if self.number == len(self._settings.passes):
             self.phase = "done"
             return
@@ -179,9 +180,10 @@ class Passes:
     # --- back to the start, above the work -------------------------------------------------------
 
     def _return(self, pose: ToolPose) -> Command:
-        """Up, across to where the pass begins, down."""
+        """Return the command that moves the tool up, across to the pass's start, and down."""
         start = self._path.at(self._start)
-        # The torch is to be there, the tool along the path.
+        # Displacement of the end point that brings the torch to the start, with the tool along the
+        # path
         aside = start.point + self._belief.distance * start.tangent - pose.position[:2]
         turn = _nearest(_heading(start) - pose.angle)
         # A place is reached when the tool is within 0.1 mm and 0.2 deg of it.
@@ -201,7 +203,7 @@ class Passes:
     # --- along the refined path ------------------------------------------------------------------
 
     def _weld(self, pose: ToolPose) -> Command:
-        """Lead the torch along the pass's path."""
+        """Return the command that steers the torch along the pass's path."""
         settings, distance = self._settings, self._belief.distance
         ahead = np.array([math.cos(pose.angle), math.sin(pose.angle)])
         torch = pose.position[:2] - distance * ahead
@@ -221,8 +223,8 @@ class Passes:
         self._estimate(error)
         across = sway.rate - GAIN * error
         torch_speed = settings.speed * place.tangent + across * place.normal
-        # The error of heading is taken back while the path's own curvature is followed; then, by
-        # (12), the end point moves at V_r = V_t + L w n_d
+        # Rotate with the path's curvature plus a correction of the heading; then, by (12), the end
+        # point moves at V_r = V_t + L w n_d
         turning = GAIN * _nearest(_heading(place) - pose.angle) + settings.speed * self._bend()
         turn = within(turning, settings.turn_rate)
         planar = torch_speed + distance * turn * np.array([-ahead[1], ahead[0]])
@@ -244,7 +246,7 @@ class Passes:
         return _nearest(_heading(after) - _heading(before)) / (2 * PATH_SPACING)
 
     def _estimate(self, error: float) -> None:
-        """State how far the torch may be from where it is to be, and stop where that is too far."""
+        """Update the torch's error bound, given its control error [m]; stop if it is too large."""
         settings = self._settings
         again = (2.0 * settings.arm_sigma) ** 2 + settings.distortion**2 + self._weave.variance
         seam = self._traced.sigma(self.torch)
@@ -259,7 +261,7 @@ class Passes:
 
 
 def follower_of(controller: Controller) -> Follower | None:
-    """Return the follower by touch; of several passes, the root's."""
+    """Return the controller that follows by touch (the root pass's); None if there is none."""
     if isinstance(controller, Passes):
         return controller.root
     return controller if isinstance(controller, Follower) else None
@@ -270,11 +272,11 @@ def _heading(place: Place) -> float:
 
 
 def _nearest(angle: float) -> float:
-    """Return an angle within half a turn."""
+    """Return an angle wrapped to +-pi [rad]."""
     return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
 def _towards(way: Floats, speed: float) -> Floats:
-    """Return the velocity (2,) towards a place: slower near to it."""
+    """Return a velocity (2,) along the remaining way, reduced near its end [m/s]."""
     far = float(np.hypot(*way))
     return way * (min(GAIN * far, speed) / max(far, 1e-9))

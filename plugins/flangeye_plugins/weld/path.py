@@ -1,4 +1,4 @@
-"""A seam in the plane of the work, by arc length. Arrays only; lengths [m]."""
+"""A seam in the plane of the work, parametrised by arc length; all lengths in [m]."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from flangeye.types import Floats
 from flangeye.types.geometry import arc_lengths, rows_at
 
 PATH_SPACING = 0.5e-3
-"""Spacing to which a path is resampled [m]; at a radius of 50 mm the chord misses it by 0.6 um."""
+"""Spacing to which a path is resampled [m]; at a radius of 50 mm the chord error is 0.6 um."""
 
 CHORD = 5e-3
-"""Length over which a path's direction and curvature are taken [m]."""
+"""Chord length for computing a path's direction and curvature [m]."""
 
 
 class Place(NamedTuple):
     """One place on a path.
 
     Attributes:
-        point: (2,) in the plane.
+        point: (2,) position in the plane.
         tangent: (2,) unit vector, forwards.
         normal: (2,) unit vector, to the left of the tangent.
-        height: Above the plane.
+        height: Height above the plane.
     """
 
     point: Floats
@@ -34,16 +34,16 @@ class Place(NamedTuple):
 
 
 class Path:
-    """A curve that continues straight beyond both ends; the seam's start has arc length zero.
+    """A curve with arc length zero at the seam's start, continued straight beyond both ends.
 
     Attributes:
         length: Length of the seam in the plane [m].
-        first: Arc length of the curve's first point: below zero where the seam goes once around,
-            and the curve goes on around beyond both of its ends.
-        last: Arc length of its last point.
-        points: (M, 3) the curve resampled: in the plane, and its height.
+        first: Arc length of the curve's first point; negative for a closed seam, which is continued
+            around beyond both ends.
+        last: Arc length of the curve's last point.
+        points: (M, 3) the resampled curve: two coordinates in the plane, and the height.
         tangents: (M, 2) unit tangents in the plane.
-        step: Arc length between two of them [m].
+        step: Arc length between two resampled points [m].
     """
 
     def __init__(self, points: Floats, wraps: float = 0.0) -> None:
@@ -51,7 +51,8 @@ class Path:
 
         Args:
             points: (N, 3) two coordinates in the plane, and the height above it.
-            wraps: How far they go on beyond both ends of a seam that goes once around.
+            wraps: Length by which a closed seam's points extend beyond both ends; 0 for an open
+                one.
         """
         along = arc_lengths(points[:, :2])
         known = float(along[-1])
@@ -70,13 +71,13 @@ class Path:
 
     @property
     def closed(self) -> bool:
-        """Whether the seam goes once around."""
+        """Whether the seam is closed."""
         return self.first < 0.0
 
     def _curvatures(self) -> Floats:
-        """Return the curvature (M,) by chords, to the left positive.
+        """Return the curvature (M,) [1/m], positive to the left.
 
-        By chords because a plan's scatter must not look like curves.
+        It is computed over chords, so that noise of the plan does not look like curvature.
         """
         span = max(1, min(round(CHORD / self.step), (len(self.points) - 1) // 2))
         chords = self.points[span:, :2] - self.points[:-span, :2]
@@ -90,7 +91,7 @@ class Path:
         return Place(np.array([x, y]), np.array([tx, ty]), np.array([-ty, tx]), z)
 
     def _at(self, s: float) -> tuple[float, float, float, float, float]:
-        """Return point, tangent and height at an arc length."""
+        """Return point (2), unit tangent (2) and height at an arc length."""
         # Called several times a cycle: plain floats are ten times faster than arrays of one.
         inside = self.first if s < self.first else self.last if s > self.last else s
         share = (inside - self.first) / self.step
@@ -119,9 +120,9 @@ class Path:
         return point, tangent
 
     def other_end(self, s: Floats, distance: float) -> Floats:
-        """Return arc lengths (K,) of a tool's other end, with one at (K,) and both on the curve.
+        """Return the arc lengths (K,) of the tool's other end, with both ends on the curve.
 
-        The tip is ahead of the torch by a distance, the torch ahead of the tip by its negative.
+        A positive distance gives the tip for torches at ``s``; a negative one the torch for tips.
         """
         here, _ = self.evaluate(s)
         other = s + distance
@@ -137,7 +138,7 @@ class Path:
         return float(self._climb[self._tick(s)]) if self.first <= s <= self.last else 0.0
 
     def sharpest(self, start: float, end: float) -> float:
-        """Return the largest curvature between two arc lengths [1/m]; none beyond the ends."""
+        """Return the largest curvature between two arc lengths [1/m]; 0 beyond the ends."""
         low, high = (int((s - self.first) / self.step) for s in (start, end))
         curvature = self._curvature[max(low, 0) : max(high + 1, 0)]
         return float(np.abs(curvature).max(initial=0.0))
@@ -150,20 +151,20 @@ class Path:
         return round((s - self.first) / self.step)
 
     def advance(self, point: Floats, s: float, reach: float) -> float:
-        """Return the arc length of the foot of ``point`` (2,), at most ``reach`` beyond ``s``.
+        """Return the arc length of the foot of ``point`` (2,), between ``s`` and ``s + reach``.
 
-        It never goes back, and never jumps to another branch of a path that crosses itself.
+        It never decreases, and never jumps to another branch of a path that crosses itself.
         """
         return s + min(max(self._ahead(point, s), 0.0), reach)
 
     def foot(self, point: Floats, s: float) -> float:
-        """Return the arc length of the foot of ``point`` (2,) near ``s``, forwards or back."""
+        """Return the arc length of the foot of ``point`` (2,) near ``s``, in either direction."""
         for _ in range(2):
             s += self._ahead(point, s)
         return s
 
     def _ahead(self, point: Floats, s: float) -> float:
-        """Return how far ahead of the place at ``s`` a point (2,) is, along the tangent there."""
+        """Return a point's (2,) distance ahead of the place at ``s``, along the tangent there."""
         x, y, tx, ty, _ = self._at(s)
         px, py = point.tolist()
         return float((px - x) * tx + (py - y) * ty)

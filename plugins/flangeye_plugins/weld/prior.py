@@ -1,9 +1,9 @@
 """A file that passes estimates of tip, play and clock from one weld to the next.
 
-The sweep at the start starts from these instead of from the finger's file, and ends with less
-doubt. The file is plain YAML: to read, and to delete when finger or camera were changed. What was
-found a weld ago counts half: so many welds that each know a little never add up to certainty, and a
-tip that creeps is followed.
+The sweep at the start of a weld uses them as its prior instead of the finger's file, and gives
+smaller uncertainties. The file is YAML; delete it after a change of finger or camera. An earlier
+weld's information counts half (its variance is doubled): many weak estimates cannot add up to false
+certainty, and a slowly creeping tip is tracked.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from flangeye_plugins.weld.following.belief import Belief, Learned
 
 
 class WeldPrior(Model):
-    """Posterior of one weld, prior of the next; each with its standard deviation."""
+    """Estimates of one weld, used as the prior of the next, with standard deviations."""
 
     finger: str
     ahead: Length = param(description="The tip is ahead of where the finger's file has it.")
@@ -34,11 +34,11 @@ class WeldPrior(Model):
 
 
 def with_prior(belief: Belief, path: Path | None, finger: str) -> Belief:
-    """Return a belief updated by earlier welds; unchanged if there is no file yet.
+    """Return a prior updated by the file of earlier welds; unchanged if there is no file yet.
 
     Raises:
-        StageError: The file is of another finger.
-        RecipeError: It is no such file.
+        StageError: The file belongs to another finger.
+        RecipeError: The file is not a valid prior.
     """
     if path is None or not path.exists():
         return belief
@@ -49,13 +49,13 @@ def with_prior(belief: Belief, path: Path | None, finger: str) -> Belief:
             "file, or name another one (prior)"
         )
     found = prior.model_dump(exclude={"finger"})
-    # Half the information is twice the variance
+    # Half the information means twice the variance
     aged = {name: math.sqrt(2) * x for name, x in found.items() if name.endswith("_sigma")}
     return replace(belief, **{**found, **aged})
 
 
 def keep_posterior(path: Path, finger: str, learned: Learned) -> None:
-    """Write a weld's estimates for the next one.
+    """Write a weld's estimates to the file for the next weld.
 
     Raises:
         StageError: The file cannot be written.

@@ -1,4 +1,4 @@
-"""The arm's path to the seam and along it, in joint space, checked before anything moves."""
+"""Check of the arm's path to the seam and along it, in joint space, before anything moves."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from flangeye_plugins.weld.path import Path, Place
 from flangeye_plugins.weld.settings import Following, WeldTactileParams
 
 ROOM = np.radians(2.0)
-"""The joints keep this far away from their limits along the seam [rad]."""
+"""Margin that the joints keep from their limits along the seam [rad]."""
 
 JUMP = np.radians(30.0)
-"""A joint that turns farther from one pose to the next takes another posture [rad]."""
+"""A joint that turns by more than this between two poses has changed its posture [rad]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,10 +36,10 @@ class Task:
         model: The arm.
         limits: The arm's motion limits.
         finger: The finger on the arm.
-        tool: Translates between flange and plane.
+        tool: Converts between the flange's pose in base and the tool's pose in the plane.
         plan: The seam.
         params: Speeds and clearances.
-        start: Where the weld begins.
+        start: Start of the weld.
         aside: Distance to the left of the plan at which the tip is set down [m].
     """
 
@@ -54,27 +54,27 @@ class Task:
 
 
 class Station(NamedTuple):
-    """A pose on the path, with its name."""
+    """A pose of the flange on the path, with its name for messages."""
 
     name: str
     pose: Transform
 
 
 class Barrier(NamedTuple):
-    """Why a posture is not allowed, and how nearly it was."""
+    """The reason why a posture is not allowed, and the rank of the failed check."""
 
     rank: int
     reason: str
 
 
 class SeamReach:
-    """Postures of the arm from above the seam's start to beyond its end."""
+    """The arm's feasible postures from above the seam's start to beyond its end."""
 
     def __init__(self, task: Task) -> None:
-        """Find every posture in which the whole seam can be driven.
+        """Find every sequence of postures with which the whole seam can be followed.
 
         Raises:
-            StageError: There is none: where, and why.
+            StageError: There is none; the message names the place and the reason.
         """
         self._task = task
         self._arm, self._volume = Arm(task.model), ArmVolume(task.model)
@@ -93,7 +93,7 @@ class SeamReach:
         """Return a checked path from joint angles (n,) to above the seam's start.
 
         Raises:
-            StageError: There is none: what bars it.
+            StageError: There is none; the message names the obstacle.
         """
         reasons = []
         chains = [self._turned_to(here, chain) for chain in self._chains]
@@ -119,7 +119,7 @@ class SeamReach:
         return self._touches(here, high) or Route((*over.legs, *down.legs))
 
     def _touches(self, start: Floats, goal: Floats) -> Barred | None:
-        """Return where finger or torch would come too near to the work's face."""
+        """Return the obstacle if finger or torch would come too near to the work; else None."""
         count = 2 + int(np.abs(goal - start).max() / LARGEST_TURN)
         postures = start + np.linspace(0.0, 1.0, count)[:, None] * (goal - start)
         task = self._task
@@ -140,7 +140,7 @@ class SeamReach:
             )
 
     def _drivable(self, stations: list[Station], postures: list[Floats]) -> list[Floats]:
-        """Return the chains of postures (M, n), one for each station, that can be driven."""
+        """Return the feasible sequences of postures (M, n), one posture for each station."""
         found: list[Floats] = []
         refusals: list[tuple[int, Barrier]] = []
         for first in postures[0]:
@@ -165,15 +165,15 @@ class SeamReach:
         return found
 
     def _whole_turns(self, low: Floats, high: Floats) -> Floats:
-        """Return the whole turns (n,) that bring a joint's way within its limits, if any do [rad].
+        """Return the whole turns (n,) that bring the joints' motion within their limits [rad].
 
         Args:
-            low: (n,) the least that each joint comes to [rad].
-            high: (n,) the most [rad].
+            low: (n,) smallest angle of each joint [rad].
+            high: (n,) largest angle of each joint [rad].
         """
         lower, upper = self._task.limits.lower, self._task.limits.upper
         outside = (low < lower + ROOM) | (high > upper - ROOM)
-        # From the middle of the joint's way to the middle of its range, in whole turns
+        # From the middle of the joint's motion to the middle of its range, in whole turns
         turns = np.round((lower + upper - low - high) / (4 * np.pi))
         return np.where(outside, 2 * np.pi * turns, 0.0)
 
@@ -182,15 +182,15 @@ class SeamReach:
         return limits.beyond(low, ROOM) or limits.beyond(high, ROOM)
 
     def _turned_to(self, here: Floats, chain: Floats) -> Floats:
-        """Return a chain with its joints turned by whole turns towards where they stand."""
+        """Return a sequence of postures moved by whole turns towards the joint angles ``here``."""
         turns = 2 * np.pi * np.round((here - chain[0]) / (2 * np.pi))
         low, high = self._task.limits.lower + ROOM, self._task.limits.upper - ROOM
         allowed = ((chain + turns >= low) & (chain + turns <= high)).all(axis=0)
         return np.asarray(chain + np.where(allowed, turns, 0.0))
 
     def _bars(self, before: Floats, joints: Floats) -> Barrier | None:
-        """Return why a posture must not be taken after another; None if it may."""
-        # The order matters: of several attempts, that which passes most of these checks is named
+        """Return why a posture is not allowed after another one; None if it is."""
+        # The order matters: the message is that of the attempt that passes most checks
         axes = self._volume.axes(self._arm.frames(joints))
         if not self._volume.above(axes, TABLE):
             return Barrier(0, "the arm touches the table")
@@ -210,10 +210,10 @@ class SeamReach:
         return None
 
     def _fastest(self, joints: Floats) -> float:
-        """Return what a joint turns at most while the seam is followed [rad/s]."""
+        """Return the largest joint speed at a posture while the seam is followed [rad/s]."""
         task = self._task
         inverse = np.linalg.pinv(self._arm.jacobian(joints))
-        # The norm of a row is the most that its joint turns for a unit velocity in any direction
+        # A row's norm is its joint's largest speed for a unit velocity in any direction
         up = task.tool.up(self._arm.flange(joints)[:3, :3])
         turning = np.abs(inverse[:, :3] @ up) * task.params.turn_rate
         turning += np.linalg.norm(inverse[:, :3], axis=1) * task.tool.tilting * task.params.speed
@@ -234,9 +234,9 @@ def flange_speed(finger: Finger, settings: Following) -> float:
 
 
 def _stations(task: Task) -> list[Station]:
-    """Return the poses to check: twice above the start, turning there, then along the seam.
+    """Return the poses to check: above the start, turning there, then along the seam.
 
-    The tip goes on beyond the seam's end by the torch's distance.
+    The tip runs beyond the seam's end by the distance to the torch.
     """
     plan, params, tool = task.plan, task.params, task.tool
     start = plan.at(task.start.tip)
@@ -264,6 +264,6 @@ def _angle(place: Place) -> float:
 
 
 def _nearest(before: Floats, postures: Floats) -> Floats:
-    """Return the one of (K, n) postures that is nearest to the last, joints by whole turns."""
+    """Return the posture closest to ``before``, out of (K, n) and their whole turns."""
     near = postures + 2 * np.pi * np.round((before - postures) / (2 * np.pi))
     return np.asarray(near[int(np.argmin(np.abs(near - before).max(axis=1)))])

@@ -1,4 +1,4 @@
-"""The report of a weld, from its log."""
+"""Builds the report of a weld from its log."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.weld_log import WeldLog, columns
 
 SAMPLES = 2000
-"""At most so many of the cycles go into the report."""
+"""Largest number of cycles in the report."""
 
 
 def report_of(  # noqa: PLR0913  all that a weld had
@@ -28,7 +28,7 @@ def report_of(  # noqa: PLR0913  all that a weld had
     reason: str,
     truth: tuple[Floats, Floats] | None = None,
 ) -> WeldReport:
-    """Return the report of a weld; ``truth`` is of a simulation: times, and the true torch."""
+    """Return the report of a weld; ``truth`` is a simulation's true torch: times, positions."""
     plan, to_base = surface.path, surface.unrolled
     reason = reason and f"{reason}; {_extent(controller, plan)}"
     every = columns(weld_log.cycles)
@@ -68,9 +68,9 @@ def report_of(  # noqa: PLR0913  all that a weld had
 
 
 def _advice(controller: Controller) -> tuple[Note, ...]:
-    """Recommend a look behind the torch where what nothing ahead of it measures is most of it."""
+    """Return a note that recommends a profile sensor if it could reduce most of the variance."""
     root = follower_of(controller)
-    # Where it is more than half, a look is worth its price.
+    # Below half of the variance the sensor would hardly improve the bound.
     if root is None or root.arc_from is None:
         return ()
     fixed = root.welding.share_fixed
@@ -83,7 +83,7 @@ def _advice(controller: Controller) -> tuple[Note, ...]:
 
 
 def _extent(controller: Controller, plan: Path) -> str:
-    """Return which part of the seam was welded before the weld was stopped."""
+    """Return a text that says which part of the seam was welded before the stop."""
     root = follower_of(controller)
     if root is None:
         return f"its torch had come to {controller.torch * 1e3:.0f} mm"
@@ -97,12 +97,12 @@ def _extent(controller: Controller, plan: Path) -> str:
 
 
 def _stated(deviations: Floats) -> Floats:
-    """Return deviations (K,), or none where the controller states no finite ones."""
+    """Return standard deviations (K,), or an empty array if any is not finite."""
     return deviations if np.isfinite(deviations).all() else np.zeros(0)
 
 
 def learned_figures(controller: Controller) -> Mapping[str, float]:
-    """Return the sweep's estimates."""
+    """Return the sweep's estimates by name, for the report."""
     root = follower_of(controller)
     if root is None:
         return {}
@@ -121,9 +121,9 @@ def learned_figures(controller: Controller) -> Mapping[str, float]:
 def _tip_displacements(
     weld_log: WeldLog, plan: Path, body: LeaningTool, kept: NDArray[np.intp]
 ) -> tuple[Floats, Floats]:
-    """Return where the tip was (K, 3) in the plane, and its deflection to the wall (K,).
+    """Return the tip's positions in the plane (K, 3) and its deflections (K,) [m].
 
-    Each image meets the pose of its own time; until the next one the tip stays there.
+    A measurement is combined with the pose at its own time, and held until the next one.
     """
     every = columns(weld_log.cycles)
     robot = np.array(every["position"]).reshape(-1, 3)
@@ -144,7 +144,7 @@ def _tip_displacements(
 
 
 def _refined(controller: Controller, plan: Path) -> tuple[Floats, Floats]:
-    """Return the seam as it was felt, (M, 3) in the plane, and its arc lengths (M,)."""
+    """Return the estimated seam in the plane (M, 3) and its arc lengths (M,) [m]."""
     root = follower_of(controller)
     if root is None or root.seam.refined.empty:
         return np.zeros((0, 3)), np.zeros(0)
@@ -165,7 +165,7 @@ def _figures(weld_log: WeldLog) -> Mapping[str, float]:
 
 
 def _loop(weld_log: WeldLog) -> Mapping[str, float]:
-    """Return how the loop kept time; not the same in two equal runs."""
+    """Return the loop's timing statistics, which differ between identical runs."""
     if not weld_log.cycles:
         return {}
     computing = np.array([c.computing for c in weld_log.cycles])

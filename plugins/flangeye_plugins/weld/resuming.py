@@ -1,7 +1,7 @@
 """Resume a stopped weld: measurements are kept, and the torch overlaps the weld's end.
 
-What was felt is in the log: the controller is stepped through the logged poses and displacements as
-far as the log goes, so nothing has to be saved when a weld is stopped, not even by kill -9.
+The state is recovered from the log by stepping the controller through all logged poses and
+displacements. So nothing has to be saved when a weld stops, even if the process was killed.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from flangeye_plugins.weld.settings import Following, Mode, WeldTactileParams
 from flangeye_plugins.weld.weld_log import LoggedLooks
 
 RUN_IN = 2 * SETTLING
-"""Way in which the torch takes back what the sweep has led it aside by, before the arc [m]."""
+"""Run-in before the arc, in which the torch recovers from its displacement by the sweep [m]."""
 
 
 def controller_of(
@@ -41,7 +41,7 @@ def controller_of(
     kept: ResumePoint | None = None,
     start: Start | None = None,
 ) -> Controller:
-    """Return the controller of the mode that was asked for; see :class:`WeldTask`."""
+    """Return the controller for a mode; for the other arguments see :class:`WeldTask`."""
     if isinstance(mode, BoundPart):
         controller: Controller = mode(task_of(plan, belief.distance, settings))
         return controller
@@ -52,7 +52,7 @@ def controller_of(
 
 
 def task_of(plan: Path, distance: float, settings: Following) -> FollowingTask:
-    """Return the task of a plugin's controller, with the torch ``distance`` behind the tip."""
+    """Return the task for a plugin's controller; the torch is ``distance`` behind the tip [m]."""
     return FollowingTask(
         plan.points, plan.tangents, plan.step, distance,
         settings.sign, settings.speed, settings.deflection, settings.preload, settings.servo_gain,
@@ -61,7 +61,7 @@ def task_of(plan: Path, distance: float, settings: Following) -> FollowingTask:
 
 
 def _mode_of(logged: str | Mapping[str, Any]) -> Mode:
-    """Return the mode that a log names; the plugin of its controller has to be installed."""
+    """Return the mode named in a log; a plugin's controller must be installed."""
     if logged in ("tactile", "vision"):
         return logged
     ((name, given),) = {logged: {}}.items() if isinstance(logged, str) else logged.items()
@@ -71,7 +71,7 @@ def _mode_of(logged: str | Mapping[str, Any]) -> Mode:
 
 
 def take_looks(controller: Controller, looks: Sequence[WeldProfile]) -> None:
-    """Give a controller new profiles from behind the torch."""
+    """Pass new bead profiles to a controller, if it follows by touch."""
     follower = follower_of(controller)
     if follower is not None:
         for profile in looks:
@@ -91,7 +91,7 @@ def controller_from(start: Mapping[str, Any]) -> Controller:
 
 
 def kept_value(kept: ResumePoint) -> dict[str, Any]:
-    """Return the state of a stopped weld as plain values, for the resuming run's log."""
+    """Return the state of a stopped weld as plain values for the log."""
     return {**asdict(kept), "samples": kept.samples.tolist(), "traced": kept.traced.tolist()}
 
 
@@ -105,11 +105,11 @@ def resume_point_of(log: FilePath, points: Floats) -> ResumePoint | None:
     """Return the state of a stopped weld; None if its torch was not on the seam yet.
 
     Args:
-        log: The weld's.
+        log: Log of the stopped weld.
         points: (N, 3) of the plan, in the plane of the work [m].
 
     Raises:
-        StageError: The log holds no weld by touch, or one that has ended or had another plan.
+        StageError: The log holds no weld by touch, or a complete one, or one on another plan.
     """
     again: LoggedWeld | None = None
     for note in read_notes(log):
@@ -127,13 +127,13 @@ def resume_point_of(log: FilePath, points: Floats) -> ResumePoint | None:
 
 
 class LoggedWeld:
-    """Steps a controller through the log of its weld.
+    """Steps a controller through a logged weld.
 
     Attributes:
-        controller: As it was at the start, and decides again.
-        felt: What was felt in an image, by its number; None where nothing was.
+        controller: The controller, created in its initial state.
+        felt: Measurement of each image, by the image's number.
         newest: Number of the newest image.
-        cycles: How many were decided.
+        cycles: Number of cycles processed.
     """
 
     def __init__(self, start: Mapping[str, Any]) -> None:
@@ -154,7 +154,7 @@ class LoggedWeld:
             self._decide(note.value)
 
     def see(self, sight: Mapping[str, Any]) -> None:
-        """Take in that an image was read."""
+        """Process the log entry of an image."""
         self.newest = sight["number"]
 
     def feel(self, logged: Mapping[str, Any]) -> None:
@@ -162,7 +162,7 @@ class LoggedWeld:
         self.felt[self.newest] = Touch(logged["time_ns"] * 1e-9, np.array(logged["displacement"]))
 
     def decided(self, command: Command, cycles: Mapping[str, list[Any]], i: int) -> None:
-        """Process the controller's decision in a cycle, the ``i``-th of its block."""
+        """Receive the controller's command in the ``i``-th cycle of a block; ignore it here."""
 
     def _decide(self, cycles: Mapping[str, list[Any]]) -> None:
         for i, time in enumerate(cycles["time"]):
@@ -184,13 +184,13 @@ def _require_same(log: FilePath, points: Floats, before: Floats) -> None:
 
 
 def set_back(params: WeldTactileParams, plan: Path, distance: float, kept: ResumePoint) -> Start:
-    """Return where a resumed weld begins, so that the torch overlaps.
+    """Return the start of a resumed weld, such that the torch overlaps the bead.
 
-    The arc begins where the overlap does, the tip is set down a run-in before that; in a later
-    pass, which touches nothing, it comes down right there.
+    The arc is struck at the start of the overlap; the tip is set down a run-in before that. A later
+    pass touches nothing and needs no run-in.
 
     Raises:
-        StageError: The tip would be beyond where it can press.
+        StageError: The rest of the seam is too short for the tip.
     """
     if kept.number:
         arc_from = max(kept.torch - params.overlap, 0.0)
@@ -206,7 +206,7 @@ def set_back(params: WeldTactileParams, plan: Path, distance: float, kept: Resum
 
 
 def _standing(plan: Path, distance: float, arc_from: float, tip: float) -> Start:
-    """Return where tip and torch stand on the plan, to weld from ``arc_from`` on."""
+    """Return the start with the tip and the torch on the plan, for an arc from ``arc_from`` [m]."""
     place = plan.at(tip)
     torch = plan.at(_away(plan, tip, -distance)).point
     heading = np.arctan2(*(place.point - torch)[::-1]) - np.arctan2(*place.tangent[::-1])
@@ -215,5 +215,5 @@ def _standing(plan: Path, distance: float, arc_from: float, tip: float) -> Start
 
 
 def _away(plan: Path, s: float, distance: float) -> float:
-    """Return where the tool's other end is; see :meth:`Path.other_end`."""
+    """Return the arc length of the tool's other end; see :meth:`Path.other_end`."""
     return float(plan.other_end(np.array([s]), distance)[0])

@@ -1,4 +1,4 @@
-"""How to follow, with units: part of the parameters of ``weld.tactile``."""
+"""Parameters of ``weld.tactile``."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from flangeye_plugins.weld.joint import JointKind
 from flangeye_plugins.weld.path import Path
 
 Mode = Annotated[str | BoundPart, Choose("controller", words=("tactile", "vision"))]
-"""By touch, by the plan alone, or as a controller of a plugin decides."""
+"""Follow by touch, by the plan alone, or by a plugin's controller."""
 
 INSIDE = 1.5e-3
-"""The tip is set down, or goes back to, where the seam has surely begun by this [m]."""
+"""Distance inside the seam's start at which the tip is set down or returns to the seam [m]."""
 
 
 class PassParams(Params):
-    """A pass after the root pass, along the seam it found, without touch."""
+    """A pass after the root pass: it follows the estimated seam without touch."""
 
     across: Length = param("0 mm", ge=-0.03, le=0.03, description="Offset to the left of the seam.")
     up: Length = param(
@@ -34,34 +34,34 @@ class PassParams(Params):
 
 
 class Following(Params):
-    """The controller's parameters; names in brackets are the paper's."""
+    """Parameters of the controller; symbols in brackets are the paper's."""
 
-    # What no cell needs otherwise. Gains: k_p of the deflection servo, of the preload's control,
-    # and by which an error of the torch is taken back [1/s].
+    # Constants that no cell has needed to change. Gains [1/s]: k_p of the deflection servo, of the
+    # preload's servo, and of the torch's cross-track control.
     servo_gain: ClassVar[float] = 3.0
     height_gain: ClassVar[float] = 3.0
     cross_track_gain: ClassVar[float] = 1.0
-    # Deflection with which lost contact is felt for, twice it where little is known of where the
-    # seam leads; the weld is stopped after this way without contact [m].
+    # Smallest deflection with which a lost wall is sought, doubled where the seam is uncertain; the
+    # weld stops after this distance without contact [m].
     probe: ClassVar[float] = 0.5e-3
     longest_gap: ClassVar[float] = 40e-3
-    # How fast a wanted deflection is changed, and ended before the seam ends [m/s].
+    # Rate limits of the deflection's set point: in general, and for its release at the end [m/s].
     ramp: ClassVar[float] = 2e-3
     release: ClassVar[float] = 0.8e-3
     # Largest speed across the seam and in height, and speed of the tool between two passes [m/s].
     lateral_speed: ClassVar[float] = 5e-3
     return_speed: ClassVar[float] = 20e-3
-    # How far inside the planned start the tip is set down, and before the planned end stops
-    # pressing, where ``ends`` asks for no more [m].
+    # Distance inside the planned start at which the tip is set down, and before the planned end at
+    # which it is released; ``ends`` may increase both [m].
     inset: ClassVar[float] = 5e-3
     ending: ClassVar[float] = 8e-3
-    # Farther from the plan the tip stops the weld; standard deviation of the seam about the plan's
-    # shape; the torch's end may be higher or lower than the seam by this [m].
+    # Largest distance of the tip from the plan; standard deviation of the seam about the plan's
+    # shape; largest height of the torch's end above or below the seam [m].
     astray: ClassVar[float] = 20e-3
     wander: ClassVar[float] = 0.3e-3
     torch_height: ClassVar[float] = 8e-3
-    # A sample is believed when contact has not been doubted for so long after it [s]. A tip that
-    # fell off the start goes back into the seam so far above where it rested [m].
+    # A measurement is accepted once contact has lasted this long after it [s]. A tip that fell off
+    # the start returns to the seam this far above its seated height [m].
     sure: ClassVar[float] = 0.3
     over: ClassVar[float] = 1e-3
     # Standard deviation of the walls' angles [rad].
@@ -156,38 +156,37 @@ class Following(Params):
 
     @property
     def stale(self) -> float:
-        """Without an image of the tag for longer the weld slows down [s]."""
+        """Time without an image of the tag after which the weld slows down [s]."""
         return 0.2 * self.blind
 
     @property
     def still(self) -> float:
-        """The arm stops if no image of the tag came for this long [s].
+        """Time without an image of the tag after which the arm is commanded to stop [s].
 
-        It is at rest, since the last image was taken, after this, the images' latency and its
-        braking.
+        The arm comes to rest later, by the images' latency and its braking time.
         """
         return 0.3 * self.blind
 
     @property
     def set_down(self) -> float:
-        """Where on the plan the tip is set down, by arc length: the seam has surely begun [m]."""
+        """Arc length at which the tip is set down, well inside the seam [m]."""
         return self.inset if self.ends is None else max(self.inset, self.ends + INSIDE)
 
     def overlapping(self, plan: Path) -> float:
-        """Return how far beyond its end a seam is welded, over its start [m]."""
+        """Return the length by which a closed seam is welded over its start [m]; 0 if open."""
         return self.overlap if plan.closed else 0.0
 
     @property
     def sign(self) -> float:
-        """1 if the left wall is pressed, -1 for the right one."""
+        """Side of the pressed wall: 1 left, -1 right."""
         return 1.0 if self.side == "left" else -1.0
 
 
 class WeldTactileParams(Following):
     """Parameters of ``weld.tactile``."""
 
-    # On the way to the seam, as far as the recipe's limits allow them: speed of the flange [m/s]
-    # and of the joints [rad/s]; height of the tip above the planned start before it descends [m].
+    # Approach to the seam, within the recipe's limits: speed of the flange [m/s] and of the joints
+    # [rad/s]; height of the tip above the planned start before it descends [m].
     approach_speed: ClassVar[float] = 50e-3
     approach_joint_speed: ClassVar[float] = math.radians(20.0)
     clearance: ClassVar[float] = 15e-3
@@ -236,9 +235,10 @@ class WeldTactileParams(Following):
 
     @model_validator(mode="after")
     def _follows_by_touch(self) -> Self:
-        """Refuse an arc and a look where no bound says when the torch may weld.
+        """Refuse options that do not go together.
 
-        A look makes up for what it sees of one pass that does not weave.
+        Arc and profile sensor need the error bound, which only mode tactile has. The profile sensor
+        measures the bead of a single pass without weave.
         """
         for name in ("arc", "look"):
             if getattr(self, name) is not None and self.mode != "tactile":

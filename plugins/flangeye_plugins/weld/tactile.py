@@ -1,4 +1,4 @@
-"""``weld.tactile``: the torch in the seam, by touch."""
+"""``weld.tactile``: follow a seam by touch with the torch behind."""
 
 from __future__ import annotations
 
@@ -51,11 +51,11 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
     stage_log: StageLog,
     params: WeldTactileParams,
 ) -> WeldReport:
-    """Follow the planned seam by touch: the tip feels it, the torch follows behind.
+    """Weld the planned seam: the tip follows it by touch, the torch follows behind.
 
     Raises:
-        StageError: The seam, the finger or the limits do not allow it; nothing has moved.
-        NothingMoved: Motion was not asked for; the message is the plan.
+        StageError: The weld is not possible with this seam, finger or limits; nothing has moved.
+        NothingMoved: Motion was not permitted; the message describes the planned weld.
         DeviceError: Arm or finger cannot be opened, or are lost on the way to the seam.
         RunStopped: The operator stopped the arm.
     """
@@ -103,18 +103,18 @@ class Planned:
     """A planned weld, before anything moves.
 
     Attributes:
-        seam: The leg that is welded.
-        surface: Surface of the workpiece.
-        plan: The seam, rolled out.
+        seam: The seam, or its leg, that is welded.
+        surface: Work surface along the seam.
+        plan: The seam in the plane.
         finger: The finger on the arm.
-        body: Posture of the tool.
-        tool: Translates between flange and plane.
+        body: Tool in its orientation along the seam.
+        tool: Converts between the flange's pose in base and the tool's pose in the plane.
         belief: Prior knowledge of tool, finger and joint.
         params: Parameters of the step.
         start: Start of the weld on its plan.
-        driver: The arm's, with the power source.
-        gas_after: For how long gas flows after the arc [s]; None without one.
-        kept: State left by the weld that is resumed.
+        driver: Driver of the arm, with the power source if there is one.
+        gas_after: Post-flow time of the gas [s]; None without a power source.
+        kept: State of the weld that is resumed; None for a new one.
     """
 
     seam: Seam
@@ -134,10 +134,10 @@ class Planned:
 def _planned(
     seam: Seam, driver: RobotDriver, allowed: MotionLimits, params: WeldTactileParams
 ) -> Planned:
-    """Return what is to be welded, and with what.
+    """Return the planned weld after all checks that need no motion.
 
     Raises:
-        StageError: The seam, the finger or the limits do not allow it.
+        StageError: The weld is not possible with this seam, finger or limits.
     """
     finger = read_model(params.finger, Finger)
     seam = leg_of(seam, params)
@@ -164,7 +164,7 @@ def _planned(
 
 
 def _kept(planned: Planned, follower: Follower | None) -> tuple[Note, ...]:
-    """Store what a weld by touch has learned for the next one; return where, or why not."""
+    """Write a weld's estimates to the ``prior`` file; return a note about it."""
     path = planned.params.prior
     if path is None or follower is None:
         return ()
@@ -181,7 +181,7 @@ def _kept(planned: Planned, follower: Follower | None) -> tuple[Note, ...]:
 def _with_power_source(
     driver: RobotDriver, params: WeldTactileParams
 ) -> tuple[RobotDriver, ArcTimes | None]:
-    """Return a driver that opens the power source with the arm, and its times; none without one."""
+    """Return a driver that opens arm and power source, and the arc's times (None without)."""
     if params.arc is None:
         return driver, None
     given = params.arc.params
@@ -190,7 +190,7 @@ def _with_power_source(
 
 
 def _longest(way: float, params: WeldTactileParams) -> float:
-    """Return the longest time that a weld may take whose tip goes a way [m] in each pass [s]."""
+    """Return the time limit of a weld [s], given the tip's travel per pass [m]."""
     passes = 1 + 2 * len(params.passes)  # there and back
     return 60.0 + 3.0 * passes * way / params.speed
 
@@ -204,7 +204,7 @@ def _plan_text(plan: Path, params: WeldTactileParams) -> str:
 
 
 def start_of(planned: Planned, belief: Belief) -> dict[str, Any]:
-    """Return all inputs of a weld's decisions other than measurements."""
+    """Return all inputs of the controller other than measurements, for the log."""
     params, kept = planned.params, planned.kept
     return {
         "points": planned.surface.points.tolist(),

@@ -1,7 +1,7 @@
-"""The log of a weld while it runs: images, measurements, and every cycle's decision.
+"""Writes the log of a running weld: images, measurements, and every cycle's command.
 
-Cycles go to the step's log in blocks, column by column. In real time a thread of its own writes, so
-that the loop never waits for the disk.
+Cycles are written to the step's log in blocks, column by column. In real time a separate thread
+writes, so that the control loop never waits for the disk.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ from flangeye_plugins.weld.touch.tip_displacement import TipDisplacement
 
 
 class Cycle(NamedTuple):
-    """One turn of the control loop, in the frame of the work's plane; SI units.
+    """Record of one control cycle, in the frame of the work's plane; SI units.
 
     Attributes:
-        time: On the robot's clock [s].
-        position: (3,) of the robot's end point P_r.
+        time: Time on the robot's clock [s].
+        position: (3,) position of the robot's end point P_r.
         angle: Angle of the tool.
-        touches: Numbers of the sights that were used first in this cycle.
-        velocity: (3,) commanded.
-        turn: Angular velocity commanded.
-        phase: Phase of the controller, after this cycle.
-        tip: Arc length of the tip's progress.
-        torch: Arc length of the torch's progress.
-        wanted: Deflection asked of the tip.
-        sigma: Standard deviation of the torch's place across the seam.
+        touches: Numbers of the images whose measurements were first used in this cycle.
+        velocity: (3,) commanded velocity.
+        turn: Commanded angular velocity.
+        phase: Phase of the controller after this cycle.
+        tip: Arc length of the tip.
+        torch: Arc length of the torch.
+        wanted: Set point of the tip's deflection.
+        sigma: Standard deviation of the torch's position across the seam.
         bound: Upper bound of the torch's distance from the seam.
-        band: The same for 95 % of the seam.
+        band: Bound of the distance that holds for 95 % of the seam.
         arc: Commanded state of gas and arc: 0 off, 1 gas, 2 arc.
-        computing: Processor time that the cycle took, besides reading images [s].
-        period: Since the last cycle began, on this computer's clock [s].
-        answering: Until its command was given, by the same clock, besides reading images [s].
+        computing: Processor time of the cycle, without reading images [s].
+        period: Wall-clock time since the last cycle began [s].
+        answering: Wall-clock time until the command was sent, without reading images [s].
     """
 
     time: float
@@ -61,16 +61,16 @@ class Cycle(NamedTuple):
 
 
 class WeldLog:
-    """Collects a weld, and writes it into the step's log.
+    """Collects the record of a weld and writes it to the step's log.
 
     Attributes:
-        cycles: All so far.
-        sights: How many images were read.
-        felt: Number of an image -> its measurement.
+        cycles: All cycles so far.
+        sights: Number of images read.
+        felt: Measurement of each image that shows the tag, by the image's number.
     """
 
     def __init__(self, stage_log: StageLog, beside: bool) -> None:
-        """Write into ``stage_log`` at once, or in a thread ``beside`` the loop."""
+        """Write to ``stage_log`` directly, or in a thread ``beside`` the control loop."""
         self.cycles: list[Cycle] = []
         self.sights = 0
         self.felt: dict[int, TipDisplacement] = {}
@@ -92,7 +92,7 @@ class WeldLog:
             self._thread.join()
 
     def note(self, name: str, value: Any) -> None:
-        """Write one value under a name."""
+        """Write one named value."""
         if self._thread:
             self._queue.put((name, value))
         else:
@@ -109,7 +109,7 @@ class WeldLog:
         return number
 
     def before(self, sight: TagObservation) -> None:
-        """Write an image that was looked at before anything moved; it has no number."""
+        """Log an image that was read before the motion; it has no number."""
         self._note_observation(-1, sight)
 
     def _note_observation(self, number: int, sight: TagObservation) -> None:
@@ -119,7 +119,7 @@ class WeldLog:
         self.note("sight", {**told, "tag": sight.feeling is not None})
 
     def looked(self, profile: WeldProfile) -> None:
-        """Log a profile, and that the present cycle uses it."""
+        """Log a bead profile with the number of the present cycle, which uses it."""
         self.note("look", {"cycle": len(self.cycles), **asdict(profile)})
 
     def turned(self, cycle: Cycle) -> None:
@@ -143,7 +143,7 @@ class WeldLog:
 
 
 class LoggedLooks:
-    """The logged profiles, for a repeated weld; each is used in its logged cycle."""
+    """The logged bead profiles by cycle, for stepping through a logged weld."""
 
     def __init__(self) -> None:
         self._by_cycle: dict[int, list[WeldProfile]] = {}
@@ -154,10 +154,10 @@ class LoggedLooks:
         self._by_cycle.setdefault(told.pop("cycle"), []).append(WeldProfile(**told))
 
     def of(self, cycle: int) -> list[WeldProfile]:
-        """Return the profiles of a cycle, by its number."""
+        """Return the profiles of the cycle with this number, once."""
         return self._by_cycle.pop(cycle, [])
 
 
 def columns(cycles: Sequence[Cycle]) -> dict[str, list[Any]]:
-    """Return cycles column by column."""
+    """Return cycles as one list per field."""
     return {name: [getattr(c, name) for c in cycles] for name in Cycle._fields}

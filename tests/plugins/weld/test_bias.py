@@ -150,5 +150,5 @@ def test_what_a_look_contradicts_is_told_with_what_was_known_before() -> None:
     last = looked(bias, 0.4e-3)
     for i in range(1, 6):
         bias.look(last + i * 1e-4, -0.9e-3, SIGMA, 0.0)
-    known = f"{bias.value * 1e3:+.2f} mm were known"
+    known = f"{bias.value * 1e3:+.2f} mm were expected"
     assert bias.value > 0.3e-3 and known in bias.doubt and "bead -0.90 mm" in bias.doubt

@@ -974,7 +974,9 @@ def test_looks_that_contradict_all_that_is_stated_stop_the_weld() -> None:
     for i in range(5):
         assert found.phase == "following"
         found.looked(WeldProfile(9e-3, 0.05e-3, 4_050_000_000 + i * 100_000_000))
-    assert found.phase == "stopped" and found.reason.startswith("the look behind the torch sees")
+    assert found.phase == "stopped" and found.reason.startswith(
+        "the profile sensor behind the torch sees"
+    )
 
 
 def test_a_torch_is_led_and_judged_by_where_it_is_seen_to_be() -> None:

@@ -188,7 +188,7 @@ def test_a_torch_that_the_files_have_elsewhere_is_told() -> None:
     world = WeldTruth(tool=ToolTruth(torch=(0.0, 1.5e-3)))
     found = try_condition(Condition(world, look=LookTruth()), 0, SHORT, 16e-3)
     assert not found.done
-    assert "the look behind the torch sees the bead +1." in found.controller.reason
+    assert "the profile sensor behind the torch sees the bead +1." in found.controller.reason
     assert "calibrate the tool" in found.controller.reason
 
 

@@ -1,1 +1,1 @@
-"""Following a seam by touch: belief, measurements, the felt seam, the torch and its bound."""
+"""Following a seam by touch: prior, measurements, seam estimate, torch control and error bound."""

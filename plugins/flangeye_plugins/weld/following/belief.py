@@ -19,29 +19,32 @@ BAND = 2.0
 
 @dataclass(frozen=True)
 class Belief:
-    """Tool, finger and joint as the files have them.
+    """Prior of tool, finger and joint: values from the files, each with its standard deviation.
 
     Attributes:
-        distance: From the torch to the tip, seen from above [m].
-        lateral: Stiffness across the finger [N/m]; of a soft one where its file gives none.
+        distance: Horizontal distance from the torch to the tip [m].
+        lateral: Stiffness across the finger [N/m]; the default is a soft finger's.
         axial: Stiffness along the finger [N/m].
         half_angle: Angle of the joint's walls from their bisector [rad]; None if unknown.
         noise: Standard deviations of one measurement across and up [m].
         torch_sigma: Standard deviation of the torch across the tool, relative to the tip [m].
         along_sigma: Standard deviation of the distance from the torch to the tip [m].
         tip_sigma: Standard deviation of the tip in the flange, along each axis [m].
-        two_walls: Whether there is a wall on the other side too.
+        two_walls: Whether the joint has a second wall that holds the tip.
         lean: Lean of the walls' bisector from the plane's normal, to the left [rad].
         radius: Radius of the tip's ball [m].
-        level_R_tool: Rows of the tool's axes in level ones; see :mod:`flangeye_plugins.weld.frame`.
-        behind: How far behind the torch a second look sees the bead [m]; None where nothing does.
-        arc: Gas before the arc; standing while it is struck; standing while the crater fills [s].
-        ahead: By how much the tip is ahead of its file, as earlier welds found it [m].
-        ahead_sigma: Its standard deviation; None where there was none: ``tip_sigma`` [m].
-        play: Half the width of the finger's play and hysteresis, as expected [m].
-        play_sigma: Its standard deviation [m].
-        stamp: By how much images' timestamps are late, as expected [s].
-        stamp_sigma: Its standard deviation [s].
+        level_R_tool: Rotation from the tool's axes to level axes; see
+            :mod:`flangeye_plugins.weld.frame`.
+        behind: Distance behind the torch at which a profile sensor sees the bead [m]; None without
+            one.
+        arc: Gas pre-flow, wait while the arc strikes, wait while the crater fills [s].
+        ahead: Tip's position minus its position in the finger's file, forwards, from earlier welds
+            [m].
+        ahead_sigma: Standard deviation of ``ahead`` [m]; None without earlier welds: ``tip_sigma``.
+        play: Expected half width of the finger's play and hysteresis [m].
+        play_sigma: Standard deviation of ``play`` [m].
+        stamp: Expected delay of the images' timestamps [s].
+        stamp_sigma: Standard deviation of ``stamp`` [s].
     """
 
     distance: float
@@ -71,7 +74,7 @@ class Belief:
 
     @property
     def ahead_known(self) -> float:
-        """Standard deviation of how far ahead the tip is, before the sweep [m]."""
+        """Standard deviation of ``ahead`` before the sweep [m]."""
         return self.tip_sigma if self.ahead_sigma is None else self.ahead_sigma
 
     @property
@@ -85,16 +88,17 @@ class Belief:
         return 0.0 if self.joint is None else self.joint.seat(self.radius)[0]
 
     def set_down(self, settings: Following) -> float:
-        """Return the place where the tip is set down, to the left of the plan [m].
+        """Return the lateral offset at which the tip is set down, to the left of the plan [m].
 
-        Where one wall alone stands upright it comes down on the other side of the seam.
+        At a joint with one upright wall this is on the flat plate, away from the wall.
         """
         return 0.0 if self.two_walls else self.beside - settings.sign * settings.reach / 2.0
 
     def pressing(self, settings: Following) -> Floats:
-        """Return the forces per deflection and preload (2, 2) [N/m].
+        """Return the tip's stiffness matrix (2, 2) [N/m].
 
-        Rows: towards the pressed wall, into the joint. The tip is free to slide along the seam.
+        Rows are the forces towards the pressed wall and into the joint; columns are deflection and
+        preload. The tip is free to slide along the seam.
         """
         axes = np.array(self.level_R_tool)
         stiff = axes @ np.diag([self.lateral, self.lateral, self.axial]) @ axes.T
@@ -104,7 +108,7 @@ class Belief:
         return np.asarray(facing @ free @ facing)
 
     def flat(self, side: float) -> float:
-        """Return the sideways motion of a tip per unit of climbing the wall on a side."""
+        """Return the tip's lateral motion per unit of height when it climbs a side's wall."""
         if self.joint is None:
             return 1.0
         # Nothing climbs a wall that leans by less than one degree.
@@ -123,17 +127,17 @@ class Belief:
         return float(into / max(aside * self._steepness(settings), 1e-9))
 
     def sliding(self, settings: Following) -> float:
-        """Return the deflection that friction alone can give on a face [m]."""
+        """Return the largest deflection that friction alone can cause on a flat plate [m]."""
         forces = self.pressing(settings)
         return float(settings.friction * forces[1, 1] * settings.preload / forces[0, 0])
 
     def reaching(self, settings: Following) -> float:
-        """Return by how much the deflection outweighs the friction on a flat wall."""
+        """Return the ratio of the force towards the wall to the friction on a flat plate."""
         aside, into = self.pressing(settings) @ [settings.deflection, settings.preload]
         return float(aside / max(settings.friction * into, 1e-9))
 
     def remedy(self, settings: Following, share: float) -> tuple[float, float]:
-        """Return a deflection, or else a preload [m], that gives the seating a wanted share."""
+        """Return the deflection and the preload [m] that each alone give a seating ratio."""
         forces, wall = self.pressing(settings), share * self._steepness(settings)
         per_deflection = wall * forces[0, 0] - forces[1, 0]
         per_preload = forces[1, 1] - wall * forces[0, 1]
@@ -143,8 +147,9 @@ class Belief:
     def fixed_variance(self, settings: Following) -> float:
         """Return the torch's variance that measurements ahead of it cannot reduce [m^2].
 
-        The arm is off when the tip passes a place and when the torch does: oppositely at worst, as
-        one that waves along its way is with both half a wave apart.
+        The arm's error counts twice: when the tip passes a place and when the torch does. In the
+        worst case the two have opposite signs, as for a periodic path error with half a period
+        between tip and torch.
         """
         # A finger creeps by 2 % of its deflection, one standard deviation.
         creep = 0.02 * settings.deflection
@@ -156,7 +161,7 @@ class Belief:
         return (2.0 * settings.arm_sigma) ** 2
 
     def _seat_variance(self, settings: Following) -> float:
-        """Return the variance of where the tip rests in a joint whose walls lean differently."""
+        """Return the variance of the seated tip's lateral position in an asymmetric joint [m^2]."""
         if self.joint is None or not self.lean:
             return 0.0
         walls = settings.joint_sigma * self.joint.seat_slope(self.radius)
@@ -172,24 +177,24 @@ class Belief:
 
 @dataclass(frozen=True)
 class Learned:
-    """Estimates of the sweep.
+    """Calibration of finger, clock and arm, as estimated from the sweep.
 
     Attributes:
-        gain: The finger shows displacements larger by this share.
-        gain_sigma: Its standard deviation.
+        gain: Relative gain error of the finger; 0.1 shows displacements 10 % too large.
+        gain_sigma: Standard deviation of ``gain``.
         width: Half width of play and hysteresis [m].
-        reversal: Half the way over which a reversal goes through them [m].
-        stamp: Timestamps are late by this [s].
+        reversal: Half the travel that a reversal of motion needs to pass through the play [m].
+        stamp: Delay of the images' timestamps [s].
         dead_time: Dead time of the arm [s].
         lag: Lag of the arm [s].
-        unexplained: rms that the model leaves beyond the noise [m].
-        askew: Tangent of the angle at which the walls stand to the plan.
+        unexplained: Residual of the fit beyond the measurement noise, rms [m].
+        askew: Tangent of the angle between the walls and the plan.
         noise: Standard deviation of one measurement across [m].
         swept: Largest deflection at which the tip stayed in its seat [m].
-        ahead: The tip is ahead of where its file has it by this [m].
-        ahead_sigma: Its standard deviation after the sweep [m].
-        width_sigma: Standard deviation of the width [m].
-        stamp_sigma: Standard deviation of the stamp [s].
+        ahead: Tip's position minus its position in the finger's file, forwards [m].
+        ahead_sigma: Standard deviation of ``ahead`` after the sweep [m].
+        width_sigma: Standard deviation of ``width`` [m].
+        stamp_sigma: Standard deviation of ``stamp`` [s].
     """
 
     gain: float = 0.0
@@ -210,7 +215,7 @@ class Learned:
 
     @property
     def kept(self) -> float:
-        """Probability that play stays taken up by the pressed wall."""
+        """Probability that the contact force keeps the play on its pressed side."""
         # Pressed to one side, the deflection still changes by 0.2 mm back and forth.
         return self.reversal / (self.reversal + 0.2e-3)
 
@@ -218,10 +223,11 @@ class Learned:
     def systematic(self) -> float:
         """Variance common to successive measurements of the tip [m^2].
 
-        Play, taken for ``kept`` of its half width, is at the pressed side as often and anywhere in
-        its width otherwise; and what the sweep left unexplained.
+        It has two parts. The measurements are corrected by ``kept`` times the half width of the
+        play, but the finger is at the pressed side with probability ``kept`` only, and uniformly
+        anywhere in the play otherwise. The second part is the sweep's unexplained residual.
         """
-        # Of 1 with a probability, and uniform in [-1, 1] otherwise: E x^2 - (E x)^2
+        # Variance of x = 1 with probability `kept`, else uniform in [-1, 1]: E x^2 - (E x)^2
         spread = self.kept + (1.0 - self.kept) / 3.0 - self.kept**2
         return (spread * self.width**2 + self.unexplained**2) / (1.0 + self.gain) ** 2
 
@@ -232,7 +238,7 @@ class Learned:
 
     @property
     def least(self) -> float:
-        """Deflection by which a held tip differs from a free one, for all play and noise [m]."""
+        """Smallest deflection that tells a held tip from a free one despite play and noise [m]."""
         return 3.0 * abs(self.width) + 2.0 * self.noise
 
 

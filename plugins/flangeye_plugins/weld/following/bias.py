@@ -1,21 +1,20 @@
 """Estimate the torch's bias, which only a profile of the bead behind it can measure.
 
-The torch is off the seam by what is measured of it and a bias: ``off = raw + b``. In b are the
-torch's place on the tool, its yaw, and how far heat has moved the seam since the tip felt it. All
-of it is in what the files state beforehand, one variance P0 about zero. A look at the bead gives z,
-how far the torch really was off where it passed; the measured part of it then is known, so
-z - raw is b there, with an error of variance R: of the look, of the arm and of what the tip felt.
-Such errors are alike over about a tool's length L (an arm that waves, a profile read askew), so a
-look that comes after a way d counts as d / L independent ones.
+The torch's true offset from the seam is the measured offset plus a bias: ``off = raw + b``. The
+bias b contains the torch's position error on the tool, its yaw, and the seam's thermal distortion
+since the tip felt it. Its prior is zero with variance P0, from the files. A bead profile gives z,
+the true offset where the torch passed. As ``raw`` was stored there, z - raw measures b with
+variance R: profile, arm and touch. These errors are correlated over about one tool length L (a
+periodic path error of the arm, a tilted profile), so a profile taken a distance d after the last
+one counts as d / L independent ones.
 
-From place to place b is a random walk. The files state by how much heat moves the seam, D one
-sigma, while the torch goes on by L: D^2 / L per length. That is a Kalman filter of one state,
+Along the seam b is a random walk of variance D^2 / L per length, where D is the standard deviation
+of the thermal distortion while the torch advances by L. The estimate is a scalar Kalman filter:
 
     P <- P + d D^2 / L,   k = P / (P + R L / d),   b <- b + k (z - raw - b),   P <- (1 - k) P.
 
-Once there are looks the torch, by how far they lag behind it, is known to P + (that way) D^2 / L.
-Where there have been none for long, nothing is left but the files: about b these have P0 + b^2,
-the most that is stated.
+The bias at the torch, a distance l ahead of the newest profile, has variance P + l D^2 / L. After a
+long time without profiles only the prior is left, so the variance is at most P0 + b^2.
 """
 
 from __future__ import annotations
@@ -24,10 +23,10 @@ import bisect
 import math
 
 BEYOND = 4.0
-"""A look that is farther off contradicts what is known, in standard deviations."""
+"""A profile farther from the estimate than this contradicts it [standard deviations]."""
 
 CONTRADICTIONS = 5
-"""So many looks in succession that contradict what is known stop the weld; fewer are spatter."""
+"""This many contradicting profiles in succession stop the weld; fewer may be spatter."""
 
 
 class Trail:
@@ -39,15 +38,15 @@ class Trail:
         self._rows: list[tuple[float, float]] = []
 
     def pass_by(self, time: float, s: float, raw: float, variance: float) -> None:
-        """Remember a place that the torch is at.
+        """Store the torch's present place.
 
         Args:
-            time: [s].
+            time: Time [s].
             s: Arc length of the torch [m].
             raw: Measured distance of the torch to the left of the refined path [m].
             variance: Variance of the offset that the tip measured there, at the torch [m^2].
         """
-        # A place every 0.2 mm is enough: what is looked at is hardly smaller.
+        # One place per 0.2 mm is enough: a profile resolves hardly less.
         if not self._along or s >= self._along[-1] + 0.2e-3:
             self._times.append(time)
             self._along.append(s)
@@ -65,20 +64,20 @@ class Trail:
 
 
 class Bias:
-    """Estimates the bias of the torch, by arc length.
+    """Estimates the torch's bias along the seam.
 
     Attributes:
-        value: How far the torch is to the left of where it is measured to be [m].
-        doubt: What the newest look contradicts, once enough have; else nothing.
-        prior: Variance before any look [m^2].
+        value: Estimated bias: true minus measured offset of the torch, to the left [m].
+        doubt: Message once enough profiles in succession have contradicted the estimate; else "".
+        prior: Variance before any profile [m^2].
     """
 
     def __init__(self, prior: float, distortion: float, length: float) -> None:
-        """Begin with what the files state.
+        """Start with the prior from the files.
 
         Args:
             prior: Variance of the bias about zero, P0 [m^2].
-            distortion: Standard deviation of heat's part of it, D [m].
+            distortion: Standard deviation of the thermal distortion over one tool length, D [m].
             length: Length of the tool, from the torch to the tip, L [m].
         """
         self.value, self.doubt = 0.0, ""
@@ -93,9 +92,9 @@ class Bias:
         return self._seen > -math.inf
 
     def variance(self, s: float) -> float:
-        """Return the variance of the bias about its value, with the torch at an arc length [m^2].
+        """Return the variance of the bias with the torch at an arc length [m^2].
 
-        Looks that are all wrong alike are no better than one of them.
+        It includes one profile's variance, as an error common to all profiles does not average out.
         """
         if not self.looked:
             return self.prior
@@ -103,13 +102,13 @@ class Bias:
         return min(grown + self._sigma**2, self.prior + self.value**2)
 
     def look(self, s: float, bias: float, sigma: float, others: float) -> None:
-        """Process a profile of the bead.
+        """Update the estimate with a bead profile.
 
         Args:
-            s: Arc length of the place that was looked at [m].
-            bias: How far to the left of where it was measured the torch was there [m].
-            sigma: Standard deviation of the look [m].
-            others: Variance of all else in it: the arm, what the tip felt [m^2].
+            s: Arc length of the profile [m].
+            bias: True minus measured offset of the torch there, to the left [m].
+            sigma: Standard deviation of the profile [m].
+            others: Variance of the arm and of the tip's measurement there [m^2].
         """
         way = s - self._seen
         if way <= 0.0:
@@ -126,15 +125,15 @@ class Bias:
         self._variance, self._seen, self._sigma = (1.0 - gain) * grown, s, sigma
 
     def _contradicts(self, bias: float, now: float, before: float) -> bool:
-        """Return whether a look is beyond what is known now, or beyond what the files state."""
+        """Return whether a profile contradicts the present estimate or the prior."""
         wrong = abs(bias - self.value) > BEYOND * math.sqrt(now)
         wrong = wrong or abs(bias) > BEYOND * math.sqrt(before)
         self._contradicted = self._contradicted + 1 if wrong else 0
         if self._contradicted >= CONTRADICTIONS:
             self.doubt = (
-                f"the look behind the torch sees the bead {bias * 1e3:+.2f} mm to the left of "
-                f"where the torch was taken to be; {self.value * 1e3:+.2f} mm were known, and the "
+                f"the profile sensor behind the torch sees the bead {bias * 1e3:+.2f} mm left of "
+                f"the torch's measured path; {self.value * 1e3:+.2f} mm were expected, and the "
                 f"files allow {BEYOND * math.sqrt(before) * 1e3:.2f} mm: calibrate the tool "
-                "(flangeye tactile calibrate), or state more 'distortion'"
+                "(flangeye tactile calibrate), or raise 'distortion'"
             )
         return wrong

@@ -3,13 +3,13 @@
 A tip is seated between the walls, up the pressed wall, up the other wall, or free and moving with
 the arm. Each measurement is compared with the extrapolated seam:
 
-* seated, the tip is on the seam, at its former height or lifted by a tack weld;
-* up a wall, the tip has risen by about :data:`RISE` and is aside by ``flat`` times that;
-* free, the tip is hardly deflected, at any height.
+* seated: the tip is on the seam, at its former height or lifted by a tack weld;
+* up a wall: the tip has risen by about :data:`RISE` and moved aside by ``flat`` times that;
+* free: the tip is hardly deflected, at any height.
 
-The tip climbs a wall if its ratio of side force to preload exceeds the largest one at which the
-initial sweep saw it stay seated. A measurement is used after a short delay, smoothed by a
-forward-backward pass over the newest ones; ``doubt`` is its remaining uncertainty.
+The tip may climb a wall if its ratio of side force to preload nears the largest one at which it
+stayed seated in the initial sweep. A measurement is used after a short delay, smoothed by a
+forward-backward pass over the newest ones; its extra variance allows for a tip that climbed.
 """
 
 from __future__ import annotations
@@ -26,41 +26,41 @@ from flangeye.types import Floats
 
 
 class Mode(IntEnum):
-    """Contact of the tip: between the walls, up the pressed one, up the other, or none."""
+    """Contact of the tip: seated between the walls, up the pressed one, up the other, or free."""
 
     SEATED, PRESSED, OTHER, FREE = range(4)
 
 
 LOST = 0.9
-"""A wall is lost where the tip is as likely free, and held again where it is as likely not."""
+"""Contact is lost above this probability of a free tip, and regained below its complement."""
 
 RISE = 0.5e-3
-"""Scale of how far a tip that climbs has risen [m]."""
+"""Typical height of a tip that has climbed a wall [m]."""
 
 LIFTS = 1.0e-3
-"""Scale of the heights of tack welds, and of how far the seam bends off the plan [m]."""
+"""Typical height of tack welds, and typical unplanned bend of the seam [m]."""
 
 STRIDE = 10e-3
-"""Way over which modes and heights change [m]."""
+"""Travel over which modes and heights change [m]."""
 
 STRAINED = 0.9
-"""Share of what the tip is known to stand from which it may climb."""
+"""The tip may climb above this share of the largest deflection at which it stayed seated."""
 
 RARE = 1e-3
-"""Share of a stride's tips that climb though pressed by little, or lose their wall."""
+"""Probability, per STRIDE, that a lightly pressed tip climbs."""
 
 
 class Felt(NamedTuple):
-    """A measurement relative to the one expected of a seated tip [m].
+    """A measurement, compared with the one expected of a seated tip [m].
 
     Attributes:
-        time: [s].
+        time: Time [s].
         s: Arc length.
         offset: To the left of the plan.
         angle: Angle of the tool [rad].
-        aside: To the left of where the seam was expected.
-        spread: Variance of it, of measurement and expectation [m^2].
-        height: Above the plan's.
+        aside: Offset to the left of the expected seam.
+        spread: Variance of ``aside``: measurement and expectation [m^2].
+        height: Height above the plan.
         deflection: Towards the pressed side.
         compression: Into the joint.
     """
@@ -80,11 +80,11 @@ class _Weighed(NamedTuple):
     """A measurement, and its likelihood in each mode.
 
     Attributes:
-        felt: As it was taken.
-        likely: (4,) of the modes, by all up to it.
-        moves: (4, 4) from each mode before to each now.
-        chances: (4,) densities in each mode.
-        climbed: How far it has risen, if it has climbed [m].
+        felt: The measurement.
+        likely: (4,) probability of each mode, given all measurements up to this one.
+        moves: (4, 4) transition probabilities from each former mode to each present one.
+        chances: (4,) likelihood of the measurement in each mode.
+        climbed: Height that the tip has risen, if it has climbed [m].
     """
 
     felt: Felt
@@ -95,23 +95,23 @@ class _Weighed(NamedTuple):
 
 
 class Contact:
-    """The state of the tip's contact.
+    """Filter for the tip's contact mode.
 
     Attributes:
-        likely: (4,) how likely each mode is.
-        deflection: Filtered, positive towards the pressed side [m].
-        compression: Filtered [m].
+        likely: (4,) probability of each mode.
+        deflection: Filtered deflection, positive towards the pressed side [m].
+        compression: Filtered compression into the joint [m].
         at: Arc length of the newest measurement [m].
-        steady: Largest deflection for its compression that the tip stands, as far as was seen.
-        play: What a finger that was pressed shows when its tip is free [m].
+        steady: Largest ratio of deflection to compression at which the tip stayed seated.
+        play: Deflection that a free tip shows after having been pressed [m].
     """
 
     def __init__(self, flat: float, slides: float, noise: tuple[float, float]) -> None:
-        """Begin seated.
+        """Start with a seated tip.
 
         Args:
-            flat: How far a tip goes aside that climbs a wall by one.
-            slides: Deflection that friction alone can give [m].
+            flat: Lateral motion of the tip per unit of height when it climbs a wall.
+            slides: Largest deflection that friction alone can cause [m].
             noise: Standard deviations of one measurement across and up [m].
         """
         self.likely = np.array([1.0, 0.0, 0.0, 0.0])
@@ -124,13 +124,13 @@ class Contact:
         self._newest: deque[_Weighed] = deque()
 
     def seat(self, time: float, deflection: float, compression: float) -> None:
-        """Set the state: the tip is seated and pressed [m], and its safe deflection is known."""
+        """Set the state to seated, with this deflection and compression [m]."""
         self.likely = np.array([1.0, 0.0, 0.0, 0.0])
         self.deflection, self.compression, self._time = deflection, compression, time
         self._spread = math.inf
 
     def lose(self) -> None:
-        """Set the state: no wall holds the tip."""
+        """Set the state to free: no wall holds the tip."""
         self.likely, self.deflection = np.array([0.0, 0.0, 0.0, 1.0]), 0.0
 
     @property
@@ -145,7 +145,7 @@ class Contact:
         return abs(self.deflection) / stands
 
     def take(self, felt: Felt, side: float) -> None:
-        """Update the modes by a measurement; wall ``side`` is pressed, 1 for the left."""
+        """Update the modes' probabilities by a measurement; ``side`` is the pressed wall."""
         # Deflection and compression are filtered over 0.1 s.
         kept = math.exp(-(felt.time - self._time) / 0.1)
         self.deflection += (1.0 - kept) * (felt.deflection - self.deflection)
@@ -167,12 +167,12 @@ class Contact:
         self._spread *= 1.0 - gain
 
     def forget(self) -> None:
-        """Drop measurements not yet used: they were made while no wall held the tip."""
+        """Drop the measurements not yet used, which were made while no wall held the tip."""
         self._newest.clear()
 
     def settled(self, until: float) -> Iterator[tuple[Felt, float]]:
         """Yield valid measurements up to a time [s], each with its extra variance [m^2]."""
-        # Backward pass: `since` is how likely each mode makes all that was measured later
+        # Backward pass: `since` is the likelihood of all later measurements, given each mode
         since, off = np.ones(4), []
         for weighed in reversed(self._newest):
             likely = weighed.likely * since
@@ -181,13 +181,18 @@ class Contact:
             since /= since.sum()
         while self._newest and self._newest[0].felt.time <= until:
             weighed, likely = self._newest.popleft(), off.pop()
-            # A tip that may be free would lead the path after it: a chance of a tenth is too much.
+            # A free tip moves with the arm and would drag the path along: 10 % probability is too
+            # much.
             if likely[Mode.FREE] < 0.1:
                 climbs = float(likely[Mode.PRESSED] + likely[Mode.OTHER])
                 yield weighed.felt, climbs * (self._flat * weighed.climbed) ** 2
 
     def _moves(self, share: float, soon: float) -> Floats:
-        """Return how likely each mode becomes each (4, 4), over shares of STRIDE and of 1 mm."""
+        """Return the transition probabilities (4, 4) of the modes.
+
+        ``share`` and ``soon`` are the probabilities of a change within the travel since the last
+        measurement, for changes over STRIDE and over 1 mm.
+        """
         climbing = share * RARE + soon * min(max(self.strained - STRAINED, 0.0) ** 2, 0.9)
         moves = np.diag([1.0, 1.0 - share, 1.0 - share, 1.0 - share])
         moves[:, Mode.SEATED] += [0.0, share, share, share]
@@ -197,9 +202,9 @@ class Contact:
         return moves
 
     def _chances(self, felt: Felt, side: float) -> tuple[Floats, float]:
-        """Return the densities (4,) of a measurement in each mode, and how far it has climbed."""
+        """Return a measurement's likelihood in each mode (4,), and the height climbed [m]."""
         up, tall = felt.height - self._height, self._spread + self.noise[1] ** 2
-        # Tack welds lift the tip on a tenth of a seam; on 2 % it bends as the plan does not.
+        # Tack welds lift the tip on 10 % of a seam; 2 % of a seam bend in a way not planned.
         seated = _mostly(up, tall, 0.1) * _mostly(felt.aside, felt.spread, 0.02)
         walls = [
             _up_a_wall(s * side * felt.aside, up, felt.spread, tall, self._flat) for s in (1, -1)
@@ -207,13 +212,14 @@ class Contact:
         free = self._let_go(felt.deflection) * _normal(up, tall + LIFTS**2)
         climbed = walls[0][1] if felt.deflection > 0.0 else walls[1][1]
         chances = np.array([seated, walls[0][0], walls[1][0], free]) + 1e-12
-        # Neighbours see the same error of what is expected: one measurement in two is new.
+        # Neighbouring measurements share the error of the expectation: each counts as half a one.
         return chances**0.5, max(climbed, RISE)
 
     def _let_go(self, deflection: float) -> float:
-        """Return the density of a free tip's deflection [m]: friction drags it, play holds it.
+        """Return the likelihood of a deflection [m], given that the tip is free.
 
-        A finger that was pressed and let go of shows its play, which it does not go through.
+        The tip of a released finger shows no deflection, or the play through which it has not
+        returned, or whatever friction drags it by.
         """
         noise, play = self.noise[0] ** 2, self.play
         held = _normal(deflection, noise) + _normal(deflection - play, noise + (0.3 * play) ** 2)
@@ -221,7 +227,7 @@ class Contact:
 
 
 def _mostly(off: float, variance: float, seldom: float) -> float:
-    """Return the density of what is seldom off by about LIFTS more."""
+    """Return a normal density with a share ``seldom`` of outliers of scale LIFTS."""
     wide = _normal(off, variance + LIFTS**2)
     return (1.0 - seldom) * _normal(off, variance) + seldom * wide
 
@@ -233,7 +239,7 @@ def _normal(off: float, variance: float) -> float:
 def _up_a_wall(
     aside: float, up: float, across: float, tall: float, flat: float
 ) -> tuple[float, float]:
-    """Return the density of a tip that rose by about RISE along a wall, and how far it has."""
+    """Return the likelihood of a tip that climbed a wall, and the estimated height climbed [m]."""
     # A rise r of N(RISE, RISE^2), seen as flat r aside and r up, integrated out in closed form
     weight = 1.0 / RISE**2 + flat**2 / across + 1.0 / tall
     risen = (1.0 / RISE + flat * aside / across + up / tall) / weight

@@ -1,4 +1,4 @@
-"""Following by touch: one step each cycle, measurements in, velocities out."""
+"""Controller that follows a seam by touch: measurements in, velocities out, once each cycle."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ class Follower:
     """Follows a seam by touch; see :class:`flangeye.motion.seam_following.Controller`.
 
     Attributes:
-        phase: Present phase.
-        reason: Why it stopped.
+        phase: Present phase of the weld.
+        reason: Why the weld stopped; "" unless it did.
         task: The seam to follow.
         progress: Progress of tip and torch.
-        pressing: Pressing force of the tip.
+        pressing: Deflection by which the tip is pressed against its wall.
         sensing: Measurements of the finger.
         seam: Estimate of the seam.
-        lead: Motion of the torch along the seam.
-        welding: Uncertainty of the torch, and whether it welds.
-        arm: Delay of the arm.
-        now: The time [s]; None before the first cycle.
+        lead: Steering of the torch along the seam.
+        welding: Error bound of the torch, and whether it may weld.
+        arm: Model of the arm's delay.
+        now: Time of the present cycle [s]; None before the first.
     """
 
     def __init__(self, task: WeldTask) -> None:
@@ -56,7 +56,7 @@ class Follower:
         self.now: float | None = None
 
     def step(self, pose: ToolPose, touches: Sequence[Touch]) -> Command:
-        """Return the command for this cycle; ``touches`` are the measurements not yet given."""
+        """Return the command for this cycle, given the measurements since the last one."""
         elapsed = self._begin_cycle(pose)
         pose = self.sensing.true(pose)
         self.sensing.watch(pose)
@@ -93,32 +93,32 @@ class Follower:
 
     @property
     def mode(self) -> str:
-        """Name shown in messages and reports."""
+        """Name of the mode in messages and reports."""
         return "tactile" if self.task.touch else "vision"
 
     @property
     def side(self) -> float:
-        """The pressed wall, 1 for the left one."""
+        """Side of the pressed wall: 1 left, -1 right."""
         return self.pressing.side
 
     @property
     def tip(self) -> float:
-        """Arc length of the tip's progress on the plan [m]."""
+        """Position of the tip, as arc length of the plan [m]."""
         return self.progress.tip
 
     @property
     def torch(self) -> float:
-        """Arc length of the torch's progress [m]."""
+        """Position of the torch, as arc length of the plan [m]."""
         return self.progress.torch
 
     @property
     def wanted(self) -> float:
-        """Deflection asked of the tip at present [m]."""
+        """Present set point of the tip's deflection [m]."""
         return self.pressing.wanted
 
     @property
     def sigma(self) -> float:
-        """Standard deviation of the torch's place across the seam [m]."""
+        """Standard deviation of the torch's position across the seam [m]."""
         return self.welding.sigma
 
     @property
@@ -128,12 +128,12 @@ class Follower:
 
     @property
     def band(self) -> float:
-        """The bound that holds for 95 % of the seam [m]."""
+        """Bound of the torch's distance that holds for 95 % of the seam [m]."""
         return self.welding.band
 
     @property
     def aim(self) -> float:
-        """Target of the torch, to the left of the seam [m]."""
+        """Target position of the torch, to the left of the seam [m]."""
         return self.lead.aim
 
     @property
@@ -150,7 +150,7 @@ class Follower:
     # --- what the finger measures -----------------------------------------------------------------
 
     def _begin_cycle(self, pose: ToolPose) -> float:
-        """Take the time; return how much has passed since the last cycle [s]."""
+        """Store the cycle's time; return the time since the last cycle [s]."""
         if self.now is None:
             self.sensing.begin(pose.time)
             self.now = pose.time
@@ -158,7 +158,7 @@ class Follower:
         return elapsed
 
     def _feel(self, touch: Touch) -> None:
-        """Take a measurement, with the tool's pose at its image's time; equation (13)."""
+        """Process a measurement, with the tool's pose at its image's time (equation 13)."""
         sensing = self.sensing
         taken = sensing.take(touch, self.now or 0.0)
         if taken is None:
@@ -179,14 +179,14 @@ class Follower:
 
     @property
     def _silence(self) -> float:
-        """For how long no image of the tag has come, where one is needed [s]."""
+        """Time since the last image of the tag [s]; 0 in a phase that needs none."""
         needed = self.task.touch and self.phase != "ending"
         return self.sensing.silence(self.now or 0.0) if needed else 0.0
 
     # --- what follows from it ---------------------------------------------------------------------
 
     def _judge(self, pose: ToolPose) -> None:
-        """Change the phase where what was felt asks for it."""
+        """Change the phase of the weld according to the measurements."""
         sensing, pressing = self.sensing, self.pressing
         if self.phase in ("following", "bridging") and self.tip >= pressing.ends:
             self.phase = "ending"
@@ -211,7 +211,10 @@ class Follower:
             self._stop(self._blind(pose))
 
     def _enter(self, pose: ToolPose) -> None:
-        """Begin to follow where the tip rests in the seam again; farther in where it does not."""
+        """Start to follow once the tip, set down inside the felt start, is seated again.
+
+        If the tip finds no seat there, the start is moved farther into the seam.
+        """
         if not self._inside:
             return
         seam, pressing, preload = self.seam, self.pressing, self.task.settings.preload
@@ -230,7 +233,7 @@ class Follower:
                 self._stop("the tip fell off the seam's start and found no way back into it")
 
     def _lost(self) -> bool:
-        """Return whether no wall holds the tip while it follows."""
+        """Return whether the tip has lost its wall."""
         contact = self.seam.contact
         if self.seam.backs or not self.task.touch:
             return False
@@ -239,7 +242,7 @@ class Follower:
         return contact.free > LOST
 
     def _learn(self) -> None:
-        """Take over what the sweep found of finger, clock and arm."""
+        """Evaluate the sweep: start to follow, stop, or let the sweep repeat."""
         found = self.sensing.probing.learned()
         if isinstance(found, str):
             self._stop(found)
@@ -248,7 +251,7 @@ class Follower:
             self._follow(replace(found, noise=max(found.noise, scatter)))
 
     def _follow(self, found: Learned) -> None:
-        """Begin to follow with what was found: how the finger shows, how hard to press."""
+        """Start to follow with the sweep's calibration."""
         sensing, seam, task = self.sensing, self.seam, self.task
         sensing.learned = found
         self.arm.dead_time, self.arm.lag = found.dead_time, found.lag
@@ -267,7 +270,7 @@ class Follower:
             seam.back()
 
     def _finish(self) -> None:
-        """End the weld, if there was one."""
+        """End the weld: fill the crater, then set the phase."""
         if self.arc_from is not None and not self.welding.striking.filled(self.now or 0.0):
             return
         if self.task.touch and self.arc_from is None:
@@ -276,7 +279,7 @@ class Follower:
             self.phase = "done"
 
     def _blind(self, pose: ToolPose) -> str:
-        """Return why going on would be blind, or nothing."""
+        """Return why the measurements no longer allow going on; "" if they do."""
         settings, plan, sensing = self.task.settings, self.task.plan, self.sensing
         # Before the arc burns the arm may stand for longer.
         patience = settings.blind if self.arc_from is not None else 4.0 * settings.blind
@@ -300,20 +303,20 @@ class Follower:
         return ""
 
     def _aside(self, pose: ToolPose) -> float:
-        """Return how far the arm is off to the inside of the plan's curve, in radii."""
+        """Return the arm's offset towards the centre of the plan's curve, in radii."""
         place = self.progress.place
         off = float((pose.position[:2] - place.point) @ place.normal)
         return off * self.task.plan.bend(self.tip)
 
     def _stop(self, reason: str) -> None:
-        """Stop for a reason; go on where there is none."""
+        """Stop if there is a reason."""
         if reason:
             self.phase, self.reason = "stopped", reason
 
     # --- where the tool goes ----------------------------------------------------------------------
 
     def _probe(self, pose: ToolPose, elapsed: float) -> Command:
-        """Return the next piece of the sweep."""
+        """Return the command of the sweep for this cycle."""
         probing, normal = self.sensing.probing, self.progress.place.normal
         speed, turn = probing.velocity(elapsed)
         slant = float(pose.direction @ normal)
@@ -326,7 +329,7 @@ class Follower:
 
         Args:
             pose: Where the tool is.
-            coming: Where it will be when it has carried out all commands sent.
+            coming: Where the tool will be when it has carried out all commands sent.
             elapsed: Time since the last cycle [s].
         """
         self.pressing.ramp(self.phase, self._press(), elapsed)
@@ -345,7 +348,7 @@ class Follower:
         return Command(velocity, self.lead.turn(velocity[:2], coming, normal, off, sway))
 
     def _estimate(self, pose: ToolPose) -> None:
-        """Judge whether the torch may weld where it is now."""
+        """Update the torch's error bound; stop if the torch may not weld on."""
         reason = self.welding.estimate(pose) if self.task.touch else ""
         if reason and self.welding.complete:
             self._finish()
@@ -353,7 +356,7 @@ class Follower:
             self._stop(reason)
 
     def _press(self) -> float:
-        """Return the deflection that the phase asks for [m]."""
+        """Return the phase's set point of the deflection [m]."""
         seeking = self.phase == "seeking" and not self.sensing.search.found
         if self.phase == "ending" or seeking or not self.task.touch:
             return 0.0
@@ -364,7 +367,7 @@ class Follower:
         return self.pressing.most
 
     def _progress(self, pose: ToolPose, coming: ToolPose) -> None:
-        """Find out how far tip and torch have come."""
+        """Update the positions of tip and torch along the plan."""
         if not self.seam.backs:
             self.progress.advance(pose, coming)
             return
@@ -381,7 +384,11 @@ class Follower:
                 self.phase, self.pressing.wanted = "entering", 0.0
 
     def _pace(self, pose: ToolPose, normal: Floats) -> float:
-        """Return the tip's speed along the seam: less where blind or crooked."""
+        """Return the tip's speed along the seam [m/s].
+
+        It is reduced while images are late, the tool is at a large angle to the seam, the seam is
+        curved or the tip is pressed weakly.
+        """
         if self.phase == "seeking" or self.welding.striking.stands(pose.time):
             return 0.0
         if self.phase == "entering" and (
@@ -399,30 +406,31 @@ class Follower:
 
     @property
     def _delay(self) -> float:
-        """Of images and arm together [s]."""
+        """Delay of images and arm together [s]."""
         return self.sensing.latency + self.arm.delay
 
     def _agility(self) -> float:
-        """Return the speed at which the arm swerves little in the time in which it is blind.
+        """Return the speed at which the delay causes a small error in a curve [m/s].
 
-        During the delay of images and arm together it goes on straight where the seam curves.
+        During the delay of images and arm the tip goes on straight while the seam curves.
         """
         # The tip slows down 10 mm before a curve.
         sharpest = self.task.plan.sharpest(self.torch, self.tip + 10e-3)
         if self._delay <= 0.0 or sharpest <= 0.0:
             return math.inf
-        # The arm may swerve from it by 0.3 mm, s = v^2 t^2 k / 2.
+        # Going straight for a time t leaves a curve of curvature k by v^2 t^2 k / 2: 0.3 mm are
+        # allowed
         swerving = math.sqrt(2.0 * 0.3e-3 / sharpest) / self._delay
         return max(swerving, SLOWEST * self.task.settings.speed)
 
     def _backwards(self) -> float:
-        """Return the speed at which the tip goes back, so as not to go far beyond the start."""
+        """Return the speed for going back to the start without overrunning it far [m/s]."""
         return INSIDE / max(2.0 * self._delay, self.task.settings.sure)
 
     def _firmness(self) -> float:
-        """Return the share of its speed that the tip may keep by how firmly it is on the wall.
+        """Return the share of its speed that the tip may keep, given how firmly it is pressed.
 
-        Where the seam turns away faster than the servo follows, the tip waits for it.
+        The tip slows down where the seam turns away faster than the deflection servo follows.
         """
         if self.phase == "bridging" and self.task.belief.two_walls:
             return WAITING
@@ -436,26 +444,30 @@ class Follower:
         return min(max(firm, WAITING), 1.0)
 
     def _velocity(self, pose: ToolPose, pace: float) -> Floats:
-        """Return V_r (3,): along the plan; the servo (14) across it and in height."""
+        """Return the velocity V_r of the end point (3,) [m/s].
+
+        Along the plan it is ``pace``; across the plan and in height it is set by the servos,
+        equation (14) of the paper.
+        """
         settings, place, felt = self.task.settings, self.progress.place, self._seam_at_tip()
         lateral = self.progress.lateral(pose)
         deflection = self.side * (lateral - felt.offset)
         if self.phase == "entering" and self._inside and self.seam.bears:
             deflection = self.seam.contact.deflection
         most = settings.lateral_speed
-        # Equation (14): pressed too hard the end point gives way, too softly it goes on to the wall
+        # Equation (14): pressed too hard the end point backs off, too softly it approaches the wall
         across = -self.side * settings.servo_gain * (deflection - self.wanted)
         search = self.sensing.search
         if self.phase == "seeking" and not search.found:
             across = settings.servo_gain * search.step(lateral)
-        # The seam's known slope is fed forward: the servo has only what it is wrong by
+        # The seam's known slope is fed forward: the servo corrects only the error of that slope
         across += pace * self._drifting()
         planar = pace * place.tangent + within(across, most) * place.normal
         climb = pace * self.task.plan.climb(self.tip)
         return np.array([*planar, climb + self._rising(pose)])
 
     def _rising(self, pose: ToolPose) -> float:
-        """Return how fast to go up for the preload to be right [m/s]."""
+        """Return the upward speed that regulates the preload [m/s]."""
         settings = self.task.settings
         preload = settings.preload if self.task.touch else 0.0
         if self.phase == "entering" and not self._inside:
@@ -463,29 +475,29 @@ class Follower:
         return within(-settings.height_gain * (self._over(pose) + preload), settings.lateral_speed)
 
     def _over(self, pose: ToolPose) -> float:
-        """Return how far above a seated tip the end point is [m]."""
+        """Return the height of the end point above that of a seated tip [m]."""
         return float(pose.position[2]) - self.progress.place.height - self._seam_at_tip().height
 
     @property
     def _inside(self) -> bool:
-        """Whether the tip is back in the seam beyond the start that it has felt."""
+        """Whether the tip is past the felt start of the seam by a safe distance."""
         return self.tip >= (self.seam.start or 0.0) + INSIDE
 
     def _drifting(self) -> float:
-        """Return the slope of the seam against the plan at the tip, positive to the left."""
+        """Return the slope of the seam relative to the plan at the tip, positive to the left."""
         refined = self.seam.refined
         if self.phase != "following" or refined.empty or self.seam.backs:
             return 0.0
         return within(refined.slope(self.tip), 1.0)
 
     def _seam_at_tip(self) -> SeamReading:
-        """Return the seam at the tip: as felt, or as predicted while nothing is felt."""
+        """Return the seam at the tip: measured in contact, otherwise predicted."""
         felt = self.sensing.felt
         if felt is None:
             return SeamReading(0.0, 0.0)
         seam = self.seam
         if self.phase in ("entering", "bridging", "ending") and not seam.refined.empty:
-            # What was smoothed while the tip fell off the start is too low.
+            # The smoothed height is too low after the tip fell off the start.
             height = seam.height if self.phase == "entering" else felt.height
             return SeamReading(seam.refined.offset(self.tip), height)
         return felt

@@ -1,15 +1,18 @@
 """A small sweep of the seated tip before the weld, which identifies finger, clock and arm.
 
-The tip is held by the groove's walls, as in a punch mark, while the arm moves across by ``D`` to
-one side and to the other. With the tip at ``y0`` and the end point at ``P`` the true displacement
-is ``u = y0 - P``; the finger measures ``m = c + (1 + g) u + w sign(du/dt)``, of an image whose
-timestamp is off by ``tau``. Gain error ``g``, the half width ``w`` of play and hysteresis, and
-``tau`` follow by least squares, ``tau`` and the reversal's length from a grid. Both sides are swept
-with the tool turned a little to the left, then to the right: what that shifts ``c`` by is how far
-the tip is ahead of where its file has it. A tip that climbs
-its wall shows less the harder it is pressed, and is higher there: it is swept again by half as
-much. The weld then presses by a third of what the tip was seen to stand, so that neither friction
-nor a flatter wall lets it climb.
+The groove's walls hold the tip, like a punch mark, while the arm moves across by ``D`` to either
+side. With the tip at ``y0`` and the end point at ``P`` the true displacement is ``u = y0 - P``. The
+finger measures ``m = c + (1 + g) u + w sign(du/dt)`` in an image whose timestamp is off by ``tau``.
+Gain error ``g`` and half width ``w`` of play and hysteresis are estimated by least squares, ``tau``
+and the reversal's length by a grid search.
+
+Both sides are swept with the tool turned a little to the left, then to the right. The turn shifts
+``c`` in proportion to the error of the tip's position ahead, which is estimated from it.
+
+A tip that climbs its wall shows less displacement than it should when pressed hard, and is higher
+there. In that case the sweep is repeated with half the reach. The weld then presses by a third of
+the largest deflection at which the tip stayed seated, so that neither friction nor a flatter wall
+lets it climb.
 """
 
 from __future__ import annotations
@@ -24,11 +27,13 @@ from flangeye_plugins.weld.following.response import identify
 from flangeye_plugins.weld.settings import Following
 
 SWEEP_MARGIN = 1.25
-"""The sweep presses harder than ``deflection`` by this."""
+"""Ratio of the sweep's reach to ``deflection``."""
 
 SOFTER = 3.0
-"""The weld presses between two walls by so much less than the tip was seen to stand: friction of
-0.3 holds a tip on a wall of 45 degrees at 3.4 times what lets it slide down again."""
+"""Between two walls the weld presses by the largest safe deflection of the sweep divided by this:
+with friction 0.3, a tip that has climbed a 45-degree wall slides down only once it is pressed by
+3.4 times less than what made it climb.
+"""
 
 PIVOTS = 0.1
 """The tool is turned about the tip to either side by this [rad]."""
@@ -41,10 +46,10 @@ LONGEST = 4.0
 
 
 class Probing:
-    """The sweep: its next motion, its measurements, and the estimates from them.
+    """The sweep: commands its motion, collects the measurements, and fits the calibration.
 
     Attributes:
-        over: Whether the sweep has been made.
+        over: Whether the sweep's motion is complete.
     """
 
     def __init__(self, settings: Following, belief: Belief, side: float) -> None:
@@ -56,8 +61,8 @@ class Probing:
         self._sweep(SWEEP_MARGIN * settings.deflection)
 
     def _sweep(self, reach: float) -> None:
-        """Begin a sweep by ``reach`` [m]."""
-        # It ends outwards: play and hysteresis are then where the weld keeps them.
+        """Begin a sweep over ``reach`` to either side [m]."""
+        # The last motion is outwards: that takes up play and hysteresis in the weld's direction.
         self._reach, self._goals = reach, [(reach, 0.0), (0.3 * reach, 0.0), (0.6 * reach, 0.0)]
         if self._two_walls:
             sides = [(side, turn) for turn in (PIVOTS, -PIVOTS) for side in (reach, -reach)]
@@ -69,7 +74,7 @@ class Probing:
         self._felt: list[tuple[float, float, float, float]] = []
 
     def begin(self, noise: float) -> None:
-        """Begin, with the noise of one measurement across the seam [m]."""
+        """Set the noise of one measurement across the seam before the sweep begins [m]."""
         self._noise = (max(self._noise[0], noise), self._noise[1])
 
     def velocity(self, elapsed: float) -> tuple[float, float]:
@@ -78,7 +83,7 @@ class Probing:
         if self._wanted is None:  # contact is found on the way to it: first it comes to rest
             self._wanted = self._rested()
             return 0.0, 0.0
-        # At one speed a delay would look like play: both then shift the tag by the same.
+        # The speed varies, as at constant speed a delay looks like play: both shift by a constant.
         rate = self._rate * (0.2 + 0.8 * math.sin(math.pi * self._time / 0.8) ** 2)
         step = float(np.clip(goal - self._wanted, -rate * elapsed, rate * elapsed))
         most = self._turn_rate * elapsed
@@ -91,11 +96,11 @@ class Probing:
 
     @property
     def rests(self) -> bool:
-        """Whether the tip still comes to rest before the sweep."""
+        """Whether the sweep still waits for the tip to come to rest."""
         return self._wanted is None
 
     def _rested(self) -> float | None:
-        """Return by how much the tip is pressed where the sweep begins [m]; None before."""
+        """Return the deflection at the start of the sweep [m]; None while the tip moves."""
         since = self._standing_since()
         felt = [-self._side * across for time, across, *_ in self._felt if time >= since]
         rested = felt[len(felt) // 2 :]
@@ -106,27 +111,27 @@ class Probing:
         return float(np.mean(rested)) if rested else self._reach / SOFTER
 
     def _standing_since(self) -> float:
-        """Return since when the arm stands [s], infinity where it still moves.
+        """Return the time since which the arm has been at rest [s]; infinity while it moves.
 
-        It moves for a while after the command to stop, longest where it turned as well.
+        It moves for a while after a stop command, longest if it also rotated.
         """
         now, _, here, _ = self._cycles[-1] if self._cycles else (0.0, 0.0, 0.0, 0.0)
         since = math.inf
         for time, _, lateral, _ in reversed(self._cycles):
-            # An arm stands that for 0.2 s was nowhere farther aside than 0.02 mm.
+            # An arm is at rest if it has moved by less than 0.02 mm within 0.2 s.
             if abs(lateral - here) > 0.02e-3:
                 break
             since = time
         return since if now - since >= 0.2 else math.inf
 
     def _settled(self) -> bool:
-        """Return whether enough was felt at the highest pressing force."""
+        """Return whether enough measurements were taken at the end of this stroke."""
         since, before = self._pressed = self._pressed or (self._time, len(self._felt))
         return len(self._felt) - before >= self._enough or self._time - since > LONGEST
 
     @property
     def _enough(self) -> float:
-        """Measurements whose mean is known as well as it has to be."""
+        """Number of measurements needed for the mean at the end of a stroke."""
         # The mean at the hard end is to be known to 0.03 mm.
         return (self._noise[0] / 0.03e-3) ** 2
 
@@ -134,7 +139,7 @@ class Probing:
         """Record a cycle.
 
         Args:
-            time: [s].
+            time: Time [s].
             sent: Speed to the left that was commanded [m/s].
             lateral: The end point's offset to the left [m].
             slant: Sine of the tool's angle to the plan.
@@ -142,11 +147,11 @@ class Probing:
         self._cycles.append((time, sent, lateral, slant))
 
     def feel(self, time: float, across: float, height: float, along: float) -> None:
-        """Remember a measurement: displacements to the left and forwards, the tip's height [m]."""
+        """Store a measurement: displacement to the left and forwards, and the tip's height [m]."""
         self._felt.append((time, across, height, along))
 
     def learned(self) -> Learned | str | None:
-        """Return the estimates, or why the weld must not begin; None to repeat the sweep."""
+        """Return the calibration, or the reason for not welding; None to repeat the sweep."""
         if len(self._felt) < 15:  # four unknowns, and as many again for what is unexplained
             return "the tag was seen too seldom while the finger was probed"
         felt, cycles = np.array(self._felt), np.array(self._cycles)
@@ -166,7 +171,7 @@ class Probing:
         return None
 
     def _fit(self, felt: Floats, cycles: Floats) -> tuple[Learned, str]:
-        """Fit finger and clock to the sweep; return the fit, and whether the tip climbs."""
+        """Return the calibration fitted to the sweep, and why it is rejected ("" if it is not)."""
         noise = max(_scatter(felt[:, 1]), self._noise[0])
         late = np.arange(-0.12, 0.121, 0.01)  # timestamps, or early, by up to 120 ms
         reversals = 1e-3 * np.array([0.02, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.6, 1.0])
@@ -176,7 +181,7 @@ class Probing:
         )
         rms, solutions = _explained(at, slant, widths, felt[:, 1])
         belief = self._belief
-        # What no candidate explains is no smaller an error for being no noise.
+        # The scale is at least the best candidate's rms: model error counts like noise
         unlikely = len(felt) * (rms / max(noise, float(rms.min()))) ** 2
         unlikely += ((stamps - belief.stamp) / belief.stamp_sigma) ** 2
         unlikely += ((solutions[:, 2] + belief.play) / belief.play_sigma) ** 2
@@ -219,7 +224,10 @@ class Probing:
     def _bent(
         self, felt: Floats, at: Floats, slant: Floats, width: float, noise: float
     ) -> tuple[tuple[float, float], float, float]:
-        """Return by how much less is shown in the hard half; its, the gain's and ahead's sigma."""
+        """Return ((loss, sigma), gain sigma, tip-ahead sigma) of the sweep's fit.
+
+        The loss is the share by which the finger shows less displacement beyond half the reach.
+        """
         away = at - np.median(at + felt[:, 1])
         hard = np.sign(away) * np.maximum(np.abs(away) - self._reach / 2.0, 0.0)
         *through, ahead = _rows(at[None], slant[None], np.array([width]))[0].T
@@ -231,7 +239,7 @@ class Probing:
         return (less, hardly), gain, leads if pivoted else 1e3
 
     def _climbs(self, felt: Floats, at: Floats, gain: float, bend: tuple[float, float]) -> str:
-        """Return that the tip rises, or its reading falls, where it is pressed hard; else ""."""
+        """Return a message if the tip climbs or shows less when pressed hard; else ""."""
         # A gain off by more is not a drift but another finger, or a tip that climbs.
         if abs(gain) > 0.35:
             return f"the finger's gain is off by {gain:.0%}, or the tip climbs the wall"
@@ -255,19 +263,21 @@ class Probing:
 
 
 def _scatter(values: Floats) -> float:
-    """Return the standard deviation of one of a row of measurements, by second differences."""
+    """Return the noise of one measurement in a series, from its second differences."""
     # Second differences have no trend, and of white noise six times the variance
     return float(np.median(np.abs(np.diff(values, 2))) / 0.6745 / np.sqrt(6.0))
 
 
 def _explained(at: Floats, slant: Floats, widths: Floats, felt: Floats) -> tuple[Floats, Floats]:
-    """Return rms (C,) and the five unknowns of :func:`_rows` (C, 5) that explain touches (N,).
+    """Return the rms residuals (C,) and least-squares solutions (C, 5) of C candidates.
+
+    The five unknowns are those of :func:`_rows`.
 
     Args:
-        at: (C, N) where the end point was, for each candidate's timestamps [m].
-        slant: (C, N) sines of the tool's angle.
-        widths: (C,) of each candidate's reversal [m].
-        felt: (N,) displacements across [m].
+        at: (C, N) end point's offset at the measurements, by each candidate's time offset [m].
+        slant: (C, N) sine of the tool's angle to the plan.
+        widths: (C,) each candidate's reversal length [m].
+        felt: (N,) measured displacements across [m].
     """
     rows = _rows(at, slant, widths)
     gram = np.swapaxes(rows, 1, 2) @ rows
@@ -277,9 +287,9 @@ def _explained(at: Floats, slant: Floats, widths: Floats, felt: Floats) -> tuple
 
 
 def _spread(unlikely: Floats, stamps: Floats, plays: Floats, best: int) -> tuple[float, float]:
-    """Return the standard deviations of play [m] and stamp [s] over the grid (C,) about the best.
+    """Return the posterior standard deviations of play [m] and timestamp delay [s] on the grid.
 
-    Neither is known better than the grid is fine: 20 um and 10 ms, evenly distributed.
+    The grid's resolution (20 um and 10 ms, uniform) is added.
     """
     weights = np.exp(-0.5 * (unlikely - unlikely[best]))
     weights /= weights.sum()
@@ -288,10 +298,10 @@ def _spread(unlikely: Floats, stamps: Floats, plays: Floats, best: int) -> tuple
 
 
 def _rows(at: Floats, slant: Floats, widths: Floats) -> Floats:
-    """Return the design (C, N, 5): offset, gain, play, where in its play it began, and ahead.
+    """Return the design matrices (C, N, 5): offset, gain, play, initial play state, tip ahead.
 
-    Where in its play the finger stood at first is a column of its own: the difference between
-    beginning at the one end and at the other, until both are the same.
+    The initial state within the play is unknown, so it has a column of its own: half the difference
+    between starting at the right and at the left end, which vanishes after the first reversals.
     """
     left, right = (_dragged(at, widths, end) for end in (-1.0, 1.0))
     reversal, began = (left + right) / 2.0 - at, (right - left) / 2.0
@@ -300,9 +310,9 @@ def _rows(at: Floats, slant: Floats, widths: Floats) -> Floats:
 
 
 def _dragged(at: Floats, half: Floats, end: float) -> Floats:
-    """Return what motions (C, N) drag along with dead bands of ``half`` (C,) to both sides.
+    """Return motions (C, N) passed through a backlash of half widths ``half`` (C,).
 
-    It begins at an end of its band: 1 for the left one, -1 for the right.
+    The output starts ``end`` half widths from the input: 1 or -1, the two ends of the backlash.
     """
     dragged = at + end * half[:, None]
     for i in range(1, at.shape[1]):

@@ -1,11 +1,13 @@
-"""The seam as the tip felt it: a Gaussian process along the plan, filtered at the tip.
+"""The seam as measured by the tip: a Gaussian process along the plan, filtered at the tip.
 
-The offset of the seam from the plan is what a shift and a turn of the whole plan give, plus a
-smooth field of Matern kind (smoothness 5/2), whose state is offset, slope and curvature. How large
-and how wavy the field is, is not known: a bank of filters, one for each size and length, is weighed
-by the likelihood of what was felt. Every place that the tip has passed stays in the joint
-distribution as the seam's offset there, so what is felt later smooths it: the same as a
-Rauch-Tung-Striebel pass back from the tip, a measurement at a time (Hartikainen and Sarkka 2010).
+The seam's offset from the plan is the sum of a rigid shift and turn of the whole plan and a
+Matern-5/2 process with the state offset, slope and curvature. The process's standard deviation and
+correlation length are unknown: a bank of Kalman filters, one for each pair, is weighted by the
+likelihood of the measurements.
+
+The offset at every place that the tip has passed stays in the joint distribution, so later
+measurements smooth it. This equals a Rauch-Tung-Striebel smoother, updated with each measurement
+(Hartikainen and Sarkka 2010).
 """
 
 from __future__ import annotations
@@ -20,17 +22,17 @@ from flangeye.types import Floats
 from flangeye_plugins.weld.path import PATH_SPACING, Path
 
 SLOPE = 1.5e-3
-"""Half the length over which the path's direction is taken [m]."""
+"""Half the base length of the finite difference for the path's direction [m]."""
 
 SIZES, LENGTHS = (1.0, 3.0, 10.0), (4e-3, 12e-3, 36e-3)
-"""Of the fields: standard deviations as multiples of ``wander``, and correlation lengths [m]."""
+"""Filter bank: standard deviations as multiples of ``wander``, and correlation lengths [m]."""
 
 PRIOR = np.array([5e-3, 5e-3, 0.05])
 """Standard deviations of the plan's error: shift along x and y [m], rotation [rad]."""
 
 
 class _Field:
-    """Matern fields (smoothness 5/2), M of them side by side: state transitions and noise."""
+    """State-space form of M Matern-5/2 processes: transitions and stationary covariance."""
 
     def __init__(self, sizes: Floats, lengths: Floats) -> None:
         # Stationary covariance of offset, slope and curvature (Hartikainen & Sarkka 2010, with
@@ -43,7 +45,7 @@ class _Field:
         self.stationary[:, 2, 2] = sizes**2 * rate**4
 
     def over(self, way: Floats) -> Floats:
-        """Return transitions (K, M, 3, 3) over ways (K,) [m]."""
+        """Return the state transition matrices (K, M, 3, 3) over distances (K,) [m]."""
         # exp(F d) of the companion form, whose three eigenvalues are all -r
         d, r = way[:, None], self.rate
         rd = r * d
@@ -57,7 +59,7 @@ class _Field:
         )
 
     def offsets_over(self, way: Floats) -> Floats:
-        """Return the first rows (K, M, 3) of the transitions: what becomes the offset."""
+        """Return the first rows (K, M, 3) of the transition matrices, which predict the offset."""
         d = way[:, None]
         rd = self.rate * d
         row = np.empty((3, *rd.shape))
@@ -67,20 +69,20 @@ class _Field:
 
 
 class RefinedPath:
-    """The seam as measured by the tip, by arc length of the plan.
+    """Estimate of the seam's offset from the plan, by arc length of the plan.
 
     Attributes:
         noise: Standard deviation of one sample [m].
-        empty: Whether nothing has been believed yet.
+        empty: Whether no measurement has been processed yet.
     """
 
     def __init__(self, plan: Path, margin: float, wander: float = 0.3e-3) -> None:
-        """Start empty.
+        """Start without measurements.
 
         Args:
             plan: The planned seam.
-            margin: Room beyond both ends of the plan [m].
-            wander: Standard deviation of the seam about the plan's shape, at least [m].
+            margin: Length beyond both ends of the plan that is covered as well [m].
+            wander: Smallest standard deviation of the seam about the plan's shape [m].
         """
         self._plan, self.empty = plan, True
         self.noise = 0.01e-3  # until the sweep measures it
@@ -106,19 +108,19 @@ class RefinedPath:
     def add(self, s: float, offset: float, angle: float, doubt: float = 0.0) -> None:
         """Add a measurement: the seam is ``offset`` to the left of the plan at ``s`` [m].
 
-        The tool then stood at ``angle`` [rad]; ``doubt`` is the variance of how far the tip may
-        have been off the seam [m^2]. What follows from it :meth:`renew` finds.
+        The tool's angle was ``angle`` [rad]; ``doubt`` is the extra variance of a tip that may have
+        been off the seam [m^2]. The measurement is only queued: :meth:`renew` processes it.
         """
         self._sure.append((s, offset, angle, doubt))
 
     def renew(self, torch: float, steps: int = 4) -> None:
-        """Process a few places and samples, as many as a control cycle has time for.
+        """Process queued measurements, a few at a time to fit in a control cycle.
 
         Args:
             torch: Arc length of the torch [m].
-            steps: How many.
+            steps: Largest number of filter steps.
         """
-        # Places more than 10 mm behind the torch are not smoothed any more.
+        # Places more than 10 mm behind the torch are no longer smoothed, to bound the cycle's time.
         self._low = max(self._index(torch - 10e-3), 0)
         while self._sure and steps > 0:
             s, offset, angle, doubt = self._sure[0]
@@ -135,7 +137,7 @@ class RefinedPath:
                 self._note(s, offset, angle, doubt)
 
     def _begin(self, s: float) -> None:
-        """Begin at an arc length: the places before it are as likely as the plan is right."""
+        """Initialise the filters at an arc length; the places before it get the prior."""
         self.empty, self._at = False, s
         self._next = self._index(s) + 1
         before = slice(0, self._next)
@@ -166,7 +168,7 @@ class RefinedPath:
         self._at = s
 
     def _pass(self) -> None:
-        """Keep the next place that the tip passes."""
+        """Add the next place that the tip passes to the joint distribution."""
         self._move(float(self._places[self._next]))
         row = self._row(self._at)
         cross = self._covariance @ row
@@ -185,7 +187,7 @@ class RefinedPath:
         gain = cross / spread[:, None]
         self._state += gain * off[:, None]
         self._covariance -= gain[:, :, None] * cross[:, None, :]
-        # Places passed before learn of it by their covariance with the state
+        # Places passed before are updated through their covariance with the state
         window = slice(self._low, self._next)
         known = self._cross[:, window] @ row
         share = known / spread[:, None]
@@ -194,8 +196,8 @@ class RefinedPath:
         self._cross[:, window] -= share[:, :, None] * cross[:, None, :]
 
     def _weigh(self, off: Floats, spread: Floats) -> None:
-        """Weigh the fields by how likely each expected a sample; note by how much it exceeds."""
-        # What was likely before a measurement weighs a hundredth less: waves may begin.
+        """Update the filters' weights by their innovations (M,), and the innovations' excess."""
+        # Forgetting factor of 1 % per measurement: the seam may become wavier further on.
         unlikely, kept = off**2 / spread, 0.99
         self._excess = np.maximum(kept * self._excess + (1 - kept) * unlikely, 1e-3)
         self._likely = kept * self._likely - 0.5 * (unlikely + np.log(spread))
@@ -208,7 +210,10 @@ class RefinedPath:
         self._angles[index] = self._angles[self._next - 1] = angle
 
     def samples(self) -> Floats:
-        """Return the measurements: rows (K, 5) of arc length, offset, angle, count, variance."""
+        """Return the measurements, averaged by place, as rows (K, 5).
+
+        Columns are arc length [m], offset [m], tool angle [rad], count and extra variance [m^2].
+        """
         filled = np.flatnonzero(self._felt[:, 2])
         along, offset, count = self._felt[filled].T
         return np.column_stack(
@@ -224,16 +229,16 @@ class RefinedPath:
     # --- what follows from it -------------------------------------------------------------------
 
     def offset(self, s: float) -> float:
-        """Return the seam's offset from the plan at one arc length."""
+        """Return the seam's offset from the plan at one arc length [m]."""
         return float(self._offsets(np.array([s]))[0])
 
     def slope(self, s: float) -> float:
-        """Return the seam's slope to the left of the plan, before ``s``."""
+        """Return the seam's slope relative to the plan just before ``s``, positive to the left."""
         before, here = self._offsets(np.array([s - SLOPE, s])).tolist()
         return float((here - before) / SLOPE)
 
     def variance(self, s: float) -> float:
-        """Return the variance of the seam's offset at an arc length [m^2]: fields and doubt."""
+        """Return the variance of the seam's offset at an arc length [m^2]."""
         return self.expected(s)[1]
 
     def expected(self, s: float) -> tuple[float, float]:
@@ -250,13 +255,14 @@ class RefinedPath:
 
     @property
     def _weights(self) -> Floats:
-        """Return how likely each field is (M,)."""
+        """Weights (M,) of the filters; they sum to 1."""
         return np.asarray(np.exp(self._likely))
 
     def worst(self, first: float, last: float) -> tuple[float, float]:
-        """Return the least certain arc length between two, and the variance there.
+        """Return the arc length of largest variance between two [m], and the variance there [m^2].
 
-        Up to what later measurements hardly change: the shortest field's length short of the tip.
+        Only places at least the shortest correlation length behind the tip count, as later
+        measurements hardly change them.
         """
         last = min(last, self._at - LENGTHS[0])
         places = np.arange(first, max(first, last) + PATH_SPACING, SLOPE)
@@ -265,7 +271,7 @@ class RefinedPath:
         return float(places[worst]), variances[worst]
 
     def angle(self, s: float, otherwise: float) -> float:
-        """Return the tool's angle when the seam was felt at ``s``, or nearest to it [rad]."""
+        """Return the tool's angle [rad] at the measurement nearest to ``s``, or ``otherwise``."""
         if self.empty:
             return otherwise
         filled = np.flatnonzero(self._felt[:, 2])
@@ -281,13 +287,13 @@ class RefinedPath:
         return place.point + here * place.normal, normal
 
     def _offsets(self, s: Floats) -> Floats:
-        """Return offsets (K,) at arc lengths."""
+        """Return the estimated offsets (K,) at arc lengths (K,) [m]."""
         if self.empty:
             return np.zeros(len(s))
         return np.asarray(self._weights @ self._expected(s))
 
     def _expected(self, s: Floats) -> Floats:
-        """Return each field's offsets (M, K) at arc lengths, behind and ahead."""
+        """Return each filter's offsets (M, K) [m]: smoothed behind the tip, predicted ahead."""
         means, ahead = self._between(self._means, s)
         if len(ahead):
             rows = self._ahead(s[ahead])
@@ -295,7 +301,7 @@ class RefinedPath:
         return means
 
     def _spread(self, s: Floats) -> Floats:
-        """Return each field's variances (M, K) at arc lengths, behind and ahead."""
+        """Return each filter's variances (M, K) at arc lengths (K,) [m^2]."""
         variances, ahead = self._between(self._vars, s)
         if len(ahead):
             rows, field = self._ahead(s[ahead]), self._field.stationary
@@ -306,7 +312,10 @@ class RefinedPath:
         return variances
 
     def _between(self, kept: Floats, s: Floats) -> tuple[Floats, NDArray[np.intp]]:
-        """Return (M, K) of what is kept for places (M, N), and which s the tip has not passed."""
+        """Return values kept per place (M, N), interpolated at ``s`` (M, K), and the indices ahead.
+
+        Those are the indices of the ``s`` that the tip has not passed.
+        """
         first = (s - self._start) / PATH_SPACING - 0.5
         below = np.minimum(np.maximum(first.astype(int), 0), max(self._next - 2, 0))
         share = np.minimum(np.maximum(first - below, 0.0), 1.0)
@@ -314,7 +323,7 @@ class RefinedPath:
         return between, (first > self._next - 1).nonzero()[0]
 
     def _ahead(self, s: Floats) -> Floats:
-        """Return how the state predicts the offset where the tip has not been (K, M, 6)."""
+        """Return the rows (K, M, 6) by which the state predicts the offset ahead of the tip."""
         over = self._field.offsets_over(np.maximum(s - self._at, 0.0))
         rows = np.empty((*over.shape[:2], 6))
         rows[..., :3], rows[..., 3:] = self._rows(s)[:, None, :], over
@@ -324,7 +333,7 @@ class RefinedPath:
         return np.concatenate([self._rows(np.array([s]))[0], [1.0, 0.0, 0.0]])
 
     def _rows(self, s: Floats) -> Floats:
-        """Return (K, 3): how a shift and a small turn of the plan move it along its normals."""
+        """Return the derivatives (K, 3) of the plan's normal offset by shift x, y and rotation."""
         points, tangents = self._plan.evaluate(s)
         # A turn about the plan's start moves a place at lever l by (-l_y, l_x)
         levers = points[:, :2] - self._plan.points[0, :2]

@@ -1,8 +1,8 @@
-"""The arm's response to velocities: identified from a sweep, used to predict its pose.
+"""The arm's response to velocity commands: identified from a sweep, used to predict its pose.
 
-After a dead time D it follows with a time constant tau. The commands it has been given but not yet
-carried out take it on by the integral over the last D seconds plus tau times its speed; a servo
-that steers by where the arm *will* be needs no smaller gain for the delay (a Smith predictor).
+The model is a dead time D followed by a first-order lag tau. Commands sent but not yet carried out
+will move the arm by their integral over the last D seconds plus tau times its present speed. A
+servo on this predicted pose needs no smaller gain for the delay (a Smith predictor).
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from flangeye.motion.seam_following import Command, ToolPose
 from flangeye.types import Floats
 
 GRID = 5e-3
-"""Times at which commands and motion are compared [s]; dead times are multiples of it."""
+"""Sampling period for comparing commands and motion [s]; dead times are multiples of it."""
 
 
 class _Told(NamedTuple):
-    """A command, and what all before it lead to.
+    """A command sent to the arm, and the displacement commanded before it.
 
     Attributes:
-        time: When it was given [s].
-        command: (4,) velocity [m/s] and turn [rad/s].
-        way: (4,) from the first command to this one [m, rad].
+        time: Time at which it was sent [s].
+        command: (4,) velocity [m/s] and angular velocity [rad/s].
+        way: (4,) displacement commanded from the first command to this one [m, rad].
     """
 
     time: float
@@ -34,16 +34,16 @@ class _Told(NamedTuple):
     way: Floats
 
     def way_at(self, time: float) -> Floats:
-        """Return the displacement (4,) up to a time while this command lasts."""
+        """Return the displacement (4,) commanded up to a time within this command [m, rad]."""
         return self.way + (time - self.time) * self.command
 
 
 class Response:
-    """Predicts the pose of an arm that lags behind its commands.
+    """Predicts the tool's pose from the commands that the arm has not yet carried out.
 
     Attributes:
-        dead_time: [s].
-        lag: [s].
+        dead_time: Dead time of the arm [s].
+        lag: Time constant of its first-order lag [s].
     """
 
     def __init__(self) -> None:
@@ -53,18 +53,18 @@ class Response:
 
     @property
     def delay(self) -> float:
-        """Both together [s]."""
+        """Dead time and lag together [s]."""
         return self.dead_time + self.lag
 
     def record(self, time: float, command: Command) -> None:
-        """Remember a command given at ``time`` [s]."""
+        """Store a command sent at ``time`` [s]."""
         if not self.delay:
             return
         way = self._commands[-1].way_at(time) if self._commands else np.zeros(4)
         self._commands.append(_Told(time, np.array([*command.velocity, command.turn]), way))
 
     def ahead(self, pose: ToolPose) -> ToolPose:
-        """Return the tool's pose once all commands have taken effect."""
+        """Return the pose that the tool will have once it has carried out all commands sent."""
         if not self._commands:
             return pose
         sent = pose.time - self.dead_time  # what is carried out now
@@ -81,11 +81,11 @@ class Response:
 def identify(cycles: Floats) -> tuple[float, float]:
     """Return the dead time and lag [s] that best explain an arm's motion along one axis.
 
-    A controller that limits acceleration makes the arm late after a step, and nowhere else. So
-    displacements over a tenth of a second are compared, without the worst two fifths of them.
+    Displacements over 0.1 s are compared. A robot controller that limits acceleration delays the
+    arm after a step only, so the worst 40 % of the differences are left out.
 
     Args:
-        cycles: (K, 3) time [s], velocity commanded [m/s], where the arm was reported [m].
+        cycles: (K, 3) time [s], commanded velocity [m/s], reported position [m].
     """
     clock = cycles[:, 0]
     grid = np.arange(clock[0], clock[-1], GRID)

@@ -1,6 +1,6 @@
-"""Find the groove at the start: down until contact, then across, in both directions.
+"""Search for the groove at the start: down until contact, then across, in both directions.
 
-Every decision is taken on the mean of several measurements, as many as their scatter asks for.
+Every decision uses the mean of several measurements; their number follows from the noise.
 """
 
 from __future__ import annotations
@@ -15,37 +15,37 @@ from flangeye_plugins.weld.following.belief import Belief
 from flangeye_plugins.weld.settings import Following
 
 MOST = 60
-"""Measurements to a mean."""
+"""Largest number of measurements in a mean."""
 
 UNTOUCHED = 0.5e-3
-"""A tip that touches nothing is displaced, and scatters, by less [m]."""
+"""Largest displacement and scatter of a tip that touches nothing [m]."""
 
 
 class SweepSearch:
     """A sweep of the tip across the planned start.
 
     Attributes:
-        resting: Whether the tip still hangs where it began, to be measured.
-        bent: Whether it was displaced there or moved about, though nothing should touch it.
+        resting: Whether the free tip's rest position is still being measured.
+        bent: Whether the tip was displaced or moved at rest, though nothing should touch it.
         down: Whether the tip has touched something.
-        found: Whether it then felt a wall.
-        seated: Whether it now bears on the groove with its preload.
-        over: Whether both sides were swept without one.
-        rest: (3,) mean displacement while nothing was touched [m].
-        sigma: (3,) standard deviations of one measurement then [m].
+        found: Whether the tip has then felt a wall.
+        seated: Whether the tip now rests in the groove with its preload.
+        over: Whether both sides were swept without finding a wall.
+        rest: (3,) median displacement at rest [m].
+        sigma: (3,) standard deviations of one measurement at rest [m].
     """
 
     def __init__(self, settings: Following, belief: Belief) -> None:
-        """Sweep ``reach`` to the left of the plan, then as far to the right.
+        """Plan a sweep by ``reach`` to the left of the plan, then as far to the right.
 
-        Where one wall alone holds the tip, that one is looked for.
+        In a joint with only one wall that holds the tip, the sweep goes towards that wall only.
         """
         self.resting, self.bent = True, False
         self.down = self.found = self.seated = self.over = False
         self.rest = np.zeros(3)
         self.sigma = np.array([belief.noise[0], belief.noise[0], belief.noise[1]])
         self._settings = settings
-        # A wall gives more than friction does at most, by a tenth.
+        # A wall deflects the tip by at least 10 % more than friction can.
         self._wall = max(1.1 * belief.sliding(settings), settings.probe / 2)
         both = [settings.reach, -settings.reach]
         self._turns = both if belief.two_walls else [settings.sign * settings.reach]
@@ -53,12 +53,12 @@ class SweepSearch:
         self._newest: deque[tuple[float, float]] = deque(maxlen=MOST)
 
     def feel(self, displacement: Floats, deflection: float, compression: float) -> None:
-        """Take a measurement of the tip.
+        """Process a measurement of the tip.
 
         Args:
             displacement: (3,) along the tool's axes, as measured [m].
-            deflection: Across the plan [m].
-            compression: Upwards [m].
+            deflection: Deflection across the plan [m].
+            compression: Compression of the tip, upwards [m].
         """
         if self.resting:
             self._rest(displacement)
@@ -88,18 +88,18 @@ class SweepSearch:
         self.bent = max(usual, float(np.linalg.norm(self.rest[:2])) - usual) > UNTOUCHED
 
     def seats(self, wanted: float) -> bool:
-        """Return whether the tip bears on its seat and is pressed aside as wanted [m]."""
+        """Return whether the tip is seated and deflected by enough of the ``wanted`` value [m]."""
         pressed = 0.6 * wanted  # past friction, and short of what the servo still settles
         return self.found and self.seated and self._mean(0, pressed) > pressed
 
     def _mean(self, axis: int, threshold: float) -> float:
-        """Return the mean of as many measurements as make it sure at a threshold [m]."""
+        """Return the mean of enough measurements for a decision at a threshold [m]; 0 before."""
         count = int(np.clip(_needed(self.sigma[1 + axis], threshold), 3, MOST))
         newest = [sample[axis] for sample in self._newest][-count:]
         return sum(newest) / len(newest) if len(newest) == count else 0.0
 
     def step(self, lateral: float) -> float:
-        """Return the next step across [m], from the end point's offset to the left of the plan."""
+        """Return the way to go across [m], given the end point's offset to the left of the plan."""
         if not self.down:
             return 0.0
         # A turning point is reached within 0.2 mm.
@@ -110,5 +110,5 @@ class SweepSearch:
 
 
 def _needed(sigma: float, threshold: float) -> int:
-    """Return how many measurements have a mean that is four deviations away from a threshold."""
+    """Return how many measurements resolve a threshold by four standard deviations."""
     return int(np.ceil((4.0 * sigma / threshold) ** 2))

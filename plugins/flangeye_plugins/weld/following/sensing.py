@@ -1,4 +1,4 @@
-"""The finger's measurements: which of its touches count, and the seam they give."""
+"""Processing of the finger's measurements ("touches"), and the seam estimated from them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from flangeye_plugins.weld.following.tip import Pressing, Progress
 from flangeye_plugins.weld.settings import INSIDE
 
 STEADY = 0.03e-3
-"""A finger that scatters less is followed from one measurement to the next [m]."""
+"""Below this noise a touch is used without averaging [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,8 +31,8 @@ class SeamReading:
     """The seam at the tip: measured in contact, otherwise predicted.
 
     Attributes:
-        offset: To the left of the plan [m].
-        height: Above the planned height [m].
+        offset: Offset to the left of the plan [m].
+        height: Height above the plan [m].
     """
 
     offset: float
@@ -43,7 +43,7 @@ class Located(NamedTuple):
     """Position of the tip at one measurement.
 
     Attributes:
-        s: Arc length of the plan [m].
+        s: Arc length on the plan [m].
         seam: The seam there, if the tip is seated.
         deflection: Deflection of the tip, towards the pressed wall [m].
         compression: Compression of the tip, into the joint [m].
@@ -58,16 +58,16 @@ class Located(NamedTuple):
 
 
 class Sensing:
-    """The finger, and the sweep at the start that identifies it.
+    """State of the finger's measurement: search for the groove, sweep, and smoothed reading.
 
     Attributes:
-        search: Finds the groove.
-        probing: Sweeps the seated tip.
+        search: Search for the groove.
+        probing: Sweep of the seated tip.
         learned: Calibration of finger, clock and arm from the sweep.
-        felt: The seam at the tip, smoothed; None before anything was felt.
+        felt: Smoothed reading of the seam at the tip; None before the first touch.
         seen: Time of the newest touch [s].
-        heard: When it came [s].
-        latency: Latency of the touches, a running mean [s].
+        heard: Time at which that touch arrived [s].
+        latency: Running mean of the touches' latency [s].
     """
 
     def __init__(self, task: WeldTask, progress: Progress, pressing: Pressing) -> None:
@@ -83,24 +83,26 @@ class Sensing:
         self._swept: list[tuple[ToolPose, Touch]] = []
 
     def begin(self, now: float) -> None:
-        """Begin at a time [s]."""
+        """Start the clock for images at a time [s]."""
         self.seen = self.heard = now
 
     def true(self, pose: ToolPose) -> ToolPose:
-        """Return a pose with the tip's offset ahead corrected by the sweep."""
+        """Return the pose with the tip's position ahead corrected by the sweep's estimate."""
         ahead = self.learned.ahead * np.array([*pose.direction, 0.0])
         return ToolPose(pose.time, pose.position + ahead, pose.angle)
 
     def watch(self, pose: ToolPose) -> None:
-        """Record the tool's pose, for later touches."""
+        """Store the tool's pose, for touches that arrive later."""
         self._track.add(pose)
 
     def take(self, touch: Touch, now: float) -> tuple[ToolPose, Touch] | None:
-        """Return a new touch in level axes, with the tool's pose then (13); None if too old.
+        """Return the tool's pose at the time of a touch, and the touch in level axes (equation 13).
+
+        Return None if the touch is not newer than the last one, or older than the stored poses.
 
         Args:
-            touch: As it was measured.
-            now: The time [s].
+            touch: Touch in the tool's axes.
+            now: Present time [s].
         """
         if not self._task.touch or touch.time <= self.seen:
             return None
@@ -114,7 +116,7 @@ class Sensing:
         return pose, Touch(touch.time, self._level @ touch.displacement)
 
     def locate(self, pose: ToolPose, touch: Touch, phase: Phase) -> Located:
-        """Return where the tip was in a touch."""
+        """Return the tip's position relative to the plan, and its deformation, at a touch."""
         plan, belief = self._task.plan, self._task.belief
         corrected = self._corrected(touch.displacement, phase)
         tip = pose.position + turned(corrected, pose.angle)
@@ -126,24 +128,24 @@ class Sensing:
         return Located(s, felt, deflection, float(corrected[2]), pose.angle)
 
     def _corrected(self, displacement: Floats, phase: Phase) -> Floats:
-        """Return a displacement (3,) without what the finger's rest, gain and play add to it."""
+        """Return a displacement (3,) corrected for the finger's rest, gain and play [m]."""
         moved = displacement - self.search.rest
         kept = self.learned.kept * self._pressing.played(phase, self.learned.reversal)
         play = np.array([0.0, self._pressing.side * self.learned.width * kept, 0.0])
         across = 1.0 + self.learned.gain
-        # The sweep measures the gain across. That upwards is its like; where it is not, the
-        # preload errs towards pressing harder, which holds the tip in its groove.
+        # The sweep measures the gain across, and the gain upwards is taken to be the same. Where it
+        # is not, this errs towards a higher preload, which keeps the tip in its groove.
         gain = np.array([across, across, max(across, 1.0)])
         return np.asarray((moved - play) / gain)
 
     def seek(self, touch: Touch, found: Located) -> None:
-        """Process a touch of the search for the groove."""
+        """Process a touch during the search for the groove."""
         self.felt = found.seam
         compression = float(touch.displacement[2] - self.search.rest[2])
         self.search.feel(touch.displacement, found.deflection, compression)
 
     def sweep(self, pose: ToolPose, touch: Touch, found: Located, noise: float) -> None:
-        """Process a touch of the sweep; one scatters by ``noise`` [m]."""
+        """Process a touch during the sweep; ``noise`` is one touch's standard deviation [m]."""
         moved = turned(touch.displacement - self.search.rest, pose.angle)
         along = float(moved[:2] @ self._progress.place.tangent)
         self.smooth(found.seam, noise)
@@ -160,11 +162,11 @@ class Sensing:
         return now - self.heard
 
     def smooth(self, felt: SeamReading, noise: float) -> None:
-        """Add a reading to a moving mean, whose length depends on the scatter.
+        """Add a reading to the running mean ``felt``; the noisier the finger, the longer the mean.
 
         Args:
-            felt: The reading.
-            noise: Standard deviation of one [m].
+            felt: The new reading.
+            noise: Standard deviation of one reading [m].
         """
         before = self.felt
         if before is None:
@@ -178,20 +180,20 @@ class Sensing:
 
 
 class Track:
-    """The recent poses, to find the tool's pose at the time of an image."""
+    """History of the tool's poses, to look up the pose at the time of an image."""
 
     def __init__(self) -> None:
         self._poses: deque[ToolPose] = deque()
 
     def add(self, pose: ToolPose) -> None:
-        """Remember a pose, and forget the oldest."""
+        """Store a pose, and drop those older than one second."""
         self._poses.append(pose)
-        # Images come later than they were taken by a fraction of this [s]
+        # Images arrive well within one second of their exposure
         while pose.time - self._poses[0].time > 1.0:
             self._poses.popleft()
 
     def at(self, time: float) -> ToolPose | None:
-        """Return the pose at ``time``, between two that are known; None before the first."""
+        """Return the pose interpolated at ``time``; None before the first stored pose."""
         index = bisect_right(self._poses, time, key=lambda pose: pose.time)
         if index == 0:
             return None
@@ -204,7 +206,7 @@ class Track:
 
 
 class _Sample(NamedTuple):
-    """A touch as added to the path: see :meth:`RefinedPath.add`."""
+    """Arguments of :meth:`RefinedPath.add`."""
 
     s: float
     offset: float
@@ -216,11 +218,11 @@ class SeamEstimate:
     """The tip's contact, and the seam estimated from it.
 
     Attributes:
-        refined: The seam as felt so far.
+        refined: Estimate of the seam from the touches so far.
         contact: The state of the tip's contact.
         start: Arc length of the seam's start as felt by the tip; None if not felt [m].
-        end: Where it ends, likewise.
-        lost: When no wall held the tip any more, and where it was then [s, m]; None while one does.
+        end: Arc length of the seam's end as felt by the tip; None if not felt [m].
+        lost: Time and arc length at which the tip lost contact [s, m]; None in contact.
     """
 
     def __init__(self, task: WeldTask) -> None:
@@ -240,7 +242,10 @@ class SeamEstimate:
         self._around = False
 
     def _path(self, noise: float | None = None) -> RefinedPath:
-        """Return the path as an earlier weld has felt it; one touch scatters by ``noise`` [m]."""
+        """Return a path with the touches of the resumed weld, if any.
+
+        ``noise`` is the standard deviation of one touch [m]; None keeps the path's own.
+        """
         task = self._task
         path = RefinedPath(task.plan, task.margin, task.settings.wander)
         path.noise = path.noise if noise is None else noise
@@ -250,27 +255,27 @@ class SeamEstimate:
 
     @property
     def backs(self) -> bool:
-        """Whether the tip goes back to where the seam begins."""
+        """Whether the tip is going back to the seam's start."""
         return self._backed is not None
 
     def renew(self, torch: float) -> None:
-        """Update the path within a cycle's time budget, with the torch at an arc length [m]."""
+        """Process queued touches within a cycle's time budget; ``torch`` is its arc length [m]."""
         if not self.backs:
             self.refined.renew(torch)
 
     def stands(self, found: Learned) -> float:
-        """Return the largest deflection at which the sweep has seen the tip stay seated [m]."""
+        """Return the largest deflection at which the tip stayed seated in the sweep [m]."""
         return min(found.swept, SWEEP_MARGIN * self._task.settings.deflection)
 
     def begin(
         self, found: Learned, height_noise: float, swept: list[Located], torch: float
     ) -> None:
-        """Begin the path with the last touches of the sweep.
+        """Start the path with the last touches of the sweep.
 
         Args:
             found: Calibration from the sweep.
             height_noise: Standard deviation of one measured height [m].
-            swept: Those touches.
+            swept: Last touches of the sweep.
             torch: Arc length of the torch [m].
         """
         if self._task.belief.two_walls:
@@ -281,20 +286,20 @@ class SeamEstimate:
         self.arrive(found, torch)
 
     def back(self) -> None:
-        """Go back to where the seam begins; measurements on the way are kept."""
+        """Start going back to the seam's start; touches on the way are collected."""
         self._backed = []
 
     def lost_for(self, now: float) -> float:
-        """Return the time since a wall last held the tip [s]; 0 while one does."""
+        """Return the time since the tip lost contact [s]; 0 in contact."""
         return 0.0 if self.lost is None else now - self.lost[0]
 
     def arrive(self, found: Learned, torch: float, lost: bool = False) -> None:
-        """Begin the path with the measurements of the sweep and of the way back to the start.
+        """Rebuild the path from the touches of the sweep and of the way back to the start.
 
         Args:
             found: Calibration from the sweep.
             torch: Arc length of the torch [m].
-            lost: Whether no wall holds the tip any more.
+            lost: Whether the tip fell off the start.
         """
         self.start = self._fell_at() if lost else None
         self.keep(math.inf)
@@ -306,7 +311,7 @@ class SeamEstimate:
         self._backed = None
 
     def leave(self, phase: Phase, now: float) -> None:
-        """Accept the place where the tip fell off as the seam's end, if it is plausible."""
+        """Take the place where the tip fell off as the seam's end, if it is plausible."""
         if (
             self.end is not None
             or phase != "ending"
@@ -320,36 +325,36 @@ class SeamEstimate:
             self.end = at
 
     def _fell_at(self) -> float | None:
-        """Return where a tip that was lost fell off the seam [m]; None where it did not.
+        """Return the arc length at which the tip fell off the seam [m]; None if it did not.
 
-        Where a wall alone is missing the joint's bottom still bears it.
+        A tip that has lost only its wall is still supported by the joint's bottom.
         """
         return None if self.lost is None or self.bears else self.lost[1]
 
     @property
     def height(self) -> float:
-        """Height above the plan's of a tip that is sure to have been seated [m]."""
+        """Mean height above the plan of the last accepted, seated touches [m]."""
         return float(np.mean(self._heights or [0.0]))
 
     @property
     def bears(self) -> bool:
-        """Whether the joint supports the tip, by the mean of the last touches."""
+        """Whether the joint supports the tip, by the mean compression of the last touches."""
         pressed = float(np.mean(self._pressed or [0.0]))
         return pressed > self._task.settings.preload / 2.0
 
     def weigh(self, time: float, found: Located, learned: Learned, side: float) -> None:
-        """Update the contact modes by a touch of the wall on a side, 1 for the left.
+        """Update the contact modes by a touch.
 
         Args:
             time: Time of the touch [s].
             found: Position of the tip at the touch.
             learned: Calibration from the sweep.
-            side: Side of the wall that is pressed.
+            side: Side of the pressed wall: 1 left, -1 right.
         """
         s, seam = found.s, found.seam
         offset, variance = self.refined.expected(s)
         aside = seam.offset - offset
-        # The effect of play is in the path already, from the touches before this one.
+        # Play is left out of the variance: it displaces the path's earlier touches by the same.
         spread = variance + (learned.noise / (1.0 + learned.gain)) ** 2 + STEADY**2
         expected = time, s, seam.offset, found.angle, aside, spread, seam.height
         self.contact.take(Felt(*expected, found.deflection, found.compression), side)
@@ -362,7 +367,7 @@ class SeamEstimate:
             self._go_around()
 
     def _go_around(self) -> None:
-        """Add what was felt at the start of a closed seam again beyond its end."""
+        """Copy the touches at the start of a closed seam to beyond its end."""
         if self._around:
             return
         self._around, task = True, self._task
@@ -371,7 +376,10 @@ class SeamEstimate:
                 self.refined.add(s + task.plan.length, offset, angle, doubt)
 
     def keep(self, until: float) -> None:
-        """Add accepted measurements up to a time [s], short of where the seam may end."""
+        """Add the accepted touches up to a time [s] to the path.
+
+        Those past the seam's earliest possible end are left out.
+        """
         task = self._task
         end = task.plan.length - max(task.settings.ending / 4.0, task.beyond)
         # Between two walls a tip shows that it has fallen off the seam's end.
@@ -388,12 +396,13 @@ class SeamEstimate:
     def regained(self, pressing: Pressing) -> bool:
         """Return whether a wall holds the tip again.
 
-        A tip that is free seems to be held where the arm leads it there.
+        Probability alone is not enough, as a free tip moves with the arm and may coincide with the
+        expected seam: the tip must be deflected as well.
         """
         return self.contact.free < 1.0 - LOST and self.contact.deflection > pressing.most / 2.0
 
     def moved(self, found: Located) -> str:
-        """Return why the weld must stop if the seam has moved since it was measured; else ""."""
+        """Return a message if the seam has moved since the weld that is resumed; else ""."""
         before = self._task.before
         enough = 15  # measurements that show whether it has moved
         if before is None or len(self._moved) == enough or found.s > before.samples[-1, 0]:

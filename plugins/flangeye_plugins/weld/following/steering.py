@@ -1,4 +1,4 @@
-"""The torch: the tool's rotation that keeps it on the seam, its weave, its gas and arc."""
+"""Steering of the torch: the tool's rotation, the weave, and the switching of gas and arc."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from flangeye_plugins.weld.following.task import WeldTask
 
 
 class WeaveOffset(NamedTuple):
-    """The weave at one time, to the left of the seam; none where it is all zero.
+    """The weave at one time, to the left of the seam; all zero means no weave.
 
     Attributes:
-        aside: [m].
-        rate: [m/s].
-        rush: Its second derivative [m/s^2].
+        aside: Offset [m].
+        rate: Velocity [m/s].
+        rush: Acceleration [m/s^2].
     """
 
     aside: float = 0.0
@@ -29,25 +29,25 @@ class WeaveOffset(NamedTuple):
     rush: float = 0.0
 
     def led(self, lag: float) -> WeaveOffset:
-        """Return the swing that an arm follows with a time constant [s], to be on this one."""
+        """Return the weave to command so that an arm with this lag [s] follows this weave."""
         # (1 + lag d/dt) undoes a first-order lag, 1 / (1 + lag s)
         return WeaveOffset(self.aside + lag * self.rate, self.rate + lag * self.rush, self.rush)
 
 
 @dataclass(frozen=True)
 class Weave:
-    """A sine across the seam.
+    """A sinusoidal weave across the seam.
 
     Attributes:
-        width: From side to side [m].
-        frequency: [Hz].
+        width: Peak-to-peak width [m].
+        frequency: Frequency [Hz].
     """
 
     width: float
     frequency: float
 
     def at(self, elapsed: float) -> WeaveOffset:
-        """Return the swing so long after it began [s]; none before it has."""
+        """Return the weave at a time after its start [s]; no weave before."""
         if elapsed < 0.0 or not self.width:
             return WeaveOffset()
         turn = 2.0 * math.pi * self.frequency
@@ -63,20 +63,20 @@ class Weave:
     @property
     def variance(self) -> float:
         """Variance of the torch across the seam due to the weave's timing error [m^2]."""
-        # The arm's delay is known to 10 ms: a swing is early or late by it, and the mean square of
-        # its speed is half the square of the fastest
+        # The arm's delay is known to 10 ms, so the weave is early or late by that; the mean square
+        # speed of a sine is half its peak speed squared
         return (self.fastest * 10e-3) ** 2 / 2.0
 
 
 Times = tuple[float, float, float]
-"""Gas before the arc; standing while it is struck; standing while the crater fills [s]."""
+"""Gas pre-flow, wait while the arc strikes, wait while the crater fills [s]."""
 
 
 class Striking:
-    """One arc: gas, burning, out."""
+    """Sequence of one arc: gas pre-flow, ignition, burning, crater fill, off."""
 
     def __init__(self, times: Times) -> None:
-        """Begin with neither gas nor arc."""
+        """Start with gas and arc off."""
         self._before, self._struck_for, self._fills_for = times
         self._gas = self._strikes = self._ended = math.inf
 
@@ -85,12 +85,12 @@ class Striking:
         self._gas = min(self._gas, now)
 
     def strike(self, now: float) -> None:
-        """Ask for the arc; it is struck once gas has flowed for its time."""
+        """Request the arc; it is struck after the gas pre-flow."""
         self.gas(now)
         self._strikes = min(self._strikes, max(now, self._gas + self._before))
 
     def filled(self, now: float) -> bool:
-        """Ask for the end of the arc; return whether its crater is filled."""
+        """Request the end of the arc; return whether its crater is filled."""
         self._ended = min(self._ended, now)
         return now >= self._ended + self._fills_for
 
@@ -105,24 +105,25 @@ class Striking:
 
 
 SETTLING = 8e-3
-"""Way in which an error of the torch is taken back at speed [m]."""
+"""Distance along the seam over which an error of the torch is corrected at full speed [m]."""
 
 SLOWEST = 0.1
-"""Share of its speed that the tip always keeps."""
+"""Smallest share of its speed to which the tip slows down."""
 
 
 @dataclass(frozen=True)
 class Steering:
-    """How the tool is turned.
+    """Control law for the tool's rotation.
 
     Attributes:
-        distance: Tip to torch, ||d|| of the paper [m].
-        gain: k_c, how fast an error of the torch is taken back [1/s].
+        distance: Distance from tip to torch, ||d|| in the paper [m].
+        gain: k_c, gain on the torch's cross-track error [1/s].
         rate: Largest angular velocity [rad/s].
-        regular: |n_d . n_t| above which equation (16) alone decides; zero half way below.
-        share: Largest part of the tip's speed that taking back an error may use.
-        usual: Share of the rate that following alone, or a weave alone, may use: the rest is for
-            errors.
+        regular: n_d . n_t above which equation (16) alone decides; below half of it, it is not
+            used.
+        share: Largest speed of the error's correction, as a share of the tip's speed.
+        usual: Share of ``rate`` that following or weaving may use; the rest is left for
+            corrections.
     """
 
     distance: float
@@ -142,12 +143,12 @@ class Steering:
             tool: (2,) unit vector from the torch to the tip, t_d.
             normal: (2,) unit normal of the refined path at the torch, n_t.
             error: How far the torch is off the refined path, along ``normal`` [m].
-            sway: How fast it is to leave that path to the left all the same [m/s].
+            sway: Velocity of the weave, to the left [m/s].
         """
         cosine, sine = _cos_sin(tool, normal)
         trusted = self.trust(cosine)
-        # Near n_d perpendicular to n_t equation (16) divides by zero and below it the torch would
-        # be pushed, not pulled: there the tool is turned into the path's direction instead.
+        # Equation (16) divides by n_d . n_t. Near zero it is singular, and below zero the torch
+        # would be pushed, not pulled: there the tool is turned into the path's direction instead.
         aligning = -float(np.copysign(self.rate, sine))
         if not trusted:
             return aligning
@@ -160,14 +161,14 @@ class Steering:
         return float(min(max(wanted, -self.rate), self.rate))
 
     def trust(self, cosine: float) -> float:
-        """Return 1 where equation (16) decides, 0 where the tool is turned back, and between."""
+        """Return the weight of equation (16), 0 to 1; the rest aligns the tool with the path."""
         return min(max(2.0 * cosine / self.regular - 1.0, 0.0), 1.0)
 
     def pace(self, speed: float, tool: Floats, normal: Floats, along: Floats) -> float:
-        """Return the speed that the tip may have: less where the tool is crooked or turns fast.
+        """Return the tip's speed [m/s], reduced at large tool angles and turn rates.
 
         Args:
-            speed: That is asked for [m/s].
+            speed: Requested speed [m/s].
             tool: (2,) unit vector from the torch to the tip.
             normal: (2,) unit normal of the refined path at the torch.
             along: (2,) unit tangent of the path at the tip.
@@ -181,12 +182,12 @@ class Steering:
 
 
 class TorchLead:
-    """Leads the torch along the seam, swinging across it where a weave is asked for.
+    """Steers the torch along the seam, with a weave if one is configured.
 
     Attributes:
-        steering: How the tool is turned.
-        weave: The swing.
-        aim: How far to the left of the seam the torch is to be [m].
+        steering: Control law of the tool's rotation.
+        weave: The configured weave.
+        aim: Present target of the torch, to the left of the seam [m].
     """
 
     def __init__(self, task: WeldTask) -> None:
@@ -199,12 +200,12 @@ class TorchLead:
         self._swings: float | None = None
 
     def swing(self, now: float, coming: float, arm: Response) -> WeaveOffset:
-        """Return the weave to command, ahead by the arm's delay; set ``aim`` to the one due now.
+        """Return the weave to command, advanced by the arm's delay; update ``aim``.
 
         Args:
-            now: The time [s].
-            coming: Arc length of the torch, where the arm will be [m].
-            arm: Delay of the arm.
+            now: Present time [s].
+            coming: Arc length of the torch at the arm's predicted pose [m].
+            arm: Model of the arm's delay.
         """
         if self._swings is None and coming >= self._from:
             self._swings = now + arm.dead_time
@@ -219,9 +220,9 @@ class TorchLead:
 
         Args:
             velocity: (2,) of the robot's end point [m/s].
-            coming: The tool, where the arm will be.
+            coming: Predicted pose of the tool.
             normal: (2,) unit normal of the refined path at the torch.
-            off: How far to the left of that path the torch is [m].
+            off: Offset of the torch to the left of that path [m].
             sway: The weave to command.
         """
         if not velocity.any():
@@ -231,5 +232,5 @@ class TorchLead:
 
 
 def _cos_sin(tool: Floats, normal: Floats) -> tuple[float, float]:
-    """Return n_d . n_t, and t_d . n_t: cosine and sine of the angle from the path to the tool."""
+    """Return n_d . n_t and t_d . n_t: cosine and sine of the angle from the path to the tool."""
     return float(tool[0] * normal[1] - tool[1] * normal[0]), float(tool @ normal)

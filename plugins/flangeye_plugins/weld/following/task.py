@@ -1,4 +1,4 @@
-"""The task of a follower, and the state of a stopped weld."""
+"""Input of a follower, and the state from which a stopped weld is resumed."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ class ResumePoint:
     """State of a stopped weld from which it is resumed.
 
     Attributes:
-        samples: (K, 5) what was felt; see :meth:`RefinedPath.samples`.
-        torch: Arc length of the torch's progress [m].
+        samples: (K, 5) touches; see :meth:`RefinedPath.samples`.
+        torch: Arc length at which the torch stopped [m].
         learned: Calibration from the sweep.
-        traced: (K, 3) how high the tool was, where there are later passes; see ``passes.Traced``.
-        number: Which pass was stopped, the root's is 0.
+        traced: (K, 3) heights of the tool for later passes; see ``passes.Traced``.
+        number: Number of the stopped pass; 0 is the root pass.
     """
 
     samples: Floats
@@ -33,11 +33,11 @@ class ResumePoint:
 
 @dataclass(frozen=True)
 class Start:
-    """Where a weld begins on its plan.
+    """Start of a weld on its plan.
 
     Attributes:
-        tip: Where the tip is set down, by arc length [m].
-        torch: Where the torch begins to weld, by arc length; 0 for where the seam begins [m].
+        tip: Arc length at which the tip is set down [m].
+        torch: Arc length at which the torch begins to weld [m]; 0 is the seam's start.
         angle: Angle of the tool to the seam [rad].
     """
 
@@ -48,7 +48,7 @@ class Start:
 
 @dataclass(frozen=True, eq=False)
 class WeldTask:
-    """A seam to follow.
+    """A seam to follow, with the prior and the settings.
 
     Attributes:
         plan: The planned seam.
@@ -56,7 +56,7 @@ class WeldTask:
         settings: Gains and limits.
         touch: Follow by touch; otherwise the plan alone, for comparison.
         before: State of the earlier weld that is resumed; None for a new weld.
-        given: Start of the weld, if it is not the plan's.
+        given: Start of the weld; None for the default start.
     """
 
     plan: Path
@@ -68,12 +68,12 @@ class WeldTask:
 
     @property
     def start(self) -> Start:
-        """Where it begins."""
+        """Start of the weld: ``given``, or the default one."""
         return Start(self.settings.set_down) if self.given is None else self.given
 
     @property
     def feels_ends(self) -> bool:
-        """Whether the seam has ends that the tip feels for."""
+        """Whether the tip searches for the seam's ends."""
         return self.settings.ends is not None and not self.plan.closed
 
     @property
@@ -101,5 +101,5 @@ class WeldTask:
 
     @property
     def margin(self) -> float:
-        """Largest distance of tip and torch beyond the plan [m]."""
+        """Largest distance by which the tip runs beyond the plan [m]."""
         return self.belief.distance + self.settings.ending + self.ends - self.plan.length

@@ -1,4 +1,4 @@
-"""Progress of tip and torch along the plan, and the deflection asked of the tip."""
+"""Progress of tip and torch along the plan, and the set point of the tip's deflection."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from flangeye_plugins.weld.following.task import WeldTask
 
 
 class Progress:
-    """Tip and torch by arc length of the plan.
+    """Positions of tip and torch, as arc lengths of the plan.
 
     Attributes:
         tip: Position of the tip once the arm has carried out all commands sent [m].
@@ -24,18 +24,18 @@ class Progress:
     def __init__(self, task: WeldTask) -> None:
         self._plan, self._distance = task.plan, task.belief.distance
         self._beside = task.belief.beside
-        # Nothing goes farther within a cycle than it does in a tenth of a second.
+        # The search window for the foot point: farther than tip or torch move in one cycle
         self._reach = task.settings.speed * 0.1
         self.tip = task.start.tip
         self.torch = self.coming = self.tip - self._distance
         self.place = self._plan.at(self.tip)
 
     def torch_at(self, pose: ToolPose) -> Floats:
-        """Return the torch's place P_t (2,) in the plane [m], equation (12)."""
+        """Return the torch's position P_t (2,) in the plane [m], by equation (12) of the paper."""
         return pose.position[:2] - self._distance * pose.direction
 
     def lateral(self, pose: ToolPose) -> float:
-        """Return the end point's offset to the left of a planned, seated tip [m]."""
+        """Return the end point's offset to the left of a tip seated in the planned seam [m]."""
         place = self.place
         return float((pose.position[:2] - place.point) @ place.normal) - self._beside
 
@@ -48,19 +48,19 @@ class Progress:
         self.torch = advance(self.torch_at(pose), self.torch, self._reach)
 
     def back(self, pose: ToolPose, coming: ToolPose) -> None:
-        """Go back to where the tool is, and will be."""
+        """Update progress by the tool's present and predicted pose while it moves backwards."""
         self.tip = self._plan.foot(coming.position[:2], self.tip)
         self.torch = self._plan.foot(self.torch_at(pose), self.torch)
         self.coming, self.place = self.torch, self._plan.at(self.tip)
 
 
 class Pressing:
-    """The deflection by which the tip is pressed against its wall, as the follower commands it.
+    """Set point of the tip's deflection against its wall.
 
     Attributes:
-        most: While the tip follows its wall [m].
-        wanted: At present [m].
-        side: The wall, 1 for the left one.
+        most: Set point while the tip follows its wall [m].
+        wanted: Present set point [m].
+        side: Side of the pressed wall: 1 left, -1 right.
     """
 
     def __init__(self, task: WeldTask) -> None:
@@ -71,32 +71,32 @@ class Pressing:
         self._lost = self._turned = self._firm = 0.0
 
     def learn(self, found: Learned, swept: float) -> None:
-        """Limit the deflection to what the sweep showed to be safe, ``swept`` at most [m]."""
+        """Limit ``most`` by the sweep, in which the tip stayed seated up to ``swept`` [m]."""
         if self._task.belief.two_walls:
             softly = max(swept / SOFTER, found.least)
             self.most = min(softly, self._task.settings.deflection)
 
     def ramp(self, phase: Phase, target: float, elapsed: float) -> None:
-        """Move the wanted deflection towards a target [m], within its rate limit."""
+        """Move the set point towards a target [m] within its rate limit."""
         settings = self._task.settings
         rate = settings.release if phase == "ending" else settings.ramp
         self.wanted += within(target - self.wanted, rate * elapsed)
 
     def feeler(self, variance: float) -> float:
-        """Return how far the tip reaches beyond a wall that has ended [m].
+        """Return the deflection with which a lost wall is sought [m].
 
-        The less is known of where the seam leads there, its ``variance`` [m^2], the farther, but
-        never so far that it would meet the end of the wall head on.
+        It grows with the standard deviation of the seam there (``variance`` [m^2]), but is limited
+        so that the tip does not run head-on into the next piece of wall.
         """
         probe = self.most if self._task.belief.two_walls else self._task.settings.probe
         return probe + min(BAND * math.sqrt(variance), probe)
 
     def played(self, phase: Phase, reversal: float) -> float:
-        """Return the side of the finger's play: 1 pressed, -1 released, and between.
+        """Return the state of the finger's play: 1 pressed side, -1 released side, or between.
 
         Args:
-            phase: What the follower is doing; at the end the tip is let go of.
-            reversal: Half the way over which a reversal goes through the play [m].
+            phase: Phase of the weld; the tip is released in "ending".
+            reversal: Half the travel that a reversal needs to pass through the play [m].
         """
         if phase != "ending":
             return 1.0
@@ -104,10 +104,10 @@ class Pressing:
 
     @property
     def ends(self) -> float:
-        """Arc length at which the wanted deflection starts to ramp down [m].
+        """Arc length at which the set point starts to ramp down [m].
 
-        The deflection reaches zero ``Following.ending`` before the end of the plan, or earlier
-        where the follower asks for more.
+        The deflection reaches zero ``Following.ending`` before the end of the plan, or earlier if
+        the seam's end is more uncertain than that.
         """
         task = self._task
         release = task.settings.speed * self.most / task.settings.release
@@ -116,15 +116,15 @@ class Pressing:
     def slack_for(self, tip: float, deflection: float, play: float) -> float:
         """Return the distance the tip has moved without contact with a wall [m].
 
-        The servo presses it again within a few millimetres where there is a wall. Where there is
-        none the finger shows its play, whatever is asked of it.
+        A wall is in contact if the deflection follows its set point. Without a wall the finger
+        shows only its play.
 
         Args:
-            tip: Its arc length [m].
-            deflection: As it is shown [m].
-            play: What a free tip shows [m].
+            tip: Arc length of the tip [m].
+            deflection: Measured deflection [m].
+            play: Deflection that a free tip shows [m].
         """
-        # A quarter of the way from there to what is wanted: in a curve a late arm presses less.
+        # A quarter of the way from the play to the set point: in a curve a late arm presses less.
         if deflection > play + (self.wanted - play) / 4.0:
             self._firm = tip
         return tip - self._firm
@@ -132,12 +132,12 @@ class Pressing:
     # --- where a wall has ended -------------------------------------------------------------------
 
     def lose(self, tip: float) -> None:
-        """Seek the wall that was lost with the tip at an arc length [m], on the other side."""
+        """Start to seek a lost wall, on the other side first; ``tip`` is an arc length [m]."""
         self._lost = tip
         self.turn_over(tip)
 
     def turn_over(self, tip: float) -> None:
-        """Press the other wall, where there is one."""
+        """Press towards the other side, in a joint with two walls."""
         self._turned = self._firm = tip
         if self._task.belief.two_walls:
             self.side, self.wanted = -self.side, -self.wanted
@@ -147,10 +147,10 @@ class Pressing:
         return tip - self._lost
 
     def since_turned(self, tip: float) -> float:
-        """Return how far the tip has moved since it was turned to this wall [m]."""
+        """Return how far the tip has moved since it last changed sides [m]."""
         return tip - self._turned
 
 
 def within(value: float, most: float) -> float:
-    """Clip a value to +-limit; NumPy's clip is ten times slower."""
+    """Clip a value to +-``most``; NumPy's clip is ten times slower."""
     return min(max(value, -most), most)

@@ -1,4 +1,4 @@
-"""The torch's error bound, and whether it may weld: the bound must stay below ``max_error``."""
+"""The torch's error bound, and the switching of the arc while it is below ``max_error``."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from flangeye_plugins.weld.following.task import WeldTask
 from flangeye_plugins.weld.following.tip import Pressing, Progress
 
 SHORT = 0.01
-"""A weld is done where no larger share of the planned seam was left out."""
+"""Largest share of the planned seam that a complete weld may leave out."""
 
 
 class Welding:
-    """The torch's error bound, and the arc, which it permits.
+    """Computes the torch's error bound and switches the arc accordingly.
 
     Attributes:
-        sigma: Standard deviation of the torch's place across the seam [m].
+        sigma: Standard deviation of the torch's position across the seam [m].
         bound: Upper bound of the torch's distance from the seam [m].
-        band: The same for 95 % of the seam [m].
-        arc_from: Where the arc begins, the torch being within ``max_error``; None before [m].
-        bias: What a look behind the torch says of errors that nothing else measures.
-        striking: The arc.
+        band: Bound of the distance that holds for 95 % of the seam [m].
+        arc_from: Arc length at which the arc was struck [m]; None before.
+        bias: Estimate of the torch's bias from the profile sensor behind it.
+        striking: Sequence of gas and arc.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class Welding:
         self._task, self._progress, self._pressing = task, progress, pressing
         self._sensing, self._seam, self._lead = sensing, seam, lead
         belief, settings = task.belief, task.settings
-        # What the arm is off by stays so, seen or not.
+        # The arm's error is not part of the bias: no profile can reduce it.
         prior = belief.fixed_variance(settings) - belief.arm_variance(settings)
         self.bias = Bias(prior, settings.distortion, belief.distance)
         self.striking = Striking(belief.arc)
@@ -51,16 +51,16 @@ class Welding:
         self._swept: float | None = None
 
     def begin(self, now: float) -> None:
-        """Begin at a time [s], from which the sweep's gain estimate ages."""
+        """Set the time of the sweep [s], from which the drift of the finger's gain counts."""
         self._swept = now
 
     # --- how well the torch is known --------------------------------------------------------------
 
     def estimate(self, pose: ToolPose) -> str:
-        """Update the torch's error bound for a tool pose; strike the arc where it permits.
+        """Update the torch's error bound for a tool pose; strike the arc once the bound permits.
 
         Returns:
-            Why the weld must not go on, or nothing.
+            The reason to stop the weld, or "".
         """
         progress, settings = self._progress, self._task.settings
         point, normal = self._seam.refined.frame(progress.torch)
@@ -73,7 +73,7 @@ class Welding:
         return "" if self._swept is None else self._light(pose.time, raw, variance)
 
     def variance(self, slant: float, pose: ToolPose) -> float:
-        """Return the variance of the torch's place across the seam [m^2].
+        """Return the variance of the torch's position across the seam [m^2].
 
         Args:
             slant: Sine of the angle between the tool and the path.
@@ -85,7 +85,8 @@ class Welding:
         # An error of the finger's gain displaces the tip by that share of its deflection
         gain = (learned.gain_sigma + settings.gain_drift * minutes) * self._pressing.most
         fixed = self._unseen() + (belief.along_sigma * slant) ** 2
-        # What the tip is off by is off for the torch too: all but what the tool has turned between.
+        # The tip's error shifts the felt seam and the torch by the same, except for the rotation of
+        # the tool between the tip's passing of a place and the torch's.
         turned_by = pose.angle - refined.angle(torch, pose.angle)
         ahead = min(learned.ahead_sigma, belief.tip_sigma) * math.sin(turned_by)
         tip = ahead**2 + (belief.tip_sigma * (1.0 - math.cos(turned_by))) ** 2
@@ -93,7 +94,7 @@ class Welding:
         return fixed + gain**2 + learned.systematic + tip + felt
 
     def _unseen(self) -> float:
-        """Return the variance of the torch that nothing ahead of it measures [m^2]."""
+        """Return the part of the torch's variance that touch ahead of it cannot reduce [m^2]."""
         belief, settings = self._task.belief, self._task.settings
         if not self.bias.looked:
             return belief.fixed_variance(settings)
@@ -103,7 +104,7 @@ class Welding:
         """Process the bead's offset from the joint, measured behind the torch.
 
         Returns:
-            Why the weld must not go on, or nothing.
+            The reason to stop the weld, or "".
         """
         belief = self._task.belief
         torch = self._trail.place_at(profile.time_ns * 1e-9)
@@ -137,19 +138,19 @@ class Welding:
 
     @property
     def ends(self) -> float:
-        """Arc length at which the torch ends [m]; from the felt end if there is one."""
+        """Arc length at which the torch stops [m], from the felt end if there is one."""
         felt = self._seam.end
         return self._task.ends if felt is None else felt + self._task.lengthwise
 
     @property
     def begins(self) -> float:
-        """Arc length at which the torch begins to weld [m]; from the felt start if there is one."""
+        """Arc length at which the torch begins to weld [m], from the felt start if there is one."""
         felt = self._seam.start
         return self._task.begins if felt is None else felt - self._task.lengthwise
 
     @property
     def complete(self) -> bool:
-        """Whether as much was welded as was planned."""
+        """Whether the whole planned seam was welded, up to 1 %."""
         return self.arc_from is not None and self.share >= 1.0 - SHORT
 
     def too_uncertain(self, bound: float, where: str = "") -> str:
@@ -160,18 +161,18 @@ class Welding:
         )
 
     def _light(self, now: float, raw: float, variance: float) -> str:
-        """Start the gas, then strike the arc where the bound allows it.
+        """Start the gas, then strike the arc once the bound permits.
 
         Args:
             now: The time [s].
-            raw: How far to the left of the refined path the torch is measured to be [m].
-            variance: Variance of the torch's place [m^2].
+            raw: Measured offset of the torch to the left of the refined path [m].
+            variance: Variance of the torch's position [m^2].
 
         Returns:
-            Why the weld must not go on, or nothing.
+            The reason to stop the weld, or "".
         """
         task, torch = self._task, self._progress.torch
-        # Gas has flowed for its time when the torch comes to where it is to weld
+        # The gas pre-flow is over when the torch reaches the start of the weld
         if self.begins - torch <= task.belief.arc[0] * task.settings.speed:
             self.striking.gas(now)
         if not self.begins <= torch <= self.ends:
@@ -189,10 +190,10 @@ class Welding:
         return ""
 
     def _ahead(self, variance: float) -> tuple[float, float]:
-        """Return where the felt seam is least certain, and the torch's bound there [m].
+        """Return the least certain place ahead on the felt seam, and the torch's bound there [m].
 
         Args:
-            variance: Variance of the torch's place where it is now [m^2].
+            variance: Variance of the torch's position at present [m^2].
         """
         refined, torch = self._seam.refined, self._progress.torch
         place, felt = refined.worst(torch, self.ends)
@@ -200,10 +201,10 @@ class Welding:
         return place, self._task.settings.sigmas * math.sqrt(max(variance, 0.0))
 
     def _too_far(self, place: float, bound: float) -> str:
-        """Return why a torch that may be too far from the seam must not go on, or nothing.
+        """Return the reason to stop a torch whose bound is too large, or "" to go on.
 
         Args:
-            place: Where the bound does not hold, by arc length [m].
+            place: Arc length at which the bound is too large [m].
             bound: The torch's bound there [m].
         """
         task, torch = self._task, self._progress.torch

@@ -1,7 +1,7 @@
-"""Estimate a finger's rest pose, gain, noise and stiffness from readings. Arrays only.
+"""Estimate a finger's rest pose, gain, noise and stiffness from readings of the tag.
 
-The tip is held in a punch mark while the robot moves a little: then it is displaced, seen from the
-tool, by exactly what the robot moved, the other way.
+A punch mark holds the tip while the robot makes small moves. Relative to the tool, the tip is then
+displaced by exactly the opposite of the robot's motion.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from flangeye_plugins.weld.touch.tag_observation import TagReading
 
 @dataclass(frozen=True, eq=False)
 class Held:
-    """One reading with the tip held in its mark.
+    """One reading of the tag with the tip held in the punch mark.
 
     Attributes:
-        reading: The tag.
-        displacement: (3,) of the tip from where it would rest, in the tool's axes [m].
-        force: (3,) on the finger, in the tool's axes [N], if it is measured.
+        reading: Pose of the tag.
+        displacement: (3,) displacement of the tip from its rest position, in the tool's axes [m].
+        force: (3,) force on the finger in the tool's axes [N]; None if not measured.
     """
 
     reading: TagReading
@@ -35,15 +35,15 @@ class Held:
 
 
 def calibrate(rest: Sequence[TagReading], held: Sequence[Held], source: str) -> Calibration:
-    """Return the least-squares calibration of the readings.
+    """Return the finger's calibration, fitted to readings by least squares.
 
     Args:
         rest: Readings of the undeformed finger.
-        held: Readings with the tip held, displaced along all three axes.
-        source: Text: when and how it was measured.
+        held: Readings with the tip held and displaced along all three axes.
+        source: Text for the file: when and how it was measured.
 
     Raises:
-        StageError: Too few readings, an axis that was not moved along, or a tip that slid.
+        StageError: There are too few readings, no motion along one axis, or the tip slid.
     """
     if min(len(rest), len(held)) < 10:
         raise StageError(
@@ -91,14 +91,14 @@ def _mean_rotation(vectors: Sequence[Floats]) -> Floats:
 
 
 def _stiffness(held: Sequence[Held]) -> tuple[SI | None, SI | None]:
-    """Return the stiffness across and along the finger, where the force was measured."""
+    """Return the stiffness across and along the finger [N/m]; None without measured forces."""
     known = [h for h in held if h.force is not None]
     if not known:
         return None, None
-    # What the robot holds against the spring: force on the finger is opposite to its displacement.
+    # The finger is a spring: the force on it is opposite to its displacement.
     force = np.array([h.force for h in known])
     tip = np.array([h.displacement for h in known])
-    if np.abs(force).max() < 0.5:  # newtons: what force sensors are off by
+    if np.abs(force).max() < 0.5:  # [N]: smaller forces are within a force sensor's error
         return None, None
     slopes = -np.sum((force - force.mean(0)) * (tip - tip.mean(0)), 0) / np.sum(
         (tip - tip.mean(0)) ** 2, 0

@@ -1,8 +1,8 @@
-"""Pivot calibration: a tool point in the flange from poses with the point at one place.
+"""Pivot calibration: a tool point in the flange, from poses that hold the point at one mark.
 
-With the point ``p`` in the flange and the mark ``q`` in base, every pose gives ``R p + t = q``; the
-differences to their mean are free of ``q``: ``(R_i - mean R) p = mean t - t_i``. A point along an
-axis about which alone the tool was turned stays unknown, and is refused.
+With the point ``p`` in the flange and the mark ``q`` in base, every pose gives ``R p + t = q``.
+Subtracting the mean eliminates ``q``: ``(R_i - mean R) p = mean t - t_i``. If the tool was rotated
+about one axis only, the position along that axis is not observable, and the poses are refused.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from flangeye.errors import StageError
 from flangeye.types import Floats
 
 TILTED = np.radians(12.0)
-"""So far the tool must have been turned, as a root of the mean of squares, about two axes."""
+"""Smallest rms rotation of the tool about each of two axes [rad]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,10 +24,10 @@ class Pivot:
     """A point of the tool.
 
     Attributes:
-        point: (3,) tool point in the flange [m].
-        covariance: (3, 3) of the point [m^2].
-        mark: (3,) the fixed place, in base [m].
-        rms: Residual along one axis, rms [m].
+        point: (3,) the tool point in the flange [m].
+        covariance: (3, 3) covariance of the point [m^2].
+        mark: (3,) the mark in base [m].
+        rms: Rms residual per axis [m].
     """
 
     point: Floats
@@ -37,16 +37,16 @@ class Pivot:
 
 
 def pivot(what: str, poses: Sequence[Floats], displaced: Sequence[Floats] | None = None) -> Pivot:
-    """Return the point that is fixed in all poses (least squares), with its covariance.
+    """Return the least-squares tool point that stays at one place in all poses.
 
     Args:
-        what: Shown in messages and reports.
-        poses: (4, 4) of the flange in base.
-        displaced: (3,) for each pose: how far the point was from its rest then, in the flange's
-            axes [m]; nothing for a rigid one.
+        what: Name of the point in messages.
+        poses: (4, 4) poses of the flange in base.
+        displaced: (3,) displacement of the point from its rest position at each pose, in the
+            flange's axes [m]; None for a rigid tool.
 
     Raises:
-        StageError: Too few poses, a motion that is missing, or a point that did not stay.
+        StageError: There are too few poses, too little rotation, or the point moved.
     """
     # Six unknowns, three equations a pose: nine are left to show what does not fit
     if len(poses) < 5:
@@ -73,7 +73,7 @@ def pivot(what: str, poses: Sequence[Floats], displaced: Sequence[Floats] | None
 
 
 def _require_turned(what: str, rows: Floats) -> None:
-    """Refuse poses that leave a direction of the point unknown; say which motion is missing."""
+    """Refuse poses from which a direction of the point is not observable."""
     # Turned about v by a, the columns across v move by about a, and the one along v does not.
     information = np.einsum("kji,kjl->il", rows, rows) / len(rows)
     values, vectors = np.linalg.eigh(information)

@@ -1,4 +1,4 @@
-"""The pose of the finger's tag in one image, with its uncertainty."""
+"""Detects the finger's tag in an image and estimates its pose with covariance."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from flangeye.models.finger import Finger, FingerGeometry
 from flangeye.types import Floats, Image
 
 TAG_MARGIN = 16
-"""Around the tag [px]: its white border, and how far it moves from image to image."""
+"""Margin around the tag [px] for its white border and its motion between images."""
 
 
 class ImageRegion(NamedTuple):
-    """A part of an image.
+    """A crop of an image.
 
     Attributes:
-        image: Its pixels, with a camera matrix of its own.
-        corner: Column and row of its first pixel in the whole image.
+        image: The crop's pixels, with its own camera matrix.
+        corner: Column and row of the crop's first pixel in the whole image.
     """
 
     image: Image
@@ -30,7 +30,10 @@ class ImageRegion(NamedTuple):
 
 
 class RegionOfInterest:
-    """Follows the tag: a piece is read, and logged, in less than half the time of the whole."""
+    """Tracks the tag from image to image, so that only a crop is searched and logged.
+
+    A crop takes less than half the time of the whole image.
+    """
 
     def __init__(self) -> None:
         self._corners: Floats | None = None
@@ -44,18 +47,18 @@ class RegionOfInterest:
         yield ImageRegion(image, (0, 0))
 
     def follow(self, piece: ImageRegion, corners: Floats | None) -> None:
-        """Search next around corners (4, 2) in a crop [px], or everywhere."""
+        """Set the next search area around corners (4, 2) in a crop [px]; None: whole image."""
         self._corners = None if corners is None else corners + np.array(piece.corner)
 
 
 def cut(image: Image, start: tuple[int, int], end: tuple[int, int]) -> ImageRegion:
-    """Return the piece of an image from one (column, row) to before another."""
+    """Return the crop of an image from one (column, row) up to, but excluding, another."""
     pixels = np.ascontiguousarray(image.pixels[start[1] : end[1], start[0] : end[0]])
     return ImageRegion(Image(pixels, shifted(image.camera_matrix, start), image.distortion), start)
 
 
 def shifted(matrix: Floats, corner: tuple[int, int]) -> Floats:
-    """Return the camera matrix (3, 3) of a piece that begins at a corner (column, row)."""
+    """Return the camera matrix (3, 3) of a crop whose first pixel is ``corner`` (column, row)."""
     moved = np.array(matrix, dtype=np.float64)
     moved[:2, 2] -= corner
     return moved
@@ -63,14 +66,14 @@ def shifted(matrix: Floats, corner: tuple[int, int]) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class TagReading:
-    """The tag in the camera.
+    """Pose of the tag in the camera's frame.
 
     Attributes:
-        translation: (3,) of its middle [m].
+        translation: (3,) position of the tag's centre [m].
         rotation: (3,) rotation vector [rad].
-        covariance: (3, 3) of the translation [m^2].
-        confidence: 1 for corners that fit a square exactly, 0 where they are off by a pixel.
-        corners: (4, 2) of the tag in the image [px].
+        covariance: (3, 3) covariance of the translation [m^2].
+        confidence: 1 if the corners fit a square exactly, 0 if they are off by one pixel.
+        corners: (4, 2) corners of the tag in the image [px].
     """
 
     translation: Floats
@@ -81,13 +84,13 @@ class TagReading:
 
 
 class TagDetector:
-    """Finds one tag, from image to image."""
+    """Detects the finger's tag in successive images."""
 
     def __init__(self, finger: Finger) -> None:
         """Prepare for the finger's tag.
 
         Raises:
-            StageError: OpenCV knows no such dictionary.
+            StageError: OpenCV has no such dictionary, or the dictionary no such tag.
         """
         import cv2
 
@@ -148,7 +151,11 @@ class TagDetector:
         )
 
     def _start(self, corners: Floats, matrix: Floats, distortion: Floats) -> tuple[Any, Any]:
-        """Return a pose to refine: the last one, so that a square seen flat does not flip over."""
+        """Return a start pose for refinement.
+
+        The last pose is used if there is one: a planar square has two solutions, and this picks the
+        right one.
+        """
         import cv2
 
         if self._last is not None:
@@ -163,7 +170,7 @@ def dictionary_of(finger: FingerGeometry) -> Any:
     """Return OpenCV's dictionary of the finger's tag.
 
     Raises:
-        StageError: There is none of this name, or it has no tag of this number.
+        StageError: OpenCV has no dictionary of this name, or it has no tag of this number.
     """
     import cv2
 

@@ -1,4 +1,4 @@
-"""From the tag's pose to the tip's displacement, in the tool's axes and in the base's."""
+"""Converts the tag's pose to the tip's displacement, in the tool's axes or in the base's."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from flangeye_plugins.weld.touch.tag_observation import TagReading
 
 @dataclass(frozen=True, eq=False)
 class TipDisplacement:
-    """How the finger is deformed in one image, in the tool's axes.
+    """Deformation of the finger in one image, in the tool's axes.
 
     Attributes:
         time_ns: Middle of the exposure, on the robot's clock.
-        displacement: (3,) of the tip from where it rests [m].
-        rotation: (3,) rotation vector of the tag, from how it rests [rad].
-        covariance: (3, 3) of the displacement [m^2].
+        displacement: (3,) displacement of the tip from its rest position [m].
+        rotation: (3,) rotation vector of the tag from its rest orientation [rad].
+        covariance: (3, 3) covariance of the displacement [m^2].
         confidence: Confidence of the tag's detection, 0 to 1.
     """
 
@@ -32,7 +32,7 @@ class TipDisplacement:
     confidence: float
 
     def turned_by(self, base_R_tool: Floats) -> TipDisplacement:
-        """Return the same in the base's axes."""
+        """Return the deformation in the base's axes."""
         return TipDisplacement(
             self.time_ns,
             base_R_tool @ self.displacement,
@@ -46,10 +46,10 @@ class Interpreter:
     """Converts the tag's pose to the tip's displacement, by the finger's calibration."""
 
     def __init__(self, finger: Finger) -> None:
-        """Take the finger's calibration.
+        """Prepare the conversion for a calibrated finger.
 
         Raises:
-            StageError: The finger has none yet.
+            StageError: The finger is not calibrated.
         """
         if finger.calibration is None:
             raise StageError(
@@ -63,7 +63,7 @@ class Interpreter:
         self._tool_R_camera = nearest_rotation(self._gain)
 
     def feel(self, reading: TagReading, time_ns: int) -> TipDisplacement:
-        """Return the tip's displacement, from the tag's pose."""
+        """Return the tip's displacement for a reading of the tag."""
         turn = rotation_log(rotation_exp(reading.rotation) @ self._upright.T)
         return TipDisplacement(
             time_ns,
