@@ -1,1 +1,1 @@
-"""Find a rigid body of known shape in a scan. Arrays only."""
+"""Find a rigid body of known shape in a scan."""

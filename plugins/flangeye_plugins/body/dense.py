@@ -1,4 +1,10 @@
-"""A body laid on all points of a scan around it, and how well that is known."""
+"""Fit a body's pose to all scan points around it, with covariance.
+
+The fit minimises distances along the surface normals, with robust weights. Besides the pose it
+estimates two systematic effects of a scanner: the width lost at edges (six values, by the edge's
+direction) and the rounding of curved surfaces. The body's scale is estimated by one step at the
+end. The covariance is a sandwich estimate: bread times meat times bread.
+"""
 
 from __future__ import annotations
 
@@ -15,28 +21,30 @@ from flangeye_plugins.body.shape import GRAZING, OrientedPoints, Shape
 from flangeye_plugins.body.view import spacing_of, view_of
 
 FEWEST = 60
-"""Points that are needed."""
+"""Smallest number of points for a fit."""
 
 
 FACINGS = 6
-"""Ways that an edge may look, each with a loss of its own."""
+"""Number of edge directions (-x, +x, -y, ...), each with its own lost width."""
 
 
 UNKNOWN = 1.0
-"""Standard deviation of what the scan does not show at all: of a turn [rad], and of a shift in
-sizes of the body. A turn that may be any has 1.8, and no estimator is linear that far."""
+"""Prior standard deviation of rotation [rad], and of translation and scale in sizes of the body. A
+completely unknown rotation has 1.8, but the linearisation does not reach that far.
+"""
 
 
 class _Equations(NamedTuple):
     """Linearised residuals.
 
-    Columns: turn [rad], shift in sizes, loss at edges by facing, rounding, and the body's scale.
+    The 14 columns are rotation [rad], translation [sizes of the body], lost width by direction of
+    the edge [m], rounding, and the body's scale.
 
     Attributes:
-        jacobian: (N, 14).
-        residual: (N,) [m].
-        place: (N, 3) on the body [m].
-        facing: (N, 3) which way the face looks there, on the body.
+        jacobian: (N, 14) derivatives of the body's surface along the residual.
+        residual: (N,) distances of scan points from the body [m].
+        place: (N, 3) points on the body, in its frame [m].
+        facing: (N, 3) directions of the residuals, in the body's frame.
     """
 
     jacobian: Floats
@@ -47,26 +55,26 @@ class _Equations(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class BodyFit:
-    """A fitted pose.
+    """A fitted pose of a body, with what its covariance needs.
 
     Attributes:
         pose: (4, 4) ``camera_T_body``.
         noise: Robust standard deviation of the points from the surface [m].
-        points: How many points of surfaces count.
-        edges: How many points of edges do.
-        size: Size of the body [m].
-        centre: (3,) of the body in ``camera`` [m].
-        bread: (14, 14) change of what is estimated by the scores: of the pose and what a scanner
-            does to it at the scale of the mesh, and in the last row that of the scale.
-        meat: (14, 14) covariance of the scores by the scan's noise, and the prior's information.
-        lost: (6,) width that the scan seems to lose at ends of faces, by the way they look: -x, +x,
-            -y, ... of the body [m]; negative where its edge is inside.
-        odd: How unlike a scanner's that and the rounding are: squared, over their prior's
-            covariance, with seven degrees of freedom.
-        patches: (P, 3) places on the body that err together, in ``camera`` [m].
-        pulls: (P, 14, 3) derivative of the scores by how far each of them is off [1/m].
-        oversize: By which share the scan shows the body larger than its mesh: one step, which falls
-            short where much of the scan is far off the mesh and counts less.
+        points: Number of surface points used.
+        edges: Number of edge points used.
+        size: Diagonal of the body's bounding box [m].
+        centre: (3,) centre of the body in ``camera`` [m].
+        bread: (14, 14) derivative of the estimates by the scores. Pose and scanner effects are
+            estimated at the mesh's scale; the last row is the scale's.
+        meat: (14, 14) covariance of the scores from the scan's noise, plus the prior's information.
+        lost: (6,) displacement of the scan's edges, by direction -x, +x, -y, ... of the body [m];
+            negative where they lie inside the body's edges.
+        odd: Squared Mahalanobis distance of ``lost`` and the rounding from their prior (7 degrees
+            of freedom); large values are implausible for a scanner.
+        patches: (P, 3) centres of patches whose errors are correlated, in ``camera`` [m].
+        pulls: (P, 14, 3) derivative of the scores by a displacement of each patch [1/m].
+        oversize: Relative excess of the body's size over its mesh's; from one step, so it is too
+            small where much of the scan is far off the mesh and has little weight.
     """
 
     pose: Floats
@@ -84,10 +92,14 @@ class BodyFit:
     oversize: float
 
     def weakest(self, freedoms: int) -> float:
-        """Return the standard deviation of the least certain of so many directions and the scale.
+        """Return the standard deviation of the least certain direction of pose or scale.
 
-        In sizes of the body, or radians, of the points alone: of the scale, how far it moves the
-        body's ends. A corner holds a pose, and any size.
+        Only the scan's noise counts. Units are sizes of the body, or radians; the scale counts by
+        the displacement of the body's ends. The scale is included because a corner alone fixes a
+        pose for a body of any size.
+
+        Args:
+            freedoms: Number of the pose's directions that the body's shape determines.
         """
         inner = self.bread @ self.meat @ self.bread.T
         pose = np.linalg.eigvalsh(inner[:6, :6])[freedoms - 1]
@@ -98,33 +110,34 @@ class BodyFit:
         """Degrees of freedom of the pose, of six, that the scan determines."""
         turn = np.linalg.eigvalsh(self.bread[:3, :3])
         shift = np.linalg.eigvalsh(self.bread[3:6, 3:6])
-        # A direction whose deviation is a smaller share of that counts as seen
+        # A direction counts as determined if its deviation is below this share of the prior's
         return int((np.r_[turn, shift] < (0.05 * UNKNOWN) ** 2).sum())
 
     def covariance(self, model_error: float, distortion: Callable[[Floats], Floats]) -> Floats:
-        """Return (6, 6) covariance, order (rotation, translation), left perturbation in ``camera``.
+        """Return the (6, 6) covariance (rotation, translation), left perturbation in ``camera``.
 
         Args:
-            model_error: Standard deviation of the surface against the CAD, along each axis [m]; a
-                smooth field over the body.
-            distortion: Scanner distortion, (P, 3, K): how each of K independent weights of unit
-                variance moves (P, 3) points [m].
+            model_error: Standard deviation of the real surface from the CAD along each axis [m], as
+                a smooth field over the body.
+            distortion: Scanner distortion: maps points (P, 3) to their displacements (P, 3, K) by
+                each of K independent unit-variance weights [m].
         """
         about_centre = self._spread(model_error, distortion)[:6, :6]
-        # The turn is about the centre, and the translation is the origin's.
+        # The fit rotates about the body's centre; the result's translation is that of its origin.
         carried = np.diag(np.repeat([1.0, self.size], 3))
         carried[3:, :3] = -hat(self.pose[:3, 3] - self.centre)
         moved = carried @ about_centre @ carried.T
         return np.asarray((moved + moved.T) / 2)
 
     def unsure(self, model_error: float, distortion: Callable[[Floats], Floats]) -> float:
-        """Return the standard deviation of ``oversize``; arguments as of ``covariance``."""
+        """Return the standard deviation of ``oversize``; arguments as for ``covariance``."""
         return float(np.sqrt(self._spread(model_error, distortion)[-1, -1]))
 
     def _spread(self, model_error: float, distortion: Callable[[Floats], Floats]) -> Floats:
-        """Return (14, 14) covariance of all that is estimated, the turn about the centre."""
+        """Return the (14, 14) covariance of all estimates; rotation is about the body's centre."""
         apart = np.linalg.norm(self.patches[:, None] - self.patches, axis=2)
-        # A body's surface is off its CAD alike over a quarter of its size: about a face
+        # The surface's deviation from the CAD is correlated over about a face: a quarter of the
+        # size
         alike = np.exp(-0.5 * (apart / ((1 / 4) * self.size)) ** 2)
         inner = self.meat + model_error**2 * np.einsum(
             "pai,pq,qbi->ab", self.pulls, alike, self.pulls, optimize=True
@@ -134,13 +147,13 @@ class BodyFit:
 
 
 def fitted(points: Singles, shape: Shape, start: Floats, most: int = 12_000) -> BodyFit | None:
-    """Return a body laid on (N, 3) points, from a pose nearby; None where too few are on it.
+    """Return a body's pose fitted to scan points (N, 3); None if too few points are on it.
 
     Args:
-        points: Around it, all finite [m].
+        points: Points around the body, all finite [m].
         shape: The body.
-        start: (4, 4) ``camera_T_body``.
-        most: Points that are used at most.
+        start: (4, 4) start pose ``camera_T_body``, close to the solution.
+        most: Largest number of points to use.
     """
     if len(points) < FEWEST:
         return None
@@ -150,7 +163,7 @@ def fitted(points: Singles, shape: Shape, start: Floats, most: int = 12_000) -> 
 
 
 class _Settled(NamedTuple):
-    """A body at rest on a scan."""
+    """Converged state of the fit."""
 
     pose: Floats
     left: _Equations
@@ -163,15 +176,15 @@ class _Settled(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Laying:
-    """A scan that a body is laid on.
+    """A scan, prepared for fitting a body to it.
 
     Attributes:
-        points: (N, 3) that are used [m].
+        points: (N, 3) points that are used [m].
         edges: Edges of the scan.
         shape: The body.
-        spacing: Between points at unit depth.
+        spacing: Distance between neighbouring points at unit depth.
         raster: Standard deviation of a scan's end across its edge [m].
-        usual, prior: (7,) and (7, 7) mean and information of what the scanner does at edges.
+        usual, prior: (7,) mean and (7, 7) information of the prior of lost widths and rounding.
     """
 
     points: Floats
@@ -187,20 +200,19 @@ class _Laying:
         some, spacing = points[:: 1 + len(points) // most].astype(np.float64), spacing_of(points)
         apart = spacing * float(np.median(some[:, 2]))
         edges, cell = _scan_edges(points, shape.size)
-        # Mean and standard deviation of the width that a scanner loses along edges, in distances
-        # between points, before any scan. Filters of scanners reach over a few points.
+        # Prior mean and standard deviation of the width lost at edges, in point distances: the
+        # filters of scanners reach over a few points
         lost = 1.0
         usual = np.r_[np.full(FACINGS, -cell / 2 - lost * apart), 0.0]
-        # How much a scanner rounds, see `_rounding`; before any scan
-        # Standard deviation of where an edge lies between two points, in their distance. All points
-        # of a straight edge along the raster share it.
+        # Standard deviation of an edge's position between two points, in their distance (uniform).
+        # All points of a straight edge along the raster share it.
         raster = 1 / 12**0.5
         spread = np.diag(np.r_[np.full(FACINGS, (raster * apart) ** 2), 10.0**2])
         spread[:FACINGS, :FACINGS] += (lost * apart) ** 2
         return cls(some, edges, shape, spacing, raster * cell, usual, np.linalg.inv(spread))
 
     def settled(self, pose: Floats) -> _Settled | None:
-        """Return the body moved until it rests; None where too few points are on it."""
+        """Return the converged fit from a start pose; None if too few points are on the body."""
         shape, scanner = self.shape, self.usual
         # As a share of the size, at first
         reach = beside = 0.06 * shape.size
@@ -208,21 +220,20 @@ class _Laying:
         prior = np.zeros((6 + len(scanner),) * 2)
         prior[:6, :6] = UNKNOWN**-2.0 * np.eye(6)
         prior[6:, 6:] = self.prior
-        # The body is moved a dozen times at most
-        # How far off points count at last, in deviations.
+        # Final cut-off of residuals, in standard deviations
         least_reach = 4.0
         for _ in range(12):
             surface = _surface(self.points, shape, pose, reach, rounding, scanner[-1])
-            # Near its rest a body shows the same ends
+            # Close to convergence the same ends stay visible, so they are no longer recomputed
             if not rounding.any():
                 model = _visible_ends(shape, pose, self.spacing)
             ends = _ends(self.edges, model, shape, pose, scanner[:-1], beside)
             if len(surface.residual) < FEWEST:
                 return None
             noise = _deviation(surface.residual)
-            # Of so few none counts
+            # So few edge points are not used at all
             few = len(ends.residual) < 9
-            # By the raster: what ends are off where the body is not there yet is no noise.
+            # Weighted by the raster, not by the residuals: before convergence these are not noise
             spread = np.inf if few else max(self.raster, noise)
             equations, weights = _weighted(surface, ends, noise, spread)
             jacobian = equations.jacobian[:, :-1]
@@ -232,7 +243,7 @@ class _Laying:
             step = np.asarray(np.linalg.solve(information, gradient), np.float64)
             pose, scanner = _moved(pose, shape, step), scanner + step[6:]
             if reach < 2 * least_reach * noise:
-                # [rad] and sizes: nothing moves any more
+                # Converged: step in [rad] and sizes of the body
                 if rounding.any() and np.abs(step[:6]).max() < 1e-5:
                     break
                 rounding = _rounding(self.points, shape, pose, self.spacing)
@@ -243,7 +254,7 @@ class _Laying:
         return _Settled(pose, left, weights, information, len(surface.residual), noise, scanner)
 
     def fit_of(self, rest: _Settled) -> BodyFit:
-        """Return it with all that its covariance needs."""
+        """Return the result of a converged fit, with the terms of its covariance."""
         shape, pose = self.shape, rest.pose
         centre = pose[:3, :3] @ shape.centre + pose[:3, 3]
         bread = _bread(rest)
@@ -261,12 +272,12 @@ class _Laying:
 
 
 def _bread(rest: _Settled) -> Floats:
-    """Return (14, 14) that takes scores to pose and scanner, at the mesh's scale, and to it."""
+    """Return the derivative (14, 14) of the estimates by the scores; see :class:`BodyFit`."""
     jacobian = rest.left.jacobian
     along = (jacobian.T * rest.weights) @ jacobian[:, -1]
     bread = np.zeros(2 * jacobian.shape[1:])
     bread[:-1, :-1] = np.linalg.inv(rest.information)
-    # What the scale does to the residuals, less what the others do alike
+    # The scale's own effect on the residuals, with the part explained by the others removed
     bread[-1] = np.r_[-bread[:-1, :-1] @ along[:-1], 1.0]
     bread[-1] /= bread[-1] @ along + UNKNOWN**-2.0
     return bread
@@ -275,41 +286,47 @@ def _bread(rest: _Settled) -> Floats:
 def _surface(
     points: Floats, shape: Shape, pose: Floats, reach: float, rounding: Floats, rounded: float
 ) -> _Equations:
-    """Return how far points are off the body along the scanner's rays, where those meet it."""
+    """Return the equations of scan points whose rays meet the body.
+
+    A residual is the distance along the ray, projected on the surface normal, corrected for the
+    scanner's rounding.
+    """
     rotation, origin = pose[:3, :3], -pose[:3, 3] @ pose[:3, :3]
     rays = points @ rotation
     met = shape.meet(origin, rays)
     length = np.linalg.norm(rays, axis=1)
     facing = -np.einsum("ni,ni->n", met.normals, rays) / length
     bent = rounding * length * facing
-    away = (1 - met.depth) * length * facing - rounded * bent  # along the normal, behind: positive
+    away = (
+        1 - met.depth
+    ) * length * facing - rounded * bent  # along the normal; behind is positive
     at = np.flatnonzero(np.isfinite(met.depth) & (facing > GRAZING))
-    at = at[np.abs(away[at]) < reach]  # none beside a step, where it is not a number
+    at = at[np.abs(away[at]) < reach]  # excludes NaN, next to a step of depth
     place = origin + met.depth[at, None] * rays[at]
     errors = np.column_stack([np.zeros((len(at), FACINGS)), -bent[at]])
     return _equations(place, met.normals[at], -away[at], pose, shape, errors)
 
 
 def _rounding(points: Floats, shape: Shape, pose: Floats, spacing: float) -> Floats:
-    """Return (N,) by which share of its depth each point lies before the mean of those around it.
+    """Return the second difference of depth at each ray (N,), relative to the ray's depth.
 
-    A scanner averages over neighbouring rays: where the surface bends, points are off by a multiple
-    of this, which depends on the scanner's filter. NaN beside a step, where it averages over what
-    is left; of a body that is nothing but edges, zero.
+    A scanner averages over neighbouring rays, so on curved surfaces its points are off by a
+    multiple of this; the factor depends on the scanner's filter and is estimated. NaN next to a
+    step of depth; all zero for a body that is mostly edges.
     """
     rotation, origin = pose[:3, :3], -pose[:3, 3] @ pose[:3, :3]
     own = shape.meet(origin, points @ rotation).depth
     total = np.zeros(len(points))
-    sides = ((1, 0), (-1, 0), (0, 1), (0, -1))  # neighbours of a ray
-    # Distances between points within which a scanner averages most: published scans of planes
-    # correlate by 0.7 so far apart.
+    sides = ((1, 0), (-1, 0), (0, 1), (0, -1))  # directions to neighbouring rays
+    # Typical reach of a scanner's averaging, in point distances: in published scans of planes,
+    # points this far apart correlate by 0.7
     reach = 2
     for side in sides:
         beside = points + reach * spacing * np.array([*side, 0.0]) * points[:, 2:]
         with np.errstate(invalid="ignore"):
             off = shape.meet(origin, beside @ rotation).depth - own
-            # Neighbouring rays meet one surface where their depths differ by less than so many of
-            # the distances between them: seen at less than 79 degrees to its normal.
+            # Neighbouring rays meet the same surface if their depths differ by less than 5 times
+            # their distance: an incidence below 79 degrees
             total += np.where(np.abs(off) < 5.0 * reach * spacing, off, np.nan)
     few = np.isfinite(total).sum() < FEWEST
     return np.zeros(len(points)) if few else total / len(sides)
@@ -323,9 +340,10 @@ def _ends(
     lost: Floats,
     reach: float,
 ) -> _Equations:
-    """Return how far ends of the scan's surfaces are off those of a body's faces that are seen.
+    """Return the equations of the scan's edges, matched to the visible ends of the body's faces.
 
-    Across the ray, as a scanner sees them: on a face askew a point lost is a longer way.
+    Offsets are measured perpendicular to the ray, because the scanner loses a fixed number of
+    pixels, which is a longer distance on an oblique face.
     """
     from scipy.spatial import cKDTree
 
@@ -357,14 +375,14 @@ def _ends(
 
 
 def _visible_ends(shape: Shape, pose: Floats, spacing: float) -> OrientedPoints:
-    """Return the ends of faces that end before the background, as the scanner sees them."""
+    """Return the visible ends of the body's faces behind which the scanner sees background."""
     ends, origin = shape.outline, -pose[:3, 3] @ pose[:3, :3]
     if not len(ends.points):
         return ends
     far = np.linalg.norm(origin - ends.points, axis=1)
     facing = np.einsum("ni,ni->n", ends.normals, origin - ends.points)
     seen = facing > GRAZING * far
-    # Right beyond its end a chamfer goes on, and a little farther a fillet.
+    # A chamfer continues right beyond a face's end, a fillet a little farther: test both distances
     for share in (2 * spacing, 0.02 * shape.size / far):
         apart = (share * far)[:, None] * ends.directions
         on, off = (ends.points + side * apart - origin for side in (-1, 1))
@@ -374,8 +392,8 @@ def _visible_ends(shape: Shape, pose: Floats, spacing: float) -> OrientedPoints:
 
 
 def _scan_edges(points: Singles, size: float) -> tuple[OrientedPoints, float]:
-    """Return where the scan's surfaces end, finely, and the width of the cells [m]."""
-    # Width of the cells that edges are found in, as a share of the size, at least
+    """Return the edges of the scan's surfaces, and the cell width of their image [m]."""
+    # Smallest cell width of the image, as a share of the body's size
     view = view_of(points, (1 / 200) * size)
     found, directions = view.ends
     found = found & np.isfinite(view.normals[..., 0])
@@ -391,9 +409,9 @@ def _equations(
     shape: Shape,
     errors: Floats,
 ) -> _Equations:
-    """Return the equations of points (N, 3) on the body that are off along (N, 3) of it.
+    """Return the equations of residuals at points ``place`` (N, 3) along ``along`` (N, 3).
 
-    The last (N, 7) are what losses at edges and rounding do to each.
+    ``errors`` (N, 7) are the derivatives by lost widths and rounding.
     """
     rotation = pose[:3, :3]
     arms = (place - shape.centre) @ rotation.T
@@ -406,10 +424,10 @@ def _equations(
 def _weighted(
     surface: _Equations, ends: _Equations, noise: float, spread: float
 ) -> tuple[_Equations, Floats]:
-    """Return all equations with weights (Geman and McClure) over their variances."""
+    """Return all equations, and their Geman-McClure weights over their variances."""
     parts = []
     for part, sigma in ((surface, noise), (ends, spread)):
-        # 94 % as efficient as least squares on normal noise; what is far off pulls at nothing
+        # This scale is 94 % efficient for normal noise; the influence of outliers goes to zero
         scale = 3.6 * sigma
         parts.append(1 / (sigma**2 * (1 + (part.residual / scale) ** 2) ** 2))
     joined = _Equations(*(np.concatenate(both) for both in zip(surface, ends, strict=True)))
@@ -417,10 +435,11 @@ def _weighted(
 
 
 def _noise(equations: _Equations, weights: Floats, cluster: Indices, surface: int) -> Floats:
-    """Return the (14, 14) covariance of the scores by noise that points of a patch share.
+    """Return the (14, 14) covariance of the scores from noise that is correlated within patches.
 
-    How many times as much as that of independent ones is one number for surfaces and one for edges:
-    a covariance by the patches' own sums would have hardly more of them than columns.
+    The covariance for independent points is scaled by one inflation factor for surfaces and one for
+    edges. A cluster-robust estimate from the patches' sums would have hardly more patches than its
+    14 columns.
     """
     each = weights * equations.residual
     out = np.zeros(2 * equations.jacobian.shape[1:])
@@ -434,7 +453,7 @@ def _noise(equations: _Equations, weights: Floats, cluster: Indices, surface: in
 
 
 def _patches(equations: _Equations, shape: Shape) -> Indices:
-    # Points of one err together
+    # Points of one cell (an eighth of the size) and facing form a patch
     place = np.floor(equations.place / (shape.size / 8)).astype(np.int64)
     keys = np.column_stack([place, _sextants(equations.facing)])
     return np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
@@ -443,7 +462,7 @@ def _patches(equations: _Equations, shape: Shape) -> Indices:
 def _pulls(
     equations: _Equations, weights: Floats, cluster: Indices, pose: Floats
 ) -> tuple[Floats, Floats]:
-    """Return where patches are (P, 3), and what being off there does to the scores (P, 14, 3)."""
+    """Return the patches' centres (P, 3) and their effect on the scores (P, 14, 3)."""
     many = np.bincount(cluster)
     place = equations.place @ pose[:3, :3].T + pose[:3, 3]
     middles = np.stack([np.bincount(cluster, x) / many for x in place.T], axis=1)
@@ -467,5 +486,5 @@ def _moved(pose: Floats, shape: Shape, step: Floats) -> Floats:
 
 
 def _deviation(residual: Floats) -> float:
-    # Exact, below [m]
+    # Floor against exact synthetic data [m]
     return max(float(SIGMA_OF_MAD * np.median(np.abs(residual))), 1e-6)

@@ -15,8 +15,9 @@ from flangeye_plugins.body.shape import GRAZING, OrientedPoints, Shape, spread_d
 from flangeye_plugins.body.view import CoarseImage
 
 ALIKE, SIMILAR = 0.5, 0.7
-"""Cosine of the largest angle between a surface of the body and the scan's there: where a
-candidate is on its way, and where it is judged."""
+"""Smallest cosine between normals of body and scan: while a candidate is refined, and when it is
+judged.
+"""
 
 
 QUARTERS = np.array([
@@ -24,33 +25,33 @@ QUARTERS = np.array([
                 for order in permutations(range(3)) for signs in product((1, -1), repeat=3))
     if np.linalg.det(m) > 0 and np.trace(m) < 3
 ])  # fmt: skip
-"""The 23 turns that bring a cube to itself."""
+"""The 23 non-trivial rotations of a cube onto itself."""
 
 LISTED = 160
-"""Points of the body that stand for what is seen of it from a direction."""
+"""Number of sample points that represent the body's visible part from one direction."""
 
 
 class Looks(Shape):
-    """A body's shape, and its visible part from each direction."""
+    """A body's shape with its visible part from each of 128 directions."""
 
     # Points for it that outweigh one that is seen through, or a face that goes on beyond its
     # end.
     against: ClassVar[float] = 2.0
 
-    # How far beyond the end of a face nothing of it should be seen, as a share of the size.
+    # Distance beyond a face's end at which no surface should be seen, as a share of the size
     beyond: ClassVar[float] = 0.05
 
     @cached_property
     def views(self) -> Floats:
-        """(V, 3) directions from the scanner to the body."""
-        # Enough to know what hides what
+        """(V, 3) viewing directions, from the scanner to the body."""
+        # 128 directions, about 20 degrees apart, are enough for occlusions
         return spread_directions(128)
 
     @cached_property
     def _seen(self) -> tuple[Mask, Mask]:
-        """(V, N) which points of the surface are seen from there, and of the ends.
+        """(V, N) masks of the surface points and of the ends that are visible from each direction.
 
-        Of these, which end before something that is far behind.
+        Only ends with free space or distant background behind them count.
         """
         ends, away = self.ends, self.beyond * self.size
         beyond = ends._replace(points=ends.points + away * ends.directions)
@@ -60,13 +61,13 @@ class Looks(Shape):
 
     @property
     def ends_seen(self) -> Mask:
-        """(V, N) which ends are seen from each direction."""
+        """(V, N) mask of the ends that are visible from each direction."""
         return self._seen[1]
 
     @cached_property
     def _listed(self) -> tuple[Indices, Indices]:
-        """(V, LISTED) numbers of surface points and of ends that stand for what is seen."""
-        # Cosine of the incidence beyond which a coarse view often lacks a surface
+        """(V, LISTED) indices of sampled visible surface points, and of sampled visible ends."""
+        # -0.4: a coarse view often misses surfaces at larger incidence than 66 degrees
         on, ends = (
             _apart(part.points, seen & (self.views @ part.normals.T < -0.4))
             for part, seen in zip((self.surface, self.ends), self._seen, strict=True)
@@ -74,16 +75,16 @@ class Looks(Shape):
         return on, ends
 
     def scores(self, poses: Floats, view: CoarseImage, count: int, tolerance: float) -> Floats:
-        """Return (K,) scores: the share of visible points in agreement, less contradictions.
+        """Return scores (K,) of poses: the share of visible points that agree, less contradictions.
 
         Args:
-            poses: (K, 4, 4).
+            poses: (K, 4, 4) ``camera_T_body``.
             view: The scan.
-            count: Number of surface points, and of ends of faces.
-            tolerance: How far off the scan may be, as a share of the size.
+            count: Number of surface points, and of ends, to compare.
+            tolerance: Largest distance from the scan that agrees, as a share of the size.
         """
         number, reach = self.view_of(poses), tolerance * self.size
-        # The first are farthest apart.
+        # The listed points are sorted: the first ones are farthest apart
         on, off = (listed[number, :count] for listed in self._listed)
         return self._surface_score(poses, view, on, reach) + self._ends_score(
             poses, view, off, reach
@@ -114,7 +115,7 @@ class Looks(Shape):
 
     @cached_property
     def _singles(self) -> list[tuple[Floats, Floats]]:
-        """Points and directions of the surface and of the ends, single precision."""
+        """Points and directions of the surface and of the ends, in single precision."""
         return [
             (part.points.astype(np.float32), part.directions.astype(np.float32))
             for part in (self.surface, self.ends)
@@ -122,7 +123,7 @@ class Looks(Shape):
 
     @cached_property
     def freedoms(self) -> int:
-        """How many of a pose's six numbers the body shows: a cylinder five, a sphere three."""
+        """Degrees of freedom of the pose that the shape determines: cylinder 5, sphere 3."""
         place = np.concatenate([self.surface.points, self.ends.points]) - self.centre
         along = np.concatenate([self.surface.directions, self.ends.directions])
         jacobian = np.hstack([np.cross(place / self.size, along), along])
@@ -132,7 +133,7 @@ class Looks(Shape):
         return int((values > 1e-4).sum())
 
     def twins(self, pose: Floats) -> Floats:
-        """Return (K, 4, 4) poses at which a body often looks nearly the same: quarter turns."""
+        """Return poses (K, 4, 4) turned by a cube's rotations, which often look alike."""
         middle = self.surface.points.mean(axis=0)
         out = np.tile(np.eye(4), (len(QUARTERS), 1, 1))
         out[:, :3, :3] = QUARTERS
@@ -140,7 +141,7 @@ class Looks(Shape):
         return np.asarray(pose @ out)
 
     def reflections(self, pose: Floats) -> Floats:
-        """Return (24, 4, 4) poses, left-handed, of the body's mirror image at its quarter turns."""
+        """Return left-handed poses (24, 4, 4) of the mirrored body in a cube's rotations."""
         flips = np.concatenate([np.eye(3)[None], QUARTERS]) @ np.diag([-1.0, 1.0, 1.0])
         out = np.tile(np.eye(4), (len(flips), 1, 1))
         out[:, :3, :3], out[:, :3, 3] = flips, self.centre - flips @ self.centre
@@ -185,7 +186,7 @@ class Looks(Shape):
         return out
 
     def view_of(self, poses: Floats) -> Indices:
-        """Return (K,) from which of the directions poses are looked at."""
+        """Return the index (K,) of the viewing direction closest to each pose's."""
         centres = poses[:, :3, :3] @ self.centre.astype(poses.dtype) + poses[:, :3, 3]
         towards = np.einsum("kji,kj->ki", poses[:, :3, :3], centres)
         return np.asarray(np.argmax(towards @ self.views.T.astype(poses.dtype), axis=1))
@@ -193,15 +194,14 @@ class Looks(Shape):
 
 @lru_cache(maxsize=8)  # a session's body, and how its mesh may be drawn wrongly
 def prepared(body: TargetBody) -> Looks:
-    """Return a body's looks; computed once for each shape."""
+    """Return a body's shape with visible parts; cached for each shape."""
     return Looks(body.vertices, body.triangles, mounted=True)
 
 
 def _apart(points: Floats, seen: Mask) -> Indices:
-    """Return (V, LISTED) numbers of the points seen from each direction, the farthest apart first.
+    """Return indices (V, LISTED) of visible points from each direction, by farthest-point sampling.
 
-    The first is the first that is seen, and each next the farthest from those before it; where
-    fewer are seen they come again.
+    Each point is the farthest from all before it. If fewer than LISTED are visible, they repeat.
     """
     rows, first = np.arange(len(seen)), np.argmax(seen, axis=1)
     out, gap = np.empty((len(seen), LISTED), np.int64), np.where(seen, np.inf, -1.0)
@@ -219,7 +219,10 @@ def _apart(points: Floats, seen: Mask) -> Indices:
 def _placed(
     poses: Floats, points: Floats, directions: Floats, at: Indices | None = None
 ) -> tuple[Floats, Floats]:
-    """Return points and directions (K, N, 3) at poses; (K, N) says which, where not all."""
+    """Return points and directions (K, N, 3) of the body moved to K poses.
+
+    ``at`` (K, N) are the indices to use for each pose; None uses all.
+    """
     turned = poses[:, :3, :3].transpose(0, 2, 1)
     if at is not None:
         points, directions = points[at], directions[at]
@@ -227,7 +230,7 @@ def _placed(
 
 
 def _seen(shape: Shape, at: OrientedPoints, views: Floats) -> Mask:
-    """Return (V, N) which points face the scanner and are not occluded by the body itself."""
+    """Return the mask (V, N) of points that face the scanner and are not occluded by the body."""
     out = at.normals @ views.T < -GRAZING
     for view, column in zip(views, out.T, strict=True):
         lifted = at.points - 1e-3 * shape.size * view
@@ -236,7 +239,7 @@ def _seen(shape: Shape, at: OrientedPoints, views: Floats) -> Mask:
 
 
 def _before(shape: Shape, points: Floats, views: Floats, reach: float) -> Mask:
-    """Return (V, N) which points lie before the body within reach, along some directions."""
+    """Return the mask (V, N) of points with the body within ``reach`` behind them, by direction."""
     return np.array([
         shape.meet(points, np.broadcast_to(view, points.shape)).depth < reach for view in views
     ]).reshape(len(views), -1)  # fmt: skip

@@ -1,8 +1,8 @@
 """Find a body in a scan: pose hypotheses, refined and tested against the scanner's rays.
 
-Guesses lay edges of the body on edges of the scan. Where a face ends, its normal and the direction
-in which it ends are a frame. Every such frame of the body is laid on every one of the scan, and a
-few points of the body rule most of them out.
+Hypotheses match edges of the body to edges of the scan. At a face's end, its normal and the outward
+direction within the face define a frame. Every such frame of the body is aligned with every one of
+the scan, and comparing a few points of the body rules most of the poses out.
 """
 
 from __future__ import annotations
@@ -22,21 +22,22 @@ from flangeye_plugins.body.shape import GRAZING, OrientedPoints, Shape, thin
 from flangeye_plugins.body.view import CoarseImage, view_of
 
 OUTLINE = 3
-"""Cells beside the body in which its surface should have ended."""
+"""Width of the band beside the body that is checked for its outline [cells]."""
 
 
 class BodyVerdict(NamedTuple):
     """Evidence for and against a body's pose: counts of the scanner's rays.
 
     Attributes:
-        due: Rays that should meet the body, away from its edges.
-        agree: How many of these agree.
-        against: How many show something that cannot be there: behind the body, or right before it.
-        goes_on: Rays beside it that show its surface where it has ended.
-        beside: Rays beside it that show anything.
-        ended: Rays beside it that show something behind it.
-        crossing: Rays beside it that show something at its own depth, where it has ended.
-        outline: All rays beside it.
+        due: Rays that should meet the body's surface, away from its edges.
+        agree: Rays of ``due`` that measured the surface where it should be.
+        against: Rays of ``due`` that contradict: they measured something behind the body, or too
+            close before it to be an occluder.
+        goes_on: Rays beside the body that show its surface continued beyond its end.
+        beside: Rays beside the body with a measurement.
+        ended: Rays beside the body that show something behind it.
+        crossing: Rays beside the body that show something at the body's depth, beyond its end.
+        outline: All rays beside the body.
     """
 
     due: int
@@ -51,8 +52,8 @@ class BodyVerdict(NamedTuple):
     @property
     def bounded(self) -> bool:
         """Whether the body's outline is seen, or nothing is seen around it."""
-        # Least share of the body's outline that is seen to end before something farther:
-        # without, any face of a box is a plate
+        # Smallest share of the outline that must end before something farther: otherwise a plate
+        # would fit any face of a box
         ended = 0.03
         return (
             self.ended >= ended * self.outline or self.beside < ended * self.outline
@@ -65,39 +66,39 @@ class BodyVerdict(NamedTuple):
 
     @property
     def trusted(self) -> float:
-        """Share of the rays at its place and right beside it that are as it makes them.
+        """Share of the rays on and beside the body that are consistent with it.
 
-        They meet its surface, or pass it and end behind it.
+        Consistent rays meet its surface, or pass it and end behind it.
         """
         held = self.agree + self.ended
         return held / max(held + self.against + self.crossing, 1)
 
     @property
     def rank(self) -> float:
-        """Rank of a pose before it is refined: its score over the scatter of so many rays.
+        """Rank of a pose before refinement: score over the square root of the number of rays.
 
-        The score alone favours what is near to the scanner and met by many rays, its share of them
-        what shows little of the body.
+        The score alone favours poses near the scanner, which many rays meet. The share of agreeing
+        rays alone favours poses that show little of the body.
         """
-        # With fewer rays a score says little
+        # Scores of fewer rays are unreliable
         return self.score / math.sqrt(max(self.due, 150))
 
     @property
     def score(self) -> float:
-        """Rank of a pose: rays that agree, less weighted rays that contradict."""
+        """Score of a pose: number of agreeing rays, less weighted contradicting ones."""
         held = self.agree if self.bounded else 0
-        # Rays in favour that one against outweighs: of the true pose there are hardly any
+        # One contradicting ray outweighs ten agreeing ones: the true pose has hardly any
         return held - 10 * self.against - self.goes_on
 
 
 def judged(shape: Shape, view: CoarseImage, pose: Floats, tolerance: float) -> BodyVerdict:
-    """Return the evidence for and against ``camera_T_body``.
+    """Return the evidence for and against a pose.
 
     Args:
         shape: The body.
-        view: What the scanner saw, finely.
-        pose: (4, 4).
-        tolerance: How far off the body's surface the scan may be [m].
+        view: Fine image of the scan.
+        pose: (4, 4) ``camera_T_body``.
+        tolerance: Largest distance of the scan from the body's surface that agrees [m].
     """
     from scipy import ndimage
 
@@ -119,7 +120,7 @@ def judged(shape: Shape, view: CoarseImage, pose: Floats, tolerance: float) -> B
 
 
 class _Compared(NamedTuple):
-    """Rays towards a body, all (H, W) or (H, W, 3): as scanned and as the body would be met."""
+    """Scan and body compared ray by ray; arrays (H, W) or (H, W, 3)."""
 
     rays: Floats
     scan: Floats
@@ -134,7 +135,7 @@ class _Compared(NamedTuple):
 
 
 def _compared(shape: Shape, view: CoarseImage, pose: Floats, tolerance: float) -> _Compared | None:
-    """Return the scan beside the body at a pose, ray by ray; None where no ray is near."""
+    """Return scan and body at a pose, compared ray by ray; None if no ray is near the body."""
     from scipy import ndimage
 
     window = _window(shape, view, pose)
@@ -158,19 +159,20 @@ def _compared(shape: Shape, view: CoarseImage, pose: Floats, tolerance: float) -
 
 
 def _hides(shape: Shape, scan: Floats, depth: Floats) -> Mask:
-    """Return (H, W) where the scan is so far before the body's depth that it hides the body."""
+    """Return the mask (H, W) of rays on which something well before the body hides it."""
     return ~(scan[..., 2] > depth - 0.1 * shape.size)
 
 
 def opposed(shape: Shape, view: CoarseImage, pose: Floats) -> Mask | None:
-    """Return (T,) which facets belong to parts that contradict a scan at a pose; None without any.
+    """Return the mask (T,) of facets in parts that the scan contradicts; None if there are none.
 
-    A part is what hangs together in the mesh; a tenth of what is seen in its place is not it.
+    A part is a connected component of the mesh. It is contradicted if a tenth of the measurements
+    in its place do not show it.
 
     Args:
         shape: The body.
-        view: What the scanner saw, finely.
-        pose: ``camera_T_body``.
+        view: Fine image of the scan.
+        pose: (4, 4) ``camera_T_body``.
     """
     parts, of_facet = shape.parts
     # How far off a part's surface a ray may be
@@ -187,14 +189,14 @@ def opposed(shape: Shape, view: CoarseImage, pose: Floats) -> Mask | None:
 
 
 def _patch(cells: Mask) -> bool:
-    """Return whether cells (H, W) hold a patch, and not single ones as along edges."""
+    """Return whether a mask of cells (H, W) contains a patch, not only isolated cells at edges."""
     from scipy import ndimage
 
     return bool(ndimage.binary_erosion(cells, np.ones((3, 3))).any())
 
 
 def _edges(depth: Floats, angle: float) -> Mask:
-    """Return (H, W) where neighbouring rays end at different depths."""
+    """Return the mask (H, W) of cells at a step of depth."""
     from scipy import ndimage
 
     far = np.where(np.isfinite(depth), depth, 1e3)
@@ -205,7 +207,7 @@ def _edges(depth: Floats, angle: float) -> Mask:
 
 
 def _window(shape: Shape, view: CoarseImage, pose: Floats) -> tuple[slice, slice]:
-    """Return the rows and columns that a body may be seen in."""
+    """Return the rows and columns of the image in which a body can be seen."""
     corners = shape.vertices[shape.hull] @ pose[:3, :3].T + pose[:3, 3]
     if (corners[:, 2] <= 0).any():
         return slice(0, 0), slice(0, 0)
@@ -217,15 +219,14 @@ def _window(shape: Shape, view: CoarseImage, pose: Floats) -> tuple[slice, slice
 
 
 def guesses(view: CoarseImage, looks: Looks, most: int) -> Floats:
-    """Return at most so many (K, 4, 4) ``camera_T_body`` that are consistent with a scan."""
+    """Return up to ``most`` poses (K, 4, 4) ``camera_T_body`` that are consistent with a scan."""
     rng = np.random.default_rng(2)
     scan = view.edges(looks.size)
-    # Points where faces end that are laid on each other, and how far those are apart, as
-    # shares of the body's size
+    # Number and spacing (as a share of the body's size) of the ends that are matched
     on = scan.take(_some(scan, 800, looks.size * (1 / 22), rng))
     poses = _passed(on, _some(looks.ends, 400, looks.size * (1 / 18), rng), view, looks)
-    # Moved before forty points choose the best: over a long body an edge's own direction is too
-    # rough. So many points move a pose at once, and so far off the scan may be
+    # Poses are refined by one ICP step before 40 points select the best: on a long body the
+    # direction of one edge is too inaccurate
     at_once, few, reach = 2_000, 16, 0.1 * looks.size
     chunks = range(0, len(poses), at_once)
     moved = [looks.settled(poses[k : k + at_once], view, few, reach) for k in chunks]
@@ -234,13 +235,13 @@ def guesses(view: CoarseImage, looks: Looks, most: int) -> Floats:
 
 
 def _best_of(scores: Floats, most: int) -> Indices:
-    """Return the numbers of the best, in no order."""
+    """Return the indices of the ``most`` highest scores, unordered."""
     every = np.arange(len(scores))
     return every if len(scores) <= most else np.argpartition(-scores, most)[:most]
 
 
 def _passed(on: OrientedPoints, at: Indices, view: CoarseImage, looks: Looks) -> Floats:
-    """Return the better of the poses that lay the body's ends at some indices on the scan's."""
+    """Return the best poses that align the body's ends ``at`` with the scan's ends ``on``."""
     off = looks.ends.take(at)
     scan, body = _frames(on), _frames(off)
 
@@ -256,11 +257,11 @@ def _passed(on: OrientedPoints, at: Indices, view: CoarseImage, looks: Looks) ->
         return number[looks.ends_seen[looks.view_of(posed(number)), at[number % max(len(at), 1)]]]
 
     def scored(number: Indices, count: int) -> Floats:
-        # How far off a surface may be while the turn is known to 9 degrees, as a share of the size
+        # Tolerance as a share of the size, while the rotation is known to 9 degrees only
         return looks.scores(posed(number), view, count, 0.06)
 
     number = _chunked(np.arange(len(scan) * len(body)), unhidden)
-    # Points of the body by which poses are judged, and how many of them pass
+    # Number of the body's points that are compared, and number of poses that pass
     for count, left in ((4, 30_000), (12, 6_000)):
         scores = _chunked(number, partial(scored, count=count))
         number = number[_best_of(scores, left)]
@@ -268,39 +269,38 @@ def _passed(on: OrientedPoints, at: Indices, view: CoarseImage, looks: Looks) ->
 
 
 def _chunked(number: Indices, work: Callable[[Indices], Any]) -> Any:
-    """Return what the work gives for some numbers at once, one after the other."""
-    # Poses judged at once: their points stay in a core's cache.
+    """Return ``work`` applied to chunks of indices, concatenated."""
+    # Poses per chunk: their points fit in a core's cache
     at_once = 30_000
     chunks = range(0, max(len(number), 1), at_once)
     return np.concatenate([work(number[k : k + at_once]) for k in chunks])
 
 
 def _some(points: OrientedPoints, count: int, spacing: float, rng: np.random.Generator) -> Indices:
-    """Return the indices of so many points spread over all surfaces."""
+    """Return indices of up to ``count`` random points, about ``spacing`` apart [m]."""
     mixed = rng.permutation(len(points.points))
     kept = thin(points.points[mixed], points.directions[mixed], spacing)
     return np.asarray(mixed[rng.permutation(kept)[:count]])
 
 
 def _frames(ends: OrientedPoints) -> Floats:
-    """Return (N, 3, 3) rotations to frames of the normals and the directions of ends."""
+    """Return the frames of ends (N, 3, 3); rows: normal, outward direction, cross product."""
     third = np.cross(ends.normals, ends.directions)
     return np.stack([ends.normals, ends.directions, third], axis=1)
 
 
 FINE_ACROSS = 100
-"""Cells across the body in the view that it is judged in: fine ones show thin parts."""
+"""Cells across the body in the image used for judging; enough to show thin parts."""
 
 
 class FoundPose(NamedTuple):
-    """A pose that a body may have.
+    """A candidate pose of a body.
 
     Attributes:
         pose: (4, 4) ``camera_T_body``.
-        verdict: What speaks for it and against.
-        weakest: Standard deviation of what the scan shows least of it and of the body's scale, in
-            sizes or radians.
-        seen: How much of the body was seen, of what it shows from its broadest side.
+        verdict: Evidence for and against the pose.
+        weakest: Standard deviation of the least certain direction of pose or scale [sizes or rad].
+        seen: Visible area of the body, as a share of its area seen from the broadest side.
     """
 
     pose: Floats
@@ -311,11 +311,11 @@ class FoundPose(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class BodySearch:
-    """One scan that is searched for one body.
+    """Search of one scan for one body.
 
     Attributes:
-        points: (N, 3) of the scan, N at least ``FEWEST``, all before the scanner [m].
-        looks: The body, and what of it is seen from where.
+        points: (N, 3) points of the scan, at least ``FEWEST``, all in front of the scanner [m].
+        looks: The body's shape with its visible parts.
     """
 
     points: Singles
@@ -341,22 +341,22 @@ class BodySearch:
         return self._distinct(found + self.near(self._twins(found[0]))) if found else []
 
     def near(self, poses: Floats) -> list[FoundPose]:
-        """Return the best of (K, 4, 4) poses, refined on the scan's own points, best first."""
+        """Return the best of the poses (K, 4, 4), refined on the scan's points, best first."""
         if not len(poses):
             return []
         scores = [judged(self.looks, self._fine, pose, self._rough).rank for pose in poses]
-        # Laid on the scan's own points
+        # Refined on the scan's own points
         poses = poses[distinct(poses, np.array(scores), self.looks)[:8]]
         return self._distinct([one for one in map(self._laid, poses) if one])
 
     def refuted(self, pose: Floats, near: Callable[[Floats], Mask]) -> float:
-        """Return the share of what was looked at of some of the body that was seen through.
+        """Return the share of a part of the body that the scan contradicts by seeing through it.
 
-        What lies before it hides it, and says nothing.
+        Hidden points do not count.
 
         Args:
             pose: ``camera_T_body``.
-            near: Which of points (N, 3) on the body are asked for.
+            near: Selects the part: maps points (N, 3) in the body's frame to a mask (N,).
         """
         seen = _compared(self.looks, self._fine, pose, self._tolerance)
         if seen is None:
@@ -367,12 +367,12 @@ class BodySearch:
         return float(seen.through.reshape(-1)[known].sum() / max(len(known), 1))
 
     def images(self, found: FoundPose) -> list[FoundPose]:
-        """Return left-handed poses, of the body's mirror image, that explain nearly as much."""
+        """Return left-handed poses of the mirrored body that fit the scan nearly as well."""
         poses = self.looks.reflections(found.pose)
         return self.near(self._as_well(poses, 0.9 * found.verdict.agree))
 
     def unrivalled(self, found: list[FoundPose], rivals: list[FoundPose]) -> list[FoundPose]:
-        """Drop poses where a rival explains the same cells and another connected patch."""
+        """Return the poses for which no rival explains the same cells and one more patch."""
         own, others = ([self._agreeing(one.pose) for one in each] for each in (found, rivals))
         return [
             one for one, cells in zip(found, own, strict=True)
@@ -380,7 +380,7 @@ class BodySearch:
         ]  # fmt: skip
 
     def twins_among(self, others: list[FoundPose], found: list[FoundPose]) -> list[FoundPose]:
-        """Return those of other poses that explain all that one of the found does."""
+        """Return those of ``others`` that explain all cells that one of ``found`` explains."""
         own, cells = ([self._agreeing(one.pose) for one in each] for each in (found, others))
         return [
             one for one, more in zip(others, cells, strict=True)
@@ -388,7 +388,7 @@ class BodySearch:
         ]  # fmt: skip
 
     def _agreeing(self, pose: Floats) -> Mask:
-        """Return (H, W) which cells of the scan agree with the body at a pose."""
+        """Return the mask (H, W) of cells that agree with the body at a pose."""
         out = np.zeros(self._fine.xyz.shape[:2], bool)
         compared = _compared(self.looks, self._fine, pose, self._tolerance)
         if compared is not None:
@@ -397,8 +397,8 @@ class BodySearch:
 
     @cached_property
     def _tolerance(self) -> float:
-        """Largest distance from scan to fitted body that counts as agreement [m]."""
-        # As a share of the size, or in deviations
+        """Largest distance between scan and fitted body that counts as agreement [m]."""
+        # As a share of the size, or in standard deviations of the noise
         return max(0.003 * self.looks.size, 3.5 * self._fine.noise)
 
     @cached_property
@@ -419,12 +419,12 @@ class BodySearch:
         return FoundPose(fit.pose, verdict, fit.weakest(self.looks.freedoms), seen)
 
     def _twins(self, best: FoundPose) -> Floats:
-        """Return quarter turns of a pose that explain the scan nearly as well."""
-        # Share of the rays that a turned pose explains as well, to be laid on the scan too
+        """Return the pose, turned by a cube's rotations, where the scan is explained as well."""
+        # A turned pose that explains 40 % of the rays is refined too
         return self._as_well(self.looks.twins(best.pose), 0.4 * best.verdict.agree)
 
     def _as_well(self, poses: Floats, least: float) -> Floats:
-        """Return those of (K, 4, 4) poses with which more rays agree than so many."""
+        """Return the poses, out of (K, 4, 4), with which more than ``least`` rays agree."""
         agree = [judged(self.looks, self._fine, pose, self._rough).agree for pose in poses]
         return np.asarray(poses[np.array(agree) > least])
 
@@ -435,11 +435,11 @@ class BodySearch:
 
 
 def around(points: Singles, shape: Shape, *poses: Floats) -> Singles:
-    """Return the points of (N, 3) around a body at any of some poses."""
+    """Return the scan points (N, 3) around a body at any of the poses."""
     near = np.zeros(len(points), bool)
     for pose in poses:
         offset = points - (pose[:3, :3] @ shape.centre + pose[:3, 3]).astype(np.float32)
-        # As a share of the size: half reaches the body's ends
+        # As a share of the size: 0.5 would just reach the body's ends
         near |= np.einsum("ni,ni->n", offset, offset) < (0.55 * shape.size) ** 2
     return np.asarray(points[near])
 
@@ -456,9 +456,9 @@ def distinct(poses: Floats, scores: Floats, looks: Looks) -> Indices:
 
 
 def alike(some: Floats, others: Floats, looks: Looks) -> Mask:
-    """Return (A, B) which of (A, 4, 4) and (B, 4, 4) are one pose, not yet laid on the scan."""
+    """Return the mask (A, B) of pose pairs that agree within 12 deg and 6 % of the size."""
     here, there = (poses[:, :3, :3] @ looks.centre + poses[:, :3, 3] for poses in (some, others))
-    # They differ by less in place, as a share of the size, and in turn
+    # Limits for unrefined poses: distance of the centres as a share of the size, and rotation
     near = np.linalg.norm(here[:, None] - there, axis=2) < 0.06 * looks.size
     trace = np.einsum("aij,bij->ab", some[:, :3, :3], others[:, :3, :3])
     return np.asarray(near & (trace > 1 + 2 * np.cos(float(np.radians(12.0)))))

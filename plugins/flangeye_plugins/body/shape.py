@@ -1,4 +1,4 @@
-"""A body as a scanner sees it: where rays meet it, and points on its outside."""
+"""A body's shape: ray casting, and sample points of its outer surface and edges."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from flangeye.types import Floats, Indices, Mask
 from flangeye.types.geometry import basis_of_plane
 
 GRAZING = 0.25
-"""Cosine of the incidence beyond which a surface counts as not seen."""
+"""Cosine of the incidence angle beyond which a surface counts as invisible."""
 
 
 class OrientedPoints(NamedTuple):
-    """Points with directions.
+    """Points with directions and normals.
 
     Attributes:
-        points: (N, 3) [m].
-        directions: (N, 3) unit normals of surfaces, outwards; at the ends of faces the direction
-            within the face in which it ends.
-        normals: (N, 3) of the face, where it ends too.
+        points: (N, 3) positions [m].
+        directions: (N, 3) unit outward normals for surface points; for points at a face's end, the
+            unit outward direction within the face.
+        normals: (N, 3) unit outward normals of the face, in both cases.
     """
 
     points: Floats
@@ -31,20 +31,20 @@ class OrientedPoints(NamedTuple):
     normals: Floats
 
     def take(self, at: Indices | Mask) -> OrientedPoints:
-        """Return those at some indices."""
+        """Return the points selected by indices or a mask."""
         return OrientedPoints(self.points[at], self.directions[at], self.normals[at])
 
 
 @dataclass(frozen=True, eq=False)
 class Met:
-    """Where rays met a body.
+    """Intersections of rays with a body.
 
     Attributes:
         shape: The body.
-        directions: (N, 3) of the rays.
-        depth: (N,) in lengths of the directions; infinite where a ray passed.
-        facets: (N,) the triangle that was met; 0 where a ray passed.
-        uv: (N, 2) where in it.
+        directions: (N, 3) directions of the rays, of any length.
+        depth: (N,) distance to the intersection in lengths of ``directions``; infinite without one.
+        facets: (N,) index of the triangle; 0 without an intersection.
+        uv: (N, 2) barycentric coordinates in the triangle.
     """
 
     shape: Shape
@@ -55,7 +55,7 @@ class Met:
 
     @cached_property
     def normals(self) -> Floats:
-        """(N, 3) of the smooth surface, towards the ray's origin."""
+        """(N, 3) unit normals of the smoothed surface, towards the ray's origin."""
         mesh, smooth = self.shape._smooth
         weights = np.column_stack([1 - self.uv.sum(axis=1), self.uv])
         normals = np.einsum("nk,nkc->nc", weights, smooth[mesh.faces[self.facets]])
@@ -67,12 +67,13 @@ class Met:
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """Triangles, in the body's frame.
+    """A triangle mesh in the body's frame.
 
     Attributes:
-        vertices: (V, 3) [m].
+        vertices: (V, 3) positions [m].
         triangles: (T, 3) indices of vertices.
-        mounted: Whether it is drawn in the frame of what carries it, with z away from that.
+        mounted: Whether the body's frame is that of its mounting face, with z away from the
+            carrier.
     """
 
     # Spacings of the samples that pairs are made of along the body's size.
@@ -96,26 +97,26 @@ class Shape:
 
     @cached_property
     def centre(self) -> Floats:
-        """(3,) of that box [m]."""
+        """(3,) centre of that bounding box [m]."""
         low, high = self.vertices.min(axis=0), self.vertices.max(axis=0)
         return np.asarray((low + high) / 2)
 
     @cached_property
     def hull(self) -> Indices:
-        """(H,) numbers of the vertices of its convex hull."""
+        """(H,) indices of the vertices of the convex hull."""
         from scipy.spatial import ConvexHull
 
         return np.asarray(ConvexHull(self.vertices, qhull_options="QJ").vertices)
 
     @cached_property
     def broadest(self) -> float:
-        """Area of its convex hull as seen from where that is largest [m^2]."""
+        """Largest projected area of the convex hull over all directions [m^2]."""
         hull = self._mesh.convex_hull
         areas = np.abs(spread_directions(128) @ hull.face_normals.T) @ hull.area_faces / 2
         return float(areas.max())
 
     def meet(self, origin: Floats, directions: Floats) -> Met:
-        """Return where rays from points (3,) or (N, 3) along (N, 3) meet the body first."""
+        """Return the first intersections of rays from ``origin`` (3,) or (N, 3) along (N, 3)."""
         import open3d as o3d
 
         rays = np.empty((len(directions), 6), dtype=np.float32)
@@ -128,13 +129,13 @@ class Shape:
 
     @property
     def facets(self) -> tuple[Floats, Indices]:
-        """Vertices (V, 3) and triangles (T, 3) as rays meet them."""
+        """Vertices (V, 3) and triangles (T, 3) of the mesh used for ray casting."""
         mesh = self._smooth[0]
         return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
     @cached_property
     def parts(self) -> tuple[int, Indices]:
-        """How many parts of facets that hang together the mesh has, and (T,) which has each."""
+        """Number of connected parts of the mesh, and the part's number of each facet (T,)."""
         from scipy.sparse import coo_matrix
         from scipy.sparse.csgraph import connected_components
 
@@ -148,17 +149,17 @@ class Shape:
 
     @cached_property
     def _mesh(self) -> Any:
-        """The triangles with vertices at one place made one, as STL does not have them."""
+        """The mesh with coincident vertices merged, which an STL file keeps separate."""
         import trimesh
 
         return trimesh.Trimesh(self.vertices, self.triangles)
 
     @cached_property
     def _smooth(self) -> tuple[Any, Floats]:
-        """The triangles with vertices apart at creases, and the smooth surface's (V, 3) normals.
+        """The mesh with vertices split at creases, and the area-weighted vertex normals (V, 3).
 
-        Weighted by the facets' areas: on a faceted cylinder they are radial, and say nothing about
-        a turn about its axis; on a large flat face beside a fillet they are the face's.
+        On a faceted cylinder these normals are radial, so the facets do not fix the rotation about
+        its axis. On a large flat face beside a fillet they are the face's normal.
         """
         import trimesh
 
@@ -181,43 +182,44 @@ class Shape:
 
     @cached_property
     def surface(self) -> OrientedPoints:
-        """Points of the outer surface, one per voxel and main direction of the normal."""
+        """Sample points of the outer surface, one per voxel and main direction of the normal."""
         points, normals = self.outside
         keep = thin(points, normals, self.size / self.spacings)
         return OrientedPoints(points[keep], normals[keep], normals[keep])
 
     @cached_property
     def ends(self) -> OrientedPoints:
-        """Points where faces end, one per voxel and main direction."""
+        """Sample points at the ends of faces, one per voxel and main direction."""
         ends = self.outline
         return ends.take(thin(ends.points, ends.directions, self.size / self.spacings))
 
     @cached_property
     def outline(self) -> OrientedPoints:
-        """Points where faces end at edges of the body that can be seen from outside."""
+        """Points at the ends of faces, along all edges that are visible from outside."""
         from scipy.spatial import cKDTree
 
-        # A file's facets may be wound either way: the face's side is the one that was looked at.
+        # A file's facets may be wound either way: the outer side is the one that rays from outside
+        # met
         ends, (seen, outwards) = self._edges(), self.outside
         within = ends.points - ends.directions * self.size / self.across
         gap, nearest = cKDTree(seen).query(within, distance_upper_bound=2 * self.size / self.across)
         ends, nearest = ends.take(np.isfinite(gap)), nearest[np.isfinite(gap)]
         side = np.einsum("ni,ni->n", ends.normals, outwards[nearest])
         ends = ends._replace(normals=ends.normals * np.sign(side)[:, None])
-        # What a body is fastened to may go on where it ends
+        # At the foot of a mounted body the carrier may continue its faces: these ends are left out
         stands = (ends.directions[:, 2] < -self.crease) & self.at_foot(ends.points)
         return ends.take((np.abs(side) > self.crease) & ~stands)
 
     def at_foot(self, points: Floats) -> Mask:
-        """Return (N,) which points of a mounted body are at the face that it is fastened by."""
+        """Return the mask (N,) of points at a mounted body's mounting face."""
         low, high = self.vertices[:, 2].min(), self.vertices[:, 2].max()
-        # Two cells of the view that poses are judged in, of a flat body less, as shares of its size
+        # Two cells of the image for judging poses (less for a flat body), as shares of the size
         near = min(0.02 * self.size, 0.1 * (high - low))
         return np.asarray((points[:, 2] < near) & (self.mounted and abs(low) < near))
 
     @cached_property
     def outside(self) -> tuple[Floats, Floats]:
-        """(N, 3) points that rays from all around meet, and normals towards them."""
+        """Dense points (N, 3) of the outer surface, and their normals (N, 3)."""
         radius = self.size / 2
         grid = (
             np.stack(np.meshgrid(*2 * [np.arange(self.across) + 0.5]), axis=-1) / self.across * 2
@@ -225,7 +227,7 @@ class Shape:
         )
         flat = grid.reshape(-1, 2) * radius
         found: list[tuple[Floats, Floats]] = []
-        # Directions from which the outside is sampled
+        # Number of directions from which the surface is sampled
         for view in spread_directions(48):
             origin = self.centre - 1.5 * radius * view + flat @ basis_of_plane(view)[:2]
             met = self.meet(origin, np.broadcast_to(view, origin.shape))
@@ -234,17 +236,17 @@ class Shape:
         return np.concatenate([p for p, _ in found]), np.concatenate([n for _, n in found])
 
     def _edges(self) -> OrientedPoints:
-        """Return points along edges, where each face beside them ends."""
+        """Return dense points along sharp edges, once for each face that ends there."""
         mesh = self._mesh
         normals, edge, facet = mesh.face_normals, mesh.edges_unique_inverse, mesh.edges_face
         mean = np.zeros((edge.max() + 1, 3))
         np.add.at(mean, edge, normals[facet])
         count = np.bincount(edge)
-        # Of two facets in one plane the mean normal has length one; of an edge less.
+        # The mean normal of two coplanar facets has length one; at an edge it is shorter
         bent = np.linalg.norm(mean, axis=1) / count < np.cos(np.arccos(self.crease) / 2)
         sharp = (bent | (count == 1))[edge]
-        # Root of the area of a facet, as a share of the size, below which it has no
-        # direction
+        # Facets smaller than this (root of the area, as a share of the size) have no reliable
+        # normal
         sharp &= mesh.area_faces[facet] > (1e-4 * self.size) ** 2
         a, b = (mesh.vertices[mesh.edges[sharp, k]] for k in range(2))
         along, normals = b - a, normals[facet[sharp]]
@@ -258,7 +260,7 @@ class Shape:
 
 
 def spread_directions(count: int) -> Floats:
-    """Return (count, 3) unit vectors spread evenly over the sphere (Fibonacci's lattice)."""
+    """Return unit vectors (count, 3) spread evenly over the sphere (Fibonacci lattice)."""
     k = np.arange(count) + 0.5
     z, turn = 1 - 2 * k / count, np.pi * (1 + 5**0.5) * k
     across = np.sqrt(1 - z**2)
@@ -266,7 +268,7 @@ def spread_directions(count: int) -> Floats:
 
 
 def thin(points: Floats, directions: Floats, spacing: float) -> Indices:
-    """Return the indices of one point for each cube of space and sextant of directions."""
+    """Return the indices of one point per voxel and main direction (+-x, +-y, +-z)."""
     place = np.floor(points / spacing).astype(np.int64)
     main = np.argmax(np.abs(directions), axis=1)
     sign = np.take_along_axis(directions, main[:, None], axis=1)[:, 0] > 0

@@ -1,4 +1,4 @@
-"""A scan as a coarse image from the scanner: depth, normals, and where surfaces end."""
+"""A scan as a coarse image from the scanner: depth, normals, and edges of surfaces."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from flangeye_plugins.body.shape import OrientedPoints
 
 @dataclass(frozen=True, eq=False)
 class CoarseImage:
-    """A coarse image.
+    """A coarse image of a scan, seen from the scanner at the origin.
 
     Attributes:
         xyz: (H, W, 3) mean of the nearest surface in each cell [m]; NaN where none was measured.
-        low: x and y of the first cell's corner, at unit depth.
+        low: (2,) x and y of the first cell's corner at unit depth.
         angle: Width of a cell at unit depth.
     """
 
@@ -28,19 +28,19 @@ class CoarseImage:
 
     @property
     def depth(self) -> Floats:
-        """(H, W) [m]."""
+        """(H, W) depth along z [m]."""
         return self.xyz[..., 2]
 
     @property
     def directions(self) -> Floats:
-        """(H, W, 3) of the rays through the cells' middles, with z = 1."""
+        """(H, W, 3) directions of the rays through the cells' centres, with z = 1."""
         rows, columns = self.xyz.shape[:2]
         x = self.low[0] + (np.arange(columns) + 0.5) * self.angle
         y = self.low[1] + (np.arange(rows) + 0.5) * self.angle
         return np.stack([*np.meshgrid(x, y), np.ones((rows, columns))], axis=-1)
 
     def cells(self, points: Floats) -> tuple[Indices, Mask]:
-        """Return the flat index of the cell that sees each point, and whether one does."""
+        """Return the flat index of each point's cell, and a mask of points inside the image."""
         rows, columns = self.xyz.shape[:2]
         z = np.maximum(points[..., 2], 1e-6)
         column = (points[..., 0] / z - self.low[0]) / self.angle
@@ -52,7 +52,7 @@ class CoarseImage:
 
     @cached_property
     def normals(self) -> Floats:
-        """(H, W, 3) unit normals towards the scanner; NaN where neighbours are too few."""
+        """(H, W, 3) unit normals towards the scanner; NaN with too few neighbours."""
         down, across = _slope(self.xyz, 0, self.angle), _slope(self.xyz, 1, self.angle)
         rough = _unit(np.cross(across, down))
         rough = _facing(rough, self.xyz)
@@ -60,9 +60,9 @@ class CoarseImage:
 
     @cached_property
     def ends(self) -> tuple[Mask, Floats]:
-        """Which cells (H, W) lie where a surface ends, and (H, W, 3) in which direction it does.
+        """Mask (H, W) of cells at a surface's edge, and unit outward directions (H, W, 3).
 
-        The direction points from the middle of the surface's cells around it to the cell.
+        The direction points to the cell from the mean of the surface's cells around it.
         """
         total, count, open_side = np.zeros_like(self.xyz), np.zeros(self.xyz.shape[:2]), None
         normals = self.normals
@@ -85,7 +85,7 @@ class CoarseImage:
 
     @cached_property
     def nearest_end(self) -> Indices:
-        """(H, W) flat index of the nearest cell at a surface's edge; its own if there is none."""
+        """(H, W) flat index of the nearest cell at an edge; the cell's own if there is none."""
         from scipy.ndimage import distance_transform_edt
 
         found = self.ends[0]
@@ -96,7 +96,7 @@ class CoarseImage:
 
     @cached_property
     def _to_ends(self) -> Singles:
-        """(H W, 6) where the end nearest to each cell is, and in which direction; NaN without."""
+        """(H W, 6) position and direction of the edge nearest to each cell; NaN without one."""
         found, directions = self.ends
         both = np.concatenate([self.xyz, directions], axis=-1)
         both[~found] = np.nan
@@ -104,19 +104,19 @@ class CoarseImage:
 
     @cached_property
     def _surfaces(self) -> Singles:
-        """(H W, 6) of cells and their normals, single precision, for many poses at once."""
+        """(H W, 6) positions and normals of the cells, in single precision for speed."""
         return np.concatenate([self.xyz, self.normals], axis=-1).reshape(-1, 6).astype(np.float32)
 
     def to_end(self, placed: Floats, outwards: Floats) -> tuple[Floats, Floats]:
-        """Return the offset to the scan's nearest surface edge, and the edge's alignment.
+        """Return the offset from points to the scan's nearest edge, and the edge's alignment.
 
         Args:
-            placed: (..., 3) where [m].
-            outwards: (..., 3) unit directions in which it should.
+            placed: (..., 3) positions [m].
+            outwards: (..., 3) unit outward directions of the body's faces there.
 
         Returns:
-            (..., 3) offset of the end nearest in the image [m], and (...) cosine of the angle
-            between its direction and the face's; NaN where there is none.
+            (..., 3) offset to the edge nearest in the image [m], and (...) cosine of the angle
+            between its direction and the face's; NaN without an edge.
         """
         cell, inside = self.cells(placed)
         there = self._to_ends[cell]
@@ -125,14 +125,14 @@ class CoarseImage:
         return there[..., :3] - placed, cosine
 
     def planes(self, placed: Floats) -> tuple[Floats, Floats]:
-        """Return (..., 3) offsets of the cells that points are seen in, and their normals."""
+        """Return offsets (..., 3) from points to the cells that see them, and cells' normals."""
         cell, inside = self.cells(placed)
         there = self._surfaces[cell]
         there[~inside] = np.nan
         return there[..., :3] - placed, np.asarray(there[..., 3:])
 
     def compared(self, placed: Floats, facing: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return how the scan is where points (..., 3) with normals (..., 3) should be seen.
+        """Compare the scan with points (..., 3) and normals (..., 3) of a body.
 
         Returns:
             (...) distance of the point from the scan's plane [m], depth of the scan behind it [m],
@@ -144,16 +144,16 @@ class CoarseImage:
 
     @cached_property
     def noise(self) -> float:
-        """Standard deviation of the cells from the planes of their neighbours [m]."""
+        """Robust standard deviation of cells from the planes through their neighbours [m]."""
         off = np.einsum("ijk,ijk->ij", _shifted(self.xyz, (0, 1)) - self.xyz, self.normals)
         off = off[np.isfinite(off)]
         return float(SIGMA_OF_MAD * np.median(np.abs(off)) / np.sqrt(2)) if len(off) else 0.0
 
     def edges(self, size: float) -> OrientedPoints:
-        """Return the edges of surfaces, except of planes larger than a body of ``size`` [m].
+        """Return the edges of surfaces, except those on planes larger than a body of ``size`` [m].
 
-        A plane that continues beyond ``size`` in at least two of eight directions is taken for a
-        table or a wall.
+        A plane that continues beyond ``size`` in at least two of eight directions is a table or a
+        wall.
         """
         found, directions = self.ends
         found = found & np.isfinite(self.normals[..., 0]) & ~self._goes_on(size)
@@ -162,7 +162,7 @@ class CoarseImage:
         )
 
     def _goes_on(self, size: float) -> Mask:
-        """Return in which cells (H, W) the plane is larger than a body of that size [m]."""
+        """Return the mask (H, W) of cells on a plane larger than a body of ``size`` [m]."""
         rows, columns = self.xyz.shape[:2]
         row, column = np.indices((rows, columns))
         with np.errstate(invalid="ignore"):
@@ -181,11 +181,12 @@ class CoarseImage:
 
 
 def view_of(points: Singles, pitch: float) -> CoarseImage:
-    """Return a scan's view, its cells ``pitch`` wide [m] at the median depth.
+    """Return the coarse image of a scan.
 
     Args:
-        points: (N, 3) before the scanner, one at least [m].
-        pitch: Wider where the points are too sparse to fill the cells.
+        points: (N, 3) points in front of the scanner, at least one [m].
+        pitch: Cell width at the median depth [m]; enlarged if the points are too sparse to fill the
+            cells.
     """
     # They fill the image well
     points = points[:: 1 + len(points) // 500_000]
@@ -214,9 +215,9 @@ def view_of(points: Singles, pitch: float) -> CoarseImage:
 
 
 def _along(ends: OrientedPoints, angle: float) -> OrientedPoints:
-    """Return ends whose directions are means over the neighbours along the same edge.
+    """Return edge points with directions averaged over neighbours along the same edge.
 
-    Of a single one the raster alone is off by 10 degrees.
+    The raster alone makes a single direction wrong by about 10 degrees.
     """
     from scipy.spatial import cKDTree
 
@@ -238,7 +239,7 @@ def _along(ends: OrientedPoints, angle: float) -> OrientedPoints:
 
 
 def spacing_of(points: Singles) -> float:
-    """Return the mean spacing of (N, 3) points, seen at unit depth."""
+    """Return the mean spacing of points (N, 3), projected to unit depth."""
     u, v = (points[:, :2] / points[:, 2:]).T
     across = max(float(np.ptp(u)), float(np.ptp(v)), 1e-6) / 64
     cell = ((u - u.min()) / across).astype(np.int64) * 65 + ((v - v.min()) / across).astype(
@@ -249,7 +250,7 @@ def spacing_of(points: Singles) -> float:
 
 
 def _shifted(image: Floats, shift: tuple[int, int]) -> Floats:
-    """Return the neighbours of each cell (H, W, ...) at so many rows and columns; NaN outside."""
+    """Return an image (H, W, ...) shifted by rows and columns, with NaN moved in."""
     out = np.full_like(image, np.nan)
     rows, columns = image.shape[:2]
     (dy, dx) = shift
@@ -270,7 +271,7 @@ def _gate(depth: Floats, angle: float, cells: int) -> Floats:
 
 
 def _slope(xyz: Floats, axis: int, angle: float) -> Floats:
-    """Return the (H, W, 3) mean difference to the neighbours on both sides of one surface."""
+    """Return the mean difference (H, W, 3) to the neighbours on the same surface."""
     total, count = np.zeros_like(xyz), np.zeros((*xyz.shape[:2], 1))
     for side in (-1, 1):
         other = _shifted(xyz, (side, 0) if axis == 0 else (0, side))
@@ -281,7 +282,7 @@ def _slope(xyz: Floats, axis: int, angle: float) -> Floats:
 
 
 def _smoothed(normals: Floats, xyz: Floats, angle: float) -> Floats:
-    """Return sums of the normals over the cells around that lie in the same plane or nearly."""
+    """Return each normal summed with those of neighbouring cells in nearly the same plane."""
     total = np.zeros_like(normals)
     for shift in [(0, 0), *_ring(1)]:
         other, there = _shifted(normals, shift), _shifted(xyz, shift)

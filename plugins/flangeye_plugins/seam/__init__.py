@@ -1,1 +1,1 @@
-"""``seam.*``: where to weld, by CAD or by the groove in a scan. Add a source: a new module."""
+"""``seam.*`` stages: plan the seam to weld from a CAD, from a joint in the scan, or from a file."""

@@ -1,4 +1,4 @@
-"""Plan a seam from the workpiece's CAD."""
+"""``seam.cad``: plan a seam from the workpiece's CAD."""
 
 from __future__ import annotations
 
@@ -59,9 +59,10 @@ def seam_cad(
 ) -> Seam:
     """Register the workpiece's CAD to the scan and map its seam into the base.
 
-    Figures: ``seen``, ``refuted`` and ``second`` as in :class:`Registered`; ``residual`` of the
-    scan from the CAD, and ``registration``, the largest standard deviation of a seam point in the
-    scanner's frame [m]; ``points`` and ``edges``, the numbers used by the fit.
+    The seam's figures are ``seen``, ``refuted`` and ``second`` as in :class:`Registered`;
+    ``residual``, the robust standard deviation of the scan from the CAD [m]; ``registration``, the
+    largest standard deviation of a seam point in the scanner's frame [m]; ``points`` and ``edges``,
+    the numbers of points used by the fit.
 
     Raises:
         StageError: The CAD cannot be read, has no such seam, or is in another unit.
@@ -115,7 +116,7 @@ def _chosen(workpiece: Workpiece, name: str | None) -> CadSeam:
 
 
 def _deviation(covariances: Floats, limit: float) -> float:
-    """Return the largest standard deviation along the seam, in any direction [m]."""
+    """Return the largest standard deviation of any seam point in any direction [m]."""
     values, vectors = np.linalg.eigh(covariances)
     worst = int(np.argmax(values[:, -1]))
     deviation = float(np.sqrt(values[worst, -1]))

@@ -1,4 +1,4 @@
-"""Find where surfaces of a scan end: a plate across the seam, a seam along it."""
+"""Find the ends of surfaces in a scan: of a plate across the seam, and of the seam itself."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from flangeye_plugins.seam.sweep import Swept
 from flangeye_plugins.seam.template import EDGES, Section
 
 FEWEST_LANES = 5
-"""Lanes that an end is known from."""
+"""Smallest number of lanes from which an end is estimated."""
 SEAM_WITHIN = 8e-3
-"""Lanes this near to the seam say where it ends [m]."""
+"""Largest distance from the seam of the lanes that define its end [m]."""
 
 
 def last_in_lanes(lanes: Floats, way: Floats, pitch: float) -> tuple[NDArray[np.intp], Floats]:
     """Return each lane's last point, and the distance (L,) from there to the surface's end [m].
 
-    A surface ends on average half a spacing beyond the last pixel that is on it.
+    A surface ends on average half a point spacing beyond its last point.
 
     Args:
-        lanes: (N,) place across the lanes, which are a pitch wide [m].
-        way: (N,) place along them [m].
+        lanes: (N,) positions across the lanes, which are one ``pitch`` wide [m].
+        way: (N,) positions along the lanes [m].
         pitch: Distance between neighbouring points [m].
     """
     if not len(way):
@@ -43,7 +43,7 @@ def last_in_lanes(lanes: Floats, way: Floats, pitch: float) -> tuple[NDArray[np.
 def face_ends(
     swept: Swept, local: Floats, pitch: float, tolerance: float
 ) -> tuple[Floats, NDArray[np.intp]]:
-    """Return (K, 5) local points where faces end at upright edges, and which edge each is on."""
+    """Return local points (K, 5) at the faces' ends at upright edges, and each one's edge (K,)."""
     joint, section = swept.section.joint, swept.section
     q = swept.in_section(local)
     away, active = section.distances(q)
@@ -74,13 +74,14 @@ def _on_face(section: Section, q: Floats, face: int, tolerance: float) -> Mask:
 
 @dataclass(frozen=True)
 class End:
-    """Where along the seam a surface ends [m].
+    """The position along the seam at which a surface ends.
 
     Attributes:
-        place: Along the way to the end: less is sooner.
-        deviation: Its standard deviation.
-        seen: Whether the scanner looked past it there; otherwise it may go on unseen.
-        covered: Whether it goes on below something else, for all that is known.
+        place: Distance along the seam, increasing towards this end [m].
+        deviation: Standard deviation of ``place`` [m].
+        seen: Whether the scanner saw background beyond the end; otherwise the surface may continue
+            unseen.
+        covered: Whether the surface may continue below something that hides it.
     """
 
     place: float
@@ -91,21 +92,22 @@ class End:
     @property
     def sharp(self) -> bool:
         """Whether the surface ends sharply, with nothing above its end."""
-        # An end that is known less well is not sharp [m]
+        # Largest standard deviation of a sharp end [m]
         loose = 0.5e-3
         return self.deviation < loose and not self.covered
 
 
 def surface_end(way: Floats, past: Mask, covered: Mask, pitch: float) -> End | None:
-    """Return where a surface ends, from the ends of its lanes; None with too few lanes.
+    """Return a surface's end, estimated from the ends of its lanes; None with too few lanes.
 
-    The median over lanes, of those behind which the scanner sees something farther away where
-    there are enough. Lanes that end at two places are not a sample of one place.
+    It is the median over lanes. If enough lanes end before visible background, only these count. If
+    the lanes' ends are spread over more than two pixels, they are not a sample of one position, and
+    averaging does not reduce the standard deviation.
 
     Args:
-        way: (L,) ends of lanes along the way to the end [m].
-        past: (L,) where the scanner looks past them.
-        covered: (L,) where something else is before what is behind them.
+        way: (L,) ends of the lanes, as distances along the seam [m].
+        past: (L,) whether the scanner sees background beyond each lane's end.
+        covered: (L,) whether something hides what is beyond each lane's end.
         pitch: Distance between neighbouring points [m].
     """
     if len(way) < FEWEST_LANES:
@@ -113,10 +115,10 @@ def surface_end(way: Floats, past: Mask, covered: Mask, pitch: float) -> End | N
     seen = past.sum() >= FEWEST_LANES
     way = way[past] if seen else way
     low, middle, high = np.quantile(way, [0.25, 0.5, 0.75])
-    # Lanes whose middle half is spread over more pixels end at two places; else it is the standard
-    # deviation of a median, 1.25 times that of a mean
+    # The standard deviation of a median is 1.25 times that of a mean; lanes spread over more than
+    # two pixels end at different positions, which averaging does not improve
     share = 1.25 / np.sqrt(len(way)) if seen and high - low <= 2.0 * pitch else 1.0
-    # Of a normal distribution, from its quartiles' distance
+    # Standard deviation of a normal distribution over its interquartile range
     sigma_of_iqr = 0.7413
     deviation = float(share * sigma_of_iqr * (high - low))
     return End(
@@ -125,12 +127,11 @@ def surface_end(way: Floats, past: Mask, covered: Mask, pitch: float) -> End | N
 
 
 def soonest(ends: list[End], limit: float) -> tuple[float, float]:
-    """Return the end that a seam reaches first, from those of its surfaces, with its deviation [m].
+    """Return a seam's end, the first of its surfaces' ends, and its standard deviation [m].
 
-    Surfaces that go on to the limit of what is looked at do not end; where none ends the deviation
-    is infinite.
-    Surfaces that may end at the same place, within their errors, are averaged. One whose end
-    is hidden or blurred, and is not seen so far, may end anywhere in between.
+    Surfaces that reach ``limit`` do not end; if none ends, the deviation is infinite. Ends that
+    coincide within three standard deviations are averaged. A hidden or blurred end that lies before
+    the result adds the uncertainty of the stretch in between.
     """
     ends = [end for end in ends if end.place < limit]
     if not ends:
@@ -145,7 +146,7 @@ def soonest(ends: list[End], limit: float) -> tuple[float, float]:
             same.append(end)
     weights = np.array([max(end.deviation, 1e-6) ** -2 for end in same])
     place = float(weights @ [end.place for end in same] / weights.sum())
-    # Anywhere within the hidden stretch alike: a uniform distribution, of length / sqrt(12)
+    # Uniform distribution over the hidden stretch: standard deviation length / sqrt(12)
     hidden = max([0.0, *(place - end.place for end in ends)])
     if first.covered:
         hidden = limit - first.place
@@ -153,21 +154,20 @@ def soonest(ends: list[End], limit: float) -> tuple[float, float]:
 
 
 class Rays:
-    """The scanner's rays about a line, from one or more poses."""
+    """The scanner's rays near a line, from one or more poses."""
 
     def __init__(self, eyes: Floats, clouds: tuple[Floats, ...], line: Floats) -> None:
-        """Keep what lies in the directions of a line.
+        """Index the rays in the directions of a line.
 
         Args:
-            eyes: (P, 3) where it was [m].
-            clouds: P of (N, 3), what it saw from there [m].
-            line: (K, 3) [m].
+            eyes: (P, 3) positions of the scanner [m].
+            clouds: P arrays (N, 3), the points measured from each position [m].
+            line: (K, 3) points of the line [m].
         """
         from scipy.spatial import cKDTree
 
         self._places = []
-        # Directions about a line in which the scanner may look past it: 40 mm at 0.7 m
-        # [rad]
+        # Margin of directions around the line [rad]: 40 mm at 0.7 m
         around = 0.06
         for eye, cloud in zip(eyes, clouds, strict=True):
             sight, seen = _directions(line - eye)[0], cloud - eye
@@ -178,18 +178,18 @@ class Rays:
                 self._places.append((eye, cKDTree(rays[about]), far[about]))
 
     def past(self, points: Floats, pitch: float, tolerance: float) -> tuple[Mask, Mask]:
-        """Return for points (N, 3) whether the scan is only behind them, and if before them.
+        """Return masks (N,): the scanner sees past each point, and something hides the point.
 
         Args:
-            points: Where something might be [m].
+            points: (N, 3) points where a surface might be [m].
             pitch: Distance between neighbouring points of the scan there [m].
-            tolerance: What is farther away or nearer by less is there [m].
+            tolerance: Largest difference of range at which a measurement is the point itself [m].
         """
         out, covered = np.zeros((2, len(points)), dtype=bool)
         for eye, tree, far in self._places:
             rays, away = _directions(points - eye)
             off, at = tree.query(rays, k=4)
-            # A ray is seen by what lies within a pixel of it.
+            # The measurements within one pixel of a ray are what the scanner sees on it.
             near = off < pitch / away[:, None]
             behind = far[np.minimum(at, len(far) - 1)] - away[:, None]
             out |= near.any(axis=1) & ((behind > tolerance) | ~near).all(axis=1)
@@ -198,13 +198,13 @@ class Rays:
 
 
 def _directions(sight: Floats) -> tuple[Floats, Floats]:
-    """Return unit vectors (N, 3), and the lengths (N,) [m]."""
+    """Return unit vectors (N, 3) and lengths (N,) [m]."""
     lengths = np.linalg.norm(sight, axis=1)
     return sight / lengths[:, None], lengths
 
 
 def surfaces(swept: Swept, local: Floats, tolerance: float) -> dict[int, Mask]:
-    """Return which of (N, 3) local points are on each surface that must be seen, near the seam."""
+    """Return the masks (N,) of points on each surface that must be visible, near the seam."""
     section = swept.section
     q = swept.in_section(local)
     away, active = section.distances(q)

@@ -1,4 +1,4 @@
-"""Find a welded joint in the scan, near a rough line: its cross-section is fitted along it."""
+"""``seam.joint``: find a joint in the scan by fitting its cross-section along a rough line."""
 
 from __future__ import annotations
 
@@ -66,16 +66,16 @@ class JointParams(SeamParams):
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A joint in ``camera``.
+    """A joint found in a scan, in ``camera``.
 
     Attributes:
-        course: Frames along it.
-        swept: Its section, beside these.
-        local: (N, 3) points about it.
+        course: Frames along the joint.
+        swept: The fitted cross-section, relative to these frames.
+        local: (N, 3) scan points near the joint, in local coordinates.
         pitch: Distance between neighbouring points [m].
-        rays: What the scanner saw along its rays.
-        ends: Where along the course it starts and ends [m].
-        deviations: Standard deviations of both ends [m]; infinite where an end was not seen.
+        rays: The scanner's rays near the joint.
+        ends: Start and end of the joint along the course [m].
+        deviations: Standard deviations of both ends [m]; infinite for an end that was not seen.
     """
 
     course: Course
@@ -88,12 +88,12 @@ class Found:
 
     @property
     def inside(self) -> Floats:
-        """(M, 3) those of the points that are between the ends."""
+        """The local points (M, 3) between the ends."""
         s = self.local[:, 0]
         return self.local[(s > self.ends[0]) & (s < self.ends[1])]
 
     def again(self, points: Floats, reach: float) -> Found:
-        """Return the same slab beside frames along the line that was found."""
+        """Return the joint with points in local coordinates of frames along the fitted line."""
         line = self.course.moved(*self.swept.spline.at(self.course.s).T)
         flat = Spline.through(line.length, line.closed, line.s, np.zeros((len(line.s), 3)))
         local = line.local(points, reach)[1]
@@ -112,17 +112,18 @@ def seam_joint(  # noqa: PLR0913  what it asks the runner for
 ) -> Seam:
     """Fit a joint's cross-section to the scan along a rough line.
 
-    The line is the step's own or that of an earlier seam step. The seam is where the joint's
-    surfaces meet, or the middle of a gap; it begins and ends where the plates do.
+    The line is given by the step's parameters or by an earlier seam step. The seam is the line
+    where the joint's surfaces meet, or the middle of the gap. It begins and ends where the plates
+    do.
 
-    Figures [m]: ``residual`` of the points on the joint; ``registration``, the largest standard
-    deviation of the line in the scan; ``start`` and ``end``, those of both ends along it, where
-    they were seen; ``explained`` and ``coverage`` as the parameters have them; of a scan from
-    several places ``apart``.
+    The seam's figures are ``residual``, the standard deviation of the points on the joint [m];
+    ``registration``, the largest standard deviation of the line in the scan [m]; ``start`` and
+    ``end``, the standard deviations of both ends, if seen [m]; ``explained`` and ``coverage``, as
+    the parameters define them; and ``apart``, for a scan from several poses [m].
 
     Raises:
-        StageError: There is no line, or too few points about it.
-        CalibrationRefused: The joint is not there, or is not known well enough, or two are.
+        StageError: There is no rough line, or there are too few points near it.
+        CalibrationRefused: The joint was not found, is too uncertain, or is ambiguous.
     """
     answer = answer_for(STAGE, calibration, params)
     seen = seen_in_base(STAGE, scan, answer, robot)
@@ -149,7 +150,7 @@ def seam_joint(  # noqa: PLR0913  what it asks the runner for
 
 
 def _refuse_apart(seen: PlacedScan) -> None:
-    """Refuse clouds of several places that do not agree where they show the same face."""
+    """Refuse a scan from several poses whose clouds disagree on faces that they share."""
     limit = 1e-3  # more than a calibrated scanner on a real arm leaves between two places [m]
     if seen.apart is not None and seen.apart > limit:
         raise CalibrationRefused(
@@ -181,7 +182,7 @@ def _rough(seen: PlacedScan, params: JointParams, seam: Seam | None) -> Course:
 
 
 def _found(seen: PlacedScan, rough: Course, params: JointParams) -> Found:
-    """Return the joint and its ends."""
+    """Return the fitted joint with its ends."""
     box = params.reach + WIDE + 10e-3
     points = seen.points
     at, local = rough.local(points, box)
@@ -211,10 +212,10 @@ def _found(seen: PlacedScan, rough: Course, params: JointParams) -> Found:
 
 
 def _solid(points: Floats) -> tuple[float, Floats]:
-    """Return the distance between neighbouring points [m], and those that have enough of them.
+    """Return the distance between neighbouring points [m], and the points without mixed pixels.
 
-    A pixel that sees two surfaces shows a point between them with few neighbours; on a
-    surface 19 are within two and a half spacings.
+    A mixed pixel gives a point between two surfaces with few neighbours. On a surface 19 points lie
+    within 2.5 spacings.
     """
     from scipy.spatial import cKDTree
 
@@ -226,7 +227,7 @@ def _solid(points: Floats) -> tuple[float, Floats]:
 
 
 def _placed(rough: Course, local: Floats, normals: Floats, params: JointParams) -> list[JointPlace]:
-    """Return the joint's way along the rough line."""
+    """Return the joint's positions along the rough line, one per slab."""
     joint = JOINTS[params.joint]
     joints: tuple[JointShape, ...] = (joint,)
     if joint.mirrored() != joint and params.joint != "fillet":
@@ -256,7 +257,7 @@ def _between(first: list[JointPlace], second: list[JointPlace]) -> float:
 
 
 def _with_ends(found: Found) -> Found:
-    """Return the joint between its ends: it ends where the first of its surfaces does."""
+    """Return the joint with its ends; it ends where the first of its surfaces ends."""
     if found.course.closed:
         return replace(found, ends=(0.0, found.course.length), deviations=(0.0, 0.0))
     start, stop = (_end(found, sign) for sign in (-1, 1))
@@ -264,9 +265,9 @@ def _with_ends(found: Found) -> Found:
 
 
 def _end(found: Found, sign: int) -> tuple[float, float]:
-    """Return where the joint starts (-1) or ends (1) along its course, and its deviation [m].
+    """Return the start (-1) or end (1) of the joint along its course, and its deviation [m].
 
-    Where it goes on to the course's end the deviation is infinite.
+    The deviation is infinite if the joint continues to the course's end.
     """
     swept, local, pitch = found.swept, found.local, found.pitch
     q = swept.in_section(local)
@@ -293,7 +294,7 @@ def _end(found: Found, sign: int) -> tuple[float, float]:
 
 
 def _line(found: Found) -> tuple[Floats, Floats, Floats]:
-    """Return the seam (N, 3), its openings (N, 3) and its covariances (N, 3, 3), in ``camera``."""
+    """Return the seam's points (N, 3), openings (N, 3) and covariances (N, 3, 3) in ``camera``."""
     start, stop = found.ends
     count = max(2, round((stop - start) / SPACING) + 1)
     s = np.linspace(start, stop, count)
@@ -315,7 +316,7 @@ def _line(found: Found) -> tuple[Floats, Floats, Floats]:
 
 
 def _half_width(swept: Swept) -> float | None:
-    """Return how far a face's end is from the opening through the seam, on average [m]."""
+    """Return half the joint's width: the mean distance of the faces' ends from the opening [m]."""
     section = swept.section
     if section.joint.gap:
         return float(section.shape[6] / 2)
@@ -328,7 +329,7 @@ def _judged(found: Found, params: JointParams) -> dict[str, float]:
     """Return the quality figures of the seam, or refuse it.
 
     Raises:
-        CalibrationRefused: A figure is beyond its limit; the message gives both.
+        CalibrationRefused: A figure exceeds its limit; the message gives both.
     """
     explained, coverage, astray = _shares(found)
     start, stop = found.ends
@@ -382,7 +383,7 @@ def _judged(found: Found, params: JointParams) -> dict[str, float]:
 
 
 def _refuse_plane(found: Found) -> None:
-    """Refuse what a plane explains as well; between plates in one plane, a gap that is not seen."""
+    """Refuse a joint that a plane explains as well, and a gap between coplanar plates not seen."""
     section, pitch, tolerance = found.swept.section, found.pitch, 5 * found.swept.sigma
     q = found.swept.in_section(found.inside)
     q = q[np.linalg.norm(q, axis=1) < WIDE / 2 + section.shape[4:].max()]
@@ -408,9 +409,10 @@ def _refuse_plane(found: Found) -> None:
 
 
 def _shares(found: Found) -> tuple[float, float, tuple[float, float] | None]:
-    """Return the share of points about the seam that are on it, and of its length that is seen.
+    """Return the share of points near the seam that are on the joint, the visible share, and a gap.
 
-    And from where to where most points are on something else [m]; None for nowhere.
+    The visible share is that of the seam's length. The gap is the longest interval in which most
+    points are on something else [m]; None without one.
     """
     swept, local = found.swept, found.local
     q = swept.in_section(local)
@@ -434,7 +436,7 @@ def _shares(found: Found) -> tuple[float, float, tuple[float, float] | None]:
 
 
 def _longest_run(flags: NDArray[np.bool_]) -> slice:
-    """Return where the longest run of true ones among (N,) is."""
+    """Return the slice of the longest run of true values."""
     steps = np.diff(np.concatenate([[0], flags.astype(int), [0]]))
     starts, stops = np.flatnonzero(steps > 0), np.flatnonzero(steps < 0)
     if not len(starts):

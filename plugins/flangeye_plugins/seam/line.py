@@ -1,4 +1,4 @@
-"""A seam from a file: taught points, a table, a drawing, or the edge of a CAD."""
+"""``seam.line``: take a seam from a file of taught points, a table, a drawing or a CAD's edge."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ STAGE = "seam.line"
 
 
 class LineParams(SeamParams, PlaceParams):
-    """Parameters of ``seam.line``; position and rpy are those of the file's frame in the base."""
+    """Parameters of ``seam.line``; ``position`` and ``rpy`` are the file's frame in the base."""
 
     path: RecipeFile = Field(
         description="Points or taught poses in order (CSV, YAML, JSON), a drawing (DXF), or CAD "
@@ -57,10 +57,11 @@ def seam_line(
     workspace: Box | None = None,
     robot: RobotModel | None = None,
 ) -> Seam:
-    """Take a seam from a file: as it is, or as the rough line of ``seam.joint``.
+    """Take a seam from a file, to be welded as it is or to serve as rough line of ``seam.joint``.
 
     Raises:
-        StageError: The file cannot be read, or holds no line, or several and no ``near``.
+        StageError: The file cannot be read, has no line, or has several lines but ``near`` is not
+            set.
         CalibrationRefused: The seam leaves the workspace.
     """
     pose = params.matrix
@@ -117,9 +118,10 @@ def _lines(path: Path, unit: LengthUnit, angle: float) -> list[Floats]:
 
 
 def _points(path: Path, unit: LengthUnit) -> Floats:
-    """Return the points (N, 3) of a table or of a list of poses, in its unit.
+    """Return the points (N, 3) of a table or of a list of poses, in the file's unit.
 
-    Columns x, y, z, or x_mm, y_mm, z_mm; position of poses in YAML or JSON; else the first three.
+    They are the columns x, y, z or x_mm, y_mm, z_mm, the positions of poses in YAML or JSON, or the
+    first three columns.
     """
     table = read_table(path.parent, path.name)
     if not table.rows:

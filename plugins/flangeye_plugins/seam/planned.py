@@ -1,4 +1,4 @@
-"""Plan a seam in the base from a line in the scan, however the line was found."""
+"""Common part of the seam stages: a seam in the base from a line in the scan."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SPACING = 2e-3
 
 
 class SeamParams(Params):
-    """Common parameters of stages that plan a seam."""
+    """Common parameters of the seam stages."""
 
     arm: Literal["as-reported", "corrected"] = Field(
         "as-reported",
@@ -36,15 +36,15 @@ class SeamParams(Params):
 
 
 def scanner_covariance(scanner: ScannerModel | None, distance: float) -> Floats:
-    """Return a part's (6, 6) pose covariance, about the part, from scanner distortion.
+    """Return the covariance (6, 6) of a part's pose due to scanner distortion, about the part.
 
-    A smooth error over the scanner's volume moves and turns a part as a whole; no residual shows
-    it. Its size is the model's, in every direction alike; its slope that of a field which
-    changes its sign over half the distance.
+    A smooth error over the scanner's volume translates and rotates a part as a whole, which no
+    residual shows. The translation has the scanner model's standard deviation in every direction;
+    the rotation is that of a field which changes sign over half the distance.
 
     Args:
-        scanner: The recipe's; zero without one.
-        distance: From the scanner to the part [m].
+        scanner: Scanner model of the recipe; None gives zero.
+        distance: Distance from the scanner to the part [m].
     """
     error = scanner.calibration_error if scanner else 0.0
     shift, turn = error / np.sqrt(3.0), 2 * error / distance
@@ -52,10 +52,10 @@ def scanner_covariance(scanner: ScannerModel | None, distance: float) -> Floats:
 
 
 def answer_for(stage: str, calibration: HandEye, params: SeamParams) -> HandEye:
-    """Return the answer for the arm that shall follow the seam.
+    """Return the hand-eye result for the arm as reported, or for the corrected arm.
 
     Raises:
-        CalibrationRefused: The corrected arm is asked for, and no error of it was found.
+        CalibrationRefused: The corrected arm is configured, but the calibration has no correction.
     """
     if params.arm == "as-reported":
         return calibration.as_reported()
@@ -71,13 +71,13 @@ def answer_for(stage: str, calibration: HandEye, params: SeamParams) -> HandEye:
 def for_the_controller(
     seam: Seam, calibration: HandEye, robot: RobotModel | None, params: SeamParams
 ) -> Seam:
-    """Return a seam with each point as the position to command in order to reach it.
+    """Return a seam whose points are the positions to command in order to reach the true ones.
 
     Args:
-        seam: In ``base``, as the corrected arm has it.
-        calibration: The answer it was planned with; see :func:`answer_for`.
-        robot: The arm.
-        params: How long the tool is.
+        seam: Seam in ``base``, in the corrected arm's coordinates.
+        calibration: Hand-eye result with which it was planned; see :func:`answer_for`.
+        robot: Model of the arm.
+        params: Parameters of the stage, with the tool's length.
 
     Raises:
         CalibrationRefused: The arm cannot reach the seam.
@@ -100,7 +100,7 @@ def for_the_controller(
 
 
 def _above(points: Floats, openings: Floats, x: Floats, tool: float) -> Floats:
-    """Return (N, 4, 4) flange poses whose tool comes down each opening, its x nearest to (3,)."""
+    """Return flange poses (N, 4, 4) with the tool along each opening and x close to ``x``."""
     # Turns about the tool are free: the one nearest to where the arm was calibrated is taken
     z = -openings / np.linalg.norm(openings, axis=1, keepdims=True)
     along = x - (z @ x)[:, None] * z
@@ -112,9 +112,9 @@ def _above(points: Floats, openings: Floats, x: Floats, tool: float) -> Floats:
 
 
 def resampled(line: Floats, spacing: float) -> Floats:
-    """Return a polyline (M, 3) at even steps of about ``spacing``, both ends included.
+    """Return a polyline (M, 3) resampled at even steps of about ``spacing``, with both ends.
 
-    Further columns of it go along: (N, K) gives (M, K).
+    Further columns are interpolated as well: (N, K) gives (M, K).
     """
     arc = arc_lengths(line[:, :3])
     at = np.linspace(0.0, arc[-1], max(2, round(arc[-1] / spacing) + 1))
@@ -122,10 +122,10 @@ def resampled(line: Floats, spacing: float) -> Floats:
 
 
 def refuse_outside(stage: str, points_in_base: Floats, workspace: Box | None) -> None:
-    """Refuse a seam that leaves the workspace, where the calibration was not checked.
+    """Refuse a seam that leaves the workspace in which the calibration was verified.
 
     Raises:
-        CalibrationRefused: It leaves it; the message says how far and along which axis.
+        CalibrationRefused: The message says how far it leaves the workspace, along which axis.
     """
     if workspace is None:
         return
@@ -141,7 +141,7 @@ def refuse_outside(stage: str, points_in_base: Floats, workspace: Box | None) ->
 
 
 def cloud_around(points: Floats, seam: Floats, base_T_camera: Transform) -> PointCloud:
-    """Return the points around a seam (N, 3), both in ``camera``, thinned, in ``base``."""
+    """Return the points (in ``camera``) around a seam, thinned and mapped to ``base``."""
     low, high = seam.min(axis=0), seam.max(axis=0)
     margin = 0.3 * np.linalg.norm(high - low) + 0.03
     points = points[((points > low - margin) & (points < high + margin)).all(axis=1)]

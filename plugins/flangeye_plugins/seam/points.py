@@ -1,4 +1,4 @@
-"""A scan's points: thinned, and with normals."""
+"""Thinning and normals of a scan's points."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from flangeye.types import Floats
 
 
 def thinned(points: NDArray[Any], voxel: float) -> Floats:
-    """Return one mean point for each cube of a grid that holds any."""
+    """Return the mean of the points in each occupied voxel."""
     import open3d as o3d
 
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.asarray(points, np.float64)))
@@ -19,7 +19,7 @@ def thinned(points: NDArray[Any], voxel: float) -> Floats:
 
 
 def normals_of(points: Floats) -> Floats:
-    """Return unit normals (N, 3) of points in ``camera``, turned towards the camera."""
+    """Return unit normals (N, 3) of points in ``camera``, oriented towards the camera."""
     import open3d as o3d
 
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))

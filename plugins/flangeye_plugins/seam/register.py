@@ -1,4 +1,4 @@
-"""Register a CAD to a scan: find the part, lay it on, and reject poor or ambiguous fits."""
+"""Register a CAD to a scan: find the part, fit its pose, and reject poor or ambiguous fits."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ STAGE = "seam.cad"
 LARGER, FEWEST = 3.0, 300
 """A part this many times larger than all of the scan, or with fewer points, has a wrong unit."""
 SAME = 1e-3
-"""Two poses whose seams differ by less are one [m]."""
+"""Poses whose seams differ by less than this count as the same [m]."""
 AROUND = 0.05
-"""How far around a seam the surface is its own, at least, as a share of the part's diagonal."""
+"""Smallest reach of the surface around a seam that must be seen, as a share of the diagonal."""
 
 
 @dataclass(frozen=True)
@@ -30,11 +30,11 @@ class RegistrationLimits:
     """Limits that a registration must meet to be accepted.
 
     Attributes:
-        seen: Least share that must have been seen of what the part shows from its broadest side:
-            the edge of a plate fits many things.
+        seen: Smallest visible area, as a share of the part's area seen from its broadest side:
+            small areas, like a plate's edge, fit many things.
         refuted: Largest share of the surface in view that may be missing in the scan.
         residual: Largest distance of the scan from the CAD, robust standard deviation [m].
-        distinct: By how much the second-best pose must agree less with the scan.
+        distinct: Smallest relative difference of score between the best and the second-best pose.
     """
 
     seen: float
@@ -49,10 +49,10 @@ class Registered:
 
     Attributes:
         fit: Pose ``camera_T_part`` and covariance.
-        seen: Seen share of the surface that the part shows from its broadest side.
-        refuted: Share of the surface in view where the scan contradicts the part: it goes through
-            it, or has a face beyond the part's edge.
-        second: Score of the best pose that has another seam, over the score of this pose.
+        seen: Visible area, as a share of the part's area seen from its broadest side.
+        refuted: Share of the surface in view that the scan contradicts, by measuring something
+            behind it or a face that continues beyond the part's edge.
+        second: Score of the best pose with a different seam, over the score of this pose.
     """
 
     fit: BodyFit
@@ -64,10 +64,10 @@ class Registered:
 def register(
     points: Floats, workpiece: Workpiece, seam: CadSeam, limits: RegistrationLimits
 ) -> Registered:
-    """Register a CAD to the scan (N, 3) in ``camera``, without any guess where it is.
+    """Register a CAD to a scan (N, 3) in ``camera``, without an initial guess.
 
     Raises:
-        StageError: The CAD cannot be in this scan: its unit is wrong.
+        StageError: The CAD's unit is wrong, as its size does not fit the scan.
         CalibrationRefused: The fit is poor or ambiguous.
     """
     check_unit(points, workpiece)
@@ -107,16 +107,15 @@ def register(
 
 
 def check_unit(points: Floats, workpiece: Workpiece) -> None:
-    """Refuse a CAD that is far larger or smaller than anything in the scan.
+    """Refuse a CAD that is far too large or too small for the scan.
 
     Raises:
-        StageError: Names the unit that would fit.
+        StageError: The message names the unit that would fit.
     """
     if len(points) < FEWEST:
         raise StageError(f"{STAGE}: the scan has {len(points)} points; {FEWEST} are needed")
     sample = points[:: max(1, len(points) // 50_000)]
-    # As if the points lay on a square: then FEWEST of them are as far across as sqrt(FEWEST) times
-    # their spacing
+    # For points on a square: a part with FEWEST points is sqrt(FEWEST) spacings wide
     extent = float(np.linalg.norm(np.ptp(sample, axis=0)))
     spacing, size, unit = extent / np.sqrt(len(points)), workpiece.diagonal, workpiece.unit
     if size > LARGER * extent:
@@ -144,9 +143,9 @@ def _laid(scan: Singles, looks: Looks, pose: Floats) -> BodyFit | None:
 
 
 def _seam_apart(seam: CadSeam, motion: Floats, size: float) -> float:
-    """Return how far a motion (4, 4) of the part takes its seam and its opening [m].
+    """Return the displacement of a part's seam and opening by a motion (4, 4) [m].
 
-    A closed seam that is moved along itself stays where it is.
+    The motion of a closed seam along itself does not count.
     """
     # A second line, out along the openings, shows a turn about the seam itself
     lines = seam.points, seam.points + AROUND * size * seam.openings

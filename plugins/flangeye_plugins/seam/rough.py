@@ -1,4 +1,4 @@
-"""Where a joint roughly is: a course along a rough line, and lines in short slabs of the scan."""
+"""Rough search for a joint: frames along a rough line, and line fits in short slabs of the scan."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ BESIDE = 2e-3
 
 
 class Line(NamedTuple):
-    """``n(angle) @ q = offset``; a face's line comes with the (N,) points on it."""
+    """A line ``n(angle) @ q = offset`` in a section; a face's has the points on it (N, 2)."""
 
     angle: float
     offset: float
@@ -29,7 +29,7 @@ class Line(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class JointPlace:
-    """A hypothesis of a joint in a slab: place (2,) q, roll and shape; score at most 1."""
+    """Hypothesis of a joint in a slab: position q (2,), roll and shape, with a score up to 1."""
 
     s: float
     q: Floats
@@ -42,16 +42,16 @@ class JointPlace:
 def rough_path(
     local: Floats, normals: Floats, joints: tuple[JointShape, ...], tolerance: float, reach: float
 ) -> list[list[JointPlace]]:
-    """Return the best ways of a joint along the line, each a place in most slabs; the best first.
+    """Return the best paths of a joint along the line, best first; each has a place in most slabs.
 
     Args:
-        local: (N, 3) the scan along, across and out of the rough line [m].
-        normals: (N, 3) in the same axes.
+        local: (N, 3) scan points along, across and out of the rough line [m].
+        normals: (N, 3) normals in the same axes.
         joints: The joint, and its mirror image.
         tolerance: Largest distance from a surface [m].
         reach: Largest distance of the seam from the rough line [m].
     """
-    # Along the line [m]: a rough line that is 3 deg askew smears an edge by half a millimetre
+    # Length of a slab [m]: a rough line that is off by 3 deg blurs an edge by half a millimetre
     slab = 10e-3
     slabs = (local[:, 0] // slab).astype(int)
     order = np.argsort(slabs, kind="stable")
@@ -72,7 +72,7 @@ def rough_path(
 
 
 def _lines(q: Floats, normals: Floats, tolerance: float) -> Iterator[Line]:
-    """Yield the lines with the most points; every point with its normal is a hypothesis of one."""
+    """Yield the lines with most points, each found from hypotheses of a point and its normal."""
     flat = normals[:, 1:]
     size = np.linalg.norm(flat, axis=1)
     q, flat = q[size > 0.8], flat[size > 0.8] / size[size > 0.8, None]
@@ -80,7 +80,7 @@ def _lines(q: Floats, normals: Floats, tolerance: float) -> Iterator[Line]:
     for _ in range(6):
         if len(q) < 12:
             return
-        # Hypotheses of each line
+        # At most 150 hypotheses for each line
         tried = slice(None, None, max(1, len(q) // 150))
         offsets = np.einsum("ni,ni->n", flat[tried], q[tried])
         on = np.abs(flat[tried] @ q.T - offsets[:, None]) < tolerance
@@ -88,7 +88,7 @@ def _lines(q: Floats, normals: Floats, tolerance: float) -> Iterator[Line]:
         best = on[on.sum(axis=1).argmax()]
         middle = q[best].mean(axis=0)
         spread, axes = np.linalg.eigh(np.cov((q[best] - middle).T))
-        # Of a line in a section [m]
+        # Shortest line in a section [m]
         shortest = 2.5e-3
         if best.sum() < 12 or 3.4 * np.sqrt(spread[1]) < shortest:
             return
@@ -100,7 +100,7 @@ def _lines(q: Floats, normals: Floats, tolerance: float) -> Iterator[Line]:
 
 
 def _ends(face: Line, right: bool) -> list[Line]:
-    """Return edges, upright on a face, where its points end: half a millimetre has none."""
+    """Return lines perpendicular to a face where its points end, with gaps of 0.5 mm or more."""
     along = np.array([np.cos(face.angle), -np.sin(face.angle)])
     at = np.sort(face.on @ along)
     bins = np.arange(at[0], at[-1] + 1e-9, 0.25e-3)
@@ -119,7 +119,7 @@ def _ends(face: Line, right: bool) -> list[Line]:
 def _places(
     s: float, q: Floats, lines: list[Line], joint: JointShape, tolerance: float, reach: float
 ) -> Iterator[JointPlace]:
-    """Yield where in a slab the lines fit the joint's half-planes."""
+    """Yield the places in a slab where lines fit the joint's half-planes."""
     present = [k for k in range(4) if joint.present[k]]
     beside = {
         k: [_ends(line, k == 1) if k in joint.unseen else [] for line in lines]
@@ -141,7 +141,7 @@ def _places(
 
 
 def _agree(joint: JointShape, which: list[int], lines: tuple[Line, ...] | list[Line]) -> bool:
-    """Return whether lines have the angles between each other that the joint's half-planes have."""
+    """Return whether the angles between lines agree with those between the joint's half-planes."""
     off = [line.angle - radians(joint.angles[k]) for line, k in zip(lines, which, strict=True)]
     allowed = [radians(2 * joint.spread[k] + 4) for k in which]
     return all(
@@ -157,18 +157,18 @@ def _placed(
     lines: tuple[Line, ...],
     tolerance: float,
 ) -> JointPlace | None:
-    """Return the joint whose half-planes are these lines, or None where that is not a joint."""
+    """Return the joint whose half-planes are these lines; None if it is not plausible."""
     nominal, spread = (np.radians([x[k] for k in present]) for x in (joint.angles, joint.spread))
     off = np.array([line.angle for line in lines]) - nominal
     weights = 1 / spread**2
-    # Weighted mean on the circle, for angles wrap
+    # Weighted circular mean, because angles wrap
     roll = float(np.angle(weights @ np.exp(1j * off)))
     angles = np.full(4, 0.0)
     angles[present] = np.angle(np.exp(1j * (off - roll)))
     turned = roll + nominal + angles[present]
     heights = joint.free[4:]
     design = np.column_stack([np.sin(turned), np.cos(turned), OFFSETS[present][:, heights]])
-    # Heights are nearer to nothing than to anything else, where lines leave them open.
+    # The ridge sets heights that the lines do not determine to zero
     ridge = 1e-6 * np.eye(design.shape[1])
     solved = np.linalg.solve(
         design.T @ design + ridge, design.T @ np.array([line.offset for line in lines])
@@ -183,7 +183,7 @@ def _placed(
 
 
 def turn(q: Floats, roll: Floats | float) -> Floats:
-    """Return (N, 2) section points in axes that are rolled (N,) from theirs: z towards y."""
+    """Return section points (N, 2) in axes rolled by angles (N,) from z towards y."""
     c, s = np.cos(roll), np.sin(roll)
     out = np.empty((len(q), 2))
     out[:, 0], out[:, 1] = c * q[:, 0] - s * q[:, 1], s * q[:, 0] + c * q[:, 1]
@@ -191,12 +191,12 @@ def turn(q: Floats, roll: Floats | float) -> Floats:
 
 
 def explained(section: Section, q: Floats, tolerance: float) -> float | None:
-    """Return the share of the points (N, 2) about a seam that a section explains, less the rest.
+    """Return the share of points (N, 2) near a seam that a section explains, less the others'.
 
-    None where one of its faces, or an edge that should be seen, has too few of them.
+    None if a face, or an edge that should be visible, has too few points.
     """
     away, active = section.distances(q)
-    # From the seam, what of a slab must be explained [m]
+    # Points within this distance of the seam must be explained [m]
     around = 12e-3
     near = np.linalg.norm(q, axis=1) < around + section.shape[4:6].max()
     good = near & (np.abs(away) < tolerance)
@@ -210,19 +210,19 @@ def explained(section: Section, q: Floats, tolerance: float) -> float | None:
 
 
 def _apart(places: list[JointPlace]) -> list[JointPlace]:
-    """Return the best few places that are not the same."""
+    """Return the best few distinct places."""
     kept: list[JointPlace] = []
     for place in sorted(places, key=lambda p: -p.score):
         if all(np.linalg.norm(place.q - other.q) > BESIDE for other in kept):
             kept.append(place)
-        # Places that are followed on to the next slab
+        # At most six places per slab are kept
         if len(kept) == 6:
             break
     return kept
 
 
 def _ways(spots: list[list[JointPlace]]) -> list[list[JointPlace]]:
-    """Return ways through the slabs, by dynamic programming; none shares a place with a better."""
+    """Return paths through the slabs, by dynamic programming; they share no places."""
     nodes = [(k, place) for k, places in enumerate(spots) for place in places]
     best: list[tuple[float, int | None]] = []
     for k, place in nodes:
@@ -251,7 +251,7 @@ def _ways(spots: list[list[JointPlace]]) -> list[list[JointPlace]]:
 
 
 def _jump(first: JointPlace, second: JointPlace, slabs: int) -> float:
-    # The joint wanders from slab to slab as a random walk: squared steps over the slabs between
+    # Random walk from slab to slab: squared steps divided by the number of slabs
     away = np.linalg.norm(first.q - second.q) / BESIDE
     rolled = np.angle(np.exp(1j * (first.roll - second.roll))) / np.radians(8)
     other = np.abs(first.shape[4:] - second.shape[4:]).max() / BESIDE
@@ -262,12 +262,12 @@ def _jump(first: JointPlace, second: JointPlace, slabs: int) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Spline:
-    """Cubic B-splines of several numbers over a line.
+    """A vector-valued cubic B-spline over a line's arc length.
 
     Attributes:
         length: Length of the line [m].
-        closed: Whether it comes back to its start.
-        values: (m, k) coefficients.
+        closed: Whether the line is closed.
+        values: (m, k) coefficients of k numbers.
     """
 
     length: float
@@ -276,7 +276,7 @@ class Spline:
 
     @classmethod
     def through(cls, length: float, closed: bool, s: Floats, values: Floats) -> Spline:
-        """Return the smooth line nearest to values (N, k) at s [m]."""
+        """Return the least-squares spline through values (N, k) at s [m]."""
         # Between the knots of the line [m]
         knots = 30e-3
         count = max(round(length / knots), 8 if closed else 1) + (0 if closed else 3)
@@ -289,7 +289,7 @@ class Spline:
         return replace(empty, values=np.linalg.solve(normal, design.T @ values))
 
     def basis(self, s: Floats) -> Any:
-        """Return the sparse (N, m) basis at s [m]."""
+        """Return the sparse basis matrix (N, m) at s [m]."""
         from scipy import sparse
         from scipy.interpolate import BSpline
 
@@ -307,7 +307,7 @@ class Spline:
         return design @ fold.tocsr()
 
     def bends(self) -> Floats:
-        """(k, m) second differences of the coefficients."""
+        """Matrix (k, m) of second differences of the coefficients."""
         count = len(self.values)
         if self.closed:
             eye = np.eye(count)
@@ -315,7 +315,7 @@ class Spline:
         return np.asarray(np.diff(np.eye(count), 2, axis=0))
 
     def at(self, s: Floats) -> Floats:
-        """Return (N, k) values at s [m]."""
+        """Return the values (N, k) at s [m]."""
         return np.asarray(self.basis(s) @ self.values)
 
 
@@ -324,11 +324,11 @@ class Course:
     """Frames along a line.
 
     Attributes:
-        points: (K, 3) at even steps [m].
-        axes: (K, 3, 3) rows: along, to the left, out of the work.
-        step: Between two of them [m].
-        closed: Whether the last is beside the first.
-        eyes: (P, 3) where the scanner was [m].
+        points: (K, 3) points at even steps [m].
+        axes: (K, 3, 3) axes as rows: along, to the left, out of the work.
+        step: Distance between two points [m].
+        closed: Whether the line is closed.
+        eyes: (P, 3) positions of the scanner [m].
     """
 
     points: Floats
@@ -339,18 +339,18 @@ class Course:
 
     @property
     def length(self) -> float:
-        """[m]."""
+        """Length of the line [m]."""
         return self.step * (len(self.points) - (not self.closed))
 
     @property
     def s(self) -> Floats:
-        """(K,) way along the line [m]."""
+        """Arc lengths (K,) of the points [m]."""
         return np.asarray(self.step * np.arange(len(self.points)), dtype=np.float64)
 
     def local(self, points: Floats, reach: float) -> tuple[Floats, Floats]:
-        """Return which of (N, 3) points are within reach [m], and (M, 5) their local coordinates.
+        """Return the mask (N,) of points within ``reach`` [m], and their local coordinates (M, 5).
 
-        Their s, y and z [m], and y and z of the unit vectors towards the scanner.
+        The coordinates are s, y and z [m], and y and z of the unit vector towards the scanner.
         """
         from scipy.spatial import cKDTree
 
@@ -370,25 +370,25 @@ class Course:
         return near, np.hstack([local[kept], seen])
 
     def at(self, s: Floats) -> tuple[Floats, Floats]:
-        """Return points (N, 3) and axes (N, 3, 3), those of the nearest frame, at s [m]."""
+        """Return points (N, 3) at s [m], and the axes (N, 3, 3) of the nearest frames."""
         k = np.round(s / self.step).astype(int)
         k = k % len(self.points) if self.closed else np.clip(k, 0, len(self.points) - 1)
         along = (s - self.step * np.round(s / self.step))[:, None] * self.axes[k, 0]
         return self.points[k] + along, self.axes[k]
 
     def points_at(self, local: Floats) -> Floats:
-        """Return (N, 3) points that are at s, y and z (N, 3) [m]."""
+        """Return the points (N, 3) with local coordinates s, y and z (N, 3) [m]."""
         origin, axes = self.at(local[:, 0])
         return np.asarray(origin + np.einsum("ni,nij->nj", local[:, 1:], axes[:, 1:]))
 
     def moved(self, y: Floats, z: Floats, roll: Floats) -> Course:
-        """Return frames along a line that lies (K,) beside this one and is rolled (K,) [rad]."""
+        """Return frames along this line, moved by y and z (K,) [m] and rolled (K,) [rad]."""
         points = self.points + y[:, None] * self.axes[:, 1] + z[:, None] * self.axes[:, 2]
         out = np.cos(roll)[:, None] * self.axes[:, 2] + np.sin(roll)[:, None] * self.axes[:, 1]
         return _with_openings(points, out, self.closed, self.eyes)
 
     def through(self, places: Sequence[JointPlace]) -> Course:
-        """Return frames along a smooth line near to the places of a joint."""
+        """Return frames along a smooth line through the places of a joint."""
         s = np.array([place.s for place in places])
         origin, axes = self.at(s)
         aside = np.array([place.q for place in places])
@@ -401,9 +401,9 @@ class Course:
 
 
 def course(line: Floats, eyes: Floats, closed: bool, beyond: float) -> Course:
-    """Return frames along a rough line (N, 3), straight on by ``beyond`` [m] at its open ends.
+    """Return frames along a rough line (N, 3), extended straight by ``beyond`` at open ends [m].
 
-    What is out of the work is towards the nearest of the eyes (P, 3): a scanner sees the seam.
+    "Out of the work" is the direction to the nearest scanner position (P, 3), which sees the seam.
     """
     if closed:
         line = np.vstack([line, line[:1]])
@@ -425,7 +425,7 @@ def course(line: Floats, eyes: Floats, closed: bool, beyond: float) -> Course:
 
 
 def _sight(points: Floats, eyes: Floats) -> Floats:
-    """Return (N, 3) from points to the nearest of the eyes [m]."""
+    """Return the vectors (N, 3) from points to the nearest scanner position [m]."""
     if len(eyes) == 1:
         return eyes - points
     nearest = np.linalg.norm(eyes - points[:, None], axis=2).argmin(axis=1)
@@ -446,7 +446,7 @@ def _smoothed(points: Floats, cells: float, closed: bool) -> Floats:
 
 
 def _with_openings(points: Floats, openings: Floats, closed: bool, eyes: Floats) -> Course:
-    """Return the frames of a line at even steps."""
+    """Return frames at even steps along a line with openings."""
     line = np.vstack([points, points[:1]]) if closed else points
     arc = arc_lengths(line)
     at = np.linspace(0.0, arc[-1], len(line))

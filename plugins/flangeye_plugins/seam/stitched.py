@@ -1,9 +1,9 @@
-"""A workpiece's scan in base coordinates: by a fixed scanner, or joined from several poses.
+"""A workpiece's scan in base coordinates: from a fixed scanner, or stitched from several poses.
 
-Clouds of a scanner on the flange are put together by the hand-eye pose and by where the controller
-had the flange. Whatever is wrong with that pose or with the zeros of the joints is wrong in every
-cloud, turned and shifted as the arm stood: a point that several clouds show is off by the mean of
-what each is off there. Where two clouds show the same face they must agree.
+Clouds of a scanner on the flange are stitched by the hand-eye pose and the reported flange poses.
+Errors of the hand-eye pose and of the joint zeros affect every cloud, each in the orientation of
+the arm at that pose. The error of a point seen in several clouds is the mean of their errors there.
+Clouds that show the same face must agree.
 """
 
 from __future__ import annotations
@@ -27,23 +27,23 @@ from flangeye_plugins.seam.points import normals_of, thinned
 
 
 class OfPose(Protocol):
-    """Covariance of points mapped to the base, from calibration and arm."""
+    """Interface: covariance of points mapped to the base, from calibration and arm."""
 
     def __call__(self, points_in_base: Floats) -> Floats:
-        """Return the (K, 3, 3) covariances [m^2] of (K, 3) points."""
+        """Return the covariances (K, 3, 3) of points (K, 3) [m^2]."""
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedScan:
-    """A scan with its pose and covariance.
+    """A scan with its pose in the base and the covariance of mapped points.
 
     Attributes:
-        base_T_camera: Pose of the camera; of the middle scan if there are several.
+        base_T_camera: Pose of the camera; that of the middle scan if there are several.
         covariance: Covariance of points mapped to the base.
-        eyes: (P, 3) where the camera was at each place, in ``camera`` [m].
-        clouds: P of (N, 3), what it saw there, in ``camera`` [m].
-        apart: Median distance of one place's face from its neighbour's, the largest of all [m];
-            None where there is one place.
+        eyes: (P, 3) positions of the camera for each cloud, in ``camera`` [m].
+        clouds: P arrays (N, 3) of points, in ``camera`` [m].
+        apart: Largest median distance between faces shared by neighbouring clouds [m]; None for one
+            cloud.
     """
 
     base_T_camera: Transform
@@ -54,14 +54,14 @@ class PlacedScan:
 
     @property
     def points(self) -> Floats:
-        """(N, 3) of all clouds."""
+        """Points (N, 3) of all clouds [m]."""
         return np.concatenate(self.clouds)
 
     def of_scanner(self, line: Floats, scanner: ScannerModel | None) -> Floats:
-        """Return the (K, 3, 3) covariances [m^2] of a line from the scanner's own distortion.
+        """Return the covariances (K, 3, 3) of a line due to scanner distortion [m^2].
 
-        It moves and turns what one place sees as a whole: about the line's middle, or, of several
-        places, about what the nearest has straight ahead.
+        The distortion translates and rotates each cloud as a whole: about the line's middle for one
+        cloud, about the nearest scanner's optical axis for several.
         """
         if len(self.eyes) == 1:
             levers, distance = line - line.mean(axis=0), np.linalg.norm(line.mean(axis=0))
@@ -74,7 +74,7 @@ class PlacedScan:
         return covariance_at(scanner_covariance(scanner, float(distance)), np.zeros(3), levers)
 
     def in_base(self, line: Floats, covariances: Floats) -> tuple[Floats, Floats]:
-        """Map (K, 3) points in ``camera`` and their covariances (K, 3, 3) to ``base``."""
+        """Return points (K, 3) and covariances (K, 3, 3), mapped from ``camera`` to ``base``."""
         rotation = self.base_T_camera.rotation
         mapped = self.base_T_camera.apply(line)
         return mapped, rotation @ covariances @ rotation.T + self.covariance(mapped)
@@ -86,13 +86,14 @@ def seen_in_base(
     """Return a scan in the base, for a fixed scanner or one on the arm.
 
     Args:
-        stage: Who asks, for the refusal.
-        scan: From one place beside the arm, or from several places of the flange.
+        stage: Name of the stage for the error message.
+        scan: Scan from a fixed scanner, or from several flange poses.
         answer: ``base_T_camera`` or ``flange_T_camera``.
-        robot: The arm, whose joints' zeros are known to ``joint_accuracy`` alone.
+        robot: Model of the arm with the standard deviation of its joint zeros (``joint_accuracy``).
 
     Raises:
-        CalibrationRefused: The scan was not taken by the scanner that was calibrated.
+        CalibrationRefused: Scan and calibration disagree about whether the scanner is on the
+            flange.
     """
     camera = answer.camera
     of_flange = camera.transform.parent != BASE
@@ -118,7 +119,7 @@ def seen_in_base(
 
 
 def _stand(place: ScanPlace, answer: HandEye, robot: RobotModel | None) -> Transform:
-    """Return ``base_T_camera`` at a place, by the arm as reported or, where found, corrected."""
+    """Return ``base_T_camera`` of one cloud, by the corrected flange pose if it is known."""
     arm = Arm(robot) if robot else None
     flange = corrected_flange(place.base_T_flange, place.joints, answer.correction, arm)
     return Transform(BASE, CAMERA, flange @ answer.camera.transform.matrix)
@@ -126,9 +127,10 @@ def _stand(place: ScanPlace, answer: HandEye, robot: RobotModel | None) -> Trans
 
 @dataclass(frozen=True, eq=False)
 class _AsOnePlace:
-    """The hand-eye pose alone: the scan of the workpiece took no part in the calibration.
+    """Covariance of points of a fixed scanner: that of the hand-eye pose alone.
 
-    For the same arm, which errs at the seam much as it did at the poses nearby.
+    The arm's own error at the seam is not added, as it is similar to that at the nearby calibration
+    poses, which the hand-eye pose contains.
     """
 
     answer: HandEye
@@ -140,7 +142,10 @@ class _AsOnePlace:
 
 @dataclass(frozen=True, eq=False)
 class _AsSeveral:
-    """The hand-eye pose and the joints' zeros, both the same at every place."""
+    """Covariance of points of a scanner on the flange, from hand-eye pose and joint zeros.
+
+    Both errors are common to all clouds.
+    """
 
     places: Sequence[ScanPlace]
     answer: HandEye
@@ -166,32 +171,32 @@ class _AsSeveral:
         return np.asarray(out + zeros * of_zeros @ of_zeros.transpose(0, 2, 1))
 
     def _shares(self, points: Floats) -> Floats:
-        """Return (places, K): how much of what is seen at each point each place shows."""
+        """Return the weight (places, K) of each cloud at each point; a point's weights sum to 1."""
         from scipy.spatial import cKDTree
 
         trees = [cKDTree(cloud) for cloud in self.shown]
-        # A cloud takes part in a point of the seam by how many of its points are so near [m]
+        # A cloud's weight at a point is the number of its points within this distance [m]
         cloud_within = 10e-3
         counts = np.array(
             [tree.query_ball_point(points, cloud_within, return_length=True) for tree in trees],
             float,
         )
         nearest = np.argmin([tree.query(points)[0] for tree in trees], axis=0)
-        counts[nearest, np.arange(len(points))] += 1e-3  # beyond what any shows: the nearest alone
+        counts[nearest, np.arange(len(points))] += 1e-3  # the nearest alone, if none has points
         return np.asarray(counts / counts.sum(axis=0))
 
 
 def _apart(clouds: Sequence[Floats]) -> float | None:
-    """Return by how much neighbouring clouds are apart, across the faces that both show."""
+    """Return the largest median distance between faces shared by neighbouring clouds [m]."""
     from scipy.spatial import cKDTree
 
     found = []
     for first, second in pairwise(clouds):
         normals = normals_of(first)
-        # Points so near to each other may show the same face [m]
+        # Points within this distance may show the same face [m]
         away, at = cKDTree(first).query(second, distance_upper_bound=10e-3)
         both = np.isfinite(away)
-        # Points that two clouds share, for their agreement to be known
+        # Smallest number of shared points for a comparison
         fewest_shared = 200
         if both.sum() >= fewest_shared:
             at = at[both]

@@ -1,8 +1,8 @@
-"""Fit one cross-section, swept along a smooth line, to all points about a seam at once.
+"""Fit one cross-section, swept along a smooth line, to all points near a seam at once.
 
-Minimise ``sum rho(f_i / sigma)`` of the signed distances f over cubic B-splines y(s), z(s) and
-roll(s) and the section's shape, by Gauss-Newton with Tukey's weights. Shape and splines share
-weak priors, so that a stretch without points is bridged and its covariance grows.
+Gauss-Newton with Tukey's weights minimises ``sum rho(f_i / sigma)`` of the signed distances f. The
+unknowns are cubic B-splines y(s), z(s) and roll(s), and the section's shape. Weak priors on shape
+and splines bridge stretches without points, where the covariance grows.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ WIDE = 18e-3
 
 @dataclass(frozen=True, eq=False)
 class Swept:
-    """A section, swept along a line.
+    """A cross-section, swept along a line.
 
     Attributes:
-        spline: The line, and how the section is rolled along it.
-        section: The section.
-        sigma: Standard deviation of the points that are on it [m].
-        covariance: (3m + k, 3m + k) of the coefficients and what is free of the shape.
+        spline: The line's y and z, and the section's roll, along the course.
+        section: The cross-section.
+        sigma: Robust standard deviation of the points on it [m].
+        covariance: (3m + k, 3m + k) covariance of the coefficients and the shape's free numbers.
     """
 
     spline: Spline
@@ -38,19 +38,19 @@ class Swept:
     covariance: Floats
 
     def in_section(self, local: Floats) -> Floats:
-        """(N, 2) places of (N, 3) local points in the section's own axes."""
+        """Return local points (N, 3) in the section's own axes (N, 2)."""
         line = self.spline.at(local[:, 0])
         return turn(local[:, 1:3] - line[:, :2], line[:, 2])
 
     def line_covariance(self, s: Floats) -> Floats:
-        """(N, 2, 2) of the seam's y and z at s [m^2]."""
+        """Return the covariance (N, 2, 2) of the seam's y and z at s [m^2]."""
         basis, m = self.spline.basis(s).toarray(), len(self.spline.values)
         blocks = self.covariance[: 2 * m, : 2 * m].reshape(2, m, 2, m)
         return np.asarray(np.einsum("ni,aibj,nj->nab", basis, blocks, basis))
 
 
 def swept_from(places: list[JointPlace], length: float, closed: bool) -> Swept:
-    """Return a start for the fit from places along the line."""
+    """Return the start of the fit from places along the line."""
     s = np.array([p.s for p in places])
     values = np.column_stack([[p.q for p in places], np.unwrap([p.roll for p in places])])
     shape = np.median([p.shape for p in places], axis=0)
@@ -61,15 +61,15 @@ def swept_from(places: list[JointPlace], length: float, closed: bool) -> Swept:
 def fitted(
     start: Swept, local: Floats, pitch: float, tolerance: float, edges: tuple[Floats, Indices]
 ) -> Swept:
-    """Return the best fit.
+    """Return the fitted cross-section and line.
 
     Args:
-        start: Near to it.
-        local: (N, 3) points about the seam [m].
-        pitch: Distance between neighbouring points [m]: nearer than one to where the boundary
-            bends, pixels see both sides.
-        tolerance: Largest distance from a surface, to begin with [m].
-        edges: (K, 3) places where faces end, and the (K,) edges there: they are on these.
+        start: Start value, near the solution.
+        local: (N, 3) points near the seam [m].
+        pitch: Distance between neighbouring points [m]; points closer than this to a corner of the
+            section are left out, as their pixels see both sides.
+        tolerance: Initial largest distance from a surface [m].
+        edges: Points (K, 3) at the ends of faces, and the edge (K,) on which each lies.
     """
     swept, sigma = start, tolerance / 2
     points = np.vstack([local, edges[0]])
@@ -87,9 +87,9 @@ def fitted(
 def _step(
     swept: Swept, points: Floats, edges: Any, basis: Any, pitch: float, sigma: float
 ) -> tuple[Swept, float]:
-    """Take one step of Gauss and Newton; return it and the spread of what is on the surface.
+    """Return the result of one Gauss-Newton step, and the spread of points on the surface [m].
 
-    The last points are on the given edges; the others on whatever is nearest to them.
+    The last points belong to the given edges, all others to the nearest surface.
     """
     line = basis @ swept.spline.values
     q = turn(points[:, 1:3] - line[:, :2], line[:, 2])
@@ -99,11 +99,10 @@ def _step(
     normals = swept.section.normals[edges]
     residual[first:] = np.einsum("ni,ni->n", normals, q[first:]) - swept.section.heights[edges]
     size = np.where(np.arange(len(points)) < first, sigma, 0.5 * pitch)
-    tukey = 4.685  # of Tukey's weights: as good as 95 % of the points would be, of normal noise
+    tukey = 4.685  # Tukey's constant: 95 % efficiency for normal noise
     weight = np.maximum(1 - (residual / (tukey * size)) ** 2, 0.0) ** 2
     sight = np.einsum("ni,ni->n", swept.section.normals[which], turn(points[:, 3:], line[:, 2]))
-    # Sine of 8 deg to the line of sight: pixels that see both sides of a jump in depth look
-    # like a surface
+    # Mixed pixels at a depth step look like a surface nearly along the line of sight: below 8 deg
     usable = _usable(swept.section, q, pitch) & (sight > 0.14)
     weight[:first][~usable[:first]] = 0.0
     used = weight > 0
@@ -116,13 +115,13 @@ def _step(
     inverse = np.linalg.inv(told + prior)
     step = inverse @ (-(rows.T @ (weight * residual)) - pull)
     shared = _shared(points[used, 0], which[used], weight * residual * size[used])
-    # Points share their errors with neighbours; what is known beforehand does not.
+    # Sandwich covariance: neighbouring points have correlated errors, the prior does not
     covariance = inverse @ (shared * told + prior) @ inverse
     return replace(_moved(swept, step), sigma=spread, covariance=covariance), spread
 
 
 def _usable(section: Section, q: Floats, pitch: float) -> Any:
-    """Return which points are on one surface alone, and near enough to the seam."""
+    """Return the mask of points near the seam, but not at a corner of the section."""
     far = np.linalg.norm(q, axis=1) < WIDE + section.shape[4:].max()
     for vertex in section.vertices:
         far &= np.linalg.norm(q - vertex, axis=1) > pitch
@@ -133,8 +132,8 @@ def _design(swept: Swept, basis: Any, line: Floats, q: Floats, which: Any) -> An
     """Return the sparse (N, 3m + k) derivatives of the signed distances."""
     from scipy import sparse
 
-    # Of the distance n(angle) . q - h, by y and z of the line and by its roll. A turn of one
-    # half-plane acts as the roll does, with the same lever
+    # Derivatives of the distance n(angle) . q - h by y and z of the line and by its roll. A
+    # half-plane's angle has the same lever as the roll
     angle = swept.section.angles[which]
     turned = angle + line[:, 2]
     lever = np.cos(angle) * q[:, 0] - np.sin(angle) * q[:, 1]
@@ -150,14 +149,13 @@ def _design(swept: Swept, basis: Any, line: Floats, q: Floats, which: Any) -> An
 
 
 def _prior(swept: Swept) -> tuple[Floats, Floats]:
-    """Return the priors' normal matrix and their pull at the present values."""
+    """Return the priors' normal matrix, and their gradient at the present values."""
     joint, values = swept.section.joint, swept.spline.values
     bends = swept.spline.bends()
     m, free = len(values), joint.free
     size = 3 * m + int(free.sum())
     normal, present = np.zeros((size, size)), np.zeros(size)
-    # Standard deviations of second differences of coefficients: across, out [m], and roll
-    # [rad]
+    # Standard deviations of the coefficients' second differences: y, z [m] and roll [rad]
     bend = np.array([1e-3, 1e-3, 0.05])
     for k in range(3):
         at = slice(k * m, (k + 1) * m)
@@ -180,8 +178,8 @@ def _moved(swept: Swept, step: Floats) -> Swept:
 
 
 def _shared(s: Floats, which: Any, scores: Floats) -> float:
-    """Return by how much neighbours' errors, which are alike, raise the variance."""
-    # Points so near along the seam may share their error [m]
+    """Return the factor by which correlated errors of neighbouring points raise the variance."""
+    # Length along the seam within which errors may be correlated [m]
     blocks = (s / 5e-3).astype(int) * 4 + which
     sums = np.bincount(blocks, scores)
     return max(float((sums**2).sum() / max((scores**2).sum(), 1e-300)), 1.0)

@@ -1,8 +1,8 @@
-"""Cross-sections of welded joints: two plates, each a face and its edge, as half-planes.
+"""Cross-sections of welded joints, built of half-planes: two plates, each a face and an edge.
 
-In a section y runs across the seam, z out of it; the first plate lies at negative y. A half-plane
-is where ``n(angle) @ q <= height``, with n(a) = (sin a, cos a). A plate is the intersection of its
-face and its edge, the joint the union of both plates: its boundary is where
+In a section y points across the seam and z out of the work; the first plate lies at negative y. A
+half-plane is ``n(angle) @ q <= height`` with n(a) = (sin a, cos a). A plate is the intersection of
+its face and its edge, and the joint is the union of both plates. So its boundary is where
 ``min(max(first), max(second))`` of the four signed distances is zero.
 """
 
@@ -24,15 +24,15 @@ OFFSETS = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -0.5], [0.0, 1.0, 0.0], [0.0, 0.
 
 @dataclass(frozen=True)
 class JointShape:
-    """One joint.
+    """A type of joint.
 
     Attributes:
-        angles: Angles of the four normals from z, positive towards y [deg].
-        spread: Standard deviation of each [deg].
+        angles: Nominal angles of the four normals from z, positive towards y [deg].
+        spread: Prior standard deviation of each angle [deg].
         heights: Whether the faces lie above the seam.
-        gap: Whether a root gap is between the edges; the seam is in its middle.
-        unseen: Edges that stand upright on their faces: where they are hidden, the face's end
-            shows them.
+        gap: Whether there is a root gap between the edges; the seam is its middle.
+        unseen: Edges perpendicular to their faces. They may be hidden; the face's end then shows
+            their position.
     """
 
     angles: tuple[float, float, float, float]
@@ -43,16 +43,16 @@ class JointShape:
 
     @property
     def present(self) -> Mask:
-        """(4,) which half-planes there are."""
+        """Mask (4,) of the half-planes that exist."""
         return np.isfinite(self.angles)
 
     @property
     def free(self) -> Mask:
-        """(7,) which of the shape's numbers are estimated: angles, heights, gap."""
+        """Mask (7,) of the shape's numbers that are estimated: angles, heights, gap."""
         return np.concatenate([self.present, [*self.heights, self.gap]])
 
     def mirrored(self) -> JointShape:
-        """Return the joint with its plates exchanged."""
+        """Return the mirrored joint, with its plates exchanged."""
         first, edge, second, other = self.angles
         spread = (*self.spread[2:], *self.spread[:2])
         return replace(
@@ -76,11 +76,11 @@ JOINTS = {
 
 @dataclass(frozen=True, eq=False)
 class Section:
-    """A joint with the numbers of one workpiece.
+    """A joint with the dimensions of one workpiece.
 
     Attributes:
-        joint: Its row of the table.
-        shape: (7,) deviations of the four angles [rad], heights of both faces and root gap [m].
+        joint: Type of the joint.
+        shape: (7,) deviations of the four angles [rad], heights of both faces [m], root gap [m].
     """
 
     joint: JointShape
@@ -88,22 +88,22 @@ class Section:
 
     @property
     def angles(self) -> Floats:
-        """(4,) angles of the normals [rad]; NaN where there is no half-plane."""
+        """Angles (4,) of the normals [rad]; NaN for a missing half-plane."""
         return np.radians(self.joint.angles) + self.shape[:4]
 
     @property
     def normals(self) -> Floats:
-        """(4, 2)."""
+        """Unit normals (4, 2) of the half-planes."""
         return np.stack([np.sin(self.angles), np.cos(self.angles)], axis=1)
 
     @property
     def heights(self) -> Floats:
-        """(4,) [m]."""
+        """Heights (4,) of the half-planes [m]."""
         return np.asarray(OFFSETS @ self.shape[4:])
 
     @property
     def vertices(self) -> Floats:
-        """(K, 2) where the boundary bends: at each face's end, and at the seam."""
+        """Corners (K, 2) of the boundary: at each face's end, and at the seam [m]."""
         pairs = [(0, 1), (2, 3), self.meeting]
         there = [p for p in pairs if self.joint.present[list(p)].all()]
         found = []
@@ -115,25 +115,25 @@ class Section:
 
     @property
     def meeting(self) -> tuple[int, int]:
-        """The two half-planes that meet at the seam."""
+        """Indices of the two half-planes that meet at the seam."""
         edge = self.joint.present
         return (1 if edge[1] else 0, 3 if edge[3] else 2)
 
     @property
     def half_angle(self) -> float | None:
-        """Half the angle between the faces that meet at the seam [rad]; None for parallel edges."""
+        """Half the angle between the surfaces that meet at the seam [rad]; None if parallel."""
         first, second = self.angles[list(self.meeting)]
         half = (np.pi - abs(first - second)) / 2
         return None if self.joint.gap else float(half)
 
     @property
     def opening(self) -> float:
-        """Angle from z of the bisector of the faces that meet at the seam [rad]."""
+        """Angle from z of the bisector of the surfaces that meet at the seam [rad]."""
         which = list(FACES if self.joint.gap else self.meeting)
         return float(self.angles[which].mean())
 
     def distances(self, q: Floats) -> tuple[Floats, NDArray[np.intp]]:
-        """Return the (N,) signed distances of points (N, 2), and the half-planes they are from."""
+        """Return signed distances (N,) of points (N, 2) [m], and the nearest half-planes (N,)."""
         away = q @ np.nan_to_num(self.normals).T - self.heights
         away[:, ~self.joint.present] = -np.inf
         # A plate is where both of its half-planes are, the larger distance; the work is where

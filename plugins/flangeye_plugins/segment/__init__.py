@@ -1,1 +1,1 @@
-"""``segment.*``: find the flange or a sphere in a scan. Add a way to find it: a new module."""
+"""``segment.*`` stages: find the flange, a sphere or a body in a scan."""

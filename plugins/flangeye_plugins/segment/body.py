@@ -1,4 +1,4 @@
-"""Find a body of known shape in a scan of the whole cell."""
+"""``segment.body``: find a body of known shape in a scan of the whole cell."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class SegmentBodyParams(Params):
     )
 
     def passed_by(self, found: FoundPose) -> bool:
-        """Return whether a pose passes."""
+        """Return whether a candidate pose satisfies these parameters."""
         return _passes(found, self.min_coverage, self.min_trust)
 
 
@@ -65,18 +65,20 @@ def segment_body(
     earlier: Earlier,
     params: SegmentBodyParams,
 ) -> FlangeCloud | Rejected:
-    """Find a body by its shape, without any guess where it is, and cut its surroundings out.
+    """Find a body by its shape, without an initial guess, and cut out the points around it.
 
-    Edges of the body are laid on edges of the scan; the poses that the scan does not contradict are
-    refined, and then checked ray by ray against everything the scanner saw: the body's surface,
-    points behind it, and anything at its depth where the body has ended; and the scan has to show
-    the body's size. Where none passes the scan is refused; where several do, the arm's motion
-    between captures decides. Where the arm's motion since earlier sightings predicts a pose that
-    passes, it is taken without a search.
+    Edges of the body are matched to edges of the scan. The poses that the scan does not contradict
+    are refined and then checked ray by ray: the body's surface must be seen, nothing may be seen
+    behind it, and nothing may continue beyond its ends. The scan must also determine the body's
+    size.
+
+    If no pose passes, the scan is rejected. If several pass, the arm's motion between captures
+    decides later. If the arm's motion since earlier captures predicts a pose that passes, that pose
+    is taken without a search.
 
     Raises:
-        StageError: The cloud is in millimetres, or otherwise a thousand times off; or the body is
-            round.
+        StageError: The cloud's unit is wrong (for example millimetres), or the body is round, so
+            that its rotation is not observable.
     """
     from flangeye_plugins.body.dense import FEWEST
     from flangeye_plugins.body.looks import prepared
@@ -122,14 +124,15 @@ def _searched(
     params: SegmentBodyParams,
     doubtful: bool,
 ) -> list[FoundPose] | Rejected:
-    """Return the poses that a scan leaves open, the best first, or why there is none.
+    """Return all poses consistent with a scan, best first, or the reason for rejecting the scan.
 
     Args:
-        search: In the scan.
-        body: What is looked for.
-        points: (N, 3) of the scan [m].
-        params: What a pose has to pass.
-        doubtful: Whether the mesh may be another one than the body's.
+        search: Search of the scan for the body.
+        body: The body.
+        points: (N, 3) points of the scan [m].
+        params: Limits that a pose must satisfy.
+        doubtful: Whether the mesh may be wrong, so that mirrored and rescaled versions are tried
+            too.
     """
     every, passes = search.everywhere(), params.passed_by
     passing = list(filter(passes, every))
@@ -155,7 +158,7 @@ def _between(points: Singles, near: float, far: float) -> Singles:
 
 
 def _predicted(capture: Capture, configuration: Configuration, earlier: Earlier) -> Floats:
-    """Return (K, 4, 4) where the arm has carried the body since the last sightings."""
+    """Return poses (K, 4, 4) predicted from earlier captures and the arm's motion since."""
     place = configuration.place
     # Earlier sightings from which the pose is predicted
     recent = earlier.observations[-3:]
@@ -172,7 +175,7 @@ def _predicted(capture: Capture, configuration: Configuration, earlier: Earlier)
 def _misdrawn(
     points: Singles, body: TargetBody, every: list[FoundPose], passes: Callable[[FoundPose], bool]
 ) -> Rejected | None:
-    """Return how a mesh is drawn wrongly, where it would be found otherwise; None where not."""
+    """Return a rejection if a corrected version of the mesh is found instead; None if not."""
     from flangeye_plugins.body.looks import Looks, prepared
     from flangeye_plugins.body.search import FINE_ACROSS, BodySearch, opposed
     from flangeye_plugins.body.view import view_of
@@ -206,7 +209,7 @@ def _misdrawn(
 
 @lru_cache(maxsize=1)
 def _otherwise(body: TargetBody) -> list[tuple[str, str, TargetBody]]:
-    """Return how a body's mesh may be written wrongly: what is wrong, what to do, the right one."""
+    """Return typical errors of a mesh: what is wrong, the remedy, and the corrected body."""
     out = [
         (
             "drawn mirrored",
@@ -244,7 +247,7 @@ def _passes(
 
 
 def _why_none(every: list[FoundPose], body: TargetBody) -> Rejected:
-    """Return why no pose is taken."""
+    """Return the rejection with the reason why no pose passed."""
     if not every:
         return Rejected(f"nothing of the size of {body.name} is there")
     best = every[0].verdict

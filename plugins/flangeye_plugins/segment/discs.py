@@ -1,4 +1,4 @@
-"""Flat parts of the scene: whether one is the flange, and if not, why not. Arrays only."""
+"""Flat parts of the scene: tests whether one is the flange, and gives the reason if not."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ class SurfacePiece(NamedTuple):
     """A smooth, connected piece of surface.
 
     Attributes:
-        points: (n, 3) [m].
+        points: (n, 3) positions [m].
         at: (n,) pixel of each point in the view.
         columns: Number of columns of the view.
-        side: Points along the side of a square patch, some ten.
+        side: Number of points along the side of a square patch, about ten.
     """
 
     points: Singles
@@ -34,7 +34,7 @@ class SurfacePiece(NamedTuple):
     side: int
 
     def patches(self, which: Indices) -> Indices:
-        """Return which patch each of some points lies in."""
+        """Return the number of the patch in which each of the points ``which`` lies."""
         rows, columns = cells(self.at.take(which), self.columns)
         return np.asarray(rows // self.side * self.columns + columns // self.side)
 
@@ -44,8 +44,8 @@ class PlanarPiece(NamedTuple):
 
     Attributes:
         plane: The plane, its normal towards the scanner.
-        points: (k, 3) points on the plane, thinned, since a table has a hundred times the points
-            its width needs [m].
+        points: (k, 3) points on the plane [m], thinned: a table has a hundred times more than
+            needed.
         at: (m,) pixels of the whole piece in the view.
     """
 
@@ -55,7 +55,7 @@ class PlanarPiece(NamedTuple):
 
     @classmethod
     def of(cls, piece: SurfacePiece, plane: Plane, members: Indices) -> PlanarPiece:
-        """Return the members of a piece that lie on a plane."""
+        """Return a piece's points that lie on a plane."""
         points = piece.points.take(thinned(members), axis=0)
         return cls(plane, points, piece.at.take(members))
 
@@ -67,7 +67,7 @@ class Patch(NamedTuple):
         piece: Piece that the patch belongs to.
         rough: Rough plane of the patch.
         members: Indices of its points in the piece.
-        rest: Indices of points that may belong to a part with its plane.
+        rest: Indices of points that may lie on the patch's plane.
     """
 
     piece: SurfacePiece
@@ -76,7 +76,7 @@ class Patch(NamedTuple):
     rest: Indices
 
     def around(self, reach: float, enough: int | None = None) -> Indices:
-        """Return which of the rest are near; a sample, if so many are ``enough``."""
+        """Return the indices of ``rest`` within ``reach`` [m]; about ``enough`` if it is given."""
         rest = self.rest
         if enough is not None:
             # A part of the largest size holds some fifty patches.
@@ -89,17 +89,17 @@ class Patch(NamedTuple):
 def flat_parts(
     pieces: list[SurfacePiece], reach: float, scatter: float, fewest: int
 ) -> list[PlanarPiece]:
-    """Return the flat parts of pieces of surface; a piece that is flat as a whole is one part.
+    """Return the flat parts of surface pieces; a piece that is flat as a whole is one part.
 
-    Where a scan is too coarse or too noisy to show the crease, a piece holds a face joined to
-    what is around it. The flattest patches of what does not lie on the piece's main plane then
-    propose planes, and each gathers the points around.
+    If a scan is too coarse or too noisy to show a crease, a piece contains a face and its
+    surroundings. In that case planes are proposed by the flattest patches of the points that are
+    not on the piece's main plane, and each plane collects the points around it.
 
     Args:
         pieces: Pieces of the scene.
-        reach: How far from its patch a part may extend [m].
-        scatter: Largest standard deviation about a plane of what is flat [m].
-        fewest: Points that are worth a search.
+        reach: Largest distance of a part's points from its patch [m].
+        scatter: Largest standard deviation of a flat part about its plane [m].
+        fewest: Smallest number of points in a part.
     """
     parts, bent = _whole(pieces, scatter)
     searched = [(p, r) for p, r in zip(pieces, bent, strict=True) if len(r) >= fewest]
@@ -119,7 +119,7 @@ def flat_parts(
 
 
 def _whole(pieces: list[SurfacePiece], scatter: float) -> tuple[list[PlanarPiece], list[Indices]]:
-    """Return the pieces that are flat as a whole, and the remainder of every piece to search."""
+    """Return the pieces that are flat as a whole, and each piece's points left to search."""
     # So many points settle the plane of a piece
     samples = [thinned(piece.points, enough=600) for piece in pieces]
     rough = [fit_plane(s.astype(np.float64), -s.mean(axis=0)) for s in samples]
@@ -138,9 +138,9 @@ def _whole(pieces: list[SurfacePiece], scatter: float) -> tuple[list[PlanarPiece
 
 
 def _planes(samples: list[Singles], rough: list[Plane], scatter: float) -> list[Plane | None]:
-    """Return the planes of what is flat; None where what lies about a rough plane is not.
+    """Return refined planes; None where the points about a rough plane are not flat.
 
-    A plane is sought in a slab somewhat thicker than the scatter allowed about it.
+    Each plane is fitted in a slab slightly thicker than the allowed scatter.
     """
     gates = np.full(len(samples), scatter + SEARCHED)
     found = robust_planes(samples, rough, gates)
@@ -158,7 +158,7 @@ def _off(plane: Plane, points: Singles) -> Singles:
 
 
 def _flattest(piece: SurfacePiece, rest: Indices) -> Iterator[Patch]:
-    """Yield the flattest patches of ``rest``, flattest first."""
+    """Yield the patches of ``rest`` in order of flatness, flattest first."""
     patches = piece.patches(rest)
     sort = np.argsort(patches, kind="stable")
     order = rest.take(sort)
@@ -177,7 +177,7 @@ def _flattest(piece: SurfacePiece, rest: Indices) -> Iterator[Patch]:
 
 
 def _principal(points: Floats, starts: Indices, sizes: Indices) -> tuple[Floats, Floats, Floats]:
-    """Return means (G, 3), variances off the plane (G,) and normals (G, 3) of groups of points."""
+    """Return means (G, 3), normal variances (G,) and unit normals (G, 3) of groups of points."""
     means = np.add.reduceat(points, starts) / sizes[:, None]
     offsets = points - np.repeat(means, sizes, axis=0)
     scatter = np.add.reduceat(offsets[:, :, None] * offsets[:, None], starts) / sizes[:, None, None]
@@ -189,12 +189,12 @@ SECTORS = 48
 
 
 class DiscLimits(NamedTuple):
-    """Limits that a disc must satisfy to be the flange.
+    """Limits that a disc must satisfy to be accepted as the flange.
 
     Attributes:
-        incidence: Largest angle of the normal to the line of sight [rad].
-        coverage: Smallest share of rim, and of bore, to be seen.
-        crease: Bend of depth between neighbours where a surface ends [m].
+        incidence: Largest angle between normal and line of sight [rad].
+        coverage: Smallest visible share of the rim, and of the bore.
+        crease: Second difference of depth that counts as a crease [m].
     """
 
     incidence: float
@@ -203,17 +203,17 @@ class DiscLimits(NamedTuple):
 
 
 class Disc(NamedTuple):
-    """A flat part compared with the flange.
+    """A flat part of the scene, compared with the flange.
 
     Attributes:
-        plane: Its plane, the normal towards the scanner.
-        cell: Row and column of the view in the middle of it.
-        centre: (3,) of the rim, as far as known [m].
-        across: Its largest width [m].
-        seen: Mean share of rim and bore with an edge where there should be one.
-        flaw: Why it is not the flange, or None.
-        rank: How far the comparison got before the flaw showed.
-        ratio: Logarithm of how much likelier the edge is the flange's rim than another disc's.
+        plane: Plane of the part, its normal towards the scanner.
+        cell: Row and column of the part's centre in the view.
+        centre: (3,) estimated centre of the rim [m].
+        across: Largest width of the part [m].
+        seen: Mean visible share of rim and bore.
+        flaw: Reason why it is not the flange; None if it is.
+        rank: Number of tests passed before the flaw.
+        ratio: Log-likelihood ratio of the edge being the flange's rim against another disc's.
     """
 
     plane: Plane
@@ -227,12 +227,12 @@ class Disc(NamedTuple):
 
 
 def of_size(part: PlanarPiece, cell: tuple[int, int], pitch: float, flange: Flange) -> Disc:
-    """Return a flat part as a disc; with a flaw, its width, if it is too wide or too narrow.
+    """Return a flat part as a disc, with a flaw if it is too wide or too narrow.
 
     Args:
-        part: The part.
-        cell: Row and column of the view in the middle of it.
-        pitch: Typical distance of neighbours there [m].
+        part: The flat part.
+        cell: Row and column of the part's centre in the view.
+        pitch: Typical distance between neighbouring points there [m].
         flange: The flange to find.
     """
     points = part.points.astype(np.float64)
@@ -247,12 +247,12 @@ def of_size(part: PlanarPiece, cell: tuple[int, int], pitch: float, flange: Flan
 def compare(
     disc: Disc, around: Floats, nearby: Floats, pitch: float, flange: Flange, limits: DiscLimits
 ) -> Disc:
-    """Return a disc of the right size, with the reason why it is not the flange, if any.
+    """Return a disc of the right size, tested against the flange; a failed test sets its flaw.
 
     Args:
         disc: A disc from :func:`of_size`.
-        around: (N, 3) all points in its plane near it, edges included [m].
-        nearby: (M, 3) all points near it, before and behind its plane too [m].
+        around: (N, 3) all points near the disc in its plane, edges included [m].
+        nearby: (M, 3) all points near the disc, also off its plane [m].
         pitch: Typical distance of neighbours there [m].
         flange: The flange to find.
         limits: Limits that a disc must satisfy.
@@ -297,7 +297,7 @@ def _unlikely(disc: Disc, other: float | None, flange: Flange) -> str | None:
 
 
 def _missing_plate(disc: Disc, nearby: Floats, flange: Flange) -> str | None:
-    """Return what is wrong with the plate that must stand before a wrist circle."""
+    """Return what is wrong with the plate in front of a wrist circle; None if nothing is."""
     if flange.bore is not None:
         return None
     around = nearby[np.abs(disc.plane.heights(nearby)) < 2 * flange.details.thickness]
@@ -328,7 +328,7 @@ def _too_steep(disc: Disc, limits: DiscLimits) -> str | None:
 
 
 def width(flat: Floats) -> float:
-    """Return the largest width of (N, 2) points over all directions, in steps of 10 degrees."""
+    """Return the largest extent of points (N, 2) over directions in steps of 10 degrees."""
     angle = np.arange(18) * np.pi / 18
     along = np.column_stack([np.cos(angle), np.sin(angle)]) @ flat.T
     return float(np.ptp(along, axis=1).max())
@@ -342,14 +342,15 @@ def incidence(centre: Floats, normal: Floats) -> float:
 def rim_ratio(
     flat: Floats, centre: Floats, pitch: float, radius: float
 ) -> tuple[float, float | None]:
-    """Return the likelihood ratio of a rim against another disc's edge, and that disc's radius [m].
+    """Return the log-likelihood ratio of the rim against another disc, and that disc's radius [m].
 
-    In each sector the edge lies on the circle, within the tolerance, or anywhere. The other disc is
-    the circle that fits the edge best; the ratio is against no disc at all where that is the rim.
+    In each sector the edge lies either on the circle within the tolerance, or anywhere. The other
+    disc is the circle that fits the edge best. If that is the rim itself, the ratio is against no
+    disc at all, and the radius is None.
 
     Args:
         flat: (N, 2) points in the disc's plane [m].
-        centre: (2,) of the rim, as :func:`ring_shares` finds it [m].
+        centre: (2,) centre of the rim from :func:`ring_shares` [m].
         pitch: Typical distance of neighbours [m].
         radius: Radius of the rim [m].
     """
@@ -364,12 +365,12 @@ def rim_ratio(
 
 
 def _log_likelihood(off: Floats, tolerance: float, spread: float) -> float:
-    """Return by how much sectors say that an edge is a circle, rather than anywhere.
+    """Return the log-likelihood ratio of an edge on a circle against an edge anywhere.
 
     Args:
-        off: (n,) distances of the edge from the circle, at most one for each sector [m].
-        tolerance: Within which it is on the circle [m].
-        spread: Width over which an edge may lie that is on no circle [m].
+        off: (n,) distances of the edge from the circle, at most one per sector [m].
+        tolerance: Largest distance of an edge on the circle [m].
+        spread: Width of the interval of an edge that is anywhere [m].
     """
     share = min(float((off < tolerance).sum()) / SECTORS, 1.0 - 0.5 / SECTORS)
     on_it = np.log(share * spread / (2 * tolerance) + 1.0 - share)
@@ -377,7 +378,7 @@ def _log_likelihood(off: Floats, tolerance: float, spread: float) -> float:
 
 
 def _circle_of(edge: Floats, tolerance: float) -> tuple[Floats, float] | None:
-    """Return centre (2,) and radius [m] of the circle by least squares through most of an edge."""
+    """Return centre (2,) and radius [m] of the least-squares circle through most of an edge."""
     kept = np.ones(len(edge), dtype=bool)
     centre, radius = np.zeros(2), 0.0
     # Fits of a circle, each to the points near the last
@@ -395,7 +396,7 @@ def _circle_of(edge: Floats, tolerance: float) -> tuple[Floats, float] | None:
 def ring_shares(
     flat: Floats, start: Floats, pitch: float, flange: Flange
 ) -> tuple[Floats, list[float]]:
-    """Return the centre (2,) of the rim, and how much of rim and bore has its edge there.
+    """Return the rim's centre (2,) [m], and the visible shares of rim and bore.
 
     Args:
         flat: (N, 2) points in the disc's plane [m].
@@ -423,12 +424,12 @@ def crop(xyz: Singles, view: Grid, disc: Disc, radius: float, margin: float) -> 
     """Return the (n, 3) points of a scan that lie on a disc.
 
     Args:
-        xyz: (N, 3) or (H, W, 3) the scan [m].
-        view: Its coarse view; of an organised scan, only the part about the disc is touched.
+        xyz: (N, 3) or (H, W, 3) points of the scan [m].
+        view: Coarse view of the scan; it locates the disc's window in an organised scan.
         disc: The disc.
         radius: Radius of the disc [m].
-        margin: How far off its plane and outside its circle points are kept; off the plane four
-            times its noise, if that is more [m].
+        margin: Largest distance of a point off the plane and outside the circle [m]; off the plane
+            at least four times the noise.
     """
     reach = radius + margin
     boxed = in_box(view.about(disc.cell, disc.centre, reach, xyz), disc.centre, reach)
@@ -440,7 +441,7 @@ def crop(xyz: Singles, view: Grid, disc: Disc, radius: float, margin: float) -> 
 
 
 def in_box(points: Singles, centre: NDArray[np.float64], reach: float) -> Singles:
-    """Return the (n, 3) points within ``reach`` of a centre along every axis, without NaN."""
+    """Return the points (n, 3) within ``reach`` of a centre along every axis, without NaN."""
     # One column at a time, each on what the last has left, depth, which removes most, first: a
     # tenth of the time of all at once.
     for k in (2, 1, 0):

@@ -1,4 +1,4 @@
-"""Find the flange in a scan of the whole cell."""
+"""``segment.flange``: find the flange in a scan of the whole cell."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ with large recesses besides its holes 0.35."""
 
 
 def find_discs(view: Grid, flange: Flange, limits: DiscLimits) -> list[Disc]:
-    """Return every flat part of the scene as a disc, with the reason why it is not the flange."""
+    """Return every flat part of the scene as a disc; all but possible flanges have a flaw."""
     smooth, noise = smooth_surface(view, limits.crease)
     some = view.xyz.reshape(-1, 3)[:, 2].take(np.flatnonzero(smooth)[::7])
     pitch = view.angle * float(median(some)) if len(some) else np.inf
@@ -64,10 +64,10 @@ def _disc(part: PlanarPiece, view: Grid, flange: Flange) -> Disc:
 
 
 def _scatter(flange: Flange, noise: float) -> float:
-    """Return the largest standard deviation about a plane of something flat [m].
+    """Return the largest standard deviation of a flat part about its plane [m].
 
-    Before a wrist circle stands the plate. Where its step is less than the noise gate on bending
-    lets through, plate and circle are one piece, as rough as the step is high.
+    A wrist circle has the tool plate in front of it. If the step between them is too small to be
+    detected as a crease, plate and circle are one piece with a roughness of that step.
     """
     hidden = flange.bore is None and flange.details.thickness < NOISE_GATE * np.sqrt(6) * noise
     # Scatter about a plane that a scanner's distortion may add to noise on something flat [m]
@@ -75,10 +75,10 @@ def _scatter(flange: Flange, noise: float) -> float:
 
 
 def _compared(discs: list[Disc], view: Grid, flange: Flange, limits: DiscLimits) -> list[Disc]:
-    """Return discs, those of the right size compared with the flange by all points nearby.
+    """Return the discs after testing those of the right size against the flange.
 
-    The piece may be an arc of a face that holes, edges and missing points have cut up; the plane
-    is fitted again to whatever lies in it.
+    A piece may be only an arc of a face that holes and missing points have cut up, so the plane is
+    fitted again to all points in it.
     """
     right = [disc for disc in discs if disc.flaw is None]
     nearby = [_near(disc, view, 2.5 * flange.outer) for disc in right]
@@ -99,20 +99,20 @@ def _compared(discs: list[Disc], view: Grid, flange: Flange, limits: DiscLimits)
 
 
 def _near(disc: Disc, view: Grid, reach: float) -> Singles:
-    """Return the (n, 3) points of the view within ``reach`` of a disc along every axis."""
+    """Return the view's points (n, 3) within ``reach`` of a disc along every axis."""
     about = view.about(disc.cell, disc.centre, reach)
     return in_box(about, disc.centre, reach)
 
 
 def smooth_surface(grid: Grid, bend: float) -> tuple[Mask, float]:
-    """Return where the surface is smooth, (H, W), and the standard deviation of depth [m].
+    """Return the mask (H, W) of smooth surface, and the standard deviation of depth [m].
 
-    Steps in depth, creases, mixed pixels and stray points are not smooth: depth does not change
-    evenly there from one neighbour to the next. On a plane it does, however tilted.
+    The second difference of depth is small on a plane, however tilted. It is large at steps,
+    creases, mixed pixels and stray points.
 
     Args:
         grid: Points in the order of the scanner's view.
-        bend: Second difference of depth that is a crease at least [m].
+        bend: Smallest second difference of depth at a crease [m].
     """
     depth = np.ascontiguousarray(grid.xyz[..., 2])
     # The second difference of independent values has six times their variance.
@@ -137,7 +137,7 @@ def smooth_surface(grid: Grid, bend: float) -> tuple[Mask, float]:
 
 
 def _averaged(depth: Singles) -> Singles:
-    """Return the mean of each point and its neighbours that are there; missing stays missing."""
+    """Return depth averaged over each point and its valid neighbours; missing points stay."""
     import cv2
 
     there = np.isfinite(depth)
@@ -147,7 +147,7 @@ def _averaged(depth: Singles) -> Singles:
 
 
 def _bending(depth: Singles, axis: int, reach: int) -> Singles:
-    """Return the second difference of depth over ``reach`` points, NaN where one is missing."""
+    """Return the second difference of depth over ``reach`` points; NaN where one is missing."""
     out = np.full_like(depth, np.nan)
     view, target = np.moveaxis(depth, axis, 0), np.moveaxis(out, axis, 0)
     inner = target[reach:-reach]
@@ -157,7 +157,7 @@ def _bending(depth: Singles, axis: int, reach: int) -> Singles:
 
 
 def _step(depth: Singles, at: Indices, axis: int) -> Singles:
-    """Return the larger step of depth to the neighbours along an axis; missing ones are none."""
+    """Return the larger step of depth to the two neighbours along an axis; 0 for missing ones."""
     flat, along = depth.ravel(), cells(at, depth.shape[1])[axis]
     to_next = (depth.shape[1], 1)[axis]
     before, after = at - to_next * (along > 0), at + to_next * (along < depth.shape[axis] - 1)
@@ -166,7 +166,7 @@ def _step(depth: Singles, at: Indices, axis: int) -> Singles:
 
 
 def _typical(values: Singles) -> float:
-    """Return the robust standard deviation of second differences."""
+    """Return the robust standard deviation of depth from its second differences."""
     # Second differences that settle what is typical, to one percent.
     sample = np.abs(values.ravel()[:: 1 + values.size // 40_000])
     sample = sample[np.isfinite(sample)]
@@ -176,7 +176,7 @@ def _typical(values: Singles) -> float:
 def connected_pieces(mask: Mask, fewest: int) -> Iterator[Indices]:
     """Yield the flat indices of each connected piece of a mask, the largest first.
 
-    Neighbours share a side: a crease that runs diagonally still separates.
+    Connectivity is by sides only, so that a diagonal crease still separates two pieces.
     """
     import cv2
 
@@ -192,11 +192,11 @@ def connected_pieces(mask: Mask, fewest: int) -> Iterator[Indices]:
 def choose(
     discs: list[Disc], cut: Callable[[Disc], Singles], flange: Flange
 ) -> tuple[Disc, Singles] | str:
-    """Return the flange's disc with its points, or why there is none.
+    """Return the flange's disc with its points, or the reason why none was found.
 
     Args:
         discs: All flat parts of the scene.
-        cut: Gives a disc's points at full resolution; asked for discs that fit.
+        cut: Returns a disc's points at full resolution; called for possible flanges only.
         flange: The flange to find.
     """
     fitting = _distinct([disc for disc in discs if disc.flaw is None], flange.rim)
@@ -219,7 +219,7 @@ def choose(
 
 
 def _distinct(discs: list[Disc], apart: float) -> list[Disc]:
-    """Return discs at different places, of those at one place the one seen best."""
+    """Return one disc for each place: the one with the best visibility."""
     kept: list[Disc] = []
     for disc in sorted(discs, key=lambda d: -d.seen):
         if all(np.linalg.norm(disc.centre - other.centre) > apart for other in kept):
@@ -228,7 +228,7 @@ def _distinct(discs: list[Disc], apart: float) -> list[Disc]:
 
 
 def _hole_score(disc: Disc, cut: Singles, flange: Flange) -> float:
-    """Return how well a disc's holes match the flange's; BLANK if undecidable."""
+    """Return the score of a disc's holes against the flange's; BLANK if undecidable."""
     points = cut.astype(np.float64)
     on_face = np.abs(disc.plane.heights(points)) < 3 * disc.plane.sigma + 1e-6
     face = points.compress(on_face, axis=0)
@@ -245,7 +245,7 @@ def _ambiguous(discs: list[Disc]) -> str:
 
 
 def _why_none(discs: list[Disc], flange: Flange) -> str:
-    """Return the flaw of the disc that came nearest to being the flange."""
+    """Return the flaw of the disc that passed most tests."""
     if not discs:
         return "no flat surface in sight"
     best = max(discs, key=lambda d: (d.rank, d.seen))
@@ -278,14 +278,14 @@ def segment_flange(
 ) -> FlangeCloud | Rejected:
     """Find the flange by its size, flatness, rim, bore and holes, and cut it out.
 
-    The steps of the paper's section 2.1.4, on a coarse view of the scan: pass-through, removal
-    of stray points and clustering (smooth, connected pieces), plane, size, incidence. What is
-    left is compared with the flange's rim and bore, by likelihood with a disc of any other size,
-    and, where two discs or a blank one are left, with its holes. Only then the full resolution is
-    touched, around the one disc found.
+    The steps of the paper's section 2.1.4 run on a coarse view of the scan: pass-through filter,
+    removal of stray points, clustering into smooth connected pieces, plane fit, size, incidence.
+    The remaining discs are compared with the flange's rim and bore, by likelihood against a disc of
+    another size. If two discs, or one without holes, are left, the holes decide. Only the points
+    around the chosen disc are read at full resolution.
 
     Raises:
-        StageError: The cloud is in millimetres, or otherwise a thousand times off.
+        StageError: The cloud's unit is wrong, for example millimetres.
     """
     from flangeye_plugins.segment.discs import DiscLimits, crop
     from flangeye_plugins.segment.grid import coarse_view, nothing_before_scanner
@@ -309,7 +309,7 @@ def segment_flange(
 
 
 def _pass_through(view: Grid, params: SegmentParams) -> Grid | None:
-    """Return the view without points too near or too far; None if there are none between."""
+    """Return the view without points too near or too far; None if no point is left."""
     depth = view.xyz[..., 2]
     outside = (depth < params.near) | (depth > params.far)
     if not outside.any():

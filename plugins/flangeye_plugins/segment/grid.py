@@ -1,7 +1,4 @@
-"""A coarse organised view of any scan: enough to find a disc in, a tenth of the points or less.
-
-Arrays only.
-"""
+"""A coarse organised view of any scan, with a tenth of its points or less."""
 
 from __future__ import annotations
 
@@ -15,12 +12,12 @@ from flangeye.types import Floats, Indices, Singles
 
 
 class Grid(NamedTuple):
-    """An organised cloud: neighbours in the array are neighbours in the scanner's view.
+    """An organised cloud: neighbours in the array are neighbours in the scanner's image.
 
     Attributes:
-        xyz: (H, W, 3) positions, a missing one NaN [m].
-        angle: Typical distance of neighbours across the view over their depth.
-        strides: Rows and columns of the full image per row and column here; None without one.
+        xyz: (H, W, 3) positions [m]; missing points are NaN.
+        angle: Typical distance of neighbours, over their depth [rad].
+        strides: Rows and columns of the full image per row and column here; None if unorganised.
     """
 
     xyz: Singles
@@ -30,13 +27,13 @@ class Grid(NamedTuple):
     def about(
         self, cell: tuple[int, int], centre: Floats, reach: float, image: Singles | None = None
     ) -> Singles:
-        """Return the (n, 3) points in a window of the view that holds all near a place.
+        """Return the points (n, 3) in a window that contains all points near a place.
 
         Args:
             cell: Row and column of the place.
             centre: (3,) the place [m].
-            reach: How near [m].
-            image: The full scan, to have the window of that; all of it if it is unorganised.
+            reach: Largest distance from the place [m].
+            image: Full scan, from which the window is taken; an unorganised one is returned whole.
         """
         if image is not None and self.strides is None:
             return image.reshape(-1, 3)
@@ -53,17 +50,17 @@ class Grid(NamedTuple):
 
 
 def cells(at: Indices, columns: int) -> tuple[Indices, Indices]:
-    """Return rows and columns of places in a view, in a fifth of the time of ``np.divmod``."""
+    """Return rows and columns of flat indices; five times faster than ``np.divmod``."""
     rows = at // columns
     return rows, at - rows * columns
 
 
 def coarse_view(xyz: Singles, pitch: float) -> Grid | None:
-    """Return a coarse view of a scan, organised or not; None if it holds no point.
+    """Return a coarse view of a scan, organised or not; None if it has no valid point.
 
     Args:
-        xyz: (H, W, 3) or (N, 3), a missing point NaN [m].
-        pitch: Wanted distance of neighbouring points [m].
+        xyz: (H, W, 3) or (N, 3) points [m]; missing ones are NaN.
+        pitch: Wanted distance between neighbouring points [m].
     """
     if xyz.ndim == 3:
         view = thin_out(xyz, pitch)
@@ -75,11 +72,10 @@ def coarse_view(xyz: Singles, pitch: float) -> Grid | None:
 
 
 def range_image(points: Singles, pitch: float) -> Grid | None:
-    """Return a range image of unorganised points (N, 3), as the scanner at the origin sees them.
+    """Return a range image of unorganised points (N, 3), seen from the scanner at the origin.
 
-    The cells of the image are about ``pitch`` wide at the median depth, or wider where the points
-    are too sparse to fill them, and hold the mean of their points. Of a scan much denser than
-    that only so many points are looked at as fill the cells well.
+    Cells are about ``pitch`` wide at the median depth [m], or wider if the points are too sparse to
+    fill them, and contain the mean of their points. A much denser scan is subsampled first.
     """
     sample = 50_000  # points that show how dense a scan is
     lot = _lots(points) if len(points) > sample else np.zeros(len(points), dtype=np.uint32)
@@ -99,24 +95,25 @@ def range_image(points: Singles, pitch: float) -> Grid | None:
 
 
 def nothing_before_scanner(points: Singles) -> str:
-    """Return why a scan without a :func:`coarse_view` has none."""
+    """Return the reason why :func:`coarse_view` returned None for a scan."""
     if np.isfinite(points).all(axis=-1).any():
         return "all points lie behind the scanner (z < 0): its z must point forward, y down"
     return "no finite point"
 
 
 def _before_scanner(points: Singles) -> Singles:
-    """Return the points that can have been seen."""
+    """Return the finite points in front of the scanner."""
     # The sum of the three is finite when they are; a point behind the scanner is none.
     seen = np.isfinite(points[:, 0] + points[:, 1] + points[:, 2]) & (points[:, 2] > 0)
     return points if seen.all() else points[seen]
 
 
 def _lots(points: Singles) -> NDArray[np.uint32]:
-    """Return a number for each of (N, 3) points, as if drawn, from nothing but where it is.
+    """Return a pseudo-random number for each point (N, 3), computed from its coordinates.
 
-    So a share of the points is the same whatever their order, and has no pattern that would beat
-    with the lines of a scanner (Fibonacci hashing of the coordinates' bits, Knuth 1998, 6.4).
+    A sample drawn by it does not depend on the points' order, and has no pattern that would
+    interfere with the scanner's lines (Fibonacci hashing of the coordinates' bits, Knuth 1998,
+    section 6.4).
     """
     bits = np.ascontiguousarray(points).view(np.uint32)
     lot = bits[:, 0] * np.uint32(0x9E3779B1)
@@ -127,16 +124,16 @@ def _lots(points: Singles) -> NDArray[np.uint32]:
 
 
 def _drawn(points: Singles, lot: NDArray[np.uint32], share: float) -> Singles:
-    """Return about a share of the points."""
+    """Return a random sample of about ``share`` of the points."""
     if share >= 0.7:  # not worth a copy
         return points
     return points.take(np.flatnonzero(lot < np.uint32(share * 2**32)), axis=0)
 
 
 def thin_out(image: Singles, pitch: float) -> Grid:
-    """Return every n-th row and column of an organised scan (H, W, 3), about ``pitch`` apart.
+    """Return every n-th row and column of an organised scan (H, W, 3), about ``pitch`` apart [m].
 
-    Nothing is copied or averaged: a thinned scan has the noise and the edges of the full one.
+    Nothing is averaged, so the result keeps the noise and the edges of the full scan.
     """
     rows, columns = image[:, :: _every(image.shape[1])], image[:: _every(image.shape[0])]
     down, across = _angle_between(rows, axis=0), _angle_between(columns, axis=1)
@@ -160,7 +157,7 @@ def _every(length: int) -> int:
 
 
 def _angle_between(lines: Singles, axis: int) -> float:
-    """Return the median distance of neighbours along ``axis`` over depth; NaN if none are."""
+    """Return the median distance of neighbours along ``axis`` over depth; NaN without any."""
     with np.errstate(divide="ignore", invalid="ignore"):
         steps = [np.diff(lines[..., k] / lines[..., 2], axis=axis) for k in range(2)]
         distance = np.hypot(*steps)
@@ -173,11 +170,11 @@ def _stride(wanted: float, spacing: float) -> int:
 
 
 def project(points: Singles, angle: float) -> Grid:
-    """Return the means of unorganised points (N, 3) in square cells of the scanner's view.
+    """Return the means of unorganised points (N, 3) in square cells of the scanner's image.
 
     Args:
-        points: (N, 3), all with positive depth [m].
-        angle: Width of a cell over its depth.
+        points: (N, 3) points, all with positive depth [m].
+        angle: Width of a cell over its depth [rad].
     """
     # Column by column: three times as fast as a transposed copy.
     x, y, z = (points[:, k].copy() for k in range(3))
@@ -198,7 +195,7 @@ def project(points: Singles, angle: float) -> Grid:
 
 
 def _cells(u: Singles, v: Singles, size: float) -> tuple[NDArray[np.intp], tuple[int, int]]:
-    """Return the flat index of each point's cell, and the shape of the image of cells."""
+    """Return the flat index of each point's cell, and the image's shape."""
     column = ((u - u.min()) / np.float32(size)).astype(np.intp)
     row = ((v - v.min()) / np.float32(size)).astype(np.intp)
     shape = (int(row.max()) + 1, int(column.max()) + 1)
@@ -206,7 +203,7 @@ def _cells(u: Singles, v: Singles, size: float) -> tuple[NDArray[np.intp], tuple
 
 
 def _typical_angle(u: Singles, v: Singles) -> float:
-    """Return the typical spacing of points in the view: the root of seen area over number."""
+    """Return the typical angular spacing: root of the visible solid angle per point."""
     across = max(float(np.ptp(u)), float(np.ptp(v)), 1e-6)
     size = across / float(np.clip(np.sqrt(len(u)) / 4, 4, 64))
     cell, _ = _cells(u, v, size)

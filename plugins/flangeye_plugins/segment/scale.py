@@ -1,4 +1,4 @@
-"""Whether a cloud can be in metres at all."""
+"""Check whether a cloud's coordinates can be in metres."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from flangeye.units import Length, param
 
 
 class RangeParams(Params):
-    """How far from the scanner something is looked for."""
+    """Range of distances from the scanner in which the target is searched."""
 
     near: Length = param("100 mm", ge=0, description="Points nearer to the scanner are left out.")
     far: Length = param("3 m", gt=0, description="Points farther from the scanner are left out.")
@@ -21,8 +21,8 @@ def check_scale(xyz: NDArray[np.float32], where: str) -> None:
     """Refuse a cloud whose median depth cannot be metres.
 
     Args:
-        xyz: (..., 3) points, a missing one NaN [m].
-        where: Whose cloud it is, for the message.
+        xyz: (..., 3) points; missing ones are NaN.
+        where: Name of the cloud for the message.
 
     Raises:
         StageError: The median depth is not plausible; the message names the likely unit.

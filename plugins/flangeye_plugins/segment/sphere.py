@@ -1,4 +1,4 @@
-"""Find a calibration sphere of known size in a scan of the whole cell."""
+"""``segment.sphere``: find a calibration sphere in a scan of the whole cell."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ class SegmentSphereParams(RangeParams):
 
 
 class Candidate(NamedTuple):
-    """A possible place of the sphere.
+    """A candidate position of the sphere.
 
     Attributes:
-        centre: (3,) [m].
-        seen: Share of the face it turns to the scanner that is there.
-        radius: [m].
+        centre: (3,) centre [m].
+        seen: Measured share of the sphere's face towards the scanner.
+        radius: Radius [m].
     """
 
     centre: Floats
@@ -53,14 +53,14 @@ class Candidate(NamedTuple):
 def segment_sphere(
     capture: Capture, sphere: Sphere, params: SegmentSphereParams
 ) -> FlangeCloud | Rejected:
-    """Find a calibration sphere, by its size where that is known, and cut it out.
+    """Find a calibration sphere, by its size if that is known, and cut it out.
 
-    Every bit of surface proposes the point one radius behind it: on the sphere they all propose
-    its centre (a Hough transform). The places with the most votes are compared with the sphere,
-    on a coarse view of the scan; only around the one that fits the full resolution is touched.
+    Every surface point votes for the point one radius behind it; points on the sphere all vote for
+    its centre (a Hough transform). The positions with most votes are compared with a sphere on a
+    coarse view of the scan. Only the points around the best one are read at full resolution.
 
     Raises:
-        StageError: The cloud is in millimetres, or otherwise a thousand times off.
+        StageError: The cloud's unit is wrong, for example millimetres.
     """
     radii = UNKNOWN_SIZES if sphere.size is None else [sphere.size]
     found: list[Candidate] = []
@@ -85,13 +85,14 @@ def segment_sphere(
 def find_spheres(
     view: Grid, radius: float, tolerance: float, sized: bool = True
 ) -> list[Candidate]:
-    """Return possible places of a sphere of this radius, best first, none overlapping.
+    """Return non-overlapping candidate positions of a sphere, best first.
 
     Args:
-        view: The scene; missing points are NaN.
-        radius: [m].
+        view: Coarse view of the scene; missing points are NaN.
+        radius: Radius of the sphere [m].
         tolerance: Largest distance of a point from the surface [m].
-        sized: Whether the radius is known; else it may be off by ``SIZE_STEP`` and is found.
+        sized: Whether the radius is known; otherwise it is estimated, within ``SIZE_STEP`` of
+            ``radius``.
     """
     points = view.xyz.reshape(-1, 3).astype(np.float64)
     votes = points - radius * surface_normals(view.xyz).reshape(-1, 3)
@@ -106,9 +107,9 @@ def find_spheres(
 
 
 def surface_normals(xyz: Singles) -> Floats:
-    """Return the (H, W, 3) unit normals of a grid of points, towards the scanner; NaN if unknown.
+    """Return unit normals (H, W, 3) of a grid of points, towards the scanner; NaN if unknown.
 
-    From the differences of the neighbours to both sides.
+    They are computed from the central differences of the neighbours.
     """
     points = xyz.astype(np.float64)
     out = np.full(points.shape, np.nan)
@@ -123,12 +124,13 @@ def surface_normals(xyz: Singles) -> Floats:
 
 
 def most_voted(votes: Floats, cell: float, apart: float) -> list[Floats]:
-    """Return the densest means of the (N, 3) votes, at most ``CANDIDATES``.
+    """Return the positions with most votes, at most ``CANDIDATES``.
 
     Args:
-        votes: (N, 3) [m].
-        cell: Edge of the cells they are counted in; a place is three of them wide [m].
-        apart: Least distance of the places returned [m].
+        votes: (N, 3) voted positions [m].
+        cell: Edge length of the counting cells [m]; a position covers three cells in each
+            direction.
+        apart: Smallest distance between returned positions [m].
     """
     index = np.floor(votes / cell).astype(np.intp)
     low = index.min(axis=0) - 1  # one empty layer to each side, so that neighbours stay neighbours
@@ -150,7 +152,7 @@ def most_voted(votes: Floats, cell: float, apart: float) -> list[Floats]:
 
 
 def _with_neighbours(keys: Indices, counts: Indices, shape: tuple[int, ...]) -> Indices:
-    """Return the votes of each occupied cell and the 26 around it, given those of each alone."""
+    """Return each occupied cell's votes, summed with those of its 26 neighbours."""
     steps = np.array([shape[1] * shape[2], shape[2], 1])
     around = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 3)
     total = np.zeros_like(counts)
@@ -163,7 +165,7 @@ def _with_neighbours(keys: Indices, counts: Indices, shape: tuple[int, ...]) -> 
 def _settled(
     start: Floats, points: Floats, angle: float, radius: float, tolerance: float, sized: bool
 ) -> Candidate:
-    """Move a candidate to where it fits the points near its surface, and say how many do."""
+    """Return a candidate fitted to the points near its surface, with its visible share."""
     centre, size, near = (
         start,
         radius,
@@ -190,10 +192,10 @@ def _settled(
 def _share_seen(
     centre: Floats, near: Floats, angle: float, radius: float, tolerance: float
 ) -> float:
-    """Return how much of the face turned to the scanner is there, as a share of what is due.
+    """Return the measured share of the sphere's face towards the scanner.
 
-    Points off that face, before it or behind, speak against a sphere as much as points on it
-    speak for one: a plane or a rounder piece of an arm can touch half of it within a millimetre.
+    Points before or behind that face count against the sphere as much as points on it count for it:
+    a plane or another round part of the arm can touch half of it within a millimetre.
     """
     offsets = near - centre
     along = offsets @ (centre / np.linalg.norm(centre))
@@ -208,7 +210,7 @@ def _share_seen(
 
 
 def _apart(candidates: list[Candidate]) -> list[Candidate]:
-    """Return the candidates that overlap no better one; the best come first."""
+    """Return the candidates that do not overlap a better one, best first."""
     kept: list[Candidate] = []
     for one in candidates:
         if all(np.linalg.norm(one.centre - k.centre) > one.radius + k.radius for k in kept):
@@ -240,7 +242,7 @@ def _why_not(
 
 
 def _shell(xyz: Singles, centre: Floats, radius: float, margin: float) -> Singles:
-    """Return the (n, 3) points of a scan within ``margin`` of the sphere's surface."""
+    """Return the scan's points (n, 3) within ``margin`` of the sphere's surface [m]."""
     near = in_box(xyz.reshape(-1, 3), centre, radius + margin)
     distance = np.linalg.norm(near - centre, axis=1)
     return np.asarray(near[np.abs(distance - radius) < margin])
