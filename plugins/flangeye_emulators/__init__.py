@@ -1,6 +1,6 @@
-"""Replacements of hardware: simulated cells; emulated controllers, scanners and fingers.
+"""Simulated hardware: cells, robot controllers, scanners and fingers.
 
-Offered to the engine as a vendor's plugin is. Nothing here runs on a real cell.
+The package is registered like a vendor's plugin. Nothing here runs on a real cell.
 """
 
 from collections.abc import Iterable, Mapping
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 @hookimpl
 def flangeye_stages() -> Mapping[str, str]:
-    """Offer the simulated stages."""
+    """Return the simulated stages: name to module and function."""
     return {
         "acquire.simulated": "flangeye_emulators.acquire.simulated:acquire_simulated",
         "acquire.simulated_cell": "flangeye_emulators.acquire.simulated_cell:"
@@ -35,7 +35,7 @@ def flangeye_stages() -> Mapping[str, str]:
 
 @hookimpl
 def flangeye_parts() -> Mapping[str, str]:
-    """Offer the simulated parts."""
+    """Return the simulated parts: name to module and function."""
     return {
         "scanner.emulator": "flangeye_emulators.scanner:scanner_loopback",
         "scanner.mounted": "flangeye_emulators.scanner:scanner_mounted",
@@ -61,7 +61,7 @@ def _serve_aubo(options: "EmulatorOptions") -> None:
 
 @hookimpl
 def flangeye_emulators() -> Iterable["Emulator"]:
-    """Offer controllers of Universal Robots and of AUBO."""
+    """Yield the emulators of the controllers of Universal Robots and of AUBO."""
     from flangeye.models.graph import Emulator
 
     return (

@@ -1,4 +1,4 @@
-"""``arc.simulated``: a power source that only remembers how it was switched."""
+"""``arc.simulated``: a power source that only records how it was switched."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ class SimulatedArc(Device):
     """An arc that burns when commanded.
 
     Attributes:
-        name: Shown in messages and reports.
-        history: What was switched: ``gas`` or ``burn``, and whether on.
+        name: Name in messages and reports.
+        history: Switching events: ``gas`` or ``burn``, and whether on.
     """
 
     def __init__(self) -> None:
-        """Begin, switched off."""
+        """Start switched off."""
         self.name = "simulated power source"
         self.history: list[tuple[str, bool]] = []
         self._burns, self._closed = False, False
 
     def gas(self, on: bool) -> None:
-        """Remember it."""
+        """Switch the gas, and record the event."""
         self._switch("gas", on)
 
     def burn(self, on: bool) -> None:
-        """Remember it."""
+        """Switch the arc, and record the event."""
         self._switch("burn", on)
         self._burns = on
 
     def burning(self) -> bool | None:
-        """Return whether it is commanded on."""
+        """Return whether the arc is commanded on."""
         return self._burns
 
     def close(self) -> None:
-        """Switch all off."""
+        """Switch gas and arc off."""
         if not self._closed:
             self.burn(False)
             self.gas(False)

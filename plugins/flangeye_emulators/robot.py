@@ -49,22 +49,22 @@ class SimulatedRobotParams(Params):
 
 
 class SimulatedRobot(Device):
-    """An arm whose time passes only in :meth:`wait_cycle`.
+    """An arm in simulated time, which advances only in :meth:`wait_cycle`.
 
-    It keeps to what the controllers on loopback keep to: a move begins at rest, goes with limited
-    speed and acceleration, and a joint's limit or a singularity on the way is a protective stop.
+    It behaves like the emulated controllers: a move starts at rest and has limited speed and
+    acceleration; a joint limit or singularity on the way causes a protective stop.
 
     Attributes:
-        name: Shown in messages and reports.
+        name: Name in messages and reports.
         period: Length of one cycle [s].
         flange_T_tool: The identity: no tool is set.
-        arm: The arm itself: ``arm.surfaces`` is what it may touch, ``arm.true_flange()`` where it
-            really is. For the simulation around it; a stage must not look.
-        cycles: How many have passed.
+        arm: The simulated arm, with the surfaces it may touch and its true flange pose. For the
+            simulation only; not to be used by stages.
+        cycles: Number of cycles passed.
     """
 
     def __init__(self, model: RobotModel, params: SimulatedRobotParams) -> None:
-        """Stand still at the beginning of time."""
+        """Start at rest at time zero."""
         self.name = f"simulated {model.model}"
         self.period = params.period
         self.flange_T_tool: Transform | None = Transform(FLANGE, TOOL, np.eye(4))
@@ -92,33 +92,33 @@ class SimulatedRobot(Device):
         )
 
     def _flange(self) -> Transform:
-        """Return where the flange is; it is asked for several times in a cycle."""
+        """Return the reported flange pose, cached within a cycle."""
         matrix = self.arm.stance.base_T_tcp
         if self._reported is None or self._reported[0] is not matrix:
             self._reported = matrix, Transform(BASE, FLANGE, matrix)
         return self._reported[1]
 
     def true_flange(self) -> Floats:
-        """Return the flange's true pose (4, 4). For the simulation; stages must not use it."""
+        """Return the flange's true pose (4, 4); not to be used by stages."""
         return self.arm.true_flange()
 
     def move_joints(self, joints: Floats, speed: float, acceleration: float) -> None:
-        """Start a move to joint angles (n,) [rad]; an arm that moves comes to rest first."""
+        """Start a move to joint angles (n,) [rad]; a moving arm comes to rest first."""
         self._begin(lambda: joint_move(self.arm.stance.joints, joints, speed, acceleration))
 
     def move_linear(self, base_T_flange: Transform, speed: float, acceleration: float) -> None:
-        """Start a straight move of the flange; an arm that moves comes to rest first."""
+        """Start a linear move of the flange; a moving arm comes to rest first."""
         target = base_T_flange.matrix
         self._begin(lambda: linear_move(self.arm.stance.base_T_tcp, target, speed, acceleration))
 
     def move_velocity(self, twist: Floats, acceleration: float) -> None:
-        """Move at a twist (6,); it brakes when the next command is :data:`GRACE` late."""
+        """Move at a twist (6,); the arm brakes if the next command is :data:`GRACE` late."""
         self._require_ready()
         self._looked = self.cycles
         self._mover.go_on(twist, acceleration, GRACE)
 
     def wait_cycle(self) -> None:
-        """Pass one cycle; a motion ends if its state is not read for SILENT."""
+        """Advance one cycle; a motion ends if the state is not read for SILENT."""
         self.cycles += 1
         if (self.cycles - self._looked) * self.period > SILENT:
             self._mover.halt()
@@ -128,7 +128,7 @@ class SimulatedRobot(Device):
             self.protective_stop(str(fault))
 
     def stop(self) -> None:
-        """Begin to brake in the next cycle."""
+        """Start braking in the next cycle."""
         self._mover.halt()
 
     def protective_stop(self, why: str) -> None:
@@ -137,7 +137,7 @@ class SimulatedRobot(Device):
         self.stop()
 
     def unlock(self) -> None:
-        """End a protective stop: on a real arm, a person at the pendant."""
+        """End a protective stop, as an operator does at a real arm's pendant."""
         self._stopped_by = ""
 
     def close(self) -> None:
@@ -191,11 +191,11 @@ class LoopbackRobotParams(Params):
 def robot_loopback(
     model: RobotModel, params: LoopbackRobotParams, reads_only: bool = False
 ) -> Robot:
-    """Start a controller on loopback and open it with the arm's own driver.
+    """Start an emulated controller on loopback and connect to it with the arm's real driver.
 
-    The controller is ``flangeye emulator``, a process that ends with the run, however that ends.
-    One that somebody started at an address the recipe names is used, left running, and told of in
-    the arm's name.
+    The controller is a process ``flangeye emulator``, which always ends with the run. If the recipe
+    names an address at which a controller runs already, that one is used and left running; the
+    arm's name says so.
 
     Raises:
         DeviceError: The controller does not start, or the driver cannot open it.
@@ -216,7 +216,7 @@ def robot_loopback(
 
 
 def _at_address(params: LoopbackRobotParams) -> tuple[BoundPart, str]:
-    """Return the arm's driver, its address filled in, and the controller's address."""
+    """Return the arm's driver with its address filled in, and the controller's address."""
     connects = address_of(_host_of(params.driver))
     listens = connects if params.host is None else address_of(params.host)
     if params.driver.params is None:
@@ -276,7 +276,7 @@ def _end(controller: subprocess.Popen[str] | None) -> None:
 
 
 class OnEmulator(Device):
-    """An arm with an emulated controller, which ends with it; else the arm's own driver."""
+    """An arm with its real driver, and an emulated controller that ends with it."""
 
     def __init__(self, robot: Robot, controller: subprocess.Popen[str] | None) -> None:
         self._robot, self._controller = robot, controller
@@ -285,15 +285,15 @@ class OnEmulator(Device):
         self.flange_T_tool: Transform | None = robot.flange_T_tool
 
     def state(self) -> RobotState:
-        """Return the newest sample."""
+        """Return the newest state of the arm."""
         return self._robot.state()
 
     def move_joints(self, joints: Floats, speed: float, acceleration: float) -> None:
-        """Start a move to joint angles (n,)."""
+        """Start a move to joint angles (n,) [rad]."""
         self._robot.move_joints(joints, speed, acceleration)
 
     def move_linear(self, base_T_flange: Transform, speed: float, acceleration: float) -> None:
-        """Start a straight move of the flange."""
+        """Start a linear move of the flange."""
         self._robot.move_linear(base_T_flange, speed, acceleration)
 
     def move_velocity(self, twist: Floats, acceleration: float) -> None:
@@ -305,7 +305,7 @@ class OnEmulator(Device):
         self._robot.wait_cycle()
 
     def stop(self) -> None:
-        """Begin to brake at once."""
+        """Start braking at once."""
         self._robot.stop()
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""``scanner.emulator`` and ``scanner.mounted``: scanners that see a simulated cell."""
+"""``scanner.emulator`` and ``scanner.mounted``: scanners in a simulated cell."""
 
 from __future__ import annotations
 
@@ -45,16 +45,16 @@ class MountedParams(ScannerQuality, BenchParams):
 
     @property
     def flange_T_camera(self) -> Floats:
-        """(4, 4), translation in [m]; the scanner is turned by a quarter about the flange's z."""
+        """Pose (4, 4) of the scanner on the flange [m]; it is rotated by 90 deg about z."""
         return rigid(rotation_from_rpy(0.0, 0.0, np.pi / 2), np.asarray(self.mount))
 
 
 @part("scanner.mounted")
 def scanner_mounted(model: ScannerModel | None, params: MountedParams) -> Scanner:
-    """Scan a workpiece on a bench from the flange of the simulated arm.
+    """A simulated scanner on the simulated arm's flange, which scans a workpiece on a bench.
 
     Raises:
-        DeviceError: There is no model of a scanner, or no simulated arm to carry it.
+        DeviceError: The recipe has no scanner model, or no simulated arm carries the scanner.
     """
     if model is None:
         raise DeviceError("scanner.mounted: the recipe must say which scanner to be: scanner.model")
@@ -69,7 +69,7 @@ class MountedScanner(OpenScanner):
     """A simulated scanner on a flange; simulated time stops during an exposure.
 
     Attributes:
-        true_seams: By name, (N, 3) in ``base`` [m]. A stage that plans must not look.
+        true_seams: True seams by name, (N, 3) in ``base`` [m]; not to be used by planning stages.
     """
 
     def __init__(self, model: ScannerModel, params: MountedParams) -> None:
@@ -88,7 +88,7 @@ class MountedScanner(OpenScanner):
         """Scan from the arm's present pose.
 
         Raises:
-            DeviceError: The arm is gone.
+            DeviceError: The simulated arm no longer exists.
         """
         arm = bench.newest()
         if arm is None:
@@ -129,12 +129,11 @@ class LoopbackScannerParams(Params):
 
 @part("scanner.emulator")
 def scanner_loopback(model: ScannerModel | None, params: LoopbackScannerParams) -> Scanner:
-    """Scan the simulated cell around a controller on loopback.
-
-    The model decides which scanner is simulated.
+    """A simulated scanner that sees the cell of an emulated controller on loopback.
 
     Raises:
-        DeviceError: There is no model, no controller, or the controller moves another arm.
+        DeviceError: The recipe has no scanner model, no controller answers, or it drives another
+            arm.
     """
     if model is None:
         raise DeviceError(
@@ -155,10 +154,10 @@ def scanner_loopback(model: ScannerModel | None, params: LoopbackScannerParams) 
 
 
 class LoopbackScanner(OpenScanner):
-    """A simulated scanner. Motion during an exposure smears the scan.
+    """A simulated scanner in a controller's cell; motion during an exposure blurs the scan.
 
     Attributes:
-        truth: Where it really stands.
+        truth: True pose of the scanner.
     """
 
     def __init__(
@@ -167,7 +166,7 @@ class LoopbackScanner(OpenScanner):
         """Set up the cell.
 
         Args:
-            model: Which scanner to be.
+            model: Model of the scanner.
             params: Parameters of the driver.
             control: Open control channel of the controller.
         """
@@ -185,7 +184,7 @@ class LoopbackScanner(OpenScanner):
         self._count = 0
 
     def require_same_arm(self) -> None:
-        """Raise DeviceError when the controller moves another arm than the one to be scanned."""
+        """Raise DeviceError if the controller drives another arm than the model's."""
         off = self._studio.disagreement(self._stance())
         # Largest distance of the controller's flange from where the robot's model puts it [m]
         if not off < 1e-3:
@@ -195,7 +194,7 @@ class LoopbackScanner(OpenScanner):
             )
 
     def prepare(self) -> None:
-        """Load slow data before the arm moves, as faults go unnoticed while rendering."""
+        """Load slow data before the arm moves, because rendering delays the detection of faults."""
         self._studio.prepare(self._stance())
 
     def expose(self) -> Callable[[], Scan]:
@@ -226,7 +225,7 @@ class LoopbackScanner(OpenScanner):
             raise DeviceError(f"{self.name}: gone after {after} exposures, as lost_after says")
 
     def _stances(self) -> list[TrueStance]:
-        """Return where the arm was, at even times over the exposure."""
+        """Return the arm's true stances at even times over the exposure."""
         began = time.monotonic()
         stances = []
         # How often the arm's place is asked for during one exposure: at its ends and in its middle
@@ -248,14 +247,14 @@ def _wait_until(moment: float) -> None:
 
 
 class TrueStance(NamedTuple):
-    """Where an arm really is: (n,) joint angles [rad], and (4, 4) its flange's pose."""
+    """True stance of an arm: joint angles (n,) [rad] and flange pose (4, 4)."""
 
     joints: Floats
     base_T_flange: Floats
 
 
 class CellScene:
-    """The simulated cell and scanner, with an arm that may move."""
+    """The simulated cell with its scanner and an arm that may move."""
 
     def __init__(
         self,
@@ -264,13 +263,13 @@ class CellScene:
         base_T_camera: Floats,
         workspace: Floats,
     ) -> None:
-        """Set the cell up around the middle of the scanner's view.
+        """Set up the cell around the centre of the scanner's view.
 
         Args:
             robot: The arm; it carries the plate its model names.
             eye: The scanner.
-            base_T_camera: (4, 4) where that stands.
-            workspace: (3,) size of the box beside which wall and stand are [m].
+            base_T_camera: (4, 4) true pose of the scanner.
+            workspace: (3,) size of the workspace, beside which wall and stand are placed [m].
         """
         plate = plate_of(robot)
         scanner: ScannerModel = eye.scanner
@@ -280,22 +279,25 @@ class CellScene:
         self._eye, self._base_T_camera = eye, base_T_camera
 
     def disagreement(self, stance: TrueStance) -> float:
-        """Return how far the flange is from where the model puts it [m]; infinite for another."""
+        """Return the distance of the flange from the model's forward kinematics [m].
+
+        It is infinite for an arm with another number of joints.
+        """
         if len(stance.joints) != self._arm.n:
             return float("inf")
         modelled = self._arm.flange(stance.joints)
         return float(np.linalg.norm((modelled - stance.base_T_flange)[:3, 3]))
 
     def scan(self, stances: Sequence[TrueStance], seed: Sequence[int]) -> Image:
-        """Return one scan (H, W, 3) in ``camera`` [m] of an arm that was seen at some stances.
+        """Return one scan (H, W, 3) in ``camera`` [m] of an arm seen at several stances.
 
-        A moving arm leaves the mean of what its stances leave, and nothing where one of them does.
+        The scan is the mean over the stances; a point missing at one of them is missing.
         """
         looks = [self._look(stance, seed) for stance in _distinct(stances)]
         return looks[0] if len(looks) == 1 else np.mean(looks, axis=0, dtype=np.float32)
 
     def prepare(self, stance: TrueStance) -> None:
-        """Compute in advance, at the arm's present pose, what the first scan needs."""
+        """Compute in advance what the first scan needs at a stance."""
         self._scene(stance)
 
     def _look(self, stance: TrueStance, seed: Sequence[int]) -> Image:

@@ -1,1 +1,1 @@
-"""``acquire.simulated*``: captures from simulated cells, whose truth is known."""
+"""``acquire.simulated*`` stages: captures from simulated cells with known truth."""

@@ -1,4 +1,4 @@
-"""Shared by simulated cell sessions: parameters, moments, and who sees whom."""
+"""Plan of a simulated cell session: parameters, poses, and which camera sees which target when."""
 
 from __future__ import annotations
 
@@ -67,14 +67,14 @@ Sighting = tuple[int, str, str]
 
 @dataclass(frozen=True, eq=False)
 class PlannedCell:
-    """A session that was planned.
+    """A planned session of a cell.
 
     Attributes:
-        moments: Possible sightings.
-        scheduled: Sightings of the schedule, unless they are chosen during the session.
-        source: Where it comes from, with the truth.
-        view: Fields of view of the cameras.
-        chooses: Whether each sighting is chosen by what was seen so far.
+        moments: Poses of all frames at each possible moment.
+        scheduled: Sightings in order; used unless sightings are chosen during the session.
+        source: Provenance of the session, with the truth.
+        view: Field of view of the cameras.
+        chooses: Whether each sighting is chosen by the observations so far.
     """
 
     moments: Moments
@@ -87,20 +87,20 @@ class PlannedCell:
         """Yield the sightings on demand.
 
         Args:
-            seen: Gives what came of the sightings so far.
+            seen: Returns the observations so far.
         """
         yield from NextBest(self).sightings(seen) if self.chooses else self.scheduled
 
 
 class NextBest:
-    """Chooses the sighting with the largest expected information, given those before.
+    """Chooses each sighting by the largest expected information, given the observations so far.
 
-    Until that tells where everything is, sightings are those a person would show: each pair in
-    turn. A choice at which the camera does not see the target after all gives nothing, and counts.
+    Until these determine all unknowns, each camera-target pair is chosen in turn. A chosen sighting
+    in which the camera does not see the target gives no observation, but counts.
     """
 
     def __init__(self, planned: PlannedCell) -> None:
-        """Start before the first sighting."""
+        """Start without observations."""
         self._planned, self._left = planned, list(planned.scheduled)
         self._rng = np.random.default_rng(len(planned.scheduled))
         self._taken: set[int] = set()
@@ -130,7 +130,7 @@ class NextBest:
         return int(best.id), best.camera, best.target
 
     def _in_view(self, like: Observation, found: Rough) -> list[Observation]:
-        """Return moments drawn, at which its camera sees its target by what is known so far."""
+        """Return random moments at which a pair is in view, by the present estimate."""
         moments = self._planned.moments
         # Moments that are compared for each camera and target
         drawn = self._rng.choice(DRAWS, 100, replace=False)
@@ -150,8 +150,8 @@ def plan_cell(
     """Draw the poses of everything that moves, and assign the moments to camera-target pairs.
 
     Raises:
-        StageError: The place of an unknown is not given, or a camera or target takes part in too
-            few sightings.
+        StageError: The true pose of an unknown is not given, or a camera or target has too few
+            sightings.
     """
     _require_places(cell, params)
     moments = _draw(cell, params, rng)
@@ -174,14 +174,14 @@ def _require_places(cell: Cell, params: CellSessionParams) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """The poses at N moments: as controllers report them, and as they truly are.
+    """The poses of a cell at N moments, as reported by controllers and true.
 
     Attributes:
-        cell: The graph of frames.
-        reported: (N, 4, 4) by what moves.
-        actual: All frames with their true places.
-        joints: (N, n) by arm, as reported [rad]; none where they are not.
-        angles: (N, n) by arm, as they are [rad].
+        cell: Graph of the cell's frames.
+        reported: (N, 4, 4) reported poses, by name of the moving carrier.
+        actual: All frames with their true poses.
+        joints: (N, n) reported joint angles, by arm [rad]; empty if not reported.
+        angles: (N, n) true joint angles, by arm [rad].
     """
 
     cell: Cell
@@ -191,11 +191,11 @@ class Moments:
     angles: Mapping[str, Floats]
 
     def seen(self, camera: str, target: str) -> Floats:
-        """Return (N, 4, 4) camera_T_target."""
+        """Return ``camera_T_target`` at all moments (N, 4, 4)."""
         return np.asarray(invert(_each(self.actual, camera)) @ _each(self.actual, target))
 
     def place(self, i: int, name: str) -> Floats:
-        """Return (4, 4) of a frame in the root, at one moment."""
+        """Return a frame's pose (4, 4) in the root frame at one moment."""
         frames = {
             each: replace(frame, place=frame.place[i])
             if frame.place is not None and frame.place.ndim == 3
@@ -205,7 +205,7 @@ class Moments:
         return composed(frames, name)
 
     def pose(self, i: int, camera: str, target: str) -> Floats:
-        """Return (4, 4) camera_T_target at one moment."""
+        """Return ``camera_T_target`` (4, 4) at one moment."""
         return np.asarray(invert(self.place(i, camera)) @ self.place(i, target))
 
     def poses(self, i: int) -> Poses:
@@ -216,11 +216,11 @@ class Moments:
         }
 
     def joints_at(self, i: int) -> dict[str, Floats]:
-        """Return the joints that the arms report at one moment."""
+        """Return the joint angles reported by the arms at one moment."""
         return {name: joints[i] for name, joints in self.joints.items()}
 
     def exact(self, i: int, camera: str, target: str) -> Observation:
-        """Return a noise-free measurement of the camera."""
+        """Return a noise-free observation of a target by a camera."""
         return replace(
             noise_free(self.pose(i, camera, target), i, self.poses(i), None),
             id=name_of((i, camera, target)),
@@ -241,7 +241,7 @@ def _each(frames: Mapping[str, Frame], name: str) -> Floats:
 
 
 def _draw(cell: Cell, params: CellSessionParams, rng: np.random.Generator) -> Moments:
-    """Draw where everything that moves is reported to be, and where it then is."""
+    """Return random poses of everything that moves, reported and true."""
     drawn = {name: _moved(name, mover, params, rng) for name, mover in cell.movers.items()}
     reported = {name: each.reported for name, each in drawn.items()}
     places = {name: each.actual for name, each in drawn.items()}
@@ -263,11 +263,11 @@ class Drawn(NamedTuple):
     """The poses of a moving carrier at N moments.
 
     Attributes:
-        reported: (N, 4, 4) by its controller.
-        actual: (N, 4, 4) as it is.
-        joints: (N, n) of an arm, by its controller [rad].
-        angles: (N, n) as they are.
-        links: (N, n + 1, 4, 4) of its base and links, as they are.
+        reported: (N, 4, 4) reported poses.
+        actual: (N, 4, 4) true poses.
+        joints: (N, n) reported joint angles of an arm [rad].
+        angles: (N, n) true joint angles [rad].
+        links: (N, n + 1, 4, 4) true poses of base and links.
     """
 
     reported: Floats
@@ -280,7 +280,7 @@ class Drawn(NamedTuple):
 def _moved(
     name: str, mover: RobotModel | Axis | None, params: CellSessionParams, rng: np.random.Generator
 ) -> Drawn:
-    """Draw where something that moves is."""
+    """Return random poses of a moving carrier."""
     if isinstance(mover, Axis):
         low, high = mover.travel
         shares = (_changes(params.plan, 1, rng)[:, 0] + 1) / 2
@@ -296,9 +296,9 @@ def _moved(
 
 
 def _changes(plan: str, joints: int, rng: np.random.Generator) -> Floats:
-    """Return (N, n) changes of joints, from -1 to 1: drawn, or on a grid in an order that is.
+    """Return relative changes of joints (N, n), from -1 to 1: random, or a shuffled grid.
 
-    Those to choose from are of both: what tells most is often at the edge.
+    Candidates for a choice are of both kinds, as the most informative ones are often at the edge.
     """
     anywhere = rng.uniform(-1, 1, (DRAWS, joints))
     if plan == "random":
@@ -312,7 +312,7 @@ def _changes(plan: str, joints: int, rng: np.random.Generator) -> Floats:
 
 
 def _schedule(cell: Cell, moments: Moments, sightings: int, view: CameraView) -> list[Sighting]:
-    """Choose who sees whom at which moment: each pair in turn, as long as it sees anything."""
+    """Return the schedule: each camera-target pair in turn, while it has moments in view."""
     free = {p: list(np.flatnonzero(seen)) for p, seen in _visible(cell, moments, view).items()}
     taken: set[int] = set()
     chosen: list[Sighting] = []
@@ -327,13 +327,13 @@ def _schedule(cell: Cell, moments: Moments, sightings: int, view: CameraView) ->
 
 
 def _visible(cell: Cell, moments: Moments, view: CameraView) -> dict[tuple[str, str], Mask]:
-    """Return (N,) whether a camera sees a target at each moment, by the two."""
+    """Return the mask (N,) of moments in view, by camera and target."""
     pairs = [(camera, target) for camera in cell.cameras for target in cell.targets]
     return {pair: view.sees(moments.seen(*pair)) for pair in pairs if _apart(cell, pair)}
 
 
 def _apart(cell: Cell, pair: tuple[str, str]) -> bool:
-    """Return whether anything moves the two against each other."""
+    """Return whether camera and target can move relative to each other."""
     first, second = ({*chain(cell.frames, end)} & {*cell.measured} for end in pair)
     return first != second
 

@@ -1,4 +1,4 @@
-"""Shared by simulated sessions of any configuration: parameters, and the plan."""
+"""Plan of a simulated session in any configuration: parameters, poses and true transforms."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ class ViewParams(SessionParams):
 
 
 class OutlierParams(Params):
-    """How often simulated cameras err."""
+    """Rate and size of outliers of simulated cameras."""
 
     outliers: float = Field(0.0, ge=0, lt=0.5, description="Share of sightings that are outliers.")
 
@@ -116,7 +116,7 @@ class OutlierParams(Params):
 def noise_free(
     camera_T_target: Floats, index: int, poses: Poses, joints: Floats | None
 ) -> Observation:
-    """Return a camera's noise-free measurement at a pose, with the reported poses."""
+    """Return a camera's noise-free observation at a pose, with the reported robot poses."""
     seen = PoseFeature(Transform(CAMERA, TARGET, camera_T_target), np.zeros((6, 6)))
     return Observation(f"exact-{index}", seen, poses, joints)
 
@@ -133,7 +133,7 @@ class PlannedSession:
 
     @property
     def truth(self) -> Truth:
-        """The unknowns as they are."""
+        """True values of the unknowns."""
         places = self.places
         values = [places.x, *([places.y] if self.configuration.other_base else []), places.z]
         camera, *others = (
@@ -143,11 +143,11 @@ class PlannedSession:
         return Truth(camera, tuple(others), self.unseen)
 
     def where(self, chosen: NDArray[np.intp]) -> PlannedSession:
-        """Return the session with some of its poses."""
+        """Return the session with the chosen poses only."""
         return replace(self, reported=self.reported.where(chosen), actual=self.actual.where(chosen))
 
     def noise_free(self) -> tuple[Observation, ...]:
-        """Return a camera's noise-free measurement at each pose, with the reported poses."""
+        """Return the camera's noise-free observation at each pose, with reported robot poses."""
         seen = seen_from(self.actual, self.places)
         return tuple(noise_free(pose, i, *self.poses(i)) for i, pose in enumerate(seen))
 
@@ -168,17 +168,17 @@ def plan_session(
     given: tuple[SessionParams, CameraView],
     rng: np.random.Generator,
 ) -> PlannedSession:
-    """Draw the arms' poses, and put camera and target where the loop closes.
+    """Return a session with random arm poses, and camera and target placed to close the loop.
 
     Args:
         robot: The first arm.
-        second: The second one, where the configuration has two.
-        configuration: Who carries what.
-        given: What the recipe states, and what the camera can see.
-        rng: Draws poses and their noise.
+        second: The second arm; None for a configuration with one.
+        configuration: What carries camera and target.
+        given: Parameters of the recipe, and the camera's field of view.
+        rng: Random generator of poses and noise.
 
     Raises:
-        StageError: A second arm is missing, or the camera does not see the target at enough poses.
+        StageError: A second arm is missing, or the target is in view at too few poses.
     """
     params, view = given
     if configuration.other_base and second is None:
@@ -214,7 +214,7 @@ def _as_built(
     params: SessionParams,
     rng: np.random.Generator,
 ) -> PlannedSession:
-    """Return a session as planned with arms that are not what they report, and poses beyond it."""
+    """Return the session with the arms' true poses, and with additional unused poses."""
     configuration, count = planned.configuration, params.poses
     every = planned.where(np.arange(min(count + UNSEEN, len(planned.reported.camera))))
     built = replace(every, actual=as_built(every.reported, configuration, arms))
@@ -226,7 +226,7 @@ def _as_built(
 def source_of(
     session: PlannedSession, robot: RobotModel, seed: int, *models: Params | Flange
 ) -> Source:
-    """Return where a session's captures come from: made of the models and parameters alone."""
+    """Return the provenance of a session's captures, from its models and parameters."""
     configuration = session.configuration
     made_of = [robot.model, configuration.describe(), *(m.model_dump(mode="json") for m in models)]
     note = f"simulated: {configuration.name}, {len(session.reported.camera)} poses"
@@ -234,6 +234,6 @@ def source_of(
 
 
 def fingerprint_of(seed: int, made_of: Sequence[Any]) -> str:
-    """Return the hash of a simulation, by its seed and plain data of all that it is made of."""
+    """Return the hash of a simulation, computed from its seed and its models' plain data."""
     text = json.dumps([VERSION, seed, made_of], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()

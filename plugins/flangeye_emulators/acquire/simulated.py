@@ -1,4 +1,4 @@
-"""``acquire.simulated``: captures from a cell whose truth is known."""
+"""``acquire.simulated``: captures from a simulated cell with known truth."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ def acquire_simulated(  # noqa: PLR0913  what it asks the runner for
     stage_log: StageLog | None = None,
     motion: MotionAllowed | None = None,
 ) -> Captures:
-    """Scan a simulated arm that moves its flange through the scanner's view.
+    """Scan a simulated arm that moves its flange through the scanner's field of view.
 
-    The reported poses are the nominal kinematics of the commanded joints; the arm that is scanned
-    has joint zeros of its own. Captures for verification come first. Each scan is made when it is
-    asked for. A robot that is asked for its wrist circle carries its own plate;
-    a body is on the flange, drawn in its frame.
+    The reported poses are the nominal kinematics of the commanded joints; the true arm has its own
+    joint zeros. Captures for verification come first. Each scan is rendered on demand. If the
+    target is the wrist circle, the robot carries its own plate; a body is mounted on the flange and
+    given in the flange's frame.
 
     Raises:
         StageError: Fewer than three poses are possible.
-        NothingMoved: Only the plan was asked for.
+        NothingMoved: Only the plan was requested.
     """
     from flangeye_emulators.acquire.simulation import Setting, simulate
 

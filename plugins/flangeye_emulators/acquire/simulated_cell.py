@@ -1,4 +1,4 @@
-"""Simulated sessions of a cell: targets as poses with noise, or scans of the arms' flanges."""
+"""Simulated sessions of a cell: noisy poses of targets, or scans of the arms' flanges."""
 
 from __future__ import annotations
 
@@ -65,13 +65,13 @@ class SimulatedCellParams(OutlierParams, CellSessionParams):
 
 @stage("acquire.simulated_cell")
 def acquire_simulated_cell(cell: Cell, seed: Seed, params: SimulatedCellParams) -> Observations:
-    """Simulate sightings of every target by every camera of a cell, with random arm poses.
+    """Simulate observations of every target by every camera of a cell, at random arm poses.
 
-    Each sighting is of a moment of its own; its pose has noise, as a marker's has.
+    Each observation has its own moment, and noise like that of a marker's pose.
 
     Raises:
-        StageError: The place of an unknown is not given, or a camera or target takes part in too
-            few sightings.
+        StageError: The true pose of an unknown is not given, or a camera or target has too few
+            sightings.
     """
     rng = np.random.default_rng([VERSION, seed])
     planned = plan_cell(cell, seed, params, params.view, rng)
@@ -81,7 +81,7 @@ def acquire_simulated_cell(cell: Cell, seed: Seed, params: SimulatedCellParams) 
 def _seen(
     planned: PlannedCell, params: SimulatedCellParams, rng: np.random.Generator
 ) -> Iterator[Observation]:
-    """Yield the sightings with their noise; some are wrong."""
+    """Yield the observations with noise and outliers."""
     moments, count, seen = planned.moments, len(planned.scheduled), list[Observation]()
     # Of a marker's measured pose, about and along each axis [rad, m]
     deviations = np.repeat([np.radians(0.05), 0.1e-3], 3)
@@ -104,13 +104,13 @@ class CellScanParams(ScannerQuality, CellSessionParams):
 def acquire_simulated_cell_scans(
     cell: Cell, scanner: ScannerModel, flange: Flange, seed: Seed, params: CellScanParams
 ) -> Captures:
-    """Simulate scans of every flange by every scanner of a cell, with random arm poses.
+    """Simulate scans of every flange by every scanner of a cell, at random arm poses.
 
-    All scanners are of the recipe's model, each with a distortion of its own.
+    All scanners are of the recipe's model; each has its own distortion.
 
     Raises:
-        StageError: A target is not a flange, the place of an unknown is not given, or a camera or
-            target takes part in too few sightings.
+        StageError: A target is not a flange, the true pose of an unknown is not given, or a camera
+            or target has too few sightings.
     """
     _require_flanges(cell)
     rng = np.random.default_rng([VERSION, seed])
@@ -150,7 +150,7 @@ def _require_flanges(cell: Cell) -> None:
 
 
 def _arms(moments: Moments, i: int, flange: Flange) -> list[SolidBody]:
-    """Return the arms as they stand at a moment, in the root."""
+    """Return the arms' bodies at a moment, in the root frame."""
     bodies, nowhere = [], np.zeros(3)
     for name, angles in moments.angles.items():
         mover = moments.cell.movers[name]

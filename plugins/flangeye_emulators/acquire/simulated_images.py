@@ -1,4 +1,4 @@
-"""``acquire.simulated_images``: a printed target seen by a camera, in any configuration."""
+"""``acquire.simulated_images``: images of a printed target in any configuration."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from flangeye_emulators.world.session import CameraView, seen_from
 
 
 def camera_of(pixels: Pixels, camera: BoardCamera) -> BoardCamera:
-    """Return a camera with the same pixels as a scanner."""
+    """Return the camera model with a scanner's pixels."""
     height, width = pixels.shape
     focal = 1 / pixels.size
     focal_y = (height - 1) / (2 * abs(float(pixels.y[0])))
@@ -42,7 +42,7 @@ def camera_of(pixels: Pixels, camera: BoardCamera) -> BoardCamera:
 
 
 def sheet_of(board: Board) -> SolidBody:
-    """Return the sheet with the print on its front, in ``target``; the print's black is as matt."""
+    """Return the printed sheet as a body in ``target``; black and white are equally matt."""
     half = np.array(board.size) / 2 + board.square
     # Of the sheet that carries the print [m]
     low, high = [*-half, -4e-3], [*half, 0.0]
@@ -50,7 +50,7 @@ def sheet_of(board: Board) -> SolidBody:
 
 
 def uncovered(cloud: PointCloud, board: Board, camera_T_target: Floats, cover: Cover) -> PointCloud:
-    """Return an organised cloud without the points that something lies over."""
+    """Return an organised cloud without the points under the cover."""
     target_T_camera = invert(camera_T_target)
     local = cloud.xyz @ target_T_camera[:3, :3].T + target_T_camera[:3, 3]
     across, down = local[..., 0] + board.size[0] / 2, board.size[1] / 2 - local[..., 1]
@@ -91,10 +91,10 @@ class SimulatedImagesParams(ViewParams):
 
 
 def camera_at(resolution: float) -> BoardCamera:
-    """Return a camera of 1280 x 1024 px, or of that share of its columns and rows.
+    """Return a camera of 1280 x 1024 px, scaled by ``resolution``.
 
-    Its principal point is in the middle of the image, its lens blurs by 0.7 px, its noise is 3 grey
-    levels, and the darker side of an image loses 0.4 of the light.
+    Its principal point is the image's centre, the lens blur is 0.7 px, the noise 3 grey levels, and
+    the darker side of an image loses 40 % of the light.
     """
     width, height, f = round(1280 * resolution), round(1024 * resolution), 1400.0 * resolution
     matrix = np.array([[f, 0, width / 2 - 0.5], [0, f, height / 2 - 0.5], [0, 0, 1]])
@@ -114,8 +114,8 @@ def acquire_simulated_images(
     """Take images of a printed target in any configuration, with or without its depth.
 
     Raises:
-        StageError: The camera does not see the target at enough poses, or depth is asked for and
-            the recipe names no scanner.
+        StageError: The target is in view at too few poses, or depth is requested and the recipe
+            names no scanner.
     """
     rng = np.random.default_rng([VERSION, seed])
     eye = _eye(scanner, params, rng)
@@ -159,7 +159,7 @@ def _field(camera: BoardCamera) -> tuple[float, float]:
 
 
 def _covers(params: SimulatedImagesParams, rng: np.random.Generator) -> list[Cover | None]:
-    """Return what lies over the target in each capture."""
+    """Return the cover over the target in each capture; None without one."""
     chosen = rng.permutation(params.poses)[: round(params.covered * params.poses)]
     side = min(BOARDS[params.board].size)
     # A cover begins this share of the board's smaller side away from its middle
@@ -171,7 +171,7 @@ def _covers(params: SimulatedImagesParams, rng: np.random.Generator) -> list[Cov
 
 @dataclass(frozen=True, eq=False)
 class _CellScene:
-    """What is needed to take images."""
+    """Camera and target, ready to render images."""
 
     board: Board
     camera: BoardCamera
@@ -181,7 +181,7 @@ class _CellScene:
     def shot(
         self, camera_T_target: Floats, cover: Cover | None, rng: np.random.Generator
     ) -> tuple[Image, PointCloud]:
-        """Return the image and, with depth, the organised cloud."""
+        """Return the image and the organised cloud, which is empty without a depth camera."""
         image = render_board(self.board, camera_T_target, self.camera, rng, cover)
         if self.eye is None:
             return image, PointCloud(CAMERA, np.zeros((0, 3), dtype=np.float32))

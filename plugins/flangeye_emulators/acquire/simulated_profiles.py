@@ -1,4 +1,4 @@
-"""``acquire.simulated_profiles``: a line scanner in the hand passes a sphere."""
+"""``acquire.simulated_profiles``: profiles of a sphere by a line scanner on the flange."""
 
 from __future__ import annotations
 
@@ -44,18 +44,18 @@ class ProfilesParams(SessionParams):
 
 @dataclass(frozen=True)
 class ProfileView(CameraView):
-    """The poses at which a line scanner's laser meets the sphere beside its centre."""
+    """The view of a line scanner: poses at which the laser meets the sphere beside its centre."""
 
     radius: float = 0.0
 
     def first(self) -> Floats:
-        """Return (4, 4) camera_T_target at the first pose, the laser 0.7 radii off centre."""
+        """Return ``camera_T_target`` (4, 4) at the first pose, the laser 0.7 radii off centre."""
         pose = super().first()
         pose[1, 3] = 0.7 * self.radius
         return pose
 
     def sees(self, poses: Floats) -> NDArray[np.bool_]:
-        """Return in which of (N, 4, 4) camera_T_target the laser cuts a circle well."""
+        """Return the mask (N,) of poses at which the laser cuts a large enough circle."""
         x, y, z = poses[:, :3, 3].T
         across = np.abs(x) + self.radius < np.tan(self.field[0] / 2) * z
         # How far beside the sphere's centre the laser passes
@@ -71,7 +71,7 @@ def acquire_simulated_profiles(
     seed: Seed,
     params: ProfilesParams,
 ) -> Captures:
-    """Take profiles of a sphere by a line scanner, the centre always on the +y side of its plane.
+    """Take profiles of a sphere by a line scanner, with the centre on the +y side of its plane.
 
     Raises:
         StageError: The laser cuts the sphere at too few poses.
@@ -99,11 +99,11 @@ def profile_of(
     """Return the (N, 3) points of a profile of a sphere over a table, y = 0 [m].
 
     Args:
-        centre: (3,) of the sphere, in ``camera`` [m].
-        radius: [m].
+        centre: (3,) centre of the sphere in ``camera`` [m].
+        radius: Radius of the sphere [m].
         up: (3,) normal of the table, in ``camera``.
-        params: The scanner.
-        rng: Draws its noise.
+        params: Parameters of the scanner.
+        rng: Random generator of the noise.
     """
     x = np.linspace(-1, 1, params.points) * np.tan(FAN / 2)
     rays = np.stack([x, np.zeros_like(x), np.ones_like(x)], axis=1)
@@ -119,14 +119,14 @@ def profile_of(
 
 
 def _sphere_depth(rays: Floats, centre: Floats, radius: float) -> Floats:
-    """Return where (N, 3) rays from the origin meet a sphere first; NaN where they do not."""
+    """Return the first intersection of rays (N, 3) from the origin with a sphere; NaN without."""
     a, b = (rays**2).sum(axis=1), rays @ centre
     inside = b**2 - a * (centre @ centre - radius**2)
     return np.asarray((b - np.sqrt(np.where(inside > 0, inside, np.nan))) / a)
 
 
 def _hidden(points: Floats, eye: Floats, centre: Floats, radius: float) -> NDArray[np.bool_]:
-    """Return which points (N, 3) the sphere hides from ``eye``, its own far side too."""
+    """Return the mask of points (N, 3) hidden from ``eye`` by the sphere, its far side included."""
     rays = points - eye
     with np.errstate(invalid="ignore"):
         first = _sphere_depth(rays, centre - eye, radius)

@@ -1,4 +1,4 @@
-"""Simulated sessions of every configuration: of a marker as poses, of circles as scans."""
+"""Simulated sessions of every configuration: noisy poses of a marker, or scans of a circle."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def acquire_simulated_marker(
     params: SimulatedMarkerParams,
     second: SecondRobot | None = None,
 ) -> Observations:
-    """Measure a marker's pose in any configuration: poses with noise, no images.
+    """Simulate measured poses of a marker in any configuration, without images.
 
     Raises:
         StageError: The camera does not see the marker at enough poses.
@@ -92,10 +92,10 @@ def acquire_simulated_session(  # noqa: PLR0913  what it asks the runner for
     params: ScanParams,
     second: SecondRobot | None = None,
 ) -> Captures:
-    """Scan a circle in any configuration: the flange's own, or one like it on the base.
+    """Simulate scans of a circle in any configuration: the flange's, or a plate's on the base.
 
     Raises:
-        StageError: The camera does not see it at enough poses.
+        StageError: The circle is in view at too few poses.
     """
     rng = np.random.default_rng([VERSION, seed])
     view = CameraView(params.distance, scanner.near, scanner.far, scanner.field_of_view, FACING)

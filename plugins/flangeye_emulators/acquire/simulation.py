@@ -1,4 +1,4 @@
-"""The simulation of ``acquire.simulated``: moves an arm before a scanner and renders each scan."""
+"""The simulation behind ``acquire.simulated``: moves an arm and renders each scan."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def simulate(
 def _explained(
     captures: Iterator[Capture], whys: Sequence[str], stage_log: StageLog | None
 ) -> Iterator[Capture]:
-    """Yield the captures; before each, say what the plan expects of it, where it does."""
+    """Yield the captures; log the plan's reason for each one beforehand."""
     for index, why in enumerate(whys):
         if why and stage_log:
             stage_log("next", {"id": f"{index:04d}", "why": why})
@@ -138,7 +138,7 @@ def _site(reach: Reach, base_T_camera: Floats) -> Site:
 
 @dataclass(frozen=True, eq=False)
 class _Stops:
-    """Where the arm stops: for the captures that verify, then for those that calibrate."""
+    """The planned poses: first those for verification, then those for calibration."""
 
     plan: Plan
     checks: list[PlannedPose]
@@ -169,7 +169,7 @@ def _stops(
 
 
 def _plan_alone(stops: _Stops, reach: Reach, site: Site) -> NothingMoved:
-    """Return the plan that is shown instead of a session."""
+    """Return the plan as an exception that ends the stage without a session."""
     roles = ["verification"] * len(stops.checks) + ["calibration"] * len(stops.poses)
     rows = [
         row_at(f"{i:04d}", role, pose, site.eye)
@@ -181,7 +181,7 @@ def _plan_alone(stops: _Stops, reach: Reach, site: Site) -> NothingMoved:
 
 
 def _checks(plan: Plan, site: Site, count: int, rng: np.random.Generator) -> list[PlannedPose]:
-    """Return poses for the captures that verify, near the middle of the workspace."""
+    """Return poses for verification, near the middle of the workspace."""
     found = poses_near(plan.centre, count, site, rng)
     if len(found) < count:
         raise StageError(
@@ -192,7 +192,7 @@ def _checks(plan: Plan, site: Site, count: int, rng: np.random.Generator) -> lis
 
 
 def _unseen(plan: Plan, site: Site, rng: np.random.Generator) -> list[Floats]:
-    """Return joints of poses over the workspace that are kept out of the calibration."""
+    """Return joint angles of poses over the workspace that calibration does not use."""
     # Largest roll, pitch and yaw of poses that show what a calibration is worth [rad]
     spread = plan.size / 2, 0.3
     return [pose.joints for pose in poses_near(plan.centre, UNSEEN, site, rng, spread)]
@@ -200,9 +200,10 @@ def _unseen(plan: Plan, site: Site, rng: np.random.Generator) -> list[Floats]:
 
 @dataclass(frozen=True, eq=False)
 class _Session:
-    """One visit to every pose. The scanner's buffers, 300 MB, live while captures are pulled.
+    """A session that visits every pose once.
 
-    The joints, (N, n) as reported and as they are, go on with those of poses that take no part.
+    The scanner's buffers, 300 MB, live while captures are read. The arrays of joints (N, n),
+    reported and true, end with the poses that calibration does not use.
     """
 
     cell: SimulatedCell
@@ -223,7 +224,7 @@ class _Session:
         return len(self.stops.all)
 
     def source(self, fingerprint: str) -> Source:
-        """Return where the captures come from, with the truth."""
+        """Return the provenance of the captures, with the truth."""
         plan, found = self.stops.plan, len(self.stops.poses)
         note = f"simulated: {self.cell.robot.model} before {self.scanner.model}, {found} poses"
         if left := plan.wanted - found:
@@ -232,16 +233,16 @@ class _Session:
         return Source(fingerprint, (note,), Box(plan.centre, plan.size), truth, simulated=True)
 
     def _unseen(self) -> tuple[Observation, ...]:
-        """Return noise-free measurements at poses that are kept out of the calibration."""
+        """Return noise-free observations at poses that calibration does not use."""
         joints, angles = self.joints[self.count :], self.angles[self.count :]
         reported = [by_frame(Transform(BASE, FLANGE, pose)) for pose in self.arm.reported(joints)]
         seen = invert(self.base_T_camera) @ self.arm.flange(angles)
         return tuple(noise_free(seen[i], i, reported[i], joints[i]) for i in range(len(joints)))
 
     def captures(self, noise: np.random.SeedSequence, at_once: int) -> Iterator[Capture]:
-        """Render the captures on demand, or a given number ahead of demand.
+        """Render the captures on demand, or up to ``at_once`` ahead of demand.
 
-        Each has its own generator: they are the same whichever is finished first.
+        Each capture has its own random generator, so the result does not depend on the order.
         """
         of_covers, *of_captures = noise.spawn(1 + self.count)
         eye = self._eye()
@@ -268,12 +269,12 @@ class _Session:
         return PointCloud(CAMERA, self._eye().scan(before_camera(bodies, self.base_T_camera), rng))
 
     def _eye(self) -> StructuredLight | TimeOfFlight:
-        """Return the scanner; its distortion is the same each time."""
+        """Return the scanner; its distortion is the same for each call."""
         rng = _rng(self.of_scanner)
         return scanner_of(self.scanner, self.params.resolution, self.params.noise, rng)
 
     def _covered(self, rng: np.random.Generator) -> set[int]:
-        """Draw the calibration captures in which a board hides the flange."""
+        """Return the random calibration captures in which a board hides the flange."""
         calibration = np.arange(len(self.stops.checks), self.count)
         count = round(self.params.outliers * len(calibration))
         return set(rng.permutation(calibration)[:count].tolist())

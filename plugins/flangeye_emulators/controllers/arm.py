@@ -1,4 +1,4 @@
-"""The emulated arm: follows motions within its limits, and feels contact forces."""
+"""The emulated arm: follows motions within its limits, and measures contact forces."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from flangeye_emulators.controllers.poses import JointStance, ToolChain, Unreach
 
 @dataclass(frozen=True, eq=False)
 class SpringSurface:
-    """A frictionless plane that yields like a spring with a damper.
+    """A frictionless plane with a contact force of spring and damper.
 
     Attributes:
         point: (3,) a point of the undeformed plane in base [m].
         normal: (3,) unit vector out of the material.
-        stiffness: [N/m]; 20 N/mm is a steel sheet on a table, felt through the arm's own give.
-        damping: [N s/m]
+        stiffness: Stiffness [N/m]; 20 N/mm is a steel sheet on a table plus the arm's compliance.
+        damping: Damping [N s/m].
     """
 
     point: Floats
@@ -49,7 +49,10 @@ class SpringSurface:
         return cls(np.array([0.0, 0.0, height]), np.array([0.0, 0.0, 1.0]))
 
     def force(self, position: Floats, velocity: Floats) -> Floats:
-        """Return the force (3,) on a point (3,) that moves with (3,) [m/s]; it never pulls."""
+        """Return the contact force (3,) [N] on a point of this position and velocity.
+
+        It pushes only: the damper never pulls.
+        """
         depth = float(self.normal @ (self.point - position))
         if depth <= 0.0:
             return np.zeros(3)
@@ -58,29 +61,29 @@ class SpringSurface:
 
 
 class MotionFault(Exception):
-    """Why the arm had to stop by itself; it is braking already."""
+    """The reason why the arm stopped by itself; it is braking already."""
 
 
 class SimulatedArm:
-    """An arm that moves in cycles.
+    """An arm that is advanced in control cycles.
 
     Attributes:
-        chain: Its kinematics as the controller knows them.
-        speed_limits: (n,) [rad/s].
+        chain: Nominal kinematics, as in the controller.
+        speed_limits: (n,) largest joint speeds [rad/s].
         cycle: Length of one cycle [s].
-        surfaces: What the tool may touch.
+        surfaces: Surfaces that the tool may touch.
         held: Whether a pause or a stop keeps the arm on its path at rest.
-        stance: Joints, tool pose, Jacobian.
-        speeds: (n,) of the joints [rad/s].
-        twist: (6,) of the tool in base [m/s, rad/s].
-        felt: (6,) wrench of the surroundings on the tool, in base [N, Nm].
-        zeros: (n,) true joint angles minus reported ones [rad]: what calibration has to live with.
+        stance: Present joints, tool pose and Jacobian.
+        speeds: (n,) joint speeds [rad/s].
+        twist: (6,) twist of the tool in base [m/s, rad/s].
+        felt: (6,) contact wrench on the tool in base [N, Nm].
+        zeros: (n,) true joint angles minus reported ones [rad].
     """
 
     def __init__(
         self, robot: RobotModel, speed_limits: Floats, cycle: float, joints: Floats, zeros: Floats
     ) -> None:
-        """Stand still at ``joints`` (n,)."""
+        """Start at rest at joint angles (n,) [rad]."""
         self.chain = ToolChain(robot)
         self.speed_limits, self.cycle, self.zeros = speed_limits, cycle, zeros
         self.surfaces: list[SpringSurface] = []
@@ -94,7 +97,7 @@ class SimulatedArm:
         self._feel()
 
     def put(self, joints: Floats) -> None:
-        """Place the arm at ``joints`` (n,) at once: the start of a simulation, not a motion."""
+        """Set the joint angles (n,) [rad] without a motion, to start a simulation."""
         self._motion, self._braking = None, False
         self.stance = self.chain.stance(np.array(joints, dtype=np.float64))
         self.speeds, self.twist = np.zeros(len(joints)), np.zeros(6)
@@ -112,11 +115,11 @@ class SimulatedArm:
 
     @property
     def fraction(self) -> float:
-        """Share of full speed in force now, 0 to 1."""
+        """Present speed as a share of the full one, 0 to 1."""
         return self._fraction
 
     def true_flange(self) -> Floats:
-        """Return where the flange really is: ``base_T_flange`` (4, 4), joint errors included."""
+        """Return the true ``base_T_flange`` (4, 4), with the errors of the joint zeros."""
         return self.chain.flange(self.stance.joints + self.zeros)
 
     def drive(self, motion: ControllerMotion) -> None:
@@ -129,7 +132,7 @@ class SimulatedArm:
         """Advance one cycle. Without a motion in this cycle the arm brakes.
 
         Raises:
-            MotionFault: A limit was met: a joint's range or speed, or reach. The arm brakes.
+            MotionFault: A limit was reached: a joint's range or speed, or reach. The arm brakes.
         """
         if self._motion is not None and not (self._claimed or self.held or self._braking):
             self._brake()
@@ -153,7 +156,7 @@ class SimulatedArm:
             self._motion, self._braking = None, False
 
     def _next_fraction(self) -> float:
-        """Move the speed share towards what is wanted: fast to a halt, slower otherwise."""
+        """Return the next speed share: fast changes for a halt, slower ones otherwise."""
         if self._braking:
             return 1.0
         # Time in which a pause or a protective stop takes the arm from full speed to none, on its
@@ -182,7 +185,7 @@ class SimulatedArm:
         )
 
     def _check(self, joints: Floats) -> None:
-        """Refuse joints that are out of their ranges or would have to move too fast."""
+        """Raise MotionFault for joints out of their ranges or above their speed limits."""
         outside = (joints < self.chain.lower) | (joints > self.chain.upper)
         if outside.any():
             i = int(outside.argmax())
@@ -210,10 +213,10 @@ class SimulatedArm:
 
 
 def starting_joints(robot: RobotModel, joints: Sequence[float] | Floats | None) -> Floats:
-    """Return the (n,) joint angles to start at [rad]; a pose of the maker's arms without any.
+    """Return the initial joint angles (n,) [rad]: the given ones, or the arm's default.
 
     Raises:
-        StageError: Their count is wrong, one is not finite, or none are known for the arm.
+        StageError: The number of angles is wrong, one is not finite, or the arm has no default.
     """
     if joints is None:
         # Joint angles [deg] at which a maker's arms hold the flange down, half a metre
@@ -234,9 +237,9 @@ def starting_joints(robot: RobotModel, joints: Sequence[float] | Floats | None) 
 
 
 def joint_zeros(robot: RobotModel, seed: int | None) -> Floats:
-    """Return how far the joints' true zeros are off (n,) [rad]; the first by definition not at all.
+    """Return random errors of the joint zeros (n,) [rad]; the first is zero by definition.
 
-    Drawn with the robot's ``joint_accuracy``; without a seed the arm stands where it reports.
+    Their standard deviation is the robot's ``joint_accuracy``; without a seed all are zero.
     """
     zeros = np.zeros(len(robot.joints))
     if seed is not None:
@@ -246,13 +249,13 @@ def joint_zeros(robot: RobotModel, seed: int | None) -> Floats:
 
 
 class ControlUnit(ABC):
-    """Common part of all controllers: an arm advanced by cycles, a log, a force limit.
+    """Common part of all controllers: an arm advanced in cycles, a log, and a force limit.
 
     Attributes:
         arm: The arm.
         cycle: Length of a control cycle [s].
-        unlock_after: Time before a protective stop can be unlocked [s].
-        log: (time, what happened), the last thousand.
+        unlock_after: Time after which a protective stop can be unlocked [s].
+        log: The last thousand events: (time [s], text).
     """
 
     def __init__(self, arm: SimulatedArm, cycle: float, unlock_after: float) -> None:
@@ -263,7 +266,7 @@ class ControlUnit(ABC):
 
     @property
     def time(self) -> float:
-        """Time since it was switched on [s]."""
+        """Time since power-on [s]."""
         return self._cycles * self.cycle
 
     @property
@@ -285,16 +288,16 @@ class ControlUnit(ABC):
 
     @abstractmethod
     def _advance(self) -> None:
-        """Do what this make does in a cycle."""
+        """Run the maker-specific part of a cycle."""
 
     @abstractmethod
     def protective_stop(self, why: str) -> None:
-        """Stop the arm and take no command."""
+        """Stop the arm and refuse commands until it is unlocked."""
 
     @abstractmethod
     def reset(self, joints: Floats) -> None:
-        """Be as after switching on, standing at ``joints`` (n,) [rad]."""
+        """Return to the state after power-on, at rest at ``joints`` (n,) [rad]."""
 
     @abstractmethod
     def modes(self) -> Mapping[str, Any]:
-        """Return its modes by name, for the control channel."""
+        """Return the controller's modes by name, for the control channel."""

@@ -1,9 +1,8 @@
-"""A controller of AUBO (ARCS), as the pyaubo-sdk client library (0.24) knows it.
+"""An emulated AUBO controller (ARCS) for the pyaubo-sdk client library (0.24).
 
-Port: JSON-RPC 30004. The methods that move the arm and read its state are there; programs, inputs
-and outputs are not. What the library sends was recorded from it; how a real controller answers is
-from the maker's documentation of the interface, and where that is silent the README of the drivers
-says so.
+It serves JSON-RPC on port 30004, with the methods that move the arm and read its state. Programs,
+inputs and outputs are not emulated. Requests were recorded from the library; answers follow the
+maker's interface documentation. Where that is silent, the drivers' README says so.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ OK = 0
 
 
 class AuboController(ControlUnit):
-    """A controller with its arm.
+    """An emulated AUBO controller with its arm.
 
     Attributes:
         robot_mode: ``Running``, or ``PowerOff``.
@@ -44,7 +43,7 @@ class AuboController(ControlUnit):
     """
 
     def __init__(self, robot: RobotModel, joints: Floats, zeros: Floats) -> None:
-        """Switch on, with the arm standing at ``joints`` (n,) [rad]."""
+        """Start powered on, with the arm at rest at ``joints`` (n,) [rad]."""
         # `RobotConfig.getCycletime` of an i5 [s]
         cycle = 0.005
         # Data sheet of the i5 [rad/s]
@@ -62,7 +61,7 @@ class AuboController(ControlUnit):
     # Motion
 
     def move_joint(self, q: Floats, a: float, v: float) -> int:
-        """Append a move to joint angles (n,); return whether it was accepted."""
+        """Append a move to joint angles (n,) [rad]; return 0, or an error code."""
         if not self._can(q, len(self.arm.speeds), a, v):
             return self._refusal()
         self.note("moveJoint")
@@ -70,7 +69,7 @@ class AuboController(ControlUnit):
         return OK
 
     def move_line(self, pose: Floats, a: float, v: float) -> int:
-        """Append a straight move of the tool to a pose (6,); return whether it was accepted."""
+        """Append a linear move of the tool to a pose (6,); return 0, or an error code."""
         if not self._can(pose, 6, a, v):
             return self._refusal()
         self.note("moveLine")
@@ -79,14 +78,14 @@ class AuboController(ControlUnit):
         return OK
 
     def speed_line(self, xd: Floats, a: float, t: float) -> int:
-        """Go at a twist (6,) of the tool for ``t`` [s], then brake."""
+        """Move at a twist (6,) for a time [s], then brake; return 0, or an error code."""
         if not self._can(xd, 6, a, 1.0):
             return self._refusal()
         self._mover.go_on(xd, a, t)
         return OK
 
     def speed_joint(self, qd: Floats, a: float, t: float) -> int:
-        """Turn the joints at speeds (n,) for ``t`` [s], then brake."""
+        """Move at joint speeds (n,) for a time [s], then brake; return 0, or an error code."""
         if not self._can(qd, len(self.arm.speeds), a, 1.0):
             return self._refusal()
         self._mover.go_on(qd, a, t, in_space=False)
@@ -100,12 +99,12 @@ class AuboController(ControlUnit):
 
     @property
     def exec_id(self) -> int:
-        """Number of the move under way, -1 for none."""
+        """Number of the move in progress; -1 for none."""
         return self._mover.begun if self._mover.under_way else -1
 
     @property
     def queue_size(self) -> int:
-        """How many moves wait."""
+        """Number of queued moves."""
         return self._mover.waiting
 
     def _can(self, numbers: Floats, count: int, a: float, v: float) -> bool:
@@ -122,14 +121,14 @@ class AuboController(ControlUnit):
     # Safety and power
 
     def protective_stop(self, why: str) -> None:
-        """Brake and take no command."""
+        """Brake, and refuse commands until unlocked."""
         if self.safety == "Normal":
             self.note(f"protective stop: {why}")
             self.safety, self._stopped_at = "ProtectiveStop", self._cycles
         self._mover.halt()
 
     def unlock(self) -> int:
-        """Release a protective stop; return whether it was done."""
+        """Release a protective stop; return 0, or an error code."""
         if self.safety != "ProtectiveStop" or self.since_stop < self.unlock_after:
             return 1  # AUBO_BAD_STATE
         self.safety = "Normal"
@@ -148,14 +147,14 @@ class AuboController(ControlUnit):
         return OK
 
     def reset(self, joints: Floats) -> None:
-        """Be as after switching on, with power."""
+        """Return to the state after power-on."""
         self.safety, self.robot_mode = "Normal", "Running"
         self._mover.halt()
         self.arm.set_tool(np.eye(4))
         self.arm.put(joints)
 
     def modes(self) -> Mapping[str, Any]:
-        """Return its modes by name, for the control channel."""
+        """Return the controller's modes by name, for the control channel."""
         return {"robot_mode": self.robot_mode, "safety": self.safety}
 
 
@@ -164,7 +163,7 @@ MARK, _HEADER = b"SOF\x01", struct.Struct(">4sI")
 
 
 def serve(options: EmulatorOptions) -> None:
-    """Run a controller until the process is asked to end.
+    """Run a controller until the process is told to stop.
 
     Raises:
         StageError: A port is taken, or an option is wrong.
@@ -186,7 +185,7 @@ class RpcSession(Connection):
         self._buffer = b""
 
     def received(self, data: bytes) -> None:
-        """Answer each whole frame."""
+        """Answer each complete frame."""
         self._buffer += data
         while len(self._buffer) >= _HEADER.size:
             mark, length = _HEADER.unpack_from(self._buffer)
@@ -202,7 +201,7 @@ class RpcSession(Connection):
 
 
 def frame(body: bytes) -> bytes:
-    """Return a body with its mark and length."""
+    """Return a message body with its header: marker and length."""
     return _HEADER.pack(MARK, len(body)) + body
 
 

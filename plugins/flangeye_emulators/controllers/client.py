@@ -1,4 +1,4 @@
-"""Client of the control channel: injects faults and reads the emulator's inner state."""
+"""Client of the control channel: injects faults and reads the emulator's true state."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ OWN = ipaddress.IPv4Network("127.64.0.0/10")
 
 
 def address_of(host: str) -> str:
-    """Return a host's address; for ``auto`` one that no other run on this machine has now."""
+    """Return a host's address; for ``auto`` a free loopback address."""
     return str(OWN[run_number() % OWN.num_addresses]) if host == "auto" else host
 
 
@@ -33,10 +33,10 @@ class EmulatorTruth(NamedTuple):
     """True state of the emulated arm.
 
     Attributes:
-        base_T_flange: (4, 4)
-        joints: (n,) true angles [rad]: reported ones plus the errors of the joints' zeros.
-        speed: Speed of the fastest joint [rad/s]; zero where the arm stands.
-        time: Clock of the controller [s], as RTDE's timestamp.
+        base_T_flange: (4, 4) true flange pose.
+        joints: (n,) true joint angles [rad]: reported ones plus the errors of the joint zeros.
+        speed: Speed of the fastest joint [rad/s]; zero at rest.
+        time: Time of the controller [s], the same as RTDE's timestamp.
     """
 
     base_T_flange: Floats
@@ -48,7 +48,7 @@ class EmulatorTruth(NamedTuple):
 class EmulatorControl(Device):
     """A connection to the control channel of a controller on loopback.
 
-    ``with LoopbackControl("127.0.0.5") as control: control.fault("freeze=3 s")``
+    ``with EmulatorControl("127.0.0.5") as control: control.fault("freeze=3 s")``
     """
 
     def __init__(self, host: str, port: int = PORT, patience: float = 5.0) -> None:
@@ -60,7 +60,7 @@ class EmulatorControl(Device):
             patience: Longest wait for an answer [s].
 
         Raises:
-            StageError: Nothing answers there.
+            StageError: No controller answers at this address.
         """
         try:
             self._socket = socket.create_connection((host, port), timeout=patience)
@@ -75,7 +75,7 @@ class EmulatorControl(Device):
         """Return the answer to one request.
 
         Raises:
-            StageError: It was refused, or the connection ended.
+            StageError: The request was refused, or the connection ended.
         """
         try:
             self._lines.write(json.dumps({"do": action, **arguments}) + "\n")
@@ -91,7 +91,7 @@ class EmulatorControl(Device):
         return answer
 
     def truth(self) -> EmulatorTruth:
-        """Return where the arm really is now."""
+        """Return the arm's true state at present."""
         said = self.ask("truth")
         return EmulatorTruth(
             np.array(said["base_T_flange"]),
@@ -105,11 +105,11 @@ class EmulatorControl(Device):
         return self.ask("state")
 
     def log(self) -> list[str]:
-        """Return the log of events: commands, programs, stops with their reasons."""
+        """Return the event log: commands, programs, and stops with their reasons."""
         return [f"{time:.3f} {what}" for time, what in self.ask("log")["lines"]]
 
     def figures(self) -> dict[str, float]:
-        """Return how punctual the control cycle was, and the process's CPU time [s]."""
+        """Return statistics of the control cycle's timing, and the process's CPU time [s]."""
         return self.ask("figures")
 
     def fault(self, text: str) -> None:
@@ -117,11 +117,11 @@ class EmulatorControl(Device):
         self.ask("fault", fault=text)
 
     def clear(self) -> None:
-        """Clear faults: dead, frozen or slow network, local control, faults to come."""
+        """Clear all faults of network and control mode, and faults still to come."""
         self.ask("clear")
 
     def reset(self) -> None:
-        """Be as after switching on, without faults; open connections stay open."""
+        """Reset the controller to its state after power-on; open connections stay open."""
         self.ask("reset")
 
     def set_surfaces(self, *surfaces: SpringSurface) -> None:
@@ -140,11 +140,11 @@ class EmulatorControl(Device):
         )
 
     def put(self, joints: Sequence[float] | Floats) -> None:
-        """Place the arm at joint angles [rad] at once."""
+        """Set the arm's joint angles [rad] without a motion."""
         self.ask("put", joints=[float(angle) for angle in joints])
 
     def unlock_after(self, seconds: float) -> None:
-        """Set the time until a protective stop can be unlocked [s]; a real arm's is longer."""
+        """Set the time after which a protective stop can be unlocked [s]."""
         self.ask("unlock-after", seconds=seconds)
 
     def close(self) -> None:

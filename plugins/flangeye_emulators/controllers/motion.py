@@ -1,7 +1,7 @@
-"""Motions that give the arm's target cycle by cycle. Pure and deterministic.
+"""Motions: deterministic generators of the arm's target in each cycle.
 
-A motion runs in its own time: when a stop is under way, that time runs slower than the clock, so
-the arm slows down on its path and never leaves it.
+A motion has its own time. During a stop this time runs slower than the clock, so the arm slows down
+on its path and does not leave it.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class ControllerMotion(Protocol):
     """A motion of the arm in progress.
 
     Attributes:
-        done: Whether there is nothing left to do; the last target has been given.
+        done: Whether the last target has been returned.
     """
 
     done: bool
@@ -39,11 +39,11 @@ class ControllerMotion(Protocol):
 
 
 class Travel:
-    """Straight from rest to rest: accelerating, at its speed, braking.
+    """A move from rest to rest with a trapezoidal speed profile.
 
     Attributes:
-        duration: How long it takes at full speed [s].
-        done: Whether it has arrived.
+        duration: Duration at full speed [s].
+        done: Whether the end is reached.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class Travel:
         speed: float,
         acceleration: float,
     ) -> None:
-        """Plan the ride to ``end``; ``between`` gives the target at a share (0 to 1) of the way."""
+        """Plan the move to ``end``; ``between`` returns the target at a share of the way."""
         self._between, self._end, self._length = between, end, length
         self._acceleration = max(acceleration, SLOWEST)
         # Accelerating all the way and braking would meet at the second speed.
@@ -67,13 +67,13 @@ class Travel:
         self.done = not self._length
 
     def step(self, dt: float, here: JointStance) -> Floats:
-        """Return the next target; the last one is the end, bit for bit."""
+        """Return the next target; the last one is exactly ``end``."""
         self._time += dt
         self.done = self._time >= self.duration
         return self._end if self.done else self._between(self._place() / self._length)
 
     def _place(self) -> float:
-        """Return how far it has come, in the space's measure."""
+        """Return the distance covered, in the unit of ``length``."""
         time, half = self._time, 0.5 * self._acceleration
         if time < self._up:
             return half * time * time
@@ -86,14 +86,14 @@ class Travel:
 
 
 def joint_move(start: Floats, end: Floats, speed: float, acceleration: float) -> Travel:
-    """Return a move in joint angles (n,); speed and acceleration are those of the leading joint."""
+    """Return a move in joint space (n,), limited by the leading joint [rad/s, rad/s^2]."""
     way = end - start
     length = float(np.abs(way).max())
     return Travel(lambda share: start + share * way, end, length, speed, acceleration)
 
 
 def linear_move(start: Floats, end: Floats, speed: float, acceleration: float) -> Travel:
-    """Return a straight move of the tool's point, (4, 4) poses, turning evenly about one axis."""
+    """Return a linear move between tool poses (4, 4), with uniform rotation about one axis."""
     way, turn = end[:3, 3] - start[:3, 3], rotation_vector(start[:3, :3].T @ end[:3, :3])
     # A turn of one radian counts as this many metres [m/rad]: a wrist turns about as fast as a
     # tool moves at such a distance. Where a move is mostly a turn, its speed limits the turn.
@@ -106,19 +106,19 @@ def linear_move(start: Floats, end: Floats, speed: float, acceleration: float) -
 
 
 class Speed:
-    """At a commanded velocity, reached with limited acceleration.
+    """A motion at a commanded velocity, reached with limited acceleration.
 
     Attributes:
-        target: (6,) twist in base, or joint speeds (n,).
-        acceleration: [m/s^2] and [rad/s^2], or [rad/s^2] of the leading joint.
+        target: Commanded twist in base (6,), or joint speeds (n,).
+        acceleration: Limit of the twist [m/s^2 and rad/s^2], or of the leading joint [rad/s^2].
         in_space: Whether the velocity is a twist.
-        done: Whether the arm stands and nothing else is wanted.
+        done: Whether the arm is at rest and the commanded velocity is zero.
     """
 
     def __init__(
         self, velocity: Floats, target: Floats, acceleration: float, in_space: bool
     ) -> None:
-        """Begin with the present velocity, (6,) or (n,)."""
+        """Start from the present velocity, (6,) or (n,)."""
         self.target, self.acceleration, self.in_space = target, acceleration, in_space
         self._velocity = velocity
         self.done = False
@@ -140,5 +140,5 @@ class Speed:
 
 
 def stop(velocity: Floats, deceleration: float, in_space: bool) -> Speed:
-    """Return a stop from a velocity: straight on in space, or in joint angles."""
+    """Return a motion that brakes from a velocity: along the twist, or in joint space."""
     return Speed(velocity, np.zeros_like(velocity), deceleration, in_space)

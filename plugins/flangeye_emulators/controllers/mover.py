@@ -1,4 +1,4 @@
-"""Queue of moves from rest to rest, and velocity commands."""
+"""Executes an arm's queue of moves, or a velocity command."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ Plan = Callable[[], ControllerMotion]
 
 
 class Mover:
-    """An arm with a queue of moves, or a velocity.
+    """Drives an arm by a queue of moves from rest to rest, or by a velocity.
 
     Attributes:
         arm: The arm.
-        begun: How many moves have begun.
+        begun: Number of moves that have begun.
     """
 
     def __init__(self, arm: SimulatedArm) -> None:
@@ -42,7 +42,7 @@ class Mover:
 
     @property
     def busy(self) -> bool:
-        """Whether anything moves, or will."""
+        """Whether a motion is in progress or queued."""
         return self.under_way or self.waiting > 0 or not self.arm.standing
 
     def append(self, plan: Plan) -> None:
@@ -54,7 +54,7 @@ class Mover:
     def go_on(
         self, target: Floats, acceleration: float, seconds: float, in_space: bool = True
     ) -> None:
-        """Take a twist (6,), or joint speeds (n,), for some time, then brake."""
+        """Move at a twist (6,), or joint speeds (n,), for some seconds, then brake."""
         if not isinstance(self._motion, Speed) or self._motion.in_space is not in_space:
             velocity = self.arm.twist if in_space else self.arm.speeds
             self._motion = Speed(velocity, target, acceleration, in_space)
@@ -63,7 +63,7 @@ class Mover:
         self._cycles_left = math.inf if seconds == math.inf else round(seconds / self.arm.cycle)
 
     def halt(self, deceleration: float | None = None, in_space: bool = True) -> None:
-        """Come to rest, in a straight line or in joint space, as fast as possible by default."""
+        """Brake to rest, along a line or in joint space; as fast as possible by default."""
         self._queue.clear()
         self._motion = None
         if deceleration is not None and not self.arm.standing:
@@ -71,7 +71,7 @@ class Mover:
             self._motion, self._cycles_left = stop(velocity, deceleration, in_space), math.inf
 
     def drive(self) -> None:
-        """Choose what moves the arm in the coming cycle."""
+        """Choose the motion for the next cycle."""
         if self._motion is not None and self._motion.done:
             self._motion = None
         if isinstance(self._motion, Speed):
@@ -88,7 +88,7 @@ class Mover:
         """Advance one cycle.
 
         Raises:
-            MotionFault: The arm met a limit; it brakes, and nothing is left to do.
+            MotionFault: The arm reached a limit; it brakes, and the queue is cleared.
         """
         self.drive()
         try:

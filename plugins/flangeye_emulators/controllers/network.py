@@ -1,4 +1,4 @@
-"""Listening ports and connections, and everything that can go wrong with a wire between."""
+"""Ports and connections of an emulated controller, with simulated network faults."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from flangeye.units import parse_quantity
 
 
 class DelayLine:
-    """Hands things on in order, each after the delay that held when it came."""
+    """Delivers items in order, each after the delay that was set when it arrived."""
 
     def __init__(self, deliver: Callable[[bytes], None]) -> None:
         self._deliver = deliver
         self._items: deque[bytes] = deque()
 
     def push(self, item: bytes, seconds: float) -> None:
-        """Take one thing; without a delay, and with nothing before it, it goes straight on."""
+        """Add an item; with zero delay and an empty queue it is delivered at once."""
         if seconds <= 0.0 and not self._items:
             self._deliver(item)
             return
@@ -37,9 +37,9 @@ class Network:
     Attributes:
         host: Address of all ports.
         latency: Delay in each direction [s].
-        frozen: Whether nothing gets through while connections stay open.
-        garbled: Whether random bytes are sent in place of each answer.
-        connections: Those that are open.
+        frozen: Whether no data passes although connections stay open.
+        garbled: Whether random bytes replace each answer.
+        connections: Open connections.
     """
 
     def __init__(self, host: str) -> None:
@@ -58,7 +58,7 @@ class Network:
         """Open the ports.
 
         Raises:
-            StageError: One is taken, or the address is not this machine's.
+            StageError: A port is in use, or the address is not this machine's.
         """
         loop = asyncio.get_running_loop()
         for port, factory in self._ports.items():
@@ -72,7 +72,7 @@ class Network:
                 ) from None
 
     def kill(self) -> None:
-        """Reset every connection and close the ports, as when the power fails."""
+        """Reset every connection and close the ports, as in a power failure."""
         for server in self._servers:
             server.close()
         self._servers.clear()
@@ -84,7 +84,7 @@ class Network:
             connection.abort()
 
     def freeze(self, frozen: bool) -> None:
-        """Block the connection in both directions, or open it again."""
+        """Block data in both directions, or release it."""
         self.frozen = frozen
         for connection in list(self.connections):
             connection.hold(frozen)
@@ -106,7 +106,7 @@ class Connection(asyncio.Protocol):
         self._held: list[bytes] = []
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Join the network."""
+        """Register the connection."""
         if not isinstance(transport, asyncio.Transport):
             raise TypeError("a connection is a stream")
         self._transport = transport
@@ -115,7 +115,7 @@ class Connection(asyncio.Protocol):
         self.opened()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Leave the network."""
+        """Unregister the connection."""
         self._transport = None
         self._network.connections.discard(self)
         self.closed()
@@ -125,30 +125,30 @@ class Connection(asyncio.Protocol):
         self._incoming.push(data, self._network.latency)
 
     def opened(self) -> None:
-        """Act on a new connection."""
+        """Handle a new connection; does nothing here."""
 
     def received(self, data: bytes) -> None:
-        """Handle a client's data."""
+        """Handle a client's data; does nothing here."""
 
     def closed(self) -> None:
-        """Act on the end of the connection."""
+        """Handle the end of the connection; does nothing here."""
 
     def send(self, data: bytes) -> None:
-        """Send an answer; while the wire is frozen it waits."""
+        """Send an answer; it waits while the network is frozen."""
         if self._network.frozen:
             self._held.append(data)
         else:
             self._outgoing.push(data, self._network.latency)
 
     def stream(self, data: bytes) -> None:
-        """Send data of the present moment only; it is dropped while the network is frozen."""
+        """Send streaming data; it is dropped while the network is frozen."""
         # Bytes a client may leave unread before stream data is dropped
         clogged = self._transport is None or self._transport.get_write_buffer_size() > 256 * 1024
         if not (self._network.frozen or clogged):
             self._outgoing.push(data, self._network.latency)
 
     def hold(self, frozen: bool) -> None:
-        """Stop or resume reading; on resuming, send the data that waited."""
+        """Stop or resume reading; on resuming, send the waiting data."""
         if self._transport is None:
             return
         if frozen:
@@ -166,7 +166,7 @@ class Connection(asyncio.Protocol):
             self._transport.abort()
 
     def close(self) -> None:
-        """End the connection when everything is sent."""
+        """Close the connection after all data is sent."""
         if self._transport is not None:
             self._transport.close()
 
@@ -176,20 +176,20 @@ class Connection(asyncio.Protocol):
 
 
 class LineConnection(Connection):
-    """A connection of lines of text."""
+    """A connection that exchanges lines of text."""
 
     def __init__(self, network: Network) -> None:
         super().__init__(network)
         self._buffer = b""
 
     def received(self, data: bytes) -> None:
-        """Act on each whole line."""
+        """Handle each complete line."""
         *lines, self._buffer = (self._buffer + data).split(b"\n")
         for line in lines:
             self.line(line.decode("utf-8", "replace").strip())
 
     def line(self, text: str) -> None:
-        """Act on one line."""
+        """Handle one line."""
 
     def say(self, text: str) -> None:
         """Send one line."""
@@ -197,27 +197,27 @@ class LineConnection(Connection):
 
 
 class Stoppable(Protocol):
-    """A controller that can stop by itself."""
+    """Interface: a controller that can stop by itself."""
 
     def protective_stop(self, why: str) -> None:
-        """Stop, and say why."""
+        """Make a protective stop for a reason."""
 
     def emergency_stop(self, why: str) -> None:
-        """Cut the power."""
+        """Make an emergency stop for a reason; the power goes off."""
 
 
 class FaultInjector:
-    """Injects faults, and clears those that can end.
+    """Injects faults, and clears those that can be cleared.
 
-    * ``protective-stop``, ``singularity``, ``joint-limit``: a protective stop, with that reason.
-    * ``emergency-stop``: the button is pressed, the power goes.
+    * ``protective-stop``, ``singularity``, ``joint-limit``: a protective stop with this reason.
+    * ``emergency-stop``: the button is pressed, and the power goes off.
     * ``drop``: every connection is reset, once.
-    * ``die``: connections are reset and nobody answers any more, for good or for a duration.
-    * ``freeze``: connections stay open and nothing comes through, for good or for a duration.
-    * ``garbage``: random bytes come in place of what the controller reports, for good.
-    * ``latency``: every byte comes late by a duration, in both directions.
+    * ``die``: connections are reset and no port answers, permanently or for a duration.
+    * ``freeze``: connections stay open but no data passes, permanently or for a duration.
+    * ``garbage``: random bytes replace the controller's reports, permanently.
+    * ``latency``: every byte is delayed by a duration, in both directions.
 
-    The arm goes on with what it was doing when the network fails, as a real one does.
+    The arm continues its motion when the network fails, as a real one does.
 
     Attributes:
         kinds: The faults by name.
@@ -240,7 +240,7 @@ class FaultInjector:
         }
 
     def clear(self) -> None:
-        """End a dead, frozen, garbled or slow network."""
+        """Clear all network faults."""
         self._network.latency = 0.0
         self._garble(False)
         self._network.freeze(False)
@@ -270,12 +270,12 @@ class FaultInjector:
 
 
 class Fault(NamedTuple):
-    """Something that will go wrong.
+    """A fault to inject.
 
     Attributes:
-        name: What.
-        seconds: How long, or how much; None where nothing was said.
-        after: How long from now [s]; None for as soon as the arm moves.
+        name: Kind of fault.
+        seconds: Duration or delay [s]; None if not given.
+        after: Time until the fault [s]; None for the arm's next motion.
     """
 
     name: str
@@ -291,10 +291,10 @@ class Kind(NamedTuple):
 
 
 def parse_fault(text: str, kinds: dict[str, Kind]) -> Fault:
-    """Read ``NAME[=DURATION][@WHEN]``, such as ``freeze=3 s@moving``.
+    """Return a fault parsed from ``NAME[=DURATION][@WHEN]``, such as ``freeze=3 s@moving``.
 
     Raises:
-        StageError: There is no such fault, or a duration is wrong; the message says what there is.
+        StageError: The kind or a duration is invalid; the message lists the valid kinds.
     """
     what, _, when = text.partition("@")
     name, _, amount = what.partition("=")
@@ -316,19 +316,19 @@ def _seconds(text: str, fault: str) -> float:
 
 
 class Schedule:
-    """Faults that wait for their time."""
+    """Schedule of faults to inject."""
 
     def __init__(self, kinds: dict[str, Kind]) -> None:
         self._kinds = kinds
         self._waiting: list[tuple[Fault, float | None]] = []
 
     def add(self, fault: Fault, now: float) -> None:
-        """Inject a fault at its time."""
+        """Schedule a fault."""
         due = None if fault.after is None else now + fault.after
         self._waiting.append((fault, due))
 
     def clear(self) -> None:
-        """Forget the faults that have not happened yet."""
+        """Remove the faults that have not occurred yet."""
         self._waiting.clear()
 
     def step(self, now: float, moving: bool) -> None:

@@ -1,4 +1,4 @@
-"""Poses as controllers write them. Scalar code: it runs in every cycle of 2 ms.
+"""Poses in the controllers' notation, and kinematics, in scalar code for cycles of 2 ms.
 
 Rotations agree with :mod:`flangeye.types.geometry` (tested).
 """
@@ -18,7 +18,7 @@ from flangeye.types.geometry import rigid
 
 
 def rotation_matrix(vector: Sequence[float] | Floats) -> Floats:
-    """Return the (3, 3) rotation of a rotation vector (3,) [rad] (Rodrigues)."""
+    """Return the rotation matrix (3, 3) of a rotation vector (3,) [rad] (Rodrigues)."""
     x, y, z = (float(v) for v in vector)
     angle = math.sqrt(x * x + y * y + z * z)
     # Below 1e-4 rad the series is exact to 1e-17 and the quotients are not.
@@ -38,9 +38,10 @@ def rotation_matrix(vector: Sequence[float] | Floats) -> Floats:
 
 
 def rotation_vector(rotation: Floats) -> Floats:
-    """Return the rotation vector (3,) [rad] of a (3, 3) rotation, its length at most pi.
+    """Return the rotation vector (3,) [rad] of a rotation matrix (3, 3), of length up to pi.
 
-    Through the quaternion's largest component, which is at least 1/2 (Shepperd 1978).
+    It is computed from the quaternion's largest component, which is at least 1/2 and therefore
+    numerically safe (Shepperd 1978).
     """
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation.tolist()
     squares = (1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz, 1 + xx + yy + zz)
@@ -71,13 +72,13 @@ def pose_vector(matrix: Floats) -> Floats:
 
 
 def twist_between(start: Floats, end: Floats) -> Floats:
-    """Return the (6,) twist in base that carries one (4, 4) pose to another in one second."""
+    """Return the twist (6,) in base that moves one pose (4, 4) to another in one second."""
     turn = end[:3, :3] @ start[:3, :3].T
     return np.concatenate([end[:3, 3] - start[:3, 3], rotation_vector(turn)])
 
 
 def carried(pose: Floats, twist: Floats, seconds: float) -> Floats:
-    """Return a (4, 4) pose after a constant (6,) twist in base, taken at the pose's origin."""
+    """Return a pose (4, 4) moved by a constant twist (6,) in base about its own origin."""
     moved = pose.copy()
     moved[:3, 3] += seconds * twist[:3]
     moved[:3, :3] = rotation_matrix(seconds * twist[3:]) @ pose[:3, :3]
@@ -85,16 +86,16 @@ def carried(pose: Floats, twist: Floats, seconds: float) -> Floats:
 
 
 class UnreachableError(ValueError):
-    """No joint angles reach the pose from where the arm is."""
+    """No joint angles near the present ones reach the pose."""
 
 
 class JointStance(NamedTuple):
     """An arm at given joint angles.
 
     Attributes:
-        joints: (n,) [rad].
-        base_T_tcp: (4, 4) where the tool's point is.
-        jacobian: (6, n) the tool point's twist in base for unit joint speeds, translation first.
+        joints: (n,) joint angles [rad].
+        base_T_tcp: (4, 4) pose of the tool centre point.
+        jacobian: (6, n) twist of the tool centre point in base per joint speed, translation first.
     """
 
     joints: Floats
@@ -103,16 +104,16 @@ class JointStance(NamedTuple):
 
 
 class ToolChain:
-    """Forward, differential and inverse kinematics of the tool's point.
+    """Forward, differential and inverse kinematics of the tool centre point.
 
     Attributes:
-        flange_T_tcp: (4, 4) the tool; the flange itself until it is set.
-        lower: (n,) joint limits [rad].
-        upper: (n,) joint limits [rad].
+        flange_T_tcp: (4, 4) tool frame; the identity until it is set.
+        lower: (n,) lower joint limits [rad].
+        upper: (n,) upper joint limits [rad].
     """
 
     def __init__(self, robot: RobotModel) -> None:
-        """Take the arm from the catalogue."""
+        """Construct the chain of a robot model."""
         self._arm = Arm(robot)
         self._first_axis = 0 if robot.convention == "standard" else 1
         self._link_T_flange = robot.link_T_flange
@@ -133,10 +134,10 @@ class ToolChain:
         return JointStance(joints, base_T_tcp, jacobian)
 
     def solve(self, base_T_tcp: Floats, near: JointStance) -> JointStance:
-        """Return the arm with its tool at a pose, on the branch of ``near``.
+        """Return the stance with the tool at a pose, on the same kinematic branch as ``near``.
 
         Raises:
-            UnreachableError: Newton's iteration does not arrive: out of reach, or singular.
+            UnreachableError: Newton's iteration does not converge: out of reach, or singular.
         """
         stance = near
         # Newton converges in two from the cycle before, in about six across a quarter of a turn
@@ -151,7 +152,7 @@ class ToolChain:
 
 
 def _newton_step(jacobian: Floats, error: Floats) -> Floats:
-    """Return the change of the joints; the smallest one for an arm with joints to spare."""
+    """Return the joints' Newton step; the one of least norm for a redundant arm."""
     rows, columns = jacobian.shape
     try:
         if rows == columns:

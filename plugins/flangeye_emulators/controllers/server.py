@@ -1,9 +1,8 @@
 """A controller process: ports, clock and control channel, for arms of any maker.
 
-The control channel: one JSON object a line asks, one a line answers.
-
-``{"do": "state"}`` is answered by ``{"ok": true, ...}`` or ``{"ok": false, "error": "..."}``. It is
-not part of any robot: it is how tests and the simulated scanner reach behind the controller.
+Requests and answers on the control channel are one JSON object per line: ``{"do": "state"}`` is
+answered by ``{"ok": true, ...}`` or ``{"ok": false, "error": "..."}``. No real robot has this
+channel. Tests and the simulated scanner use it to read the true state and to inject faults.
 """
 
 from __future__ import annotations
@@ -37,11 +36,11 @@ from flangeye_emulators.controllers.network import (
 
 
 def run_server(server: Server, publish: Callable[[int], None] = lambda cycle: None) -> None:
-    """Run a controller until the process is asked to end.
+    """Run a controller until the process is told to stop.
 
     Args:
         server: The controller and its ports.
-        publish: Is called after every cycle, with its number.
+        publish: Called after every cycle with the cycle's number.
 
     Raises:
         StageError: A port is taken, or an option is wrong.
@@ -56,16 +55,16 @@ def _precise_loop() -> asyncio.AbstractEventLoop:
 
 
 def _end_with_input(ended: asyncio.Event) -> None:
-    """End with whoever started it: its end of standard input closes, even if it is killed."""
+    """Set ``ended`` when standard input closes, which happens when the parent process ends."""
     if not os.read(sys.stdin.fileno(), 4096):
         ended.set()
 
 
 def _take_precedence() -> None:
-    """Make the cycle punctual: run before others, and keep the collector's rounds short.
+    """Raise the process's priority and tune the garbage collector, for punctual cycles.
 
-    A robot's controller has a processor of its own. This one takes a quarter of a core; without
-    the right to come first (root has it) it is as punctual as the machine is idle.
+    A real controller has its own processor; this one takes a quarter of a core. Raising the
+    priority needs root; without it the timing depends on the machine's load.
     """
     with contextlib.suppress(OSError, AttributeError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
@@ -84,7 +83,7 @@ class Server:
         fault_injector: FaultInjector,
         ports: Mapping[str, int],
     ) -> None:
-        """Put a controller that is switched on behind its ports; nothing listens yet."""
+        """Connect a powered-on controller to its ports; nothing listens yet."""
         self._options, self._box, self._network = options, box, network
         self._fault_injector, self._ports = fault_injector, ports
         self._home = starting_joints(options.robot, options.joints)
@@ -112,7 +111,7 @@ class Server:
         }
 
     async def run(self, publish: Callable[[int], None]) -> None:
-        """Listen and step until a signal comes; ``publish`` is called after every cycle."""
+        """Listen and step until a signal arrives; ``publish`` is called after every cycle."""
         self._publish = publish
         ended = asyncio.Event()
         for number in (signal.SIGINT, signal.SIGTERM):
@@ -214,12 +213,12 @@ class Server:
 
 
 class ControllerClock:
-    """Calls a step once per cycle.
+    """Calls a function once per cycle.
 
     Attributes:
-        ticks: Steps made.
-        made_up: Steps that were made late, right after another.
-        gaps: Times the clock had to start again.
+        ticks: Number of steps.
+        made_up: Number of late steps, made right after another to catch up.
+        gaps: Number of restarts after a delay that was too long to catch up.
     """
 
     # Lateness is kept for so many cycles: two minutes at 500 Hz.
@@ -258,7 +257,7 @@ class ControllerClock:
         self._step()
 
     def figures(self) -> dict[str, float]:
-        """Return how punctual the steps were; times in [s]."""
+        """Return statistics of the steps' timing [s]."""
         late = self._lateness[: min(self.ticks, self.kept)]
         if not len(late):
             return {"ticks": 0}

@@ -1,1 +1,1 @@
-"""The simulated compliant finger: a tip in a groove, and its camera's images of the tag."""
+"""Simulated compliant finger: a tip in a groove, and its camera's images of the tag."""

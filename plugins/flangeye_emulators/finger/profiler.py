@@ -1,4 +1,4 @@
-"""A simulated profile sensor behind the torch: it sees the bead of the simulated finger's world."""
+"""A simulated profile sensor behind the torch, which measures the simulated bead."""
 
 from __future__ import annotations
 
@@ -23,36 +23,36 @@ class SimulatedProfilerParams(Params):
 
 
 class SimulatedProfiler(Device):
-    """Measures the simulated bead, at the torch's true place.
+    """A simulated profile sensor for the bead behind the torch.
 
     Attributes:
-        name: Shown in messages and reports.
-        behind: How far behind the torch it looks [m].
+        name: Name in messages and reports.
+        behind: Distance of the profile behind the torch [m].
     """
 
     def __init__(
         self, finger: SimulatedFinger, robot: StateSource, seed: Seed, truth: LookTruth
     ) -> None:
-        """Mount it behind the finger's torch."""
+        """Mount the sensor behind the torch of a simulated finger."""
         self.name, self.behind = f"look behind the torch of {finger.name}", truth.behind
         self._world, self._robot = finger.world, robot
         self._look = LookBehind(truth, np.random.default_rng([seed, 13]))
 
     def profile(self) -> WeldProfile | None:
-        """Return the next scan that was ready at the arm's newest sample; None without one."""
+        """Return the next profile that has arrived by the arm's present time; None without one."""
         now = self._robot.state().time_ns * 1e-9
         self._look.watch(now, self._world)
         return self._look.profile(now)
 
     def close(self) -> None:
-        """Do nothing; there is no device."""
+        """Do nothing: there is no device."""
 
 
 @part("profiler.simulated")
 def profiler_simulated(
     robot: StateSource, sensor: TactileSensor, seed: Seed, params: SimulatedProfilerParams
 ) -> Profiler:
-    """A profile of the bead of a simulated weld, behind the torch."""
+    """A simulated profile sensor that measures the bead behind the torch."""
     if not isinstance(sensor, SimulatedFinger):
         raise StageError(
             f"profiler.simulated sees the weld of sensor.simulated_finger, not of {sensor.name}"
@@ -61,7 +61,7 @@ def profiler_simulated(
 
 
 class LookBehind:
-    """Measures the bead as laid, independently of the controller's estimate."""
+    """Measures the true bead, independently of the controller's estimate."""
 
     def __init__(self, truth: LookTruth, rng: np.random.Generator) -> None:
         self._truth, self._rng = truth, rng
@@ -71,7 +71,7 @@ class LookBehind:
         self._began: float | None = None
 
     def watch(self, time: float, world: WeldWorld) -> None:
-        """Update the world's state [s]; a bead is laid at the torch's place across the seam."""
+        """Update the bead: at ``time`` [s] it is laid at the torch's true position."""
         s = world.torch_s
         if 0.0 < s < world.groove.root.length:
             again = bisect.bisect_left(self._along, s)  # where it was before, it is molten again
@@ -86,13 +86,13 @@ class LookBehind:
             self._shutter.expose(time, seen + noise)
 
     def profile(self, time: float) -> WeldProfile | None:
-        """Return the next profile that has arrived at a time [s], if any."""
+        """Return the next profile that has arrived by ``time`` [s]; None without one."""
         seen = self._shutter.arrived(time)
         if seen is None:
             return None
         return WeldProfile(seen.item, self._truth.noise, round(seen.stamp * 1e9))
 
     def _bead(self, s: float) -> float | None:
-        """Return how far the bead is to the left of the joint at an arc length, if there is one."""
+        """Return the bead's offset to the left of the joint at an arc length; None without bead."""
         after = bisect.bisect_right(self._along, s)
         return None if after == 0 else self._off[after - 1]

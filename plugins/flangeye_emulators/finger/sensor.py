@@ -1,4 +1,4 @@
-"""A simulated finger: its tip in the groove of a workpiece, its camera rendering real images."""
+"""A simulated finger: its tip in a workpiece's groove, and a camera that renders images."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from flangeye_plugins.weld.touch.tag_observation import dictionary_of
 
 
 class SimulatedFingerParams(LaidParams):
-    """Parameters of ``sensor.simulated_finger``: the world, whatever the controller's files say."""
+    """Parameters of ``sensor.simulated_finger``: the true world of the finger."""
 
     tool: ToolPath = param(
         "srm", description="The true finger and torch: one of data/tools, or a .yaml file."
@@ -57,20 +57,21 @@ class SimulatedFingerParams(LaidParams):
 
 
 class SimulatedFinger(Device):
-    """A finger on an arm, over a workpiece, in a world of its own.
+    """A finger on an arm, over a workpiece, in a simulated true world.
 
     Attributes:
-        name: Shown in messages and reports.
-        camera_matrix: (3, 3) [px].
+        name: Name in messages and reports.
+        camera_matrix: (3, 3) camera matrix [px].
         distortion: (k,) OpenCV's distortion coefficients.
-        world: What is true. A stage must not look.
-        tool: Where the tool truly is in the plane of the groove. A stage must not look.
+        world: The true world; not to be used by stages.
+        tool: Conversion to the true pose of the tool in the groove's plane; not to be used by
+            stages.
     """
 
     def __init__(
         self, robot: StateSource, seed: Seed, params: SimulatedFingerParams, truth: WeldTruth
     ) -> None:
-        """Lay the workpiece down and mount the true finger, in a world that has what is true."""
+        """Create the true world with the workpiece and the true finger."""
         finger = read_model(params.tool, ToolFile)
         self.name = f"simulated finger {finger.model}"
         self.camera_matrix, self.distortion = finger.camera.matrix, np.array([])
@@ -90,7 +91,7 @@ class SimulatedFinger(Device):
         self._torch: list[tuple[float, Floats, float]] = []
 
     def frame(self) -> SensorFrame | None:
-        """Settle the tip at the arm's present pose; return an image that has arrived, if any.
+        """Simulate the tip at the arm's present pose; return the next arrived image, if any.
 
         Raises:
             DeviceError: The camera is lost.
@@ -114,10 +115,11 @@ class SimulatedFinger(Device):
         )
 
     def true_torch(self) -> tuple[Floats, Floats]:
-        """Return times (K,) [s] and where the torch really was then (K, 3), in base [m].
+        """Return times (K,) [s] and the true positions of the torch (K, 3) in base [m].
 
-        It lies beside the planned seam as it lay beside the true one, which wanders and which heat
-        moves: what scores it knows the planned one.
+        The true seam differs from the planned one, and heat moves it. The positions are shifted so
+        that they lie relative to the planned seam as they really did to the true one, because the
+        score compares them with the planned seam.
         """
         known = list(self._torch)  # in one go: a thread that reads images may add to it
         times, near = (np.array([each[i] for each in known]) for i in (0, 2))
@@ -125,9 +127,9 @@ class SimulatedFinger(Device):
         return times, self._surface.unrolled(torch, near)
 
     def _beside_plan(self) -> tuple[Floats, float]:
-        """Return the torch (3,) less what the true seam is off the planned one beside it [m].
+        """Return the torch (3,) relative to the planned seam [m], and its arc length there [m].
 
-        And where on the planned one that is, by arc length [m].
+        The true seam's offset from the planned one is subtracted.
         """
         world = self.world
         true = world.groove.root.at(world.torch_s)
@@ -142,7 +144,7 @@ class SimulatedFinger(Device):
         """Do nothing; there is no device."""
 
     def _shown(self, pose: ToolPose, base_T_flange: Transform) -> Floats:
-        """Return what the tag shows of the tip's displacement (3,), along the tool's axes."""
+        """Return the tip's displacement (3,) as the tag shows it, in the tool's axes [m]."""
         if not self._params.held:
             return self.world.settle(pose, self._stands(pose, base_T_flange))
         axes, tip = self.world.held(pose, self._stands(pose, base_T_flange))
@@ -150,12 +152,12 @@ class SimulatedFinger(Device):
         return np.asarray(axes.T @ (self._mark - tip))
 
     def _stands(self, pose: ToolPose, base_T_flange: Transform) -> Floats:
-        """Return how the tool stands (3, 3): its axes, turned back by its heading."""
+        """Return the tool's tilt (3, 3): its axes with the heading removed."""
         axes = self.tool.in_plane(base_T_flange)
         return np.asarray(rotation_from_rpy(0.0, 0.0, -pose.angle) @ axes)
 
     def _rolled_out(self, tip: Floats, torch: Floats) -> Floats:
-        """Return the torch (3,) rolled out, from where it is in the plane tangential at the tip."""
+        """Return the torch (3,) in the rolled-out plane, from the tangent plane at the tip."""
         surface = self._surface
         before = self.world.contact.s
         in_base = surface.unrolled(tip[None], np.array([before]))[0]
@@ -170,7 +172,7 @@ class SimulatedFinger(Device):
 
 
 def _as_planned(finger: ToolFile, params: SimulatedFingerParams) -> tuple[WorkSurface, Nominal]:
-    """Return the surface of the work, and the seam as its CAD has it, rolled out."""
+    """Return the work surface, and the nominal values with the CAD's seam in the plane."""
     workpiece = load_workpiece(params.workpiece)
     if params.seam not in workpiece.seams:
         known = ", ".join(workpiece.seams)
@@ -204,13 +206,13 @@ def _section(seam: CadSeam, params: SimulatedFingerParams) -> GrooveSection:
 def sensor_simulated_finger(
     finger: Finger, robot: StateSource, seed: Seed, params: SimulatedFingerParams
 ) -> TactileSensor:
-    """A compliant finger in a groove, simulated, on whatever arm the recipe drives.
+    """A simulated compliant finger in a groove, on the recipe's arm.
 
     Args:
         finger: The finger as configured for the controller; the simulation does not use it.
-        robot: Carries it.
+        robot: The arm that carries the finger.
         seed: Seed of the noise and of the world's random values.
-        params: The world.
+        params: Parameters of the true world.
     """
     del finger
     return SimulatedFinger(robot, seed, params, read_model(params.world, WeldTruth))
@@ -221,9 +223,9 @@ class Optics:
     """Defects of the images.
 
     Attributes:
-        blur: Standard deviation [px].
-        noise: Standard deviation [grey levels].
-        glare: Brightness of the reflection that wanders over the image [grey levels].
+        blur: Standard deviation of the blur [px].
+        noise: Standard deviation of the noise [grey levels].
+        glare: Brightness of a reflection that moves over the image [grey levels].
     """
 
     blur: float = 0.7
@@ -233,14 +235,14 @@ class Optics:
 
 @dataclass(frozen=True, eq=False)
 class Compliance:
-    """The true motion of the tag with the tip; known to the simulation only.
+    """True relation between the motions of tip and tag; known to the simulation only.
 
     Attributes:
         share: (3,) displacement of the tag per displacement of the tip, in the tool's axes.
         tilt: Tilt of the tag per lateral displacement of the tip [rad/m].
         stiffening: Relative loss of ``share`` at a displacement of 2 mm.
-        camera_R_tool: (3, 3) how the camera is mounted.
-        rest: (3,) of the undeformed tag in the camera [m].
+        camera_R_tool: (3, 3) rotation from tool axes to the camera.
+        rest: (3,) position of the undeformed tag in the camera [m].
         rotation: (3,) rotation vector of the undeformed tag in the camera [rad].
     """
 
@@ -261,7 +263,7 @@ class Compliance:
 
 
 def typical_compliance() -> Compliance:
-    """Return a soft finger: the tag sits above the tip and follows it in part, leaning."""
+    """Return a soft finger's compliance: the tag above the tip follows in part and tilts."""
     # The camera looks down along the tool's -z, turned a little about it.
     turn = rotation_exp(np.array([0.0, 0.0, np.deg2rad(25.0)]))
     return Compliance(
@@ -288,7 +290,7 @@ class FingerCamera:
     modules: ClassVar[int] = 8
 
     def __init__(self, finger: FingerGeometry, optics: Optics, rng: np.random.Generator) -> None:
-        """Print the tag; every image draws its noise from ``rng``."""
+        """Prepare the tag's print; every image takes its noise from ``rng``."""
         import cv2
 
         self._lens, self._optics, self._rng = finger.camera, optics, rng
@@ -314,7 +316,7 @@ class FingerCamera:
         self._clock = 0.0
 
     def image(self, rotation: Floats, translation: Floats) -> Image:
-        """Return the image of a tag at a pose in the camera: (3, 3), and (3,) [m]."""
+        """Return the image of the tag at a rotation (3, 3) and translation (3,) [m]."""
         lens = self._lens
         onto = lens.matrix @ np.column_stack([rotation[:, 0], rotation[:, 1], translation])
         seen = np.full((lens.height, lens.width), self.background, dtype=np.uint8)
@@ -325,7 +327,7 @@ class FingerCamera:
         return Image(self._spoilt(seen), lens.matrix, np.array(lens.distortion))
 
     def _extent(self, sheet: Floats, size: int) -> tuple[slice, slice]:
-        """Return the columns and rows in which the paper may be seen."""
+        """Return the columns and rows of the image that can show the paper."""
         rim = np.array([[0, 0, 1], [size, 0, 1], [size, size, 1], [0, size, 1]]) - [0.5, 0.5, 0.0]
         ends = rim @ sheet.T
         if (ends[:, 2] <= 0).any():  # partly behind the camera: its corners cannot be projected
@@ -339,7 +341,7 @@ class FingerCamera:
         )
 
     def _warped(self, sheet: Floats, x: slice, y: slice) -> NDArray[np.uint8]:
-        """Return the printed sheet as some columns and rows see it, each pixel the mean of four."""
+        """Return the printed sheet in a window of the image, with four samples per pixel."""
         import cv2
 
         k = 2
@@ -354,7 +356,7 @@ class FingerCamera:
         return np.asarray(small, dtype=np.uint8)
 
     def _sheet(self) -> Floats:
-        """Return (3, 3): from the texture's pixels to the tag's plane; its y points up."""
+        """Return the homography (3, 3) from texture pixels to the tag's plane (y upwards)."""
         middle = self.modules * self.texels / 2 - 0.5
         u = self._texel
         return np.array([[u, 0.0, -u * middle], [0.0, -u, u * middle], [0.0, 0.0, 1.0]])
@@ -372,12 +374,12 @@ class FingerCamera:
         return grey.astype(np.uint8)
 
     def _noise(self, shape: tuple[int, ...]) -> NDArray[np.float32]:
-        """Return noise: a random piece of a larger field, which is quicker than drawing it."""
+        """Return noise: a random crop of a larger field, which is faster than new noise."""
         row, column = (int(self._rng.integers(0, size)) for size in shape)
         return np.asarray(self._grain[row : row + shape[0], column : column + shape[1]])
 
     def _reflection(self, shape: tuple[int, ...]) -> Floats:
-        """Return a soft bright spot that wanders over the image."""
+        """Return a soft bright spot that moves over the image."""
         self._clock += 1.0
         height, width = shape
         x = width * (0.5 + 0.45 * np.sin(0.031 * self._clock))
@@ -390,6 +392,6 @@ class FingerCamera:
 
 
 def _half_pixel(factor: int) -> Floats:
-    """Return (3, 3): pixel centres of an image onto those of one ``factor`` times as fine."""
+    """Return the (3, 3) map of pixel centres to those of an image ``factor`` times as fine."""
     shift = (factor - 1) / (2 * factor)
     return np.array([[1.0, 0.0, shift], [0.0, 1.0, shift], [0.0, 0.0, 1.0]])

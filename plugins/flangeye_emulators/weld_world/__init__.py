@@ -1,5 +1,5 @@
-"""The truth of a simulated weld: arm, tool, finger, clock, workpiece and heat as they really are.
+"""The true world of a simulated weld: arm, tool, finger, clock, workpiece and heat.
 
-A controller is given files that differ from it by stated amounts; nothing here is reachable from
-one. All is in the plane of the work, lengths in metres.
+The controller gets files whose values differ from the truth within stated tolerances, and has no
+access to this package. Coordinates are in the plane of the work, in metres.
 """

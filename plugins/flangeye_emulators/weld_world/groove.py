@@ -1,7 +1,7 @@
 """A joint between two walls, and the rest position of a compliant ball-ended tip in it.
 
-Quasi-static: the tip takes the place of least elastic energy that the walls leave it, as far as
-friction lets it go there. Lengths [m].
+The model is quasi-static: the tip moves to the position of least elastic energy allowed by the
+walls, as far as friction permits. Lengths are in [m].
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ class Gap:
     """A piece of one wall that is missing.
 
     Attributes:
-        start: Arc length where it begins [m].
-        end: Where it ends [m].
-        side: 1 for the wall to the left of the seam, -1 for the right one.
+        start: Arc length of the gap's start [m].
+        end: Arc length of the gap's end [m].
+        side: Side of the missing wall: 1 left of the seam, -1 right.
     """
 
     start: Length
@@ -39,7 +39,7 @@ class GrooveSection:
 
     Attributes:
         half_angle: Angle of each wall from the bisector [rad].
-        depth: From the plate's face to the root [m].
+        depth: Depth of the root below the plate's face [m].
         lean: Lean of the bisector from the vertical, to the left [rad]; a fillet's is 45 degrees.
     """
 
@@ -49,9 +49,10 @@ class GrooveSection:
 
 
 def square_butt(gap: float, radius: float) -> GrooveSection:
-    """Return the groove that a ball of a radius meets in a gap between two square edges [m].
+    """Return the groove that holds a ball like a gap between two square edges [m].
 
-    Its walls are the tangents at the edges; the ball is out of it where it lies on the plates.
+    Its walls are the ball's tangents at the edges. The groove ends where the ball lies on the
+    plates.
     """
     half_angle = edges_half_angle(gap, radius)
     rise = radius - math.sqrt(radius**2 - gap**2 / 4.0)
@@ -63,9 +64,10 @@ class Relief:
     """Variation of a groove along the seam, sampled every :data:`TICK`.
 
     Attributes:
-        fill: How far the tip is lifted: tack welds, spatter; less at a root gap [m].
+        fill: Height by which the tip is lifted by tack welds and spatter; negative at a root gap
+            [m].
         aside: Shift of the tip to the left by spatter [m].
-        half_angle: More than the section's [rad].
+        half_angle: Addition to the section's half angle [rad].
     """
 
     fill: tuple[float, ...]
@@ -73,7 +75,7 @@ class Relief:
     half_angle: tuple[float, ...]
 
     def at(self, s: float) -> tuple[float, float, float]:
-        """Return fill, aside and half angle at an arc length."""
+        """Return fill [m], aside [m] and half angle [rad] at an arc length."""
         index = min(max(int(s / TICK), 0), len(self.fill) - 1)
         return self.fill[index], self.aside[index], self.half_angle[index]
 
@@ -84,13 +86,13 @@ TICK = 0.2e-3
 
 @dataclass(frozen=True, eq=False)
 class Groove:
-    """A joint: its root is the seam.
+    """A joint whose root is the seam.
 
     Attributes:
         root: The seam, in the plane of the work, with its height.
         section: Its cross-section.
         gaps: Pieces of wall that are missing.
-        relief: How it differs from place to place.
+        relief: Variation of the groove along the seam.
     """
 
     root: Path
@@ -99,7 +101,7 @@ class Groove:
     relief: Relief = Relief((0.0,), (0.0,), (0.0,))
 
     def missing(self, s: float, radius: float) -> tuple[int, float]:
-        """Return the side where no wall is, and how far a ball may go there; (0, 0) for none."""
+        """Return the side of a missing wall, and the ball's travel there [m]; (0, 0) if none."""
         for gap in self.gaps:
             inside = min(s - gap.start, gap.end - s)
             if inside > 0.0:
@@ -112,7 +114,7 @@ class Groove:
 
 @dataclass(frozen=True)
 class Tip:
-    """A ball on springs.
+    """A ball on springs, with friction.
 
     Attributes:
         radius: Radius of the ball [m].
@@ -128,11 +130,11 @@ class Tip:
 
 
 class TipContact:
-    """The tip in the groove, from cycle to cycle.
+    """State of the tip in the groove, updated in each cycle.
 
     Attributes:
-        position: (3,) of the tip [m].
-        force: (3,) on the tip: along the seam, across it to the left, upwards [N].
+        position: (3,) position of the tip [m].
+        force: (3,) force on the tip: along the seam, to the left, upwards [N].
     """
 
     def __init__(self, groove: Groove, tip: Tip) -> None:
@@ -153,12 +155,12 @@ class TipContact:
     def settle(
         self, rest: Floats, moved: float = 0.0, plane_R_tool: Floats | None = None
     ) -> Floats:
-        """Return where the tip is (3,), when without any contact it would be at ``rest`` (3,).
+        """Return the tip's position (3,), given its position ``rest`` (3,) without contact.
 
         Args:
-            rest: In the plane of the work [m].
+            rest: Position of the undeformed tip in the plane of the work [m].
             moved: Shift of the seam to the left [m].
-            plane_R_tool: (3, 3) the finger's axes; upright when not given.
+            plane_R_tool: (3, 3) axes of the finger; upright if not given.
         """
         root = self._groove.root
         self._s = root.foot(rest[:2], self._s)
@@ -187,9 +189,9 @@ class TipContact:
         return WeldJoint(section.half_angle + wider, section.lean)
 
     def _springs(self, place: Place, plane_R_tool: Floats | None) -> tuple[Floats, Floats]:
-        """Return stiffness across and up (2, 2), and how the tip then slides along (2,).
+        """Return the stiffness across and up (2, 2), and the coupled sliding along the seam (2,).
 
-        Along the seam nothing but friction holds a finger that leans.
+        A leaning finger slides along the seam when it is deflected, held by friction only.
         """
         tip = self._tip
         if plane_R_tool is None:
@@ -209,7 +211,7 @@ class TipContact:
     def _cross_section(
         self, across: float, up: float, joint: WeldJoint, stiff: Floats
     ) -> tuple[float, float]:
-        """Return where the ball rests: across, and above the root."""
+        """Return the ball's rest position: across the seam, and above the root [m]."""
         beside, seat = joint.seat(self._tip.radius)
         top = self._groove.section.depth + self._tip.radius
         wall = joint.left if across >= beside else joint.right
@@ -226,7 +228,7 @@ class TipContact:
         return y + beside, z + seat
 
     def _on_face(self, across: float, up: float, top: float) -> tuple[float, float]:
-        """Return where the ball is on the plate: friction holds it back."""
+        """Return the ball's position on the plate's face, dragged against friction."""
         if up >= top:
             self._across = None
             return across, up
@@ -238,9 +240,9 @@ class TipContact:
     def _between_walls(
         self, across: float, up: float, joint: WeldJoint, stiff: Floats
     ) -> tuple[float, float]:
-        """Return the ball's place from where it touches both walls.
+        """Return the ball's position relative to its seat between both walls [m].
 
-        On a wall it moves when the springs overcome friction, and stays where they do not.
+        On a wall it moves only if the springs overcome friction.
         """
         gone, room = self._groove.missing(self._s, self._tip.radius)
         side = 1 if across >= 0 else -1
@@ -264,10 +266,10 @@ class TipContact:
     def _held(
         self, away: Floats, along: Floats, inward: Floats, stiff: Floats
     ) -> tuple[float, float]:
-        """Return between which places on a wall friction holds the ball [m], none below its foot.
+        """Return the interval on a wall in which friction holds the ball [m], from its foot up.
 
-        Force along the wall, and onto it, are linear in the place: T(t) = along K (away - t along)
-        and N(t) = -inward K (away - t along); it moves up where T > mu N, down where T < -mu N.
+        Forces along and onto the wall are linear in the position t: T(t) = along K (away - t along)
+        and N(t) = -inward K (away - t along). The ball moves up if T > mu N, and down if T < -mu N.
         """
         friction = self._tip.friction
         pulled, pushed = float(along @ stiff @ away), float(inward @ stiff @ away)
@@ -279,7 +281,7 @@ class TipContact:
         return max(low, 0.0), max(high, 0.0)
 
     def _drag(self, normal_force: float) -> float:
-        """Return how far the tip lags along the seam: it sticks until friction gives way."""
+        """Return the tip's lag along the seam [m]: it sticks until friction is overcome."""
         if normal_force == 0.0:
             self._stuck = None
             return 0.0
@@ -291,6 +293,6 @@ class TipContact:
 
 
 def _wall(side: int, angle: float) -> tuple[Floats, Floats]:
-    """Return unit vectors (2,) up a wall and into the joint: across, up."""
+    """Return unit vectors (2,) up a wall and into the joint, each as (across, up)."""
     sine, cosine = math.sin(angle), math.cos(angle)
     return np.array([side * sine, cosine]), np.array([-side * cosine, sine])

@@ -1,7 +1,7 @@
-"""Truth of a simulated weld, from its tool's and its world's files.
+"""True values of a simulated weld, read from a tool's and a world's file.
 
-A recipe names one of ``data/worlds``, or a file of its own. Lengths [m], angles [rad], times [s];
-in the files each has its unit.
+A recipe names one of ``data/worlds``, or its own file. Values are in [m], [rad] and [s]; in the
+files each has its unit.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ T = TypeVar("T")
 
 
 class ToolFile(FingerGeometry):
-    """A world's finger and torch as they really are, in a file that no controller reads."""
+    """True finger and torch of a world, from a file that no controller reads."""
 
     lateral: Stiffness = param(gt=0, description="Across the finger, at its tip.")
     axial: Stiffness = param(gt=0, description="Along the finger.")
@@ -36,23 +36,23 @@ ToolPath = Annotated[
 
 @dataclass_transform(frozen_default=True)
 def checked(cls: type[T]) -> type[T]:
-    """Return a frozen dataclass from a file; refuse keys it does not have."""
+    """Make a class a frozen dataclass that is validated and refuses unknown keys."""
     return with_config(ConfigDict(extra="forbid"))(dataclass(frozen=True)(cls))
 
 
 @checked
 class ArmTruth:
-    """Errors of the simulated arm: how it follows, and how far its true pose is off.
+    """Errors of the simulated arm: its response, and its true minus reported pose.
 
     Attributes:
-        lag: Time constant with which it follows.
-        dead_time: Before a command has any effect.
-        wave: Amplitude of its error along its way.
+        lag: Time constant of its first-order response.
+        dead_time: Delay before a command takes effect.
+        wave: Amplitude of a periodic position error along the path.
         wave_length: Period of that error.
         backlash: Lost motion across the seam.
-        repeatability: Standard deviation, cycle by cycle.
-        scale: Relative error of distances: zeros of joints, lengths.
-        sag: How far it is lower after 100 mm of way.
+        repeatability: Standard deviation of the position, independent in each cycle.
+        scale: Relative error of distances, from joint zeros and link lengths.
+        sag: Sag after 100 mm of travel.
     """
 
     lag: Duration = 0.0
@@ -67,13 +67,13 @@ class ArmTruth:
 
 @checked
 class ToolTruth:
-    """True places of tip and torch, relative to the finger's file.
+    """True positions of tip and torch, relative to the finger's file.
 
     Attributes:
-        tip: Ahead, to the left, up.
-        torch: Ahead, to the left.
-        yaw: Turn of finger and torch about the tool's axis.
-        work: Its upper end leans to the right by this about its tip.
+        tip: Offset of the tip: ahead, to the left, up.
+        torch: Offset of the torch: ahead, to the left.
+        yaw: Rotation of finger and torch about the tool's axis.
+        work: Lean of the tool's upper end to the right, about the tip.
     """
 
     tip: tuple[Length, Length, Length] = (0.0, 0.0, 0.0)
@@ -89,14 +89,14 @@ class FingerTruth:
     Attributes:
         lateral: Stiffness across, as a share of the world file's.
         axial: Stiffness along, as a share of the world file's.
-        gain: The tag shows displacements larger by this share.
-        drift: Change of the gain in 60 s, as it warms.
+        gain: Relative gain error of the displacement that the tag shows.
+        drift: Change of the gain in 60 s, by warming.
         rest: Pose of the tag on an undeformed finger.
-        play: The tip moves by this before the tag does.
-        hysteresis: Share of a displacement that lags.
-        creep: Share by which a displacement grows in time, 10 s.
-        friction: Coulomb coefficient, along and across.
-        noise: Standard deviation of a measurement across; 6 times that up.
+        play: Motion of the tip before the tag follows.
+        hysteresis: Lagging share of a displacement.
+        creep: Relative growth of a displacement by creep, with a time constant of 10 s.
+        friction: Coulomb coefficient, along and across the seam.
+        noise: Standard deviation of a measurement across; upwards it is 6 times larger.
     """
 
     lateral: float = 1.0
@@ -113,15 +113,15 @@ class FingerTruth:
 
 @checked
 class ClockTruth:
-    """When images are exposed and arrive, and what their timestamps state.
+    """Timing of images: exposure, arrival and timestamps.
 
     Attributes:
         rate: Images per second.
-        latency: From the exposure to the image.
+        latency: Time from exposure to arrival.
         jitter: Standard deviation of the latency.
-        stamp: Timestamps are late by this.
+        stamp: Delay of the timestamps.
         dropped: Share of images that never arrive.
-        hidden: Something covers the tag from the first time to the second.
+        hidden: Start and end of the time in which the tag is covered.
     """
 
     rate: float = 30.0
@@ -134,11 +134,11 @@ class ClockTruth:
 
 @checked
 class Tack:
-    """A tack weld of 8 mm: the groove is filled there.
+    """A tack weld of 8 mm length, which fills the groove.
 
     Attributes:
-        start: Where it begins, along the seam.
-        height: By how much it is filled.
+        start: Arc length of its start.
+        height: Height of the fill.
     """
 
     start: Length
@@ -150,15 +150,15 @@ class WorkpieceTruth:
     """True shape of the workpiece, relative to its CAD.
 
     Attributes:
-        wave: Amplitude with which its edges wander.
-        wave_length: Period of that.
-        bow: How far its middle is aside of the CAD's curve.
-        half_angle: Added to the CAD's half angle of its walls.
-        lean: How far its walls lean to the left of the CAD's.
+        wave: Amplitude of a periodic deviation of its edges.
+        wave_length: Period of that deviation.
+        bow: Lateral offset of its middle from the CAD's curve.
+        half_angle: Addition to the CAD's half angle of the walls.
+        lean: Lean of its walls to the left, relative to the CAD.
         half_angle_wave: Amplitude of the half angle's variation.
-        root_gap: Between the plates.
+        root_gap: Gap between the plates.
         tacks: Tack welds.
-        spatter: Standard deviation of its roughness.
+        spatter: Standard deviation of the roughness by spatter.
         gaps: Pieces of a wall that are missing.
     """
 
@@ -176,11 +176,11 @@ class WorkpieceTruth:
 
 @checked
 class HeatTruth:
-    """How the seam moves while it is welded.
+    """Thermal distortion of the seam while it is welded.
 
     Attributes:
-        shift: Across the seam, from the start of the arc to its end.
-        local: Around the torch, within some 15 mm.
+        shift: Shift across the seam, growing from the start of the weld to its end.
+        local: Local shift around the torch, within about 15 mm.
     """
 
     shift: Length = 0.0
@@ -189,12 +189,12 @@ class HeatTruth:
 
 @checked
 class LookTruth:
-    """A profile sensor behind the torch: its field of view and timing.
+    """True position, noise and timing of a profile sensor behind the torch.
 
     Attributes:
-        behind: How far behind the torch it looks.
-        noise: Standard deviation of one look; stated.
-        clock: When it looks, when its measurements arrive, and which it misses.
+        behind: Distance of the profile behind the torch.
+        noise: Standard deviation of one profile; reported correctly with it.
+        clock: Timing of profiles: exposure, arrival, and losses.
     """
 
     behind: Length = 30e-3
@@ -204,7 +204,7 @@ class LookTruth:
 
 @checked
 class WeldTruth:
-    """The whole truth of a simulated weld: the content of a world's file."""
+    """All true values of a simulated weld: the content of a world's file."""
 
     arm: ArmTruth = ArmTruth()
     tool: ToolTruth = ToolTruth()

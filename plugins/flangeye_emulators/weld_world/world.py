@@ -1,4 +1,4 @@
-"""The true state of one simulated weld: its tip at rest, its tag, its torch."""
+"""The true state of a simulated weld: tip, tag, torch and seam."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ GRAIN = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Nominal:
-    """Nominal values that the files state; the true world differs from them.
+    """Nominal values from the files, from which the true world differs.
 
     Attributes:
-        seam: The CAD's, in the plane of the work.
-        section: The CAD's.
-        tip: The finger's.
-        torch: (3,) from the tip to the torch, in the tool's axes [m].
-        level_R_tool: (3, 3) how the tool stands: its axes in level ones.
+        seam: The CAD's seam in the plane of the work.
+        section: The CAD's cross-section.
+        tip: The finger's tip.
+        torch: (3,) vector from the tip to the torch in the tool's axes [m].
+        level_R_tool: (3, 3) nominal rotation from the tool's axes to level axes.
     """
 
     seam: Path
@@ -59,11 +59,11 @@ class WeldWorld:
     """The true arm, tool, finger, workpiece and heat.
 
     Attributes:
-        groove: The true one.
-        tip: (3,) where the tip is, in the plane of the work [m].
+        groove: The true groove.
+        tip: (3,) position of the tip in the plane of the work [m].
         torch: (3,) position of the torch [m].
-        torch_s: Its arc length on the true seam [m].
-        off: Distance of the torch to the left of the seam's present position [m].
+        torch_s: Arc length of the torch on the true seam [m].
+        off: Offset of the torch to the left of the seam's present position [m].
     """
 
     def __init__(
@@ -73,15 +73,14 @@ class WeldWorld:
         seed: int | list[int],
         rolled_out: Callable[[Floats, Floats], Floats] = lambda tip, torch: torch,
     ) -> None:
-        """Prepare a world.
+        """Construct a world from nominal and true values.
 
         Args:
             nominal: Values that the files state.
             truth: True values of the world.
             seed: Seed of its random values.
-            rolled_out: Returns where a torch (3,) is when the work's surface is rolled out, from
-                where it is in the plane that touches the surface at the tip (3,): its arguments
-                are tip and torch. The surface is flat where it is not given.
+            rolled_out: Maps tip (3,) and torch (3,), both in the tangent plane at the tip, to the
+                torch (3,) in the rolled-out plane; the default is a flat surface.
         """
         rng = np.random.default_rng(seed)
         self.groove: Groove = true_groove(nominal.seam, nominal.section, truth.workpiece, rng)
@@ -96,15 +95,15 @@ class WeldWorld:
         self.torch_s, self.off = self._behind, 0.0
 
     def held(self, pose: ToolPose, level_R_tool: Floats) -> tuple[Floats, Floats]:
-        """Return the finger's axes (3, 3) in the plane's and where its tip would rest (3,)."""
+        """Return the finger's axes (3, 3) in the plane, and the undeformed tip (3,) [m]."""
         return self._tool.axes(pose, level_R_tool), self._tool.rest(pose, level_R_tool)
 
     def settle(self, reported: ToolPose, level_R_tool: Floats | None = None) -> Floats:
-        """Simulate until the tip rests; return its displacement as the tag shows it (3,) [m].
+        """Simulate the tip's equilibrium; return its displacement as shown by the tag (3,) [m].
 
         Args:
-            reported: The tool, as arm and files have it.
-            level_R_tool: (3, 3) how it really stands now, where that is known.
+            reported: Pose of the tool by the arm's report and the files.
+            level_R_tool: (3, 3) true rotation of the tool at present; the nominal one if not given.
         """
         stands = self._stands if level_R_tool is None else level_R_tool
         pose = self._arm.true_pose(reported)
@@ -129,13 +128,13 @@ def _true_tip(tip: Tip, truth: WeldTruth) -> Tip:
 
 
 class SeamDistortion:
-    """The seam's motion to the left, at a place, while the torch is at another."""
+    """Thermal displacement of the seam, as a function of the torch's position."""
 
     def __init__(self, truth: HeatTruth, length: float) -> None:
         self._truth, self._length = truth, length
 
     def at(self, s: float, torch: float) -> float:
-        """Return how far the seam at ``s`` has moved, the torch being at ``torch`` [m]."""
+        """Return the seam's displacement to the left at ``s``, with the torch at ``torch`` [m]."""
         truth = self._truth
         if torch <= 0.0:
             return 0.0
@@ -148,29 +147,29 @@ class TrueTool:
     """True tip and torch of a tool whose file is wrong."""
 
     def __init__(self, truth: ToolTruth, torch: Floats) -> None:
-        """Take the world file's torch (3,) from the tip, in the tool's axes [m]."""
+        """Construct the tool from the true errors and the nominal torch (3,) from the tip [m]."""
         self._tip = turned(np.asarray(truth.tip, dtype=np.float64), truth.yaw)
         aside = np.array([*truth.torch, truth.tip[2]])
         self._leans = leaning(truth.work, 0.0)
         self._torch = turned(self._leans @ torch + aside, truth.yaw)
 
     def axes(self, pose: ToolPose, level_R_tool: Floats) -> Floats:
-        """Return the finger's axes (3, 3) in the plane's."""
+        """Return the finger's true axes (3, 3) in the plane."""
         c, s = np.cos(pose.angle), np.sin(pose.angle)
         heading = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         return np.asarray(heading @ level_R_tool @ self._leans)
 
     def rest(self, pose: ToolPose, level_R_tool: Floats) -> Floats:
-        """Return where the undeformed tip is (3,)."""
+        """Return the true position of the undeformed tip (3,) [m]."""
         return pose.position + turned(level_R_tool @ self._tip, pose.angle)
 
     def torch(self, pose: ToolPose, level_R_tool: Floats) -> Floats:
-        """Return the true place of the torch (3,)."""
+        """Return the true position of the torch (3,) [m]."""
         return pose.position + turned(level_R_tool @ self._torch, pose.angle)
 
 
 class TrueFinger:
-    """Play, hysteresis, creep and a gain that drifts, one after the other."""
+    """Chain of the finger's errors: play, hysteresis, creep and a drifting gain."""
 
     def __init__(self, truth: FingerTruth) -> None:
         self._truth = truth
@@ -179,9 +178,10 @@ class TrueFinger:
         self._age = 0.0
 
     def shown(self, time: float, displacement: Floats) -> Floats:
-        """Return the displacement (3,) that the tag speaks of, when the tip's is ``displacement``.
+        """Return the displacement (3,) that the tag shows for a true displacement of the tip (3,).
 
-        All along the tool's axes [m]; to be called in the order of time [s].
+        Both are in the tool's axes [m]. Calls must be in order of time [s], as the errors have
+        memory.
         """
         truth = self._truth
         elapsed = 0.0 if self._time is None else time - self._time
@@ -197,20 +197,20 @@ class TrueFinger:
 
 
 def _follow(behind: Floats, ahead: Floats, half: float) -> Floats:
-    """Return what is dragged along by ``ahead``, with a dead band of ``half`` to both sides."""
+    """Return the output of a backlash of half width ``half``, driven by ``ahead``."""
     return np.clip(behind, ahead - half, ahead + half)
 
 
 def true_groove(
     seam: Path, section: GrooveSection, truth: WorkpieceTruth, rng: np.random.Generator
 ) -> Groove:
-    """Return the groove that is really there.
+    """Return the true groove.
 
     Args:
-        seam: The CAD's in the plane of the work, with its height.
-        section: The CAD's.
-        truth: What differs.
-        rng: Draws spatter, and where waves begin.
+        seam: The CAD's seam in the plane of the work, with its height.
+        section: The CAD's cross-section.
+        truth: Differences from the CAD.
+        rng: Random generator of spatter and of the waves' phases.
     """
     root = _wandered(seam, truth, rng.uniform(0.0, 2 * np.pi))
     real = GrooveSection(
@@ -252,7 +252,7 @@ def _grains(s: Floats, sigma: float, rng: np.random.Generator) -> Floats:
 
 
 class ArmError:
-    """Truth minus report, for one pose after the other."""
+    """Model of the arm's pose error, applied to successive reported poses."""
 
     def __init__(self, truth: ArmTruth, rng: np.random.Generator) -> None:
         self._truth, self._rng = truth, rng
@@ -261,7 +261,7 @@ class ArmError:
         self._slack = 0.0
 
     def true_pose(self, reported: ToolPose) -> ToolPose:
-        """Return where the tool really is."""
+        """Return the tool's true pose for a reported one."""
         truth, position = self._truth, reported.position
         self._origin = position.copy() if self._origin is None else self._origin
         way = position - self._origin
@@ -274,17 +274,17 @@ class ArmError:
         return ToolPose(reported.time, position + error, reported.angle)
 
     def _lost(self, way: float) -> float:
-        """Return the part of a way that the gears have not passed on yet."""
+        """Return the part of a travel that is lost in backlash."""
         half = self._truth.backlash / 2
         self._slack = min(max(self._slack, way - half), way + half)
         return self._slack - way
 
 
 class ArmResponse:
-    """An arm in the plane of the work that follows velocities late and lagging."""
+    """An arm in the plane of the work that follows velocities with dead time and lag."""
 
     def __init__(self, truth: ArmTruth, pose: ToolPose, period: float) -> None:
-        """Stand still at a pose for ``period`` [s]."""
+        """Start at rest at a pose; a cycle lasts ``period`` [s]."""
         self.pose = pose
         self._period = period
         self._commands: deque[Floats] = deque([np.zeros(4)] * round(truth.dead_time / period))
@@ -305,14 +305,14 @@ Item = TypeVar("Item")
 
 
 class Stamped(NamedTuple, Generic[Item]):
-    """An exposure with its stated timestamp [s]."""
+    """An exposure with its reported timestamp [s]."""
 
     stamp: float
     item: Item
 
 
 class Shutter(Generic[Item]):
-    """Exposures in transit from the camera to the reader."""
+    """Queue of exposures in transit from the camera to the reader."""
 
     def __init__(self, truth: ClockTruth, rng: np.random.Generator) -> None:
         self._truth, self._rng = truth, rng
@@ -320,14 +320,14 @@ class Shutter(Generic[Item]):
         self._count = 0
 
     def due(self, age: float) -> bool:
-        """Whether an image is due at this age of the camera [s]; counts it."""
+        """Return whether an image is due at this age of the camera [s], and count it."""
         if age * self._truth.rate < self._count:
             return False
         self._count += 1
         return True
 
     def expose(self, time: float, item: Item) -> None:
-        """Expose an image at ``time`` [s]; it may be lost in transit."""
+        """Add an exposure at ``time`` [s]; it may be lost in transit."""
         truth = self._truth
         late = max(0.0, truth.latency + truth.jitter * float(self._rng.standard_normal()))
         if self._rng.uniform() < truth.dropped:
@@ -335,12 +335,12 @@ class Shutter(Generic[Item]):
         self._under_way.append((time + late, Stamped(time + truth.stamp, item)))
 
     def hidden(self, age: float) -> bool:
-        """Whether something covers the tag."""
+        """Return whether the tag is covered at this age of the camera [s]."""
         hidden = self._truth.hidden
         return hidden is not None and hidden[0] <= age < hidden[1]
 
     def arrived(self, time: float) -> Stamped[Item] | None:
-        """Return the next image that has arrived, if any."""
+        """Return the next image that has arrived by ``time`` [s]; None without one."""
         if not self._under_way or self._under_way[0][0] > time:
             return None
         return self._under_way.popleft()[1]

@@ -1,1 +1,1 @@
-"""A cell with known truth: an arm, its flange, surroundings, and scanners."""
+"""Simulated cell with known truth: an arm, its flange, surroundings, and scanners."""

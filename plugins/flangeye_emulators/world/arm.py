@@ -1,4 +1,4 @@
-"""A simulated arm whose true pose differs from the reported one, as of real arms."""
+"""A simulated arm whose true pose differs from the reported one, like a real arm's."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class ArmErrors(Params):
     )
 
     def sizes(self, robot: RobotModel) -> ErrorSizes:
-        """Return the sizes for an arm."""
+        """Return the standard deviations for a robot model."""
         kind = ErrorSizes(robot.joint_accuracy)
         preset = {"exact": ErrorSizes(0.0), "kind": kind, "real": REAL}[self.quality]
         return preset if self.zeros is None else preset._replace(zeros=self.zeros)
@@ -56,10 +56,10 @@ class ArmErrors(Params):
 
 
 class ImperfectArm:
-    """An arm with joint zeros, lengths, encoders and elasticity of its own; a rail is perfect.
+    """An arm with errors of joint zeros, lengths, encoders and elasticity; a rail has none.
 
-    The first joint's zero is right by definition: it is what fixes the base's x axis, and an error
-    of it could not be distinguished from a turn of the base.
+    The first joint's zero has no error by definition: it defines the base's x axis, and an error
+    would be the same as a rotation of the base.
     """
 
     def __init__(
@@ -88,14 +88,14 @@ class ImperfectArm:
         self._drift[0] = 0.0
 
     def reported(self, joints: Floats) -> Floats:
-        """Return ``base_T_flange`` (..., 4, 4) as the controller computes it, joints (..., n)."""
+        """Return the nominal ``base_T_flange`` (..., 4, 4) at joint angles (..., n) [rad]."""
         return self._believed.flange(joints)
 
     def angles(self, joints: Floats) -> Floats:
-        """Return the angles (N, n) the joints really have at N poses visited in this order [rad].
+        """Return the true joint angles (N, n) at N poses visited in this order [rad].
 
         Args:
-            joints: (N, n) as commanded and reported [rad].
+            joints: (N, n) commanded and reported joint angles [rad].
         """
         came_from = np.sign(np.diff(joints, axis=0, prepend=joints[:1]))
         warm = 1 - np.exp(-3 * np.linspace(0, 1, len(joints)))
@@ -104,28 +104,29 @@ class ImperfectArm:
         return np.asarray(angles + self._sag * self._levers(angles))
 
     def flange(self, angles: Floats) -> Floats:
-        """Return where the flange really is on average, (..., 4, 4), at angles (..., n) [rad]."""
+        """Return the true mean ``base_T_flange`` (..., 4, 4) at true angles (..., n) [rad]."""
         return self._actual.flange(angles)
 
     def frames(self, angles: Floats) -> Floats:
-        """Return where the links really are, (..., n + 1, 4, 4), at angles (..., n) [rad]."""
+        """Return the true link frames (..., n + 1, 4, 4) at true angles (..., n) [rad]."""
         return self._actual.frames(angles)
 
     def stand(self, angles: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
-        """Return link frames (..., n + 1, 4, 4) and flange (..., 4, 4), with repeatability.
+        """Return link frames (..., n + 1, 4, 4) and flange (..., 4, 4) with repeatability errors.
 
         Args:
-            angles: (..., n) really, of :meth:`angles` [rad].
-            rng: Draws what does not repeat.
+            angles: (..., n) true joint angles from :meth:`angles` [rad].
+            rng: Random generator of the repeatability errors.
         """
         base_T_flange = self.flange(angles)
         base_T_flange[..., :3, 3] += self._scatter * rng.standard_normal((*angles.shape[:-1], 3))
         return self.frames(angles), base_T_flange
 
     def _levers(self, angles: Floats) -> Floats:
-        """Return (N, n) gravity's torque about each joint over the weight that hangs on it [m].
+        """Return gravity's lever arm about each joint (N, n): torque over supported weight [m].
 
-        The weight is taken to be spread evenly over the links' origins beyond the joint.
+        The weight is assumed to be distributed evenly over the origins of the links beyond the
+        joint.
         """
         frames = self._actual.frames(angles)
         axes, origins = self._actual.axes(angles)
@@ -137,7 +138,7 @@ class ImperfectArm:
 
 
 def _as_built(robot: RobotModel, sizes: ErrorSizes, rng: np.random.Generator) -> RobotModel:
-    """Return the arm with the lengths and twists that it really has."""
+    """Return the robot model with true lengths and twists."""
     joints = tuple(_altered(j, robot.convention == "urdf", sizes, rng) for j in robot.joints)
     return robot.model_copy(update={"joints": joints})
 

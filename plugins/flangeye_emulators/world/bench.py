@@ -1,9 +1,8 @@
-"""A workpiece on a bench, among things that lie about.
+"""A workpiece on a bench among other objects, and a registry of the simulated arms.
 
-The arms that are simulated in this process: what else is simulated meets them where they are.
-
-A controller reads where an arm says it is; a finger on that arm touches the work where the arm
-really is. The two meet here, as they do in a real room, and not through the controller.
+Controllers read an arm's reported pose, but a simulated finger or scanner on it needs the true one.
+Simulated arms of this process therefore register here, and simulated sensors look them up without
+going through the controller.
 """
 
 from __future__ import annotations
@@ -48,19 +47,19 @@ class LaidParams(Params):
 
     @property
     def base_T_part(self) -> Floats:
-        """(4, 4), translation in [m]."""
+        """True pose (4, 4) of the workpiece [m]."""
         return rigid(rotation_from_rpy(*self.rpy), np.asarray(self.position))
 
 
 class BenchParams(LaidParams):
-    """A workpiece on a bench."""
+    """Parameters of a workpiece on a bench."""
 
     covered: float = Field(
         0.0, ge=0, lt=1, description="Share of the workpiece covered by a sheet, at one end."
     )
 
     def true_seams(self, workpiece: Workpiece) -> dict[str, Floats]:
-        """Return the true seams by name, (N, 3) in ``base`` [m]."""
+        """Return the workpiece's true seams by name, (N, 3) in ``base`` [m]."""
         pose = self.base_T_part
         return {
             name: np.asarray(seam.points @ pose[:3, :3].T + pose[:3, 3])
@@ -74,13 +73,13 @@ def bench_with(
     covered: float,
     rng: np.random.Generator,
 ) -> list[SolidBody]:
-    """Return the bodies of the scene, in ``base``.
+    """Return the bodies of a bench with a workpiece, in ``base``.
 
     Args:
-        workpiece: The workpiece to weld.
+        workpiece: The workpiece.
         base_T_part: (4, 4) pose of the workpiece; the bench is directly below it.
-        covered: Share of the workpiece, from its end with the largest x, under a sheet.
-        rng: Draws the things that lie about, some of them against the workpiece.
+        covered: Share of the workpiece under a sheet, from the end with the largest x.
+        rng: Random generator of other objects; some of them touch the workpiece.
     """
     part = Mesh(workpiece.vertices, workpiece.triangles).moved(base_T_part)
     low, high = part.vertices.min(axis=0), part.vertices.max(axis=0)
@@ -96,7 +95,7 @@ def bench_with(
 
 
 def _free_place(low: Floats, high: Floats, seams: list[Floats], rng: np.random.Generator) -> Floats:
-    """Return (2,) a place around the workpiece that is not over a seam."""
+    """Return a random place (2,) around the workpiece, away from the seams."""
     for _ in range(200):
         place = rng.uniform(low[:2] - BENCH_MARGIN / 2, high[:2] + BENCH_MARGIN / 2)
         flat = [seam * [1.0, 1.0, 0.0] for seam in seams]
@@ -109,7 +108,7 @@ def _free_place(low: Floats, high: Floats, seams: list[Floats], rng: np.random.G
 
 
 def _thing(place: Floats, floor: float, rng: np.random.Generator) -> SolidBody:
-    """Return a block or a rod on the bench."""
+    """Return a random block or rod on the bench."""
     size = rng.uniform(0.01, 0.03, 3)
     pose = rigid(rotation_from_rpy(0.0, 0.0, rng.uniform(0, np.pi)), np.array([*place, floor]))
     if rng.random() < 0.6:
@@ -130,13 +129,13 @@ def _sheet(workpiece: Workpiece, base_T_part: Floats, covered: float) -> SolidBo
 
 
 class StandingArm(Protocol):
-    """An arm in the room."""
+    """Interface: a simulated arm in the registry."""
 
     def state(self) -> RobotState:
-        """Return its reported state."""
+        """Return the arm's reported state."""
 
     def true_flange(self) -> Floats:
-        """Return where its flange really is (4, 4), in base."""
+        """Return the true ``base_T_flange`` (4, 4)."""
 
 
 _ARMS: WeakSet[StandingArm] = WeakSet()
@@ -144,20 +143,20 @@ _NEWEST: list[ref[StandingArm]] = []
 
 
 def enter(arm: StandingArm) -> None:
-    """Register an arm in the room for its lifetime."""
+    """Register a simulated arm for its lifetime."""
     _ARMS.add(arm)
     _NEWEST[:] = [ref(arm)]
 
 
 def newest() -> StandingArm | None:
-    """Return the arm registered last; it carries whatever is mounted on an arm."""
+    """Return the arm registered last, which carries all mounted sensors; None without one."""
     return _NEWEST[0]() if _NEWEST else None
 
 
 def true_flange(reported: RobotState) -> Transform:
-    """Return where the flange of the arm that reports this really is.
+    """Return the true flange pose of the arm with this reported state.
 
-    An arm that is not simulated here is where it reports.
+    For an arm that is not simulated in this process it is the reported pose.
     """
     for arm in _ARMS:
         try:

@@ -1,4 +1,4 @@
-"""Render a printed board: perspective, lens, blur and noise; and its depth."""
+"""Render a printed board with perspective, lens, blur and noise, and its depth."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ GROUND = 90
 
 @dataclass(frozen=True, eq=False)
 class BoardCamera:
-    """A camera that images boards.
+    """Model of a camera for rendering boards.
 
     Attributes:
-        camera_matrix: (3, 3) [px].
+        camera_matrix: (3, 3) camera matrix [px].
         size: Width and height [px].
         distortion: (k,) OpenCV's distortion coefficients.
         blur: Standard deviation of the lens's blur [px].
         noise: Standard deviation of a pixel's grey value.
-        shade: Share of the light that is missing at the darker side of each image.
+        shade: Relative loss of light at the darker side of an image.
         depth_noise: Standard deviation of a point along its ray [m].
     """
 
@@ -43,18 +43,18 @@ class BoardCamera:
 
 @dataclass(frozen=True)
 class Cover:
-    """Something dark that lies over a side of the board, such as a cable or a clamp.
+    """A dark object over one side of the board, such as a cable or a clamp.
 
     Attributes:
-        angle: Direction of what is covered from the middle, in the board's plane [rad].
-        distance: From the middle to where it begins [m].
+        angle: Direction of the covered side from the board's centre, in its plane [rad].
+        distance: Distance from the board's centre to the cover [m].
     """
 
     angle: float
     distance: float
 
     def hides(self, board: Board, across: Floats, down: Floats) -> NDArray[np.bool_]:
-        """Return which places, right and down from the top left corner [m], it lies over."""
+        """Return the mask of covered positions, given from the top left corner [m]."""
         x, y = across - board.size[0] / 2, board.size[1] / 2 - down
         return np.asarray(np.cos(self.angle) * x + np.sin(self.angle) * y > self.distance)
 
@@ -69,10 +69,10 @@ def render_board(
     """Return the camera's image of a board on white paper before grey.
 
     Args:
-        board: The print.
-        camera_T_target: (4, 4) its pose [m].
+        board: The printed board.
+        camera_T_target: (4, 4) pose of the board [m].
         camera: Lens and sensor.
-        rng: Draws the noise, and from where it is darker.
+        rng: Random generator of the noise and of the darker side.
         cover: Occlusion of the board, if any.
     """
     import cv2
@@ -89,7 +89,7 @@ def render_board(
 
 
 def _light(camera: BoardCamera, rng: np.random.Generator) -> Floats | float:
-    """Return the share of the light (H, W) at each pixel: it falls along a direction drawn."""
+    """Return the relative light (H, W) at each pixel, with a gradient in a random direction."""
     if not camera.shade:
         return 1.0
     angle, (width, height) = rng.uniform(0, 2 * np.pi), camera.size
@@ -105,7 +105,7 @@ def _seen(
     window: tuple[slice, slice],
     cover: Cover | None,
 ) -> Floats:
-    """Return the print's grey values (h, w) in a window of the image, less bright at a slant."""
+    """Return the print's grey values (h, w) in a window, darker at oblique incidence."""
     import cv2
 
     rows, columns = window
@@ -129,7 +129,7 @@ def _seen(
 
 
 def _between(pixels: slice) -> Floats:
-    """Return where rays go through a row of pixels, several through each."""
+    """Return the coordinates of several rays through each pixel of a row [px]."""
     count = FINE * (pixels.stop - pixels.start)
     return np.asarray(pixels.start + (np.arange(count) + 0.5) / FINE - 0.5)
 
@@ -151,7 +151,7 @@ def _window(board: Board, camera_T_target: Floats, camera: BoardCamera) -> tuple
 def scan_board(
     board: Board, camera_T_target: Floats, camera: BoardCamera, rng: np.random.Generator
 ) -> PointCloud:
-    """Return the organised cloud of the board and its paper that belongs to the image."""
+    """Return the organised cloud of board and paper that matches the image."""
     width, height = camera.size
     u, v = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
     rays = _rays(u, v, camera)
@@ -166,14 +166,14 @@ def scan_board(
 
 
 def _paper(board: Board) -> tuple[NDArray[np.uint8], float]:
-    """Return the print with its margin of a square, and how far that moves it [px]."""
+    """Return the print with a margin of one square, and the shift by that margin [px]."""
     return np.pad(print_of(board, PER_SQUARE), PER_SQUARE, constant_values=255), float(PER_SQUARE)
 
 
 def _rays(u: Floats, v: Floats, camera: BoardCamera) -> Floats:
-    """Return the rays (H, W, 3) of a regular grid of pixels, z = 1.
+    """Return the rays (H, W, 3) of a regular grid of pixels, with z = 1.
 
-    The lens is asked at every few pixels only: it is smooth, and slow to answer.
+    The lens model is slow and smooth, so it is evaluated at every few pixels and interpolated.
     """
     import cv2
 
@@ -194,7 +194,7 @@ def _rays(u: Floats, v: Floats, camera: BoardCamera) -> Floats:
 
 
 def _between_nodes(coarse: Floats, x: Floats, y: Floats) -> Floats:
-    """Return values (H, W) of a grid at columns x and rows y of it, linearly between its nodes."""
+    """Return a grid's values (H, W), bilinearly interpolated at columns x and rows y."""
     i = np.clip(x[0].astype(int), 0, coarse.shape[1] - 2)
     j = np.clip(y[:, 0].astype(int), 0, coarse.shape[0] - 2)
     right, low = x[0] - i, (y[:, 0] - j)[:, None]
@@ -208,7 +208,7 @@ def _depth(camera_T_target: Floats, rays: Floats) -> Floats:
 
 
 def _places(board: Board, camera_T_target: Floats, rays: Floats) -> tuple[Floats, Floats]:
-    """Return where rays meet the board's plane, right and down from its top left corner [m]."""
+    """Return the rays' intersections with the board, from its top left corner [m]."""
     points = rays * _depth(camera_T_target, rays)[..., None] - camera_T_target[:3, 3]
     local = points @ camera_T_target[:3, :3]
     width, height = board.size

@@ -1,4 +1,4 @@
-"""The simulated cell: an arm on a table, a wall, and a stand with a disc that is not a flange."""
+"""The simulated cell: an arm on a table, a wall, and a stand with a disc as a distractor."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from flangeye_emulators.world.raycast import SolidBody
 
 @lru_cache(maxsize=8)
 def sphere_mesh(sphere: Sphere) -> Mesh:
-    """Return the sphere."""
+    """Return the mesh of a calibration sphere."""
     segments = 360  # at a radius of 20 mm its facets are within 1 um of its surface
     latitude = np.linspace(-np.pi / 2, np.pi / 2, segments // 2 + 1)
     radius, height = sphere.radius * np.cos(latitude), sphere.radius * np.sin(latitude)
@@ -41,7 +41,7 @@ def sphere_mesh(sphere: Sphere) -> Mesh:
 
 @lru_cache(maxsize=8)
 def stub_mesh(sphere: Sphere) -> Mesh:
-    """Return the rod that holds the sphere: along z, from the flange's face into the sphere."""
+    """Return the mesh of the rod along z from the flange's face into the sphere."""
     x, y, z = sphere.centre_in_flange
     # Radius of the stub over that of the sphere
     return capsule(np.array([x, y, 0.0]), np.array([x, y, z]), 0.25 * sphere.radius, COARSE)
@@ -49,15 +49,15 @@ def stub_mesh(sphere: Sphere) -> Mesh:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedCell:
-    """The surroundings in ``base``, and the arm.
+    """The simulated cell: surroundings in ``base``, and the arm.
 
     Attributes:
         robot: The arm.
         flange: The flange on the arm.
-        centre: (3,) middle of the workspace [m].
-        size: (3,) of the workspace [m].
-        sphere: What the flange carries besides, if anything.
-        body: The same of a tool, drawn in the flange's frame.
+        centre: (3,) centre of the workspace [m].
+        size: (3,) size of the workspace [m].
+        sphere: Calibration sphere on the flange; None without one.
+        body: Tool on the flange, in the flange's frame; None without one.
     """
 
     robot: RobotModel
@@ -68,7 +68,7 @@ class SimulatedCell:
     body: TargetBody | None = None
 
     def around(self) -> list[SolidBody]:
-        """Return the static bodies."""
+        """Return the static bodies of the cell."""
         x, y = self.centre[:2]
         far = x + self.size[0] / 2 + 0.13
         return [
@@ -78,11 +78,11 @@ class SimulatedCell:
         ]
 
     def arm(self, frames: Floats, base_T_flange: Floats) -> list[SolidBody]:
-        """Return the arm and its flange.
+        """Return the bodies of the arm and its flange.
 
         Args:
             frames: (n + 1, 4, 4) ``base_T_link``.
-            base_T_flange: (4, 4) where the flange really is.
+            base_T_flange: (4, 4) true flange pose.
         """
         volume = ArmVolume(self.robot)
         links = [
@@ -98,7 +98,7 @@ class SimulatedCell:
         ]
 
     def _at_flange(self) -> list[SolidBody]:
-        """Return what moves with the flange, in ``flange``."""
+        """Return the bodies fixed to the flange, in ``flange``."""
         finish = MATERIALS[self.flange.details.finish]
         plate = SolidBody(flange_mesh(self.flange), finish)
         wrist = SolidBody(wrist_mesh(self.flange), MATERIALS["painted"])
@@ -121,7 +121,7 @@ class SimulatedCell:
         return sheet.moved(base_T_flange)
 
     def _stand(self) -> list[SolidBody]:
-        """Return a post with a ring of nearly the flange's size, beside the workspace."""
+        """Return a post with a ring of nearly the flange's size, as a distractor."""
         foot = self.centre + np.array([0.05, self.size[1] / 2 + 0.1, 0.0])
         top = max(float(self.centre[2] - self.size[2] / 2 - 0.03), 0.05)
         pose = np.eye(4)

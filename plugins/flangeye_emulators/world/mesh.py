@@ -1,10 +1,9 @@
-"""Triangle meshes of the shapes a cell is made of. Lengths in [m].
+"""Triangle meshes of a cell's shapes, in [m], and optical properties of their materials.
 
-What surfaces do to light, as far as a scanner is disturbed by it.
-
-The figures are judgements, set so that simulated scans resemble published ones: noise on a bare
-metal flange 1.2 times and on a black anodised one 1.5 times what the makers state for a white
-diffuse target, hardly any hole in the face at moderate incidence, and none of it at a highlight.
+The materials' values are estimates, chosen so that simulated scans resemble published ones: noise
+on a bare metal flange is 1.2 times, and on a black anodised one 1.5 times, the maker's value for a
+white diffuse target. Faces have hardly any holes at moderate incidence, and are missing at a
+highlight.
 """
 
 from __future__ import annotations
@@ -36,10 +35,10 @@ HOLE_SEGMENTS = 120
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A surface of triangles.
+    """A triangle mesh.
 
     Attributes:
-        vertices: (V, 3) [m].
+        vertices: (V, 3) positions [m].
         triangles: (T, 3) indices of vertices.
     """
 
@@ -53,7 +52,7 @@ class Mesh:
 
 
 def merged(meshes: Sequence[Mesh]) -> Mesh:
-    """Return one mesh of several."""
+    """Return several meshes merged into one."""
     offsets = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
     triangles = [m.triangles + k for m, k in zip(meshes, offsets, strict=True)]
     vertices = np.concatenate([mesh.vertices for mesh in meshes])
@@ -61,7 +60,7 @@ def merged(meshes: Sequence[Mesh]) -> Mesh:
 
 
 def circle(radius: float, segments: int, centre: tuple[float, float] = (0.0, 0.0)) -> Floats:
-    """Return (segments, 2) points on a circle, anticlockwise."""
+    """Return points (segments, 2) on a circle, anticlockwise."""
     angle = 2 * np.pi * np.arange(segments) / segments
     unit = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     return np.asarray(unit * radius + np.asarray(centre))
@@ -72,14 +71,14 @@ def lathe(
     segments: int = FINE,
     centre: tuple[float, float] = (0.0, 0.0),
 ) -> Mesh:
-    """Return the surface that a profile of (radius, z) sweeps about an axis along z."""
+    """Return the surface of revolution of a profile of (radius, z) about an axis along z."""
     rings = [np.column_stack([circle(r, segments, centre), np.full(segments, z)])
              for r, z in profile]  # fmt: skip
     return Mesh(np.concatenate(rings), _bands(len(profile), segments))
 
 
 def _bands(rings: int, segments: int) -> Ints:
-    """Join every point of each ring with the two next to it on the following ring."""
+    """Return the triangles that join successive rings of points."""
     here = np.arange(segments)
     after = (here + 1) % segments
     quad = np.stack([here, after, after + segments, here, after + segments, here + segments])
@@ -88,7 +87,7 @@ def _bands(rings: int, segments: int) -> Ints:
 
 
 def wall(loop: Floats, top: float, bottom: float) -> Mesh:
-    """Return the wall between two heights z along a closed loop of (N, 2) points."""
+    """Return the vertical wall between two heights z along a closed loop of points (N, 2)."""
     rings = [np.column_stack([loop, np.full(len(loop), z)]) for z in (top, bottom)]
     return Mesh(np.concatenate(rings), _bands(2, len(loop)))
 
@@ -96,8 +95,8 @@ def wall(loop: Floats, top: float, bottom: float) -> Mesh:
 def region(outline: Floats, holes: Sequence[Floats], z: float) -> Mesh:
     """Return the flat region inside an outline and outside its holes, at height z.
 
-    Delaunay's triangulation contains every side of the loops, because they are sampled much more
-    finely than they are apart; the triangles in the holes are then left out.
+    The Delaunay triangulation contains every side of the loops, because their sampling is much
+    finer than the distances between them. Triangles in holes are then removed.
 
     Args:
         outline: (N, 2) points of a closed loop.
@@ -117,7 +116,7 @@ def region(outline: Floats, holes: Sequence[Floats], z: float) -> Mesh:
 
 
 def _inside(points: Floats, loop: Floats) -> NDArray[np.bool_]:
-    """Return which (N, 2) points a closed loop encloses (even number of crossings: outside)."""
+    """Return the mask of points (N, 2) inside a closed loop, by the even-odd rule."""
     x, y = points[:, :1], points[:, 1:]
     (x0, y0), (x1, y1) = loop.T, np.roll(loop, -1, axis=0).T
     crosses = (y0 > y) != (y1 > y)
@@ -141,7 +140,7 @@ def box(low: Sequence[float], high: Sequence[float]) -> Mesh:
 
 
 def capsule(start: Floats, end: Floats, radius: float, segments: int = COARSE) -> Mesh:
-    """Return a cylinder between two points (3,), closed by half spheres."""
+    """Return a cylinder between two points (3,), closed by hemispheres."""
     axis = np.asarray(end, dtype=np.float64) - np.asarray(start, dtype=np.float64)
     length = float(np.linalg.norm(axis))
     latitude = np.linspace(-np.pi / 2, np.pi / 2, segments // 2 + 1)
@@ -158,13 +157,13 @@ def capsule(start: Floats, end: Floats, radius: float, segments: int = COARSE) -
 
 @lru_cache(maxsize=8)
 def flange_mesh(flange: Flange) -> Mesh:
-    """Return the plate: face, chamfers, centring bore, threaded holes, pin hole, recesses.
+    """Return a flange plate: face, chamfers, centring bore, threaded holes, pin hole, recesses.
 
-    Chamfers fall at 45 degrees, as those of the published CAD models do. Recesses belong to the
-    plate a robot is made with, and no other that a recipe puts on it.
+    Chamfers are at 45 degrees, as in published CAD models. Only the robot's own plate has recesses,
+    not another one that a recipe mounts.
 
     Raises:
-        StageError: The holes run into the bore or the rim.
+        StageError: A hole overlaps the bore or the rim.
     """
     details = flange.details
     recesses = details.recesses if flange.name == details.standard else ()
@@ -188,7 +187,7 @@ def wrist_mesh(flange: Flange) -> Mesh:
 
 
 def recess_outline(recess: Recess) -> Floats:
-    """Return the (N, 2) closed outline of a slot that follows a circle, with round ends."""
+    """Return the closed outline (N, 2) of a circular-arc slot with round ends."""
     half, span = recess.width / 2, recess.half_span
     along = np.linspace(-span, span, 61)
     inner = _polar(recess.radius - half, along)
@@ -241,12 +240,12 @@ def _hole(centre: tuple[float, float], edge: float, flange: Flange) -> Mesh:
 
 @dataclass(frozen=True)
 class Material:
-    """How one surface answers the projector.
+    """Optical properties of a surface for a scanner.
 
     Attributes:
-        albedo: Share of the light it returns in all directions.
-        gloss: Share of the points that are lost in the middle of a highlight.
-        grain: Standard deviation of depth, over that on a white diffuse surface.
+        albedo: Diffusely reflected share of the light.
+        gloss: Share of points lost in the centre of a highlight.
+        grain: Depth noise relative to that on a white diffuse surface.
     """
 
     albedo: float

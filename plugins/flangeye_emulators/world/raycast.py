@@ -1,7 +1,7 @@
 """Ray casting: the first hit of each pixel, and shadows of a light source.
 
-Rays are followed through every second pixel of every second row; the pixels of the four phases,
-``SQUARES``, stand for each other where nothing changes between them.
+Rays are cast through every second pixel of every second row. The other pixels of each 2 x 2 square
+(the phases in ``SQUARES``) are interpolated where nothing changes between samples.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ SQUARES = ((0, 0), (0, 1), (1, 0), (1, 1))
 
 @dataclass(frozen=True, eq=False)
 class SolidBody:
-    """A body: its surface, in some frame, and its material."""
+    """A body: its mesh, in a frame given by context, and its material."""
 
     mesh: Mesh
     material: Material
@@ -40,12 +40,12 @@ class SolidBody:
 
 @dataclass(frozen=True, eq=False)
 class Pixels:
-    """The rays of a pinhole camera, in ``camera``: z along the view, x along the rows.
+    """The rays of a pinhole camera in ``camera``, with z along the view and x along the rows.
 
     Attributes:
-        x: (W,) of the directions through the columns, with z = 1, so that the distance along a
-            ray is the depth itself.
-        y: (H,) of those through the rows.
+        x: (W,) x of the directions through the columns, with z = 1, so that the ray parameter is
+            the depth.
+        y: (H,) y of the directions through the rows.
         size: Width of a pixel at unit depth [rad].
     """
 
@@ -90,12 +90,12 @@ def pixels_of(scanner: ScannerModel, resolution: float = 1.0) -> Pixels:
 
 
 class _Met(NamedTuple):
-    """Hits of rays (...).
+    """Intersections of an array of rays (...).
 
     Attributes:
-        depth: (...) distances, in units of the directions' lengths; infinite where nothing is met.
-        body: (...) numbers of the bodies.
-        normals: (3, ...) unit normals, zero where nothing is met.
+        depth: (...) distances in lengths of the directions; infinite without a hit.
+        body: (...) indices of the bodies.
+        normals: (3, ...) unit normals; zero without a hit.
     """
 
     depth: Image
@@ -105,12 +105,13 @@ class _Met(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """The first surface along each ray.
+    """The first surface along each pixel's ray.
 
     Attributes:
-        depth: (H, W) z in ``camera`` [m]; infinite where there is nothing.
-        body: (H, W) number of the body that was hit; one more than the last where there is none.
-        slant: (H, W) product of the ray's direction and the surface's unit normal, of either sign.
+        depth: (H, W) z in ``camera`` [m]; infinite without a hit.
+        body: (H, W) index of the body hit; the number of bodies without a hit.
+        slant: (H, W) dot product of the ray's direction and the unit normal; the normal's sign is
+            arbitrary.
     """
 
     depth: Image
@@ -121,7 +122,7 @@ class Hits:
     _normals: Image
 
     def facing(self, vector: Floats) -> Image:
-        """Return the (H, W) product of the surface's unit normal, as in ``slant``, and a vector."""
+        """Return the dot product (H, W) of a vector and the unit normal used in ``slant``."""
         x, y, z = (np.float32(v) for v in vector)
         out = _spread(_dot(self._samples, x, y, z), self.depth.shape)
         out.ravel()[self._between] = _dot(self._normals, x, y, z)
@@ -129,10 +130,10 @@ class Hits:
 
 
 class RaycastScene:
-    """Bodies in ``camera``, ready to be looked at."""
+    """Bodies in ``camera``, prepared for ray casting."""
 
     def __init__(self, bodies: Sequence[SolidBody]) -> None:
-        """Build the search tree; single-threaded, so that a run keeps to its one core."""
+        """Build the acceleration structure; single-threaded, so that a run uses one core only."""
         import open3d as o3d
 
         self.materials = [body.material for body in bodies]
@@ -144,11 +145,11 @@ class RaycastScene:
             )
 
     def look(self, pixels: Pixels) -> Hits:
-        """Find the first surface along every pixel's ray.
+        """Return the first surface along every pixel's ray.
 
-        Every second row and column is followed. Where a sample and its eight neighbours lie in
-        one plane, so do the pixels between, and their depth is computed; the others are followed
-        too. Half the time, and a thing has to be narrower than two pixels to be missed.
+        Rays are cast through every second row and column. If a sample and its eight neighbours lie
+        in one plane, the depths of the pixels between are computed from the plane; otherwise their
+        rays are cast too. This halves the time, and misses only objects narrower than two pixels.
         """
         met = self._cast(pixels.samples)
         slant = _dot(met.normals, pixels.x[::2], pixels.y[::2, None], 1)
@@ -171,13 +172,13 @@ class RaycastScene:
         return _Met(found["t_hit"].numpy(), body, np.ascontiguousarray(normals))
 
     def hidden(self, light: Floats, pixels: Pixels, depth: Image, wanted: Mask) -> Mask:
-        """Return the (H, W) pixels whose points are in shadow of a light; exact where wanted.
+        """Return the mask (H, W) of pixels whose points are in shadow; exact where ``wanted``.
 
-        Every second row and column is followed, and the others only where those around them
-        disagree: a shadow has to be narrower than two pixels to be missed.
+        Rays are cast for every second row and column, and for the others only if the samples around
+        them disagree. This misses only shadows narrower than two pixels.
 
         Args:
-            light: (3,) where it is, in ``camera``.
+            light: (3,) position of the light in ``camera`` [m].
             pixels: The camera's.
             depth: (H, W) of the points [m].
             wanted: (H, W) pixels that matter.
@@ -199,13 +200,13 @@ class RaycastScene:
         return out
 
     def _blocked(self, rays: Any) -> Mask:
-        """Return which of Open3D's rays (N, 6) hit something before their end, at parameter 1."""
+        """Return the mask (N,) of Open3D rays (N, 6) that hit something before parameter 1."""
         # The last thousandth is not looked at: the point it leads to must not hide itself.
         hit = self._scene.test_occlusions(rays, tnear=0.0, tfar=1.0 - 1e-3, nthreads=1)
         return np.asarray(hit.numpy())
 
     def figure(self, name: str, body: NDArray[np.uint8]) -> Image:
-        """Return one figure of the material of the bodies that were hit; zero for nothing."""
+        """Return a property of the material at each pixel (H, W); zero without a hit."""
         import cv2
 
         table = np.zeros(256, dtype=np.float32)
@@ -214,7 +215,7 @@ class RaycastScene:
 
 
 def bands(shape: tuple[int, ...]) -> Iterator[slice]:
-    """Yield the rows of an (H, W) image, some at a time."""
+    """Yield bands of rows that cover an image (H, W)."""
     # Pixels that are worked on at once: the images of as many stay in a core's cache
     height = max((1 << 16) // shape[1], 1)
     for start in range(0, shape[0], height):
@@ -222,7 +223,7 @@ def bands(shape: tuple[int, ...]) -> Iterator[slice]:
 
 
 def _dot(vectors: Image, x: Any, y: Any, z: Any) -> Image:
-    """Return the product of (3, ...) vectors and others, given by their coordinates."""
+    """Return the dot product of vectors (3, ...) with others given by coordinates."""
     out = vectors[0] * x
     out += vectors[1] * y
     out += vectors[2] if isinstance(z, int) and z == 1 else vectors[2] * z
@@ -230,12 +231,12 @@ def _dot(vectors: Image, x: Any, y: Any, z: Any) -> Image:
 
 
 def _in_planes(pixels: Pixels, normals: Image, away: Image) -> tuple[Image, Image]:
-    """Return (H, W) depth and slant of pixels in the planes of their samples.
+    """Return depth and slant (H, W) of pixels on the planes of their samples.
 
     Args:
         pixels: The camera's.
-        normals: (3, h, w) of the samples.
-        away: (h, w) distance of their planes from the camera [m]; infinite where there is none.
+        normals: (3, h, w) unit normals of the samples.
+        away: (h, w) distance of the samples' planes from the camera [m]; infinite without a hit.
     """
     depth = np.empty(pixels.shape, dtype=np.float32)
     slant = np.empty_like(depth)
@@ -255,17 +256,17 @@ def through(pixels: Pixels, at: Indices) -> tuple[Image, Image]:
 
 
 def _beams(light: Floats, pixels: Pixels, depth: Image, at: Indices) -> Any:
-    """Return Open3D's rays (N, 6) from a light to the points that pixels at flat indices see."""
+    """Return Open3D rays (N, 6) from a light to the points seen by pixels at flat indices."""
     z = depth.ravel().take(at)
     x, y = (direction * z for direction in through(pixels, at))
     return _rays(light, *(c - np.float32(of) for c, of in zip((x, y, z), light, strict=True)))
 
 
 def _is_flat(met: _Met, away: Image) -> Mask:
-    """Return which samples and their eight neighbours lie in one plane of one body.
+    """Return the mask of samples that lie with their eight neighbours in one plane of one body.
 
     Args:
-        met: (h, w) samples.
+        met: Hits of the samples (h, w).
         away: (h, w) distance of each sample's plane from the camera [m].
     """
     import cv2
@@ -282,7 +283,7 @@ def _is_flat(met: _Met, away: Image) -> Mask:
 
 
 def _spread(samples: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    """Return an image in which every sample stands for its square of pixels."""
+    """Return an image in which each sample is repeated for its square of pixels."""
     out = np.empty(shape, dtype=samples.dtype)
     for r, c in SQUARES:
         part = out[r::2, c::2]
@@ -291,7 +292,7 @@ def _spread(samples: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
 
 
 def _any_of_square(marked: Mask) -> NDArray[np.uint8]:
-    """Return which samples stand for a pixel that is marked."""
+    """Return the mask of samples with a marked pixel in their square."""
     out = marked[::2, ::2].astype(np.uint8)
     for r, c in SQUARES[1:]:
         part = marked[r::2, c::2]
@@ -300,7 +301,7 @@ def _any_of_square(marked: Mask) -> NDArray[np.uint8]:
 
 
 def _between(marked: Mask, shape: tuple[int, ...]) -> Indices:
-    """Return the flat indices of the pixels that marked samples stand for, but for themselves."""
+    """Return the flat indices of the pixels in marked samples' squares, without the samples."""
     at = np.flatnonzero(marked)
     row = at // marked.shape[1]
     column = at - row * marked.shape[1]
@@ -312,7 +313,7 @@ def _between(marked: Mask, shape: tuple[int, ...]) -> Indices:
 
 
 def _rays(origin: Floats, *directions: Any) -> Any:
-    """Return Open3D's rays (..., 6) from one origin (3,), given the x, y and z of directions."""
+    """Return Open3D rays (..., 6) from one origin (3,), given x, y and z of their directions."""
     import open3d as o3d
 
     rays = np.empty((*np.broadcast_shapes(*map(np.shape, directions)), 6), dtype=np.float32)

@@ -1,7 +1,8 @@
-"""A simulated scanner by its principle, with its errors and pose.
+"""Simulated scanners with their typical errors, by measurement principle.
 
-Structured light: a camera and a projector beside it. Time of flight: one eye, its lamp beside it,
-and the errors of measuring phases. Both round, lose and invent points where the depth steps.
+A structured-light scanner has a camera and a projector beside it. A time-of-flight camera has one
+lens with a lamp beside it, and errors of phase measurement. At depth steps both round edges, lose
+points and create flying pixels.
 """
 
 from __future__ import annotations
@@ -43,10 +44,10 @@ DEGREE = 3
 
 
 def steps(depth: Image, width: Image) -> Mask:
-    """Return which pixels of (H, W) have a neighbour beyond a step in depth.
+    """Return the mask (H, W) of pixels with a neighbour beyond a depth step.
 
     Args:
-        depth: [m], finite.
+        depth: (H, W) depth [m], finite.
         width: Width of a pixel at that depth [m].
     """
     import cv2
@@ -60,7 +61,7 @@ def steps(depth: Image, width: Image) -> Mask:
 def _beyond(
     change: Callable[[Image], NDArray[Any]], depth: Image, widths: float, width: Image
 ) -> Mask:
-    """Return where the change of depth (H, W) to the eight neighbours exceeds so many widths."""
+    """Return the mask (H, W) where depth changes to a neighbour by more than ``widths`` pixels."""
     out = np.empty(depth.shape, dtype=bool)
     for rows in bands(depth.shape):
         first = max(rows.start - 1, 0)
@@ -71,7 +72,7 @@ def _beyond(
 
 
 def distance_to(marked: Mask) -> Image:
-    """Return the (H, W) distance of pixels to the nearest marked one [px], zero on it."""
+    """Return each pixel's distance (H, W) to the nearest marked one [px]."""
     import cv2
 
     # The 3 x 3 approximation errs by 5 % at most, and only the first few pixels matter.
@@ -81,7 +82,7 @@ def distance_to(marked: Mask) -> Image:
 def distance_within(reach: int, marked: Mask) -> Image:
     """Return :func:`distance_to` up to ``reach`` [px]; larger distances may be overestimated.
 
-    Most of an image is far from any step: that takes half the time.
+    It takes half the time, because most of an image is far from any step.
     """
     out = np.full(marked.shape, np.inf, dtype=np.float32)
     for rows in bands(marked.shape):
@@ -96,13 +97,13 @@ def distance_within(reach: int, marked: Mask) -> Image:
 
 
 def lost(distance: Indices | Image, loss: float, grain: Image) -> Mask:
-    """Return the pixels that a scanner drops, by their distance from the nearest depth step.
+    """Return the mask of pixels that a scanner drops near depth steps.
 
     Args:
-        distance: Pixels to the nearest one with a step beside it; the step itself is half a pixel
-            further.
-        loss: Mean width of what is given up [px].
-        grain: Standard normal values, correlated as the scanner's noise is.
+        distance: Distance to the nearest pixel beside a step [px]; the step is half a pixel
+            farther.
+        loss: Mean width of the dropped strip [px].
+        grain: Standard normal values, with the correlation of the scanner's noise.
     """
     # Standard deviation of the line along which points are lost [px]; published scans of a rim are
     # rough by 0.16 to 0.25 mm at 0.2 to 0.3 mm a pixel
@@ -110,14 +111,14 @@ def lost(distance: Indices | Image, loss: float, grain: Image) -> Mask:
 
 
 def rounded(depth: Image, width: Image, blur: float) -> Image:
-    """Return depths with their creases rounded, as the scanner's own smoothing rounds them.
+    """Return depths with rounded creases, like those smoothed by a scanner.
 
-    Two Gaussian averages over 5 x 5 pixels of the same surface, near bends and steps only: where
-    a flat surface goes on to all sides they change nothing. Beside a step the average is one-sided,
-    and lifts or sinks the edge of a slanted face by 0.1 mm, as it is in published scans.
+    Two Gaussian averages over 5 x 5 pixels of the same surface are applied near bends and steps;
+    elsewhere they would change nothing. Beside a step the average is one-sided and displaces the
+    edge of an oblique face by 0.1 mm, as in published scans.
 
     Args:
-        depth: (H, W) [m], finite.
+        depth: (H, W) depth [m], finite.
         width: Width of a pixel at that depth [m].
         blur: Standard deviation of each average [px].
     """
@@ -160,12 +161,12 @@ def _local_average(depth: Image, at: Indices, width: Image, blur: float) -> Imag
 def fly(depth: Image, beside: Mask, rng: np.random.Generator) -> None:
     """Turn some pixels beside a depth step into flying pixels between its sides, in place.
 
-    A pixel that sees both sides reports something between, nearer to what it sees more of.
+    A pixel that sees both sides reports a depth in between, closer to the side it sees more of.
 
     Args:
-        depth: (H, W) [m], finite.
-        beside: (H, W) pixels beside a step that are measured.
-        rng: Draws them.
+        depth: (H, W) depth [m], finite.
+        beside: (H, W) mask of measured pixels beside a step.
+        rng: Random generator.
     """
     at = np.flatnonzero(beside)
     # Share of the surviving points beside a step that lie between its two sides
@@ -178,7 +179,7 @@ def fly(depth: Image, beside: Mask, rng: np.random.Generator) -> None:
 
 
 def _neighbours(depth: Image, at: Indices) -> Image:
-    """Return the (9, N) depths at and around some pixels; beyond the border, of those at it."""
+    """Return depths (9, N) at and around pixels at flat indices; the border is replicated."""
     (rows, columns), (row, column) = depth.shape, np.divmod(at, depth.shape[1])
     return np.stack([
         depth[np.clip(row + dy, 0, rows - 1), np.clip(column + dx, 0, columns - 1)]
@@ -187,13 +188,13 @@ def _neighbours(depth: Image, at: Indices) -> Image:
 
 
 def correlated_normal(shape: tuple[int, ...], width: float, rng: np.random.Generator) -> Image:
-    """Return an (H, W) image of standard normal values.
+    """Return an image (H, W) of spatially correlated standard normal values.
 
     Args:
         shape: (H, W).
         width: Standard deviation of the Gaussian filter that correlates neighbours [px]; two
             pixels d apart then correlate by exp(-d^2 / (4 width^2)).
-        rng: Draws it.
+        rng: Random generator.
     """
     import cv2
 
@@ -210,27 +211,26 @@ def correlated_normal(shape: tuple[int, ...], width: float, rng: np.random.Gener
 
 
 def normal_quantile(probability: Image | Floats) -> Image:
-    """Return the standard normal value below which this probability lies, to 0.02.
+    """Return the standard normal quantile of a probability, accurate to 0.02.
 
-    A logistic curve stands for the normal one: what is drawn with it is not known any better.
+    A logistic approximation is accurate enough for the random effects that use it.
     """
     p = np.asarray(np.clip(probability, 1e-6, 1 - 1e-6), dtype=np.float64)
     return np.asarray(np.log(p / (1 - p)) / 1.702, dtype=np.float32)
 
 
 class Distortion:
-    """A low-order polynomial field over the scanner's volume.
+    """A scanner's distortion: a low-order polynomial field over its measuring volume.
 
-    Legendre polynomials are orthogonal over the box of (column, row, depth), so that the field's
-    mean square is the sum of the squared coefficients, and it is scaled to what is wanted.
-    Constant and tilted fields are left out: they would only move the camera's frame, of which
-    nobody could say that it is wrong.
+    Legendre polynomials are orthogonal over the box of (column, row, depth), so the field's mean
+    square is the sum of the squared coefficients, by which the field is scaled. Constant and tilted
+    fields are left out: they only move the camera's frame, which is not observable.
     """
 
     def __init__(
         self, scanner: ScannerModel, pixels: Pixels, rms: float, rng: np.random.Generator
     ) -> None:
-        """Draw a field whose depth error has this root mean square over the volume [m]."""
+        """Draw a random field whose depth error has the given rms over the volume [m]."""
         rows, columns = pixels.shape
         self._middle = (scanner.near + scanner.far) / 2
         self._half = (scanner.far - scanner.near) / 2
@@ -250,7 +250,7 @@ class Distortion:
             self._terms.append((direction + shift).astype(np.float32))
 
     def depth_error(self, depth: Image, rows: slice = slice(None)) -> Image:
-        """Return the (R, W) error of the depths of some rows [m]."""
+        """Return the depth error (R, W) in a slice of rows [m]."""
         w = (depth - np.float32(self._middle)) / np.float32(self._half)
         first, second, third, fourth = (term[rows] for term in self._terms[: DEGREE + 1])
         # Legendre's P2 and P3 by Horner's rule.
@@ -258,7 +258,7 @@ class Distortion:
         return np.asarray(first + w * (second + cubic) + third * (np.float32(1.5) * w * w - 0.5))
 
     def points(self, depth: Image) -> Image:
-        """Return the (H, W, 3) points the scanner reports for depths, error of direction only."""
+        """Return the reported points (H, W, 3) for depths (H, W), with lateral errors only."""
         out = np.empty((*depth.shape, 3), dtype=np.float32)
         for rows in bands(depth.shape):
             np.multiply(self._terms[-2][rows], depth[rows], out=out[rows, :, 0])
@@ -268,7 +268,7 @@ class Distortion:
 
 
 def _drawn(rms: float, rng: np.random.Generator, depth: bool) -> Floats:
-    """Return Legendre coefficients (row, column, depth) of a field with this rms."""
+    """Return random Legendre coefficients (row, column, depth) of a field with the given rms."""
     size = DEGREE + 1
     out = np.zeros((size, size, size))
     for i, j, k in product(range(size), repeat=3):
@@ -286,14 +286,14 @@ def _drawn(rms: float, rng: np.random.Generator, depth: bool) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """What the camera and the projector see in some rows, before any error.
+    """What camera and projector see in a slice of R rows, before errors.
 
     Attributes:
         depth: (R, W) z of the first surface [m].
-        cosine: (R, W) of the incidence of the camera's ray.
-        strength: (R, W) share of the light that returns, see ``FAINTEST``.
-        dazzled: (R, W) probability that a highlight spoils it.
-        grain: (R, W) what the surface makes of the noise, see ``Material``.
+        cosine: (R, W) cosine of the camera ray's incidence.
+        strength: (R, W) returned share of the light; see ``FAINTEST``.
+        dazzled: (R, W) probability that a highlight saturates the pixel.
+        grain: (R, W) noise factor of the surface; see ``Material``.
     """
 
     depth: Image
@@ -304,7 +304,7 @@ class _View:
 
 
 class DepthCamera:
-    """What all simulated scanners share: pixels, noise, and the unit's own distortion."""
+    """Common part of the simulated scanners: pixels, noise, and the unit's distortion."""
 
     def __init__(
         self, scanner: ScannerModel, resolution: float, noise: float, rng: np.random.Generator
@@ -315,7 +315,7 @@ class DepthCamera:
             scanner: The scanner's model.
             resolution: Scale of the image's columns and rows.
             noise: Scale of the temporal noise and of the distortion; 0 gives exact depths.
-            rng: Draws the distortion.
+            rng: Random generator of the distortion.
         """
         self.scanner = scanner
         self.pixels = pixels_of(scanner, resolution)
@@ -327,10 +327,10 @@ class DepthCamera:
 
 
 class StructuredLight(DepthCamera):
-    """One scanner with a projector.
+    """A structured-light scanner: a camera with a projector beside it.
 
-    The depth noise grows with the square of the depth and with one over the cosine of incidence,
-    as the deviations from the plane in published scans do, and neighbouring pixels share it.
+    The depth noise is proportional to depth squared over the cosine of incidence, like the
+    deviations from planes in published scans, and is correlated between neighbouring pixels.
     """
 
     def __init__(
@@ -346,11 +346,11 @@ class StructuredLight(DepthCamera):
         self._inverse_length: Image = 1 / self._length
 
     def scan(self, scene: RaycastScene, rng: np.random.Generator) -> Image:
-        """Return the organised scan, (H, W, 3) in ``camera`` [m], NaN where nothing was measured.
+        """Return the organised scan (H, W, 3) in ``camera`` [m]; missing points are NaN.
 
         Args:
-            scene: Objects before the scanner, in ``camera``.
-            rng: Draws this scan's noise.
+            scene: Bodies in ``camera``.
+            rng: Random generator of this scan's noise.
         """
         hits = scene.look(self.pixels)
         np.minimum(hits.depth, np.float32(2 * self.scanner.far), out=hits.depth)
@@ -374,7 +374,7 @@ class StructuredLight(DepthCamera):
         return self._distortion.points(depth)
 
     def _illuminated(self, scene: RaycastScene, depth: Image) -> Mask:
-        """Return which points (H, W) are in range and see the projector's light."""
+        """Return the mask (H, W) of points in range and lit by the projector."""
         seen = np.empty(depth.shape, dtype=bool)
         for rows in bands(depth.shape):
             near, far = self.scanner.near, self.scanner.far
@@ -383,7 +383,7 @@ class StructuredLight(DepthCamera):
         return np.asarray(seen & ~scene.hidden(self.projector, self.pixels, depth, seen))
 
     def _beams(self, depth: Image, rows: slice) -> tuple[Image, Image, Image]:
-        """Return x, y and z (R, W) of the beams from the projector to the points of some rows."""
+        """Return x, y and z (R, W) of the projector's beams to the points in a slice of rows."""
         x, y, z = self.projector.astype(np.float32)
         pixels, depth = self.pixels, depth[rows]
         return pixels.x * depth - x, pixels.y[rows, None] * depth - y, depth - z
@@ -399,12 +399,12 @@ class StructuredLight(DepthCamera):
         return np.asarray((np.abs(aside) <= half_x * ahead) & (np.abs(y) <= half_y * ahead))
 
     def _view(self, scene: RaycastScene, hits: Hits, to_light: Image, rows: slice) -> _View:
-        """Return what is seen in some rows.
+        """Return what is seen in a slice of rows.
 
         Args:
-            scene: Objects before the scanner.
+            scene: Bodies in ``camera``.
             hits: Hits of the camera's rays on the scene.
-            to_light: (H, W) product of the surface's normal and the projector's position.
+            to_light: (H, W) dot product of the surface's normal and the projector's position.
             rows: Rows of the image.
         """
         depth, slant, body = hits.depth[rows], hits.slant[rows], hits.body[rows]
@@ -431,7 +431,7 @@ class StructuredLight(DepthCamera):
     def _decode(
         self, view: _View, distance: Image, grains: tuple[Image, Image], measured: Mask
     ) -> None:
-        """Forget, in place, the points that the scanner does not measure after all."""
+        """Clear the mask, in place, of the points that the scanner fails to measure."""
         # Turned images of the grain are as good as new ones, and cost nothing.
         patchy, ragged = grains
         # No scanner decodes its pattern beyond
@@ -457,10 +457,10 @@ class StructuredLight(DepthCamera):
 
 
 def _highlight(cosines: Image, between: Image) -> Image:
-    """Return the strength of a highlight: one where the surface mirrors the beam to the camera.
+    """Return the strength of a highlight: one where the surface mirrors the beam into the camera.
 
     Args:
-        cosines: (N,) sum of the cosines between the normal and the camera's ray and the beam.
+        cosines: (N,) sum of the cosines of normal and camera ray, and of normal and beam.
         between: (N,) cosine between the ray and the beam.
     """
     # The halfway vector is the sum of two unit vectors, of length sqrt(2 + 2 cos).
@@ -470,14 +470,14 @@ def _highlight(cosines: Image, between: Image) -> Image:
 
 
 class TimeOfFlight(DepthCamera):
-    """One camera that measures how long light takes."""
+    """A time-of-flight camera."""
 
     def scan(self, scene: RaycastScene, rng: np.random.Generator) -> Image:
-        """Return the organised scan, (H, W, 3) in ``camera`` [m], NaN where nothing was measured.
+        """Return the organised scan (H, W, 3) in ``camera`` [m]; missing points are NaN.
 
         Args:
-            scene: Objects before the camera, in ``camera``.
-            rng: Draws this scan's noise.
+            scene: Bodies in ``camera``.
+            rng: Random generator of this scan's noise.
         """
         hits = scene.look(self.pixels)
         depth = np.minimum(hits.depth, np.float32(2 * self.scanner.far))
@@ -512,7 +512,7 @@ class TimeOfFlight(DepthCamera):
     def _error(
         self, scene: RaycastScene, hits: Hits, depth: Image, strength: Image, distance: Image
     ) -> Image:
-        """Return what every scan of the same scene is wrong by, along the ray (H, W) [m]."""
+        """Return the error along the ray (H, W) [m] that all scans of a scene share."""
         swing = np.float32(self.noise * self.scanner.calibration_error * np.sqrt(2) / 3)
         # Period of the systematic error in distance [m]: half the wavelength of light modulated at
         # 400 MHz, an overtone of the highest of the frequencies such cameras measure at
@@ -526,7 +526,7 @@ class TimeOfFlight(DepthCamera):
         return np.asarray(wiggle + multipath + self._distortion.depth_error(depth))
 
     def _sigma(self, scene: RaycastScene, hits: Hits, depth: Image, strength: Image) -> Image:
-        """Return the standard deviation along the ray (H, W) [m]."""
+        """Return the standard deviation of the random error along the ray (H, W) [m]."""
         sigma = np.float32(self.noise * self.scanner.temporal_noise)
         # Share of the noise that does not depend on the distance; the rest grows with its
         # square
@@ -538,9 +538,10 @@ class TimeOfFlight(DepthCamera):
 
 
 def _mixed(depth: Image, strength: Image) -> Image:
-    """Return the depths pixels report that see a spot: the mean, weighted by the light.
+    """Return the depths of pixels that see a finite spot: the mean weighted by the light.
 
-    For differences well below the wavelength the sum of the phasors has that phase.
+    For depth differences well below the modulation wavelength this is the phase of the sum of the
+    returned phasors.
     """
     import cv2
 
@@ -570,7 +571,7 @@ class CameraPose(PlaceParams):
 
     @property
     def base_T_camera(self) -> Floats:
-        """(4, 4), translation in [m]; the page draws the scanner there."""
+        """Pose (4, 4) of the scanner in ``base`` [m]; the user interface draws it there."""
         return self.matrix
 
 
@@ -586,13 +587,13 @@ class ScannerQuality(Params):
 def scanner_of(
     scanner: ScannerModel, resolution: float, noise: float, rng: np.random.Generator
 ) -> StructuredLight | TimeOfFlight:
-    """Return the scanner, with the distortion that ``rng`` draws for it."""
+    """Return the simulated scanner of a model, with a random distortion."""
     kind = StructuredLight if scanner.principle == "structured light" else TimeOfFlight
     return kind(scanner, resolution, noise, rng)
 
 
 def before_camera(bodies: Sequence[SolidBody], base_T_camera: Floats) -> RaycastScene:
-    """Return bodies given in ``base`` in the camera's frame."""
+    """Return the scene of bodies given in ``base``, moved to ``camera``."""
     from flangeye_emulators.world.raycast import RaycastScene
 
     camera_T_base = Transform(BASE, CAMERA, base_T_camera).inverse().matrix

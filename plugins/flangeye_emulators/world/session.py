@@ -1,8 +1,8 @@
-"""A simulated session of any configuration: where the arms go, and where everything with_noise is.
+"""Poses of a simulated session in any configuration: reported, true and in view.
 
-The loop is closed at a first pose: with camera and target where the recipe puts them, the place
-that is left over follows. Around it joints are drawn at random, and those kept at which the camera
-sees the target. Arrays only.
+The kinematic loop is closed at a first pose: given the poses of camera and target in the recipe,
+the remaining transform follows. Further joint angles are drawn around it at random, and those are
+kept at which the camera sees the target.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ class CameraView:
     """The camera's field of view.
 
     Attributes:
-        distance: To the target at the first pose [m].
-        near: Least distance [m].
+        distance: Distance to the target at the first pose [m].
+        near: Smallest distance [m].
         far: Largest distance [m].
         field: Full angles of view, horizontal and vertical [rad].
         facing: Largest angle between the target's z and the line to the camera [rad].
-        draws: Joint vectors to try.
+        draws: Number of random joint vectors to try.
     """
 
     distance: float
@@ -44,11 +44,11 @@ class CameraView:
     draws: int = DRAWS
 
     def first(self) -> Floats:
-        """Return (4, 4) camera_T_target at the first pose: ahead, and facing the camera."""
+        """Return ``camera_T_target`` (4, 4) at the first pose: straight ahead of the camera."""
         return rigid(rotation_from_rpy(np.pi, 0.0, 0.0), np.array([0.0, 0.0, self.distance]))
 
     def sees(self, poses: Floats) -> NDArray[np.bool_]:
-        """Return which of (N, 4, 4) camera_T_target are in view."""
+        """Return the mask (N,) of poses ``camera_T_target`` (N, 4, 4) in view."""
         x, y, z = poses[:, :3, 3].T
         # Share of the field of view, to either side, in which the target's centre stays
         half = np.tan(np.asarray(self.field) / 2) * 0.75
@@ -61,7 +61,7 @@ class CameraView:
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """True places X, Y and Z of the loop, each (4, 4)."""
+    """True transforms X, Y and Z of the kinematic loop, each (4, 4)."""
 
     x: Floats
     y: Floats
@@ -70,14 +70,14 @@ class Places:
 
 @dataclass(frozen=True, eq=False)
 class ArmPoses:
-    """N poses of the arms.
+    """Poses of the arms at N moments.
 
     Attributes:
-        joints: (N, n) of the first arm [rad]; None where it is not an arm of the catalogue.
-        second: (N, m) of the second arm [rad]; None where there is none.
-        camera: (N, 4, 4) where the camera is carried, in ``base``.
-        flange: (N, 4, 4) base_T_flange.
-        target: (N, 4, 4) where the target is carried, in its arm's base.
+        joints: (N, n) joint angles of the first arm [rad]; None for an arm without a model.
+        second: (N, m) joint angles of the second arm [rad]; None without one.
+        camera: (N, 4, 4) poses in ``base`` of the frame that carries the camera.
+        flange: (N, 4, 4) ``base_T_flange``.
+        target: (N, 4, 4) poses of the frame that carries the target, in its arm's base.
     """
 
     joints: Floats | None
@@ -87,7 +87,7 @@ class ArmPoses:
     target: Floats
 
     def where(self, chosen: NDArray[np.intp]) -> ArmPoses:
-        """Return some of the poses."""
+        """Return the chosen poses only."""
         joints = None if self.joints is None else self.joints[chosen]
         second = None if self.second is None else self.second[chosen]
         carried = (self.camera[chosen], self.flange[chosen], self.target[chosen])
@@ -99,12 +99,13 @@ class Cast:
     """Arms and limits of a simulated session.
 
     Attributes:
-        configuration: Who carries what.
+        configuration: What carries camera and target.
         first: The first arm.
-        second: The second one, where there is one.
-        four_axes: Whether the first arm's flange only moves and turns about the base's z.
-        in_turns: Whether of two arms one rests at its first pose while the other moves.
-        draws: Joint vectors to try.
+        second: The second arm; None without one.
+        four_axes: Whether the first arm's flange only translates and rotates about the base's z.
+        in_turns: Whether only one of two arms moves at a time, while the other rests at its first
+            pose.
+        draws: Number of random joint vectors to try.
     """
 
     configuration: Configuration
@@ -118,13 +119,13 @@ class Cast:
 def draw_arm_poses(
     cast: Cast, home: tuple[Floats, Floats], spread: float, rng: np.random.Generator
 ) -> ArmPoses:
-    """Return the first pose and random ones around it, in view or not.
+    """Return the first pose and random ones around it, whether in view or not.
 
     Args:
-        cast: The arms.
-        home: Joints of the first and the second arm at the first pose [rad].
+        cast: Arms and limits.
+        home: Joint angles of the first and the second arm at the first pose [rad].
         spread: Largest change of any joint [rad].
-        rng: Draws the joints.
+        rng: Random generator of the joint angles.
     """
     joints = _around(home[0], spread, cast.draws, rng)
     if cast.in_turns:
@@ -152,7 +153,7 @@ def _around(home: Floats, spread: float, draws: int, rng: np.random.Generator) -
 
 
 def _of_four_axes(first: Floats, spread: float, draws: int, rng: np.random.Generator) -> Floats:
-    """Return poses of an arm whose flange moves in space and turns about the vertical."""
+    """Return poses of an arm whose flange translates and rotates about the vertical only."""
     turns = rotation_exp(np.outer(rng.uniform(-spread, spread, draws), [0.0, 0.0, 1.0]))
     out = np.tile(first, (draws, 1, 1))
     out[1:, :3, :3] = turns[1:] @ first[:3, :3]
@@ -167,14 +168,14 @@ def close_loop(
     camera: Floats | None,
     place: Floats,
 ) -> Places:
-    """Return where everything is, such that the camera sees the target at the first pose.
+    """Return the loop's transforms such that the camera sees the target at the first pose.
 
     Args:
-        poses: The arms' poses, the first of which counts.
-        view: How the camera sees the target there.
-        configuration: Says what there is to close the loop with.
-        camera: (4, 4) of the camera in what carries it; None for wherever it has to be.
-        place: (4, 4) of the target in what carries it, unless that closes the loop.
+        poses: The arms' poses; only the first one is used.
+        view: The camera's field of view.
+        configuration: Determines which transform closes the loop.
+        camera: (4, 4) pose of the camera in its carrier; None to compute it.
+        place: (4, 4) pose of the target in its carrier, unless that closes the loop.
     """
     a, b, seen = poses.camera[0], poses.target[0], view.first()
     identity = np.eye(4)
@@ -186,10 +187,10 @@ def close_loop(
 
 
 def home_of(arm: Arm, base_T_flange: Floats) -> Floats:
-    """Return joints (n,) that reach a pose.
+    """Return joint angles (n,) that reach a pose [rad].
 
     Raises:
-        StageError: There are none.
+        StageError: The pose is out of reach.
     """
     found = arm.inverse(base_T_flange)
     if not len(found):
@@ -201,7 +202,7 @@ def home_of(arm: Arm, base_T_flange: Floats) -> Floats:
 
 
 def seen_from(poses: ArmPoses, places: Places) -> Floats:
-    """Return (N, 4, 4) camera_T_target."""
+    """Return ``camera_T_target`` at all poses (N, 4, 4)."""
     world = places.y @ poses.target @ places.z
     return np.asarray(invert(poses.camera @ places.x) @ world)
 
@@ -210,7 +211,7 @@ def visible(poses: ArmPoses, places: Places, view: CameraView, count: int) -> Ar
     """Return at least ``count`` poses at which the camera sees the target.
 
     Raises:
-        StageError: There are too few.
+        StageError: There are too few such poses.
     """
     found = np.flatnonzero(view.sees(seen_from(poses, places)))
     if len(found) < count:
@@ -222,7 +223,7 @@ def visible(poses: ArmPoses, places: Places, view: CameraView, count: int) -> Ar
 
 
 def disturbed(poses: Floats, noise: tuple[float, float], rng: np.random.Generator) -> Floats:
-    """Return (N, 4, 4) poses moved in their own frames by noise [rad, m]."""
+    """Return poses (N, 4, 4) disturbed in their own frames by noise [rad, m]."""
     out = poses.copy()
     turns, shifts = rng.standard_normal((2, len(poses), 3))
     out[:, :3, :3] = poses[:, :3, :3] @ rotation_exp(noise[0] * turns)
@@ -233,15 +234,15 @@ def disturbed(poses: Floats, noise: tuple[float, float], rng: np.random.Generato
 def as_built(
     reported: ArmPoses, configuration: Configuration, arms: tuple[ImperfectArm, ImperfectArm | None]
 ) -> ArmPoses:
-    """Return where imperfect arms are when they report ``reported``.
+    """Return the true poses of imperfect arms that report ``reported``.
 
     Args:
-        reported: As reported, in the order of their visit.
+        reported: Reported poses in the order of their visit.
         configuration: Who carries what.
-        arms: The first, and the second where there is one.
+        arms: The first arm, and the second one if there is one.
 
     Raises:
-        StageError: The poses are none of an arm of the catalogue.
+        StageError: The arm has no model in the catalogue.
     """
     if reported.joints is None:
         raise StageError("an arm of four axes has no joints to be wrong; leave 'arm' out")
@@ -263,7 +264,10 @@ def with_noise(
     noise: tuple[float, float],
     rng: np.random.Generator,
 ) -> ArmPoses:
-    """Return where the arms are when they report ``reported``; bases do not move."""
+    """Return the true poses of arms that report ``reported``, with random noise.
+
+    Frames fixed to a base have no noise.
+    """
     carried = ((configuration.camera, reported.camera), (configuration.target, reported.target))
     camera, target = (m if frame == BASE else disturbed(m, noise, rng) for frame, m in carried)
     flange = camera if configuration.camera == FLANGE else reported.flange

@@ -1,4 +1,4 @@
-"""The control box: power, safety, the program it runs, and the arm, advanced cycle by cycle."""
+"""The control box: power, safety, the running program and the arm, advanced cycle by cycle."""
 
 from __future__ import annotations
 
@@ -21,27 +21,27 @@ UR10e 120 and 180 deg/s; the CB3 arms alike)."""
 
 
 class RefusedError(Exception):
-    """The controller refuses a command; the text is the dashboard's."""
+    """The controller refuses a command; the message is the dashboard's answer."""
 
 
 class URController(ControlUnit):
-    """A control box with its arm.
+    """An emulated control box with its arm.
 
     Attributes:
         robot: Model of the arm.
-        box: Which generation of control box.
+        box: Generation of the control box.
         registers: The general-purpose registers.
-        robot_mode: Power and brakes.
-        safety: Which stop is in force.
-        runtime: Whether a program runs.
-        remote_control: Whether programs may come through the network.
-        digital_outputs: Bits: standard 0-7, configurable 8-15, tool 16-17.
-        wired: Whether standard inputs are as the outputs of their numbers: what an output starts
-            says through an input that it runs.
+        robot_mode: State of power and brakes.
+        safety: Active safety stop, if any.
+        runtime: State of the program.
+        remote_control: Whether programs are accepted from the network.
+        digital_outputs: Bit mask of outputs: standard 0-7, configurable 8-15, tool 16-17.
+        wired: Whether each standard input follows the output of the same number, like the feedback
+            of a device that the output switches.
     """
 
     def __init__(self, robot: RobotModel, joints: Floats, zeros: Floats) -> None:
-        """Switch on, with the arm standing at ``joints`` (6,) [rad]."""
+        """Start powered on, with the arm at rest at ``joints`` (6,) [rad]."""
         self.robot, self.box = robot, control_box_of(robot)
         arm = SimulatedArm(robot, joint_speeds_of(robot), self.box.cycle, joints, zeros)
         # A protective stop cannot be unlocked earlier [s]: the dashboard server's manual
@@ -59,7 +59,7 @@ class URController(ControlUnit):
 
     @property
     def program_time(self) -> float:
-        """How long the present program has been running [s]."""
+        """Running time of the present program [s]."""
         if self._program is None:
             return 0.0
         return (self._cycles - self._program_began) * self.box.cycle
@@ -85,22 +85,22 @@ class URController(ControlUnit):
             self.stop_program(f"watchdog: input_int_register_{register} was not renewed")
 
     def set_watchdog(self, register: int, frequency: float) -> None:
-        """Stop the program when an integer input is renewed more slowly than [Hz]; 0 for never."""
+        """Stop the program if a register is renewed less often than this [Hz]; 0 disables it."""
         self._watchdog = (register, 1.0 / frequency) if frequency > 0 else None
         self._input_times[register] = self.time
 
     def set_input_int(self, register: int, value: int) -> None:
-        """Write an integer input register, as a client does."""
+        """Write an integer input register on behalf of a client."""
         self.registers.input_int[register] = value
         self._input_times[register] = self.time
 
     # Programs
 
     def load(self, program: Callable[[], bool], name: str) -> None:
-        """Run a program in place of the present one.
+        """Replace the present program.
 
         Raises:
-            RefusedError: There is no power, a stop is in force, or the control is local.
+            RefusedError: The power is off, a stop is active, or the control is local.
         """
         self._require_ready()
         self.note(f"program {name}")
@@ -109,7 +109,7 @@ class URController(ControlUnit):
         self.runtime, self.arm.held = Runtime.PLAYING, False
 
     def stop_program(self, why: str) -> None:
-        """End the program; an arm that moves brakes."""
+        """End the program and brake the arm."""
         if self._program is not None:
             self.note(f"program stopped: {why}")
         self._program, self._watchdog = None, None
@@ -127,7 +127,7 @@ class URController(ControlUnit):
     # Safety and power
 
     def protective_stop(self, why: str) -> None:
-        """Stop the arm on its path, or by brakes if it leaves it, and pause the program."""
+        """Stop the arm on its path, or by its brakes off it, and pause the program."""
         if self.safety is not SafetyMode.NORMAL:
             return
         self.note(f"protective stop: {why}")
@@ -140,7 +140,7 @@ class URController(ControlUnit):
         """Release a protective stop; the program stays paused.
 
         Raises:
-            RefusedError: It is too early.
+            RefusedError: The stop was too recent to be unlocked.
         """
         if self.safety is not SafetyMode.PROTECTIVE_STOP:
             return
@@ -154,41 +154,41 @@ class URController(ControlUnit):
         self.note("protective stop unlocked")
 
     def emergency_stop(self, why: str) -> None:
-        """Cut the power; the program ends."""
+        """Switch the power off and end the program."""
         self.note(f"emergency stop: {why}")
         self.safety = SafetyMode.ROBOT_EMERGENCY_STOP
         self.power_off()
 
     def release_emergency_stop(self) -> None:
-        """Pull the button out again; the power stays off."""
+        """Release the emergency-stop button; the power stays off."""
         if self.safety is SafetyMode.ROBOT_EMERGENCY_STOP:
             self.safety = SafetyMode.NORMAL
 
     def power_off(self) -> None:
-        """End the program and cut the power."""
+        """End the program and switch the power off."""
         self.stop_program("power off")
         self.robot_mode = RobotMode.POWER_OFF
 
     def power_on(self) -> None:
-        """Power on; the brakes stay on."""
+        """Switch the power on; the brakes stay on."""
         if self.safety is SafetyMode.NORMAL and self.robot_mode is RobotMode.POWER_OFF:
             self.robot_mode = RobotMode.IDLE
 
     def release_brakes(self) -> None:
-        """Be ready to move."""
+        """Release the brakes; the arm is ready to move."""
         if self.safety is SafetyMode.NORMAL:
             self.robot_mode = RobotMode.RUNNING
             self.arm.held = self.runtime is Runtime.PAUSED
 
     def reset(self, joints: Floats) -> None:
-        """Be as after switching on: no program, no stop, power, remote control."""
+        """Return to the initial state: no program, no stop, power on, remote control."""
         self.safety, self.robot_mode = SafetyMode.NORMAL, RobotMode.RUNNING
         self.remote_control = True
         self.stop_program("reset")
         self.arm.put(joints)
 
     def modes(self) -> Mapping[str, Any]:
-        """Return its modes by name, for the control channel."""
+        """Return the controller's modes by name, for the control channel."""
         return {
             "robot_mode": self.robot_mode.name,
             "safety": self.safety.name,
@@ -198,7 +198,7 @@ class URController(ControlUnit):
         }
 
     def tcp_pose(self) -> Floats:
-        """Return the tool's pose (6,) in base, as the pendant shows it."""
+        """Return the tool's pose (6,) in base, as shown on the teach pendant."""
         if self._posed is not self.arm.stance:
             self._posed, self._pose = self.arm.stance, pose_vector(self.arm.stance.base_T_tcp)
         return self._pose
@@ -209,7 +209,7 @@ class ControlBox:
     """A generation of control boxes.
 
     Attributes:
-        version: Software version it reports: major, minor, bugfix, build.
+        version: Reported software version: major, minor, bugfix, build.
         rate: Control cycles and data packages per second [Hz].
     """
 
@@ -223,14 +223,14 @@ class ControlBox:
 
 
 def control_box_of(robot: RobotModel) -> ControlBox:
-    """Return the control box of an arm: e-Series where the model's name ends in ``e``."""
+    """Return the control box of an arm: e-Series if the model's name ends in ``e``."""
     if robot.model.endswith("e"):
         return ControlBox((5, 21, 3, 1), 500)
     return ControlBox((3, 15, 8, 1), 125)
 
 
 def joint_speeds_of(robot: RobotModel) -> NDArray[np.float64]:
-    """Return the (6,) largest joint speeds [rad/s]; those of a UR5 for an arm with another name."""
+    """Return the largest joint speeds (6,) [rad/s]; an unknown arm has those of a UR5."""
     return np.radians(SPEEDS.get(robot.model.rstrip("e"), SPEEDS["ur5"]))
 
 

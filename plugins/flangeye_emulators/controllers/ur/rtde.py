@@ -1,7 +1,7 @@
-"""RTDE, version 2: packages of a length, a letter and a body, all big-endian.
+"""RTDE protocol, version 2: big-endian packages of a length, a type letter and a body.
 
-One client negotiates, says which variables it wants (one output recipe) and which it will send
-(input recipes, numbered from 1), starts the stream, and then data packages go both ways.
+A client negotiates the version and sets up the variables to receive (one output recipe) and to send
+(input recipes, numbered from 1). It then starts the stream, and data packages go both ways.
 """
 
 from __future__ import annotations
@@ -58,14 +58,14 @@ DIGITAL_SHIFTS = {
 
 
 class Output(NamedTuple):
-    """A variable a client may read: its type and its values."""
+    """A variable that a client may read: its type and a function that returns its values."""
 
     type: str
     values: Callable[[URController], Values]
 
 
 def _raw_wrench(box: URController) -> Values:
-    """Wrench at the flange in the flange's axes, nothing subtracted."""
+    """Return the contact wrench at the flange in flange axes, without tare."""
     tool, base_T_tcp = box.arm.chain.flange_T_tcp, box.arm.stance.base_T_tcp
     fx, fy, fz = tool[:3, :3] @ base_T_tcp[:3, :3].T @ box.arm.felt[:3]
     x, y, z = tool[:3, 3]
@@ -73,7 +73,7 @@ def _raw_wrench(box: URController) -> Values:
 
 
 def _robot_status(box: URController) -> Values:
-    """Bit 0: power on, bit 1: program running."""
+    """Return the robot status bits: 0 power on, 1 program running."""
     powered = box.robot_mode is not RobotMode.POWER_OFF
     return (powered | (box.runtime is Runtime.PLAYING) << 1,)
 
@@ -150,7 +150,7 @@ for _name in ("q", "qd", "TCP_pose", "TCP_speed"):
 
 
 def write_inputs(box: URController, values: dict[str, float]) -> None:
-    """Do what one input package says: registers and digital outputs; no more is imitated."""
+    """Apply one input package: registers and digital outputs; no other inputs are emulated."""
     for name, value in values.items():
         group, _, number = name.rpartition("_")
         if group == "input_int_register":
@@ -169,7 +169,7 @@ _HEADER = struct.Struct(">HB")
 
 
 class RtdePort:
-    """The RTDE port of a controller: its sessions, and which session writes which input."""
+    """The RTDE port of a controller, with its sessions and their claimed inputs."""
 
     def __init__(self, network: Network, box: URController) -> None:
         self._network = network
@@ -178,12 +178,12 @@ class RtdePort:
         network.offer(PORT, lambda: RtdeSession(network, self))
 
     def publish(self, cycle: int) -> None:
-        """Send every session the package of this control cycle."""
+        """Send this control cycle's data package to every session."""
         for session in self.sessions:
             session.publish(cycle)
 
     def claim(self, names: list[str], session: RtdeSession) -> list[str]:
-        """Claim inputs for a session; return those that another session has claimed."""
+        """Claim inputs for a session; return those already claimed by another session."""
         taken = [
             name
             for name in names
@@ -198,7 +198,7 @@ class RtdeSession(Connection):
     """One client.
 
     Attributes:
-        inputs: Names of the variables it writes.
+        inputs: Names of the variables that the client writes.
     """
 
     def __init__(self, network: Network, port: RtdePort) -> None:
@@ -212,7 +212,7 @@ class RtdeSession(Connection):
         self._started = False
 
     def opened(self) -> None:
-        """Join the port."""
+        """Register the session at the port."""
         self._port.sessions.add(self)
 
     def closed(self) -> None:
@@ -221,7 +221,7 @@ class RtdeSession(Connection):
         self._port.sessions.discard(self)
 
     def received(self, data: bytes) -> None:
-        """Act on each whole package."""
+        """Handle each complete package."""
         self._buffer += data
         while len(self._buffer) >= _HEADER.size:
             size, kind = _HEADER.unpack_from(self._buffer)
@@ -236,7 +236,7 @@ class RtdeSession(Connection):
                 act(self, body)
 
     def publish(self, cycle: int) -> None:
-        """Send a data package, when the stream runs and it is time."""
+        """Send a data package if the stream runs and one is due."""
         if self._started and self._output is not None and cycle % self._every == 0:
             self.stream(_package("U", self._output.pack(self._port.box)))
 
@@ -305,11 +305,11 @@ def _names(body: bytes) -> list[str]:
 
 
 class OutputRecipe:
-    """Variables that are sent to a client again and again.
+    """The variables that are sent to a client in each data package.
 
     Attributes:
-        types: Type of each variable; ``NOT_FOUND`` where there is none of that name.
-        valid: Whether all were found.
+        types: Type of each variable; ``NOT_FOUND`` for an unknown name.
+        valid: Whether all names are known.
     """
 
     def __init__(self, names: Sequence[str]) -> None:
@@ -329,16 +329,16 @@ class OutputRecipe:
 
 
 class InputRecipe:
-    """Variables that a client sends together.
+    """The variables that a client sends in one data package.
 
     Attributes:
         names: Names of the variables.
-        types: Type of each; ``NOT_FOUND`` where there is none of that name.
-        valid: Whether all were found.
+        types: Type of each variable; ``NOT_FOUND`` for an unknown name.
+        valid: Whether all names are known.
     """
 
     def __init__(self, names: Sequence[str]) -> None:
-        """Look the names up."""
+        """Look up the recipe's variables."""
         self.names = list(names)
         self.types = [INPUTS.get(name, "NOT_FOUND") for name in names]
         self.valid = "NOT_FOUND" not in self.types
@@ -352,9 +352,9 @@ class InputRecipe:
                 place += len(struct.unpack(f">{FORMATS[type_]}", bytes(_size(type_))))
 
     def apply(self, body: bytes, box: URController) -> None:
-        """Apply a package; a package that is too short is dropped.
+        """Apply a data package; one that is too short is dropped.
 
-        ur_rtde sends packages that are longer than their recipe; what is beyond is not read.
+        ur_rtde sends packages longer than their recipe; the excess is ignored.
         """
         if len(body) >= self._packing.size:
             values = self._packing.unpack_from(body)

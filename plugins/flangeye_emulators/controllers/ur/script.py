@@ -1,7 +1,7 @@
-"""ur_rtde's control script, done natively: it takes commands from the input registers.
+"""Native implementation of ur_rtde's control script, which reads commands from input registers.
 
-Commands are numbers of ur_rtde 1.6. Those that the project's driver gives are here; any other is
-noted, answered as done and has no effect.
+Command numbers are those of ur_rtde 1.6. Only the commands used by the project's driver are
+implemented. Any other is logged and answered as done, without effect.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from flangeye_emulators.controllers.ur.controller import RefusedError, URControl
 
 
 class ControlScript:
-    """The script, cycle by cycle."""
+    """The control script, run cycle by cycle."""
 
     # Values of the first register, which the client reads
     ready: ClassVar[int] = 1
@@ -36,7 +36,7 @@ class ControlScript:
         self._signal(self.ready)
 
     def cycle(self) -> bool:
-        """Do what the client asks for; return whether the script goes on."""
+        """Execute the client's command; return whether the script continues."""
         code = self._integer(0)
         if code == 255:  # stop script
             return False
@@ -58,7 +58,7 @@ class ControlScript:
         return True
 
     def _act(self, code: int) -> bool:
-        """Do one command; return whether it is done only when the arm rests."""
+        """Execute one command; return whether it completes only when the arm is at rest."""
         arm = self._box.arm
         if code in (1, 3):  # moveJ, moveL
             self._mover.halt()
@@ -83,7 +83,7 @@ class ControlScript:
         return False
 
     def _move(self, code: int, target: Floats, speed: float, acceleration: float) -> Travel:
-        """Return a move to joint angles, or straight to a pose, from where the arm stands."""
+        """Return a move from the present position, to joint angles or linearly to a pose."""
         stance = self._box.arm.stance
         if code == 3:
             return linear_move(stance.base_T_tcp, pose_matrix(target), speed, acceleration)
@@ -93,13 +93,13 @@ class ControlScript:
         return joint_move(stance.joints, target, min(speed, float(fastest)), acceleration)
 
     def _client_waits(self) -> bool:
-        """Return whether the client waits for the end; if not, its progress is shown."""
+        """Return whether the client waits for the end; otherwise progress is reported."""
         self._in_background = self._integer(1) == 1
         self._show_progress(0 if self._in_background else None)
         return not self._in_background
 
     def _integer(self, index: int) -> int:
-        """Return an integer argument; 0 is the command itself."""
+        """Return an integer argument; index 0 is the command itself."""
         return self._box.registers.input_int[self._offset + index]
 
     def _number(self, index: int) -> float:
@@ -114,9 +114,10 @@ class ControlScript:
         self._box.registers.output_int[self._offset] = state
 
     def _show_progress(self, value: int | None) -> None:
-        """Show how far an operation in the background is; None when there is none.
+        """Write the progress of a background operation to its register; None if there is none.
 
-        Bits 0-14 the progress, 15 whether one runs, 16-22 a count of writes, 24-30 of operations.
+        Bits 0-14 are the progress, bit 15 is set while one runs, bits 16-22 count writes, bits
+        24-30 count operations.
         """
         self._writes = (self._writes + 1) % 128
         if value == 0:
@@ -128,7 +129,7 @@ class ControlScript:
 
 
 class ScriptSource(NamedTuple):
-    """A whole program: its name, and its lines from ``def`` to ``end``."""
+    """A complete program: its name, and its text from ``def`` to ``end``."""
 
     name: str
     text: str
@@ -145,7 +146,7 @@ def take_program(text: str) -> tuple[ScriptSource | None, str]:
 
 
 def run_program(box: URController, source: ScriptSource) -> None:
-    """Run the control script; a controller that is not ready ignores it, as the robot does."""
+    """Start the control script; a controller that is not ready ignores it, like the robot."""
     if source.name != "rtde_control":
         box.note(f"program {source.name} is not simulated")
         return

@@ -1,4 +1,4 @@
-"""A controller of Universal Robots as a process, and its dashboard server."""
+"""An emulated controller of Universal Robots as a process, with its dashboard server."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class DashboardSession(LineConnection):
         self._box = box
 
     def opened(self) -> None:
-        """Greet."""
+        """Send the greeting."""
         self.say("Connected: Universal Robots Dashboard Server")
 
     def line(self, text: str) -> None:
@@ -89,11 +89,11 @@ ANSWERS: dict[str, Answer] = {
 
 
 class URFaultInjector(FaultInjector):
-    """Causes three more faults.
+    """Injects three faults specific to Universal Robots, besides the common ones.
 
-    * ``program-stop``: somebody stops the program at the pendant.
-    * ``remote-control-off``: somebody takes local control.
-    * ``inputs-low``: what the digital outputs started does not run any more.
+    * ``program-stop``: the program is stopped at the pendant.
+    * ``remote-control-off``: the controller is switched to local control.
+    * ``inputs-low``: the feedback inputs of devices switched by outputs go low.
     """
 
     def __init__(self, box: URController, network: Network) -> None:
@@ -104,7 +104,7 @@ class URFaultInjector(FaultInjector):
         self.kinds["inputs-low"] = Kind(lambda _: setattr(box, "wired", False))
 
     def clear(self) -> None:
-        """Clear every fault, return to remote control and connect the inputs again."""
+        """Clear every fault, return to remote control and reconnect the inputs."""
         super().clear()
         self._box.remote_control = self._box.wired = True
 
@@ -113,7 +113,7 @@ class URFaultInjector(FaultInjector):
 
 
 class ScriptSession(Connection):
-    """One client; every whole program it sends takes the place of the one that runs."""
+    """One client; each complete program that it sends replaces the running one."""
 
     def __init__(self, network: Network, box: URController) -> None:
         super().__init__(network)
@@ -121,7 +121,7 @@ class ScriptSession(Connection):
         self._buffer = ""
 
     def received(self, data: bytes) -> None:
-        """Run each whole program."""
+        """Run each complete program."""
         self._buffer += data.decode("utf-8", "replace")
         source, self._buffer = take_program(self._buffer)
         while source is not None:
@@ -133,7 +133,7 @@ class ScriptSession(Connection):
 
 
 def serve(options: EmulatorOptions) -> None:
-    """Run a controller until the process is asked to end.
+    """Run a controller until the process is told to stop.
 
     Raises:
         StageError: A port is taken, or an option is wrong.
