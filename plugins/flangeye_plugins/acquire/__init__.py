@@ -1,1 +1,1 @@
-"""``acquire.*``: where scans and robot poses come from. Add a source: a new module here."""
+"""``acquire.*`` stages: sources of scans and robot poses, one module per source."""

@@ -1,4 +1,4 @@
-"""``acquire.archive``: recorded scans and robot poses, through a reader for their layout."""
+"""``acquire.archive``: recorded scans and robot poses, read by a reader for their layout."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ StatedUnit = Literal["auto", "m", "mm", "in"]
 
 
 class ArchiveParams(OpeningParams):
-    """Parameters: the archive, its unit, and how strictly it is checked."""
+    """Parameters of ``acquire.archive``: layout, unit, and checks."""
 
     unit: StatedUnit = Field(
         "auto",
@@ -88,9 +88,8 @@ def acquire_archive(
 ) -> Captures:
     """Replay recorded scans and robot poses: a folder in a known layout, or a run.mcap.
 
-    Everything but the inside of the clouds is checked before the first capture is given; the
-    clouds are read one at a time as they are asked for, verification first. Those of a cell are
-    read by ``reader: cell``.
+    Everything except the clouds' content is checked before the first capture. Clouds are read one
+    at a time on demand, those for verification first. Recordings of a cell need ``reader: cell``.
     """
     path = archive_path("acquire.archive", archive, params)
     if is_log(path):
@@ -115,7 +114,7 @@ def acquire_archive(
 
 
 def _usable(archive: Archive, unreadable: str) -> tuple[list[Recording], list[str]]:
-    """Return the recordings whose cloud can be read, verification first, and notes."""
+    """Return the recordings with a readable cloud, verification first, and notes."""
     with_cloud = [r for r in archive.recordings if r.cloud]
     if not any(r.role == "calibration" for r in with_cloud):
         centres = sum(r.centre_in_camera is not None for r in archive.recordings)
@@ -151,7 +150,7 @@ def _clouds(recordings: Iterable[Recording]) -> Iterator[tuple[Recording, Path]]
 def _unit(
     archive: Archive, usable: Sequence[Recording], params: ArchiveParams, scanner: ScannerData
 ) -> tuple[LengthUnit, list[str]]:
-    """Return the unit of the clouds and the notes on the first of them."""
+    """Return the unit of the clouds, and notes on the first cloud."""
     told: list[str] = []
     path, raw = _first_distance(archive.root, usable, params.viewpoint, told)
     unit: LengthUnit
@@ -169,7 +168,7 @@ def _unit(
 def _first_distance(
     root: Path, usable: Sequence[Recording], from_viewpoint: bool, told: list[str]
 ) -> tuple[Path, float]:
-    """Return the first cloud with a finite point, and its median distance in its own unit."""
+    """Return the first cloud with a finite point, and its median distance in the file's unit."""
     for _, path in _clouds(usable):
         told.clear()
         raw = median_distance(read_scan(path, "m", told.append, from_viewpoint))
@@ -185,7 +184,7 @@ def _captures(
     params: ArchiveParams,
     cell: Cell | None,
 ) -> Iterator[Capture]:
-    """Read one cloud at a time, and the image beside it."""
+    """Yield the captures, reading one cloud and its image at a time."""
     for recording, path in _clouds(usable):
         cloud = read_scan(path, unit, from_viewpoint=params.viewpoint)
         if params.stretch != (1.0, 1.0, 1.0):
@@ -207,7 +206,7 @@ def _captures(
 
 
 def _camera_note(usable: Iterable[Recording], camera: CameraParams | None) -> list[str]:
-    """Return a note on the images' camera, from the first image; none if the recipe states it."""
+    """Return a note on the camera implied by the first image; empty if the recipe states it."""
     first = next((r for r in usable if r.image), None)
     if camera is not None or first is None or first.image is None or first.cloud is None:
         return []
@@ -232,7 +231,7 @@ def _image(recording: Recording, cloud: PointCloud, camera: CameraParams | None)
 
 
 def _replay(path: Path, cell: Cell | None) -> Captures:
-    """Return the captures of a log of ours."""
+    """Return the captures of a flangeye log."""
     log = read_run(path)
     if not log.has_full_clouds:
         raise StageError(

@@ -19,7 +19,7 @@ Grey = NDArray[np.uint8]
 
 
 class CameraParams(Params):
-    """The calibration of the camera that took the images."""
+    """Intrinsic calibration of the camera that took the images."""
 
     focal_length: tuple[float, float] = Field(description="fx and fy of the camera's matrix [px].")
     principal_point: tuple[float, float] = Field(description="cx and cy [px].")
@@ -28,7 +28,7 @@ class CameraParams(Params):
     )
 
     def image(self, pixels: Grey) -> Image:
-        """Return the pixels with the camera that took them."""
+        """Return the pixels as an image with this camera."""
         matrix = pinhole(self.focal_length, self.principal_point)
         return Image(pixels, matrix, np.array(self.distortion))
 
@@ -40,16 +40,17 @@ def pinhole(focal: tuple[float, float], principal: tuple[float, float]) -> Float
 
 
 def image_of_cloud(pixels: Grey, cloud: PointCloud) -> Image | None:
-    """Return an image with the camera that the organised cloud under it implies.
+    """Return an image with the pinhole camera implied by its organised cloud.
 
-    Each point lies on its pixel's ray: u = fx x / z + cx, and v alike, are linear in the unknowns.
+    Each point lies on its pixel's ray: u = fx x / z + cx, and likewise v, are linear in the unknown
+    intrinsics.
 
     Args:
         pixels: (H, W) grey values.
-        cloud: Its points in ``camera``, in any unit.
+        cloud: Points of the pixels in ``camera``, in any unit.
 
     Returns:
-        None where the cloud is not organised as the image, or no pinhole camera fits it.
+        None if the cloud is not organised like the image, or no pinhole camera fits.
     """
     if cloud.xyz.shape[:-1] != pixels.shape:
         return None
@@ -64,7 +65,7 @@ def image_of_cloud(pixels: Grey, cloud: PointCloud) -> Image | None:
 
 
 def _line(rays: NDArray[np.float32], pixels: NDArray[np.intp]) -> tuple[tuple[float, float], float]:
-    """Return slope and offset of pixels over rays, and what remains, rms [px]."""
+    """Return slope and offset of pixels over rays, and the rms residual [px]."""
     if len(rays) < 3:
         return (1.0, 0.0), float("inf")
     rows = np.stack([rays.astype(np.float64), np.ones(len(rays))], axis=1)
@@ -77,7 +78,7 @@ def read_image(path: Path) -> Grey:
     """Return the grey values (H, W) of an image file.
 
     Raises:
-        StageError: It is missing or damaged.
+        StageError: The file is missing or damaged.
     """
     import cv2
 

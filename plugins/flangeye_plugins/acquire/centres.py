@@ -1,4 +1,4 @@
-"""Features that another program has detected: circle centres, or poses of markers."""
+"""``acquire.centres`` and ``acquire.samples``: features detected by another program."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from flangeye_plugins.acquire.opening import (
 
 
 class CentresParams(OpeningParams):
-    """Which archive, and how good its centres are."""
+    """Parameters of ``acquire.centres``."""
 
     centre_noise: Length = param(
         "0.3 mm",
@@ -52,12 +52,12 @@ def acquire_centres(
     flange: Flange | None = None,
     cell: Cell | None = None,
 ) -> Observations:
-    """Take ready-made circle centres and robot poses: an archive's, or those of a run.mcap.
+    """Take detected circle centres and robot poses from an archive or a run.mcap.
 
-    The centres go straight to the solver: no normals and no clouds come with them, so steps
-    that need those cannot follow. Centres of verification poses are kept from it. Where the
-    recipe's feature is the wrist's circle, its centres are taken to lie as far behind the flange
-    as the robot's file states. Those of a cell are read by ``reader: cell``.
+    The centres go directly to the solver. There are no normals and no clouds, so steps that need
+    them cannot follow. Centres of verification poses are not given to the solver. If the recipe's
+    feature is the wrist circle, its centre lies behind the flange by the distance in the robot's
+    file. Recordings of a cell need ``reader: cell``.
     """
     path = archive_path("acquire.centres", archive, params)
     if is_log(path):
@@ -118,7 +118,7 @@ def _circle(centre: Floats, noise: float, behind: float) -> CircleFeature:
 
 
 class SamplesParams(OpeningParams):
-    """Which archive, and how good its markers' poses are."""
+    """Parameters of ``acquire.samples``."""
 
     position_noise: Length = param(
         "0.5 mm", gt=0, description="Standard deviation of a marker's position along each axis."
@@ -132,10 +132,10 @@ class SamplesParams(OpeningParams):
 def acquire_samples(
     archive: ArchivePath, params: SamplesParams, cell: Cell | None = None
 ) -> Observations:
-    """Take ready-made poses of a marker with robot poses: samples of another calibration tool.
+    """Take measured poses of a marker with robot poses: samples of another calibration tool.
 
-    They go straight to the solver. Files of samples do not say how good they are: the recipe does.
-    Those of a cell are read by ``reader: cell``.
+    They go directly to the solver. Sample files contain no accuracy, so the recipe states it.
+    Samples of a cell need ``reader: cell``.
     """
     recorded = open_archive(archive_path("acquire.samples", archive, params), params)
     usable = [

@@ -1,4 +1,4 @@
-"""``acquire.images``: recorded images with robot poses; of a calibrated camera, or by a board."""
+"""``acquire.images``: recorded images with robot poses, of a camera known or to be calibrated."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ Grey = NDArray[np.uint8]
 
 
 class SeenBoardParams(Params):
-    """The board that calibrates the camera, with its fit step's parameters."""
+    """The board for calibrating the camera, with the parameters of its fit step."""
 
     kind: Kind = Field("charuco", description="charuco, checkerboard, or circles.")
     columns: int = Field(
@@ -76,7 +76,7 @@ class SeenBoardParams(Params):
 
     @property
     def board(self) -> Board:
-        """The print."""
+        """The printed board."""
         size = self.columns, self.rows, self.square
         return Board(self.kind, *size, self.marker, self.dictionary)
 
@@ -85,12 +85,12 @@ class CalibratedLens(NamedTuple):
     """A camera calibrated from views of a board.
 
     Attributes:
-        matrix: (3, 3) [px].
-        distortion: (4,) k1, k2, p1, p2.
-        covariance: (8, 8) of fx, fy, cx, cy [px] and of the coefficients.
+        matrix: (3, 3) camera matrix [px].
+        distortion: (4,) coefficients k1, k2, p1, p2.
+        covariance: (8, 8) covariance of fx, fy, cx, cy [px] and the coefficients.
         error: Root mean square of a corner's reprojection error [px].
-        views: How many were used.
-        left_out: Those that were not: no board in them, or beside the others.
+        views: Number of views used.
+        left_out: Images not used, because they show no board or are outliers.
     """
 
     matrix: Floats
@@ -102,11 +102,11 @@ class CalibratedLens(NamedTuple):
 
     @property
     def deviations(self) -> Floats:
-        """(8,) standard deviations."""
+        """Standard deviations (8,) of intrinsics and coefficients."""
         return np.sqrt(np.diag(self.covariance))
 
     def against(self, known: Floats) -> Warn | None:
-        """Return a warning where the views contradict a camera's matrix (3, 3) [px]."""
+        """Return a warning if the views contradict a given camera matrix (3, 3) [px]; else None."""
         stated, found = known[0, 0], self.matrix[0, 0]
         # By what share of itself a focal length may be off before a calibration is another camera's
         if abs(stated / found - 1) < max(0.02, 5 * self.deviations[0] / found):
@@ -119,7 +119,7 @@ class CalibratedLens(NamedTuple):
         )
 
     def note(self) -> str:
-        """Return the note about it: parameters, their standard deviations and the fit."""
+        """Return a note with the parameters, their standard deviations and the fit's error."""
         (fx, _, cx), (_, fy, cy), _ = self.matrix
         s = self.deviations
         # The views of an arm's calibration determine these coefficients and no others.
@@ -137,12 +137,12 @@ def lens_of(images: Mapping[str, Grey], board: Board, start: Image | None = None
     """Return the intrinsics of a camera from its images of a board, by least squares (Zhang 2000).
 
     Args:
-        images: (H, W) each, by name.
-        board: What they show.
-        start: A camera to begin with, refined; None for one that is not known at all.
+        images: Images (H, W) by name.
+        board: The board in the images.
+        start: Initial camera, which is refined; None if unknown.
 
     Raises:
-        StageError: Too few show the board, or they are too alike to estimate the intrinsics.
+        StageError: Too few images show the board, or its poses are too similar.
     """
     sizes = {pixels.shape[::-1] for pixels in images.values()}
     if len(sizes) > 1:
@@ -166,10 +166,10 @@ def lens_of(images: Mapping[str, Grey], board: Board, start: Image | None = None
 
 
 def _looked(images: Mapping[str, Grey], board: Board) -> dict[str, Corners | Rejected]:
-    """Return what is seen of a board in each image.
+    """Return the corners of the board in each image, or the reason why there are none.
 
     Raises:
-        StageError: The first to be looked at, spread over all, do not show it.
+        StageError: None of a first sample, spread over all images, shows the board.
     """
     views = {name: Image(pixels, np.eye(3)) for name, pixels in images.items()}
     if len(views) <= FIRST:
@@ -191,7 +191,7 @@ def _spread_over(names: Sequence[str]) -> list[str]:
 def _not_shown(
     board: Board, missed: Mapping[str, Rejected], count: int, first: Image
 ) -> StageError:
-    """Return the error that no image shows the board, with what the first of them shows."""
+    """Return the error that no image shows the board; it names a board seen in the first one."""
     name, found = next(iter(missed.items()))
     seen = board_seen(first.pixels)
     instead = f"it shows {seen.what}: write fit.{seen.fit}" if seen else found.reason
@@ -210,10 +210,10 @@ def _not_shown(
 def _require_shown(
     usable: Sequence[Recording], cameras: Mapping[str, Camera], board: Board
 ) -> None:
-    """Refuse images of which none shows the board that is fitted, before all are searched for it.
+    """Refuse images if none of a sample shows the board, before searching all of them.
 
     Raises:
-        StageError: None of those that are looked at first does; names the board that is seen.
+        StageError: None of the sample shows it; the message names a board that is seen.
     """
     files = {r.id: r.image for r in usable if r.image is not None}
     first = _spread_over(list(files))
@@ -250,7 +250,7 @@ def _outlies(error: float, errors: Floats) -> bool:
 def camera_of(
     seen: Mapping[str, Corners], size: tuple[int, ...], start: Image | None
 ) -> tuple[CalibratedLens, Floats]:
-    """Return the camera, and each view's reprojection error, rms [px]."""
+    """Return the calibrated camera, and each view's rms reprojection error [px]."""
     import cv2
 
     points = [corners.points.astype(np.float32) for corners in seen.values()]
@@ -277,7 +277,7 @@ def camera_of(
 
 
 def _spread(views: Iterable[tuple[Any, Any, Any]], matrix: Any, lens: Any) -> Floats:
-    """Return the (8, 8) covariance of the camera for corners known to a pixel, all poses free."""
+    """Return the camera's covariance (8, 8) for a corner noise of 1 px, with free poses."""
     import cv2
 
     information = np.zeros((8, 8))
@@ -290,7 +290,10 @@ def _spread(views: Iterable[tuple[Any, Any, Any]], matrix: Any, lens: Any) -> Fl
 
 
 def _require_tilted(seen: Mapping[str, Corners]) -> None:
-    """Refuse parallel boards: the lens is not observable, which least squares does not show."""
+    """Refuse parallel board poses: the intrinsics are not observable then.
+
+    The residual of the least-squares fit does not show this.
+    """
     changes = np.array([_depth_change(corners) for corners in seen.values()])
     spread = np.linalg.norm(changes - changes.mean(axis=0), ord=2) / np.sqrt(len(changes))
     # How much the board's depth, as a share of it, has to change across it otherwise between
@@ -304,9 +307,9 @@ def _require_tilted(seen: Mapping[str, Corners]) -> None:
 
 
 def _depth_change(corners: Corners) -> Floats:
-    """Return by how much of itself the board's depth changes across it, to the right and up (2,).
+    """Return the relative change of the board's depth across it, to the right and up (2,).
 
-    The last row of the homography is the depth, up to scale, whatever the camera.
+    The last row of the homography is the depth up to scale, for any camera.
     """
     import cv2
 
@@ -330,7 +333,7 @@ Camera = tuple[Floats, Floats] | tuple[Floats, Floats, Floats]
 
 
 class ImagesParams(OpeningParams):
-    """Which archive, and the camera that took its images."""
+    """Parameters of ``acquire.images``."""
 
     focal_length: tuple[float, float] | None = Field(
         None, description="fx and fy of the camera's matrix [px]; the archive's own if not given."
@@ -356,7 +359,7 @@ class ImagesParams(OpeningParams):
     )  # fmt: skip
 
     def camera(self, recording: Recording) -> Camera | None:
-        """Return the camera matrix (3, 3) [px] and distortion: as given, else from the archive."""
+        """Return the recipe's camera matrix (3, 3) [px] and distortion, else the archive's."""
         if self.focal_length is None or self.principal_point is None:
             return recording.camera
         return pinhole(self.focal_length, self.principal_point), np.array(self.distortion)
@@ -366,10 +369,10 @@ class ImagesParams(OpeningParams):
 def acquire_images(
     archive: ArchivePath, params: ImagesParams, board: Board | None = None
 ) -> Captures:
-    """Replay recorded images and robot poses; for targets that are found in images.
+    """Replay recorded images and robot poses, for targets that are found in images.
 
-    A cloud of the same name as an image comes with it: where it is organised as the image, fits
-    of printed targets use its depth.
+    A cloud with the name of an image is read with it. If it is organised like the image, fits of
+    printed targets use its depth.
     """
     recorded = open_archive(archive_path("acquire.images", archive, params), params)
     usable = [r for r in recorded.recordings if r.image is not None]
@@ -391,7 +394,7 @@ def acquire_images(
 def _cameras(
     root: Path, usable: Sequence[Recording], params: ImagesParams
 ) -> tuple[dict[str, Camera], list[str]]:
-    """Return the camera of each image by the pose's name, and notes on how it was found."""
+    """Return the camera of each image by the pose's name, and notes on its source."""
     given = {r.id: camera for r in usable if (camera := params.camera(r)) is not None}
     filed = None if given else _filed(root, params.camera_file)
     if params.board is None:
@@ -418,7 +421,7 @@ def _cameras(
 
 
 def _off_centre(usable: Sequence[Recording], camera: CameraFile) -> list[Warn]:
-    """Return a warning where a calibration is of images of another size."""
+    """Return a warning if a calibration is for another image size."""
     first = next(r.image for r in usable if r.image is not None)
     height, width = read_image(first).shape
     middle = camera.matrix[:2, 2] / [0.5 * width, 0.5 * height]
@@ -435,10 +438,10 @@ def _off_centre(usable: Sequence[Recording], camera: CameraFile) -> list[Warn]:
 
 
 def _filed(root: Path, name: str | None) -> CameraFile | None:
-    """Return the calibration that lies beside the images.
+    """Return the camera calibration file in the images' folder; None without one.
 
     Raises:
-        StageError: The named file holds none, or there are several and none is named.
+        StageError: The named file has no calibration, or there are several and none is named.
     """
     folder = root if root.is_dir() else root.parent
     if name is not None:
@@ -463,7 +466,7 @@ def _unit_of_clouds(usable: Sequence[Recording]) -> LengthUnit:
 def _captures(
     usable: Sequence[Recording], cameras: Mapping[str, Camera], unit: LengthUnit
 ) -> Iterator[Capture]:
-    """Read one image at a time."""
+    """Yield the captures, reading one image at a time."""
     nothing = PointCloud(CAMERA, np.zeros((0, 3), dtype=np.float32))
     for recording in usable:
         if recording.image is not None:

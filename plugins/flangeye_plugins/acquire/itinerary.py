@@ -24,12 +24,12 @@ from flangeye.units import in_mm
 
 
 class Stop(NamedTuple):
-    """A pose to scan at.
+    """A pose at which a scan is taken.
 
     Attributes:
         id: Identifier of the capture taken there.
         role: Purpose of the capture.
-        pose: The flange's pose, and the joint angles that reach it.
+        pose: The flange's pose with the joint angles that reach it.
     """
 
     id: str
@@ -38,17 +38,17 @@ class Stop(NamedTuple):
 
 
 class Itinerary:
-    """The stops of a session: those for verifying first, then the plan's.
+    """The stops of a session: first those for verification, then the plan's.
 
     Attributes:
         outcomes: Outcomes of the captures so far, by id; adaptive plans read them.
-        centre: (3,) middle of the work, in ``base`` [m].
-        size: (3,) of the work [m].
-        total: How many stops there are at most.
+        centre: (3,) centre of the workspace in ``base`` [m].
+        size: (3,) size of the workspace [m].
+        total: Largest number of stops.
     """
 
     def __init__(self, reach: Reach, base_T_camera: Floats, centre: Floats, router: Router) -> None:
-        """Take the place; see :func:`itinerary_of`."""
+        """Construct an itinerary without stops; see :func:`itinerary_of`."""
         self.outcomes: Mapping[str, Observation | None] = {}
         self._reach, self._router = reach, router
         eye = base_T_camera[:3, 3]
@@ -58,10 +58,10 @@ class Itinerary:
         self._plan = Plan([], 0, centre, np.zeros(3))
 
     def plan(self, poses: BoundPart, verification: int, seed: int) -> None:
-        """Plan the stops.
+        """Plan the stops for verification and create the plan for calibration.
 
         Raises:
-            StageError: No stop for verifying is possible.
+            StageError: No stop for verification is possible.
         """
         planning, checking = np.random.SeedSequence(seed).spawn(2)
         self._plan = poses(self._site, np.random.default_rng(planning))
@@ -76,21 +76,21 @@ class Itinerary:
 
     @property
     def centre(self) -> Floats:
-        """(3,) middle of the work, in ``base`` [m]."""
+        """Centre (3,) of the workspace in ``base`` [m]."""
         return self._plan.centre
 
     @property
     def size(self) -> Floats:
-        """(3,) of the work [m]."""
+        """Size (3,) of the workspace [m]."""
         return self._plan.size
 
     @property
     def total(self) -> int:
-        """How many stops there are at most."""
+        """Largest number of stops."""
         return len(self._checks) + self._plan.wanted
 
     def stops(self) -> Iterator[Stop]:
-        """Yield the stops in order; a plan may choose each when it is asked for."""
+        """Yield the stops in order; an adaptive plan chooses each one on demand."""
         for index, pose in enumerate(self._checks):
             yield Stop(f"{index:04d}", "verification", pose)
         for index, pose in enumerate(self._plan.poses, len(self._checks)):
@@ -99,24 +99,24 @@ class Itinerary:
             self._look_again()
 
     def _look_again(self) -> None:
-        """Plan again from the scanner's estimated pose, which was a guess before."""
+        """Replan with the scanner's estimated pose, which was a guess before."""
         base_T_camera = view_of([seen for seen in self.outcomes.values() if seen])
         if base_T_camera is not None:
             self._reach.look_from(base_T_camera)
 
     def way(self, start: Floats, stop: Stop) -> Route | Barred:
-        """Return the path to a stop from joint angles (n,)."""
+        """Return the path from joint angles (n,) to a stop, or the obstacle."""
         return self._router.route(start, stop.pose.joints)
 
     def why_not(self) -> str:
-        """Return why poses were impossible, and how often."""
+        """Return a text with the reasons for impossible poses and their counts."""
         return self._reach.why_refused() or "none was tried"
 
     def shown(self, start: Floats | None) -> tuple[str, dict[str, Any]]:
         """Return the plan as text and data: every stop, the path to it, and its duration.
 
         Args:
-            start: (n,) where the arm stands [rad]; None where it does not answer.
+            start: (n,) present joint angles [rad]; None if the arm does not answer.
 
         Raises:
             StageError: Fewer than three poses are possible.
@@ -139,7 +139,7 @@ class Itinerary:
         """Refuse a plan of fewer than three poses.
 
         Raises:
-            StageError: There are fewer; the message says why the others are impossible.
+            StageError: There are fewer than three; the message says why the others are impossible.
         """
         fewest = 3  # without which no camera pose can be found
         if found < fewest:
@@ -167,10 +167,10 @@ class Itinerary:
 
 
 def view_of(seen: Sequence[Observation]) -> Floats | None:
-    """Return a scanner's pose base_T_camera (4, 4) for planning; None if it is unknown.
+    """Return an estimate of ``base_T_camera`` (4, 4) for planning; None if it is not possible.
 
     Args:
-        seen: Circles, or else poses of a target that is anywhere on the flange.
+        seen: Observed circles, or poses of a target with unknown pose on the flange.
     """
     poses = [o for o in seen if isinstance(o.feature, PoseFeature)]
     found = _by_poses(poses) if poses else _by_circles(seen)
@@ -180,9 +180,9 @@ def view_of(seen: Sequence[Observation]) -> Floats | None:
 
 
 def _by_circles(seen: Sequence[Observation]) -> tuple[Floats, float] | None:
-    """Return base_T_camera, and how far a circle or its normal is from where it should be [m].
+    """Return ``base_T_camera``, and the rms residual of centres and normals [m].
 
-    The least-squares motion of the circles' centres and of points before them, along the normals.
+    It is the least-squares rigid motion of the circles' centres and of points on their normals.
     """
     fewest, ahead = 3, 0.1  # [m]: a normal weighs as a place so far off
     points = [
@@ -202,7 +202,7 @@ def _by_circles(seen: Sequence[Observation]) -> tuple[Floats, float] | None:
 
 
 def _by_poses(seen: Sequence[Observation]) -> tuple[Floats, float] | None:
-    """Return base_T_camera, and how far a target is from where it should be [m]; by Shah, 2013."""
+    """Return ``base_T_camera``, and the rms residual of the target's position [m] (Shah 2013)."""
     fewest = 5  # two of them determine the rotations, if they turn about two axes
     if len(seen) < fewest:
         return None
@@ -222,13 +222,13 @@ def itinerary_of(
     margins: Margins,
     start: Floats | None,
 ) -> Itinerary:
-    """Return an itinerary without stops, for a scanner that is roughly at ``base_T_camera``.
+    """Return an itinerary without stops, for a scanner with the rough pose ``base_T_camera``.
 
-    It begins at ``start`` (n,), where the arm stands [rad], if that is known. What the scanner has
-    to see is the arm's flange, or a body.
+    It begins at the present joint angles ``start`` (n,) [rad], if known. The target is the arm's
+    flange or a body.
 
     Raises:
-        StageError: The arm cannot show it to the scanner at all.
+        StageError: The arm cannot show the target to the scanner.
     """
     if isinstance(target, TargetBody):
         body, what = target, target.name
@@ -252,16 +252,16 @@ def itinerary_of(
 
 @dataclass(frozen=True)
 class PlanRow:
-    """A line of the plan that is shown without motion; fields as in its JSON.
+    """A line of a printed plan; the fields are those of its JSON.
 
     Attributes:
-        id: Identifier of the capture; None where no pose is possible.
-        role: What it is for: verification, calibration, or ``left out``.
-        place: Place of the flange in ``base`` [m].
+        id: Identifier of the capture; None if no pose is possible.
+        role: ``verification``, ``calibration``, or ``left out``.
+        place: Position of the flange in ``base`` [m].
         tilt: Tilt of the flange against the line of sight [rad].
-        path: ``direct`` or ``by home``; None where it is not known, or there is none.
-        seconds: What the motion takes [s].
-        why_not: Why the arm cannot get there.
+        path: ``direct`` or ``by home``; None if unknown or impossible.
+        seconds: Duration of the motion [s].
+        why_not: Reason why the arm cannot reach the pose.
     """
 
     id: str | None
@@ -284,13 +284,13 @@ class PlanRow:
 
 
 def row_at(id_: str, role: str, pose: PlannedPose, eye: Floats) -> PlanRow:
-    """Return the row of a stop, without its path; the scanner stands at ``eye`` (3,) [m]."""
+    """Return the row of a stop without its path; ``eye`` (3,) is the scanner's position [m]."""
     place, normal = pose.base_T_flange[:3, 3], pose.base_T_flange[:3, 2]
     return PlanRow(id_, role, list(_place(place)), float(angle_between(normal, eye - place)))
 
 
 def left_out(refusals: Iterable[Refusal], poses: Iterable[PlannedPose]) -> list[PlanRow]:
-    """Return a row for each place at which no pose is possible, a few of every reason first."""
+    """Return a row for each place without a possible pose, a few of every reason first."""
     reasons = defaultdict[tuple[float, ...], Counter[str]](Counter)
     for refusal in refusals:
         reasons[_place(refusal.place)][refusal.reason] += 1
@@ -313,7 +313,7 @@ def seconds_of(rows: Iterable[PlanRow]) -> float:
 def as_plan(
     head: str, rows: Sequence[PlanRow], without: Sequence[PlanRow]
 ) -> tuple[str, dict[str, Any]]:
-    """Return a plan as lines of text, below its first line, and as data for programs."""
+    """Return a plan as text, starting with the line ``head``, and as data for programs."""
     listed = 12  # of the places left out
     more = len(without) - listed
     lines = [
@@ -327,5 +327,5 @@ def as_plan(
 
 
 def _place(point: Floats) -> tuple[float, ...]:
-    """Return a point [m] rounded to 0.1 mm, the resolution at which the plan compares places."""
+    """Return a point [m] rounded to 0.1 mm, the plan's resolution for comparing places."""
     return tuple(round(float(x), 4) + 0.0 for x in point)

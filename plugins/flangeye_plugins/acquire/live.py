@@ -1,4 +1,4 @@
-"""``acquire.live``: a real arm, a real scanner, one pose at a time until the solver has enough."""
+"""``acquire.live``: drive a real arm and scan with a real scanner until the solver has enough."""
 
 from __future__ import annotations
 
@@ -59,29 +59,29 @@ from flangeye_plugins.acquire.itinerary import Itinerary, Stop, itinerary_of
 
 
 class Idle:
-    """The time in which the arm stood without an exposure, since its first move.
+    """Measures the time for which the arm was at rest without an exposure, since its first move.
 
-    What is computed while the arm is under way, or stands for a scan, costs no time.
+    Computations while the arm moves or is scanned cost no session time, and do not count.
     """
 
     def __init__(self) -> None:
         self._began = self._stands_since = self._idle = 0
 
     def leaves(self, time_ns: int) -> None:
-        """Note that the arm starts to move; the session's clock starts with the first move."""
+        """Record that the arm starts to move; the first move starts the session's clock."""
         if self._began:
             self._idle += time_ns - self._stands_since
         else:
             self._began = time_ns
 
     def exposed(self, arrived_ns: int, began_ns: int, ended_ns: int) -> None:
-        """It arrived, and was scanned for some time."""
+        """Record an exposure, with the times of arrival, start and end [ns]."""
         self._idle += max(0, began_ns - arrived_ns)
         self._stands_since = ended_ns
 
     @property
     def share(self) -> float | None:
-        """Share of the session up to the last exposure; None before there was one."""
+        """Idle share of the session up to the last exposure; None before the first."""
         whole = self._stands_since - self._began
         return self._idle / whole if whole > 0 else None
 
@@ -126,17 +126,17 @@ def acquire_live(  # noqa: PLR0913  what it asks the runner for
     resumed: Resumed | None = None,
     body: TargetBody | None = None,
 ) -> Captures:
-    """Drive an arm through planned poses and scan its flange at each, or the body that it shows.
+    """Drive an arm through planned poses and scan its flange, or a body on it, at each.
 
-    Every pose and every way is checked before anything moves. The arm is watched by a process of
-    its own and stops on any safety fault. While a scan is transferred, logged and fitted, the arm
-    is already on its way to the next pose. When the solver has enough, the arm stops. Without
-    permission to move the arm is only read, and the plan is shown. Captures that an earlier run
-    took (``resumed``) are not taken again.
+    Every pose and path is checked before anything moves. A separate process supervises the arm,
+    which stops on any safety fault. While a scan is transferred, logged and fitted, the arm already
+    moves to the next pose. The arm stops when the solver has enough captures. Without permission to
+    move, the arm is only read and the plan is shown. Captures of an earlier run (``resumed``) are
+    not repeated.
 
     Raises:
         StageError: Fewer than three poses are possible, or a device cannot be opened.
-        NothingMoved: Motion was not asked for; the message is the plan.
+        NothingMoved: Motion was not permitted; the message is the plan.
     """
     allowed = limits.for_robot(robot)
     # Poses keep 5 deg from the limits of the joints: a pose at a limit cannot be approached.
@@ -174,7 +174,7 @@ def acquire_live(  # noqa: PLR0913  what it asks the runner for
 
 
 def _source(session: LiveSession, arm: RobotDriver, eye: ScannerDriver) -> Source:
-    """Return what is known of a session before its first capture."""
+    """Return the provenance of a session, before its first capture."""
     itinerary, scanner = session.itinerary, session.scanner
     return Source(
         fingerprint=_fingerprint(arm, eye, scanner),
@@ -186,10 +186,10 @@ def _source(session: LiveSession, arm: RobotDriver, eye: ScannerDriver) -> Sourc
 
 
 def require_inside(state: RobotState, allowed: MotionLimits) -> None:
-    """Refuse an arm that starts outside its limits, where no checked path begins.
+    """Refuse an arm that starts outside its limits.
 
     Raises:
-        StageError: The arm is outside; the message says where, and what is allowed.
+        StageError: The message gives the position and the limits.
     """
     where = allowed.outside(state.base_T_flange.translation) or allowed.beyond(state.joints)
     if where:
@@ -200,7 +200,7 @@ def require_inside(state: RobotState, allowed: MotionLimits) -> None:
 
 
 def _read(arm: RobotDriver, allowed: MotionLimits) -> tuple[Floats | None, str]:
-    """Return the arm's present joint angles, None where they cannot be read, and a note."""
+    """Return the arm's present joint angles (None if they cannot be read), and a note."""
     try:
         name, state = read_state(arm)
     except DeviceError as error:
@@ -212,10 +212,10 @@ def _read(arm: RobotDriver, allowed: MotionLimits) -> tuple[Floats | None, str]:
 def _offline(
     params: LiveParams, robot: RobotModel, resumed: Resumed | None
 ) -> tuple[Floats | None, str]:
-    """Return the joint angles at which a plan begins without the arm, None if unknown; and a note.
+    """Return the start of a plan made without the arm (None if unknown), and a note.
 
     Raises:
-        StageError: acquire.live's home is of another arm.
+        StageError: The parameter ``home`` has another number of joints than the arm.
     """
     if resumed is not None and resumed.joints is not None:
         return resumed.joints, "offline: the plan begins where the arm stood at its last capture"
@@ -230,13 +230,13 @@ def _offline(
 
 
 def _fingerprint(arm: RobotDriver, eye: ScannerDriver, scanner: Scanner) -> str:
-    """Return what names this session: a live one is never repeated."""
+    """Return a unique fingerprint of this session, as a live session is never repeated exactly."""
     text = f"{arm.name} {eye.name} {scanner.name} {time.time_ns()}"
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 class LiveCaptures(Captures):
-    """Captures that are taken when they are asked for; closing them stops the arm."""
+    """Captures taken on demand; closing them stops the arm."""
 
     def __init__(self, session: LiveSession, source: Source, release: ExitStack) -> None:
         super().__init__(session.captures(), source, session.itinerary.total)
@@ -245,7 +245,7 @@ class LiveCaptures(Captures):
 
     @property
     def idle(self) -> float | None:
-        """Share of the session in which the arm stood without an exposure."""
+        """Share of the session for which the arm was at rest without an exposure."""
         return self._session.idle.share
 
     def close(self) -> None:
@@ -260,13 +260,13 @@ class LiveSession:
 
     Attributes:
         itinerary: The stops.
-        arm: Goes there.
+        arm: Executes the motions.
         scanner: The scanner.
-        moved: A scan during which the flange moved by more is set aside [m].
-        done: Captures that were taken before.
-        stage_log: Hears where the arm goes next, and why there.
-        passive: Whether another program moves the arm, so that nothing is planned here.
-        idle: Time in which the arm had nothing to do.
+        moved: A scan is rejected if the flange moved by more than this during it [m].
+        done: Captures of an earlier run.
+        stage_log: Receives the next stop and the reason for it.
+        passive: Whether another program moves the arm, so that no paths are planned.
+        idle: Measures the arm's idle time.
     """
 
     itinerary: Itinerary
@@ -279,7 +279,7 @@ class LiveSession:
     idle: Idle = field(default_factory=Idle)
 
     def captures(self) -> Iterator[Capture | Rejection]:
-        """Take the captures; while one is transferred and fitted the arm moves on."""
+        """Yield the captures; the arm moves on while one is transferred and fitted."""
         taken: Callable[[], Capture | Rejection] | None = None
         for stop in self.itinerary.stops():
             if stop.id in self.done:
@@ -303,7 +303,7 @@ class LiveSession:
         return self.itinerary.way(self.arm.state.joints, stop)
 
     def _expose(self, stop: Stop, arrived_ns: int) -> Callable[[], Capture | Rejection]:
-        """Expose at a stop; what is returned waits for the data."""
+        """Expose at a stop; return a function that waits for the data."""
         began = time.monotonic_ns()
         try:
             if self.passive and isinstance(self.scanner, Overhears):
@@ -318,7 +318,7 @@ class LiveSession:
         return partial(self._capture, stop, transfer, self.arm.during(began, time.monotonic_ns()))
 
     def _stands_since(self, arrived_ns: int) -> int:
-        """Return since when the arm stands, ten seconds ago at most [ns]."""
+        """Return the time since which the arm has been at rest, at most 10 s ago [ns]."""
         samples = self.arm.during(arrived_ns - 10_000_000_000, arrived_ns)
         away = np.flatnonzero(movements(samples[::-1]) > 0.5 * self.moved)
         return samples[len(samples) - away[0] if len(away) else 0].time_ns
@@ -326,7 +326,7 @@ class LiveSession:
     def _capture(
         self, stop: Stop, transfer: Callable[[], Scan], samples: Sequence[RememberedState]
     ) -> Capture | Rejection:
-        """Return the capture, if the arm stood still during the exposure."""
+        """Return the capture, or a rejection if the arm moved during the exposure."""
         try:
             scan = transfer()
         except FrameDropped as dropped:
@@ -356,7 +356,7 @@ class LiveSession:
 
 
 def within(samples: Sequence[RememberedState], start_ns: int, end_ns: int) -> list[RememberedState]:
-    """Return the samples of an exposure, one on either side; none when they do not cover it."""
+    """Return the samples of an exposure and one on either side; empty if they do not cover it."""
     if not samples or samples[0].time_ns > start_ns or samples[-1].time_ns < end_ns:
         return []
     times = np.array([sample.time_ns for sample in samples])
@@ -366,12 +366,12 @@ def within(samples: Sequence[RememberedState], start_ns: int, end_ns: int) -> li
 
 
 def movement(samples: Sequence[RememberedState]) -> float:
-    """Return how far a point 0.1 m off the flange's centre moved, at most [m]."""
+    """Return the largest motion of a point 0.1 m off the flange's centre [m]."""
     return float(movements(samples).max())
 
 
 def movements(samples: Sequence[RememberedState]) -> Floats:
-    """Return (N,) how far a point 0.1 m off the flange's centre is from its first place [m]."""
+    """Return the distances (N,) of a point 0.1 m off the flange's centre from its start [m]."""
     poses = np.array([sample.base_T_flange for sample in samples])
     moves = np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1)
     turns = np.linalg.norm(poses[:, :3, :3] - poses[0, :3, :3], axis=(1, 2)) / np.sqrt(2)

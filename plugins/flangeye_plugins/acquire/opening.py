@@ -1,4 +1,4 @@
-"""Shared by ``acquire.archive`` and ``acquire.centres``: find the archive, read its poses."""
+"""Common part of the stages that read archives: find the archive and read its poses."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 
 class OpeningParams(Params):
-    """Which archive, and how it is laid out."""
+    """Common parameters: the archive and its layout."""
 
     path: RecipePath | None = Field(
         None, description="The archive; --archive on the command line comes before it."
@@ -67,10 +67,10 @@ class OpeningParams(Params):
 
 
 def archive_path(stage: str, given: ArchivePath, params: OpeningParams) -> Path:
-    """Return where the archive is.
+    """Return the path of the archive.
 
     Raises:
-        StageError: Nobody said, or it is not there.
+        StageError: No path is given, or it does not exist.
     """
     path = given.path or params.path
     if path is None:
@@ -81,10 +81,10 @@ def archive_path(stage: str, given: ArchivePath, params: OpeningParams) -> Path:
 
 
 def open_archive(path: Path, params: OpeningParams) -> Archive:
-    """Return the poses and files at ``path``, without those left out.
+    """Return the poses and files of an archive, without those excluded by the parameters.
 
     Raises:
-        StageError: The reader cannot read it, it holds no poses, or two have one name.
+        StageError: The archive cannot be read, has no poses, or two poses have the same name.
     """
     archive: Archive = params.reader(path)
     check_ids(archive)
@@ -112,8 +112,8 @@ def source_of(
 
     Args:
         archive: The archive; its notes come first.
-        told: Further notes for the user.
-        digests: Digests of all files that are used; of the archive's own if not given.
+        told: Additional notes for the user.
+        digests: Digests of all files used; None for those of the archive.
     """
     notes = (with_urls(f"archive: {archive.layout}, {archive.root}"), *archive.notes, *told)
     used = digests_of(archive.files) if digests is None else digests
@@ -122,7 +122,7 @@ def source_of(
 
 
 def skipped_note(archive: Archive, has: Callable[[Recording], bool], what: str) -> list[str]:
-    """Return a note on the poses to calibrate with that lack something; none if none do."""
+    """Return a note on calibration poses without ``what``; empty if there are none."""
     poses = [r for r in archive.recordings if r.role == "calibration"]
     skipped = [r.id for r in poses if not has(r)]
     if not skipped:
@@ -137,7 +137,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def poses_of(recording: Recording, cell: Cell | None = None) -> Poses:
-    """Return the recording's poses as the values stages see."""
+    """Return a recording's robot poses in the stages' type."""
     if cell is not None:
         return cell.reported(recording.poses, recording.axes)
     return {
@@ -167,14 +167,14 @@ def check_usable(
     whole: bool = False,
     fewest: int = MIN_CAPTURES,
 ) -> None:
-    """Refuse recordings that no calibration of one camera, or of a cell, can be made from.
+    """Refuse recordings from which neither a camera nor a cell can be calibrated.
 
     Args:
-        root: Prefix of messages.
+        root: Path of the archive, the prefix of messages.
         recordings: Recordings to use, verification included.
-        cell: The recipe's, where it has one.
-        whole: Whether the target's full pose was seen; rotation alone is then enough motion.
-        fewest: Captures there have to be.
+        cell: Cell of the recipe; None without one.
+        whole: Whether the target's full pose is measured; pure rotation is then enough motion.
+        fewest: Smallest number of captures.
 
     Raises:
         StageError: See :func:`check_poses` and :func:`check_cell`.
@@ -190,15 +190,15 @@ def check_usable(
 
 
 def log_source(log: RunLog, recordings: Sequence[Recording], cell: Cell | None = None) -> Source:
-    """Return the source of a log's captures: the log, and its own notes.
+    """Return the source of a log's captures: the log with its notes.
 
     Args:
         log: The log.
-        recordings: The poses that are taken from it.
-        cell: The recipe's, where it has one.
+        recordings: The recordings used from it.
+        cell: Cell of the recipe; None without one.
 
     Raises:
-        StageError: No calibration can be made from these poses.
+        StageError: No calibration is possible with these poses.
     """
     check_usable(log.path, recordings, cell)
     source = log.source or Source(fingerprint="")
@@ -208,12 +208,11 @@ def log_source(log: RunLog, recordings: Sequence[Recording], cell: Cell | None =
 
 
 def check_cell(root: Path, recordings: Sequence[Recording], cell: Cell) -> None:
-    """Refuse recordings of another cell, or from which nothing can be estimated.
+    """Refuse recordings of another cell, or from which nothing is observable.
 
     Raises:
-        StageError: A camera, a target or something that moves is unknown or lacks its recordings,
-            an arm is out of any arm's reach, or its joints do not lead to its poses, or nothing
-            moves.
+        StageError: A camera, target or carrier is unknown or has no recordings, an arm's pose is
+            out of reach or contradicts its joints, or nothing moves.
     """
     _require_known(root, "camera", (r.seen_by for r in recordings), cell.cameras)
     _require_known(root, "target", (r.saw for r in recordings), cell.targets)
@@ -274,7 +273,7 @@ def _require_kinds(root: Path, recordings: Sequence[Recording], cell: Cell) -> N
 
 
 def _require_joints(root: Path, recordings: Sequence[Recording], name: str, cell: Cell) -> None:
-    """Refuse joints of an arm that are not those of its poses, and a link's place without any."""
+    """Refuse joint angles that contradict an arm's poses, and a link's pose without joints."""
     from flangeye.estimation.sightings import REACHED
     from flangeye.maths.kinematics import Arm
 
@@ -302,7 +301,7 @@ def _require_joints(root: Path, recordings: Sequence[Recording], name: str, cell
 
 
 def _cure(arm: Arm, joints: Floats, pose: Floats) -> str:
-    """Return what would make joints and pose of an arm agree."""
+    """Return a hint that would make joints and pose of an arm agree."""
     from flangeye.estimation.sightings import REACHED
 
     cures = {

@@ -1,1 +1,1 @@
-"""``robot.*``: drivers, a folder for each maker; client libraries are imported on connecting."""
+"""``robot.*`` drivers, one folder per maker; client libraries are imported when connecting."""

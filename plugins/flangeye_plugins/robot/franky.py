@@ -1,8 +1,8 @@
 """``robot.franky``: arms of Franka Robotics through franky and libfranka.
 
-Proven with the library as far as it goes without a controller: it loads, its motions and poses are
-built, a refused and a silent connection are errors in time. Moving, reading and stopping ran
-against a stand-in for the connection alone; see the README of the drivers.
+Tested with the library as far as possible without a controller: it loads, motions and poses can be
+built, and refused and silent connections give errors in time. Moving, reading and stopping were
+tested with a mock connection only; see the drivers' README.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def require_answer(name: str, host: str, realtime: bool) -> None:
         realtime: Whether to insist on a real-time kernel.
 
     Raises:
-        DeviceError: It does not work, or takes too long.
+        DeviceError: The robot does not answer, or not in time.
     """
     # In a process that can be killed: where a host is silent, the library never returns
     program = """
@@ -88,7 +88,7 @@ os._exit(0)
 
 
 def cannot_connect(name: str, why: str) -> DeviceError:
-    """Return the error to raise."""
+    """Return the DeviceError for a failed connection."""
     return DeviceError(
         f"{name}: cannot connect ({one_line(why)}): is FCI active in Desk, is this its address, "
         "is this computer in its network?"
@@ -112,12 +112,13 @@ class FrankyParams(ControllerParams):
 def robot_franky(model: RobotModel, params: FrankyParams) -> Robot:
     """An arm of Franka Robotics, through franky.
 
-    In Desk: joints unlocked, FCI activated, the end effector and its load; a wired network of its
-    own, and a real-time kernel on this computer. The model's kinematics are compared with what the
-    controller says.
+    Set in Desk: joints unlocked, FCI activated, the end effector and its load. The arm needs a
+    dedicated wired network and a real-time kernel on this computer. The model's kinematics are
+    compared with the controller's.
 
     Raises:
-        DeviceError: The library is missing, or the arm cannot be driven: why, and what to do.
+        DeviceError: The library is missing, or the arm cannot be driven; the message says what to
+            do.
     """
     sdk = load_sdk("franky", "robot.franky", "pip install 'flangeye[franka]'")
     name = f"{model.model} at {params.host}"
@@ -134,7 +135,7 @@ def opened(robot: FrankyRobot, model: RobotModel, params: FrankyParams) -> Frank
     """Return a connected robot after checking its state.
 
     Raises:
-        DeviceError: Tool or arm are not the recipe's, or it is not ready.
+        DeviceError: Tool or arm differ from the recipe's, or the arm is not ready.
     """
     shown = CONVENTIONS["rpy"].in_units("mm", "deg")
     expected = params.tool.flange_T_tool(shown)
@@ -150,18 +151,18 @@ class FrankyRobot(Device):
     """An arm of Franka Robotics; see :class:`flangeye.devices.Robot`.
 
     Attributes:
-        offset: (4, 4) ``flange_T_tool`` as the controller has it.
+        offset: (4, 4) ``flange_T_tool`` set in the controller.
     """
 
     period = 0.001
 
     def __init__(self, name: str, sdk: Any, connection: Any) -> None:
-        """Take over a connection.
+        """Use an open connection.
 
         Args:
-            name: Shown in messages and reports.
+            name: Name in messages and reports.
             sdk: The module ``franky``.
-            connection: Its ``Robot``.
+            connection: The library's ``Robot``.
 
         Raises:
             DeviceError: The connection is lost.
@@ -211,7 +212,7 @@ class FrankyRobot(Device):
         self._start(motion, sdk.JointStopMotion)
 
     def move_linear(self, base_T_flange: Transform, speed: float, acceleration: float) -> None:
-        """Start a straight move of the flange."""
+        """Start a linear move of the flange."""
         sdk = self._sdk
         pose = sdk.RobotPose(sdk.Affine(base_T_flange.matrix @ self.offset))
         target = sdk.CartesianState(pose)
@@ -221,7 +222,7 @@ class FrankyRobot(Device):
         self._start(motion, sdk.CartesianStopMotion)
 
     def move_velocity(self, twist: Floats, acceleration: float) -> None:
-        """Move the flange at a twist (6,); the library stops unless renewed within GRACE."""
+        """Move the flange at a twist (6,); the arm stops if it is not renewed within GRACE."""
         sdk = self._sdk
         base_T_tool = np.array(self._ask(lambda: self._robot.state).O_T_EE.matrix)
         at_tool = twist_at_tool(twist, base_T_tool @ self._tool_T_flange, base_T_tool)
@@ -234,7 +235,7 @@ class FrankyRobot(Device):
         self._start(motion, sdk.CartesianVelocityStopMotion)
 
     def wait_cycle(self) -> None:
-        """Wait for as long as a cycle of the controller lasts."""
+        """Wait for the duration of one controller cycle."""
         time.sleep(self.period - time.monotonic() % self.period)
 
     def stop(self) -> None:
@@ -255,10 +256,10 @@ class FrankyRobot(Device):
                 self._closed, self._robot = True, None
 
     def _end_unwatched(self) -> None:
-        """Stop a motion that was not read for SILENT, once.
+        """Stop a motion, once, if its state was not read for SILENT.
 
-        The library moves the arm on from a thread of this process. Where the whole process stands,
-        that thread does as well, and the controller stops by itself after 20 lost cycles.
+        The library drives the arm from a thread of this process. If the whole process hangs, that
+        thread does too, and the controller stops by itself after 20 lost cycles.
         """
         while not self._closed:
             time.sleep(0.1 * SILENT)
@@ -280,7 +281,7 @@ class FrankyRobot(Device):
             self._ask(lambda: self._robot.move(motion, asynchronous=True))
 
     def _motion(self) -> tuple[bool, str]:
-        """Return whether a motion is in progress, and why the last one failed, if it did."""
+        """Return whether a motion is in progress, and the last one's error ("" if none)."""
         try:
             return bool(self._robot.poll_motion()), ""
         except self._sdk.ControlException as error:
@@ -296,7 +297,7 @@ class FrankyRobot(Device):
         )
 
     def _factor(self, speed: float, acceleration: float) -> Any:
-        """Return shares of the arm's limits; jerk follows the acceleration."""
+        """Return speed, acceleration and jerk as shares of the arm's limits."""
         # Smallest share of the arm's limits that the library is asked for
         shares = np.clip([speed, acceleration, acceleration], 1e-3, 1.0)
         return self._sdk.RelativeDynamicsFactor(*(float(share) for share in shares))

@@ -1,4 +1,4 @@
-"""``robot.manual``: no connection at all; a person moves the arm and reads its pose out."""
+"""``robot.manual``: no connection; an operator moves the arm and types its pose."""
 
 from __future__ import annotations
 
@@ -22,9 +22,10 @@ from flangeye.types.pose_formats import CONVENTIONS, AngleUnit, LengthUnit, Pose
 
 
 class OperatorConsole:
-    """Prints to the terminal, and reads typed lines without waiting.
+    """Prints to the terminal, and reads typed lines without blocking.
 
-    No thread reads: one that waits for input when the interpreter ends takes it down with it.
+    It does not use a reading thread, because a thread that waits for input crashes the interpreter
+    at exit.
     """
 
     def __init__(self, heard: TextIO | None = None, said: TextIO | None = None) -> None:
@@ -35,18 +36,18 @@ class OperatorConsole:
         self._ended = False
 
     def say(self, text: str) -> None:
-        """Show the person a line."""
+        """Print a line for the operator."""
         self._said.write(text + "\n")
         self._said.flush()
 
     def line(self, patience: float = 0.0) -> str | None:
-        """Return a typed line, ignoring blank ones; None if there is none yet.
+        """Return the next typed line, skipping blank ones; None if there is none yet.
 
         Args:
-            patience: How long to wait for one [s].
+            patience: Longest wait for a line [s].
 
         Raises:
-            EOFError: There will be none any more.
+            EOFError: The input has ended.
         """
         while (line := self._take()) is None:
             if self._ended:
@@ -91,23 +92,23 @@ class ManualParams(Params):
 
 @part("robot.manual", interactive=True)
 def robot_manual(model: RobotModel, params: ManualParams) -> Robot:
-    """An arm jogged by hand: poses are printed, and entered as the pendant shows them.
+    """An arm jogged by an operator: target poses are printed, reached poses are typed in.
 
-    Opening it waits for the person to say where the arm stands. Text comes from standard input, so
-    a file of poses can be piped in; a pose that makes no sense is asked about, with the probable
-    mistake, and kept when the answer is ``yes``. The model's kinematics find its joint angles.
+    Poses are typed as the pendant shows them; a file of poses can be piped to standard input.
+    Opening waits for the arm's present pose. An implausible pose is queried with the probable
+    mistake, and kept if the answer is ``yes``. Joint angles are computed by the model's kinematics.
 
     Raises:
-        DeviceError: The input ends before a pose was entered.
+        DeviceError: The input ended before a pose was entered.
     """
     return ManualRobot(model, params, OperatorConsole())
 
 
 class ManualRobot(Device):
-    """An arm that a person moves; see :class:`flangeye.devices.Robot`.
+    """An arm moved by an operator; see :class:`flangeye.devices.Robot`.
 
-    No method waits for the person: an arm that was sent somewhere is ``moving`` until they have
-    said where it is.
+    No method waits for the operator: after a move request the arm is ``moving`` until its new pose
+    was typed.
     """
 
     # Between two looks at the input [s].
@@ -117,10 +118,10 @@ class ManualRobot(Device):
     """See :class:`flangeye.devices.MovedByHand`."""
 
     def __init__(self, model: RobotModel, params: ManualParams, desk: OperatorConsole) -> None:
-        """Wait until the person enters where the arm stands.
+        """Wait until the operator has entered the arm's pose.
 
         Raises:
-            DeviceError: Nobody will.
+            DeviceError: The input has ended.
         """
         self.name = f"{model.model} moved by hand"
         self.period = self._period
@@ -141,7 +142,7 @@ class ManualRobot(Device):
             self._listen(patience=self._period)
 
     def state(self) -> RobotState:
-        """Return the arm's pose as the person last entered it."""
+        """Return the arm's state with the pose entered last."""
         self._listen()
         return RobotState(
             base_T_flange=Transform(BASE, FLANGE, self._pose),
@@ -157,29 +158,29 @@ class ManualRobot(Device):
         )
 
     def move_joints(self, joints: Floats, speed: float, acceleration: float) -> None:
-        """Ask the person to move the flange to where joint angles put it."""
+        """Ask the operator to move the flange to the pose of joint angles (n,) [rad]."""
         self._ask(self._arm.flange(joints), joints)
 
     def move_linear(self, base_T_flange: Transform, speed: float, acceleration: float) -> None:
-        """Ask the person to move the flange to a pose."""
+        """Ask the operator to move the flange to a pose."""
         self._ask(base_T_flange.matrix, self._joints)
 
     def move_velocity(self, twist: Floats, acceleration: float) -> None:
-        """Refuse: a person cannot follow a velocity."""
+        """Raise DeviceError: an operator cannot follow a velocity."""
         raise DeviceError(f"{self.name}: it is moved by hand to poses; it takes no velocities")
 
     def wait_cycle(self) -> None:
-        """Wait a little."""
+        """Wait for a short time."""
         time.sleep(self._period)
 
     def stop(self) -> None:
-        """Ask the person to stop moving the arm."""
+        """Ask the operator to stop moving the arm."""
         if self._waiting:
             self._waiting, self._stopped = False, True
             self._desk.say("Stop: leave the arm where it is.")
 
     def close(self) -> None:
-        """Do nothing; a person moves the arm."""
+        """Do nothing: an operator moves the arm."""
 
     def _mode(self) -> Mode:
         if self._stopped:
@@ -193,7 +194,7 @@ class ManualRobot(Device):
         self._desk.say("then type or paste where it stands")
 
     def _listen(self, patience: float = 0.0) -> None:
-        """Take what has been typed, if anything was asked.
+        """Process typed lines while a pose is being requested.
 
         Raises:
             DeviceError: The input has ended.
@@ -234,7 +235,7 @@ class ManualRobot(Device):
         self._desk.say(f"Stands at {self._convention.text(pose)}")
 
     def _joints_at(self, pose: Floats, near: Floats) -> Floats | None:
-        """Return the joint angles (n,) of a pose that are nearest to ``near``, if there are any."""
+        """Return the joint angles (n,) of a pose closest to ``near``; None if out of reach."""
         found = self._arm.inverse(pose)
         if not len(found):
             return None
@@ -245,11 +246,11 @@ class ManualRobot(Device):
 
 
 class Tolerance(NamedTuple):
-    """Largest distance of a pose from the requested one.
+    """Largest deviation of a pose from the requested one.
 
     Attributes:
-        distance: [m]
-        angle: [rad]
+        distance: Distance [m].
+        angle: Angle [rad].
     """
 
     distance: float
@@ -263,14 +264,14 @@ def fault(
     asked: Floats | None,
     tolerance: Tolerance,
 ) -> str | None:
-    """Return what is implausible about a pose, and the probable mistake; None if nothing.
+    """Return why a typed pose is implausible, with the probable mistake; None if it is plausible.
 
     Args:
-        numbers: As typed, in the convention.
-        convention: The one that was agreed.
+        numbers: Typed numbers in the convention.
+        convention: Configured convention of poses.
         reach: Reach of the arm, from the origin of its base [m].
-        asked: (4, 4) where the arm was to go; None where any pose will do.
-        tolerance: How near to it counts as there.
+        asked: (4, 4) requested pose; None if any pose is acceptable.
+        tolerance: Largest deviation from the requested pose.
     """
     pose = convention.matrix(numbers)
     if asked is not None:
@@ -308,7 +309,7 @@ def _other_length(convention: PoseConvention) -> LengthUnit:
 def _meant(
     numbers: Floats, convention: PoseConvention, asked: Floats, tolerance: Tolerance
 ) -> str | None:
-    """Return the reading of the numbers that puts the arm where it was asked to go."""
+    """Return the interpretation of the numbers that agrees with the requested pose, if any."""
     for hint, reading in _readings(numbers, convention):
         try:
             off = _apart(asked, reading[0].matrix(reading[1]))
@@ -322,7 +323,7 @@ def _meant(
 def _readings(
     numbers: Floats, convention: PoseConvention
 ) -> Iterator[tuple[str, tuple[PoseConvention, Floats]]]:
-    """Yield other ways to read the numbers, the simplest mistake first."""
+    """Yield other interpretations of the numbers, the simplest mistake first."""
     length = _other_length(convention)
     angle: AngleUnit = "rad" if convention.angle == "deg" else "deg"
     in_length = convention.in_units(length, convention.angle)
@@ -342,7 +343,7 @@ def _readings(
 
 
 def _tool(pose: Floats, asked: Floats, tolerance: Tolerance) -> str | None:
-    """Return a hint where only a tool can lie between the pose and the flange."""
+    """Return a hint if the typed pose is probably the tool's instead of the flange's."""
     off = _apart(asked, pose)
     in_flange = asked[:3, :3].T @ (pose[:3, 3] - asked[:3, 3])
     # How far from the flange's axis a tool's tip is looked for [m]
@@ -353,6 +354,6 @@ def _tool(pose: Floats, asked: Floats, tolerance: Tolerance) -> str | None:
 
 
 def _apart(asked: Floats, pose: Floats) -> Tolerance:
-    """Return how far two (4, 4) poses are apart."""
+    """Return distance and angle between two poses (4, 4)."""
     angle = float(np.linalg.norm(rotation_log(asked[:3, :3].T @ pose[:3, :3])))
     return Tolerance(float(np.linalg.norm(asked[:3, 3] - pose[:3, 3])), angle)

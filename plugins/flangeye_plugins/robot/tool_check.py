@@ -1,4 +1,4 @@
-"""Checks of a controller's tool and arm model; twists and wrenches at tool and flange."""
+"""Checks of a controller's tool and arm model; conversion of twists and wrenches."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from flangeye.units import Angle, Length, param
 
 
 class ToolOffset(Params):
-    """The tool offset that the controller should have set, from the flange."""
+    """Tool offset from the flange that the controller must have set."""
 
     position: tuple[Length, Length, Length] = param(("0 mm", "0 mm", "0 mm"))
     rotation: tuple[Angle, Angle, Angle] = param(
@@ -24,7 +24,7 @@ class ToolOffset(Params):
     )
 
     def flange_T_tool(self, convention: PoseConvention) -> Floats:
-        """Return the offset as a (4, 4) matrix [m]; the rotation is the convention's."""
+        """Return the offset as a matrix (4, 4) [m]; its rotation is given in a convention."""
         return convention.in_units("m", "rad").matrix([*self.position, *self.rotation])
 
 
@@ -63,10 +63,10 @@ def require_tool(
 
 
 def require_model(name: str, state: RobotState, model: RobotModel) -> None:
-    """Refuse an arm whose flange is not where the model's kinematics put it.
+    """Refuse an arm whose reported flange pose differs from the model's kinematics.
 
     Raises:
-        DeviceError: It is not, or has another number of joints.
+        DeviceError: The poses or the numbers of joints differ.
     """
     if len(state.joints) != len(model.joints):
         raise DeviceError(
@@ -85,19 +85,19 @@ def require_model(name: str, state: RobotState, model: RobotModel) -> None:
 
 
 def twist_at_tool(twist: Floats, base_T_flange: Floats, base_T_tool: Floats) -> list[float]:
-    """Convert a (6,) twist of the flange to the tool's tip, both in base."""
+    """Return the twist (6,) of the tool's tip for a twist (6,) of the flange, both in base."""
     lever = base_T_tool[:3, 3] - base_T_flange[:3, 3]
     return [*(twist[:3] + hat(twist[3:]) @ lever).tolist(), *(float(turn) for turn in twist[3:])]
 
 
 def wrench_at_flange(wrench: Floats, base_T_flange: Floats, base_T_tool: Floats) -> Floats:
-    """Convert a (6,) wrench on the tool's tip to the flange's centre, both in base."""
+    """Return the wrench (6,) at the flange for a wrench (6,) at the tool's tip, both in base."""
     lever = base_T_tool[:3, 3] - base_T_flange[:3, 3]
     return np.concatenate([wrench[:3], wrench[3:] + hat(lever) @ wrench[:3]])
 
 
 def _differ(pose: Floats, other: Floats, tolerance: tuple[float, float]) -> bool:
-    """Return whether two (4, 4) poses differ; rotations as matrices, whose vectors may jump."""
+    """Return whether two poses (4, 4) differ; rotation vectors are ambiguous and not compared."""
     turn = pose[:3, :3].T @ other[:3, :3]
     angle = np.arccos(np.clip((np.trace(turn) - 1) / 2, -1.0, 1.0))
     distance = np.linalg.norm(pose[:3, 3] - other[:3, 3])

@@ -1,4 +1,4 @@
-"""Our side of the bridge, a process under ROS 2's own Python."""
+"""Client of the bridge process that runs under ROS 2's own Python."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ class GraphMessage(NamedTuple):
     """A received message, serialised.
 
     Attributes:
-        number: How many of its topic had come, with it.
-        received_ns: When, by ``time.monotonic_ns``.
-        ahead_ns: By how much the wall clock, which stamps are of, was ahead of that one.
-        data: Serialised (CDR).
+        number: Running number of the message on its topic, from 1.
+        received_ns: Time of receipt on ``time.monotonic_ns`` [ns].
+        ahead_ns: Wall clock (used by stamps) minus monotonic clock at receipt [ns].
+        data: Serialised message (CDR).
     """
 
     number: int
@@ -49,8 +49,8 @@ class Bridge(Device):
     """A ROS 2 node in its own process.
 
     Attributes:
-        asker: Name of the driver, for errors.
-        middleware: The RMW implementation that the node uses.
+        asker: Name of the driver, for error messages.
+        middleware: RMW implementation of the node.
     """
 
     # After its start a node knows what runs; on an idle machine it does after half a second
@@ -58,14 +58,14 @@ class Bridge(Device):
     discovery: ClassVar[float] = 2.0
 
     def __init__(self, asker: str, sim_time: bool = False) -> None:
-        """Start it.
+        """Start the bridge process.
 
         Args:
-            asker: Name of the driver, for errors.
-            sim_time: Whether stamps are those of the topic ``/clock``.
+            asker: Name of the driver, for error messages.
+            sim_time: Whether stamps are in the simulated time of ``/clock``.
 
         Raises:
-            DeviceError: There is no ROS 2 here, or its node does not start.
+            DeviceError: ROS 2 is not installed, or the node does not start.
         """
         types()  # without them nothing that comes can be read
         self.asker = asker
@@ -99,7 +99,7 @@ class Bridge(Device):
 
     @property
     def place(self) -> str:
-        """Text that names this graph."""
+        """Text that names this ROS 2 graph in messages."""
         domain = os.environ.get("ROS_DOMAIN_ID", "0")
         return f"(ROS_DOMAIN_ID {domain}, RMW_IMPLEMENTATION {self.middleware})"
 
@@ -111,37 +111,37 @@ class Bridge(Device):
         }
 
     def services(self) -> dict[str, str]:
-        """Return service -> type."""
+        """Return the services' types by name."""
         return dict(self._ask("services"))
 
     def until_known(self) -> float:
-        """Return when discovery has finished, by ``time.monotonic`` [s]."""
+        """Return the time on ``time.monotonic`` at which discovery will have finished [s]."""
         return max(self._began + self.discovery, time.monotonic() + MATCHING)
 
     def awaited(self, look: Callable[[], Found]) -> Found:
-        """Return what was discovered, waiting for it at most until discovery has finished."""
+        """Return a found result, retrying until discovery has finished."""
         until = self.until_known()
         while not (found := look()) and time.monotonic() < until:
             time.sleep(0.05)
         return found
 
     def wait_until_known(self) -> None:
-        """Return when all that runs is known."""
+        """Wait until discovery has finished."""
         time.sleep(max(self._began + self.discovery - time.monotonic(), 0.0))
 
     # --- what comes
 
     def follow(self, topic: str, kind: str, always: bool = True, take: Take | None = None) -> None:
-        """Subscribe to a topic as soon as it is published.
+        """Subscribe to a topic, waiting for a publisher during discovery.
 
         Args:
-            topic: Its name.
-            kind: Its type.
-            always: Whether every message is wanted, or those that :meth:`want` asks for.
-            take: Is given each message as it comes, in another thread, before :meth:`wait` has it.
+            topic: Name of the topic.
+            kind: Type of its messages.
+            always: Whether every message is forwarded, or only those requested by :meth:`want`.
+            take: Called with each message in another thread, before :meth:`wait` returns it.
 
         Raises:
-            DeviceError: Nobody publishes it, or with another type.
+            DeviceError: The topic has no publisher, or another type.
         """
         if take:
             self._takers[topic] = take
@@ -149,7 +149,7 @@ class Bridge(Device):
             raise DeviceError(f"{self.asker}: nobody publishes {topic}; {self._others(kind)}")
 
     def newest(self, topic: str) -> GraphMessage | None:
-        """Return the newest message of a topic that is followed.
+        """Return the newest message of a subscribed topic; None before the first.
 
         Raises:
             DeviceError: The bridge has ended.
@@ -158,7 +158,7 @@ class Bridge(Device):
         return self._newest.get(topic)
 
     def wait(self, topic: str, after: int, patience: float) -> GraphMessage | None:
-        """Return a message of a higher number than ``after``; None where none comes in time [s]."""
+        """Return a message with a number above ``after``; None if none arrives in time [s]."""
         with self._news:
             self._news.wait_for(lambda: self._gone or self._count(topic) > after, timeout=patience)
         found = self.newest(topic)
@@ -168,23 +168,23 @@ class Bridge(Device):
         """Request a topic's newest message since a given time, or else its next one.
 
         Returns:
-            The number after which it comes.
+            The number to pass to :meth:`wait` as ``after``.
         """
         count = self._count(topic)
         self._ask("want", topic=topic, since_ns=since_ns or time.monotonic_ns())
         return count
 
     def heard(self, topic: str) -> int:
-        """Return how many messages of a topic have arrived since it was subscribed to."""
+        """Return the number of messages received on a subscribed topic."""
         return int(self._ask("heard", topic=topic))
 
     def local_ns(self, topic: str, message: GraphMessage) -> int:
-        """Return the moment of a message's stamp, by ``time.monotonic_ns``.
+        """Return the time of a message's stamp, converted to ``time.monotonic_ns`` [ns].
 
-        A stamp of simulated time is held against ``/clock``.
+        A stamp in simulated time is compared with ``/clock``.
 
         Raises:
-            DeviceError: It has no stamp.
+            DeviceError: The message has no stamp.
         """
         stamp = stamp_of(message.data)
         if not stamp:
@@ -200,7 +200,7 @@ class Bridge(Device):
         )
 
     def stamp_ns(self, local_ns: int) -> int:
-        """Return the message stamp that belongs to a time of ``time.monotonic_ns``."""
+        """Return the message stamp [ns] for a time on ``time.monotonic_ns``."""
         tick = self.newest("/clock") if self._sim_time else None
         if tick is None:
             return local_ns + time.time_ns() - time.monotonic_ns()
@@ -213,7 +213,7 @@ class Bridge(Device):
         self._ask("offer", topic=topic, type=kind, latched=latched)
 
     def listeners(self, topic: str) -> int:
-        """Return how many listen to a topic that is offered."""
+        """Return the number of subscribers of an offered topic."""
         return int(self._ask("listeners", topic=topic))
 
     def publish(self, topic: str, data: bytes) -> None:
@@ -228,7 +228,7 @@ class Bridge(Device):
         """Call a Trigger service and wait for its answer.
 
         Raises:
-            DeviceError: It has ended, does not answer in time [s], or says that it failed.
+            DeviceError: The service has ended, does not answer in time [s], or reports a failure.
         """
         self._calls += 1
         self._ask("trigger", service=service, call=self._calls)
@@ -251,7 +251,7 @@ class Bridge(Device):
         return bool(self._gone)
 
     def close(self) -> None:
-        """End the process; safe to call twice."""
+        """End the bridge process; safe to call twice."""
         self._gone = self._gone or "is closed"
         # How long a node may take to say that it leaves: one that is killed is sent messages for
         # 20 s, which costs those that are sent to others [s]
@@ -278,7 +278,7 @@ class Bridge(Device):
             return self._answer(arguments, 2.5)
 
     def _answer(self, about: dict[str, Any], patience: float) -> Any:
-        """Return the answer to what was asked last, about a topic or a service."""
+        """Return the answer to the last request about a topic or a service."""
         until, answer = time.monotonic() + patience, dict[str, Any]()
         while answer.get("number") != self._asked:  # one to an earlier question came too late
             try:
@@ -331,19 +331,20 @@ class Bridge(Device):
 
 
 def _named(about: dict[str, Any]) -> str:
-    """Return which topic or service an error is about."""
+    """Return the name of the topic or service for an error message."""
     name = about.get("topic") or about.get("service")
     return f"{name}: " if name else ""
 
 
 def ros_python(asker: str) -> list[str]:
-    """Return the command of the Python that has rclpy: this machine's, the sourced one, or this.
+    """Return the command of a Python that has rclpy.
 
-    A sourced distribution puts its packages into ``PYTHONPATH``, in a folder that says for which
-    Python they were built.
+    It is the one in the machine's settings, that of the sourced distribution, or the present one. A
+    sourced distribution adds its packages to ``PYTHONPATH``, in a folder named after the Python
+    version they were built for.
 
     Raises:
-        DeviceError: There is none: says what to do.
+        DeviceError: There is none; the message says what to do.
     """
     if (named := find_named("programs", "ros2")) is not None:
         return [str(named)]
@@ -364,6 +365,6 @@ def ros_python(asker: str) -> list[str]:
 
 
 def _environment() -> dict[str, str]:
-    """Return this environment without what would keep the other Python from its own packages."""
+    """Return the environment without variables that would mislead the other Python."""
     mine = ("PYTHONHOME", "PYTHONSAFEPATH", "PYTHONDONTWRITEBYTECODE")
     return {name: value for name, value in os.environ.items() if name not in mine}

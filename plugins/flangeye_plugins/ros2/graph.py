@@ -1,4 +1,4 @@
-"""The ROS 2 graph: inspect what runs for a recipe, and publish a calibrated pose."""
+"""The ROS 2 graph: find arm and camera for a recipe, and publish a calibrated pose."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from flangeye_plugins.ros2.messages import (
 
 
 class StampedFrame(NamedTuple):
-    """A tf frame: its parent, its pose there (4, 4), and its time; None if static."""
+    """A tf frame: its parent, its pose in the parent (4, 4), and its time (None if static)."""
 
     parent: str
     pose: Floats
@@ -50,17 +50,17 @@ class StampedFrame(NamedTuple):
 
 
 class Frames:
-    """The frames of a graph, as their transforms arrive.
+    """The tf frames of a graph, updated as transforms arrive.
 
     Attributes:
-        frames: By name.
+        frames: Frames by name.
     """
 
     def __init__(self, bridge: Bridge, moving: bool = True) -> None:
-        """Listen to tf_static, where anybody publishes it, and to tf where frames move.
+        """Subscribe to tf_static, if it is published, and to tf for moving frames.
 
         Raises:
-            DeviceError: tf is wanted and nobody publishes it, or this ROS 2 has no tf2_msgs.
+            DeviceError: tf is needed but not published, or this ROS 2 has no tf2_msgs.
         """
         self.frames: dict[str, StampedFrame] = {}
         self._asker, self._bridge = bridge.asker, bridge
@@ -71,7 +71,7 @@ class Frames:
             bridge.follow("/tf_static", Type.TF, take=self._standing)
 
     def root(self, name: str) -> str:
-        """Return the frame at the top of a frame's tree."""
+        """Return the root frame of a frame's tree."""
         while name in self.frames:
             name = self.frames[name].parent
         return name
@@ -80,7 +80,7 @@ class Frames:
         """Return ``parent_T_child`` (4, 4) now.
 
         Raises:
-            DeviceError: No chain of frames joins the two, or one in it is no longer published.
+            DeviceError: The frames are not connected, or a frame between is no longer published.
         """
         up, down = self._chain(child), self._chain(parent)
         shared = next((name for name in up if name in down), None)
@@ -93,7 +93,7 @@ class Frames:
         return invert(self._from(parent, shared)) @ self._from(child, shared)
 
     def wait_for(self, parent: str, child: str) -> None:
-        """Wait until a pose is available; raises like :meth:`pose` when time runs out."""
+        """Wait until a pose is available; raise as :meth:`pose` does after a timeout."""
         until = self._bridge.until_known()
         while time.monotonic() < until:
             try:
@@ -161,25 +161,25 @@ class Ros2Graph(Device):
     counted: ClassVar[float] = 1.5
 
     def __init__(self) -> None:
-        """Join it.
+        """Join the graph.
 
         Raises:
-            DeviceError: There is no ROS 2 in this terminal.
+            DeviceError: ROS 2 is not sourced in this terminal.
         """
         self._bridge = Bridge("ROS 2")
 
     def close(self) -> None:
-        """Leave it."""
+        """Leave the graph."""
         self._bridge.close()
 
     def topics(self) -> list[Topic]:
-        """Return the topics that run, by name, 2 s after joining: then all are known."""
+        """Return all topics, sorted by name, once discovery has finished (2 s after joining)."""
         self._bridge.wait_until_known()
         known = self._bridge.topics()
         return [known[n] for n in sorted(known) if known[n].publishers or known[n].subscribers]
 
     def running(self) -> list[Running]:
-        """Return what runs and is of use; see :class:`flangeye.models.graph.Graph`."""
+        """Return the running arms and cameras; see :class:`flangeye.models.graph.Graph`."""
         topics = self.topics()
         found = [Running(name, f"{name}: String", "robot") for name in descriptions_in(topics)]
         found += [
@@ -195,11 +195,11 @@ class Ros2Graph(Device):
         ]
 
     def cell(self, ask: Ask, name: str) -> RunningCell:
-        """Return the arm and the camera that run; publishes nothing and calls no service.
+        """Return the running arm and camera; publish nothing and call no service.
 
         Raises:
-            DeviceError: No arm or no camera runs.
-            RecipeError: The URDF is not of a known arm, or its links are ambiguous.
+            DeviceError: There is no running arm or no running camera.
+            RecipeError: The URDF has no arm, or its links are ambiguous.
         """
         topics = self.topics()
         if not any(
@@ -237,13 +237,13 @@ class Ros2Graph(Device):
         )
 
     def publish(self, pose: CalibratedPose, frames: Mapping[str, str]) -> list[str]:
-        """Put a pose on ``/tf_static``; see :class:`flangeye.models.graph.Graph`.
+        """Publish a pose on ``/tf_static``; see :class:`flangeye.models.graph.Graph`.
 
-        A camera whose driver publishes a tree of its own frames is joined at the tree's root, for a
-        frame has one parent.
+        If the camera's driver publishes its own tree of frames, the root of that tree is connected,
+        because a frame has only one parent.
 
         Raises:
-            DeviceError: Something joins a camera to its carrier already, or this ROS 2 has no
+            DeviceError: The camera is connected to its carrier already, or this ROS 2 has no
                 ``tf2_msgs``.
         """
         tree = self._tree()
@@ -264,7 +264,7 @@ class Ros2Graph(Device):
         return told
 
     def stay(self) -> None:
-        """Never return; see :class:`flangeye.models.graph.Graph`."""
+        """Keep publishing until interrupted; see :class:`flangeye.models.graph.Graph`."""
         while True:
             # [s]
             self._bridge.wait("", 0, 86400.0)
@@ -272,7 +272,10 @@ class Ros2Graph(Device):
     # --- what runs
 
     def _triggers(self) -> list[str]:
-        """Return the services that may take a scan, by type and name; none that switches an arm."""
+        """Return the services that may trigger a scan, chosen by type and name.
+
+        Services that could switch an arm are left out.
+        """
         words = r"capture|trigger|acquire|scan|grab|snap|frame"
         services = self._bridge.services().items()
         return [
@@ -280,7 +283,7 @@ class Ros2Graph(Device):
         ]
 
     def _description(self, topics: Sequence[Topic], ask: Ask) -> str:
-        """Return the URDF that a node publishes, or of a file."""
+        """Return the URDF published by a node, or that of a file."""
         known = descriptions_in(topics)
         question = f"which robot_description ({', '.join(known) or 'none runs'}), or a .urdf file"
         chosen = ask("robot", question, known[0] if len(known) == 1 else None, "arm.urdf")
@@ -295,7 +298,7 @@ class Ros2Graph(Device):
         return str(decoded(latched.data, Type.TEXT).data)
 
     def _listen(self, topics: Sequence[Topic]) -> list[Heard]:
-        """Count the messages of all arms and cameras at once."""
+        """Return what all topics of arms and cameras sent in a short time."""
         some = [t for t in topics if t.publishers and t.type in (Type.JOINT_STATE, *SCANS)]
         joints: dict[str, dict[str, float]] = {topic.name: {} for topic in some}
 
@@ -321,13 +324,13 @@ class Ros2Graph(Device):
         ]
 
     def _place(self, base: str, frame: str) -> Floats | None:
-        """Return where the camera stands by tf (4, 4); None where tf does not join it."""
+        """Return the camera's pose by tf (4, 4); None if tf does not connect it."""
         with suppress(DeviceError):
             return self._tree().pose(base, frame)
         return None
 
     def _tree(self) -> Frames:
-        """Return the frames that run, as soon as those that stand have come."""
+        """Return the frames of tf once the static ones have arrived."""
         moving = any(t.name == "/tf" and t.publishers for t in self.topics())
         frames = Frames(self._bridge, moving)
         time.sleep(MATCHING)
@@ -355,7 +358,7 @@ class Ros2Graph(Device):
 
 
 class Heard(NamedTuple):
-    """A topic that was listened to: how often it comes [Hz], its newest message, joint -> angle."""
+    """What was received on a topic: rate [Hz], newest message, and joint angles by name."""
 
     topic: Topic
     rate: float
@@ -364,14 +367,14 @@ class Heard(NamedTuple):
 
     @property
     def frame(self) -> str:
-        """The frame of its messages, empty where none came."""
+        """Frame of the topic's messages; empty without a message."""
         return frame_of(self.newest.data) if self.newest else ""
 
     @property
     def scans(self) -> str:
-        """The parameter of ``scanner.ros2`` that takes it; empty where it has no scans.
+        """Parameter of ``scanner.ros2`` for this topic; empty if it has no scans.
 
-        Depth images are recognised by their encoding, or by their topic's name where none came.
+        Depth images are recognised by their encoding, or by the topic's name without a message.
         """
         kind, name = self.topic.type, self.topic.name
         if kind not in SCANS or name.endswith("/compressedDepth"):
@@ -385,7 +388,7 @@ class Heard(NamedTuple):
 
     @property
     def line(self) -> str:
-        """One line of text about the topic."""
+        """One line of text that describes the topic."""
         name, kind = self.topic.name, self.topic.type.rpartition("/")[2]
         often = f"{self.rate:.3g} Hz" if self.newest else "silent"
         frame = f", frame {self.frame}" if self.frame else ""
@@ -393,13 +396,13 @@ class Heard(NamedTuple):
 
 
 def descriptions_in(topics: Iterable[Topic]) -> list[str]:
-    """Return the topics that have an arm's URDF."""
+    """Return the topics with an arm's URDF."""
     texts = (t.name for t in topics if t.type == Type.TEXT and t.publishers)
     return [name for name in texts if name.endswith("robot_description")]
 
 
 def controllers_in(topics: Iterable[Topic]) -> list[str]:
-    """Return the topics on which a controller takes joint trajectories."""
+    """Return the topics on which a controller accepts joint trajectories."""
     return [t.name for t in topics if t.type == Type.TRAJECTORY and t.subscribers]
 
 
@@ -407,7 +410,7 @@ def described_arm(text: str, path: Path, ask: Ask) -> tuple[UrdfArm, dict[str, A
     """Return the arm of a URDF to be saved at ``path``, and the recipe's section for it.
 
     Raises:
-        RecipeError: It is no URDF, or its base link is ambiguous.
+        RecipeError: The text is no URDF, or its base link is ambiguous.
     """
     packages, urdf, flange = packages_of(text), parse_urdf(text, path), None
     links = flange_links(urdf)
@@ -422,7 +425,7 @@ def described_arm(text: str, path: Path, ask: Ask) -> tuple[UrdfArm, dict[str, A
 
 
 def packages_of(text: str) -> dict[str, Path]:
-    """Return the folders of the packages that a URDF's meshes are in, as the terminal has them."""
+    """Return the folders of the packages named by a URDF's meshes, in the sourced environment."""
     prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
     found = {}
     for name in dict.fromkeys(re.findall(r"package://([^/\"]+)/", text)):
@@ -433,9 +436,9 @@ def packages_of(text: str) -> dict[str, Path]:
 
 
 def states_of(heard: Sequence[Heard], joints: Sequence[str]) -> tuple[str, Floats]:
-    """Return the topic that has all joints of an arm, and their angles (n,) now [rad].
+    """Return the topic with all joints of an arm, and their present angles (n,) [rad].
 
-    Of several it is one named joint_states: others may be what the joints are commanded.
+    Among several a topic named joint_states is preferred, as others may contain commands.
 
     Raises:
         DeviceError: No topic has all joints; the message names the joints of each.
@@ -454,7 +457,7 @@ def states_of(heard: Sequence[Heard], joints: Sequence[str]) -> tuple[str, Float
 def arm_driver(
     topics: Iterable[Topic], joints: Sequence[str], states: str, ask: Ask
 ) -> dict[str, Any]:
-    """Return the driver of an arm as a recipe names it, with its parameters."""
+    """Return the recipe's entry for an arm's driver with its parameters."""
     listening = controllers_in(topics)
     question = "which controller moves the arm; none: others do, by hand or by a program"
     told = f" ({', '.join(listening)})" if len(listening) > 1 else ""
@@ -471,7 +474,7 @@ def scans_of(heard: Sequence[Heard], ask: Ask) -> Heard:
     """Return the topic of the scans: clouds, else depth images, else images of a printed target.
 
     Raises:
-        DeviceError: There is none, or not the one that was asked for.
+        DeviceError: There is none, or not the requested one.
     """
     every = {each.topic.name: each for each in heard if each.scans}
     # An image that is published compressed besides is taken as it is
@@ -489,7 +492,7 @@ def scans_of(heard: Sequence[Heard], ask: Ask) -> Heard:
 
 
 def unit_of(scans: Heard) -> list[str]:
-    """Return a warning where the newest cloud of a topic is not in metres, as ROS 2 has it."""
+    """Return a warning if the newest cloud of a topic is not in metres, the unit of ROS 2."""
     if scans.topic.type != Type.CLOUD or scans.newest is None:
         return []
     xyz = decoded(scans.newest.data, Type.CLOUD, cloud_of)
@@ -509,19 +512,19 @@ def unit_of(scans: Heard) -> list[str]:
 
 
 def seen_by(scans: Heard) -> Any:
-    """Return the newest image of a topic, (H, W) or (H, W, 3); empty where none came."""
+    """Return the newest image of a topic, (H, W) or (H, W, 3); empty without one."""
     if scans.newest is None:
         return np.zeros((0, 0), np.uint8)
     return np.ascontiguousarray(decoded(scans.newest.data, scans.topic.type, pixels_of))
 
 
 def scanner_driver(scans: Heard, triggers: Iterable[str], ask: Ask) -> dict[str, Any]:
-    """Return the parameters of ``scanner.ros2``; one that is silent has to be triggered.
+    """Return the parameters of ``scanner.ros2``; a silent topic needs a trigger.
 
     Args:
-        scans: The topic of its scans.
-        triggers: Services that may take one.
-        ask: For which does.
+        scans: Topic of the scans.
+        triggers: Services that may trigger a scan.
+        ask: Asks the user which one does.
     """
     params: dict[str, Any] = {scans.scans: scans.topic.name}
     if scans.newest is None:

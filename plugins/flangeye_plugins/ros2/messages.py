@@ -1,4 +1,4 @@
-"""ROS 2 messages without ROS: CDR to objects and back; clouds and images of them as arrays."""
+"""ROS 2 messages without ROS: conversion from and to CDR, and to arrays."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from flangeye.types import Floats, Singles
 
 
 class Type(StrEnum):
-    """The types of messages and services that are spoken."""
+    """Types of the messages and services used."""
 
     JOINT_STATE = "sensor_msgs/msg/JointState"
     TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
@@ -45,7 +45,7 @@ PER_METRE = {"16UC1": 1000.0, "mono16": 1000.0, "32FC1": 1.0}
 
 
 def stamp_of(data: bytes) -> int:
-    """Return ``header.stamp`` [ns] of a message that begins with a header or time; 0 for none."""
+    """Return ``header.stamp`` [ns] of a message that begins with a header or time; 0 if unset."""
     if len(data) < SHORTEST:
         return 0
     seconds, nanoseconds = struct.unpack_from(f"{_order(data)}iI", data, 4)
@@ -67,7 +67,7 @@ def _order(data: bytes) -> str:
 
 @cache
 def types() -> Any:
-    """Return the message types; the four living distributions agree on those that are read here.
+    """Return the store of message types; the four supported distributions agree on those used.
 
     Raises:
         StageError: The extra ``ros`` is not installed.
@@ -84,7 +84,7 @@ def decoded(data: bytes, kind: str, use: Callable[[Any], Any] = lambda message: 
     """Return the result of a function on a deserialised message.
 
     Raises:
-        StageError: It is damaged, or not of this type.
+        StageError: The message is damaged, or not of this type.
     """
     try:
         return use(types().deserialize_cdr(data, kind))
@@ -105,10 +105,10 @@ def message(kind: str, **fields: Any) -> Any:
 
 
 def positions_of(message: Any) -> dict[str, float]:
-    """Return joint -> position of a ``sensor_msgs/JointState``; empty if it has no positions.
+    """Return the positions of a ``sensor_msgs/JointState`` by joint; empty without positions.
 
     Raises:
-        StageError: It has fewer positions than names.
+        StageError: The message has fewer positions than names.
     """
     names, positions = list(message.name), message.position.tolist()
     if positions and len(positions) != len(names):
@@ -122,7 +122,7 @@ def cloud_of(message: Any) -> Singles:
     """Return the points of a ``sensor_msgs/PointCloud2``, (H, W, 3) if organised, else (N, 3) [m].
 
     Raises:
-        StageError: It has no x, y and z.
+        StageError: The cloud has no x, y and z.
     """
     fields = {f.name: f for f in message.fields}
     if not {"x", "y", "z"} <= set(fields):
@@ -146,12 +146,12 @@ def cloud_of(message: Any) -> Singles:
 
 
 def _rows_of(message: Any, row: int, step: int) -> NDArray[np.uint8]:
-    """Return the bytes of a cloud or an image, (H, row), without what pads its rows.
+    """Return the bytes (H, row) of a cloud or an image without the padding of its rows.
 
-    Some drivers state a wrong step: rows that just fill the message are not padded.
+    Some drivers state a wrong step; rows that exactly fill the message are not padded.
 
     Raises:
-        StageError: It has fewer or more bytes than its size needs.
+        StageError: The number of bytes does not match the size.
     """
     data = np.frombuffer(bytes(message.data), np.uint8)
     step = row if len(data) == message.height * row else step
@@ -167,7 +167,8 @@ def intrinsics_of(message: Any, rectified: bool = False) -> tuple[Floats, Floats
 
     Args:
         message: The CameraInfo.
-        rectified: Whether the images are rectified: their camera is P's, without distortion.
+        rectified: Whether the images are rectified; the camera is then that of P, without
+            distortion.
     """
     k, d, p = (
         np.array(getattr(message, name if hasattr(message, name) else name.upper()), dtype=float)
@@ -197,13 +198,13 @@ def values_of(message: Any) -> NDArray[Any]:
 
 
 def pixels_of(message: Any) -> Any:
-    """Return the pixels of a ``sensor_msgs/Image`` as 8 bits, blue first where coloured.
+    """Return the pixels of a ``sensor_msgs/Image`` as 8-bit grey or BGR.
 
     Those of a ``CompressedImage`` are grey.
 
     Raises:
         StageError: The image's encoding is not known.
-        ImageError: It is compressed, and damaged.
+        ImageError: The compressed image is damaged.
     """
     if hasattr(message, "format"):
         import cv2

@@ -1,1 +1,1 @@
-"""``scanner.*``: scanners, a module each, which imports its SDK when it opens a device."""
+"""``scanner.*`` drivers, one module per scanner; an SDK is imported when opening a device."""

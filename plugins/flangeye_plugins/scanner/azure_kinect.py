@@ -1,7 +1,7 @@
-"""``scanner.azure_kinect``: an Azure Kinect, or one's MKV recording, through pyk4a.
+"""``scanner.azure_kinect``: an Azure Kinect, or its MKV recording, through pyk4a.
 
-The camera lives in a process of its own: libk4a aborts the process it is in when a device is gone
-at the wrong moment, and a run must not end with it.
+The camera runs in a separate process, because libk4a may abort its process when a device is
+unplugged, which must not end the run.
 """
 
 from __future__ import annotations
@@ -60,12 +60,12 @@ class AzureKinectParams(Params):
 
 @part("scanner.azure_kinect")
 def scanner_azure_kinect(model: ScannerModel | None, params: AzureKinectParams) -> Scanner:
-    """Scan with an Azure Kinect, or play its recording: depth, and colour mapped to it.
+    """Scan with an Azure Kinect, or its recording: depth, and colour mapped to it.
 
     A scan far out of the model's range is refused.
 
     Raises:
-        DeviceError: No SDK, no camera, or no recording.
+        DeviceError: The SDK, the camera or the recording was not found.
     """
     if params.recording is not None and not params.recording.is_file():
         raise DeviceError(f"{NAME}: no recording at {params.recording}")
@@ -94,7 +94,7 @@ def _host(params: AzureKinectParams) -> Pipe:
 
 
 def _python(name: str) -> list[str]:
-    """Return the command of the Python that this machine names; of this one if it names none."""
+    """Return the command of the Python in the machine's settings; by default the present one."""
     if name == "kinect" and find_named("programs", name) is None:
         return python_command()
     # An older Python knows no -P; isolated, it imports nothing from the current folder either.
@@ -102,7 +102,7 @@ def _python(name: str) -> list[str]:
 
 
 def _answer(pipe: Pipe, patience: float) -> dict[str, Any]:
-    """Return what the host says, in its own words where it is an error."""
+    """Return the host process's answer; raise its error message as DeviceError."""
     try:
         answer: dict[str, Any] = json.loads(pipe.line(patience))
     except PipeEndedError as error:
@@ -133,13 +133,13 @@ class AzureKinect(OpenScanner):
         model: ScannerModel | None,
         params: AzureKinectParams,
     ) -> None:
-        """Take over the process that holds the camera."""
+        """Use a running host process with an open camera."""
         what = params.recording.name if params.recording else facts["serial"]
         super().__init__(f"Azure Kinect {what}", {"unit": "mm", **facts}, model)
         self._pipe, self._params = pipe, params
 
     def expose(self) -> Callable[[], Scan]:
-        """Take the next capture; the arm waits until it is here."""
+        """Take the next capture; the arm must wait until it has arrived."""
         started = time.monotonic_ns()
         with contextlib.suppress(OSError):  # the answer says what became of the process
             self._pipe.write(b"next\n")

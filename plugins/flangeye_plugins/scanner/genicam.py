@@ -1,4 +1,4 @@
-"""``scanner.genicam``: 3D scanners that speak GenICam, such as Photoneo's, through harvesters."""
+"""``scanner.genicam``: 3D scanners with GenICam, such as Photoneo's, through harvesters."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ ORGANISED = "CalibratedABC_Grid"
 
 @dataclass(frozen=True, eq=False)
 class RangeLayout:
-    """How the device lays out a range map, in its own words.
+    """Layout of a device's range map.
 
     Attributes:
         shape: (rows, columns).
-        per_metre: How many of its units are in a metre.
-        scale: (3,) factor of the transmitted coordinates.
-        offset: (3,) added to them after that, in its unit.
-        invalid: (3,) value that stands for no measurement, NaN where there is none.
-        facts: The same as text.
+        per_metre: Number of the device's units per metre.
+        scale: (3,) scale factors of the transmitted coordinates.
+        offset: (3,) offsets added after scaling, in the device's unit.
+        invalid: (3,) values that mark missing measurements; NaN without one.
+        facts: The layout as text for reports.
     """
 
     shape: tuple[int, int]
@@ -53,13 +53,13 @@ class RangeLayout:
     facts: dict[str, str]
 
     def coordinates(self, parts: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
-        """Return (H, W, 3) in the device's unit, NaN where nothing was measured.
+        """Return coordinates (H, W, 3) in the device's unit; missing points are NaN.
 
         Args:
-            parts: A frame's components by pixel format.
+            parts: Components of a frame by pixel format.
 
         Raises:
-            DeviceError: The frame is not laid out as the device stated.
+            DeviceError: The frame does not have the layout stated by the device.
         """
         raw = _raw_coordinates(parts)
         if raw.shape != (*self.shape, 3):
@@ -75,16 +75,15 @@ class RangeLayout:
 
 
 def configure(nodes: Any) -> RangeLayout:
-    """Set a device to organised range maps, and return the format of its data.
+    """Set a device to organised range maps, and return the layout of its data.
 
-    Settings that the device does not have or does not let go of are left; what matters is read
-    back.
+    Settings that the device lacks or locks are skipped; the important ones are read back.
 
     Args:
         nodes: The device's node map.
 
     Raises:
-        DeviceError: It cannot give range maps, or not organised, or in no unit of length.
+        DeviceError: The device cannot send organised range maps in a unit of length.
     """
     _enable_range(nodes)
     _write(nodes, "Scan3dOutputMode", ORGANISED)
@@ -98,7 +97,7 @@ def configure(nodes: Any) -> RangeLayout:
 
 
 def has_node(nodes: Any, name: str) -> bool:
-    """Return whether the device has a feature at all."""
+    """Return whether the device has a feature."""
     return bool(nodes.has_node(name))
 
 
@@ -146,7 +145,7 @@ def _row(values: tuple[float, ...]) -> NDArray[np.float32]:
 
 
 def _axis(nodes: Any, axis: str) -> tuple[float, float, float]:
-    """Return scale, offset, and the value that stands for nothing."""
+    """Return scale, offset, and the value of a missing measurement for an axis."""
     _write(nodes, "Scan3dCoordinateSelector", axis)
     flagged = _read(nodes, "Scan3dInvalidDataFlag", default=False)
     invalid = _read(nodes, "Scan3dInvalidDataValue", default=np.nan) if flagged else np.nan
@@ -166,14 +165,14 @@ def _read(nodes: Any, name: str, default: Any = None) -> Any:
 
 
 def _write(nodes: Any, name: str, value: Any) -> None:
-    """Set a feature where the device has it and lets it be set."""
+    """Set a feature if the device has it and it is writable."""
     if _read(nodes, name) != value and has_node(nodes, name):
         with contextlib.suppress(Exception):
             getattr(nodes, name).value = value
 
 
 def _raw_coordinates(parts: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
-    """Return (H, W, 3) as transmitted, whether the coordinates came together or one by one."""
+    """Return the transmitted coordinates (H, W, 3), from one component or from three."""
     if "Coord3D_ABC32f" in parts:
         together = parts["Coord3D_ABC32f"]
         return together.reshape(len(together), -1, 3)
@@ -207,8 +206,8 @@ def scanner_genicam(model: ScannerModel | None, params: GenicamParams) -> Scanne
     A scan far out of the model's range is refused.
 
     Raises:
-        DeviceError: No SDK, no producer, no such device, or it cannot give an organised range map
-            in a known unit.
+        DeviceError: SDK, producer or device was not found, or the device cannot send organised
+            range maps in a known unit.
     """
     core = load_sdk("harvesters.core", NAME, INSTALL)
     # Its own words on the console would stand beside the one line that we say.
@@ -230,10 +229,12 @@ def scanner_genicam(model: ScannerModel | None, params: GenicamParams) -> Scanne
 
 
 def producers(wanted: str | None) -> list[Path]:
-    """Return the GenTL producers to load: libraries that this machine names, never a recipe.
+    """Return the GenTL producers (libraries) to load, from the machine's settings only.
+
+    A recipe cannot name a library, as it would be executed.
 
     Raises:
-        DeviceError: There are none, or none of that name.
+        DeviceError: There is no producer, or none of this name.
     """
     if wanted is not None and (named := find_named("libraries", wanted)):
         return [named]
@@ -289,7 +290,7 @@ class GenicamScanner(OpenScanner):
         model: ScannerModel | None,
         params: GenicamParams,
     ) -> None:
-        """Take over an open and configured device."""
+        """Use an open and configured device."""
         device = acquirer.device
         name = f"{device.vendor} {device.model} {device.serial_number}"
         super().__init__(name, {"transport": device.tl_type, **layout.facts}, model)
@@ -297,7 +298,7 @@ class GenicamScanner(OpenScanner):
         self._params, self._closed = params, False
 
     def expose(self) -> Callable[[], Scan]:
-        """Scan once; the arm waits until the frame is here, for devices say no earlier."""
+        """Scan once; the arm must wait for the frame, as an exposure's end is not reported."""
         if self._closed:
             raise DeviceError(f"{self.name}: is closed")
         started = time.monotonic_ns()
@@ -314,7 +315,7 @@ class GenicamScanner(OpenScanner):
             self._harvester.reset()
 
     def _fetch(self) -> dict[str, NDArray[Any]]:
-        """Return a new frame's components by pixel format, copied, each (H, W * k)."""
+        """Return copies of a new frame's components (H, W * k) by pixel format."""
         gentl = load_sdk("genicam.gentl", NAME, INSTALL)
         nodes = self._acquirer.remote_device.node_map
         try:

@@ -1,8 +1,8 @@
 """Process that runs an Azure Kinect, or its recording; see ``azure_kinect.py``.
 
-Runs under any Python that has pyk4a, without flangeye: libk4a may abort the process it is in, and
-the wheel of pyk4a needs NumPy 1. Takes ``next`` a line on standard input; answers on standard
-output with one line of JSON, and the arrays it names.
+It runs under any Python that has pyk4a, without flangeye: libk4a may abort its process, and the
+wheel of pyk4a needs NumPy 1. For each line ``next`` on standard input it answers on standard output
+with one line of JSON, followed by the arrays named in it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any, BinaryIO
 
 
 class NoDepthError(Exception):
-    """A capture came without a depth image."""
+    """A capture has no depth image."""
 
 
 def main() -> None:
@@ -96,7 +96,7 @@ def _answer(out: BinaryIO, source: Any) -> None:
 
 
 def _calibration(calibration: Any, coloured: bool) -> dict[str, Any]:
-    """Return the device's own calibration: its cameras, and where the colour camera is."""
+    """Return the device's factory calibration of both cameras and the pose between them."""
     from pyk4a import CalibrationType
 
     depth, colour = CalibrationType.DEPTH, CalibrationType.COLOR
@@ -116,7 +116,7 @@ def _calibration(calibration: Any, coloured: bool) -> dict[str, Any]:
 
 
 def _colour(capture: Any) -> Any:
-    """Return the colour image (H, W, 4) BGRA, or None."""
+    """Return the colour image (H, W, 4) as BGRA; None without one."""
     from pyk4a import ImageFormat
 
     colour = capture.color

@@ -33,7 +33,7 @@ def scanner_mech_eye(model: ScannerModel | None, params: MechEyeParams) -> Scann
     A scan far out of the model's range is refused.
 
     Raises:
-        DeviceError: No SDK, no camera, or it does not connect.
+        DeviceError: The SDK or the camera was not found, or the connection failed.
     """
     api = load_sdk("mecheye.area_scan_3d_camera", NAME, "pip install 'flangeye[mech_eye]'")
     camera, patience = api.Camera(), round(params.timeout * 1e3)
@@ -69,7 +69,7 @@ class MechEye(OpenScanner):
     def __init__(
         self, api: Any, camera: Any, model: ScannerModel | None, params: MechEyeParams
     ) -> None:
-        """Take over a connected camera."""
+        """Use a connected camera."""
         super().__init__(NAME, {"unit": "m", "layout": "organised"}, model)
         self._api, self._camera, self._params = api, camera, params
 
@@ -77,7 +77,7 @@ class MechEye(OpenScanner):
         """Read the camera's identity, and set its unit to metres.
 
         Raises:
-            DeviceError: It does not answer, or keeps to another unit.
+            DeviceError: The camera does not answer, or its unit cannot be set.
         """
         info, metres = self._api.CameraInfo(), self._api.shared.CoordinateUnit_Meter
         _require(self._camera.get_camera_info(info), self.name)
@@ -90,7 +90,7 @@ class MechEye(OpenScanner):
             raise DeviceError(f"{self.name}: its points stay in unit {unit}, metres are needed")
 
     def expose(self) -> Callable[[], Scan]:
-        """Capture; the arm waits until the frame is here."""
+        """Capture a frame; the arm must wait until it has arrived."""
         frame, patience = self._api.Frame3D(), round(self._params.timeout * 1e3)
         started = time.monotonic_ns()
         _require(self._camera.capture_3d(frame, patience), self.name)

@@ -1,4 +1,4 @@
-"""Common parts of open scanners."""
+"""Common parts of scanner drivers."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ Numbers = NDArray[Any]
 
 
 class ColourCamera(NamedTuple):
-    """The colour camera; ``colour = rotation @ depth + translation`` [m].
+    """The colour camera beside a depth camera; ``colour = rotation @ depth + translation`` [m].
 
     Attributes:
         matrix: 3 x 3 pinhole matrix [px].
         distortion: OpenCV's eight coefficients.
-        rotation: 3 x 3, from the depth camera.
-        translation: 3, the same [m].
+        rotation: 3 x 3 rotation from the depth camera.
+        translation: 3-vector of the translation from the depth camera [m].
     """
 
     matrix: list[list[float]]
@@ -48,12 +48,12 @@ class DepthView:
         distortion: list[float],
         colour: dict[str, Any] | None = None,
     ) -> None:
-        """Take the 3 x 3 matrix [px], OpenCV's eight coefficients, and a :class:`ColourCamera`."""
+        """Store camera matrix [px], OpenCV's 8 coefficients, and a :class:`ColourCamera`."""
         self.matrix, self.distortion = np.array(matrix), np.array(distortion)
         self.colour = None if colour is None else ColourCamera(**colour)
 
     def points(self, depth: Numbers) -> NDArray[np.float32]:
-        """Return (H, W, 3) for a depth image (H, W), in its unit; zero where it is zero."""
+        """Return points (H, W, 3) of a depth image (H, W), in its unit; zero where it is zero."""
         import cv2
 
         rows, columns = depth.shape
@@ -67,8 +67,9 @@ class DepthView:
         """Return the colour image as seen from the depth camera.
 
         Args:
-            xyz: (H, W, 3) points [mm]; black where there is none, or the colour image ends.
-            colour: (h, w, 4) BGRA.
+            xyz: (H, W, 3) points [mm]; pixels without a point or outside the colour image are
+                black.
+            colour: (h, w, 4) colour image, BGRA.
         """
         import cv2
 
@@ -89,7 +90,7 @@ class DepthView:
 
 
 class SerialParams(Params):
-    """Which of several cameras."""
+    """Selection of a camera by its serial number."""
 
     serial: str | None = Field(
         None, description="Serial number of the camera, if there are several."
@@ -97,11 +98,11 @@ class SerialParams(Params):
 
 
 def cloud_of(xyz: NDArray[Any], per_metre: float) -> PointCloud:
-    """Return a cloud from (H, W, 3) or (N, 3) coordinates.
+    """Return a cloud from coordinates (H, W, 3) or (N, 3).
 
     Args:
-        xyz: As the device gives them; a point at the device's own origin was not measured.
-        per_metre: How many of the device's units are in a metre.
+        xyz: The device's coordinates; a point at the origin is a missing one.
+        per_metre: Number of the device's units per metre.
     """
     metres = xyz.astype(np.float32)
     metres /= np.float32(per_metre)  # exact to the last bit, which times 0.001 is not
@@ -110,7 +111,7 @@ def cloud_of(xyz: NDArray[Any], per_metre: float) -> PointCloud:
 
 
 def require_in_range(name: str, cloud: PointCloud, model: ScannerModel | None) -> None:
-    """Raise DeviceError if a cloud is so far out of range that its unit must be wrong."""
+    """Raise DeviceError if a cloud is so far out of range that its unit is probably wrong."""
     if model is None:
         return
     distance = median_distance(cloud)
@@ -125,12 +126,12 @@ def require_in_range(name: str, cloud: PointCloud, model: ScannerModel | None) -
 
 
 class OpenScanner(Device):
-    """A connected scanner; drivers implement ``expose``, and ``close`` if a device is open."""
+    """Base class of scanners; drivers implement ``expose``, and ``close`` if there is a device."""
 
     def __init__(
         self, name: str, facts: Mapping[str, str], model: ScannerModel | None = None
     ) -> None:
-        """Take name and facts, see :class:`flangeye.devices.Scanner`, and the model if known."""
+        """Store name and facts (see :class:`flangeye.devices.Scanner`), and the model if known."""
         self.name = name
         self.facts = dict(facts)
         self._model = model
@@ -145,10 +146,10 @@ class OpenScanner(Device):
         times: tuple[int, int],
         image: Image | None = None,
     ) -> Scan:
-        """Return what an exposure gave, coordinates as :func:`cloud_of` takes them.
+        """Return the scan of an exposure; for the coordinates see :func:`cloud_of`.
 
         Raises:
-            DeviceError: It is far out of the model's range.
+            DeviceError: The scan is far out of the model's range.
         """
         cloud = cloud_of(xyz, per_metre)
         require_in_range(self.name, cloud, self._model)

@@ -32,12 +32,12 @@ class RealsenseParams(SerialParams):
 
 @part("scanner.realsense")
 def scanner_realsense(model: ScannerModel | None, params: RealsenseParams) -> Scanner:
-    """Scan with a RealSense, or play its recording.
+    """Scan with a RealSense depth camera, or its recording.
 
     A scan far out of the model's range is refused.
 
     Raises:
-        DeviceError: No SDK, no camera, or no recording.
+        DeviceError: The SDK, the camera or the recording was not found.
     """
     rs = load_sdk("pyrealsense2", NAME, "pip install 'flangeye[realsense]'")
     pipeline, config = rs.pipeline(), rs.config()
@@ -57,7 +57,7 @@ def scanner_realsense(model: ScannerModel | None, params: RealsenseParams) -> Sc
 
 
 def _serial(rs: Any, wanted: str | None) -> str:
-    """Return the serial number of the camera to open; starting without one waits 15 s for it."""
+    """Return the serial number of the camera; without a camera raise at once, not after 15 s."""
     devices = rs.context().query_devices()
     found = sorted(device.get_info(rs.camera_info.serial_number) for device in devices)
     if not found:
@@ -83,7 +83,7 @@ class Realsense(OpenScanner):
         model: ScannerModel | None,
         params: RealsenseParams,
     ) -> None:
-        """Take over a started pipeline."""
+        """Use a started pipeline."""
         device = profile.get_device()
         self._rs, self._pipeline, self._params = rs, pipeline, params
         self._unit = float(device.first_depth_sensor().get_depth_scale())
@@ -95,7 +95,7 @@ class Realsense(OpenScanner):
         super().__init__(name, self._facts(profile), model)
 
     def expose(self) -> Callable[[], Scan]:
-        """Take a new frame; the arm waits until it is here."""
+        """Take a new frame; the arm must wait until it has arrived."""
         started = time.monotonic_ns()
         # Frames of a running camera that may have been exposed before they were asked for
         for _ in range(0 if self._params.recording else 2):
@@ -113,7 +113,7 @@ class Realsense(OpenScanner):
             self._pipeline.stop()
 
     def _run_out(self) -> None:
-        """Let a recording come to its end: stopped while it is read, the SDK may abort."""
+        """Play a recording to its end, because the SDK may abort if it is stopped while reading."""
         limit = time.monotonic() + PATIENCE
         with contextlib.suppress(RuntimeError):
             while time.monotonic() < limit:
@@ -138,7 +138,7 @@ class Realsense(OpenScanner):
             ) from None
 
     def _coordinates(self, depth: Any) -> Any:
-        """Return (H, W, 3) in metres, zero where nothing was measured."""
+        """Return coordinates (H, W, 3) [m]; missing points are zero."""
         unit, rows, columns = depth.get_units(), depth.get_height(), depth.get_width()
         # Largest relative difference of two reports of one unit, in single precision
         if abs(unit - self._unit) > 1e-6 * self._unit:

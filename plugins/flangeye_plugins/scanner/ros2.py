@@ -33,7 +33,7 @@ NAME = "scanner.ros2"
 
 
 class Ros2ScannerParams(Params):
-    """Parameters of ``scanner.ros2``: a cloud, or a depth image, or an image of a marker alone."""
+    """Parameters of ``scanner.ros2``: topic of a cloud, a depth image, or an image only."""
 
     cloud: str | None = Field(None, description="Topic of the clouds (PointCloud2).")
     depth: str | None = Field(None, description="Topic of depth images (Image), not of clouds.")
@@ -62,7 +62,7 @@ class Ros2ScannerParams(Params):
 
     @property
     def timeout(self) -> float:
-        """Longest wait for a scan [s]; one that is triggered may take several exposures."""
+        """Longest wait for a scan [s]; a triggered scan may take several exposures."""
         return 10.0 if self.trigger else 2.5
 
     @property
@@ -75,12 +75,12 @@ class Ros2ScannerParams(Params):
 
 @part("scanner.ros2")
 def scanner_ros2(model: ScannerModel | None, params: Ros2ScannerParams) -> Scanner:
-    """Any camera with a ROS 2 driver; a scan is the first message stamped after it was asked for.
+    """Any camera with a ROS 2 driver; a scan is the first message stamped after the request.
 
-    Clouds may be organised or not, of any layout. A scan far out of the model's range is refused.
+    Clouds may be organised or not, in any layout. A scan far out of the model's range is refused.
 
     Raises:
-        DeviceError: No ROS 2, nobody publishes the topic, or with another type.
+        DeviceError: There is no ROS 2, or the topic has no publisher or another type.
     """
     bridge = Bridge(NAME, params.sim_time)
     try:
@@ -91,11 +91,11 @@ def scanner_ros2(model: ScannerModel | None, params: Ros2ScannerParams) -> Scann
 
 
 class NothingCame(DeviceError):
-    """No message of a topic arrived in time, though its publisher runs."""
+    """No message of a topic arrived in time, although its publisher runs."""
 
 
 class Camera(NamedTuple):
-    """A pinhole camera: its matrix (3, 3), OpenCV's distortion (k,), and its images' (H, W)."""
+    """A pinhole camera: matrix (3, 3) [px], OpenCV's distortion (k,), and image size (H, W)."""
 
     matrix: Floats
     distortion: Floats
@@ -103,15 +103,15 @@ class Camera(NamedTuple):
 
 
 class Ros2Scanner(OpenScanner):
-    """Topics of one camera."""
+    """A camera under ROS 2, by its topics."""
 
     def __init__(
         self, bridge: Bridge, model: ScannerModel | None, params: Ros2ScannerParams
     ) -> None:
-        """Subscribe.
+        """Subscribe to the camera's topics.
 
         Raises:
-            DeviceError: Nobody publishes, or what is needed does not come.
+            DeviceError: A topic is not published, or a needed message does not arrive.
         """
         self._bridge, self._params = bridge, params
         self._kinds: dict[str, str] = {}
@@ -132,17 +132,20 @@ class Ros2Scanner(OpenScanner):
         super().__init__(f"{params.cloud or params.depth or params.image}", self._facts(), model)
 
     def expose(self) -> Callable[[], Scan]:
-        """Take the first message stamped from now on; the arm waits until it is here."""
+        """Take the first message stamped from now on; the arm must wait until it has arrived."""
         return self._exposed(time.monotonic_ns(), DeviceError)
 
     def overhear(self, since_ns: int) -> Callable[[], Scan]:
-        """Take a message stamped after a given time, triggered by others; see ``Overhears``."""
+        """Take a scan triggered by others, stamped after a given time; see ``Overhears``."""
         if self._params.trigger:
             return self.expose()
         return self._exposed(since_ns, FrameDropped)
 
     def _exposed(self, started: int, silent: type[DeviceError]) -> Callable[[], Scan]:
-        """Return what waits for the scan; raises ``silent`` where none comes from one that runs."""
+        """Return a function that waits for the scan.
+
+        It raises ``silent`` if no message arrives although the publisher runs.
+        """
         until = time.monotonic() + self._params.timeout
         wanted = {topic: self._bridge.want(topic, started) for topic in self._kinds}
         self._trigger()
@@ -167,7 +170,7 @@ class Ros2Scanner(OpenScanner):
         return decode
 
     def require_alive(self) -> None:
-        """Raise DeviceError when the bridge has ended; see ``HearsLoss``."""
+        """Raise DeviceError if the bridge has ended; see ``HearsLoss``."""
         for topic in self._kinds:
             self._bridge.newest(topic)
 
@@ -178,10 +181,10 @@ class Ros2Scanner(OpenScanner):
     # --- what is there
 
     def _camera(self, until: float) -> Camera:
-        """Return what the newest CameraInfo says; the first may come after the image, or with it.
+        """Return the camera of the newest CameraInfo; the first one may arrive after the image.
 
         Raises:
-            DeviceError: None has come by then, or it is of no pinhole camera that was calibrated.
+            DeviceError: None arrives in time, or it is not of a calibrated pinhole camera.
         """
         topic = self._params.info
         message = self._bridge.wait(topic, 0, max(until - time.monotonic(), 0.0))
@@ -209,10 +212,10 @@ class Ros2Scanner(OpenScanner):
         return Camera(matrix, lens, (info.height, info.width))
 
     def _find_trigger(self, trigger: str) -> bool:
-        """Return whether the trigger is a service; a topic is offered.
+        """Return whether the trigger is a service; for a topic, create a publisher.
 
         Raises:
-            DeviceError: It is neither.
+            DeviceError: The trigger is neither a service nor a topic.
         """
         found = self._bridge.awaited(
             lambda: self._bridge.services().get(trigger) or _running(self._bridge, trigger)
@@ -248,7 +251,7 @@ class Ros2Scanner(OpenScanner):
             self._bridge.publish(self._params.trigger, b"\x00\x01\x00\x00\x00")
 
     def _after(self, topic: str, count: int, started: int, until: float) -> GraphMessage:
-        """Return the first message stamped after a moment; those before it are passed over."""
+        """Return the first message stamped after a moment, skipping earlier ones."""
         late: list[float] = []
         while message := self._bridge.wait(topic, count, max(until - time.monotonic(), 0.0)):
             stamp = self._bridge.local_ns(topic, message)
@@ -284,7 +287,7 @@ class Ros2Scanner(OpenScanner):
         )
 
     def _points(self, taken: dict[str, GraphMessage], camera: Camera | None) -> Floats:
-        """Return the scan's points (H, W, 3) or (N, 3) [m]; none where there is an image alone."""
+        """Return the scan's points (H, W, 3) or (N, 3) [m]; empty for an image only."""
         if cloud := self._params.cloud:
             seen: Floats = decoded(taken[cloud].data, Type.CLOUD, cloud_of)
             return seen
@@ -321,7 +324,7 @@ class Ros2Scanner(OpenScanner):
 
 
 def _metres(topic: str, message: Any) -> Floats:
-    """Return the depths (H, W) of an image [m], 0 where there is none."""
+    """Return the depths (H, W) of a depth image [m]; 0 where missing."""
     if message.encoding not in PER_METRE:
         known = ", ".join(PER_METRE)
         raise DeviceError(

@@ -1,4 +1,4 @@
-"""``scanner.watched_folder``: clouds that the scanner's own software exports, as they come."""
+"""``scanner.watched_folder``: reads the clouds that the scanner's own software exports."""
 
 from __future__ import annotations
 
@@ -41,18 +41,18 @@ class WatchedFolderParams(Params):
 def scanner_watched_folder(model: ScannerModel | None, params: WatchedFolderParams) -> Scanner:
     """Read each new cloud that appears in a folder, once it is complete.
 
-    What lies there when the recipe starts is left alone. Trigger the scan in the scanner's own
-    software when the arm stands; files are taken in the order in which they appear. The stated unit
-    is held against the model's range.
+    Files that exist when the recipe starts are ignored. Trigger a scan in the scanner's own
+    software when the arm is at rest; files are read in the order in which they appear. The stated
+    unit is checked against the model's range.
 
     Raises:
-        DeviceError: There is no such folder, or it may not be read.
+        DeviceError: The folder does not exist or is not readable.
     """
     return WatchedFolder(model, params)
 
 
 class Stamp(NamedTuple):
-    """Size and times of a file, to detect a change; times may be coarse on network shares."""
+    """Size and times of a file, for detecting a change; times may be coarse on network shares."""
 
     inode: int
     size: int
@@ -60,7 +60,7 @@ class Stamp(NamedTuple):
 
 
 class Arrival(NamedTuple):
-    """A new file: its last stamp, since when it has that, and when it was not there yet."""
+    """A new file: its last stamp, the time since that stamp, and the last time without the file."""
 
     stamp: Stamp
     since: float
@@ -68,10 +68,10 @@ class Arrival(NamedTuple):
 
 
 class WatchedFolder(OpenScanner):
-    """A folder that is watched. ``close`` from another thread ends a wait."""
+    """A watched folder; ``close`` from another thread ends a wait."""
 
     def __init__(self, model: ScannerModel | None, params: WatchedFolderParams) -> None:
-        """Note what is there already."""
+        """Record the files that exist already."""
         super().__init__(f"folder {params.path}", {"unit": params.unit})
         self._model, self._params = model, params
         self._looked_ns = time.monotonic_ns()
@@ -80,11 +80,10 @@ class WatchedFolder(OpenScanner):
         self._closed = threading.Event()
 
     def expose(self) -> Callable[[], Scan]:
-        """Wait up to ``timeout`` for the next file: a person may have to act.
+        """Ask the operator to scan, and wait up to ``timeout`` for the next file.
 
-        The exposure is said to have begun when the folder was last seen without the file, so a
-        file that came while the arm moved cannot pass for one of where it stands. The person is
-        asked to scan.
+        The exposure's start is the time when the folder was last seen without the file. So a scan
+        taken while the arm moved is not mistaken for one at rest.
         """
         limit = time.monotonic() + self._params.timeout
         incomplete = ""
@@ -112,7 +111,7 @@ class WatchedFolder(OpenScanner):
         self._closed.set()
 
     def _look(self) -> dict[Path, Stamp]:
-        """Return the clouds in the folder; whole or not."""
+        """Return the cloud files in the folder, complete or not."""
         found = {}
         name = "scanner.watched_folder"
         try:
@@ -131,7 +130,7 @@ class WatchedFolder(OpenScanner):
         return found
 
     def _notice(self) -> None:
-        """Note which files are new, and since when each looks as it does."""
+        """Record new files, and the time since which each has not changed."""
         looked_ns, now = time.monotonic_ns(), time.monotonic()
         there = self._look()
         self._arrivals = {path: a for path, a in self._arrivals.items() if path in there}
@@ -145,7 +144,7 @@ class WatchedFolder(OpenScanner):
         self._looked_ns = looked_ns
 
     def _settled(self) -> list[Path]:
-        """Return the files that may be whole, in order, up to the first that still changes."""
+        """Return the files that may be complete, in order, up to the first that still changes."""
         settled = []
         for path, arrival in self._arrivals.items():
             if time.monotonic() - arrival.since < self._params.settle:
@@ -171,5 +170,5 @@ def _is_cloud(path: Path) -> bool:
 
 
 def _counted(path: Path) -> list[str]:
-    """Return a key that sorts scan_9 before scan_10."""
+    """Return a sort key that puts scan_9 before scan_10."""
     return [part.zfill(20) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]

@@ -34,7 +34,7 @@ def scanner_zivid(model: ScannerModel | None, params: ZividParams) -> Scanner:
     A scan far out of the model's range is refused.
 
     Raises:
-        DeviceError: No SDK, no camera, or settings that cannot be read.
+        DeviceError: SDK or camera was not found, or the settings cannot be read.
     """
     name = "scanner.zivid"
     zivid = load_sdk("zivid", name, "install the Zivid SDK, then pip install 'flangeye[zivid]'")
@@ -65,14 +65,14 @@ class ZividScanner(OpenScanner):
     def __init__(
         self, application: Any, camera: Any, settings: Any, model: ScannerModel | None
     ) -> None:
-        """Take over a connected camera."""
+        """Use a connected camera."""
         info = camera.info
         facts = {"unit": "mm", "firmware": str(info.firmware_version), "layout": "organised"}
         super().__init__(f"{info.model_name} {info.serial_number}", facts, model)
         self._application, self._camera, self._settings = application, camera, settings
 
     def expose(self) -> Callable[[], Scan]:
-        """Capture; the SDK returns when the images are taken, and computes points when asked."""
+        """Capture images; the points are computed later, when the scan is fetched."""
         if self._camera is None:
             raise DeviceError(f"{self.name}: is closed")
         started = time.monotonic_ns()

@@ -1,4 +1,4 @@
-"""The maker's client library, with every failure turned into one sort of error."""
+"""Wrapper of AUBO's client library that turns every failure into a DeviceError."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ STANDING = 2e-3
 
 
 class AuboClient:
-    """A logged-in connection.
+    """A logged-in connection to a controller.
 
-    One that gave no answer in time is lost for good: nothing more is asked or commanded on it, for
-    each wait would keep the arm's guard from its program. The arm needs no stop, for every piece of
-    its motion ends by itself.
+    After one timeout the connection counts as lost: no further calls are made, because each wait
+    would block the process that supervises the arm. The arm needs no stop command then, as every
+    piece of its motion ends by itself.
 
     Attributes:
         state: The library's ``RobotState``.
-        motion: Its ``MotionControl``.
-        config: Its ``RobotConfig``.
+        motion: The library's ``MotionControl``.
+        config: The library's ``RobotConfig``.
     """
 
     # Longest wait for one answer [s]; the library then raises, it never hangs.
@@ -41,11 +41,11 @@ class AuboClient:
             sdk: The module ``pyaubo_sdk``.
             name: Name of the robot, for messages.
             host: Address of the controller.
-            user: Account on it.
+            user: Account on the controller.
             password: Password of that account.
 
         Raises:
-            DeviceError: Nobody answers, or the login fails.
+            DeviceError: The controller does not answer, or the login fails.
         """
         self._name, self._lost = name, False
         self._failure = sdk.AuboException
@@ -71,7 +71,7 @@ class AuboClient:
         """Call a query of the library and return its answer.
 
         Raises:
-            DeviceError: It raises: the connection is lost, or the controller refuses.
+            DeviceError: The connection is lost, or the controller refuses.
         """
         if self._lost:
             raise self._error(what, "the connection is lost")
@@ -92,7 +92,7 @@ class AuboClient:
         """Call a command of the library.
 
         Raises:
-            DeviceError: It was not taken.
+            DeviceError: The controller did not accept the command.
         """
         code = self.ask(what, order)
         if code != 0:
@@ -117,15 +117,15 @@ class AuboClient:
 
 
 def _say_nothing(*_: object) -> None:
-    """Take the library's log lines, which would go to standard output."""
+    """Discard the library's log lines, which would go to standard output."""
 
 
 class Ride:
-    """One move: velocities towards the goal, renewed at every reading of the arm.
+    """One move, made of velocity commands that are renewed whenever the arm's state is read.
 
-    It begins at rest, heads straight for the goal with a trapezoidal profile of speed, comes to
-    rest near it, and leaves the last bit to the controller. A motion that was not read for SILENT
-    is over: the piece under way has ended by itself.
+    The move starts at rest, goes straight to the goal with a trapezoidal speed profile, stops near
+    it, and ends with the controller's own move over the remaining distance. If the state is not
+    read for SILENT, the move is over, as the last velocity command has expired.
     """
 
     def __init__(
@@ -136,12 +136,12 @@ class Ride:
         stop: Callable[[], None],
         arrive: Callable[[], None],
     ) -> None:
-        """Begin with an arm that was commanded to stop.
+        """Start a move of an arm that was commanded to stop.
 
         Args:
             speed: Largest speed of the leading joint, or of the tool [rad/s, m/s].
-            acceleration: The same way [rad/s^2, m/s^2].
-            go: Commands a velocity (n,) that ends by itself.
+            acceleration: Largest acceleration, likewise [rad/s^2, m/s^2].
+            go: Commands a velocity (n,) that expires by itself.
             stop: Brakes.
             arrive: Commands the controller's own move to the goal.
         """
@@ -158,9 +158,9 @@ class Ride:
         """Command the next piece of a move that is not finished.
 
         Args:
-            rest: (n,) what is left of the way, in the space of the velocities.
-            left: Its length, of which ``speed`` is the speed.
-            fastest: Speed of the fastest joint now [rad/s].
+            rest: (n,) remaining displacement, in the space of the velocities.
+            left: Remaining distance, in the unit of ``speed`` times seconds.
+            fastest: Present speed of the fastest joint [rad/s].
         """
         now = time.monotonic()
         passed, self._renewed = now - self._renewed, now
@@ -181,7 +181,7 @@ class Ride:
             self._go(self._velocity / left * rest)
 
     def _finish(self) -> None:
-        """Come to rest, then go to the very goal."""
+        """Brake to rest, then command the final move to the goal."""
         if self._velocity > 0.0:
             self._velocity = 0.0
             self._stop()

@@ -58,17 +58,18 @@ class AuboParams(ControllerParams):
 def robot_aubo(model: RobotModel, params: AuboParams, reads_only: bool = False) -> Robot:
     """An arm of AUBO with an ARCS controller, through its JSON-RPC interface.
 
-    On the pendant: power on, brakes released, the payload of what is mounted, no program running.
-    The controller has no watchdog for this interface, so every motion is commanded in pieces that
-    end by themselves after a tenth of a second, and each look at the arm brings the next.
+    Set on the pendant: power on, brakes released, the mounted payload, no program running. The
+    controller has no watchdog for this interface. Every motion is therefore commanded in pieces
+    that expire after 0.1 s, and each reading of the arm's state commands the next one.
 
     Args:
         model: The arm; its kinematics are compared with what the controller reports.
         params: See :class:`AuboParams`.
-        reads_only: Ask only; closing stops nothing, and the arm may be in any mode.
+        reads_only: Only read the state; closing does not stop the arm, which may be in any mode.
 
     Raises:
-        DeviceError: The library is missing, or the arm cannot be driven: why, and what to do.
+        DeviceError: The library is missing, or the arm cannot be driven; the message says what to
+            do.
     """
     sdk = load_sdk("pyaubo_sdk", "robot.aubo", "pip install 'flangeye[aubo]'")
     name = f"{model.model} at {params.host}"
@@ -91,15 +92,15 @@ def robot_aubo(model: RobotModel, params: AuboParams, reads_only: bool = False) 
 class AuboRobot(Device):
     """An arm of AUBO; see :class:`flangeye.devices.Robot`.
 
-    A state is read in several questions, one after the other. They take a millisecond together:
-    an arm at 0.1 m/s moves 0.1 mm meanwhile; one that stands is read exactly.
+    A state is read by several queries, which take 1 ms together. An arm at 0.1 m/s moves 0.1 mm in
+    that time; an arm at rest is read exactly.
 
     Attributes:
-        offset: (4, 4) ``flange_T_tool`` as the controller has it.
+        offset: (4, 4) ``flange_T_tool`` set in the controller.
     """
 
     def __init__(self, name: str, client: AuboClient, reads_only: bool = False) -> None:
-        """Read the tool and the cycle of a connected controller.
+        """Read tool offset and cycle time of a connected controller.
 
         Raises:
             DeviceError: The controller does not answer.
@@ -116,9 +117,9 @@ class AuboRobot(Device):
         self._closed = False
 
     def state(self) -> RobotState:
-        """Read the arm's state; also continues a move that is under way.
+        """Return the arm's state, and continue a move in progress.
 
-        It is read once more where this computer was too busy to read it at one time.
+        The state is read again if the queries took too long on a busy computer.
         """
         state, took = self._read()
         # Reading the arm takes a millisecond; where it takes longer than this [s], the
@@ -144,7 +145,7 @@ class AuboRobot(Device):
         return state
 
     def _read(self) -> tuple[RobotState, float]:
-        """Return the arm's state, and how long it took to read [s]."""
+        """Return the arm's state, and the time it took to read [s]."""
         began = time.monotonic_ns()
         tell = self._client.state
         # The mode is read before the pose: an arm that is reported to stand stood at that pose.
@@ -181,7 +182,7 @@ class AuboRobot(Device):
         self._ride_to(target, motion.speedJoint, motion.moveJoint, speed, acceleration)
 
     def move_linear(self, base_T_flange: Transform, speed: float, acceleration: float) -> None:
-        """Start a straight move of the flange; a moving arm is stopped first."""
+        """Start a linear move of the flange; a moving arm is stopped first."""
         base_T_goal = base_T_flange.matrix @ self.offset
         target = POSE.numbers(base_T_goal).tolist()
         motion = self._client.motion
@@ -192,7 +193,7 @@ class AuboRobot(Device):
     def _ride_to(
         self, target: list[float], go: Any, end: Any, speed: float, acceleration: float
     ) -> None:
-        """Ride by the controller's speed command and end by its move, in one space."""
+        """Start a move by speed commands that ends with the controller's own move, in one space."""
         self._ride = Ride(
             speed, acceleration,
             lambda speeds: self._client.command(
@@ -203,7 +204,7 @@ class AuboRobot(Device):
         )  # fmt: skip
 
     def move_velocity(self, twist: Floats, acceleration: float) -> None:
-        """Move the flange at a twist (6,); the controller stops unless renewed within GRACE."""
+        """Move the flange at a twist (6,); the arm stops if it is not renewed within GRACE."""
         base_T_tool = POSE.matrix(self._ask("pose", self._client.state.getTcpPose))
         self._require_able()
         at_tool = twist_at_tool(twist, base_T_tool @ self._tool_T_flange, base_T_tool)
@@ -246,13 +247,13 @@ class AuboRobot(Device):
         return self._client.ask(what, question)
 
     def _begin(self, in_joints: bool) -> None:
-        """Bring an arm that moves to rest, and expect the next move to begin."""
+        """Brake a moving arm, and prepare for the next move."""
         self._require_able()
         self.stop()
         self._in_joints = in_joints
 
     def _go_on(self, ride: Ride, state: RobotState) -> None:
-        """Command the next piece of a move, or let it be."""
+        """Command the next piece of a move, unless it is over or a stop is active."""
         if state.message or ride.over:
             self._ride = None
             return
@@ -260,7 +261,7 @@ class AuboRobot(Device):
         ride.renew(rest, left, float(np.abs(state.joint_speeds).max()))
 
     def _arrive(self, move: Callable[[], int]) -> None:
-        """Command the controller's own move over the last bit of the way."""
+        """Command the controller's own move over the remaining distance."""
         # A move that has not begun after this has ended already [s]
         self._begins = time.monotonic() + 0.3
         self._client.command("move", move)
@@ -277,13 +278,13 @@ class AuboRobot(Device):
         return rest
 
     def _require_able(self) -> None:
-        """Do nothing for an arm that can move; raise DeviceError for another."""
+        """Raise DeviceError if the arm cannot move."""
         _, message = self._condition(np.zeros(1))
         if message:
             raise DeviceError(f"{self.name}: {message}")
 
     def _condition(self, speeds: Floats) -> tuple[Mode, str]:
-        """Return the mode, and what to do about it."""
+        """Return the mode, and a message with the remedy."""
         tell = self._client.state
         safety = self._ask("safety mode", tell.getSafetyModeType).name
         if safety in SAFETY:
@@ -295,7 +296,7 @@ class AuboRobot(Device):
         return ("moving" if moves else "ready"), ""
 
     def _under_way(self) -> bool:
-        """Return whether a command is carried out, or has yet to begin."""
+        """Return whether a command is in progress or queued."""
         motion = self._client.motion
         if self._ride is not None and not self._ride.over:
             return True

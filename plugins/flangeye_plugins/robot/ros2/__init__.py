@@ -1,1 +1,1 @@
-"""Arms with a ROS 2 driver: moved by us, or by others."""
+"""Arms with a ROS 2 driver: driven by flangeye, or moved by others."""

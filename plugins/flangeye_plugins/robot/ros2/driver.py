@@ -1,4 +1,4 @@
-"""``robot.ros2`` moves an arm under ROS 2; ``robot.ros2_freedrive`` follows one moved by others."""
+"""``robot.ros2`` drives an arm under ROS 2; ``robot.ros2_freedrive`` reads one moved by others."""
 
 from __future__ import annotations
 
@@ -44,19 +44,20 @@ class FreedriveParams(ListenParams):
 
 @part("robot.ros2")
 def robot_ros2(model: RobotModel, params: Ros2RobotParams, reads_only: bool = False) -> Robot:
-    """Any arm with a ROS 2 driver: joint states report it, a joint trajectory moves it.
+    """Any arm with a ROS 2 driver, read by joint states and moved by joint trajectories.
 
-    Motions are published in pieces that lead a third of a second ahead and end by themselves, so an
-    arm that nobody leads any more stands within half a second. The controller must replace the
-    trajectory before, as ros2_control's joint_trajectory_controller does.
+    Motions are published as short trajectories that extend 0.3 s ahead and end at rest. So the arm
+    stops within half a second if they are not renewed. The controller must replace a running
+    trajectory by a new one, as ros2_control's joint_trajectory_controller does.
 
     Args:
-        model: The arm, as its URDF has it.
+        model: The arm's model, from its URDF.
         params: See :class:`Ros2RobotParams`.
         reads_only: Publish nothing.
 
     Raises:
-        DeviceError: No ROS 2, no joint states of this arm, or no controller that listens.
+        DeviceError: There is no ROS 2, no joint states of this arm, or no controller that
+            subscribes.
     """
     bridge = Bridge("robot.ros2", params.sim_time)
     try:
@@ -69,13 +70,13 @@ def robot_ros2(model: RobotModel, params: Ros2RobotParams, reads_only: bool = Fa
 
 @part("robot.ros2_freedrive", passive=True)
 def robot_ros2_freedrive(model: RobotModel, params: FreedriveParams) -> Robot:
-    """An arm under ROS 2 that others move: by hand, in freedrive, or by the cell's own program.
+    """An arm under ROS 2 moved by others: by hand, in freedrive, or by the cell's program.
 
-    Nothing is ever published, so no permission to move is needed: a scan is taken whenever the arm
-    has moved on and stands still.
+    Nothing is published, so no permission to move is needed. A scan is taken whenever the arm has
+    moved and come to rest.
 
     Raises:
-        DeviceError: No ROS 2, or no joint states of this arm.
+        DeviceError: There is no ROS 2, or there are no joint states of this arm.
     """
     bridge = Bridge("robot.ros2_freedrive", params.sim_time)
     try:
@@ -86,15 +87,15 @@ def robot_ros2_freedrive(model: RobotModel, params: FreedriveParams) -> Robot:
 
 
 class Ros2Arm(Listener):
-    """An arm that is moved in pieces; see :class:`flangeye.devices.Robot`."""
+    """An arm driven by short trajectories; see :class:`flangeye.devices.Robot`."""
 
     def __init__(
         self, asker: str, model: RobotModel, params: Ros2RobotParams, bridge: Bridge
     ) -> None:
-        """Hear where the arm is, and find the controller.
+        """Subscribe to the arm's joint states and find its controller.
 
         Raises:
-            DeviceError: Joint states do not come, or no controller subscribes to the trajectories.
+            DeviceError: No joint states arrive, or no controller subscribes to the trajectories.
         """
         self._topic, self._names = params.trajectory, list(params.joints)
         self._motion: pieces.DrivenMotion | None = None
@@ -106,7 +107,7 @@ class Ros2Arm(Listener):
 
     @property
     def patience(self) -> float:
-        """For how long news are waited for [s]: of an arm on its way, not at all."""
+        """Longest wait for a new joint state [s]; 0 while the arm moves."""
         return 0.0 if self._mode(False) == "moving" else super().patience
 
     def move_joints(self, joints: Floats, speed: float, acceleration: float) -> None:
@@ -114,7 +115,7 @@ class Ros2Arm(Listener):
         self._begin(pieces.joint_path(self._fresh().joints, joints, speed, acceleration))
 
     def move_linear(self, base_T_flange: Transform, speed: float, acceleration: float) -> None:
-        """Start a straight move of the flange."""
+        """Start a linear move of the flange."""
         start, goal = self._fresh().joints, base_T_flange.matrix
         self._begin(pieces.linear_path(self.arm, start, goal, speed, acceleration))
 
@@ -131,7 +132,7 @@ class Ros2Arm(Listener):
         motion.ask(speeds, acceleration / max(lever, 1.0))
 
     def wait_cycle(self) -> None:
-        """Wait for the next joint state, and extend the motion; it ends if this is not called."""
+        """Wait for the next joint state and extend the motion, which otherwise ends."""
         super().wait_cycle()
         silent = time.monotonic() - self._renewed
         if self._motion is not None and silent > SILENT:
@@ -142,8 +143,8 @@ class Ros2Arm(Listener):
     def stop(self) -> None:
         """Publish a trajectory that brakes from the arm's present point on its motion.
 
-        Nothing is published where the motion was not renewed for SILENT: its last piece has ended
-        by itself, and a point where the arm was before would set it moving again.
+        Nothing is published if the motion was not renewed for SILENT: its last piece has ended at
+        rest, and a point where the arm was before would move it again.
         """
         if self._motion is not None:
             if time.monotonic() - self._renewed <= SILENT:
@@ -173,7 +174,7 @@ class Ros2Arm(Listener):
         self._renew()
 
     def _renew(self) -> None:
-        """Publish the motion's next piece; the last one leads to its end."""
+        """Publish the motion's next piece; the last one ends at the goal."""
         now, joints = time.monotonic(), self._fresh().joints
         motion = self._motion
         if motion is None:
@@ -229,13 +230,13 @@ def _point(point: pieces.Point) -> object:
 
 
 class FreedriveArm(Listener):
-    """An arm that others move; see :class:`flangeye.devices.Robot`."""
+    """An arm moved by others; see :class:`flangeye.devices.Robot`."""
 
     by_hand = True
     """See :class:`flangeye.devices.MovedByHand`."""
 
     def __init__(self, model: RobotModel, params: FreedriveParams, bridge: Bridge) -> None:
-        """Hear where the arm is."""
+        """Subscribe to the arm's joint states."""
         self._still = params.still
         self._left: Floats | None = None
         self._awaited = False
@@ -243,7 +244,7 @@ class FreedriveArm(Listener):
         super().__init__("robot.ros2_freedrive", model, params, bridge)
 
     def move_joints(self, joints: Floats, speed: float, acceleration: float) -> None:
-        """Wait until others have moved the arm and it stands; suggest the most informative pose."""
+        """Suggest the most informative pose; then wait until others have moved the arm to rest."""
         pose = self.arm.flange(joints)
         lean = np.degrees(np.arccos(np.clip(pose[:3, 2] @ self._facing(), -1.0, 1.0)))
         if self._left is not None:  # the first scan is taken where the arm stands
@@ -254,12 +255,12 @@ class FreedriveArm(Listener):
         self._awaited = True
 
     def move_linear(self, base_T_flange: Transform, speed: float, acceleration: float) -> None:
-        """Wait as for joints."""
+        """Wait until others have moved the arm; see :meth:`move_joints`."""
         found = self.arm.inverse(base_T_flange.matrix)
         self.move_joints(found[0] if len(found) else self._fresh().joints, speed, acceleration)
 
     def move_velocity(self, twist: Floats, acceleration: float) -> None:
-        """Refuse: others move the arm."""
+        """Raise DeviceError: others move the arm."""
         raise DeviceError(f"{self.name}: others move it; it cannot be servoed")
 
     def stop(self) -> None:

@@ -1,4 +1,4 @@
-"""Pose of an arm from ROS 2: joint states with its model, or tf."""
+"""Pose of an arm from ROS 2: from joint states and the arm's model, or from tf."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from flangeye_plugins.ros2.messages import Type, decoded, positions_of
 
 
 class TfParams(Params):
-    """The frames of a pose that is taken from tf."""
+    """Frames of the flange's pose in tf."""
 
     base: str = Field("base_link", description="Frame of the arm's base.")
     flange: str = Field("tool0", description="Frame of the flange, origin in its face, z outwards.")
 
 
 class ListenParams(Params):
-    """Source of the arm's pose."""
+    """Source of the arm's pose in ROS 2."""
 
     joints: tuple[str, ...] = Field(
         min_length=1,
@@ -55,12 +55,12 @@ class JointSample(NamedTuple):
 
 
 class Listener(Device):
-    """An arm that is listened to; see :class:`flangeye.devices.Robot` for its state.
+    """The reading part of an arm under ROS 2; see :class:`flangeye.devices.Robot`.
 
     Attributes:
-        name: Shown in messages and reports.
-        period: Between two joint states [s].
-        flange_T_tool: None: joint states know no tool.
+        name: Name in messages and reports.
+        period: Time between two joint states [s].
+        flange_T_tool: None, as joint states contain no tool.
     """
 
     nothing: ClassVar[str] = "nothing came on it"
@@ -71,10 +71,10 @@ class Listener(Device):
     flange_T_tool: Transform | None = None
 
     def __init__(self, asker: str, model: RobotModel, params: ListenParams, bridge: Bridge) -> None:
-        """Hear where the arm is.
+        """Subscribe to the arm's joint states and wait for the first.
 
         Raises:
-            DeviceError: Joint states do not come, or are not this arm's.
+            DeviceError: No joint states arrive, or they are not this arm's.
         """
         self.name = f"{model.model} on {params.joint_states}"
         self.arm, self._params, self._bridge = Arm(model), params, bridge
@@ -98,7 +98,7 @@ class Listener(Device):
         require_model(self.name, self.state(), model)
 
     def state(self) -> RobotState:
-        """Return the newest sample."""
+        """Return the newest state of the arm."""
         self._take(0.0)
         newest = self._fresh()
         pose = self._flange(newest)
@@ -113,7 +113,7 @@ class Listener(Device):
         )
 
     def wait_cycle(self) -> None:
-        """Return when the next joint state has come."""
+        """Wait for the next joint state."""
         if not self._take(self.stale):
             self._fresh()
 
@@ -123,11 +123,11 @@ class Listener(Device):
 
     @property
     def patience(self) -> float:
-        """For how long news are waited for [s]: of an arm that we do not move nothing depends."""
+        """Longest wait for a new joint state [s]; not critical for an arm moved by others."""
         return 0.5
 
     def speeds(self) -> Floats:
-        """Return the joints' speeds (n,) over the last 50 ms [rad/s]."""
+        """Return the joint speeds (n,) over the last 50 ms [rad/s]."""
         first, last = self._samples[0], self._samples[-1]
         seconds = 1e-9 * (last.time_ns - first.time_ns)
         return (last.joints - first.joints) / seconds if seconds > 0 else np.zeros(self.arm.n)
@@ -166,7 +166,7 @@ class Listener(Device):
     # --- samples
 
     def _take(self, patience: float) -> bool:
-        """Take in what came of this arm; return whether a sample is new."""
+        """Process the messages about this arm; return whether there is a new sample."""
         until, new = time.monotonic() + patience, False
         while not new:
             left = max(until - time.monotonic(), 0.0)
@@ -179,9 +179,9 @@ class Listener(Device):
         return True
 
     def _keep(self, message: GraphMessage) -> bool:
-        """Keep a message's angles; return whether every joint has a new one by now.
+        """Store a message's joint angles; return whether every joint has a new one.
 
-        One message may have some of the joints, and another, soon after it, the others.
+        The joints may be split over several messages that arrive shortly after each other.
         """
         try:
             told = decoded(message.data, Type.JOINT_STATE, positions_of)
@@ -222,7 +222,7 @@ class Listener(Device):
             )
 
     def _fresh(self) -> JointSample:
-        """Return the newest sample, waited for; raise DeviceError where none is news of the arm."""
+        """Return the newest sample after waiting for it; raise DeviceError if none is recent."""
         if not self._samples:
             raise DeviceError(f"{self.name}: {self._missing() or self.nothing}")
         until = time.monotonic() + self.patience
@@ -233,7 +233,7 @@ class Listener(Device):
         return self._samples[-1]
 
     def _fault(self, newest: JointSample) -> str:
-        """Return why a sample is not a new state of the arm; empty if it is one."""
+        """Return why a sample is not a current state of the arm; "" if it is."""
         age = 1e-9 * (time.monotonic_ns() - newest.received_ns)
         if age > self.stale:
             allowed = self.patience or self.stale
@@ -248,7 +248,7 @@ class Listener(Device):
         return ""
 
     def _missing(self) -> str:
-        """Return which joints are missing from the messages that came."""
+        """Return a text that names the joints missing from the received messages."""
         lost = [joint for joint in self._params.joints if joint not in self._heard]
         if not self._heard or not lost:
             return ""

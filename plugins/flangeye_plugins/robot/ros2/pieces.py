@@ -1,9 +1,11 @@
-"""Motions published in short pieces: if they are not renewed, the arm stops at their end.
+"""Motions published as short pieces of trajectory: without renewal the arm stops at their end.
 
-A piece holds where the motion has just been, leads a little way along it, and then to rest. The
-controller replaces the piece before. When no more come, because anything on the way here has died,
-it drives the last one to its end. Pieces begin in the past: joint_trajectory_controller then goes
-on between points it was given, and not from a measured place, which is always a little behind.
+A piece contains the motion's recent past, a short stretch ahead, and then a braking to rest. The
+controller replaces the previous piece. If no more arrive, because any process on the way has died,
+it executes the last one to its end, at rest.
+
+Pieces begin in the past so that joint_trajectory_controller interpolates between commanded points,
+and not from the measured position, which always lags.
 """
 
 from __future__ import annotations
@@ -42,7 +44,7 @@ SAMPLE_TIME = 0.01
 
 
 class Point(NamedTuple):
-    """A point of a piece: joints (n,) [rad] and their speeds [rad/s], so long after now [s]."""
+    """A point of a piece: joint angles (n,) [rad], speeds (n,) [rad/s], and time from now [s]."""
 
     joints: Floats
     speeds: Floats
@@ -53,7 +55,7 @@ class DrivenMotion(ABC):
     """A motion that is published in pieces.
 
     Attributes:
-        done: Whether there is nothing left to lead to.
+        done: Whether the motion's end is published.
     """
 
     def __init__(self) -> None:
@@ -62,7 +64,7 @@ class DrivenMotion(ABC):
         self._past: deque[Point] = deque()
 
     def piece(self, joints: Floats, seconds: float) -> list[Point]:
-        """Return the next piece, ``seconds`` after the one before, of an arm at ``joints`` (n,)."""
+        """Return the next piece, ``seconds`` after the last one, for an arm at ``joints`` (n,)."""
         self._go_on(joints, seconds)
         self._elapsed += seconds
         now = self._point(0.0)
@@ -71,7 +73,7 @@ class DrivenMotion(ABC):
         return [*points, *brake(points[-1], self._deceleration())]
 
     def stop(self) -> list[Point]:
-        """Return the piece that brakes from where the arm is on the motion."""
+        """Return the piece that brakes from the arm's present point on the motion."""
         # The stop takes effect at the controller so much later [s]: it brakes from where the arm is
         # by then
         points = [*self._recent(), self._point(0.03)]
@@ -88,28 +90,28 @@ class DrivenMotion(ABC):
 
     @abstractmethod
     def _point(self, after: float) -> Point:
-        """Return where the motion is going to be."""
+        """Return the motion's point at a time from now [s]."""
 
     @abstractmethod
     def _ahead(self) -> list[Point]:
-        """Return the points up to where the piece brakes."""
+        """Return the points ahead, up to the start of the braking."""
 
     def _deceleration(self) -> float:
         return BRISK
 
 
 class DrivenPath(DrivenMotion):
-    """A motion that is known from its beginning to its end."""
+    """A motion along a path known in advance."""
 
     # Between the points of a piece [s]; the controller's cubics between them keep to the
     # motion.
     knot: ClassVar[float] = 0.05
 
     def __init__(self, joints: Floats, acceleration: float) -> None:
-        """Follow (N, n) joint angles :data:`SAMPLE_TIME` apart, braking at a rate [rad/s^2].
+        """Follow joint angles (N, n) :data:`SAMPLE_TIME` apart, with a braking rate [rad/s^2].
 
-        Its acceleration is spread over :data:`AHEAD`: the controller's cubic across a corner of the
-        speed would be faster than either side of it.
+        Changes of speed are smoothed over :data:`AHEAD`, because the controller's cubic
+        interpolation across a step of speed would exceed both speeds.
         """
         super().__init__()
         width = round(AHEAD / SAMPLE_TIME)
@@ -126,9 +128,9 @@ class DrivenPath(DrivenMotion):
         self.done = self._end - self._phase <= LAST
 
     def _pace(self, joints: Floats) -> float:
-        """Return how fast the arm goes along the motion, 1 for as planned.
+        """Return the arm's speed along the motion relative to the planned one, at most 1.
 
-        One that is held up is waited for and never hurried after.
+        The motion waits for an arm that is held up, and does not catch up later.
         """
         self._seen.append((self._elapsed, self._reached(joints)))
         # Over which it is seen how fast the arm goes along a motion [s].
@@ -143,7 +145,7 @@ class DrivenPath(DrivenMotion):
         return float(np.clip((here - start) / (now - began), 0.1, 1.0))
 
     def _reached(self, joints: Floats) -> float:
-        """Return the time at which the motion passes nearest to where the arm is [s]."""
+        """Return the motion's time at its point closest to the arm [s]."""
         until = int(self._phase / SAMPLE_TIME) + 2
         nearest = int(np.argmin(np.abs(self._joints[:until] - joints).max(axis=1)))
         along = SAMPLE_TIME * self._speeds[nearest]
@@ -174,16 +176,16 @@ class DrivenPath(DrivenMotion):
 
 
 class Velocity(DrivenMotion):
-    """A motion at the speeds that were asked for last."""
+    """A motion at the last commanded joint speeds."""
 
     def __init__(self, joints: Floats) -> None:
-        """Begin at rest at (n,) joint angles [rad]."""
+        """Start at rest at joint angles (n,) [rad]."""
         super().__init__()
         self._place, self._speeds = joints, np.zeros_like(joints)
         self._wanted, self._acceleration, self._left = self._speeds, 1.0, 0.0
 
     def ask(self, speeds: Floats, acceleration: float) -> None:
-        """Take (n,) speeds [rad/s], reached at an acceleration [rad/s^2], for :data:`GRACE`."""
+        """Command joint speeds (n,) [rad/s] for :data:`GRACE`, with an acceleration [rad/s^2]."""
         self._wanted, self._acceleration, self._left = speeds, acceleration, GRACE
 
     def _go_on(self, joints: Floats, seconds: float) -> None:
@@ -204,9 +206,9 @@ class Velocity(DrivenMotion):
 
 
 def brake(last: Point, deceleration: float) -> list[Point]:
-    """Return the point at which the joints come to rest; none if they are at rest.
+    """Return the point at which braking joints come to rest; empty if they are at rest.
 
-    With positions and speeds at both ends a controller's cubic is the parabola of a constant
+    With positions and speeds at both ends, the controller's cubic is the parabola of a constant
     deceleration.
     """
     fastest = float(np.abs(last.speeds).max())
@@ -218,7 +220,7 @@ def brake(last: Point, deceleration: float) -> list[Point]:
 
 
 def joint_path(start: Floats, goal: Floats, speed: float, acceleration: float) -> DrivenPath:
-    """Return a straight motion in joint angles (n,); the leading joint keeps ``speed`` [rad/s]."""
+    """Return a linear motion in joint space (n,); the leading joint moves at ``speed`` [rad/s]."""
     way = goal - start
     length = float(np.abs(way).max())
     share = _ride(length, speed, acceleration) / max(length, 1e-12)
@@ -228,10 +230,10 @@ def joint_path(start: Floats, goal: Floats, speed: float, acceleration: float) -
 def linear_path(
     arm: Arm, start: Floats, goal: Floats, speed: float, acceleration: float
 ) -> DrivenPath:
-    """Return a motion of the flange straight to a pose (4, 4) [m/s, m/s^2].
+    """Return a linear motion of the flange to a pose (4, 4) [m/s, m/s^2].
 
     Raises:
-        DeviceError: The arm cannot follow the line without a jump of its joints.
+        DeviceError: The arm cannot follow the line without a jump of a joint.
     """
     base_T_flange = arm.flange(start)
     way = goal[:3, 3] - base_T_flange[:3, 3]
@@ -256,7 +258,7 @@ def _nearest(found: Floats, before: Floats) -> Floats:
 
 
 def _ride(length: float, speed: float, acceleration: float) -> Floats:
-    """Return places along a length, :data:`SAMPLE_TIME` apart in time, standing at both ends."""
+    """Return positions along a length at times :data:`SAMPLE_TIME` apart, from rest to rest."""
     ramp = min(speed / acceleration, np.sqrt(length / acceleration))
     top = acceleration * ramp
     seconds = length / max(top, 1e-12) + ramp

@@ -1,1 +1,1 @@
-"""Arms of Universal Robots: ``driver`` in this process, the client library in another."""
+"""Arms of Universal Robots: the driver in this process, the client library in another."""

@@ -57,16 +57,16 @@ its text."""
 
 
 def safety_of(told: int | str) -> tuple[Mode, str] | None:
-    """Return what a safety mode means, by its number or the dashboard's word; None if unknown."""
+    """Return mode and message for a safety mode (number or word); None if it is unknown."""
     return next((meaning for names, meaning in SAFETY.items() if told in names), None)
 
 
 class DashboardFacts(NamedTuple):
-    """State and versions reported by the dashboard.
+    """Facts about a controller from its dashboard.
 
     Attributes:
         version: Version of the controller's software.
-        period: Length of its cycle [s].
+        period: Cycle time of the controller [s].
     """
 
     version: str
@@ -77,7 +77,7 @@ def facts_of(name: str, host: str, to_drive: bool = True) -> DashboardFacts:
     """Return a controller's software version and cycle time, after checking that it can be driven.
 
     Raises:
-        DeviceError: Nobody answers; or it cannot be driven: it is not ready, the network is slow.
+        DeviceError: The controller does not answer or is not ready, or the network is too slow.
     """
     try:
         with ask_dashboard(host, PATIENCE) as ask:
@@ -99,10 +99,10 @@ def facts_of(name: str, host: str, to_drive: bool = True) -> DashboardFacts:
 
 
 def stop(host: str) -> None:
-    """Stop the controller's program through a separate connection: the last resort.
+    """Stop the controller's program through a separate connection, as a last resort.
 
     Raises:
-        OSError: Nobody answers.
+        OSError: The dashboard does not answer.
     """
     with ask_dashboard(host, PATIENCE) as ask:
         ask("stop")
@@ -138,11 +138,11 @@ def _reason(error: OSError) -> str:
 
 
 class Condition(NamedTuple):
-    """State of the controller, and what to do about it.
+    """State of the controller, with a message.
 
     Attributes:
-        mode: As in :class:`flangeye.devices.RobotState`.
-        message: What to do about it; empty when nothing is wrong.
+        mode: Mode, as in :class:`flangeye.devices.RobotState`.
+        message: Remedy for a fault; empty without one.
     """
 
     mode: Mode
@@ -150,11 +150,11 @@ class Condition(NamedTuple):
 
 
 def condition_of(sample: CycleSample, commanded: bool) -> Condition:
-    """Return the controller's state; of several faults, the most severe.
+    """Return the controller's state; of several faults it is the most severe.
 
     Args:
-        sample: The newest one.
-        commanded: Whether a command was given that the sample does not know of.
+        sample: The newest sample.
+        commanded: Whether a command was sent after the sample.
     """
     # NORMAL and REDUCED (RTDE guide)
     if sample.safety_mode not in (1, 2):
@@ -182,17 +182,18 @@ POSE = CONVENTIONS["ur"].in_units("m", "rad")
 def robot_ur_rtde(model: RobotModel, params: ControllerParams, reads_only: bool = False) -> Robot:
     """An arm of Universal Robots, e-Series or CB3, through the library ur_rtde.
 
-    On the pendant: power on, brakes released, Remote Control, the payload of what is mounted in
-    the installation, and no other program that writes RTDE registers (fieldbuses do).
+    Set on the pendant: power on, brakes released, Remote Control, and the mounted payload in the
+    installation. No other client, such as a fieldbus, may write RTDE registers.
 
     Args:
         model: The arm; its kinematics are compared with what the controller reports.
         params: See :class:`ControllerParams`.
-        reads_only: Open RTDE's receiving side alone. The client library starts its program on the
-            controller for the other side only; the arm may be in local control, or switched off.
+        reads_only: Open only RTDE's receiving side, for which the client library starts no program
+            on the controller; the arm may be in local control or powered off.
 
     Raises:
-        DeviceError: The library is missing, or the arm cannot be driven: why, and what to do.
+        DeviceError: The library is missing, or the arm cannot be driven; the message says what to
+            do.
     """
     load_sdk("rtde_control", "robot.ur_rtde", "pip install 'flangeye[ur]'")
     name = f"{model.model} at {params.host}"
@@ -219,11 +220,11 @@ def robot_ur_rtde(model: RobotModel, params: ControllerParams, reads_only: bool 
 class UrRobot(Device):
     """An arm of Universal Robots; see :class:`flangeye.devices.Robot`.
 
-    Every call ends within three seconds: connecting within two and a half, commands within one
-    and a half, an unanswered stop included.
+    Every call returns within 3 s: connecting within 2.5 s, commands within 1.5 s, even a stop that
+    is not answered.
 
     Attributes:
-        offset: (4, 4) ``flange_T_tool`` as the controller has it.
+        offset: (4, 4) ``flange_T_tool`` set in the controller.
     """
 
     # A sample older than this is no news of the arm [s].
@@ -238,15 +239,15 @@ class UrRobot(Device):
         offset: Floats,
         patience: float,
     ) -> None:
-        """Take over a connection to a controller.
+        """Use an open connection to a controller.
 
         Args:
             name: Name of the robot, for messages.
             host: Address of the controller.
-            period: Length of its cycle [s].
+            period: Cycle time of the controller [s].
             link: The connection.
-            offset: (4, 4) ``flange_T_tool`` as the controller has it.
-            patience: For how long news of the arm are waited for [s].
+            offset: (4, 4) ``flange_T_tool`` set in the controller.
+            patience: Longest wait for a new sample [s].
         """
         self.name, self.period, self._patience = name, period, patience
         self._host, self._link = host, link
@@ -280,19 +281,19 @@ class UrRobot(Device):
         self._command("move_joints", joints=target, speed=speed, acceleration=acceleration)
 
     def move_linear(self, base_T_flange: Transform, speed: float, acceleration: float) -> None:
-        """Start a straight move of the flange; a moving arm is stopped first."""
+        """Start a linear move of the flange; a moving arm is stopped first."""
         self._require_able()
         pose = POSE.numbers(base_T_flange.matrix @ self.offset).tolist()
         self._command("move_linear", pose=pose, speed=speed, acceleration=acceleration)
 
     def move_velocity(self, twist: Floats, acceleration: float) -> None:
-        """Command a twist (6,) of the flange, converted to the tool's for the controller."""
+        """Move the flange at a twist (6,); the controller gets the tool's twist."""
         base_T_tool = self._base_T_tool(self._require_able())
         at_tool = twist_at_tool(twist, base_T_tool @ self._tool_T_flange, base_T_tool)
         self._command("move_velocity", twist=at_tool, acceleration=acceleration)
 
     def wait_cycle(self) -> None:
-        """Wait for a sample newer than the last one waited for."""
+        """Wait for a sample newer than that of the last call."""
         until = time.monotonic() + self._patience
         late = False
         while (sample := self._link.sample()) is None or sample.number <= self._seen:
@@ -320,13 +321,13 @@ class UrRobot(Device):
         self._link.close()
 
     def _base_T_tool(self, sample: CycleSample) -> Floats:
-        """Return the tool's pose (4, 4), computed once for each sample."""
+        """Return the tool's pose (4, 4), cached for each sample."""
         if self._posed[0] != sample.number:
             self._posed = sample.number, POSE.matrix(sample.tool_pose)
         return self._posed[1]
 
     def _fresh(self) -> CycleSample:
-        """Return the newest sample; wait for one where this computer was too busy to take it."""
+        """Return the newest sample, after waiting if this computer was too busy to receive it."""
         until = time.monotonic() + self._patience
         while True:
             # The time comes first: who is not let run for a while after reading has read it fresh.
@@ -343,7 +344,7 @@ class UrRobot(Device):
             time.sleep(self.period)
 
     def _command(self, what: str, **arguments: Any) -> None:
-        """Send a command; the samples on their way do not show it yet, and the next may not."""
+        """Send a command; the next samples may not show its effect yet."""
         try:
             self._link.request(what, **arguments)
         except DeviceError:
@@ -355,7 +356,7 @@ class UrRobot(Device):
         self._commanded = newest.number + 1 if newest else 0
 
     def _require_able(self) -> CycleSample:
-        """Return the newest sample of an arm that can move; raise DeviceError for another."""
+        """Return the newest sample; raise DeviceError if the arm cannot move."""
         sample = self._fresh()
         condition = condition_of(sample, commanded=False)
         if condition.message:

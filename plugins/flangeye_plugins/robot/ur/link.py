@@ -1,4 +1,4 @@
-"""Our side of the client library's process: monitors it, and kills it if it hangs."""
+"""Owner's side of the client library's process: monitors it, and kills it if it hangs."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ class CycleSample(NamedTuple):
     """The controller's data of one cycle.
 
     Attributes:
-        number: Samples since the connection was made.
-        time_ns: When the controller took it, by the monotonic clock.
+        number: Number of the sample since the connection was made.
+        time_ns: Time at which the controller took it, on this computer's monotonic clock [ns].
         robot_mode: RTDE ``robot_mode``.
         safety_mode: RTDE ``safety_mode``.
         runtime: RTDE ``runtime_state``.
-        remote: 1 for remote control, 0 for local, -1 where that is not known.
-        busy: Whether a command is under way.
-        joints: (6,) [rad].
-        joint_speeds: (6,) [rad/s].
+        remote: 1 for remote control, 0 for local, -1 if unknown.
+        busy: Whether a command is in progress.
+        joints: (6,) joint angles [rad].
+        joint_speeds: (6,) joint speeds [rad/s].
         tool_pose: (6,) position [m] and rotation vector [rad] of the tool in base.
-        tool_force: (6,) on the tool's tip, in the base's axes [N, N m].
+        tool_force: (6,) wrench at the tool's tip in base axes [N, N m].
     """
 
     number: int
@@ -67,12 +67,13 @@ class ControllerLink:
         Args:
             name: Name of the robot, for messages.
             host: Address of the controller.
-            period: Length of its cycle [s].
+            period: Cycle time of the controller [s].
             patience: Longest time to wait [s].
-            reads_only: Whether samples are wanted alone: no program is started on the controller.
+            reads_only: Whether only samples are needed; no program is started on the controller
+                then.
 
         Raises:
-            DeviceError: It cannot connect, or not in time; nothing is left behind.
+            DeviceError: It cannot connect, or not in time; the process has ended then.
         """
         self._name = name
         self._gone = ""
@@ -103,7 +104,7 @@ class ControllerLink:
         """Return the newest sample; None before the first.
 
         Raises:
-            DeviceError: The process is gone, with the connection or without.
+            DeviceError: The process has ended.
         """
         if self._process.poll() is not None and not self._gone:
             self._give_up(self._loss())
@@ -117,14 +118,14 @@ class ControllerLink:
         return None
 
     def look(self) -> None:
-        """Renew the watchdog: without it a motion ends."""
+        """Renew the watchdog, without which a motion ends."""
         worker.LOOK.pack_into(self._memory, worker.SIZE, time.monotonic())
 
     def request(self, what: str, **arguments: Any) -> Any:
         """Send a call to the library's process, and return its result.
 
         Raises:
-            DeviceError: It did not do it, or did not answer: then its process is ended.
+            DeviceError: The call failed, or was not answered in time; the process is killed then.
         """
         if self._gone:
             raise DeviceError(self._gone)
@@ -136,10 +137,11 @@ class ControllerLink:
         return self._answer(what, 0.8)
 
     def close(self, hopeless: bool = False) -> None:
-        """Have the process stop arm and program, then end it; safe to call twice.
+        """Stop arm and program through the process, then end it; safe to call twice.
 
         Args:
-            hopeless: The controller is not heard any more, so there is nothing to wait for.
+            hopeless: Whether the controller no longer answers, so that the process is ended at
+                once.
         """
         if not self._gone:
             self._gone = f"{self._name} is closed"
@@ -163,7 +165,10 @@ class ControllerLink:
         return said["given"]
 
     def _loss(self) -> str:
-        """Return how the process ended; the library may abort it when a connection breaks."""
+        """Return a text that says how the process ended.
+
+        The library may abort the process when a connection breaks.
+        """
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(LEAVING)
         code = self._process.returncode
@@ -173,7 +178,7 @@ class ControllerLink:
         return f"is lost: its client process ended ({why})"
 
     def _give_up(self, why: str) -> NoReturn:
-        """Kill the process, say why, and stay with it."""
+        """Kill the process and raise DeviceError; later calls raise it again."""
         self._process.kill()
         self._gone = (
             f"{self._name} {why}; its watchdog stops the arm: look at the controller and the "
@@ -196,7 +201,7 @@ def _sample_of(body: bytes) -> CycleSample | None:
 
 
 def _let_go(line: socket.socket, process: subprocess.Popen[bytes]) -> None:
-    """End what an owner that forgot to close has left; also at the interpreter's exit."""
+    """End the process of an owner that did not close it; also called at the interpreter's exit."""
     line.close()
     try:
         process.wait(LEAVING)

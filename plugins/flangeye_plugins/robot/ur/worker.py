@@ -1,11 +1,11 @@
-"""The process that holds the client library ur_rtde, and nothing else.
+"""The process that runs the client library ur_rtde.
 
-The library blocks for ever where a controller has died, returns its last pose for ever, and may
-abort the process it is in. So it lives here, where it can be killed. This file is run as a script,
-with the standard library alone: it starts in a twentieth of the time the package takes.
+If a controller dies, the library blocks or returns its last pose for ever, and it may abort its
+process. It therefore runs in this process, which can be killed. This file is run as a script with
+the standard library only, which starts twenty times faster than the package.
 
-Samples go into a file mapped into memory, commands come through a socket, a JSON object each.
-When the socket ends, or its owner does, the arm is stopped and the process ends.
+Samples go into a memory-mapped file; commands come through a socket, one JSON object each. If the
+socket closes or its owner dies, the arm is stopped and the process ends.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class SampleClock:
     """Converts the controller's sample times to this computer's clock.
 
     Transport delays are never negative, so the smallest difference of arrival and sample time is
-    the best estimate of the clocks' offset.
+    the best estimate of the offset between the clocks.
     """
 
     def __init__(self) -> None:
@@ -63,7 +63,7 @@ class SampleClock:
         self._last = 0.0
 
     def sampled(self, controller: float, arrived: float) -> float:
-        """Return when a sample of the controller's time ``controller`` was taken [s]."""
+        """Return this computer's time of a sample with the controller's time ``controller`` [s]."""
         # How fast a delay that stays is taken for the clock's own. A clock drifts a thousand times
         # less; but a controller on loopback stands still while its machine is too busy, and its
         # clock with it. A network that becomes slow by 400 ms still shows for fifteen seconds
@@ -73,7 +73,7 @@ class SampleClock:
 
 
 class Publisher(threading.Thread):
-    """Writes every new sample into the mapped file."""
+    """Thread that writes every new sample into the mapped file."""
 
     def __init__(
         self, receive: Any, commander: Commander | Onlooker, memory: mmap.mmap, period: float
@@ -85,7 +85,7 @@ class Publisher(threading.Thread):
         self._owner = os.getppid()
 
     def run(self) -> None:
-        """Publish until the connection or the owner is gone."""
+        """Publish samples until the connection or the owner has ended."""
         while self._receive.isConnected():
             sample = self._fresh()
             if sample is not None:
@@ -99,7 +99,7 @@ class Publisher(threading.Thread):
         os._exit(LOST)
 
     def _fresh(self) -> tuple[float, list[int], list[float]] | None:
-        """Return a sample not yet seen, all of one cycle; None while there is none."""
+        """Return a new sample whose values are all of one cycle; None if there is none."""
         receive = self._receive
         stamp = receive.getTimestamp()
         if stamp == self._last:
@@ -130,7 +130,7 @@ class Commander:
     """Passes commands to the library, one at a time.
 
     Attributes:
-        remote: Whether programs may come through the network: 1, 0, or -1 where it cannot be asked.
+        remote: Whether the control is remote: 1, 0, or -1 if it cannot be queried.
     """
 
     playing: ClassVar[int] = 2
@@ -154,17 +154,17 @@ class Commander:
         return begins or status.isAsyncOperationRunning()
 
     def move_joints(self, joints: Sequence[float], speed: float, acceleration: float) -> None:
-        """Start a move in joint angles."""
+        """Start a move to joint angles (6,) [rad]."""
         self._begin(self._control.stopJ)
         self._require(self._control.moveJ(joints, speed, acceleration, True))
 
     def move_linear(self, pose: Sequence[float], speed: float, acceleration: float) -> None:
-        """Start a straight move of the tool."""
+        """Start a linear move of the tool to a pose (6,)."""
         self._begin(self._control.stopL)
         self._require(self._control.moveL(pose, speed, acceleration, True))
 
     def move_velocity(self, twist: Sequence[float], acceleration: float) -> None:
-        """Move at a twist of the tool."""
+        """Move the tool at a twist (6,)."""
         if self._velocity_until == -math.inf and self.busy():
             self.stop()
         self._require(self._control.speedL(twist, acceleration, self._period))
@@ -172,7 +172,7 @@ class Commander:
         self._stopping = self._control.speedStop
 
     def stop(self) -> None:
-        """Brake if the arm moves; the next command starts from rest."""
+        """Brake a moving arm; the next command starts from rest."""
         if self.busy() or self._velocity_until > -math.inf:
             self._velocity_until = -math.inf
             # Deceleration of a stop: [m/s^2] along a straight way, [rad/s^2] in joints
@@ -180,11 +180,11 @@ class Commander:
         self._commanded = -math.inf
 
     def tool(self) -> list[float]:
-        """Return the tool offset."""
+        """Return the controller's tool offset (6,)."""
         return list(self._control.getTCPOffset())
 
     def idle(self) -> None:
-        """Do periodic work between commands: the watchdog, and ends of motions."""
+        """Do the periodic work between commands: renew the watchdog, and end expired motions."""
         if self._receive.getRuntimeState() != self.playing:
             return
         # The time comes first: who is held up after reading must not take a look for an old one.
@@ -195,11 +195,11 @@ class Commander:
         self._control.kickWatchdog()
 
     def answered(self) -> None:
-        """Renew the watchdog: while the owner waits for an answer it cannot do so itself."""
+        """Renew the watchdog on behalf of the owner, who is waiting for an answer."""
         self._answered = time.monotonic()
 
     def _looked(self) -> float:
-        """Return when the owner was last known to watch the arm [s]."""
+        """Return the time at which the owner last renewed the watchdog [s]."""
         looked: float = LOOK.unpack_from(self._memory, SIZE)[0]
         return max(self._answered, looked)
 
@@ -210,7 +210,7 @@ class Commander:
             self._control.stopScript()
 
     def give_up(self) -> None:
-        """End the process after a last try to stop the arm; then the watchdog stops it."""
+        """Try to stop the arm and end the process; otherwise the watchdog stops the arm."""
         last_try = threading.Thread(target=self.end, daemon=True)
         last_try.start()
         # Longest time for stopping the arm before the process ends [s]
@@ -229,34 +229,34 @@ class Commander:
 
 
 class Onlooker:
-    """Takes the commander's place in a process that only reads."""
+    """Replaces :class:`Commander` in a process that only reads."""
 
     remote = -1
 
     def busy(self) -> bool:
-        """Return False: nothing was commanded."""
+        """Return False, as nothing is commanded."""
         return False
 
     def idle(self) -> None:
-        """Do nothing when no command comes."""
+        """Do nothing."""
 
     def answered(self) -> None:
-        """Do nothing: there is no watchdog to renew."""
+        """Do nothing, as there is no watchdog."""
 
     def give_up(self) -> None:
-        """End the process without stopping the arm, which it never commanded."""
+        """End the process without stopping the arm, which it does not command."""
         os._exit(0)
 
 
 class RemoteControl(threading.Thread):
-    """Asks the dashboard whether the control is still remote."""
+    """Thread that asks the dashboard repeatedly whether the control is remote."""
 
     def __init__(self, host: str, commander: Commander) -> None:
         super().__init__(daemon=True)
         self._host, self._commander = host, commander
 
     def run(self) -> None:
-        """Ask for ever, through a new connection when the old one fails."""
+        """Ask repeatedly, and reconnect after a failure."""
         asking = 0.2  # between two questions whether the control is remote [s]
         while True:
             with contextlib.suppress(OSError), ask_dashboard(self._host) as ask:
@@ -268,10 +268,10 @@ class RemoteControl(threading.Thread):
 
 @contextlib.contextmanager
 def ask_dashboard(host: str, patience: float = 1.0) -> Any:
-    """Yield a function that asks the dashboard server one line and returns its answer.
+    """Yield a function that sends a line to the dashboard server and returns its answer.
 
     Raises:
-        OSError: It does not answer.
+        OSError: The dashboard does not answer.
     """
     with (
         # The dashboard server.
@@ -311,7 +311,7 @@ def serve(line: socket.socket, commander: Commander | Onlooker) -> None:
 
 
 def answer(commander: Commander | Onlooker, request: dict[str, Any]) -> dict[str, Any]:
-    """Return the answer to one request, after doing it."""
+    """Execute one request and return its answer."""
     try:
         given = getattr(commander, request.pop("do"))(**request)
     except Exception as error:
@@ -325,16 +325,16 @@ def one_line(error: Exception) -> str:
 
 
 def take_precedence() -> None:
-    """Be as punctual as the machine allows; where this process may not, it is as the rest."""
+    """Request real-time priority; without the right to, the priority stays normal."""
     with contextlib.suppress(OSError, AttributeError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
 
 
 def connect(host: str) -> Any:
-    """Return the library's interface for commands, the watchdog set: it starts a program.
+    """Return the library's command interface with its watchdog set; this starts its program.
 
     Raises:
-        Exception: Whatever the library raises.
+        Exception: Any exception of the library.
     """
     import rtde_control
 
@@ -356,7 +356,7 @@ def connect(host: str) -> Any:
 
 
 def main(host: str, period: float, memory: int, channel: int, reads_only: bool) -> None:
-    """Connect, say so, and serve."""
+    """Connect, report success, and serve requests."""
     # First of all, so that the library's threads are as punctual.
     take_precedence()
     line = socket.socket(fileno=channel)

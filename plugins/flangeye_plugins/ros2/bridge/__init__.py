@@ -1,1 +1,1 @@
-"""In a folder of its own, so that the bridge's Python imports these modules and no others."""
+"""The bridge process, in its own folder so that its Python imports no other module."""

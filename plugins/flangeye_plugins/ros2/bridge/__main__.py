@@ -1,9 +1,9 @@
-"""The process that holds rclpy: serialised messages in, serialised messages out.
+"""The process that runs rclpy and passes serialised messages in and out.
 
-It runs under the Python of the sourced distribution, with the standard library and rclpy alone, and
-without flangeye. Requests come on standard input, answers and messages leave on standard output: a
-line of JSON each, followed by as many bytes as its ``size`` says. It knows no message's content and
-commands nothing of its own: who wants an arm to move has to say so again and again.
+It runs under the Python of the sourced ROS 2 distribution, with only the standard library and
+rclpy, without flangeye. Requests come on standard input; answers and messages go to standard
+output. Each is a line of JSON, followed by ``size`` bytes. The process does not interpret messages
+and repeats no command by itself, so an arm moves only while commands keep coming.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class RequestRefused(Exception):
 
 
 class FramedOutput:
-    """Standard output as frames; output of libraries goes to standard error."""
+    """Writes frames to standard output; other output of libraries goes to standard error."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -43,7 +43,7 @@ class FramedOutput:
         os.dup2(2, 1)
 
     def say(self, header: Request, body: bytes = b"") -> None:
-        """Write a frame; exit if the reader has gone."""
+        """Write a frame; exit the process if the reader has gone."""
         line = json.dumps({**header, "size": len(body)}).encode() + b"\n"
         try:
             with self._lock:
@@ -54,7 +54,7 @@ class FramedOutput:
 
 
 class BridgeNode:
-    """The ROS 2 node of the bridge, and its pending requests."""
+    """The bridge's ROS 2 node, with its subscriptions, publishers and clients."""
 
     def __init__(self, node: Any, output: FramedOutput) -> None:
         self._node, self._output = node, output
@@ -66,7 +66,7 @@ class BridgeNode:
         self._newest: dict[str, tuple[int, bytes]] = {}
 
     def graph(self) -> Any:
-        """Return topic -> type, nodes that publish, and the number of those that listen."""
+        """Return by topic: its type, the publishing nodes, and the number of subscribers."""
         return {
             topic: {
                 "type": types[0],
@@ -79,16 +79,16 @@ class BridgeNode:
         }
 
     def services(self) -> Any:
-        """Return service -> type."""
+        """Return the services' types by name."""
         return {name: types[0] for name, types in self._node.get_service_names_and_types()}
 
     def follow(self, topic: str, type: str, always: bool) -> Any:
         """Subscribe with the publishers' QoS; return the number of publishers, 0 if there are none.
 
         Args:
-            topic: Its name.
-            type: Its type.
-            always: Whether every message is passed on, or only the next one after each ``want``.
+            topic: Name of the topic.
+            type: Type of its messages.
+            always: Whether every message is forwarded, or only the next one after each ``want``.
         """
         kind = type_of(type)
         infos = self._node.get_publishers_info_by_topic(topic)
@@ -101,7 +101,7 @@ class BridgeNode:
         return len(infos)
 
     def _subscribe(self, kind: Any, topic: str, take: Callable[[bytes], None]) -> None:
-        """Subscribe to a topic, once more when somebody begins to publish it in another way."""
+        """Subscribe to a topic; subscribe again when a publisher with another QoS appears."""
         before = self._subscriptions.get(topic, [])
         events = SubscriptionEventCallbacks(
             incompatible_qos=lambda _: self._subscribe(kind, topic, take)
@@ -128,7 +128,7 @@ class BridgeNode:
         self._publishers[topic] = self._node.create_publisher(type_of(type), topic, profile)
 
     def listeners(self, topic: str) -> Any:
-        """Return how many subscriptions match a publisher of ours."""
+        """Return the number of subscriptions to one of the bridge's publishers."""
         return self._publishers[topic].get_subscription_count()
 
     def publish(self, topic: str, body: bytes) -> None:
@@ -138,8 +138,8 @@ class BridgeNode:
     def find(self, service: str) -> Any:
         """Find a service of type std_srvs/srv/Trigger.
 
-        Its client is kept: the answer to a call is lost while the server does not know the client
-        yet, and there is no event for when it does.
+        The service client is kept, because a call's answer is lost until the server has discovered
+        the client, and no event reports that.
         """
         kind = getattr(importlib.import_module("std_srvs.srv"), "Trigger")  # noqa: B009
         self._clients[service] = self._node.create_client(kind, service)
@@ -162,7 +162,7 @@ class BridgeNode:
         client.call_async(client.srv_type.Request()).add_done_callback(answered)
 
     def heard(self, topic: str) -> Any:
-        """Return how many messages of a topic have come since it was followed."""
+        """Return the number of messages received on a topic."""
         return self._heard.get(topic, 0)
 
     def _passes_on(self, topic: str, always: bool) -> Callable[[bytes], None]:
@@ -182,10 +182,10 @@ class BridgeNode:
 
 
 def matching(infos: list[Any]) -> list[QoSProfile]:
-    """Return subscription QoS profiles that are compatible with some publishers.
+    """Return subscription QoS profiles that are compatible with the publishers.
 
-    Where some keep what they published last and others do not, it takes two subscriptions: what
-    comes from now on may then come twice.
+    Two subscriptions are needed if some publishers are latched (transient local) and others are
+    not; new messages may then arrive twice.
     """
     found = []
     for durability in {info.qos_profile.durability for info in infos}:
@@ -227,7 +227,7 @@ def serve(bridge: BridgeNode, output: FramedOutput) -> None:
 
 
 def answer(bridge: BridgeNode, request: Request) -> Request:
-    """Return the answer to a request, after doing it."""
+    """Execute a request and return its answer."""
     try:
         given = getattr(bridge, request.pop("ask"))(**request)
     except RequestRefused as refused:
@@ -238,17 +238,17 @@ def answer(bridge: BridgeNode, request: Request) -> Request:
 
 
 def be_punctual() -> None:
-    """Request real-time priority for this process, if the user may.
+    """Request real-time priority for this process, if permitted.
 
-    An arm is watched through it, and a cloud that is sent without acknowledgement is lost to a
-    process that is late: on two cores with a load of fourteen 6 of 10 came, and 1 without this.
+    An arm is supervised through this process, and a late process loses clouds sent without
+    acknowledgement. On two cores with a load of 14, 6 of 10 clouds arrived, and 1 without this.
     """
     with contextlib.suppress(OSError, AttributeError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
 
 
 def main() -> None:
-    """Open a node, say so, and serve."""
+    """Create the node, report success, and serve requests."""
     output = FramedOutput()
     be_punctual()
     rclpy.init()
