@@ -180,11 +180,11 @@ def view_of(seen: Sequence[Observation]) -> Floats | None:
 
 
 def _by_circles(seen: Sequence[Observation]) -> tuple[Floats, float] | None:
-    """Return ``base_T_camera``, and the rms residual of centres and normals [m].
+    """Return ``base_T_camera``, and the largest residual of a centre or normal [m].
 
     It is the least-squares rigid motion of the circles' centres and of points on their normals.
     """
-    fewest, ahead = 3, 0.1  # [m]: a normal weighs as a place so far off
+    fewest, ahead = 3, 0.1  # [m]: a normal counts as a point this far ahead
     points = [
         (
             o.feature.centre + far * o.feature.normal,
@@ -202,7 +202,7 @@ def _by_circles(seen: Sequence[Observation]) -> tuple[Floats, float] | None:
 
 
 def _by_poses(seen: Sequence[Observation]) -> tuple[Floats, float] | None:
-    """Return ``base_T_camera``, and the rms residual of the target's position [m] (Shah 2013)."""
+    """Return ``base_T_camera``, and the target's largest residual [m] (Shah 2013)."""
     fewest = 5  # two of them determine the rotations, if they turn about two axes
     if len(seen) < fewest:
         return None

@@ -1,4 +1,4 @@
-"""``check.*``: mistakes in recordings that ``flangeye doctor`` names. Add one: a new module."""
+"""``check.*`` parts: detection of mistakes in recordings, for ``flangeye doctor``."""
 
 from flangeye_plugins.check.order import clock, identity, moved, order, repeated, tool
 from flangeye_plugins.check.outliers import flips, motion, outlier, scatter

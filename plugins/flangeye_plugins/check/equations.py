@@ -1,22 +1,18 @@
-"""A session as equations, with many variants of it solved at once.
+"""The calibration equations of a session, with closed-form solutions of many variants at once.
 
-One form holds for every configuration. ``carrier_T_camera`` is the camera in what holds it (the
-base, a link or the flange), ``carrier_T_mount`` what holds the target, seen from there as the
-controllers report it, and ``mount_T_target`` the target in what holds it::
+All configurations have the same form. ``carrier_T_camera`` is the camera in its carrier (the base,
+a link or the flange), ``mount_T_target`` is the target in its mount, and ``carrier_T_mount`` is the
+reported pose between the two::
 
     carrier_T_camera @ camera_T_target = carrier_T_mount @ mount_T_target
 
-With the camera beside the robot the mount is the flange; in the hand it is the base, and
-``carrier_T_mount`` the inverse of the pose. With a second arm the mount is that arm's flange, and
-where its base stands is unknown too: ``carrier_T_mount = carrier_T_base @ base_T_base2 @
-base2_T_mount``.
+For a camera beside the robot the mount is the flange. For a camera on the flange it is the base,
+and ``carrier_T_mount`` is the inverse of the reported pose. With a second arm the mount is that
+arm's flange, and its base is a further unknown: ``carrier_T_mount = carrier_T_base @ base_T_base2 @
+base2_T_mount``. The equation of two arms is
 
-Closed-form calibrations of every variant, to start from.
-
-Where two arms' calibrations start: the second one's base is unknown too.
-
-``X @ camera_T_target = carrier_T_base @ Y @ base2_T_mount @ Z``, with ``X = carrier_T_camera``,
-``Y = base_T_base2`` and ``Z = mount_T_target``; of every variant at once.
+``X @ camera_T_target = carrier_T_base @ Y @ base2_T_mount @ Z`` with ``X = carrier_T_camera``, ``Y
+= base_T_base2`` and ``Z = mount_T_target``.
 """
 
 from __future__ import annotations
@@ -33,15 +29,15 @@ from flangeye.workflow.doctor.diagnosis import RecordedSession
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """K variants of N samples; the arrays have leading dimensions (K, N), or (1, N) for all.
+    """Equations of K variants of N samples; arrays (K, N, ...), or (1, N, ...) if common to all.
 
     Attributes:
         mounts: (K, N, 4, 4) ``carrier_T_mount`` [m]; with a second arm ``base2_T_mount``.
-        bases: (K, N, 4, 4) ``carrier_T_base`` [m] where there is a second arm, else None.
-        centres: (K, N, 3) in ``camera`` [m]; NaN where nothing was seen.
-        normals: (K, N, 3) in ``camera``; NaN where none was measured.
-        rotations: (K, N, 3, 3) ``camera_R_target``; NaN where it has none.
-        places: (K, N, 3) the target's centre in the mount [m]; NaN where unknown.
+        bases: (K, N, 4, 4) ``carrier_T_base`` [m] with a second arm; else None.
+        centres: (K, N, 3) measured centres in ``camera`` [m]; NaN if not seen.
+        normals: (K, N, 3) measured normals in ``camera``; NaN if not measured.
+        rotations: (K, N, 3, 3) measured ``camera_R_target``; NaN if not measured.
+        places: (K, N, 3) the target's centre in the mount [m]; NaN if unknown.
     """
 
     mounts: Floats
@@ -53,22 +49,22 @@ class Equations:
 
     @property
     def knows_place(self) -> bool:
-        """Whether it is known where the mount has the target."""
+        """Whether the target's position in the mount is known."""
         return bool(np.isfinite(self.places).all())
 
     @property
     def has_rotations(self) -> bool:
-        """Whether the target has a whole pose."""
+        """Whether the target's full pose was measured."""
         return bool(np.isfinite(self.rotations).any())
 
     def carried(self, base_T_base2: Floats) -> Floats:
-        """Return ``carrier_T_mount`` (K, N, 4, 4), the second arm's base being at (K, 4, 4)."""
+        """Return ``carrier_T_mount`` (K, N, 4, 4), given the second arm's base (K, 4, 4)."""
         if self.bases is None:
             return self.mounts
         return np.asarray(self.bases @ base_T_base2[:, None] @ self.mounts)
 
     def without(self, mask: Mask) -> Equations:
-        """Return variants in which the samples of a mask (K, N) saw nothing."""
+        """Return variants without the measurements of the samples in a mask (K, N)."""
         return replace(
             self,
             centres=np.where(mask[..., None], np.nan, self.centres),
@@ -77,12 +73,12 @@ class Equations:
         )
 
     def with_free_place(self) -> Equations:
-        """Return the same with the target's place unknown."""
+        """Return the equations with the target's position unknown."""
         return replace(self, places=np.full_like(self.places, np.nan))
 
 
 def equations_of(*sessions: RecordedSession) -> Equations:
-    """Return sessions of the same samples, each as one variant."""
+    """Return the equations of sessions with the same samples, one variant for each."""
     bases, mounts = zip(*map(_carriers, sessions), strict=True)
     return Equations(
         np.stack(mounts),
@@ -95,9 +91,9 @@ def equations_of(*sessions: RecordedSession) -> Equations:
 
 
 def _carriers(session: RecordedSession) -> tuple[Floats, Floats]:
-    """Return (N, 4, 4) of the base in the camera's carrier, and of the mount there.
+    """Return base and mount in the camera's carrier, (N, 4, 4) each.
 
-    With a second arm the mount is that in its own base.
+    With a second arm the mount is given in that arm's base.
     """
     eye = np.broadcast_to(np.eye(4), session.poses.shape)
     camera = eye if session.carried == "target" else session.poses
@@ -109,17 +105,17 @@ def _carriers(session: RecordedSession) -> tuple[Floats, Floats]:
 
 
 class VariantUnknowns(NamedTuple):
-    """The unknowns of a variant.
+    """Values of the unknowns of K variants.
 
     Attributes:
         rotation: (K, 3, 3) ``carrier_R_camera``.
-        position: (K, 3) of the camera in the carrier [m].
-        place: (K, N or 1, 3) of the target in the mount [m].
+        position: (K, 3) position of the camera in the carrier [m].
+        place: (K, N or 1, 3) position of the target in the mount [m].
         turn: (K, 3, 3) ``mount_R_target``.
-        other: (K, 4, 4) ``base_T_base2`` [m]; the identity where there is no second arm.
-        free_place: Whether the place has to be found.
-        free_turn: Whether the turn has to be found.
-        free_other: Whether the second arm's base has to be found.
+        other: (K, 4, 4) ``base_T_base2`` [m]; the identity without a second arm.
+        free_place: Whether ``place`` is estimated.
+        free_turn: Whether ``turn`` is estimated.
+        free_other: Whether ``other`` is estimated.
     """
 
     rotation: Floats
@@ -133,7 +129,7 @@ class VariantUnknowns(NamedTuple):
 
 
 def start_of(equations: Equations) -> VariantUnknowns:
-    """Return a closed-form solution of each variant; of two arms one from random rotations."""
+    """Return a start solution of each variant; for two arms from random rotations."""
     if equations.bases is not None:
         return _of_two_arms(equations)
     if equations.has_rotations:
@@ -144,7 +140,7 @@ def start_of(equations: Equations) -> VariantUnknowns:
 
 
 def _of_two_arms(equations: Equations) -> VariantUnknowns:
-    """Find the rotations first, then the positions, which are linear."""
+    """Return a solution for two arms: first the rotations, then the positions, which are linear."""
     seen = equations.has_rotations
     rotations = (rotations_of_poses if seen else rotations_of_circles)(equations)
     position, base, place = positions(equations, rotations)
@@ -157,7 +153,7 @@ def _of_two_arms(equations: Equations) -> VariantUnknowns:
 
 
 def _from_known_places(equations: Equations) -> VariantUnknowns:
-    """Fit centres to where the arm has them, and normals to its axis (Umeyama 1991)."""
+    """Return the solution for known target positions, by rigid registration (Umeyama 1991)."""
     mounts = equations.mounts
     there = (mounts[..., :3, :3] @ equations.places[..., None])[..., 0] + mounts[..., :3, 3]
     here, there = np.broadcast_arrays(equations.centres, there)
@@ -174,7 +170,7 @@ def _from_known_places(equations: Equations) -> VariantUnknowns:
 
 
 def _from_poses(equations: Equations) -> VariantUnknowns:
-    """Rotations from the Kronecker product (Shah 2013), then positions, which are linear."""
+    """Return the solution for full poses, by the Kronecker product (Shah 2013)."""
     k, n = np.broadcast_shapes(equations.mounts.shape[:2], equations.rotations.shape[:2])
     turns = np.broadcast_to(equations.mounts[..., :3, :3], (k, n, 3, 3))
     seen = np.broadcast_to(np.nan_to_num(equations.rotations), (k, n, 3, 3))
@@ -189,7 +185,7 @@ def _from_poses(equations: Equations) -> VariantUnknowns:
 
 
 def _positions(equations: Equations, rotation: Floats) -> tuple[Floats, Floats]:
-    """Return the camera's position and the target's place (K, 3), the rotation being known."""
+    """Return the camera's and the target's positions (K, 3), given the rotation."""
     turned = equations.centres @ rotation.swapaxes(-1, -2)
     rows, right = _linear(equations, equations.mounts[..., :3, 3] - turned)
     found = _least_squares(rows, right)
@@ -197,7 +193,7 @@ def _positions(equations: Equations, rotation: Floats) -> tuple[Floats, Floats]:
 
 
 def _from_centres(equations: Equations) -> VariantUnknowns:
-    """All but that the rotation is one is linear in the unknowns; then it is made one."""
+    """Return the solution for centres: linear least squares, then projection onto a rotation."""
     centres = np.nan_to_num(equations.centres)
     targets = np.where(
         np.isfinite(equations.centres), equations.mounts[..., :3, 3], np.nan
@@ -242,9 +238,9 @@ Rotations = tuple[Floats, Floats, Floats]
 
 
 def rotations_of_poses(equations: Equations) -> Rotations:
-    """Return rotations (K, 3, 3) of X, Y and Z, where whole poses were seen.
+    """Return rotations (K, 3, 3) of X, Y and Z for full poses.
 
-    Each in turn is the one that fits best given the other two (Procrustes), from random ones.
+    Each one in turn is fitted given the other two (Procrustes), from random starts.
     """
     by_x, by_y, by_z = _by_unknown(*_rotations(equations))
     k = len(by_x)
@@ -262,25 +258,25 @@ def rotations_of_poses(equations: Equations) -> Rotations:
 
 
 def _by_unknown(left: Floats, seen: Floats, right: Floats) -> list[Floats]:
-    """Return what is to be largest, ``sum_n tr(X seen_n (left_n Y right_n Z)^T)``, as matrices.
+    """Return the objective ``sum_n tr(X seen_n (left_n Y right_n Z)^T)`` as three matrices.
 
-    It is linear in X, in Y and in Z: summed over the samples once, a round costs the same however
-    many there are. Each (K, 9, 81) has the entries of one of them in its rows and the products of
-    the other two's in its columns.
+    It is linear in each of X, Y and Z. The samples are summed once, so an iteration's cost does not
+    depend on their number. Each matrix (K, 9, 81) has the entries of one unknown in its rows and
+    the products of the other two in its columns.
     """
     form = np.einsum("knac,knde,knbf->kabcdef", left, right, seen).reshape(-1, 9, 9, 9)
     return [np.moveaxis(form, axis, 1).reshape(-1, 9, 81) for axis in (1, 2, 3)]
 
 
 def _contracted(form: Floats, one: Floats, other: Floats) -> Floats:
-    """Return what the rotation in the rows is to be nearest to, given two (S, K, 3, 3)."""
+    """Return the matrix to which the rows' rotation must be closest, given the other two."""
     s, k = one.shape[:2]
     products = (one.reshape(s, k, 9, 1) * other.reshape(s, k, 1, 9)).reshape(s, k, 81, 1)
     return np.asarray((form @ products).reshape(s, k, 3, 3))
 
 
 def _rotations(equations: Equations) -> Rotations:
-    """Return (K, N, 3, 3) of the bases, of what was seen (zero where nothing), of the mounts."""
+    """Return the rotations (K, N, 3, 3) of bases, measurements (zero if none) and mounts."""
     bases = equations.mounts if equations.bases is None else equations.bases
     seen = np.nan_to_num(equations.rotations)
     mounts = equations.mounts[..., :3, :3]
@@ -292,10 +288,10 @@ def _rotations(equations: Equations) -> Rotations:
 
 
 def rotations_of_circles(equations: Equations) -> Rotations:
-    """Return rotations (K, 3, 3) of X and Y, and the identity, where circles were seen.
+    """Return rotations (K, 3, 3) of X and Y, and the identity, for circles.
 
-    Where the mount has them is known, or near its origin, so that all is linear but that the
-    rotations are some:
+    The circles' position in the mount is known, or near its origin, so everything is linear except
+    for the orthogonality of the rotations:
     ``R_X c + t_X = R_b (R_Y p + t_Y) + t_b``, and likewise for the normals.
     """
     rows, right = _rows_of_centres(equations)
@@ -310,7 +306,7 @@ def rotations_of_circles(equations: Equations) -> Rotations:
 
 
 def _rows_of_centres(equations: Equations) -> tuple[Floats, Floats]:
-    """Return rows (K, 3 N, 24) and their right side; zero where nothing was seen."""
+    """Return the rows (K, 3 N, 24) of centres and their right side; zero if not seen."""
     bases, mounts = _transforms(equations)
     places = np.nan_to_num(equations.places)
     carried = (mounts[..., :3, :3] @ places[..., None])[..., 0] + mounts[..., :3, 3]
@@ -326,7 +322,7 @@ def _rows_of_normals(equations: Equations) -> Floats:
 
 
 def _outer_rows(here: Floats, bases: Floats, there: Floats) -> Floats:
-    """Return (K, N, 3, 24): what the entries of R_X and R_Y do to points or directions."""
+    """Return the rows (K, N, 3, 24) by which the entries of R_X and R_Y move points."""
     k, n = bases.shape[:2]
     rows = np.zeros((k, n, 3, 24))
     here = np.broadcast_to(np.nan_to_num(here), (k, n, 3))
@@ -343,7 +339,7 @@ def _where_seen(seen: Floats, rows: Floats, right: Floats) -> tuple[Floats, Floa
 
 
 def _transforms(equations: Equations) -> tuple[Floats, Floats]:
-    """Return (K, N, 4, 4) of the bases and of the mounts."""
+    """Return the transforms (K, N, 4, 4) of bases and mounts."""
     bases = equations.mounts if equations.bases is None else equations.bases
     seen = equations.centres.shape[:2]
     k, n = np.broadcast_shapes(equations.mounts.shape[:2], bases.shape[:2], seen)
@@ -351,9 +347,9 @@ def _transforms(equations: Equations) -> tuple[Floats, Floats]:
 
 
 def positions(equations: Equations, rotations: Rotations) -> tuple[Floats, Floats, Floats]:
-    """Return positions (K, 3) of X, Y and the place, linear once rotations are known.
+    """Return the positions (K, 3) of X, Y and the target, given the rotations (linear).
 
-    A place that is known stays.
+    A known target position is kept.
     """
     x, y, _ = rotations
     bases, mounts = _transforms(equations)

@@ -1,18 +1,16 @@
 """Fit many variants of a session at once, each with its likelihood; robust to a few bad samples.
 
-Errors of a centre, of a normal and of a rotation are each taken as multivariate t with four
-degrees of freedom and a scale of their own: close to normal in the middle, and a sample that is
-far off costs the logarithm of its distance instead of its square. Fitted by
-expectation-maximisation (Lange, Little & Taylor 1989), a Gauss-Newton step each.
+Errors of centres, normals and rotations have multivariate t distributions with four degrees of
+freedom and separate scales: nearly normal in the middle, but an outlier costs the logarithm of its
+distance instead of the square. They are fitted by expectation-maximisation (Lange, Little & Taylor
+1989) with one Gauss-Newton step per iteration.
 
-Whether an alternative fits better than chance and a small error of the model can explain.
-
-An alternative is held against the session as it is by the ratio of their likelihoods, as an F test
-(for normal errors they are the same). Two things make it honest. Alternatives that were tried are
-counted (Bonferroni). And no arm and no scanner is perfect: a session without a mistake still has
-errors that an alternative with more freedom takes up. So the hypothesis that is tested is not that
-an alternative changes nothing, but that it changes less than is negligible: a minimum-effect test
-(Murphy & Myors 1999), by the non-central F distribution.
+An alternative is compared with the unchanged session by their likelihood ratio, as an F test
+(equivalent for normal errors). Two corrections keep the test valid. The number of alternatives is
+taken into account (Bonferroni). And as arms and scanners are imperfect, even a correct session has
+errors that an alternative with more parameters can absorb. The null hypothesis is therefore that
+the alternative's effect is negligible, not zero: a minimum-effect test (Murphy & Myors 1999) by the
+non-central F distribution.
 """
 
 from __future__ import annotations
@@ -38,7 +36,7 @@ FINEST_ANGLE = 1e-4
 
 
 class ErrorBlock(NamedTuple):
-    """Errors of one kind: residuals (K, N, 3), their squares (K, N), derivatives (K, N, 3, P)."""
+    """Errors of one kind: residuals (K, N, 3), squared norms (K, N), derivatives (K, N, 3, P)."""
 
     residuals: Floats
     squares: Floats
@@ -52,14 +50,14 @@ class VariantFits:
     """The best calibration of each of K variants.
 
     Attributes:
-        likelihood: (K,) logarithm; minus infinity where no fit was found.
-        residuals: (K, N, 3) of each kind of error, the centres' first [m, rad]; NaN where nothing
-            was seen. In the carrier.
+        likelihood: (K,) log-likelihoods; minus infinity without a fit.
+        residuals: (K, N, 3) residuals in the carrier for each kind of error, the centres' first [m,
+            rad]; NaN if not seen.
         scales: (K, B) standard deviation of each kind of error per coordinate [m, rad].
-        count: (K,) coordinates that were measured.
-        parameters: How many numbers were fitted.
-        unknowns: What was fitted.
-        information: (K, P, P) of the parameters.
+        count: (K,) numbers of measured coordinates.
+        parameters: Number of fitted parameters.
+        unknowns: Fitted values of the unknowns.
+        information: (K, P, P) information matrices of the parameters.
     """
 
     likelihood: Floats
@@ -82,7 +80,7 @@ class VariantFits:
 
 
 def fit(equations: Equations) -> VariantFits:
-    """Fit every variant: the camera, and the target where its place is not known."""
+    """Return the fits of all variants: the camera's pose, and the target's if unknown."""
     unknowns = start_of(equations)
     blocks = _blocks(equations, unknowns)
     scales = [_first_scale(block) for block in blocks]
@@ -104,10 +102,10 @@ def errors_at(equations: Equations, unknowns: VariantUnknowns) -> Floats:
 
 
 def _blocks(equations: Equations, unknowns: VariantUnknowns) -> list[ErrorBlock]:
-    """Return every kind of error and how the parameters move it.
+    """Return the errors of every kind with their derivatives.
 
-    Parameters: rotation and position of the camera (left perturbation); where the target's place
-    is not known, its position, and its rotation if it has one; the second arm's base, if any.
+    The parameters are rotation and position of the camera (left perturbation), the target's
+    position if unknown and its rotation if measured, and the second arm's base if there is one.
     """
     mounts = equations.carried(unknowns.other)
     blocks = [_centre_block(equations, unknowns, mounts)]
@@ -164,7 +162,7 @@ def _normal_block(equations: Equations, unknowns: VariantUnknowns, mounts: Float
 
 
 def _block(residuals: Floats, parts: Sequence[Floats], dimension: int, finest: float) -> ErrorBlock:
-    """Return errors with what each group of parameters does to them."""
+    """Return errors with their derivatives by all groups of parameters."""
     jacobian = np.empty((*residuals.shape, 3 * len(parts)))
     for i, part in enumerate(parts):
         jacobian[..., 3 * i : 3 * i + 3] = part
@@ -178,7 +176,7 @@ def _first_scale(block: ErrorBlock) -> Floats:
 
 
 def _weights(block: ErrorBlock, scale: Floats) -> Floats:
-    """(K, N) what each sample counts: 0 where it was not measured."""
+    """Return the weights (K, N) of the samples; 0 if not measured."""
     distances = block.squares / scale[:, None] ** 2
     weights = np.asarray((TAILS + block.dimension) / (TAILS + distances))
     weights[np.isnan(weights)] = 0.0
@@ -267,7 +265,7 @@ def _score(
 def log_of(rotations: Floats) -> Floats:
     """Return the rotation vectors (..., 3) [rad] of rotations (..., 3, 3).
 
-    Their lengths are right at any angle; close to half a turn their direction is rough.
+    Their lengths are accurate at any angle; their directions are inaccurate close to 180 deg.
     """
     twice_sine_axis = np.stack(
         [
@@ -293,12 +291,12 @@ def fit_of(session: RecordedSession) -> VariantFits:
 
 
 def called(arms: Arms) -> str:
-    """Return what one of two arms, or both, are called in messages."""
+    """Return the name of one of two arms, or both, in messages."""
     return "both arms" if arms == "both" else f"the {arms} arm"
 
 
 def named(arms: Arms, session: RecordedSession) -> str:
-    """Return whose poses are meant, in the words of messages."""
+    """Return a text that names the arm whose poses are concerned."""
     if session.seconds is None:
         return "the robot's"
     return called(arms) + ("'" if arms == "both" else "'s")
@@ -317,10 +315,11 @@ class Significance(NamedTuple):
 
     Attributes:
         which: Index of the alternative.
-        before: Errors of the session as it is.
+        before: Errors of the unchanged session.
         after: Errors of the alternative.
-        probability: Probability of so much better a fit without a mistake, alternatives counted.
-        gain: Logarithm of the likelihood ratio less what further parameters cost (Schwarz 1978).
+        probability: p-value: probability of such an improvement without a mistake, corrected for
+            the number of alternatives.
+        gain: Log-likelihood ratio minus the penalty for additional parameters (Schwarz 1978).
     """
 
     which: int
@@ -337,7 +336,7 @@ class Significance(NamedTuple):
         fix: str | None = None,
         samples: tuple[str, ...] = (),
     ) -> Finding:
-        """Return the mistake that the alternative is without; see :class:`Finding`."""
+        """Return a finding for the mistake that the alternative corrects; see :class:`Finding`."""
         return Finding(name, what, fix or corrected.step(), samples, *self[1:], corrected)
 
 
@@ -351,13 +350,13 @@ def best_of(
     """Return the alternative with the largest likelihood ratio to the unchanged session.
 
     Args:
-        null: The session as it is: once, or on several choices of its samples.
+        null: Fits of the unchanged session, on all or on several subsets of its samples.
         alternatives: K variants of the same samples.
-        further: Parameters an alternative has more than the session; 0 for another reading of
-            the same numbers, which is tested as if it had twice as many (the model that holds
-            both).
-        tried: How many alternatives there were, where they were not all fitted.
-        against: (K,) which of ``null`` has the samples of each alternative; the first if not given.
+        further: Number of additional parameters of an alternative; 0 for another interpretation of
+            the same numbers, which is tested with twice the parameters (those of the model that
+            contains both).
+        tried: Number of alternatives, if not all were fitted.
+        against: (K,) index in ``null`` of the fit on each alternative's samples; None is the first.
     """
     if against is None:
         against = np.zeros(len(alternatives.likelihood), dtype=int)
@@ -378,13 +377,13 @@ def best_of(
 
 
 def narrowed(starts: Indices, ratios: Callable[[Indices], Floats]) -> Indices:
-    """Return the (K,) starts about the likeliest, by a coarse-to-fine search; linear in samples.
+    """Return the starts (K,) around the most likely one, by a coarse-to-fine search.
 
-    Evidence for a change grows from both sides towards where it was.
+    The search works because the evidence for a change grows towards its position from both sides.
 
     Args:
-        starts: Samples that a change may begin with, rising.
-        ratios: Gives the logarithms of likelihood ratios of some of them.
+        starts: Possible first samples of a change, ascending.
+        ratios: Returns the log-likelihood ratios of some starts.
     """
     at_once = 16  # starts that are tried at once; each round leaves an eighth of them
     while len(starts) > at_once:
@@ -396,16 +395,16 @@ def narrowed(starts: Indices, ratios: Callable[[Indices], Floats]) -> Indices:
 
 
 def exceedance(ratio: float, count: float, further: int, freedom: float, effect: float) -> float:
-    """Return the probability of so large a likelihood ratio where the effect is negligible.
+    """Return the probability of a likelihood ratio this large if the effect is negligible.
 
-    The non-central F distribution by Patnaik's approximation (1949).
+    The non-central F distribution is approximated by Patnaik's method (1949).
 
     Args:
-        ratio: Logarithm of the likelihood ratio.
-        count: Coordinates that were measured.
+        ratio: Log-likelihood ratio.
+        count: Number of measured coordinates.
         further: Number of additional parameters of the alternative.
         freedom: Residual degrees of freedom of the alternative.
-        effect: Size of what it changes, in units of what is negligible.
+        effect: Size of the effect, in units of a negligible one.
     """
     from scipy.special import fdtrc
 
@@ -419,23 +418,23 @@ def exceedance(ratio: float, count: float, further: int, freedom: float, effect:
 
 
 def negligible(kinds: int) -> Floats:
-    """Return (B,) negligible sizes of each kind of error [m, rad]."""
+    """Return the negligible size (B,) of each kind of error [m, rad]."""
     # What is negligible of a normal's or a marker's rotation: 4 mrad
     # Error that an arm's kinematics or a scanner may have without a mistake [m]
     return np.array([0.5e-3, *[4e-3] * (kinds - 1)])
 
 
 def _effect(before: Misfit, after: Misfit) -> float:
-    """Return by how much the errors shrink, in units of what is negligible; the largest kind."""
+    """Return the largest reduction of any kind of error, in units of the negligible size."""
     shrunk = np.sqrt(np.clip(before.numbers**2 - after.numbers**2, 0.0, None))
     return float((shrunk / negligible(len(shrunk))).max())
 
 
 def helps(session: RecordedSession, corrected: RecordedSession) -> bool:
-    """Whether held-out samples are predicted better with the correction than without.
+    """Return whether the correction improves the prediction of held-out samples.
 
-    Positions count by their share of how far the samples are apart: to divide all lengths by a
-    thousand divides the errors too, and explains nothing.
+    Position errors are relative to the samples' spread, because dividing all lengths by 1000 also
+    divides the errors without explaining anything.
     """
     before, after = _foretold(session), _foretold(corrected)
     # Errors that sound samples have, too: growing up to these is no loss [of the spread, rad]
@@ -445,12 +444,12 @@ def helps(session: RecordedSession, corrected: RecordedSession) -> bool:
 
 
 def explained(session: RecordedSession) -> bool:
-    """Whether the samples predict each other, which unrelated ones do not."""
+    """Return whether the samples predict each other, unlike unrelated ones."""
     return bool(_foretold(session)[0] <= EXPLAINED)
 
 
 def moved_helps(session: RecordedSession, after: Mask) -> bool:
-    """Whether two calibrations, before and after a move, foretell samples better than one."""
+    """Return whether two calibrations, before and after a move, predict samples better than one."""
     equations = equations_of(session)
     whole = held_out_errors(equations, np.zeros_like(after))
     first, second = (held_out_errors(equations, mask) for mask in (after, ~after))
@@ -460,11 +459,11 @@ def moved_helps(session: RecordedSession, after: Mask) -> bool:
 
 
 def held_out_errors(equations: Equations, ignored: Mask) -> Floats:
-    """Return (N, B) errors [m, rad] of each sample by the calibration without its fold.
+    """Return the errors (N, B) [m, rad] of each sample by the calibration without its fold.
 
     Args:
-        equations: One variant.
-        ignored: (N,) samples that take no part at all; NaN.
+        equations: Equations of one variant.
+        ignored: (N,) mask of samples left out; their errors are NaN.
     """
     seen = np.isfinite(equations.centres[0, :, 0]) & ~ignored
     folds_of = 4  # every fourth sample is held out in turn
@@ -478,7 +477,7 @@ def held_out_errors(equations: Equations, ignored: Mask) -> Floats:
 
 
 def _foretold(session: RecordedSession) -> Floats:
-    """Return (B,) medians of the errors held out; positions as a share of the samples' spread."""
+    """Return the medians (B,) of held-out errors; positions relative to the samples' spread."""
     errors = held_out_errors(equations_of(session), ~session.seen)
     middle = np.nanmedian(errors, axis=0)
     middle[0] /= max(_spread(session), 1e-12)
@@ -486,24 +485,24 @@ def _foretold(session: RecordedSession) -> Floats:
 
 
 def _spread(session: RecordedSession) -> float:
-    """Return how far the samples are apart [m]: the arm's places, or what was seen, if farther."""
+    """Return the samples' spread [m]: of the arm's or of the measured positions, if larger."""
     sides = (session.poses[session.seen, :3, 3], session.centres[session.seen])
     return max(float(np.linalg.norm(side.std(axis=0))) for side in sides)
 
 
 def covariance_of(information: Floats) -> Floats:
-    """Return the inverse; directions without information get a variance beyond all limits."""
+    """Return the inverse of an information matrix; unobservable directions get a huge variance."""
     size = np.sqrt(np.maximum(np.diag(information), 1e-300))
     scaled = information / np.outer(size, size) + 1e-13 * np.eye(len(size))
     return np.asarray(np.linalg.inv(scaled) / np.outer(size, size))
 
 
 def offset_left_open(session: RecordedSession) -> float:
-    """Return how well the poses show a constant offset of the target from the flange [m].
+    """Return the uncertainty of a constant offset of the target from the flange [m].
 
     Returns:
-        One sigma along the direction that they show least; 0 where that is below a millimetre, so
-        that a tool set in the controller would show.
+        One sigma in the least certain direction; 0 below a millimetre, where a tool offset set in
+        the controller would be detected.
     """
     free = fit(equations_of(session).with_free_place())
     known = float(np.sqrt(np.linalg.eigvalsh(covariance_of(free.information[0])[6:9, 6:9])[-1]))
@@ -511,7 +510,7 @@ def offset_left_open(session: RecordedSession) -> float:
 
 
 def size_by_chance(session: RecordedSession) -> float:
-    """Return the probability that errors of the arm show so wrong a marker's size by chance."""
+    """Return the probability that errors of the arm cause the apparent error of a marker's size."""
     one_arm = session.seconds is None and session.links is None
     if not one_arm or np.isfinite(session.places).any():
         return 1.0
@@ -522,7 +521,7 @@ def size_by_chance(session: RecordedSession) -> float:
 
 
 def pairs_of(session: RecordedSession) -> Pairs:
-    """Return the poses of one arm and of what was seen: whole ones, or of centres turned by NaN."""
+    """Return the poses of one arm and of the target; centres have NaN as rotation."""
     turned = np.isfinite(session.rotations).all(axis=(1, 2))
     shown = turned if turned.any() else session.seen
     markers = np.tile(np.eye(4), (int(shown.sum()), 1, 1))

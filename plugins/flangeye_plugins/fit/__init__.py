@@ -1,1 +1,1 @@
-"""``fit.*``: circle centre or marker pose, with covariance. Add a fit: a new module here."""
+"""``fit.*`` stages: fit a circle's centre or a target's pose, with covariance."""

@@ -1,4 +1,4 @@
-"""Printed targets: ChArUco boards, checkerboards, and single ArUco or AprilTag markers."""
+"""``fit.*`` stages of printed targets: ChArUco boards, checkerboards, circle grids, markers."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def fit_charuco(capture: Capture, params: CharucoParams) -> PoseFeature | Reject
 
 @stage("fit.checkerboard")
 def fit_checkerboard(capture: Capture, params: CheckerboardParams) -> PoseFeature | Rejected:
-    """Find a complete checkerboard that looks different after half a turn.
+    """Find a complete checkerboard whose pattern is not symmetric under half a turn.
 
     The frame has its origin in the middle of the board, x right, y up, z towards the camera; the
     square at the top left is black.
@@ -173,8 +173,8 @@ def fit_circles(capture: Capture, params: CirclesParams) -> PoseFeature | Reject
 def fit_aruco(capture: Capture, params: MarkerParams) -> PoseFeature | Rejected:
     """Find one ArUco or AprilTag marker.
 
-    A board with many corners gives a pose several times better than these four. Seen nearly
-    frontally a marker has two poses that fit alike, and is set aside unless depth decides.
+    A board with many corners gives a pose several times more accurate than four corners. A marker
+    seen nearly frontally has two poses that fit equally well, and is rejected unless depth decides.
     """
     return fit_board(capture, params.board, params)
 
@@ -217,7 +217,7 @@ def _fit_corners(
 
 
 def _by_depth(corners: Corners, capture: Capture, board: Board) -> PlanarPose | Rejected | None:
-    """Return the pose by depth; None without depth, Rejected where the size contradicts it."""
+    """Return the pose by depth; None without depth, Rejected if the size is wrong."""
     image = capture.image
     if image is None or capture.cloud.xyz.shape[:2] != image.pixels.shape[:2]:
         return None
@@ -258,7 +258,7 @@ def _better(
 
 
 def _ambiguity(poses: list[PlanarPose]) -> Rejected | None:
-    """Reject corners that another pose explains nearly as well."""
+    """Return a rejection if two poses explain the corners nearly as well; else None."""
     if len(poses) < 2:
         return None
     best, other = poses

@@ -1,4 +1,4 @@
-"""The pose of a body of known shape, with its covariance, from a scan around it."""
+"""``fit.body``: pose of a body of known shape, with covariance, from the scan points around it."""
 
 from __future__ import annotations
 
@@ -58,14 +58,14 @@ def fit_body(
     scanner: ScannerModel | None = None,
     capture: Capture | None = None,
 ) -> PoseFeature | Rejected:
-    """Lay a body on the scan around it: surface on points, and ends of faces on the scan's edges.
+    """Fit a body to the scan around it: its surface to points, its faces' ends to the scan's edges.
 
-    Every point of the scan is compared with the body along the scanner's own ray, so that only
-    visible faces count, and robustly. A scanner loses the outermost points of an edge, and rounds
-    what bends: by how much is fitted along. Neighbouring points err together: they count as
-    patches. The covariance has what no scan shows as smooth fields: the body against its CAD, and
-    the scanner's distortion. What a symmetric body does not show keeps a variance as large as the
-    body.
+    Every scan point is compared with the body along the scanner's ray, so that only visible faces
+    count, with robust weights. A scanner loses the outermost points at edges and rounds curved
+    surfaces; both effects are estimated with the pose. Errors of neighbouring points are
+    correlated, so they count as patches. The covariance includes two smooth fields that no scan
+    shows: the body's deviation from its CAD, and the scanner's distortion. Directions that a
+    symmetric body does not determine get a variance as large as the body.
     """
     from flangeye_plugins.body.dense import fitted
     from flangeye_plugins.body.looks import prepared
@@ -98,7 +98,7 @@ def fit_body(
 def _unlike(
     fit: BodyFit, name: str, params: FitBodyParams, distortion: Callable[[Floats], Floats]
 ) -> Rejected | None:
-    """Return in what a scan is unlike the body that was laid on it; None where in nothing."""
+    """Return a rejection if the scan does not match the fitted body; None if it does."""
     if fit.noise > params.max_rms:
         return Rejected(
             f"the scan is {fit.noise * 1e3:.2f} mm off {name}'s surface (limit "
@@ -124,9 +124,10 @@ def _unlike(
 
 
 def _somewhere(error: float, points: Floats) -> Floats:
-    """Return (P, 3, 12): a distortion at (P, 3) points, about their middle, linear in 12 weights.
+    """Return a distortion field at points (P, 3), linear in 12 random weights (P, 3, 12) [m].
 
-    Its slope is that of a field which changes its sign over half the distance.
+    It is linear about the points' centre; its slope is that of a field which changes sign over half
+    the distance.
     """
     middle = points.mean(axis=0)
     arms = (points - middle) / (np.linalg.norm(middle) / 2)

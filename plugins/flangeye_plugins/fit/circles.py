@@ -1,4 +1,4 @@
-"""Faces of scans, and concentric circles fitted to their edge points, radii free."""
+"""Robust fits of a disc's face, and of concentric circles with free radii to edge points."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ class Circles(NamedTuple):
     """Concentric circles.
 
     Attributes:
-        centre: (2,) [m].
-        radii: (k,) [m].
+        centre: (2,) common centre [m].
+        radii: (k,) radii [m].
     """
 
     centre: Floats
@@ -26,11 +26,11 @@ class Circles(NamedTuple):
 
 
 def circle_residuals(circles: Circles, points: Floats, ring: NDArray[np.intp]) -> Floats:
-    """Return each point's distance outside its own circle, (N,) [m].
+    """Return each point's signed distance (N,) from its circle, positive outside [m].
 
     Args:
         circles: The circles.
-        points: (N, 2) [m].
+        points: (N, 2) positions [m].
         ring: (N,) index of each point's circle.
     """
     offsets = points - circles.centre
@@ -40,19 +40,19 @@ def circle_residuals(circles: Circles, points: Floats, ring: NDArray[np.intp]) -
 def fit_concentric(
     points: Floats, ring: NDArray[np.intp], start: Circles, scale: float, within: float = 1e-8
 ) -> Circles:
-    """Return the circles that minimise the points' distances, far ones counting less and less.
+    """Return the concentric circles that minimise the Cauchy loss of the points' distances.
 
-    Cauchy's loss of the geometric distance, by Newton steps where they lower it, else by
-    Gauss-Newton with its weights ``1 / (1 + (r / scale)^2)``, which alone takes fifty steps where
-    many points are strays. The radii are free: chamfers and the scanner's edge erosion move them
-    by up to a millimetre, and a wrong fixed radius would move the centre of a partial arc with it.
+    The loss is minimised by Newton steps where they lower it, otherwise by Gauss-Newton steps with
+    weights ``1 / (1 + (r / scale)^2)``, which alone need fifty steps with many outliers. The radii
+    are free: chamfers and the scanner's edge erosion change them by up to a millimetre, and a wrong
+    fixed radius would displace the centre of a partial arc.
 
     Args:
         points: (N, 2) edge points [m].
         ring: (N,) index of each point's circle.
-        start: Where to begin.
+        start: Start values.
         scale: Distance at which a point's weight is a half [m].
-        within: The last step [m].
+        within: Step size at convergence [m].
     """
     circles, residual = start, circle_residuals(start, points, ring)
     loss = cauchy_loss(residual, scale)
@@ -73,14 +73,14 @@ def fit_concentric(
 
 
 def _step(jacobian: Floats, slope: Floats, bend: Floats) -> Floats:
-    """Return the step down the loss's slope where its residuals' curvatures are ``bend`` (N,)."""
+    """Return the minimisation step for gradient ``slope`` and residual curvatures ``bend`` (N,)."""
     # Keeps a circle without points where it is; beside the points of another it is nothing
     damping = 1e-9 * np.eye(len(slope))
     return np.asarray(-np.linalg.solve((jacobian.T * bend) @ jacobian + damping, slope))
 
 
 def cauchy_loss(residual: Floats, scale: float) -> float:
-    """Return the sum that the weights minimise, ``log(1 + (r / scale)^2)``."""
+    """Return the Cauchy loss: the sum of ``log(1 + (r / scale)^2)``."""
     return float(np.log1p((residual / scale) ** 2).sum())
 
 
@@ -109,13 +109,13 @@ ACROSS = 5
 
 
 def disc_face(points: Floats, rough: Plane, ring: tuple[float, float], gate: float) -> Plane | None:
-    """Return the plane that most points of a ring lie on, its normal towards the scanner.
+    """Return the plane of most points in a ring, with its normal towards the scanner.
 
     Args:
         points: (N, 3) in the scanner's frame [m].
         rough: Rough centre and normal of the disc.
         ring: Inner and outer radius about the rough centre that points must lie between [m].
-        gate: Half thickness of the slab about the rough plane to begin with [m].
+        gate: Initial half thickness of the slab about the rough plane [m].
 
     Returns:
         The plane, or None when fewer than three points lie near it.
@@ -131,14 +131,15 @@ def disc_face(points: Floats, rough: Plane, ring: tuple[float, float], gate: flo
 
 
 def likeliest_plane(points: Floats, rough: Plane) -> Plane:
-    """Return the rough plane or that of a patch of the points, whichever they lie nearest to.
+    """Return the plane with the least median distance: the rough one, or that of a patch.
 
-    Least median of squares (Rousseeuw 1984), with patches instead of random draws: where recesses
-    take a third of a face, a rough plane may lie half way down to their floors.
+    Least median of squares (Rousseeuw 1984), with patches in place of random samples. It is needed
+    because with recesses over a third of a face the rough plane may lie half way down to their
+    floors.
 
     Args:
-        points: (N, 3), more than half of them on the plane that is sought [m].
-        rough: Rough plane; its axes lay the patches out.
+        points: (N, 3) points, more than half of them on the plane [m].
+        rough: Rough plane; the patches are a grid in it.
     """
     sample = thinned(points)
     normals, levels = _planes_of_patches(sample, _patches(rough.flatten(sample)), rough)
@@ -150,16 +151,16 @@ def likeliest_plane(points: Floats, rough: Plane) -> Plane:
 
 
 def _patches(flat: Floats) -> Indices:
-    """Return which of ``ACROSS`` x ``ACROSS`` patches each of (N, 2) points lies in."""
+    """Return the number of the patch (of ``ACROSS`` x ``ACROSS``) of each point (N, 2)."""
     low, high = flat.min(axis=0), flat.max(axis=0)
     cell = np.minimum(((flat - low) / (high - low + 1e-12) * ACROSS).astype(np.intp), ACROSS - 1)
     return np.asarray(cell @ [ACROSS, 1])
 
 
 def _planes_of_patches(points: Floats, patch: Indices, rough: Plane) -> tuple[Floats, Floats]:
-    """Return normals (P, 3) and levels (P,) above the rough plane's point; first the rough plane's.
+    """Return normals (P, 3) and heights (P,) [m] of the patches' least-squares planes.
 
-    The least-squares planes of all patches with enough points, in one computation.
+    The first one is the rough plane. Heights are above its point.
     """
     offsets = points - rough.point
     members = (patch == np.arange(ACROSS**2)[:, None]).astype(np.float64)

@@ -1,4 +1,4 @@
-"""The pose of a flat target from its corners: by their pixels, or by their depth."""
+"""Pose of a flat target from its corners, by pixels or by depth."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class PlanarPose(NamedTuple):
         covariance: (6, 6), order (rotation, translation), left perturbation in ``camera``, the
             translation taken at the target's origin.
         noise: Standard deviation of a coordinate of a corner [px], or [m] by depth.
-        misfit: Sum of the squared errors, in the same unit.
+        misfit: Sum of squared errors, in the squared unit of ``noise``.
     """
 
     matrix: Floats
@@ -37,13 +37,13 @@ class PlanarPose(NamedTuple):
     misfit: float
 
     def blurred(self, position: float, angle: float) -> PlanarPose:
-        """Return the pose, known less well by a position [m] and an angle [rad] along each axis."""
+        """Return the pose with variance added: of a position [m] and an angle [rad] per axis."""
         return self._replace(
             covariance=self.covariance + np.diag([angle**2] * 3 + [position**2] * 3)
         )
 
     def error_at(self, points: Floats) -> float:
-        """Return the expected error of points (N, 3) in ``target``, rms [m]."""
+        """Return the expected rms error of points (N, 3) given in ``target`` [m]."""
         moved = points @ self.matrix[:3, :3].T + self.matrix[:3, 3]
         covariances = covariance_at(self.covariance, self.matrix[:3, 3], moved)
         return float(np.sqrt(np.trace(covariances, axis1=1, axis2=2).mean()))
@@ -52,14 +52,14 @@ class PlanarPose(NamedTuple):
 def poses_from_pixels(corners: Corners, image: Image, expected: float) -> list[PlanarPose]:
     """Return the one or two poses that explain a flat target's corners, best first.
 
-    A plane seen in perspective has two poses that fit nearly alike, tilted towards and away from
-    the camera; the flatter the perspective the more alike (Collins & Bartoli 2014, IPPE). Both
-    are taken to their own least squares.
+    A plane in perspective has two poses with similar residuals, tilted towards and away from the
+    camera; the weaker the perspective, the more similar (Collins & Bartoli 2014, IPPE). Both are
+    refined by least squares.
 
     Args:
         corners: Corners in the image and on the target.
-        image: With the camera's matrix and distortion.
-        expected: Standard deviation of a corner's coordinate known beforehand [px].
+        image: Image with the camera's matrix and distortion.
+        expected: Prior standard deviation of a corner's coordinate [px].
     """
     import cv2
 
@@ -100,9 +100,9 @@ def _least_squares(corners: Corners, image: Image, start: Floats, expected: floa
 
 
 def reprojection(corners: Corners, image: Image, pose: Floats) -> tuple[Floats, Floats]:
-    """Return errors (2N,) [px] and their derivatives (2N, 6) to rotation and translation.
+    """Return errors (2N,) [px] and their derivatives (2N, 6) by rotation and translation.
 
-    An error is where the pose (4, 4) has a corner, minus where it was detected.
+    An error is a corner's predicted position minus its detected one.
     """
     import cv2
 
@@ -119,14 +119,14 @@ def reprojection(corners: Corners, image: Image, pose: Floats) -> tuple[Floats, 
 
 
 def moved_by_camera(corners: Corners, image: Image, pose: Floats) -> Floats:
-    """Return (6, k) how a pose moves by one standard deviation of each of the camera's errors.
+    """Return the pose's displacement (6, k) by one sigma of each of the camera's k errors.
 
-    Corners stay where they were detected: what another camera does to their predictions, the pose
-    takes back by least squares. Of a camera that counts as known there are no errors, k = 0.
+    The detected corners stay fixed, so a change of the camera changes the predictions, and the pose
+    compensates it by least squares. A camera without covariance has k = 0.
 
     Args:
         corners: Corners in the image and on the target.
-        image: With the camera and its covariance.
+        image: Image with the camera and its covariance.
         pose: (4, 4) ``camera_T_target`` [m].
     """
     import cv2
@@ -145,12 +145,12 @@ def moved_by_camera(corners: Corners, image: Image, pose: Floats) -> Floats:
 def middles_beside_centres(corners: Corners, image: Image, pose: Floats, radius: float) -> Floats:
     """Return the offsets (N, 2) of discs' image centroids from their centres' images [px].
 
-    A disc about P in the plane of u and v has the image with the dual conic M diag(1, 1, -1) M',
-    M = [r u, r v, P]; its middle is that of the conic (Heikkila 2000, section 3).
+    The image of a disc about P in the plane of u and v has the dual conic M diag(1, 1, -1) M' with
+    M = [r u, r v, P]; the centroid is the conic's centre (Heikkila 2000, section 3).
 
     Args:
-        corners: The discs; their middles in the image, their centres in ``target``.
-        image: With the camera's matrix and distortion.
+        corners: The discs: centroids in the image, centres in ``target``.
+        image: Image with the camera's matrix and distortion.
         pose: (4, 4) ``camera_T_target`` [m].
         radius: Radius of the discs [m].
     """
@@ -169,10 +169,10 @@ def middles_beside_centres(corners: Corners, image: Image, pose: Floats, radius:
 
 
 def points_of(corners: Corners, cloud: PointCloud) -> Floats:
-    """Return the corners as the scanner measured them (N, 3) [m]; NaN with too few points.
+    """Return the corners' positions measured by the scanner (N, 3) [m]; NaN with too few points.
 
-    The points about a corner are taken as a plane, linear in the pixel: the corner lies between
-    pixels, and many points are better than one.
+    The points around a corner are fitted by a plane, linear in the pixel coordinates, because the
+    corner lies between pixels and the fit averages the noise.
     """
     return np.array([_point_at(cloud.xyz, pixel) for pixel in corners.pixels])
 
@@ -196,7 +196,7 @@ def _point_at(xyz: NDArray[np.float32], pixel: Floats) -> Floats:
 
 
 def pose_from_points(points: Floats, measured: Floats) -> PlanarPose:
-    """Return the pose that takes points (N, 3) in ``target`` onto those measured in ``camera``."""
+    """Return the pose that maps points (N, 3) in ``target`` to those measured in ``camera``."""
     rotation, translation = kabsch(points, measured)
     errors = points @ rotation.T + translation - measured
     misfit = float((errors**2).sum())
@@ -208,7 +208,7 @@ def pose_from_points(points: Floats, measured: Floats) -> PlanarPose:
 
 
 def scale_of(points: Floats, measured: Floats) -> tuple[float, float]:
-    """Return how much larger measured points (N, 3) are than those of the target, and its sigma."""
+    """Return the scale of measured points (N, 3) relative to the target's, and its sigma."""
     rotation, _ = kabsch(points, measured)
     here = (points - points.mean(axis=0)) @ rotation.T
     there = measured - measured.mean(axis=0)

@@ -1,4 +1,4 @@
-"""The paper's fit: a circle through three points, chosen by how many points lie near it."""
+"""``fit.ransac_circle``: the paper's fit, RANSAC with circles through three points."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ class RansacCircleParams(Params):
 
 
 class CircleHypotheses(NamedTuple):
-    """Circles through three points each, and how many points lie near them.
+    """Circles through three points each, with their numbers of inliers.
 
     Attributes:
-        centres: (M, 3) [m].
-        radii: (M,) [m].
-        scores: (M,) points within e_d of the sphere about the centre.
+        centres: (M, 3) centres [m].
+        radii: (M,) radii [m].
+        scores: (M,) numbers of points within e_d of the sphere about the centre.
     """
 
     centres: Floats
@@ -58,10 +58,10 @@ def fit_ransac_circle(
 ) -> CircleFeature | Rejected:
     """Fit the rim as the paper does: RANSAC on three points, no refinement (section 2.1.4).
 
-    All ``k_max`` samples are drawn at once; those whose circle has a radius from R - e_r to R
-    are scored by the points within e_d of the sphere about the centre, and the best is the
-    answer as it is. Its covariance is the scatter, about it, of the circles that score nearly
-    as well: which of them wins is a matter of the seed.
+    All ``k_max`` samples are drawn at once. Circles with a radius from R - e_r to R are scored by
+    the number of points within e_d of the sphere about the centre, and the best one is the result.
+    Its covariance is the scatter of the circles that score nearly as well, as the seed decides
+    which of them wins.
     """
     points = cloud.cloud.xyz.astype(np.float64)
     rough = Plane(cloud.centre, cloud.normal)
@@ -92,7 +92,7 @@ def fit_ransac_circle(
 def draw_circles(
     points: Floats, radii: tuple[float, float], params: RansacCircleParams, seed: int
 ) -> CircleHypotheses:
-    """Return the scored circles through random triples of the points, of radii between two."""
+    """Return scored circles through random triples of points, with radii in an interval."""
     rng = np.random.default_rng(seed)
     triples = points[rng.integers(len(points), size=(params.k_max, 3))]
     centres, found = circles_through(triples)
@@ -102,10 +102,10 @@ def draw_circles(
 
 
 def circles_through(triples: Floats) -> tuple[Floats, Floats]:
-    """Return centres (N, 3) and radii (N,) of the circles through (N, 3, 3) points.
+    """Return centres (N, 3) and radii (N,) of the circles through triples of points (N, 3, 3).
 
-    The circumcentre from a = p1 - p3 and b = p2 - p3:
-    p3 + ((|a|^2 b - |b|^2 a) x (a x b)) / (2 |a x b|^2). Collinear triples give infinity.
+    With a = p1 - p3 and b = p2 - p3 the circumcentre is p3 + ((|a|^2 b - |b|^2 a) x (a x b)) / (2
+    |a x b|^2). Collinear triples give infinity.
     """
     a, b = triples[:, 0] - triples[:, 2], triples[:, 1] - triples[:, 2]
     normal = np.cross(a, b)
@@ -120,7 +120,7 @@ def circles_through(triples: Floats) -> tuple[Floats, Floats]:
 
 
 def sphere_scores(points: Floats, centres: Floats, radii: Floats, e_d: float) -> NDArray[np.intp]:
-    """Return for each of M circles how many points lie within e_d of its sphere."""
+    """Return the number of points within e_d of each circle's sphere (M,)."""
     # Differences of single-precision coordinates about their mean are exact to 10 nm here, and
     # twice as fast to score as doubles.
     middle = points.mean(axis=0)
@@ -154,12 +154,12 @@ def _feature(
 
 
 def scatter_of_rivals(hypotheses: CircleHypotheses, best: int, e_d: float) -> Floats:
-    """Return the (3, 3) mean square of the good circles' centres about the best one's [m^2].
+    """Return the scatter (3, 3) of good circles' centres about the best one's [m^2].
 
-    Good means 70 % of the best score: on the published clouds the normalised squared difference
-    from the rim's own fit is then 2.5 on average, where 3 is right; with 90 % a third of the
-    true scatter is missed, and now and then all of it. Points up to e_d away are all the same
-    to the score, so no direction is taken to be known better than a tenth of e_d.
+    A good circle has at least 70 % of the best score. On the published clouds the normalised
+    squared difference from ``fit.rim`` is then 2.5 on average (3 is expected); with 90 % a third of
+    the true scatter is missed, sometimes all of it. As points up to e_d away score equally, a tenth
+    of e_d is the smallest standard deviation in any direction.
     """
     good = hypotheses.scores >= 0.7 * hypotheses.scores[best]
     offsets = hypotheses.centres[good] - hypotheses.centres[best]
@@ -167,6 +167,6 @@ def scatter_of_rivals(hypotheses: CircleHypotheses, best: int, e_d: float) -> Fl
 
 
 def _coverage(offsets: Floats, radius: float, e_d: float) -> float:
-    """Return the share of the circle, in steps of 5 degrees, that has points within e_d of it."""
+    """Return the share of the circle's 5-degree sectors that have points within e_d of it."""
     on_circle = np.abs(np.hypot(offsets[:, 0], offsets[:, 1]) - radius) <= e_d
     return len(np.unique(sectors(offsets[on_circle], 72))) / 72

@@ -1,4 +1,4 @@
-"""The default fit: the flange's face as a plane, its rim and bore as concentric circles in it."""
+"""``fit.rim``, the default: the flange's face as a plane, rim and bore as concentric circles."""
 
 from __future__ import annotations
 
@@ -62,11 +62,11 @@ class RimParams(ScannerErrorParams):
 def fit_rim(cloud: FlangeCloud, flange: Flange, params: RimParams) -> CircleFeature | Rejected:
     """Fit the flange's rim and bore as concentric circles in its face.
 
-    A robust plane gives depth and normal; the outermost and innermost points of the face, sector
-    by sector, give two circles with one centre and free radii. The covariance has the edges'
-    scatter in the face, where neighbouring points err together, and the plane's across it. There
-    is no randomness. For a wrist circle the centre is moved along the normal by the plate's
-    thickness, to where the robot's flange frame has its origin.
+    A robust plane gives depth and normal. The outermost and innermost points of the face in each
+    sector give two circles with one centre and free radii. The covariance contains the edges'
+    scatter in the face, with correlated neighbours, and the plane's covariance across it. The fit
+    is deterministic. For a wrist circle the centre is moved along the normal by the plate's
+    thickness, to the origin of the robot's flange frame.
     """
     points = cloud.cloud.xyz.astype(np.float64, order="F")
     rough = Plane(cloud.centre, cloud.normal)
@@ -101,7 +101,7 @@ def _on_face(face: Plane, points: Floats) -> Mask:
 
 
 def _why_not(rings: Rings, flange: Flange, params: RimParams) -> str | None:
-    """Return why the circles are not the flange's, or None."""
+    """Return the reason why the circles are not the flange's; None if they are."""
     coverage = rings.coverage(params.inlier)
     for k, (name, expected) in enumerate(flange.radii.items()):
         if coverage[k] < params.min_coverage:
@@ -119,10 +119,10 @@ def _why_not(rings: Rings, flange: Flange, params: RimParams) -> str | None:
 
 
 def away_from_edges(points: Floats, face: Plane, rings: Rings, flange: Flange) -> Plane:
-    """Return the face's plane from points a millimetre inside rim and bore.
+    """Return the face's plane from points at least a millimetre away from rim and bore.
 
-    Near an edge chamfers, mixed pixels and reflections pull points off the plane, and most of
-    them backwards: with 0.2 mm of noise they hide in it and move the plane by 0.015 mm.
+    Near edges chamfers, mixed pixels and reflections displace points, mostly backwards. With 0.2 mm
+    of noise they cannot be detected as outliers and would shift the plane by 0.015 mm.
     """
     offsets = face.flatten(points) - rings.circles.centre
     radius = distances(offsets)
@@ -143,7 +143,7 @@ def away_from_edges(points: Floats, face: Plane, rings: Rings, flange: Flange) -
 def _feature(
     points: Floats, plane: Plane, face: Plane, rings: Rings, flange: Flange, params: RimParams
 ) -> CircleFeature:
-    """Return the feature of a circle: moved from ``face`` to ``plane``, with its covariances."""
+    """Return the circle's feature, moved from ``face`` to ``plane``, with its covariances."""
     centre = face.lift(rings.circles.centre)
     centre = centre - plane.heights(centre) * plane.normal
     axes = basis_of_plane(plane.normal)
@@ -164,10 +164,10 @@ def _feature(
 
 
 def _unevenness(flange: Flange, params: RimParams) -> Floats:
-    """Return the (3, 3) covariance of slopes and height that the face's tolerance allows.
+    """Return the covariance (3, 3) of a face's slopes and height from its flatness tolerance.
 
-    A surface anywhere within a band has the band's width over root 12 as standard deviation; a
-    slope is that over the standard deviation of a disc's points along an axis, half its radius.
+    A surface uniform within a band has the standard deviation width / sqrt(12). For a slope this is
+    divided by half the radius, the standard deviation of a disc's points along an axis.
     """
     height = params.flatness**2 / 12
     slope = height / (flange.rim / 2) ** 2
@@ -175,7 +175,7 @@ def _unevenness(flange: Flange, params: RimParams) -> Floats:
 
 
 def _centre_covariance(rings: Rings, of_plane: Floats, params: RimParams) -> Floats:
-    """Return the (3, 3) covariance of the centre in the face's axes, the normal last [m^2]."""
+    """Return the centre's covariance (3, 3) in the face's axes, with the normal last [m^2]."""
     covariance = params.scanner_error**2 * np.eye(3)
     covariance[:2, :2] += params.edge_bias**2 * np.eye(2)
     covariance[:2, :2] += rings.covariance()[:2, :2]
@@ -187,10 +187,10 @@ class Rings(NamedTuple):
     """Rim, and bore if there is one, with the edge points they were fitted to.
 
     Attributes:
-        circles: In the face's coordinates; radii in the order rim, bore.
+        circles: Circles in the face's coordinates; radii in the order rim, bore.
         points: (N, 2) edge points [m].
         ring: (N,) 0 for rim, 1 for bore.
-        bins: (k,) number of sectors each ring was searched in.
+        bins: (k,) number of sectors for each ring.
         scale: Distance at which an edge point's weight is a half [m].
     """
 
@@ -202,16 +202,16 @@ class Rings(NamedTuple):
 
     @property
     def residuals(self) -> Floats:
-        """(N,) how far outside its circle each edge point lies [m]."""
+        """Signed distances (N,) of edge points from their circles, positive outside [m]."""
         return circle_residuals(self.circles, self.points, self.ring)
 
     def coverage(self, inlier: float) -> Floats:
-        """Return (k,) the share of each circle with an edge point within ``inlier`` of it."""
+        """Return the share of each circle (k,) that has an edge point within ``inlier`` of it."""
         on_circle = np.abs(self.residuals) <= inlier
         return np.bincount(self.ring[on_circle], minlength=len(self.bins)) / self.bins
 
     def covariance(self) -> Floats:
-        """Return the (2 + k, 2 + k) covariance of centre and radii [m^2]."""
+        """Return the covariance (2 + k, 2 + k) of centre and radii [m^2]."""
         jacobian = circle_jacobian(self.circles, self.points, self.ring)
         stretch = sectors(self.points - self.circles.centre, STRETCHES) + STRETCHES * self.ring
         residuals, scale = self.residuals, self.scale
@@ -246,9 +246,9 @@ def find_rings(flat: Floats, nominal: Floats, start: Floats, scale: float) -> Ri
 def _settled(
     flat: Floats, circles: Circles, nominal: Floats, bins: Indices, scale: float, within: float
 ) -> Rings:
-    """Return the circles through the points at the edges, once their centre has come to rest.
+    """Return the circles through the edge points, iterated until the centre converges.
 
-    Which points are at the edge depends on the centre, and the centre on them.
+    The choice of edge points depends on the centre, and the centre on the edge points.
     """
     # Rounds of choosing edge points and fitting
     for _ in range(12):
@@ -261,9 +261,9 @@ def _settled(
 
 
 def _sectors_for(flat: Floats, nominal: Floats) -> Indices:
-    """Return (k,) numbers of sectors, each about two points wide at its ring.
+    """Return the number of sectors for each ring (k,), each about two points wide.
 
-    Narrower ones often hold no point at the edge itself, wider ones lose detail.
+    Narrower sectors often have no point at the edge itself; wider ones lose detail.
     """
     rim, *bore = nominal**2
     spacing = np.sqrt(np.pi * (rim - sum(bore)) / len(flat))
@@ -274,9 +274,9 @@ def _sectors_for(flat: Floats, nominal: Floats) -> Indices:
 def _edges_near(
     flat: Floats, centre: Floats, nominal: Floats, bins: Indices, depth: float = 0.0
 ) -> tuple[Floats, Indices]:
-    """Return the edge points near each nominal circle, and which circle each belongs to.
+    """Return the edge points near each nominal circle, and each point's circle.
 
-    With a depth, all points that are at most so far [m] behind them.
+    With ``depth`` all points up to this distance behind an edge point are returned [m].
     """
     offsets = flat - centre
     reach = distances(offsets)

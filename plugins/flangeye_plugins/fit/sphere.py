@@ -1,4 +1,4 @@
-"""Estimate the centre of a calibration sphere from the cap that a scanner sees."""
+"""``fit.sphere``: centre of a calibration sphere from its visible cap."""
 
 from __future__ import annotations
 
@@ -48,9 +48,9 @@ class SphereFit(NamedTuple):
     """A sphere fitted to points.
 
     Attributes:
-        centre: (3,) [m].
-        radius: [m].
-        points: (N, 3) those within the incidence limit [m].
+        centre: (3,) centre [m].
+        radius: Radius [m].
+        points: (N, 3) points within the incidence limit [m].
         scale: Distance at which a point's weight is a half [m].
     """
 
@@ -61,17 +61,17 @@ class SphereFit(NamedTuple):
 
     @property
     def residuals(self) -> Floats:
-        """(N,) distance of each point outside the sphere [m]."""
+        """Signed distances (N,) of the points from the sphere, positive outside [m]."""
         return np.asarray(np.linalg.norm(self.points - self.centre, axis=1) - self.radius)
 
     @property
     def weights(self) -> Floats:
-        """(N,) weight of each point."""
+        """Weights (N,) of the points."""
         return cauchy_weights(self.residuals, self.scale)
 
     @property
     def jacobian(self) -> Floats:
-        """(N, 4) derivative of the residuals to centre and radius."""
+        """Derivatives (N, 4) of the residuals by centre and radius."""
         return sphere_jacobian(self.points, self.centre)
 
 
@@ -81,10 +81,10 @@ def fit_sphere(
 ) -> CircleFeature | Rejected:
     """Fit a calibration sphere of known size to the cap that the scanner sees.
 
-    Robust least squares on the distance from the surface, over points seen within the incidence
-    limit: beyond it scanners smear and lose points. The radius is fitted too, to tell whether it
-    is the sphere at all; the centre is that of the known radius unless the recipe leaves it free.
-    There is no randomness.
+    Robust least squares on the distances from the surface, over points within the incidence limit,
+    beyond which scanners blur and lose points. The radius is fitted as well, to test whether it is
+    the sphere; the centre is that for the known radius, unless the recipe leaves it free. The fit
+    is deterministic.
     """
     points = cloud.cloud.xyz.astype(np.float64)
     fewest = 50
@@ -114,15 +114,15 @@ def fit_sphere(
 def fit_cap(
     points: Floats, start: Floats, radius: float, max_incidence: float, free: bool
 ) -> SphereFit:
-    """Return the sphere that minimises the points' distances, far ones counting less and less.
+    """Return the sphere that minimises the Cauchy loss of the points' distances.
 
-    Gauss-Newton with Cauchy weights; their scale is twice the residuals' own scatter. Which points
-    are seen within the limit depends on the centre, and is settled with it.
+    Gauss-Newton with Cauchy weights, whose scale is twice the residuals' scatter. The points within
+    the incidence limit depend on the centre and are updated with it.
 
     Args:
-        points: (N, 3) in ``camera`` [m].
+        points: (N, 3) points in ``camera`` [m].
         start: (3,) rough centre [m].
-        radius: Radius of the sphere, or where to begin [m].
+        radius: Radius of the sphere, or its start value [m].
         max_incidence: Largest angle of the surface's normal to the line of sight [rad].
         free: Whether the radius is fitted.
     """
@@ -148,27 +148,27 @@ def _scaled(fit: SphereFit) -> SphereFit:
 
 
 def sphere_jacobian(points: Floats, centre: Floats) -> Floats:
-    """Return the (N, 4) derivative of the distances from a sphere to its centre and radius."""
+    """Return the derivatives (N, 4) of distances from a sphere by centre and radius."""
     offsets = points - centre
     distance = np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-9)
     return np.hstack([-offsets / distance, -np.ones((len(points), 1))])
 
 
 def incidence_cosine(points: Floats, centre: Floats) -> Floats:
-    """Return the (N,) cosines between the sphere's normal at points and their lines of sight."""
+    """Return the cosines (N,) of the incidence angle at points on a sphere."""
     offsets = points - centre
     lengths = np.linalg.norm(offsets, axis=1) * np.linalg.norm(points, axis=1)
     return np.asarray(-np.einsum("ni,ni->n", offsets, points) / np.maximum(lengths, 1e-12))
 
 
 def cap_coverage(fit: SphereFit, max_incidence: float) -> float:
-    """Return the share of the cap within the limit that has points, in patches of equal width."""
+    """Return the share of the cap's patches within the incidence limit that have points."""
     patches = 2 * STRETCHES * RINGS
     return len(np.unique(_patch(fit, 2 * STRETCHES, np.sin(max_incidence)))) / patches
 
 
 def _patch(fit: SphereFit, count: int, widest: float) -> Indices:
-    """Return which patch each point lies in: sectors about the line of sight, in rings."""
+    """Return each point's patch: a sector of a ring about the line of sight."""
     flat = fit.points @ basis_of_plane(fit.centre)[:2].T  # across the line to the centre
     share = (np.hypot(flat[:, 0], flat[:, 1]) / (widest * fit.radius)) ** 2
     ring = np.minimum((RINGS * share).astype(np.intp), RINGS - 1)
@@ -176,7 +176,7 @@ def _patch(fit: SphereFit, count: int, widest: float) -> Indices:
 
 
 def _why_not(free: SphereFit, coverage: float, sphere: Sphere, params: SphereParams) -> str | None:
-    """Return why the fit is not the sphere, or None."""
+    """Return the reason why the fit is not the sphere; None if it is."""
     if coverage < params.min_coverage:
         return (
             f"{coverage:.0%} of the cap seen within {np.degrees(params.max_incidence):g} deg, at "
@@ -191,7 +191,7 @@ def _why_not(free: SphereFit, coverage: float, sphere: Sphere, params: SpherePar
 
 
 def _covariance(fit: SphereFit, held: bool, params: SphereParams) -> Floats:
-    """Return the (3, 3) covariance of the centre [m^2], its radius held or fitted."""
+    """Return the covariance (3, 3) of the centre [m^2], for a held or a fitted radius."""
     jacobian = fit.jacobian[:, :3] if held else fit.jacobian
     cluster = _patch(fit, STRETCHES, np.sin(params.max_incidence))
     curvature = cauchy_curvature(fit.residuals, fit.scale)

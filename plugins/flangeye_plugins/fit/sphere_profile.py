@@ -1,4 +1,4 @@
-"""The centre of a calibration sphere from one profile of a line scanner."""
+"""``fit.sphere_profile``: centre of a calibration sphere from one profile of a line scanner."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ class PlanarCircle(NamedTuple):
     """A circle in the laser's plane, and the points on it.
 
     Attributes:
-        circles: The one circle, in (x, z).
-        points: (N, 2) its points [m].
+        circles: The circle in (x, z); there is only one.
+        points: (N, 2) points on it [m].
         scale: Distance at which a point's weight is a half [m].
     """
 
@@ -63,7 +63,7 @@ class PlanarCircle(NamedTuple):
 
     @property
     def radius(self) -> float:
-        """Of the circle [m]."""
+        """Radius of the circle [m]."""
         return float(self.circles.radii[0])
 
 
@@ -73,9 +73,9 @@ def fit_sphere_profile(
 ) -> CircleFeature | Rejected:
     """Find the centre of a sphere of known size from one profile of it.
 
-    The laser's plane, y = 0 of the scanner, cuts the sphere in a circle. Its centre gives x and z,
-    its radius r the distance of the sphere's centre from the plane: ``y = sqrt(R^2 - r^2)``, on the
-    side that the recipe states. The uncertainty of r grows by r / y on its way to y.
+    The laser's plane (y = 0 of the scanner) cuts the sphere in a circle. Its centre gives x and z;
+    its radius r gives the distance of the sphere's centre from the plane, ``y = sqrt(R^2 - r^2)``,
+    on the side stated in the recipe. An error of r is multiplied by r / y.
     """
     xyz = capture.cloud.points().astype(np.float64)
     xyz = xyz[np.isfinite(xyz).all(axis=1)]
@@ -120,16 +120,17 @@ def _why_no_profile(xyz: Floats) -> str | None:
 def find_arc(
     points: Floats, radius: float, params: SphereProfileParams, seed: int
 ) -> PlanarCircle | Rejected:
-    """Return the circle that most points of a profile lie on, seen from outside.
+    """Return the circle with most points of a profile, seen from outside.
 
-    Circles through random triples, no larger than the sphere and farther from the scanner than
-    their points, are counted; the best is fitted to its points by robust least squares.
+    Candidates are circles through random triples that are not larger than the sphere and whose
+    centre is farther from the scanner than their points. The one with most inliers is fitted to
+    them by robust least squares.
 
     Args:
-        points: (N, 2) of the profile, x and z [m].
-        radius: The sphere's [m].
-        params: Gives tolerance and the distances from the plane that are asked for.
-        seed: Seed of the draw.
+        points: (N, 2) points of the profile, x and z [m].
+        radius: Radius of the sphere [m].
+        params: Tolerance, and limits of the centre's distance from the plane.
+        seed: Seed of the random triples.
     """
     centres, radii = _candidates(points, radius, params, seed)
     if not len(radii):
@@ -145,7 +146,7 @@ def find_arc(
 def _candidates(
     points: Floats, radius: float, params: SphereProfileParams, seed: int
 ) -> tuple[Floats, Floats]:
-    """Return the centres (M, 2) and radii (M,) that triples give and that can be the sphere's."""
+    """Return centres (M, 2) and radii (M,) of circles through triples that can be the sphere's."""
     rng = np.random.default_rng(seed)
     flat = np.insert(points[np.argsort(points[:, 0])], 1, 0.0, axis=1)
     near = np.searchsorted(flat[:, 0], flat[:, 0] + radius)  # beyond it nothing is on the circle
@@ -193,7 +194,7 @@ def _why_not(offset: float, coverage: float, params: SphereProfileParams) -> str
 
 
 def _covariance(arc: PlanarCircle, y: float, radius: float, params: SphereProfileParams) -> Floats:
-    """Return the (3, 3) covariance of the centre [m^2]: of circle, sphere and scanner."""
+    """Return the centre's covariance (3, 3) [m^2] from circle, sphere radius and scanner."""
     ring = np.zeros(len(arc.points), dtype=np.intp)
     residual = circle_residuals(arc.circles, arc.points, ring)
     cluster = sectors(arc.points - arc.circles.centre, 2 * STRETCHES)

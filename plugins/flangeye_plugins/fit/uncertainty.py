@@ -1,4 +1,4 @@
-"""How well a fit is known when neighbouring points err together."""
+"""Covariance of fits to points whose errors are correlated with their neighbours'."""
 
 from __future__ import annotations
 
@@ -33,20 +33,20 @@ def clustered_covariance(
     cluster: NDArray[np.intp],
     curvature: Floats | None = None,
 ) -> Floats:
-    """Return the (p, p) covariance of a weighted least-squares fit with correlated neighbours.
+    """Return the covariance (p, p) of a weighted least-squares fit with correlated residuals.
 
-    The sandwich estimator with clusters (Liang and Zeger 1986): residuals may be correlated in
-    any way inside a cluster and differ in size between clusters. Edge points do both: the pixel
-    grid, the chamfer and reflections shift whole stretches of an edge together, so that counting
-    every point as independent makes a centre look several times better than it is.
+    This is the sandwich estimator with clusters (Liang and Zeger 1986): residuals may be correlated
+    within a cluster and differ in variance between clusters. Both hold for edge points: the pixel
+    grid, the chamfer and reflections displace whole stretches of an edge, so treating the points as
+    independent understates a centre's standard deviation several times.
 
     Args:
-        jacobian: (N, p) derivative of the residuals.
-        residual: (N,) at the solution.
+        jacobian: (N, p) derivatives of the residuals.
+        residual: (N,) residuals at the solution.
         weights: (N,) weight of each residual.
         cluster: (N,) number of the cluster each residual belongs to, from zero.
-        curvature: (N,) derivative of ``weights * residual``, where the weights follow the
-            residuals; the weights if not given.
+        curvature: (N,) derivatives of ``weights * residual`` by the residual; None for constant
+            weights.
     """
     p = jacobian.shape[1]
     each = jacobian.T * (weights * residual)
@@ -59,13 +59,13 @@ def clustered_covariance(
 
 
 def plane_covariance(offsets: Floats, heights: Floats) -> Floats:
-    """Return the (3, 3) covariance of a plane's two slopes and of its height at the origin.
+    """Return the covariance (3, 3) of a plane's two slopes and its height at the origin.
 
-    A face's unevenness is wider than a point, so the clusters are sectors of 15 degrees in three
-    rings.
+    As a face's unevenness is correlated over more than one point, the clusters are sectors of 15
+    degrees in three rings.
 
     Args:
-        offsets: (N, 2) points in the plane, about where the height is taken [m].
+        offsets: (N, 2) points in the plane, relative to the point of the height [m].
         heights: (N,) residuals [m].
     """
     radius = distances(offsets)

@@ -1,1 +1,1 @@
-"""``solve.*``: solvers as stages, a module each; their mathematics is ``flangeye.estimation``."""
+"""``solve.*`` stages: solvers; their mathematics is in ``flangeye.estimation``."""

@@ -1,4 +1,4 @@
-"""The paper's Algorithm 1: a small pool of poses, improved one by one until good enough."""
+"""``solve.iterative``: the paper's Algorithm 1, which improves a small pool of poses one by one."""
 
 from __future__ import annotations
 
@@ -65,10 +65,10 @@ class SearchState:
     """The state of the search.
 
     Attributes:
-        pool: The poses of the best answer so far, the oldest first.
-        cost: Cost of the answer [m]; infinite until one could be measured.
-        history: The cost after the first pool and after each pose tried.
-        losers: Pose id -> why it is not in the pool.
+        pool: Poses of the best result so far, the oldest first.
+        cost: Cost of that result [m]; infinite until one could be measured.
+        history: Cost after the first pool and after each further pose.
+        losers: Reason why a pose is not in the pool, by pose id.
     """
 
     pool: list[Observation]
@@ -84,18 +84,18 @@ def solve_iterative(
     flange: Flange | None,
     params: IterativeParams,
 ) -> HandEye:
-    """Algorithm 1: keep a pool of poses; each new pose replaces the one whose removal helps most.
+    """Keep a pool of poses; each new pose replaces the one whose removal reduces the cost most.
 
-    Algorithm 1, its errata mended: k advances; a pose enters the pool once; while no pool can be
-    measured (cost +infinity) the oldest pose makes way. It stops pulling observations, and so
-    the arm stops, as soon as the cost is as required.
+    This is the paper's Algorithm 1 with its errors corrected: k is incremented; a pose enters the
+    pool only once; while no pool can be measured (infinite cost) the oldest pose is replaced. The
+    stage stops reading observations, and so the arm stops, once the cost is below the required one.
 
-    The pool is chosen for its cost on the verification data, so that cost says little about
-    other places; ``verify.holdout`` does. The covariance is that of the pool's poses, with the
-    noise taken from all poses seen.
+    The pool is selected by its cost on the verification data, so this cost is no estimate of the
+    error elsewhere; ``verify.holdout`` gives one. The covariance is that of the pool's poses, with
+    the noise estimated from all poses.
 
     Raises:
-        StageError: Fewer poses than the pool needs, or nothing to measure a candidate on.
+        StageError: There are fewer poses than the pool needs, or no verification data.
         CalibrationRefused: No pool could be measured.
     """
     # Pulling an observation drives a live arm to its next pose: none is pulled ahead of need
@@ -127,7 +127,7 @@ def improve_pool(
     required: float,
     k_max: int,
 ) -> SearchState:
-    """Run Algorithm 1 from a first pool; pulls from ``stream`` only while it is not good enough."""
+    """Run Algorithm 1 from a first pool; read ``stream`` only while the cost is too high."""
     search = SearchState(list(first), _cost(first, evaluate))
     search.history.append(search.cost)
     # Lines 4 and 5; k, which is never advanced as printed, is the length of the history
@@ -141,7 +141,7 @@ def improve_pool(
 
 
 def _try(newcomer: Observation, search: SearchState, evaluate: Evaluate) -> None:
-    """Put the newcomer in the place where it helps most, if it helps (lines 6 to 15)."""
+    """Replace the pose whose exchange for the newcomer reduces the cost most (lines 6 to 15)."""
     pools = [[*search.pool[:i], *search.pool[i + 1 :], newcomer] for i in range(len(search.pool))]
     costs = [_cost(pool, evaluate) for pool in pools]
     best = int(np.argmin(costs))
@@ -158,7 +158,7 @@ def _try(newcomer: Observation, search: SearchState, evaluate: Evaluate) -> None
 
 
 def _cost(pool: Sequence[Observation], evaluate: Evaluate) -> float:
-    """Return the cost of a pool's answer; infinite for poses in line, which give none."""
+    """Return the cost of a pool's result; infinite for collinear poses, which have none."""
     # The rotation about a line through all centres [m] is free: the SVD would return any
     in_line = spread_of(tcps_of(pool)).width < 1e-3
     return float("inf") if in_line else evaluate(solve_pool(pool))

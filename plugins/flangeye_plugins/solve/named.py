@@ -1,4 +1,4 @@
-"""One stage for each closed form of the literature: for comparison, and where speed is all."""
+"""One stage for each closed-form method of the literature, for comparison and for speed."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ ClosedForm = Callable[[Problem], Places]
 
 
 class ClosedFormParams(LimitsParams):
-    """Parameters of the closed forms."""
+    """Parameters of the closed-form methods."""
 
 
 def solve_closed(
@@ -59,19 +59,19 @@ def solve_closed(
     given: tuple[Sequence[Observation], Cell, ScannerModel | None],
     params: ClosedFormParams,
 ) -> HandEye:
-    """Return a closed form's calibration from all observations.
+    """Return a closed-form method's calibration from all observations.
 
-    Its covariance and expected error are those of the mixed model, at the closed form's answer.
+    Covariance and expected error are those of the mixed model, evaluated at the closed-form result.
 
     Args:
         method: Name of the stage.
-        solver: The closed form.
-        given: What was observed, where, and by which scanner.
-        params: Limits of what counts as observable.
+        solver: The closed-form method.
+        given: Observations, cell and scanner.
+        params: Limits of observability.
 
     Raises:
-        StageError: Too few poses, or all the same.
-        CalibrationRefused: The motion leaves something unknown; the message has what is missing.
+        StageError: There are too few poses, or all are the same.
+        CalibrationRefused: An unknown is not observable; the message names the missing motion.
     """
     observations, cell, scanner = given
     problem = problem_of(observations, cell)
@@ -87,7 +87,7 @@ def solve_closed(
 
 
 def by_motions(method: Callable[[Motions], Floats]) -> ClosedForm:
-    """Return AX = XB as a closed form: the other unknown is the mean over the poses."""
+    """Return a method for AX = XB as a closed form; the other unknown is a mean over poses."""
 
     def closed(problem: Problem) -> Places:
         carried, seen = _one_arm(problem)
@@ -99,7 +99,7 @@ def by_motions(method: Callable[[Motions], Floats]) -> ClosedForm:
 
 
 def by_both(method: Callable[[Floats, Floats], tuple[Floats, Floats]]) -> ClosedForm:
-    """Return AX = ZB as a closed form."""
+    """Return a method for AX = ZB as a closed form."""
 
     def closed(problem: Problem) -> Places:
         return _placed(problem, *method(*_one_arm(problem)))
@@ -129,17 +129,17 @@ def by_three(
 
 
 def linear(problem: Problem) -> Places:
-    """Return the unknowns of circles by linear least squares."""
+    """Return the unknowns for circles by linear least squares."""
     if (problem.seen.ranks == 6).all():
         raise StageError("takes circles, and there are whole poses: use solve.park_martin")
     return start_of_circles(problem)
 
 
 def _one_arm(problem: Problem) -> tuple[Floats, Floats]:
-    """Return ``G`` and ``M`` of ``G X M`` that is the same at every pose, both (N, 4, 4).
+    """Return ``G`` and ``M`` (N, 4, 4) such that ``G X M`` is the same at every pose.
 
     Raises:
-        StageError: The measurements are not whole poses, or the unknowns are others.
+        StageError: The measurements are not full poses, or the unknowns do not have this form.
     """
     if not (problem.seen.ranks == 6).all():
         raise StageError(
@@ -251,14 +251,14 @@ class SvdParams(LimitsParams):
 def solve_svd(observations: Observations, params: SvdParams) -> HandEye:
     """Fit the camera's pose to all centres by equally weighted least squares.
 
-    Equations (8) to (10) of the paper with scale one. The noise is taken as equal in every
-    coordinate of every centre and estimated from the residuals; the covariance is widened for
-    few poses so that its 95 % region holds its share (see ``covariance_inflation``).
+    Equations (8) to (10) of the paper with scale one. The noise is assumed equal in every
+    coordinate of every centre and estimated from the residuals. For few poses the covariance is
+    inflated so that its 95 % region has the right coverage (see ``covariance_inflation``).
 
     Raises:
-        StageError: Fewer than three poses, or all at one place.
-        CalibrationRefused: The centres are in another unit or mirrored, lie on a line, or leave a
-            rotation unknown.
+        StageError: There are fewer than three poses, or all are at one position.
+        CalibrationRefused: The centres are in another unit or mirrored, are collinear, or do not
+            determine a rotation.
     """
     pulled = list(observations)
     check_poses(pulled)
@@ -270,10 +270,10 @@ def solve_svd(observations: Observations, params: SvdParams) -> HandEye:
 
 
 def check_poses(observations: Sequence[Observation]) -> None:
-    """Refuse observations that determine no pose by any method.
+    """Refuse observations from which no method can determine the pose.
 
     Raises:
-        StageError: There are too few, or they are all at one place.
+        StageError: There are too few, or all are at one position.
         CalibrationRefused: Units differ, or the centres fit only when mirrored.
     """
     require_poses(len(observations))
@@ -298,10 +298,10 @@ def least_squares_estimate(
     """Return a least-squares pose with the covariance estimated from its residuals.
 
     Args:
-        rotation: (3, 3) base_R_camera.
-        translation: (3,) [m].
-        tcps: (N, 3) in base [m].
-        residuals: (N, 3) [m], of N >= 3 pairs.
+        rotation: (3, 3) ``base_R_camera``.
+        translation: (3,) translation [m].
+        tcps: (N, 3) flange centres in ``base`` [m].
+        residuals: (N, 3) residuals of N >= 3 pairs [m].
     """
     # A rigid fit takes six; the 95 % region of a variance that is estimated from the rest is wider
     # than the chi-square's by F's quantile

@@ -1,4 +1,4 @@
-"""From observations to arrays, and from arrays to a calibration."""
+"""Conversion of observations to arrays, and of arrays to a calibration result."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from flangeye.units import Angle, param
 
 
 class LimitsParams(Params):
-    """When a calibration is not observable."""
+    """Limits beyond which a calibration counts as not observable."""
 
     rotation_limit: Angle = param(
         "2 deg",
@@ -32,22 +32,22 @@ class LimitsParams(Params):
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Largest standard deviations still observable: of a rotation [rad], a place [m]."""
+        """Largest allowed standard deviations of a rotation [rad] and of a position [m]."""
         return self.rotation_limit, 20e-3
 
 
 def centres_of(observations: Sequence[Observation]) -> Floats:
-    """Return the (N, 3) circle centres in ``camera`` [m]."""
+    """Return the circle centres (N, 3) in ``camera`` [m]."""
     return np.array([o.circle.centre for o in observations]).reshape(-1, 3)
 
 
 def tcps_of(observations: Sequence[Observation]) -> Floats:
-    """Return the (N, 3) flange centres the controller reports, in ``base`` [m]."""
+    """Return the reported flange centres (N, 3) in ``base`` [m]."""
     return np.array([o.tcp_in_base for o in observations]).reshape(-1, 3)
 
 
 def residuals_of(observations: Sequence[Observation], rotation: Floats, shift: Floats) -> Floats:
-    """Return the (N, 3) measured centres, mapped to ``base``, minus the TCPs [m]."""
+    """Return the measured centres mapped to ``base`` minus the flange centres (N, 3) [m]."""
     return np.asarray(centres_of(observations) @ rotation.T + shift - tcps_of(observations))
 
 
@@ -70,11 +70,11 @@ def hand_eye(
     """Return the calibration, with one pair for each observation in the given order.
 
     Args:
-        observations: Everything the solver pulled.
+        observations: All observations that the solver read.
         estimate: The camera's pose.
         method: Name of the stage.
-        rejected: Observation id -> why it took no part.
-        notes: For the person.
+        rejected: Reason for leaving an observation out, by its id.
+        notes: Notes for the user.
     """
     rejected = rejected or {}
     residuals = residuals_of(

@@ -1,4 +1,4 @@
-"""``solve.robust``: every configuration and cell by one linear mixed model."""
+"""``solve.robust``: calibrate any configuration or cell by one linear mixed model."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class RobustParams(LimitsParams):
 
     @property
     def corrects_arm(self) -> bool:
-        """Whether the arm's own error may be estimated; read if a step asks for that answer."""
+        """Whether the arm's errors may be estimated; read by steps that need the corrected arm."""
         return True
 
 
@@ -72,19 +72,22 @@ def solve_robust(  # noqa: PLR0913  what it asks the runner for
     scanner: ScannerModel | None = None,
     second: SecondRobot | None = None,
 ) -> HandEye:
-    """Estimate every unknown transform with all that may be wrong with arms, targets and sensors.
+    """Estimate all unknown transforms, with random effects for errors of arms, targets and sensors.
 
-    Takes whole poses, centres with normals, or centres alone, each with its covariance, of any
-    number of cameras and targets. Needs no first guess. Outliers are sightings that all the others,
-    with every effect that may be wrong, do not predict; they are set aside with their residual. The
-    answer is the best for the arms as their controllers report them, with the error to expect at
-    the work; where correcting the arms is worth its while there is a second answer for them.
+    Observations may be full poses, centres with normals, or centres alone, each with its
+    covariance, of any number of cameras and targets. No initial guess is needed. An observation is
+    an outlier if the model, fitted to all others with all error effects, does not predict it; it is
+    left out and reported with its residual.
+
+    The result is the best one for the arms as their controllers report them, with the expected
+    error at the work. If correcting the arms improves it enough, there is a second result for the
+    corrected arms.
 
     Raises:
-        StageError: Too few poses, all the same, those of a mirrored camera, or a carrier's pose is
-            missing.
-        CalibrationRefused: Fewer than half of the poses agree, the motion leaves something unknown
-            (the message has the missing motion), or a marker's size is not the configured one.
+        StageError: There are too few poses, all are the same, the camera is mirrored, or a
+            carrier's pose is missing.
+        CalibrationRefused: Fewer than half of the poses agree, an unknown is not observable (the
+            message names the missing motion), or a marker's size differs from the configured one.
     """
     standing = cell or cell_of(configuration or DEFAULT, robot, second.model if second else None)
 
@@ -104,7 +107,7 @@ def solve_cell(
     scanner: ScannerModel | None = None,
     workspace: Box | None = None,
 ) -> HandEye:
-    """Solve observations that are all there; see :func:`solve_robust`."""
+    """Return the calibration from a complete list of observations; see :func:`solve_robust`."""
     from flangeye.estimation.calibrate import calibrate
 
     return calibrate(pulled, cell, scanner, _options(params, workspace), "solve.robust")
@@ -129,7 +132,7 @@ def pull(
     required: float,
     stage_log: StageLog | None = None,
 ) -> list[Observation]:
-    """Take observations until the predicted 95 % error at the work is below ``required``."""
+    """Return observations, read until the predicted 95 % error at the work is low enough."""
     pulled: list[Observation] = []
     for observation in observations:
         pulled.append(observation)
@@ -146,7 +149,7 @@ def pull(
 
 
 def _expected(pulled: Sequence[Observation], solve: Solver) -> float | None:
-    """Return what 95 % of the errors at the work are below [m]; None while nothing is known."""
+    """Return the 95 % quantile of the predicted error at the work [m]; None if unknown."""
     try:
         expected = solve(pulled).expected
     except FlangeyeError:

@@ -1,1 +1,1 @@
-"""``verify.*``: tests whether a calibration may be used. Add one: a new module here."""
+"""``verify.*`` stages: tests whether a calibration may be used."""

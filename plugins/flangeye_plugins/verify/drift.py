@@ -1,4 +1,4 @@
-"""``verify.drift``: compare a run's sightings with an earlier calibration of the same cell."""
+"""``verify.drift``: compare a run's observations with an earlier calibration of the same cell."""
 
 from __future__ import annotations
 
@@ -26,17 +26,18 @@ class DriftParams(Params):
 
 @stage("verify.drift")
 def verify_drift(calibration: HandEye, params: DriftParams) -> Verification:
-    """Check whether the scanner is still where an earlier calibration found it.
+    """Check whether the scanner still has the pose of an earlier calibration.
 
-    The poses that this run used are held against the earlier matrix and its covariance. It fails
-    when the cell has moved, so that a robot program with the old matrix is stopped; this run's own
-    matrix is the cure. ``flangeye monitor`` does the same from check to check, and remembers.
+    The observations of this run are compared with the earlier pose and its covariance. The check
+    fails if the cell has moved, which stops a robot program that uses the old matrix; this run's
+    matrix is the new one to use. ``flangeye monitor`` does the same for a series of checks and
+    keeps their history.
 
-    Figures [m, rad]: ``shift`` of the work at its worst corner, ``turn`` of the scanner, and
-    ``statistic``, the likelihood ratio over its threshold.
+    The figures are ``shift``, of the work at its worst corner [m]; ``turn``, of the scanner [rad];
+    and ``statistic``, the likelihood ratio over its threshold.
 
     Raises:
-        StageError: The reference holds no calibration of a camera beside a robot.
+        StageError: The reference has no calibration of a camera beside a robot.
     """
     stored = stored_calibration(params.reference)
     seen = [pair.observation for pair in calibration.pairs if pair.used]

@@ -1,4 +1,4 @@
-"""Held-out error: poses that were not used for the estimate."""
+"""``verify.holdout``: error of a calibration on poses that were not used for it."""
 
 from __future__ import annotations
 
@@ -48,12 +48,12 @@ class HoldoutParams(Params):
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Errors of the poses, each from a calibration that did not know it.
+    """Errors of all poses, each by a calibration without that pose.
 
     Attributes:
-        errors: (N, 3) mapped centre minus where the calibration has it by the arm [m].
-        tilts: (N,) angle between the measured and the expected orientation [rad]; of a face that
-            of its normal, NaN of a centre.
+        errors: (N, 3) measured centre mapped by the calibration, minus the arm's centre [m].
+        tilts: (N,) angle between measured and expected orientation [rad]: of a full pose, or of a
+            face's normal; NaN for a centre alone.
     """
 
     errors: Floats
@@ -71,19 +71,19 @@ def verify_holdout(  # noqa: PLR0913  what it asks the runner for
     second: SecondRobot | None = None,
     seed: Seed = Seed(0),  # noqa: B008  a NewType is the int itself
 ) -> Verification:
-    """k-fold cross-validation over poses: the answer without each fold, and its error on it.
+    """Cross-validate the calibration over k folds of poses.
 
-    A solver that knows its answer without some poses is asked; any other solves each rest again.
+    Each fold's error is that of the calibration without the fold. A solver that can remove poses
+    from its result is used directly; any other solves the remaining poses again.
 
-    ``rms``, ``median``, ``p95`` and ``max`` are over all poses but outliers, of the pose for the
-    arm as its controller reports it; ``rms_inliers`` is the same
-    ``rms``, ``rms_all`` is over all. ``outliers`` counts the poses that
-    the solver did not use and that are off by more than the limit. Where the solver gave an answer
-    for the corrected arm, ``corrected_rms``, ``corrected_median`` and ``corrected_p95`` are those
-    of the pose and the arm so corrected.
+    ``rms``, ``median``, ``p95`` and ``max`` are over all poses except outliers, for the arm as its
+    controller reports it; ``rms_inliers`` equals ``rms``, and ``rms_all`` is over all poses.
+    ``outliers`` is the number of poses that the solver did not use and whose error exceeds the
+    limit. ``corrected_rms``, ``corrected_median`` and ``corrected_p95`` are for the corrected arm,
+    if the solver gave a result for it.
 
-    Figures [m, rad]: these, ``folds``, ``limit``, ``poses``, and ``tilt_rms`` where orientations
-    were measured.
+    The figures [m, rad] are these, ``folds``, ``limit``, ``poses``, and ``tilt_rms`` if
+    orientations were measured.
     """
     poses = [pair.observation for pair in calibration.pairs]
     deals = (
@@ -113,9 +113,9 @@ def verify_holdout(  # noqa: PLR0913  what it asks the runner for
 
 
 def deal(count: int, folds: int, seed: int) -> list[Indices]:
-    """Return the indices of each fold: shuffled once, then dealt round; none is empty.
+    """Return the indices of each fold: shuffled, then dealt in turn; no fold is empty.
 
-    Shuffled, because grids are recorded in raster order and whole planes would fall together.
+    Without shuffling, poses recorded on a grid would put whole planes into one fold.
     """
     order = np.random.default_rng(seed).permutation(count)
     folds = min(folds, count)
@@ -123,9 +123,9 @@ def deal(count: int, folds: int, seed: int) -> list[Indices]:
 
 
 def deal_moments(observations: Sequence[Observation], folds: int, seed: int) -> list[Indices]:
-    """Return the indices of each fold; all sightings of one moment go into the same fold.
+    """Return the indices of each fold; all observations of one moment are in the same fold.
 
-    Else the error of a pose that one camera saw would be known from what the other saw.
+    Otherwise another camera's observation of the same arm pose would make the test dependent.
     """
     moments: dict[bytes, list[int]] = {}
     for i, o in enumerate(observations):
@@ -140,8 +140,8 @@ def solve_without(calibration: HandEye, solve: Solver, folds: Sequence[Indices])
     """Return the calibration without each fold.
 
     Raises:
-        StageError: The rest of some fold cannot be solved.
-        CalibrationRefused: The rest of some fold gives no trustworthy answer.
+        StageError: The poses outside a fold cannot be solved.
+        CalibrationRefused: The poses outside a fold give no acceptable result.
     """
     poses = [pair.observation for pair in calibration.pairs]
     if without := calibration.without or solve(poses).without:  # a log does not hold it
@@ -156,7 +156,7 @@ def hold_out(
     solved: Sequence[HandEye],
     cell: Cell,
 ) -> HeldOut:
-    """Measure each fold by the calibration without it."""
+    """Return the errors of each fold by the calibration without it."""
     n = len(observations)
     held = HeldOut(np.zeros((n, 3)), np.full(n, np.nan))
     for fold, calibration in zip(folds, solved, strict=True):
@@ -171,7 +171,7 @@ def hold_out(
 
 
 def _tilts(features: Sequence[Feature], turns: Floats) -> Floats:
-    """Return (N,) angles between features' orientations and (N, 3, 3) expected ones [rad]."""
+    """Return the angles (N,) between features' orientations and expected ones (N, 3, 3) [rad]."""
     whole = np.array([isinstance(each, PoseFeature) for each in features])
     out, nothing = np.empty(len(features)), np.full(3, np.nan)
     seen = [each.camera_T_target.rotation for each in features if isinstance(each, PoseFeature)]
@@ -205,7 +205,7 @@ def _figures(held: HeldOut, counted: Mask) -> dict[str, float]:
 
 
 def _misread(calibration: HandEye, cell: Cell, optical: bool) -> str | None:
-    """Return how one arm's and a marker's poses were rather meant; None if as they were read."""
+    """Return a more plausible interpretation of arm and marker poses; None if there is none."""
     seen = [o for pair in calibration.pairs if pair.used for o in [pair.observation]]
     shown = [o.feature.camera_T_target for o in seen if isinstance(o.feature, PoseFeature)]
     if (

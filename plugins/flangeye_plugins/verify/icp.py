@@ -1,4 +1,4 @@
-"""The paper's own check, equation (11): the scanned flange against the flange's true shape."""
+"""``verify.icp``: the paper's check, equation (11): the scanned flange against its true shape."""
 
 from __future__ import annotations
 
@@ -70,8 +70,8 @@ class ViewComparison:
     """One verification view against the flange's shape.
 
     Attributes:
-        error: What takes the seen flange onto the predicted one, in ``camera``.
-        registration: The same in ``flange``, with the fit.
+        error: Motion from the measured to the predicted flange in ``camera``.
+        registration: The same motion in ``flange``, with the quality of the fit.
     """
 
     error: PoseError
@@ -88,16 +88,17 @@ def verify_icp(
 ) -> Verification:
     """Register the flange seen in each verification view with its shape, point to plane.
 
-    Equation (11) with its subscripts mended: the shape is predicted in ``camera`` as
-    ``inverse(base_T_camera) @ base_T_flange @ shape``, and the motion that takes the measured
-    cloud onto it is the error; it is infinite when ICP fails. The view with the largest
-    translation counts.
+    Equation (11) with corrected subscripts: the shape is predicted in ``camera`` as
+    ``inverse(base_T_camera) @ base_T_flange @ shape``. The error is the motion that maps the
+    measured cloud onto it; it is infinite if ICP fails. The view with the largest translation
+    counts.
 
-    Figures [m, rad], all in ``camera``: ``x, y, z`` at the flange, where the view was taken;
-    ``camera_x, camera_y, camera_z`` at the camera's origin, as the paper prints them: there
-    every rotation error counts times the distance. ``roll, pitch, yaw``; ``tilt`` of the axis and
-    ``clocking`` about it (present when the shape shows it; it speaks of the flange's own turn
-    as much as of the calibration); ``rms`` and ``overlap`` of the fit; ``views``.
+    The figures [m, rad] are in ``camera``: ``x, y, z`` are the translation at the flange;
+    ``camera_x, camera_y, camera_z`` that at the camera's origin, as in the paper, where a rotation
+    error is multiplied by the distance. ``roll, pitch, yaw`` are the rotation, ``tilt`` that of the
+    axis and ``clocking`` that about it (only if the shape determines it; it includes errors of the
+    flange's own orientation). ``rms`` and ``overlap`` are those of the fit; ``views`` is their
+    number.
 
     Raises:
         StageError: There is no verification view.
@@ -115,10 +116,10 @@ def verify_icp(
 
 
 def require_views(views: Views) -> Views:
-    """Return the views, if there are any.
+    """Return the views; refuse an empty list.
 
     Raises:
-        StageError: There is none.
+        StageError: There are no verification views.
     """
     if not views:
         raise StageError(
@@ -139,14 +140,14 @@ def shape_of(flange: Flange, settings: IcpSettings) -> SampledSurface:
 
 @lru_cache(maxsize=4)
 def _read(cad: CadCloud) -> SampledSurface:
-    """Read a CAD cloud once: solvers ask for it for every candidate."""
+    """Return a CAD cloud's surface, cached because solvers need it for every candidate."""
     return read_surface(cad.file, cad.unit, rotation_from_rpy(*cad.rpy), np.array(cad.offset))
 
 
 def compare(
     base_T_camera: Transform, view: VerificationView, surface: SampledSurface, settings: IcpSettings
 ) -> ViewComparison | str:
-    """Register one view with the surface, or say why ICP failed."""
+    """Return one view registered with the surface, or the reason why ICP failed."""
     camera_T_flange = base_T_camera.inverse() @ view.base_T_flange
     measured = camera_T_flange.inverse().apply(view.flange.cloud.points())
     found = register(measured, surface, settings.reach, settings.distance)

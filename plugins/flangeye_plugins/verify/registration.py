@@ -1,7 +1,8 @@
-"""The flange's shape, and point-to-plane ICP of a measured flange against it. Arrays only.
+"""The flange's shape, and point-to-plane ICP of a measured flange against it.
 
-Not open3d's: its sums depend on the number of threads, and it gives some rotation about the
-axis of a round plate, about which the plate says nothing. Here such a motion stays zero.
+Open3D's ICP is not used, because its result depends on the number of threads and contains an
+arbitrary rotation about the axis of a round plate, which is not observable. Here such a motion
+stays zero.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ class SampledSurface:
     """A sampled surface in ``flange``.
 
     Attributes:
-        points: (N, 3) [m].
+        points: (N, 3) positions [m].
         normals: (N, 3) unit normals.
     """
 
@@ -36,7 +37,7 @@ class SampledSurface:
 
     @cached_property
     def tree(self) -> Any:
-        """Finds nearest points; built once, for solvers compare many candidates."""
+        """Search tree for nearest points; built once, because solvers compare many candidates."""
         from scipy.spatial import cKDTree
 
         return cKDTree(self.points)
@@ -44,10 +45,10 @@ class SampledSurface:
 
 @lru_cache(maxsize=8)
 def surface_of(flange: Flange, spacing: float = 0.5e-3) -> SampledSurface:
-    """Sample the visible surface of a flange: face, chamfers, walls, bore, wrist behind it.
+    """Return samples of a flange's visible surface: face, chamfers, walls, bore, wrist behind it.
 
     Args:
-        flange: The plate as this robot has it.
+        flange: The flange plate.
         spacing: Distance between neighbouring points [m].
     """
     rings = [
@@ -61,7 +62,7 @@ def surface_of(flange: Flange, spacing: float = 0.5e-3) -> SampledSurface:
 
 
 def _profile(flange: Flange) -> list[tuple[float, float]]:
-    """Return (radius, height) of the outline's corners, from the wrist's edge to the axis."""
+    """Return the profile's corners (radius, height), from the wrist's edge to the axis."""
     if flange.bore is None:  # a wrist circle: nothing is known but its disc
         return [(flange.rim, 0.0), (0.0, 0.0)]
     details = flange.details
@@ -82,7 +83,7 @@ def _profile(flange: Flange) -> list[tuple[float, float]]:
 def _ring(
     start: tuple[float, float], end: tuple[float, float], spacing: float
 ) -> tuple[Floats, Floats]:
-    """Sample the surface that a line from ``start`` to ``end`` (radius, height) sweeps."""
+    """Return samples of the surface of revolution of a line between two (radius, height)."""
     first, last = np.array(start), np.array(end)
     length = float(np.linalg.norm(last - first))
     steps = int(np.ceil(length / spacing))
@@ -100,7 +101,7 @@ def _ring(
 
 
 def _in_a_hole(points: Floats, flange: Flange) -> NDArray[np.bool_]:
-    """Return which (N, 3) points of the face are drilled away."""
+    """Return the mask of points (N, 3) of the face that are inside a hole."""
     holes = [(angle, flange.hole) for angle in flange.holes]
     holes += [(flange.pin, flange.pin_hole)] if flange.pin is not None else []
     drilled = np.zeros(len(points), dtype=bool)
@@ -111,12 +112,12 @@ def _in_a_hole(points: Floats, flange: Flange) -> NDArray[np.bool_]:
 
 
 def read_surface(path: Path, unit: LengthUnit, rotation: Floats, offset: Floats) -> SampledSurface:
-    """Read a CAD cloud and express it in ``flange``; normals come from the nearest neighbours.
+    """Return a CAD cloud in ``flange``, with normals estimated from nearest neighbours.
 
     Args:
         path: A file that :func:`flangeye.files.clouds.read_cloud` reads.
         unit: Unit of its coordinates.
-        rotation: (3, 3) flange_R_cad.
+        rotation: (3, 3) ``flange_R_cad``.
         offset: (3,) origin of the CAD frame in ``flange`` [m].
 
     Raises:
@@ -131,7 +132,7 @@ def read_surface(path: Path, unit: LengthUnit, rotation: Floats, offset: Floats)
 
 
 def _normals(points: Floats, neighbours: int = 12) -> Floats:
-    """Return the (N, 3) directions in which the neighbourhood of each point is thinnest."""
+    """Return unit normals (N, 3): the direction of least variance around each point."""
     from scipy.spatial import cKDTree
 
     near = points[cKDTree(points).query(points, k=neighbours)[1]]
@@ -152,10 +153,10 @@ class Registration:
     """The result of an ICP that converged.
 
     Attributes:
-        motion: (4, 4) that takes the measured points onto the surface.
-        rms: Distance of the matched points from the surface afterwards [m].
+        motion: (4, 4) motion of the measured points onto the surface.
+        rms: Distance of the matched points from the surface after the motion, rms [m].
         overlap: Share of the measured points that matched.
-        roll_seen: Whether rotation about the plate's axis was determined.
+        roll_seen: Whether the rotation about the plate's axis is observable.
     """
 
     motion: Floats
@@ -167,19 +168,19 @@ class Registration:
 def register(
     measured: Floats, surface: SampledSurface, reach: float, distance: float
 ) -> Registration | str:
-    """Move (N, 3) measured points onto a surface, both roughly in ``flange``, or say why not.
+    """Return the registration of measured points with a surface, or the reason for a failure.
 
-    Chen & Medioni (1992). Points further from the surface than a limit are left out; the limit
-    falls from ``reach`` to ``distance`` by halves, and ICP converges at each.
+    Point-to-plane ICP (Chen & Medioni 1992). Points farther from the surface than a limit are left
+    out. The limit is halved from ``reach`` to ``distance``, and ICP converges at each value.
 
-    It fails when it does not converge, when less than half of the points match in the end, or
-    when the matched points leave more than rotation about the axis undetermined.
+    It fails if it does not converge, if less than half of the points match at the end, or if more
+    than the rotation about the axis is not observable.
 
     Args:
-        measured: (N, 3) [m].
-        surface: The plate, its axis along z through the origin.
-        reach: First limit: how far off the calibration may be [m].
-        distance: Last limit: what noise and other objects set it to [m].
+        measured: (N, 3) points, roughly in ``flange`` [m].
+        surface: The plate's surface, with its axis along z through the origin.
+        reach: First limit: largest error of the calibration [m].
+        distance: Last limit, given by noise and other objects [m].
     """
     source = measured[:: 1 + len(measured) // 6000]
     motion = np.eye(4)
@@ -200,7 +201,7 @@ def _limits(reach: float, distance: float) -> list[float]:
 def _converge(
     source: Floats, surface: SampledSurface, motion: Floats, limit: float, still: float
 ) -> tuple[Floats, Floats] | str:
-    """Iterate at one limit; return the motion and its unobservable directions (k, 6)."""
+    """Return the converged motion at one limit, and its unobservable directions (k, 6)."""
     iterations = 200
     for _ in range(iterations):
         jacobian, distances = _equations(source, surface, motion, limit)
@@ -216,7 +217,7 @@ def _converge(
 def _equations(
     source: Floats, surface: SampledSurface, motion: Floats, limit: float
 ) -> tuple[Floats, Floats]:
-    """Return the (K, 6) Jacobian in (rotation, translation) and (K,) point-to-plane distances."""
+    """Return the Jacobian (K, 6) (rotation, translation), and point-to-plane distances (K,) [m]."""
     moved = source @ motion[:3, :3].T + motion[:3, 3]
     gap, nearest = surface.tree.query(moved, distance_upper_bound=limit)
     matched = np.isfinite(gap)
@@ -227,7 +228,7 @@ def _equations(
 
 
 def _least_squares(jacobian: Floats, distances: Floats) -> tuple[Floats, Floats]:
-    """Return the (6,) step, zero along the (k, 6) directions that are not determined."""
+    """Return the step (6,), zero along unobservable directions, and these directions (k, 6)."""
     scale = np.array([SIZE] * 3 + [1.0] * 3)
     scaled = jacobian / scale
     values, vectors = np.linalg.eigh(scaled.T @ scaled / len(distances))

@@ -1,4 +1,4 @@
-"""``verify.sphere``: distances between places of one target, by the scanner and by the arm."""
+"""``verify.sphere``: compare distances between target positions by scanner and by arm."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from flangeye.units import Length, param
 
 
 class BallBar(Params):
-    """Two balls at a known distance, as one scan shows them."""
+    """Two balls at a known distance, with their centres measured in one scan."""
 
     first: tuple[Length, Length, Length] = Field(
         description="Centre of one ball, in the camera frame."
@@ -49,18 +49,18 @@ def verify_sphere(
 ) -> Verification:
     """Compare distances measured by the scanner with those of the arm, or with known ones.
 
-    After the manner of the sphere-spacing error of VDI/VDE 2634 and ISO 10360-13; it is not that
-    test. The target is a ball on the flange (``fit.sphere``), or the flange's own circle, with the
-    arm in place of a ball bar; or two balls at a known distance (``bars``). Distances do not depend
-    on the matrix: it can show a scanner or an arm of the wrong scale and a scanner that is bent,
-    and cannot show a wrong matrix. Which of scanner and arm is wrong only ``bars`` can tell.
+    The method follows the sphere-spacing error of VDI/VDE 2634 and ISO 10360-13, but is not that
+    test. The target is a ball on the flange (``fit.sphere``) or the flange's circle, with the arm
+    in place of a ball bar; or two balls at a known distance (``bars``). Distances do not depend on
+    the hand-eye matrix. The check detects wrong scale of scanner or arm and distortion of the
+    scanner, but not a wrong matrix. Only ``bars`` distinguish scanner and arm.
 
-    Figures [m]: ``pairs``, ``rms``, ``p95`` and ``max`` of the errors of distance, ``mean``, and
-    ``scale``: the seen distances over the others, less one. The errors over the distances are in
-    the log as ``comparison``.
+    The figures are ``pairs``, the number of distances; ``rms``, ``p95``, ``max`` and ``mean`` of
+    their errors [m]; and ``scale``, the ratio of scanner to reference distances minus one. The
+    errors over the distances are in the log as ``comparison``.
 
     Raises:
-        StageError: Too few pairs are far enough apart.
+        StageError: There are too few pairs with a large enough distance.
     """
     if params.bars:
         measured, lengths = _of_bars(params.bars)
@@ -81,7 +81,7 @@ def verify_sphere(
 
 
 def _of_bars(bars: Sequence[BallBar]) -> tuple[Floats, Floats]:
-    """Return (N,) distances as seen, and as they are [m]."""
+    """Return measured and known distances (N,) of ball bars [m]."""
     seen = np.array([bar.first for bar in bars]) - np.array([bar.second for bar in bars])
     return np.linalg.norm(seen, axis=1), np.array([bar.length for bar in bars])
 
@@ -89,10 +89,10 @@ def _of_bars(bars: Sequence[BallBar]) -> tuple[Floats, Floats]:
 def _of_poses(
     calibration: HandEye, params: SphereCheckParams, arm: Arm | None
 ) -> tuple[Floats, Floats]:
-    """Return (N,) distances of all pairs of poses as seen, and as driven [m].
+    """Return the distances (N,) of pairs of poses by scanner and by arm [m].
 
     Raises:
-        StageError: Too few pairs are far enough apart.
+        StageError: There are too few pairs with a large enough distance.
     """
     used = [pair for pair in calibration.pairs if pair.used]
     seen = np.array([pair.observation.feature.centre for pair in used]).reshape(-1, 3)
@@ -111,7 +111,7 @@ def _of_poses(
 
 
 def _driven(calibration: HandEye, arm: Arm | None) -> Floats:
-    """Return (N, 3) where the arm had the target, as the calibration corrects it."""
+    """Return the target's positions (N, 3) by the arm, corrected by the calibration [m]."""
     out = []
     for pair in calibration.pairs:
         if pair.used:

@@ -1,4 +1,4 @@
-"""``verify.stitch``: every view of the flange laid over the others, in the flange's own frame."""
+"""``verify.stitch``: overlay all views of the flange in the flange's frame."""
 
 from __future__ import annotations
 
@@ -33,17 +33,18 @@ def verify_stitch(
 ) -> Verification:
     """Overlay the clouds of all verification views and measure their spread.
 
-    It can show that the views disagree: rotation errors of the matrix, the arm's errors from pose
-    to pose, a bent scanner. It cannot show an error that all views share, such as a shift of the
-    matrix while the flange keeps its orientation, and heights alone do not show a slide in the
-    plane; ``slide`` is that of the clouds' centres.
+    The check detects disagreement between views: rotation errors of the matrix, pose-dependent
+    errors of the arm, distortion of the scanner. It cannot detect an error common to all views,
+    such as a translation error of the matrix while the flange keeps its orientation. Heights do not
+    show a displacement in the flange's plane; ``slide`` does, by the clouds' centres.
 
-    Figures [m]: ``spread`` of the heights between views, rms over places that two or more saw;
-    ``p95`` and ``max`` of them; ``slide`` of the clouds' middles in the plane, rms; ``views``.
-    A picture of the spread, blue none and red the limit, is in the log as ``spread``.
+    The figures [m] are ``spread``, the rms of heights between views over places seen by two or
+    more; their ``p95`` and ``max``; ``slide``, the rms of the clouds' centres in the plane; and
+    ``views``. An image of the spread, from blue (none) to red (the limit), is in the log as
+    ``spread``.
 
     Raises:
-        StageError: There are fewer than two verification views, or no place was seen twice.
+        StageError: There are fewer than two verification views, or no place is in two of them.
     """
     if len(views) < 2:
         raise StageError(
@@ -77,7 +78,7 @@ def verify_stitch(
 
 
 def _in_flange(calibration: HandEye, views: Views, arm: Arm | None) -> list[Floats]:
-    """Return each view's points (N, 3) in the flange, as the calibration has it."""
+    """Return each view's points (N, 3), mapped to ``flange`` by the calibration."""
     camera, out = calibration.base_T_camera.transform.matrix, []
     for view in views:
         flange = corrected_view(view, calibration.correction, arm).base_T_flange.matrix
@@ -87,7 +88,7 @@ def _in_flange(calibration: HandEye, views: Views, arm: Arm | None) -> list[Floa
 
 
 def _spread(clouds: list[Floats], fewest: int) -> Floats:
-    """Return (CELLS, CELLS) the standard deviation of heights between views, NaN where unseen."""
+    """Return the standard deviation of heights between views (CELLS, CELLS); NaN if unseen."""
     reach = max(float(np.quantile(np.linalg.norm(c[:, :2], axis=1), 0.98)) for c in clouds)
     heights = np.stack([_heights(cloud, reach, fewest) for cloud in clouds])
     seen = np.isfinite(heights)

@@ -1,4 +1,4 @@
-"""``verify.touch``: points that the scanner saw and a tip was jogged to."""
+"""``verify.touch``: compare scanned points with the same points touched by a tip."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flangeye.units import Angle, Length, param
 
 
 class TouchedPoint(Params):
-    """One point, seen and touched."""
+    """A point measured by the scanner and touched by the tip."""
 
     seen: tuple[Length, Length, Length] = Field(
         description="Point in the camera frame, from a scan."
@@ -42,16 +42,16 @@ class TouchParams(Params):
 def verify_touch(
     calibration: HandEye, params: TouchParams, stage_log: StageLog | None = None
 ) -> Verification:
-    """Compare the predicted positions of scanned points with those a tip touched.
+    """Compare the predicted positions of scanned points with those touched by a tip.
 
-    It can show that scanner, matrix, arm and tip agree at these places, which is what the work
-    needs. It cannot tell which of them is wrong when they do not, nor anything finer than the eye
-    of who jogged, nor what happens far from the touched points.
+    The check shows whether scanner, matrix, arm and tip agree at these points, as the work
+    requires. It cannot tell which of them is wrong, is limited by the operator's jogging accuracy,
+    and is valid near the touched points only.
 
-    Figures [m]: ``rms``, ``max``, ``x, y, z`` of the mean error in base (a tip that is wrong shows
-    here too), and ``explained``: the share of points within what the covariance and the jogging
-    allow with 95 %. Predicted less actual, along each axis at each point, is in the log as
-    ``comparison``.
+    The figures [m] are ``rms`` and ``max`` of the errors; ``x, y, z`` of the mean error in
+    ``base``, which includes the tip's error; and ``explained``, the share of points within the 95 %
+    region of covariance and jogging. Predicted minus touched position along each axis is in the log
+    as ``comparison``.
     """
     estimate = calibration.base_T_camera
     predicted = estimate.transform.apply(np.array([t.seen for t in params.touches]))
@@ -76,7 +76,7 @@ def verify_touch(
 
 
 def _compared(errors: Floats) -> dict[str, object]:
-    """Return errors (N, 3) to be drawn: one that all points share is the matrix, or the tip."""
+    """Return errors (N, 3) for a chart; a common offset comes from the matrix or the tip."""
     series = {
         f"along {axis}": [[i + 1, 1e3 * float(x)] for i, x in enumerate(errors[:, column])]
         for column, axis in enumerate("xyz")
