@@ -1,5 +1,6 @@
 """What the documents say is what the project does."""
 
+import importlib.util
 import re
 import shlex
 from pathlib import Path
@@ -7,11 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+import typer.main
 
+from flangeye.cli import commands
 from flangeye.maths.kinematics import Arm
 from flangeye.models.model import read_model
 from flangeye.models.robots import RobotModel
+from flangeye.plugin.registry import load_registry
 from flangeye.plugin.stage import Plugin
+from flangeye.workflow.recipe.find import recipe_names
 from tests.conftest import Call
 from tools import gallery
 
@@ -88,6 +93,72 @@ def test_commands_of_a_page_run(
             if words[:1] == ["flangeye"] and (shared.exists() or "../shared" not in line):
                 code, _, err = command(*words[1:])
                 assert code in (0, 1), f"{line}\n{err}"
+
+
+PROMPT = re.compile(r"^ *\$ ((?:.*\\\n)*.*)", re.M)
+"""A line typed at a prompt, with its continuation lines."""
+
+MENTION = re.compile(r"`(flangeye [^`<\[…]*)`")
+"""A command in a sentence, without placeholders; its arguments may be missing."""
+
+DOCUMENTS = sorted(ROOT.glob("*.md")) + sorted(
+    path for room in ("data", "docs", "plugins", "recipes") for path in (ROOT / room).rglob("*.md")
+)
+
+
+def _parsed(words):
+    """Return name and parameters of a command as the command line understands it."""
+    command, context = typer.main.get_command(commands()), None
+    name, rest = "flangeye", list(words)
+    while True:
+        context = command.make_context(name, rest, parent=context)
+        if not hasattr(command, "resolve_command"):
+            return name, context.params
+        name, command, rest = command.resolve_command(
+            context, [*context._protected_args, *context.args]
+        )
+
+
+def _prompts(document):
+    typed = PROMPT.findall(document.read_text(encoding="utf-8"))
+    return [shlex.split(line.replace("\\\n", " "), comments=True) for line in typed]
+
+
+@pytest.mark.parametrize(
+    "document", [pytest.param(d, id=str(d.relative_to(ROOT))) for d in DOCUMENTS if _prompts(d)]
+)
+def test_commands_at_a_prompt_are_understood(document: Any) -> None:
+    """Also those that need a robot, a network or an archive: command, options, names."""
+    for words in _prompts(document):
+        if words[:2] == ["python", "-m"]:
+            assert importlib.util.find_spec(words[2]), words
+        if words[0] != "flangeye":
+            continue
+        name, params = _parsed(words[1:])
+        recipe = params.get("recipe") if name in ("run", "batch") else None
+        if recipe and Path(recipe).suffix != ".yaml":
+            assert recipe in recipe_names(), words
+        if params.get("at"):
+            assert params["at"] in load_registry().stages, words
+
+
+@pytest.mark.parametrize(
+    "document",
+    [
+        pytest.param(d, id=str(d.relative_to(ROOT)))
+        for d in DOCUMENTS
+        if MENTION.search(d.read_text(encoding="utf-8"))
+    ],
+)
+def test_commands_in_a_sentence_exist(document: Any) -> None:
+    for line in MENTION.findall(document.read_text(encoding="utf-8")):
+        words = shlex.split(line.partition(" < ")[0])
+        try:
+            _parsed(words[1:])
+        except Exception as error:
+            # An option may be named without its value, a command without its arguments
+            known = type(error).__name__ in ("MissingParameter", "NoArgsIsHelpError", "Exit")
+            assert known or "requires an argument" in str(error), f"{line}: {error}"
 
 
 WALKS = ROOT / "docs" / "how-to" / "add-a-plugin.md"
