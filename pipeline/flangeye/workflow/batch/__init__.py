@@ -64,13 +64,13 @@ def run_sessions(
     software: Software,
     console: Console,
 ) -> Batch:
-    """Do as :func:`run_batch` with sessions that are already planned, of any recipes.
+    """Run planned sessions of any recipes, as :func:`run_batch` does.
 
     Args:
         request: How to run the sessions.
         out: The batch's folder, path or URL.
-        sessions: Gone through up to three times, and not held.
-        varied: Path in the recipe -> all its values, for what differs between them.
+        sessions: The sessions; iterated up to three times, and not kept in memory.
+        varied: All values of each varied entry, by its path in the recipe.
         software: Versions of the software that planned the sessions.
         console: Console for the progress.
     """

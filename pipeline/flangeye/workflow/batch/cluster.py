@@ -100,7 +100,7 @@ def remove_forgotten() -> None:
 
 
 def _is_ours(folder: Path) -> bool:
-    """Return whether a folder, and no link to one, belongs to this user."""
+    """Return whether a path is a folder (not a link) of this user."""
     try:
         return not folder.is_symlink() and folder.is_dir() and folder.stat().st_uid == os.getuid()
     except (OSError, AttributeError):  # gone meanwhile; a system whose users have no numbers
@@ -108,10 +108,10 @@ def _is_ours(folder: Path) -> bool:
 
 
 def check_installed() -> None:
-    """Refuse to start without the packages of the extra.
+    """Raise BatchError if the optional packages for clusters are missing.
 
     Raises:
-        BatchError: Says what to install.
+        BatchError: The message says what to install.
     """
     missing = [name for name in ("dask", "distributed", "pyarrow") if find_spec(name) is None]
     if missing:
@@ -167,9 +167,10 @@ def _interrupts_kept_here() -> Iterator[None]:
 
 
 def _track_semaphores() -> None:
-    """Start what removes the workers' semaphores when all of them are gone, in a group of its own.
+    """Start the tracker that removes the workers' semaphores, in its own process group.
 
-    multiprocessing starts it in ours: who kills the group leaves them in the system's memory.
+    multiprocessing would start it in this process's group; killing the group would then leave the
+    semaphores in the system's memory.
     """
     tracker: Any = resource_tracker._resource_tracker
     if tracker._fd is not None:
@@ -213,7 +214,7 @@ def remote_client(address: str, tls: Tls | None = None) -> Iterator[Client]:
 
 
 def _security(tls: Tls | None) -> Security:
-    """Return dask's own settings, or what the command line gives instead."""
+    """Return the security settings from the command line, or dask's own."""
     from distributed import Security
 
     if tls is None:
@@ -230,7 +231,7 @@ def _security(tls: Tls | None) -> Security:
 
 
 async def _kind_of_server(address: str, security: Security) -> str:
-    """Return what a dask server says it is; a Client that cannot connect lingers for seconds."""
+    """Return a dask server's type, because a Client that cannot connect blocks for seconds."""
     from distributed import rpc
 
     arguments = security.get_connection_args("client")
@@ -245,10 +246,10 @@ def worker_count(client: Client) -> int:
 
 
 class Pace:
-    """Decides how many sessions to submit ahead, and how many go into one chunk.
+    """Decides how many sessions to submit ahead, and how many form a chunk.
 
-    Some seconds of work, so that nothing counts beside it; less towards the end, so that all
-    workers come to it together.
+    A chunk is some seconds of work, so that overheads are negligible, and less towards the end, so
+    that all workers finish together.
     """
 
     def __init__(self, client: Client, sessions: int) -> None:
@@ -272,7 +273,7 @@ class Pace:
         return max(1, int(wanted))
 
     def asks(self, chunks: int, sessions: int, share: float = 1.0) -> bool:
-        """Return whether to submit more than so many sessions; ``share`` scales the limits."""
+        """Return whether to submit more sessions than these; ``share`` scales the limits."""
         if chunks < share * AHEAD * self.workers():
             return True
         # Sessions that a scheduler elsewhere is to know of at least: its workers may only be
@@ -297,13 +298,13 @@ def run_all(
 ) -> Iterator[ChunkTold]:
     """Yield the outcome of each chunk as it ends.
 
-    They are submitted as others end: what client and scheduler hold does not grow with their
-    number.
+    Chunks are submitted as others end, so the memory of client and scheduler does not grow with
+    their number.
 
     Args:
-        client: Of the scheduler.
+        client: Client of the scheduler.
         job: Settings that all sessions share.
-        sessions: Where each stands among all that are asked for, and what it is.
+        sessions: Index among all requested sessions, and session.
         count: Number of sessions.
 
     Raises:
@@ -348,7 +349,7 @@ def run_all(
 
 
 def _outcome(future: Future, job: Job, chunk: Chunk) -> ChunkTold | None:
-    """Return what the worker gave, or why it could give nothing; None for one of several."""
+    """Return a worker's result, or the reason for a failure; None for a chunk to be retried."""
     if future.cancelled():
         reason = "the connection to the scheduler was lost before it ended"
     else:

@@ -1,9 +1,8 @@
 """The rows of a batch as partitioned Parquet: ``sessions.parquet/``, written by the workers.
 
-Sessions are numbered in the order they are asked for, and ten thousand of them make a block. A
-worker writes the rows of a chunk as one part of their block; when a batch begins and ends, the
-parts of each block are settled into one file: a row a session, in order. So no process ever holds
-more than a block.
+Sessions are numbered in the requested order; ten thousand form a block. A worker writes the rows of
+a chunk as one part of their block. When a batch begins and ends, the parts of each block are merged
+into one file with one row per session, in order. So no process has more than a block in memory.
 """
 
 from __future__ import annotations
@@ -35,11 +34,11 @@ BLOCK = 10_000
 
 
 def columns_of(varied: Mapping[str, Sequence[str]]) -> dict[str, Kind]:
-    """Return the columns of the table: name -> kind.
+    """Return the types of the table's columns by name.
 
     Args:
-        varied: Path in the recipe -> all its values as written. They are numbers when all of them
-            are; ``0.2 mm`` stays text.
+        varied: All values of each varied entry as written, by path in the recipe. A column is
+            numeric if all its values are; ``0.2 mm`` stays text.
     """
     names = ("session", "recipe", "archive", *varied, "seed", *SessionOutcome.__dataclass_fields__)
     return {name: _kind(name, varied) for name in names}
@@ -112,12 +111,12 @@ class Dataset:
         self._write(f"{FOLDER}/{block:06}-{name}.parquet", pa.Table.from_pylist(rows, self._schema))
 
     def finished(self, ledger: Ledger, report: bool) -> Bools:
-        """Return which sessions have finished, and forget every other row.
+        """Return the mask of finished sessions, and drop all other rows.
 
-        A row that is forgotten costs little: the session's folder has it too.
+        Dropping a row costs little, as the session's folder has it too.
 
         Args:
-            ledger: The sessions that are asked for.
+            ledger: The requested sessions.
             report: Whether each must have a report.
         """
         done = np.zeros(len(ledger.numbers), dtype=bool)
@@ -127,7 +126,7 @@ class Dataset:
         return done
 
     def blocks(self, ledger: Ledger) -> Iterator[pa.Table]:
-        """Yield the rows, settled, in the order in which the sessions are asked for."""
+        """Yield the merged rows block by block, in the sessions' order."""
         for block, parts in self._parts().items():
             yield self._settled(block, parts, ledger)[0]
 
@@ -153,7 +152,7 @@ class Dataset:
         statuses: Sequence[str] = (),
         report: bool = False,
     ) -> tuple[pa.Table, Ints]:
-        """Return a block's rows that count, and where they stand; leave them as one file."""
+        """Merge a block's rows into one file; return the valid ones and their positions."""
         import pyarrow as pa
         import pyarrow.compute as pc
 

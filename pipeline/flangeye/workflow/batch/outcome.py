@@ -24,21 +24,21 @@ class SessionOutcome:
     """The outcome of one session; SI units.
 
     Attributes:
-        status: How it ended; ``failed`` is a foreseen mistake such as an unreadable archive,
-            ``crashed`` one that is not, or the death of its worker.
-        reason: Why, unless the calibration was accepted.
+        status: Final status; ``failed`` is an expected error such as an unreadable archive,
+            ``crashed`` an unexpected one or the death of its worker.
+        reason: Reason, unless the calibration was accepted.
         used: Captures used.
         captures: Captures seen.
-        holdout_rms_m: Error on poses that took no part in the estimate.
-        holdout_median_m: The same, its median.
-        holdout_p95_m: The same, 95 % are below.
-        expected_rms_m: Error to expect at the work.
-        expected_p95_m: The same, 95 % are below.
+        holdout_rms_m: Held-out error, rms.
+        holdout_median_m: Held-out error, median.
+        holdout_p95_m: Held-out error, 95 % quantile.
+        expected_rms_m: Expected error at the work, rms.
+        expected_p95_m: Expected error at the work, 95 % quantile.
         true_rms_m: True error over the workspace, in simulation.
-        true_centre_m: True error at its centre.
+        true_centre_m: True error at the workspace's centre.
         true_rotation_rad: True error of the rotation.
-        seconds: What the session took on its worker.
-        report: Report of the session, from the batch's folder.
+        seconds: Duration of the session on its worker.
+        report: Path of the session's report, relative to the batch's folder.
     """
 
     status: Status
@@ -87,13 +87,13 @@ def mark_finished(place: Storage, folder: str, key: str, outcome: SessionOutcome
 
 
 def finished_outcome(place: Storage, folder: str, key: str, report: bool) -> SessionOutcome | None:
-    """Return the outcome that :func:`mark_finished` stored; None if the session has to run.
+    """Return the outcome stored by :func:`mark_finished`; None if the session has to run.
 
     Args:
         place: The batch's folder.
-        folder: The session's in it.
-        key: The session's key; anything else there is of another session.
-        report: Whether a report is wanted.
+        folder: The session's folder in it.
+        key: The session's key; a stored outcome with another key is ignored.
+        report: Whether a report is required.
     """
     try:
         data = json.loads(place.read(f"{folder}/{MARKER}") or b"")
@@ -110,12 +110,12 @@ class BatchError(FlangeyeError):
 
 @dataclass(frozen=True)
 class Tls:
-    """Files for an encrypted connection in which both sides are known.
+    """Files for a mutually authenticated TLS connection.
 
     Attributes:
         ca: Certificate of the authority that signed the others, PEM.
-        cert: Our certificate, PEM.
-        key: Its private key, PEM: who has it may run code on every worker.
+        cert: This side's certificate, PEM.
+        key: Private key of the certificate, PEM; its owner may run code on every worker.
     """
 
     ca: Path
@@ -128,12 +128,12 @@ class Request:
     """A batch as requested on the command line.
 
     Attributes:
-        recipe: File, or name of a bundled recipe.
-        archives: Recordings to run on, paths or URLs; none for recipes that simulate.
+        recipe: Recipe file, or name of a bundled recipe.
+        archives: Recordings to run on, paths or URLs; empty for simulating recipes.
         overrides: ``PATH=VALUE``, the same in every session.
         grid: ``PATH=a,b,c``: every combination is run.
-        repeat: How many seeds, counted up from the recipe's; None for the recipe's alone.
-        vary: What ``repeat`` counts up; only ``seed`` can be.
+        repeat: Number of seeds, counting from the recipe's; None for the recipe's seed only.
+        vary: The entry that ``repeat`` counts up; only ``seed`` is possible.
         workers: Worker processes on this machine; None for one per core.
         scheduler: Address of a running dask scheduler, instead of workers here.
         tls: Certificates by which scheduler and client authenticate each other.

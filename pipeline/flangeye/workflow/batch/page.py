@@ -1,4 +1,4 @@
-"""``summary.html``: all sessions side by side, in one file that needs nothing else."""
+"""``summary.html``: all sessions side by side, in one self-contained file."""
 
 from __future__ import annotations
 
@@ -93,20 +93,20 @@ def render(tally: Tally) -> str:
 
 
 def _with_short_archive(row: Row, tally: Tally) -> Row:
-    """Return the row with what archives have in common left out of its path."""
+    """Return the row with the archives' common folder removed from its path."""
     if tally.common is None or row["archive"] is None:
         return row
     return row | {"archive": str(Path(row["archive"]).relative_to(tally.common))}
 
 
 def _columns(tally: Tally) -> list[str]:
-    """Return the columns that say anything, in the order people read them."""
+    """Return the non-empty columns in reading order."""
     order = ["session", "archive", *tally.varied, *list(_HEADINGS)[2:]]
     return [name for name in order if name in tally.told]
 
 
 def _groups(tally: Tally) -> list[dict[str, Any]]:
-    """Return one line for each variant that was repeated; none where nothing was."""
+    """Return one line for each repeated variant; empty without repetitions."""
     return [
         {
             "names": _with_short_archive(
@@ -142,11 +142,11 @@ Drawing = dict[str, Any]
 
 @dataclass(frozen=True)
 class Figure:
-    """A column worth a plot.
+    """A column that is plotted.
 
     Attributes:
-        column: Its name.
-        title: Shown in messages and reports.
+        column: Name of the column.
+        title: Title of the plot.
         unit: Unit in which it is shown.
         scale: Factor from SI to that unit.
     """
@@ -158,7 +158,7 @@ class Figure:
 
 
 def drawings_of(rows: Sequence[Row], varied: Sequence[str]) -> list[tuple[str, Drawing]]:
-    """Return (title, plot) for every figure that some session has.
+    """Return (title, plot) for every figure with values.
 
     Args:
         rows: Rows of the sessions to draw.
@@ -178,7 +178,7 @@ def drawings_of(rows: Sequence[Row], varied: Sequence[str]) -> list[tuple[str, D
 
 
 def _axes(rows: Sequence[Row], varied: Sequence[str]) -> tuple[str, str | None]:
-    """Return the columns that say where a session stands and, if there is a second, its colour."""
+    """Return the columns for a session's position and, if there is a second, its colour."""
     distinct = {name: len({row[name] for row in rows}) for name in (*varied, "archive")}
     varying = sorted((n for n in distinct if distinct[n] > 1), key=lambda n: -distinct[n])
     if not varying:
@@ -251,7 +251,7 @@ def _medians(places: Sequence[Any], values: Sequence[float]) -> list[Drawing]:
 
 
 def _places(values: Sequence[Any]) -> tuple[list[Any], str | None]:
-    """Return where values stand on an axis, and its unit; None for names, "" for bare numbers."""
+    """Return values' positions on an axis, and its unit: None for names, "" for bare numbers."""
     matches = [
         re.fullmatch(r"([-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S*)", str(value))
         for value in values

@@ -1,8 +1,7 @@
-"""Which sessions a batch has: the recipe's variants times the archives, checked before any runs.
+"""Plan of a batch: the recipe's variants times the archives, checked before any session runs.
 
-Whether a session is still the one that was run: a hash of everything that decides its result.
-
-It is made at every start for every session, so large files are not read.
+A hash of everything that determines a session's result shows whether it has run already. It is
+computed at every start for every session, so large files are not read.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ class Fingerprints:
     def of(self, path: Path) -> str:
         """Return a hash of a file, or of every file below a folder; large files are not read.
 
-        A path that is not there has a fingerprint too: its session will say what is wrong.
+        A missing path has a hash too; its session reports the error.
         """
         if path not in self._known:
             self._known[path] = _fingerprint(path)
@@ -56,9 +55,9 @@ class Fingerprints:
 
 
 def common_key(recipe: Recipe, software: Software, prints: Fingerprints) -> str:
-    """Return the hash of everything that sessions share apart from seed and archive.
+    """Return the hash of everything that sessions share, without seed and archive.
 
-    It is of the recipe, the models and files that it names, and what computes.
+    It covers the recipe, the models and files that it names, and the code.
     """
     data = recipe.data()
     data.pop("seed")
@@ -131,7 +130,7 @@ def software_of(registry: Registry) -> Software:
 
 @cache
 def _code_of(module: str | None) -> str:
-    """Return a hash of a package's Python files, or of a module's: a version may stay as it is."""
+    """Return a hash of the Python files of a package or module, whose version may not change."""
     if module is None:
         return "unknown"
     file = Path(module)
@@ -166,14 +165,14 @@ def check_software(expected: Software, here: Software, host: str) -> None:
 
 @dataclass(frozen=True)
 class BatchSession:
-    """One run of the batch.
+    """One session of the batch.
 
     Attributes:
         id: Name of its folder: readable, and unique by ``number``.
-        key: Hash of everything that decides its result.
-        recipe: Absolute path.
-        archive: Absolute path or URL, if any.
-        overrides: All of them, those of the grid included, the seed aside if it is counted up.
+        key: Hash of everything that determines its result.
+        recipe: Absolute path of the recipe.
+        archive: Absolute path or URL of the archive, if any.
+        overrides: All overrides including those of the grid, without a counted seed.
         varied: Path in the recipe -> value as written, for what differs between sessions.
         seed: The recipe's, or the repetition's.
     """

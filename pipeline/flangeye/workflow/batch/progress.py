@@ -47,16 +47,16 @@ class VariantTold:
 
 
 class Tally:
-    """Aggregates of rows; of each row it holds three figures, its status and its variant.
+    """Aggregates of rows; it stores three figures, status and variant of each row.
 
     Attributes:
-        columns: Names, in order.
-        varied: Those of them that the grid sets.
-        total: How many sessions there are.
-        seconds: What all of them took [s].
-        recipe: The first one's, for the title.
-        told: Columns that hold a value in any row.
-        sample: Rows of every so many.
+        columns: Names of the columns, in order.
+        varied: Columns that the grid sets.
+        total: Number of sessions.
+        seconds: Total duration of the sessions [s].
+        recipe: Recipe of the first session, for the title.
+        told: Columns with a value in any row.
+        sample: Every k-th row, for plots.
         common: Folder that all archives have in common; None for URLs, or without archives.
     """
 
@@ -79,7 +79,7 @@ class Tally:
         self._figures: list[NDArray[np.float64]] = []
 
     def add(self, table: pa.Table) -> None:
-        """Take in a block, in the order in which its sessions are asked for."""
+        """Add a block of rows, in the sessions' order."""
         if not len(table):
             return
         if not self.total:
@@ -111,7 +111,7 @@ class Tally:
         return {name: v[~np.isnan(v)] for name, v in zip(FIGURES, whole, strict=True)}
 
     def shown(self) -> list[Row]:
-        """Return all rows if they are few, else those without a calibration, then the worst."""
+        """Return all rows if few; otherwise those without a calibration, then the worst."""
         return [] if self._worst is None else list(self._worst.to_pylist())
 
     def by(self) -> list[str]:
@@ -173,9 +173,9 @@ class Batch:
     """Summary of a batch.
 
     Attributes:
-        out: Its folder, path or URL.
+        out: Folder of the batch, path or URL.
         tally: Aggregates of all sessions.
-        known: How many of them had finished at an earlier start.
+        known: Number of sessions that had finished before this start.
     """
 
     out: str

@@ -30,12 +30,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ManifestComparison:
-    """The comparison of one manifest with its results.
+    """Comparison of a run's results with a manifest of expected ones.
 
     Attributes:
-        name: The manifest's file, without its ending.
-        verdict: Whether the run is as expected, or did not take place.
-        told: What differs, what was found, or why it was skipped.
+        name: File name of the manifest, without its suffix.
+        verdict: Whether the run agrees, differs, or was skipped.
+        told: Text: the differences, the results, or the reason for skipping.
     """
 
     name: str

@@ -57,7 +57,7 @@ READY = f"{STARTS}/ready"
 
 @dataclass(frozen=True)
 class Job:
-    """What all sessions of a batch share.
+    """Settings that all sessions of a batch share.
 
     Attributes:
         out: The batch's folder, the same path or URL on every worker.
@@ -139,10 +139,10 @@ class Recipes:
 
     @cached_property
     def registry(self) -> Registry:
-        """The plugins, if the worker is one that this job may use.
+        """The plugins, after checking that the worker fits the job.
 
         Raises:
-            StageError: It does not see the batch's folder, or has other software.
+            StageError: The worker cannot access the batch's folder, or has other software versions.
         """
         registry, host = _registry(), socket.gethostname()
         if self._job.place.read(READY) is None:
@@ -157,7 +157,7 @@ class Recipes:
         """Return a session's recipe.
 
         Raises:
-            FlangeyeError: It is wrong by now, or no longer what was planned with.
+            FlangeyeError: The recipe has become invalid, or has changed since planning.
         """
         given = (session.recipe, session.overrides)
         if given not in self._known:

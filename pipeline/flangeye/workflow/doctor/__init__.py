@@ -47,7 +47,7 @@ def _details(finding: Finding) -> list[str]:
 
 
 def evidence_of(finding: Finding) -> str:
-    """Return what a correction makes of errors and likelihood; empty if it was not computed."""
+    """Return a text on how a correction changes errors and likelihood; empty if not computed."""
     if finding.before is None or finding.after is None:
         return ""
     error = f"error {_error(finding.before)} before, {_error(finding.after)} after"
@@ -58,10 +58,10 @@ def evidence_of(finding: Finding) -> str:
 
 
 def mended_together(findings: Sequence[Finding]) -> tuple[str, str, list[str]]:
-    """Return what is wrong, how it is known, and what to do, as one answer to several findings.
+    """Return mistake, evidence and remedy of several findings as one answer.
 
-    Each was found with those before it mended, so the last line of a section of the recipe mends
-    them all. A first mistake that no line mends stands alone.
+    Each finding was made with the earlier ones corrected, so the last recipe line of a section
+    corrects them all. A first mistake without such a line is reported alone.
     """
     together = list(takewhile(lambda finding: finding.lines, findings)) or [findings[0]]
     lines = {finding.fix.split(": ")[0]: finding.fix for finding in together}

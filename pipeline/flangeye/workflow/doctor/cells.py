@@ -1,8 +1,8 @@
-"""Mistakes in the recordings of a cell: each one is tried on the whole graph.
+"""Detection of mistakes in the recordings of a cell, tested on the whole graph.
 
-A mistake is a change of the recipe: of how a table is read, or of what stands on what. The tables
-are read again with it, and it is named only where the cell then predicts held-out sightings far
-better, of all cameras together. The line that mends it is the recipe's own, so changed.
+A mistake corresponds to a change of the recipe: how a table is read, or what is mounted on what.
+The tables are read again with the change, and the mistake is reported only if held-out observations
+of all cameras are then predicted far better. The remedy is the changed line of the recipe.
 """
 
 from __future__ import annotations
@@ -72,15 +72,15 @@ class Suspicion(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class CellSession:
-    """Sightings of a cell, and the recipe by which they are read.
+    """Observations of a cell, and the recipe by which they are read.
 
     Attributes:
-        observations: Every sighting.
+        observations: All observations.
         cell: Graph of frames by the recipe.
         recipe: Read with the parts of ``registry``.
-        registry: The plugins on offer.
-        tables: Folder of the tables that ``reader.cell`` reads; None where the sightings come from
-            elsewhere, or the tables are gone.
+        registry: The installed plugins.
+        tables: Folder of the tables for ``reader.cell``; None if the observations come from
+            elsewhere, or the tables do not exist any more.
     """
 
     observations: Sequence[Observation]
@@ -91,7 +91,7 @@ class CellSession:
 
     @property
     def first(self) -> tuple[Keys, Mapping[str, Any]]:
-        """Where the first step's parameters stand in the recipe, and what they are."""
+        """Path of the first step's parameters in the recipe, and their values."""
         ((name, params),) = self._data["steps"][0].items()
         return ("steps", 0, name), params
 
@@ -164,12 +164,12 @@ def _recorded(observation: Observation, recording: Recording, cell: Cell) -> Obs
 
 
 def open_cell(path: Path, registry: Registry, recipe: Recipe | None = None) -> CellSession | None:
-    """Return a cell's sightings with the recipe by which they are read; None if it is not a cell.
+    """Return a cell's observations with their recipe; None if the recording is not of a cell.
 
     Args:
         path: A run.mcap, or a folder that the recipe's reader knows.
         registry: The plugins on offer.
-        recipe: Says what stands on what; a log brings its own.
+        recipe: Recipe with the cell's structure; a log contains its own.
 
     Raises:
         StageError: The recordings cannot be read.
@@ -189,10 +189,10 @@ def open_cell(path: Path, registry: Registry, recipe: Recipe | None = None) -> C
 
 
 def examine_cell(session: CellSession) -> Diagnosis:
-    """Return the mistake that explains most, else the sightings that do not fit their poses.
+    """Return the mistake that explains most, or else the observations that contradict their poses.
 
     Raises:
-        StageError: There are too few sightings to recognise anything.
+        StageError: There are too few observations.
     """
     counted = _session(session.observations)
     require_enough(counted)
@@ -271,7 +271,7 @@ def _read_otherwise(whose: str, tables: Mapping[Keys, Table]) -> Iterator[Suspic
 
 
 def _rotations(whose: str, tables: Mapping[Keys, Table]) -> Iterator[Suspicion]:
-    """Yield the conventions in which the rotations of all these tables may be written instead."""
+    """Yield other conventions in which the rotations of these tables may be written."""
     rotation, angle = _common(tables, "rotation"), _common(tables, "angle")
     for other in other_conventions(rotation, angle) if rotation is not None else ():
         was, fits = spelt(rotation, angle), spelt(*other)
@@ -282,7 +282,7 @@ def _rotations(whose: str, tables: Mapping[Keys, Table]) -> Iterator[Suspicion]:
 
 
 def _common(tables: Mapping[Keys, Table], key: str) -> Any:
-    """Return what all tables state; None where they differ."""
+    """Return the value that all tables state; None if they differ."""
     stated = {table.get(key) for table in tables.values()}
     return stated.pop() if len(stated) == 1 else None
 
@@ -307,7 +307,7 @@ def _of_axes(at: Keys, tables: Mapping[str, Table], cell: Cell) -> Iterator[Susp
 
 
 def _exchanged(at: Keys, arms: Mapping[str, Table]) -> Iterator[Suspicion]:
-    """Yield two arms of which each has the other's table."""
+    """Yield changes that exchange the tables of two arms."""
     for one, two in combinations(arms, 2):
         tables = arms[one], arms[two]
         changes = {
@@ -322,7 +322,7 @@ def _exchanged(at: Keys, arms: Mapping[str, Table]) -> Iterator[Suspicion]:
 
 
 def _of_mountings(cell: Cell) -> Iterator[Suspicion]:
-    """Yield cameras and targets that stand on something else than the recipe says."""
+    """Yield changes that mount a camera or target on another frame."""
     for group, name in _to_find(cell):
         stands = cell.frames[name].parent
         for other in ("base", *cell.movers):
@@ -332,7 +332,7 @@ def _of_mountings(cell: Cell) -> Iterator[Suspicion]:
 
 
 def _of_links(session: CellSession) -> Iterator[Suspicion]:
-    """Yield cameras and targets that stand on another link of the same arm."""
+    """Yield changes that mount a camera or target on another link of the same arm."""
     cell = session.cell
     for group, name in _to_find(cell):
         stands = cell.frames[name].parent
@@ -349,9 +349,9 @@ def _to_find(cell: Cell) -> list[tuple[str, str]]:
 
 
 def _links_beside(stands: str, observations: Sequence[Observation], cell: Cell) -> list[Link]:
-    """Return the links of the arm that carries something, if its joints are known.
+    """Return the links of the arm that carries a frame, if its joints are recorded.
 
-    The last is left out: what stands on it stands on the flange as well.
+    The last link is left out, as it is rigidly connected to the flange.
     """
     arm = cell.links[stands].arm if stands in cell.links else stands
     if arm not in cell.joints(observations):
@@ -361,7 +361,7 @@ def _links_beside(stands: str, observations: Sequence[Observation], cell: Cell) 
 
 
 def _mispaired(session: CellSession) -> list[Finding]:
-    """Return the sightings that do not belong to the poses beside them, if others agree."""
+    """Return the observations that contradict their poses, if the others agree."""
     observations = session.observations
     try:
         found = rough(problem_of(observations, session.cell), session.cell.freedoms)
@@ -385,12 +385,12 @@ def _mispaired(session: CellSession) -> list[Finding]:
 
 @dataclass(frozen=True)
 class Predicted:
-    """Prediction error of held-out sightings.
+    """Prediction error of held-out observations.
 
     Attributes:
-        misfit: Medians over the sightings, of the pair where they are largest.
-        share: That of places, as a share of how far the pair's sightings are apart: a unit that
-            changes no error is not a finding.
+        misfit: Median errors over the observations, of the camera-target pair with the largest.
+        share: Position error relative to the spread of the pair's observations; a change of unit
+            scales both and is no finding.
     """
 
     misfit: Misfit

@@ -1,9 +1,9 @@
 """Input and output of ``check`` parts: a session as arrays, and findings about it.
 
-A check is a part ``check.<name>``, a function of a :class:`RecordedSession` (and its own
-parameters) that returns the :class:`Finding` s it can defend, or raises :class:`NotApplicable`.
-``flangeye doctor`` runs every check that is installed, believes the finding that explains most,
-corrects the session as that finding says, and looks again.
+A check is a part ``check.<name>``: a function of a :class:`RecordedSession` (and its own
+parameters) that returns the significant :class:`Finding` s, or raises :class:`NotApplicable`.
+``flangeye doctor`` runs every installed check, accepts the finding that explains most, corrects the
+session accordingly, and repeats.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ FEWEST_SAMPLES = 4
 
 
 class NotApplicable(Exception):
-    """This session cannot show the mistake that a check looks for; the message says why."""
+    """A check's mistake cannot be detected in this session; the message says why."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,32 +42,31 @@ class RecordedSession:
     """N robot poses with the measurement at each, in recording order.
 
     Attributes:
-        ids: Name of each.
+        ids: Names of the samples.
         poses: (N, 4, 4) ``base_T_flange`` [m], as the archive's reader gave them.
-        centres: (N, 3) the target's centre in ``camera`` [m]; NaN where nothing was found.
-        normals: (N, 3) its axis in ``camera``; NaN where none was measured.
-        rotations: (N, 3, 3) ``camera_R_target``; NaN where the target has no full pose.
-        places: (N, 3) that centre in the target's own frame [m]; NaN where it is not known where
-            the target is.
-        times: (N,) when each was taken [s]; NaN where unknown.
-        carried: What the arm moves: the target, or the camera; ``both`` where it moves the camera
-            and a second arm the target.
-        links: (N, 4, 4) base_T_link of the link that carries the camera [m]; None where none does.
-        seconds: (N, 4, 4) base2_T_flange2 [m], where a second arm carries the target, else None.
-        place: (4, 4) of the target in the flange or base that has it, where that is known [m].
-        robot: The arm's model, where the recipe names one.
+        centres: (N, 3) target's centre in ``camera`` [m]; NaN if not found.
+        normals: (N, 3) target's axis in ``camera``; NaN if not measured.
+        rotations: (N, 3, 3) ``camera_R_target``; NaN without a full pose.
+        places: (N, 3) the centre in the target's own frame [m]; NaN if unknown.
+        times: (N,) times of the samples [s]; NaN if unknown.
+        carried: What the arm moves: the target or the camera; ``both`` if it moves the camera and a
+            second arm the target.
+        links: (N, 4, 4) ``base_T_link`` of the link that carries the camera [m]; else None.
+        seconds: (N, 4, 4) ``base2_T_flange2`` [m] if a second arm carries the target; else None.
+        place: (4, 4) pose of the target in its carrier [m]; None if unknown.
+        robot: The arm's model, if the recipe names one.
         motions: N motions of the flange about each sample; None unless all were recorded.
         reach: Nearest and farthest distance that the scanner sees [m].
         reader: The archive's reader, as the recipe writes it.
         acquire: Name of the recipe's first step.
-        changes: Parameters of that step that differ from the recipe's, by what was mended.
-        board: The board that the recipe's fit step looks for, as ``acquire.images`` takes it.
-        limit: Smallest error that the recipe asks for [m]; that of ``verify.holdout`` if for none.
-        marks_open: Whether the recipe's solver marks translations that the motion cannot show.
-        remarks: Mistakes that opening the archive has shown already, mended here.
-        damage: What of the log could not be read or was changed, a line each.
-        again: Reads the session again with other parameters of the reader and of its target. None
-            where the session's numbers are not those of the reader any more.
+        changes: Parameters of that step changed by accepted findings.
+        board: The board of the recipe's fit step, as a parameter of ``acquire.images``.
+        limit: Error limit of the recipe [m]; by default that of ``verify.holdout``.
+        marks_open: Whether the recipe's solver marks unobservable translations.
+        remarks: Mistakes found and corrected when opening the archive.
+        damage: Damaged or changed parts of the log, one line each.
+        again: Reads the session again with other parameters of the reader and of its target; None
+            if the session was changed after reading.
     """
 
     ids: tuple[str, ...]
@@ -168,12 +167,12 @@ class RecordedSession:
         return replace(self, reader=reader, again=None)
 
     def corrected(self, change: Change, arms: Arms = "both", **correction: Any) -> RecordedSession:
-        """Return the session with changed poses, as ``reader.corrected`` reads them.
+        """Return the session with corrected poses, as read by ``reader.corrected``.
 
         Args:
-            change: Gives an arm's poses (N, 4, 4) as they should be.
+            change: Returns an arm's corrected poses (N, 4, 4).
             arms: Names of the arms.
-            correction: Options to add to the reader, which make the same change.
+            correction: Options of the reader that make the same change.
         """
         poses = self.poses if arms == "second" else change(self.poses)
         given = self.seconds
@@ -183,7 +182,7 @@ class RecordedSession:
         return replace(read, poses=poses, seconds=seconds, motions=None)
 
     def stretched(self, factors: Floats) -> RecordedSession:
-        """Return the session with what was seen (3,) times as far along each axis, as read so."""
+        """Return the session with measured positions scaled by factors (3,) along each axis."""
         # A mirror (a factor below 0) turns directions over; a unit leaves them as they are
         normals = self.normals * np.sign(factors)
         seen = replace(self, centres=self.centres * factors, normals=normals)
@@ -209,7 +208,7 @@ class Misfit(NamedTuple):
 
     Attributes:
         position: Position residual of the target's centre [m].
-        angle: Angular residual of its normal or rotation [rad]; None where only centres were seen.
+        angle: Angular residual of its normal or rotation [rad]; None for centres only.
     """
 
     position: float
@@ -226,19 +225,19 @@ class Finding:
     """One mistake that a check found.
 
     Attributes:
-        name: The mistake, in a word or two.
-        what: One sentence: what is wrong, and with which samples.
-        fix: What to do: the recipe's line to change, where one helps.
-        samples: Ids of the samples it concerns; empty for all of them.
-        before: Errors as things are; None where they say nothing.
-        after: The same once it is mended.
-        probability: Probability of so large an improvement in a session without this mistake, every
-            alternative that was tried counted.
-        gain: Logarithm of the likelihood ratio, less what further parameters cost; ranks findings.
-            Infinite where no statistics are needed, as for a pose that is exactly the identity.
-        corrected_session: The session without the mistake, to look for others; None where only
-            new recordings help.
-        note: Whether it is only worth knowing, and no mistake.
+        name: Short name of the mistake.
+        what: One sentence on the mistake and the samples concerned.
+        fix: Remedy: the line of the recipe to change, if there is one.
+        samples: Ids of the samples concerned; empty for all.
+        before: Errors without the correction; None if not meaningful.
+        after: Errors with the correction.
+        probability: p-value: probability of such an improvement without this mistake, corrected for
+            the number of alternatives.
+        gain: Log-likelihood ratio minus the penalty for additional parameters; ranks findings.
+            Infinite if no statistics are needed, as for a pose that is exactly the identity.
+        corrected_session: The corrected session, for finding further mistakes; None if only new
+            recordings help.
+        note: Whether it is information only, not a mistake.
     """
 
     name: str
@@ -317,10 +316,10 @@ class Diagnosis:
 
     Attributes:
         session: The examined session.
-        findings: In the order they were found, each with those before it mended.
-        notes: What is not a mistake, but worth knowing.
+        findings: Findings in order, each made with the earlier ones corrected.
+        notes: Information that is not a mistake.
         checks: Names of the checks.
-        idle: Those that do not apply to this session, by name, and why.
+        idle: Checks that do not apply to this session: name and reason.
     """
 
     session: RecordedSession
@@ -381,7 +380,7 @@ def _names(checks: Sequence[BoundPart]) -> tuple[str, ...]:
 def _offered(
     session: RecordedSession, checks: Sequence[BoundPart], checked: Callable[[], None]
 ) -> tuple[list[Finding], dict[str, str]]:
-    """Return the findings that hold against the number of checks, and which do not apply."""
+    """Return the findings significant for this number of checks, and the checks not applicable."""
     found: list[Finding] = []
     idle: dict[str, str] = {}
     for check in checks:

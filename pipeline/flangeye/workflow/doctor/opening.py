@@ -1,7 +1,7 @@
-"""Read an archive, with the recipe that would run on it, into the arrays that checks use.
+"""Read an archive with its recipe into the arrays that checks use.
 
-The reader's poses are taken as they are, whatever is wrong with them. Features are found in the
-scans by the recipe's own steps with stand-in poses, so that wrong ones cannot spoil them.
+The reader's poses are used unchanged, even if they are wrong. Features are found in the scans by
+the recipe's steps with placeholder poses, so that wrong poses have no influence.
 """
 
 from __future__ import annotations
@@ -55,13 +55,13 @@ def in_configuration(
     robot: RobotModel | None,
     states: Mapping[str, State],
 ) -> RecordedSession:
-    """Add the configuration: who carries camera and target, and where the target is mounted.
+    """Return the session with its configuration: carriers of camera and target, and mounting.
 
     Args:
         session: The session of one arm beside its camera, as far as is known.
         configuration: Replaces the configuration that the session assumes.
-        robot: The arm's model, where the recipe names one.
-        states: What else was recorded, by the samples' ids.
+        robot: The arm's model, if the recipe names one.
+        states: Other recorded data, by the samples' ids.
 
     Raises:
         StageError: A carrier's pose is missing.
@@ -119,11 +119,11 @@ def open_session(path: Path, registry: Registry, recipe: Recipe | None = None) -
     Args:
         path: A run.mcap, or a folder that a reader knows.
         registry: The plugins on offer.
-        recipe: Says how the archive is read and how the target is found in its scans; a log
-            brings its own, and a folder with ready-made centres needs none.
+        recipe: Recipe for reading the archive and finding the target in scans; a log contains its
+            own, and a folder with detected centres needs none.
 
     Raises:
-        StageError: The archive cannot be read, or has scans and no recipe states what is in them.
+        StageError: The archive cannot be read, or contains scans and there is no recipe.
     """
     if not path.exists():
         raise StageError(f"{path}: does not exist")
@@ -155,7 +155,7 @@ def _of_log(path: Path, registry: Registry, recipe: Recipe | None) -> RecordedSe
 
 
 def _archive_again(recipe: Recipe, found: Mapping[str, t.Feature]) -> ReadAgain | None:
-    """Return how to read a log's own archive again, where the recipe states which it was."""
+    """Return a function that reads a log's archive again, if the recipe names it."""
     params = recipe.steps[0].params
     path, reader = getattr(params, "path", None), getattr(params, "reader", None)
     if path is None or not isinstance(reader, BoundPart) or not Path(path).exists():
@@ -336,7 +336,7 @@ def _rotations(features: Iterable[t.Feature | None]) -> Floats:
 def _as_recipe(
     session: RecordedSession, recipe: Recipe, states: Mapping[str, State]
 ) -> RecordedSession:
-    """Add what the recipe states of the cell and of how the archive is read."""
+    """Return the session with the recipe's facts about cell and reader."""
     first = recipe.steps[0]
     scanner: ScannerData | None = recipe.context.get(ScannerData)
     robot: RobotModel | None = recipe.context.get(RobotModel)
@@ -356,7 +356,7 @@ def _as_recipe(
 
 
 def _board_of(recipe: Recipe) -> dict[str, Any]:
-    """Return the board that a recipe's fit step looks for, with what was stated of it."""
+    """Return the board of a recipe's fit step, with its parameters as written."""
     asked = {"columns", "rows", "square", "marker", "dictionary"}
     for step in recipe.steps:
         kind = step.stage.name.removeprefix("fit.")
@@ -367,7 +367,7 @@ def _board_of(recipe: Recipe) -> dict[str, Any]:
 
 
 def _path_in(recipe: Recipe) -> dict[str, Any]:
-    """Return the archive's path as the recipe has it, which a line for the recipe keeps."""
+    """Return the archive's path as written in the recipe, for use in a suggested line."""
     steps = parse_yaml(recipe.text, recipe.name).data["steps"]
     params = next(iter(steps[0].values())) if isinstance(steps[0], Mapping) else None
     path = params.get("path") if isinstance(params, Mapping) else None
@@ -402,7 +402,7 @@ def _given(params: Params | None, apart_from: Set[str] = frozenset()) -> dict[st
 
 
 class _Seen(NamedTuple):
-    """What a recipe's steps saw in scans: features by id, what was set aside, what refused all."""
+    """Result of a recipe's steps on scans: features, rejections, and a refusal of all."""
 
     features: dict[str, t.Feature]
     rejections: Sequence[t.Rejection]
@@ -412,11 +412,11 @@ class _Seen(NamedTuple):
 def found_in(
     archive: Archive, first: Step, recipe: Recipe, registry: Registry
 ) -> tuple[dict[str, t.Feature], tuple[Finding, ...], tuple[Mapping[str, Any], str] | None]:
-    """Return the features that the recipe finds in the scans; read them otherwise if none is found.
+    """Return the features that the recipe finds in the scans; try other parameters if none.
 
     Returns:
-        The features by id; findings from the captures set aside; where the recipe's parameters
-        find none, those that do, and why.
+        The features by id; findings from rejected captures; and, if the recipe's parameters find no
+        feature, working parameters with the reason.
     """
     stated = None if first.params is None else getattr(first.params, "unit", None)
     seen = _seen_by(archive, first, recipe, registry)
@@ -442,7 +442,7 @@ def found_in(
 
 
 def _seen_by(archive: Archive, first: Step, recipe: Recipe, registry: Registry) -> _Seen:
-    """Return what the recipe's own steps see in the archive's scans."""
+    """Return the result of the recipe's own steps on the archive's scans."""
     stand_in = BoundPart(
         Part("reader.stand_in", lambda _: _with_stand_in_poses(archive), None, {}, (Archive,)), None
     )

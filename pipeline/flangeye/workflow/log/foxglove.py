@@ -62,7 +62,7 @@ def pose_in_frame(transform: Transform, time_ns: int) -> Any:
 
 
 def compressed_image(image: Image, time_ns: int) -> Any:
-    """Return the pixels as a foxglove.CompressedImage, PNG: nothing is lost."""
+    """Return the pixels as a foxglove.CompressedImage in PNG, lossless."""
     import cv2
     from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 

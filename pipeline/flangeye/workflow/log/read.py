@@ -1,8 +1,8 @@
-"""Read a run's MCAP log, complete or not, to show it or to run from it again.
+"""Read a run's MCAP log, complete or not, to show it or to rerun from it.
 
-Read from front to back: a file without its end is read as far as its last whole message, and there
-is one way for both. What is damaged or foreign is named in ``RunLog.damage`` and left out; the rest
-is read (:mod:`flangeye.workflow.log.records`).
+The file is read sequentially, so an unfinished one is read up to its last complete message. Damaged
+or foreign parts are named in ``RunLog.damage`` and left out; the rest is read
+(:mod:`flangeye.workflow.log.records`).
 """
 
 from __future__ import annotations
@@ -118,18 +118,18 @@ class RunLog:
     """The content of a log, except its raw clouds (see :meth:`captures`).
 
     Attributes:
-        path: The file.
-        complete: Whether the run came to its end.
-        attachments: Name -> bytes: the recipe, the result.
-        source: Where the captures came from; None when the run died before.
-        total: How many captures were expected, when known.
-        poses: Capture id -> its metadata, in order of arrival.
-        entries: Every value, in order.
-        rejections: Captures set aside.
-        finished: Ids of the captures that went through.
+        path: Path of the file.
+        complete: Whether the run finished.
+        attachments: Attached files (recipe, result) by name, as bytes.
+        source: Provenance of the captures; None if the run died before it was known.
+        total: Expected number of captures, if known.
+        poses: Metadata of the captures by id, in order of arrival.
+        entries: All values, in order.
+        rejections: Rejected captures.
+        finished: Ids of completely processed captures.
         messages: Log lines as text.
-        noted: Steps that wrote into their logs, by label; see :func:`read_notes`.
-        damage: What could not be read, and why, a sentence each.
+        noted: Labels of the steps that logged notes; see :func:`read_notes`.
+        damage: Unreadable parts with reasons, one sentence each.
     """
 
     path: Path
@@ -152,7 +152,7 @@ class RunLog:
 
     @property
     def notes(self) -> list[str]:
-        """The log's damage in a few lines, for those who use it."""
+        """The log's damage in a few lines, as notes for a result."""
         kept = f"kept: {len(self.poses)} captures, {len(self.entries)} values of steps"
         told_at_most = 10
         told = [f"{self.path}: damaged: {what}; {kept}" for what in self.damage[:told_at_most]]
@@ -160,10 +160,10 @@ class RunLog:
         return told + ([f"{self.path}: damaged: and {more} more"] if more > 0 else [])
 
     def require_sound(self) -> None:
-        """Refuse a log of which a part is damaged.
+        """Refuse a damaged log.
 
         Raises:
-            StageError: The first damage, how many there are, and what was kept.
+            StageError: The message gives the first damage, their number, and what is readable.
         """
         if self.damage:
             more = f" (and {len(self.damage) - 1} more)" if len(self.damage) > 1 else ""
@@ -299,7 +299,7 @@ class RunLog:
         return t.Capture(capture, cloud, poses, joints, *when, image, *ends, *moved)
 
     def _motion(self, capture: str) -> t.Motion | None:
-        """Return how the flange passed; logs of arms that stood still do not say."""
+        """Return the flange's motion at a capture; None for an arm at rest."""
         motion = adapter(t.Motion | None).validate_python(self.poses[capture].get("motion"))
         return cast("t.Motion | None", motion)
 
@@ -309,7 +309,7 @@ class RunLog:
         return {name: np.array(joints) for name, joints in given.items()}
 
     def _ends(self, capture: str) -> tuple[str, str]:
-        """Return which camera looked at which target; logs of one camera may not say."""
+        """Return camera and target of a capture; defaults for logs of one camera."""
         meta = self.poses[capture]
         return meta.get("camera", t.CAMERA), meta.get("target", t.TARGET)
 
@@ -352,11 +352,11 @@ def read_notes(path: Path, steps: Set[str] | None = None) -> Iterator[JournalEnt
 
     Args:
         path: The log.
-        steps: Labels of those to read, of all when not given.
+        steps: Labels of the steps to read; None for all.
 
     Raises:
-        StageError: The file is missing, no MCAP file, or damaged: decisions without what was
-            noted would be others.
+        StageError: The file is missing, no MCAP file, or damaged; missing notes would change the
+            repeated decisions.
     """
     for message in _messages(path, strict=True):
         topic = message.channel.topic
@@ -376,11 +376,11 @@ def _note(message: LogMessage) -> JournalEntry:
 
 
 def take(log: RunLog, message: LogMessage, clouds: dict[str, t.PointCloud]) -> None:
-    """Add one message to what is known of a run; unreadable ones are counted as damage.
+    """Add one message to a run's log; an unreadable one is recorded as damage.
 
     Args:
-        log: What is known so far.
-        message: The next one.
+        log: The log so far, which is changed.
+        message: The next message.
         clouds: Clouds read so far that later values refer to, by topic.
     """
     try:
@@ -439,7 +439,7 @@ def _check_kind(entry: Entry) -> None:
 
 
 def _check_texts(log: RunLog) -> None:
-    """Take attachments that are not what their name says for damaged."""
+    """Record attachments whose content does not match their name as damaged."""
     for name, raw in list(log.attachments.items()):
         try:
             if name.endswith(".yaml"):
@@ -455,7 +455,7 @@ def decode_json(raw: bytes) -> dict[str, Any]:
     """Return a JSON object of a log.
 
     Raises:
-        ValueError: It is too long, no JSON, or something else.
+        ValueError: The text is too long, no JSON, or no object.
     """
     most = 1 << 24  # decoded, a message takes forty times as much [bytes]
     if len(raw) > most:
@@ -513,7 +513,7 @@ def _decode_log(data: bytes) -> str:
 
 
 def _messages(path: Path, log: RunLog | None = None, strict: bool = False) -> Iterator[LogMessage]:
-    """Yield the messages until the log's end, or as far as it goes; fill ``log``."""
+    """Yield the messages up to the log's end or its first unreadable part; fill ``log``."""
 
     def damaged(what: str) -> None:
         if strict:

@@ -83,7 +83,7 @@ class Recorder:
     """Writes one run to one MCAP file.
 
     Attributes:
-        gathered: Whether the log holds scans or results worth keeping.
+        gathered: Whether the log contains scans or results worth keeping.
     """
 
     def __init__(self, path: Path, recipe: dict[str, str], full_clouds: bool) -> None:
@@ -183,7 +183,7 @@ class Recorder:
 
     @hookimpl
     def flangeye_capture_rejected(self, rejection: t.Rejection) -> None:
-        """Log a capture that was set aside."""
+        """Log a rejected capture."""
         self._json("/rejection", "Rejection", _plain(rejection))
         self._log(f"{rejection.id} set aside by {rejection}", "WARNING")
 
@@ -211,7 +211,7 @@ class Recorder:
                 self._json("/ended", "Ended", {"reason": reason})
 
     def close(self) -> None:
-        """Close the file as it is; a log without an end can still be read."""
+        """Close the file; a log without an end can still be read."""
         try:
             self._file.close()
         except OSError as error:
@@ -238,7 +238,7 @@ class Recorder:
             self._log(value.reason, level)
 
     def _in_base(self, calibration: t.HandEye, now: int) -> None:
-        """Log every flange where the calibration puts it: apart, they show what is wrong."""
+        """Log every flange mapped to the base by the calibration; they disagree if it is wrong."""
         found = {x.transform.child: x.transform for x in calibration.transforms.values()}
         for capture, cloud in self._flanges.items():
             place, pose = found[self._cameras.get(capture, t.CAMERA)], self._poses.get(capture)
@@ -297,7 +297,7 @@ def dump_result(result: dict[str, Any]) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Return a flowing value as plain JSON data, without what has a channel of its own."""
+    """Return a stage's value as plain JSON data, without parts that have their own channel."""
     left_out: dict[str, Any] = dict.fromkeys(clouds_of(value), True)
     if isinstance(value, t.Capture):
         left_out["image"] = {"pixels"}
@@ -305,7 +305,7 @@ def _plain(value: Any) -> Any:
 
 
 def _thinned(cloud: t.PointCloud, most: int = 40_000) -> NDArray[np.float32]:
-    """Return at most so many finite points, spread evenly."""
+    """Return at most a given number of finite points, evenly thinned."""
     flat = cloud.xyz.reshape(-1, 3)
     if cloud.organised:
         step = max(1, int(np.ceil(np.sqrt(len(flat) / most))))

@@ -1,18 +1,16 @@
 """The only reader of log files: checks sizes and CRCs, and skips damaged parts.
 
-A log may be torn, changed, or made by anybody. Checksums of chunks and attachments are compared,
-hashes of the recipe and the result too; what a chunk expands to is bounded before it is expanded.
-A damaged part is named and left out, and reading goes on behind it.
+A log may be truncated, changed, or from an untrusted source. Checksums of chunks and attachments
+and hashes of recipe and result are compared, and a chunk's uncompressed size is limited before it
+is decompressed. A damaged part is named and skipped, and reading continues after it.
 
 MCAP's records: https://mcap.dev/spec. The library's own stream reader does not check attachments,
 and stops at the first damaged chunk; its parsers of single records are used here.
 
-A whole scan in few bytes, and quickly: the bytes of its numbers in planes, then a fast codec.
-
-Neighbours in a scan share sign, exponent and leading bits; their last bits are noise. With the
-bytes of equal weight side by side the codec packs the first and passes over the last: seven tenths
-of the size that it reaches on the points as they are, in a third of the time (the shuffle filter
-of HDF5 and Blosc).
+Whole scans are compressed by a byte shuffle (as in HDF5 and Blosc) and a fast codec. Neighbouring
+points share sign, exponent and leading bits, while their last bits are noise. With bytes of equal
+significance side by side, the codec compresses the first and skips the last: 70 % of the size
+without shuffling, in a third of the time.
 """
 
 from __future__ import annotations
@@ -74,10 +72,10 @@ class LogMessage(NamedTuple):
     """One message of a log.
 
     Attributes:
-        channel: Where it comes from.
-        time_ns: When it was logged.
-        data: Its bytes.
-        number: How many came before it.
+        channel: Channel of the message.
+        time_ns: Time of logging [ns].
+        data: Content as bytes.
+        number: Index of the message in the log.
     """
 
     channel: Channel
@@ -120,7 +118,7 @@ class LogFile:
 
     @property
     def may_be_ours(self) -> bool:
-        """Whether the log was written by flangeye, or ended before it could say so."""
+        """Return whether the log was written by flangeye, or ends before its header."""
         return self.library.startswith("flangeye") or not self._read
 
     def messages(self, file: IO[bytes], size: int = MAX_RECORD) -> Iterator[LogMessage]:
@@ -128,7 +126,7 @@ class LogFile:
 
         Args:
             file: The log, open at its first byte; a read may wait for more.
-            size: Size of the file, where it is known [bytes]: no record is longer.
+            size: Size of the file [bytes], the limit of a record's length; None if unknown.
 
         Raises:
             NotMcapError: It is not an MCAP file.
@@ -187,7 +185,7 @@ class LogFile:
             self.ended = True
 
     def _flat(self, opcode: int, body: bytes) -> Iterator[LogMessage]:
-        """Take in one of the records that may stand in a chunk."""
+        """Process a record that may be inside a chunk."""
         from mcap import records
         from mcap.data_stream import ReadDataStream
         from mcap.opcode import Opcode

@@ -28,12 +28,12 @@ MoverSection = CellArmSection | RailSection | PositionerSection
 
 
 def cell_of(header: Header, model: Callable[[str], RobotModel], complain: Complain) -> Cell | None:
-    """Return the cell of a recipe after reporting every mistake; None if there is one.
+    """Return the cell of a recipe; report all mistakes and return None if there are any.
 
     Args:
-        header: The sections.
+        header: Sections of the recipe.
         model: Reads an arm's model by its name.
-        complain: Called with each mistake: where it is, and what.
+        complain: Called with place and text of each mistake.
     """
     section = header.cell
     if section is None:
@@ -120,7 +120,7 @@ def _beyond_links(
 
 
 def _at_one_place(section: CellSection) -> Iterator[Mistake]:
-    """Complain of two things that stand at one place: one of the two is not known."""
+    """Report two frames with the same given pose, one of which is probably unknown."""
     seen: dict[str, str] = {}
     for name, each in _movers(section):
         if each.place != "known":

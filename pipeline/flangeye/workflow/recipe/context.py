@@ -1,7 +1,7 @@
 """Values of a recipe's header for its stages, by type: models, mounting, devices.
 
-What a section should have given and could not is there as None, so that a mistake in it is told
-once, where it was made, and not again by every step that needs it.
+The value of a section with a mistake is None, so that the mistake is reported once, in the section,
+and not again by every step that needs the value.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ Complain = Callable[[Sequence[Hashable], str], None]
 
 
 def context_of(header: Header, folder: Path, complain: Complain) -> Context:
-    """Return the values that a recipe's sections provide, after reporting every mistake.
+    """Return the values that a recipe's sections provide, and report every mistake.
 
     Args:
-        header: The sections.
+        header: Sections of the recipe.
         folder: Folder of the recipe; files it names are beside it.
-        complain: Called with each mistake: where it is, and what.
+        complain: Called with place and text of each mistake.
     """
     context: Context = {t.Seed: header.seed}
     offer = partial(_offer, context, complain)
@@ -116,7 +116,7 @@ def _arm(section: RobotSection, standard: str | None, folder: Path) -> RobotMode
 
 
 def body_of(target: TargetSection, robot: RobotModel | None, folder: Path) -> TargetBody:
-    """Return the body that a recipe's target is.
+    """Return the body given by a recipe's ``target`` section.
 
     Args:
         target: The section.
@@ -124,7 +124,7 @@ def body_of(target: TargetSection, robot: RobotModel | None, folder: Path) -> Ta
         folder: Folder of the recipe.
 
     Raises:
-        RecipeError: It cannot be read, or is not where it may be.
+        RecipeError: The file cannot be read, or is outside the allowed folders.
     """
     if target.body != ARM:
         if target.links:
@@ -157,7 +157,7 @@ def _scanner(section: ScannerSection, folder: Path) -> ScannerData:
 
 
 def _carrier(cell: Cell | None) -> RobotModel | None:
-    """Return the arm of a cell whose flange is looked for: the first that carries a target."""
+    """Return the arm of a cell whose flange is the target: the first that carries one."""
     carriers = [cell.frames[target].parent for target in cell.targets] if cell else []
     arms = [cell.movers.get(carrier) for carrier in carriers] if cell else []
     return next((arm for arm in arms if isinstance(arm, RobotModel)), None)
@@ -251,7 +251,7 @@ def _require_link(camera: str, context: Context) -> None:
 
 
 def _check_limits(limits: LimitsSection, robot: RobotModel, complain: Complain) -> None:
-    """Hold limits against the arm they are for: what it cannot do is a slip of the pen."""
+    """Report limits that exceed the arm's capabilities, which are probably typing errors."""
     if limits.joint_speed > robot.joint_speed:
         complain(
             ("robot", "limits", "joint_speed"),

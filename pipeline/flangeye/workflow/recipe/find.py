@@ -44,7 +44,7 @@ def find_recipe(name: str) -> Path:
 
 
 def _near_file(path: Path, known: Iterable[str]) -> str:
-    """Return a hint which recipe is meant: one beside a missing path, or a bundled one."""
+    """Return a hint at a similarly named recipe: beside a missing path, or a bundled one."""
     folder = path if path.is_dir() else path.parent
     if not folder.is_dir():
         return f"there is no folder {folder}"

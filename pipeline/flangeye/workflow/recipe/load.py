@@ -42,11 +42,11 @@ class Recipe:
 
     Attributes:
         name: File name without its suffix.
-        header: The sections, as written.
+        header: Sections of the recipe as written.
         steps: The checked steps.
-        context: What stages may ask for by type: robot, scanner, flange, sphere, workspace, seed,
-            and the printed board that its fit step looks for.
-        text: The recipe as the person wrote it.
+        context: Values for stages by type: robot, scanner, flange, sphere, workspace, seed, and the
+            printed board of its fit step.
+        text: The recipe's original text.
     """
 
     name: str
@@ -81,7 +81,7 @@ class Recipe:
 
     @property
     def plans(self) -> bool:
-        """Whether its first step plans poses of an arm, which can be shown without a run."""
+        """Whether the first step plans poses of an arm, which can be shown without a run."""
         return _moves(self.steps[0])
 
     @property
@@ -132,14 +132,14 @@ def parse_recipe(
     overrides: Sequence[str] = (),
     models: Mapping[str, bytes] = MappingProxyType({}),
 ) -> Recipe:
-    """Check a recipe given as text, as a log holds it; see :func:`load_recipe`.
+    """Return a checked recipe from text, such as that in a log; see :func:`load_recipe`.
 
     Args:
         text: The recipe.
-        name: What to call it.
-        registry: The plugins on offer.
+        name: Name of the recipe in messages.
+        registry: The installed plugins.
         overrides: As for :func:`load_recipe`.
-        models: Files of models that come with it, by the name it gives them.
+        models: Contents of model files that belong to it, by their name in the recipe.
     """
     with carried_files(models) as folder:
         checker = _Checker(parse_yaml(text, name), Lookup(registry), folder)
@@ -195,11 +195,11 @@ class _Checker:
                 leave_out(rest, [e["loc"] for e in error.errors()])
 
     def _follows(self, keys: tuple[Hashable, ...]) -> bool:
-        """Return whether a mistake follows from what was left out at or below its place."""
+        """Return whether a mistake is a consequence of an omission at or below its path."""
         return keys in self._left_out
 
     def _context(self, header: Header) -> Context:
-        """Return what the sections offer; what a broken one would offer is there as None."""
+        """Return the values of the sections; the value of an invalid section is None."""
         broken = {left_out[0] for left_out in self._left_out if left_out}
 
         def complain(keys: Sequence[Hashable], message: str) -> None:
@@ -292,7 +292,7 @@ class _Checker:
             self.complain(keys, ", or ".join(sentences))
 
     def _given(self, keys: Sequence[Hashable], parsed: Any) -> Any:
-        """Return what the person wrote at ``keys``, before any of it was converted."""
+        """Return the original value at ``keys``, before conversion."""
         there = _existing(self._document.data, tuple(keys))
         return _at(self._document.data, keys) if len(there) == len(keys) else parsed
 
@@ -366,7 +366,7 @@ def _require_reached(path: Path, robot: RobotModel) -> None:
     """Refuse an arm that cannot be sent to the poses of a plan.
 
     Raises:
-        RecipeError: It has fewer than six joints, or does not find back to poses of its own.
+        RecipeError: The arm has fewer than six joints, or its inverse kinematics fails.
     """
     import numpy as np
 

@@ -17,14 +17,14 @@ Keys = tuple[Hashable, ...]
 
 
 def apply_override(data: dict[Hashable, Any], override: str) -> Keys:
-    """Set one value in a recipe's data; return the path of keys it went to.
+    """Set one value in a recipe's data, and return the path of its keys.
 
-    A step goes by its place, its name or both: ``steps.2.inlier``, ``fit.rim.inlier`` and
-    ``steps.2.fit.rim.inlier`` are one. ``steps.3=solve.svd`` puts another stage in a step's place,
-    with its own defaults.
+    A step is addressed by its index, its name or both: ``steps.2.inlier``, ``fit.rim.inlier`` and
+    ``steps.2.fit.rim.inlier`` are the same. ``steps.3=solve.svd`` replaces a step by another stage
+    with default parameters.
 
     Raises:
-        RecipeError: The text is not PATH=VALUE, or the path leads nowhere.
+        RecipeError: The text is not PATH=VALUE, or the path does not exist.
     """
     path, equals, text = override.partition("=")
     if not equals or not path:
@@ -111,7 +111,7 @@ def params_given(plugin: Plugin, values: Sequence[str], registry: Registry) -> P
     """Return a plugin's parameters from ``name=value`` texts; None if it has no parameters.
 
     Raises:
-        RecipeError: Names every mistake.
+        RecipeError: A parameter is invalid; the message names every mistake.
     """
     data: dict[Hashable, Any] = {}
     for value in values:

@@ -31,14 +31,14 @@ def sections(header: Header) -> dict[str, Any]:
 def written_out(
     header: Header, context: Context, moves: bool
 ) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return a recipe's sections as data, and the files of the models that are not bundled.
+    """Return a recipe's sections as data, and the files of models that are not bundled.
 
-    A URDF and a factory calibration become a model's file as well: what was read of them.
+    The contents read from a URDF or a factory calibration become model files too.
 
     Args:
-        header: The sections.
-        context: What they offered.
-        moves: Whether an arm moves, so that the space it fills is needed.
+        header: Sections of the recipe.
+        context: Values of the sections.
+        moves: Whether an arm moves, so that its collision shape is needed.
     """
     data = sections(header)
     files = {}
@@ -58,7 +58,7 @@ def written_out(
 def _own(
     data: dict[str, Any], context: Context, moves: bool
 ) -> Iterator[tuple[dict[str, Any], str, str, Model]]:
-    """Yield each section that names a model of one's own: it, the key, a name, the model."""
+    """Yield for each user-defined model: the section, its key, a name, and the model."""
     robot = data.get("robot", {})
     if robot.get("urdf") or robot.get("factory") or _is_file(robot.get("model")):
         link = ("flange",) if "urdf" in robot else ()  # with a model, flange is its plate

@@ -97,9 +97,9 @@ class Step:
     """One step of a recipe: a stage with its checked parameters.
 
     Attributes:
-        index: Place in the recipe, from 0.
-        stage: The plugin.
-        params: Its parameters, or None when it takes none.
+        index: Index in the recipe, from 0.
+        stage: The stage.
+        params: Parameters of the stage; None if it has none.
     """
 
     index: int
@@ -119,8 +119,8 @@ class StepOrder:
         """Start before the first step.
 
         Args:
-            complain: Called with each mistake: where it is, and what.
-            given: What stages may ask for from the start, by type.
+            complain: Called with place and text of each mistake.
+            given: Values available to stages from the start, by type.
         """
         self._cell = Cell in given
         self._configuration: Configuration = given.get(Configuration) or DEFAULT
@@ -132,7 +132,7 @@ class StepOrder:
         self._kinds: list[str] = []
 
     def visit(self, index: int, name: str, stage: Stage | None) -> None:
-        """Check one step against those before it; ``stage`` is None if it is not installed."""
+        """Check one step against the earlier ones; ``stage`` is None if it is not installed."""
         kind = name.partition(".")[0]
         if kind not in KINDS:
             return

@@ -44,9 +44,9 @@ AXES = 0.2
 def cell_drawing(facts: Facts) -> PlotlyFigure | None:
     """Return a drawing of clouds, workspace and frames.
 
-    In the base where the camera stands there. Where an arm's flange carries the camera also in
-    the base, each capture from where the camera was: what stands still must then lie in one place.
-    On a link, whose place is not in the log, in the link's frame.
+    The drawing is in the base for a fixed camera, and also for one on the flange, with each capture
+    at the camera's pose; static objects must then coincide. For a camera on a link, whose pose is
+    not in the log, it is in the link's frame.
     """
     found = facts.estimate
     carrier = found[0].partition("_T_")[0] if found else t.BASE
@@ -79,7 +79,7 @@ def cell_drawing(facts: Facts) -> PlotlyFigure | None:
 
 
 def _from_moving_camera(facts: Facts) -> PlotlyFigure | None:
-    """Return the base with the camera and what it saw at every capture."""
+    """Return a drawing in the base with a moving camera's poses and clouds."""
     if facts.estimate is None:
         return None
     eye = np.array(facts.estimate[1].matrix)
@@ -156,7 +156,7 @@ class FoundBody(NamedTuple):
 def found_body(facts: Facts) -> FoundBody | None:
     """Return the body used as target, at its first detection; None without one.
 
-    None too where it cannot be read here, as one of another version: the rest of the page stands.
+    None too if it cannot be read, for example from another version; the rest of the page is drawn.
     """
     poses, found = _marker_poses(facts), {o.id: o for o in facts.log.observations()}
     section = facts.section("target")
@@ -189,7 +189,7 @@ def _flanges(facts: Facts, pose: Floats) -> list[Trace]:
 
 
 def _scan(facts: Facts, pose: Floats, capture: str | None) -> list[Trace]:
-    """Return one scan, the first by default: the arm must be where it is, the table level."""
+    """Return one scan, by default the first, for a visual check of its place in the cell."""
     every = facts.log.captures()
     first = next((each for each in every if capture in (None, each.id)), None)
     if first is None:

@@ -1,7 +1,7 @@
-"""Facts of a run from its log, finished or not, in the shape of ``result.json``.
+"""Facts of a run from its log, finished or not, in the structure of ``result.json``.
 
-A finished run brings its own result. For a run that was killed the same document is put together
-from what was logged, with the same functions, so that everything after this has one case.
+A finished run's log contains its result. For a killed run the same document is assembled from the
+log with the same functions, so that reports need not distinguish the two.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Facts:
 
     Attributes:
         log: The run's log.
-        result: The run's own result, or what the log allows to say.
+        result: The run's result, or one assembled from the log.
         recipe: The resolved recipe, or an empty text.
     """
 
@@ -56,15 +56,15 @@ class Facts:
         return found if isinstance(found, dict) else {}
 
     def section(self, name: str) -> dict[str, Any]:
-        """Return a section of the recipe; empty where a foreign log has none, or something else."""
+        """Return a section of the recipe; empty if a foreign log has no valid one."""
         found = self.header.get(name)
         return found if isinstance(found, dict) else {}
 
     def model(self, kind: Literal["robots", "scanners"]) -> Any:
-        """Return the recipe's arm or scanner, where its file is here: it may be another machine's.
+        """Return the recipe's arm or scanner; None if its file is not on this machine.
 
         Args:
-            kind: Kind of the models, as their folder is called.
+            kind: Kind of the models: the name of their folder.
         """
         name = self.section(kind.removesuffix("s")).get("model")
         with suppress(FlangeyeError), carried_files(self.log.models) as folder:
@@ -206,10 +206,10 @@ class SetAside:
 
     Attributes:
         rows: One row for each capture.
-        counts: (how many, stage, why), most frequent first; reasons that differ only in numbers are
-            merged.
-        early: Set aside before the solver.
-        late: Set aside by the solver.
+        counts: (number, stage, reason), most frequent first; reasons that differ in numbers only
+            are merged.
+        early: Number of captures rejected before the solver.
+        late: Number of captures rejected by the solver.
     """
 
     rows: list[RejectedRow] = field(default_factory=list)

@@ -1,4 +1,4 @@
-"""The one look of report, certificate, page and documentation: colours, type and logo.
+"""Common style of report, certificate, page and documentation: colours, fonts and logo.
 
 Text colours have a contrast of at least 4.5 on their background (WCAG 2.1, AA), in both themes.
 """

@@ -49,10 +49,10 @@ def write_report(log: RunLog, path: Path, library: Path | None = None) -> None:
     """Write the report of a run, finished or not, as one self-contained HTML file.
 
     Args:
-        log: What :func:`flangeye.workflow.log.read.read_run` gave.
-        path: The file to write.
-        library: A copy of plotly.js that several reports share, for example those of a batch; it
-            is written if it is not there. Without it the page holds one.
+        log: The log from :func:`flangeye.workflow.log.read.read_run`.
+        path: Path of the file to write.
+        library: Path of a copy of plotly.js shared by several reports, written if missing; None
+            embeds a copy in the page.
 
     Raises:
         StageError: The file cannot be written.
@@ -91,7 +91,7 @@ def packed_plotly() -> str:
 
 
 def _still(facts: Facts) -> str:
-    """Return a picture of the cell, which needs no script; empty where it is not known."""
+    """Return a static picture of the cell, without script; empty if the cell is unknown."""
     scene = scene_of(facts)
     return still(scene, "The cell: arm, scanner and poses") if scene else ""
 
@@ -105,7 +105,7 @@ def _corrected(facts: Facts) -> list[TransformText]:
 
 
 def _content(facts: Facts) -> dict[str, Any]:
-    """Return what the template shows, in reading order."""
+    """Return the template's values, in reading order."""
     errors = errors_of(facts)
     return {
         "facts": facts,
@@ -142,9 +142,9 @@ class CheckDrawing:
 
     Attributes:
         step: The verify step, such as ``4.verify.stitch``.
-        summary: What the step found, in its own words.
-        picture: As a data URI; empty for a figure.
-        figure: For plotly; None for a picture.
+        summary: The step's summary text.
+        picture: Picture as a data URI; empty for a figure.
+        figure: Plotly figure; None for a picture.
     """
 
     step: str
@@ -198,9 +198,9 @@ class ImageView:
 
     Attributes:
         id: Identifier of the capture.
-        data: The picture, a data URI.
-        box: (x, y, width, height) of what is shown, in the image [px].
-        corners: Where each corner was detected, x and y [px].
+        data: The picture as a data URI.
+        box: Shown window (x, y, width, height) of the image [px].
+        corners: Detected corners (x, y) [px].
         misses: (x1, y1, x2, y2) of the line for each corner [px].
         radius: Radius of the circles about the corners [px].
         summary: The figure's content in words.
@@ -216,7 +216,7 @@ class ImageView:
 
 
 def missed_view(facts: Facts) -> ImageView | None:
-    """Return the first image in which no target was found, and why; None without one."""
+    """Return the first image without a detected target, with the reason; None without one."""
     why = {x.id: x.reason for x in facts.log.rejections if x.stage.startswith("fit.")}
     for capture in facts.log.captures() if why else ():
         if capture.id in why and capture.image is not None:
@@ -273,7 +273,7 @@ def _view(name: str, image: t.Image, found: dict[str, t.PoseFeature]) -> ImageVi
 
 
 def _around(at: Floats, image: t.Image) -> tuple[int, int, int, int]:
-    """Return (x, y, width, height) of what is to be shown [px]."""
+    """Return the window to show (x, y, width, height) [px]."""
     low, high = at.min(axis=0), at.max(axis=0)
     # Around the corners, over their extent
     margin = 0.25 * float((high - low).max()) + 10

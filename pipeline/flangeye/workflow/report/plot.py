@@ -36,7 +36,7 @@ def packed(values: Any) -> dict[str, str]:
 
 
 def plain(text: str, width: int = 200) -> str:
-    """Return text from data for plotly, which would read markup in it; elided in the middle."""
+    """Return text from data with plotly's markup escaped, and elided in the middle if long."""
     if len(text) > width:
         text = f"{text[: width // 2]}…{text[-(width // 2 - 1) :]}"
     return escape(text)
@@ -59,7 +59,7 @@ def lines(parts: list[Floats], colour: str, width: float, **rest: Any) -> Trace:
 
 
 def joined(parts: list[Floats]) -> Floats:
-    """Return polylines as one array, with a row of NaN, which plotly leaves out, after each."""
+    """Return polylines as one array, separated by rows of NaN, at which plotly breaks the line."""
     gap = np.full((1, 3), np.nan)
     rows = [row for part in parts for row in (np.asarray(part, dtype=np.float64), gap)]
     return np.concatenate(rows) if rows else np.zeros((0, 3))
@@ -122,7 +122,7 @@ def _as_columns(trace: Trace) -> Trace:
 
 
 def thinned(rows: NDArray[Any], limit: int) -> NDArray[Any]:
-    """Return at most ``limit`` rows, drawn at random but always the same ones."""
+    """Return at most ``limit`` random rows; the choice is deterministic."""
     if len(rows) <= limit:
         return rows
     chosen = np.random.default_rng(0).choice(len(rows), limit, replace=False)

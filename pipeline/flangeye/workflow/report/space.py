@@ -102,14 +102,15 @@ def in_words(frame: str) -> str:
 
 
 def target_centres(facts: Facts, frame: str, pose: Floats | None, size: float) -> list[Trace]:
-    """Return where the target was, by whether it was used.
+    """Return the target's positions, used and unused ones separately.
 
-    In the base that is where the robot reports its flange; elsewhere where the camera saw it.
+    In the base they are the reported flange positions, in other frames those measured by the
+    camera.
 
     Args:
-        facts: The run.
-        frame: What the drawing is in.
-        pose: (4, 4) of the camera in it.
+        facts: Facts of the run.
+        frame: Frame of the drawing.
+        pose: (4, 4) pose of the camera in it.
         size: Diameter of the symbols.
     """
     what = "flange" if frame == t.BASE else "target"
@@ -178,9 +179,9 @@ def graph_drawing(facts: Facts) -> PlotlyFigure | None:
 
 
 def _cell_of(facts: Facts) -> Cell | None:
-    """Return the cell of a run's recipe, with the models of its own that the log carries.
+    """Return the cell of a run's recipe, with the user-defined models from the log.
 
-    None where it cannot be read here, as one of another version: the rest of the page stands.
+    None if it cannot be read, for example from another version; the rest of the page is drawn.
     """
     with suppress(FlangeyeError, ValueError), carried_files(facts.log.models) as folder:
         section = CellSection.model_validate(facts.header.get("cell"))
@@ -190,7 +191,7 @@ def _cell_of(facts: Facts) -> Cell | None:
 
 
 def _of(camera: str, seen: Sequence[Observation], ends: Ends) -> Floats:
-    """Return (N, 4, 4) where a camera was at what it saw."""
+    """Return a camera's poses (N, 4, 4) at its observations."""
     return ends.camera[[o.camera == camera for o in seen]]
 
 

@@ -30,11 +30,11 @@ class StillScene:
 
     Attributes:
         robot: The arm, drawn from its capsules.
-        joints: Its joint values [rad or m]; None draws it ready to scan.
+        joints: Joint values of the arm [rad or m]; None draws it in a typical pose.
         scanner: The scanner.
         base_T_camera: (4, 4) pose of the camera; None where unknown.
-        box: Centre and size of the box that the arm keeps to [m].
-        poses: Places of the flange [m], and whether each is taken.
+        box: Centre and size of the arm's allowed box [m].
+        poses: Positions of the flange [m], each with whether it was taken.
     """
 
     robot: RobotModel | None = None
@@ -46,7 +46,7 @@ class StillScene:
 
 
 def ready(robot: RobotModel) -> Floats:
-    """Return joint values that hold the flange out and up, as an arm waits to be scanned."""
+    """Return typical joint values for a drawing, with the flange out and up."""
     return np.array(_ready(robot.model_dump_json()))
 
 
@@ -67,7 +67,7 @@ def _ready(model: str) -> tuple[float, ...]:
 def scene_of(facts: Facts) -> StillScene | None:
     """Return the calibrated cell, with its arm at the first used pose.
 
-    None where the scanner does not stand in the base, or its models are not known here.
+    None if the scanner is not fixed to the base, or a model is not available.
     """
     arm, camera = facts.model("robots"), facts.model("scanners")
     if facts.base_T_camera is None or arm is None or camera is None:
@@ -84,7 +84,7 @@ def scene_of(facts: Facts) -> StillScene | None:
 
 
 def still(scene: StillScene, label: str) -> str:
-    """Return the picture as SVG; its colours follow the look of the page that it stands in."""
+    """Return the picture as SVG, with the colours of the page that contains it."""
     shapes = [*_arm(scene), *_seen(scene), *_kept(scene), *_poses(scene)]
     corners = np.vstack([shape.points for shape in shapes] or [np.zeros((1, 3))])
     floor = _floor(corners)
@@ -117,7 +117,7 @@ class _Line:
 
 
 def _flat(points: Floats) -> Floats:
-    """Return (N, 2) where points stand in the picture, y down."""
+    """Return the positions (N, 2) of points in the picture, with y down."""
     ahead = np.array([np.cos(AZIMUTH), np.sin(AZIMUTH), 0.0])
     right = np.array([-ahead[1], ahead[0], 0.0])
     up = np.cos(ELEVATION) * np.array([0.0, 0.0, 1.0]) - np.sin(ELEVATION) * ahead
@@ -180,7 +180,7 @@ def _arm(scene: StillScene) -> list[_Line]:
 
 
 def _seen(scene: StillScene) -> list[_Line]:
-    """Return the scanner, and the edges of what it sees."""
+    """Return lines of the scanner and of its field of view."""
     if scene.scanner is None:
         return []
     at = np.eye(4) if scene.base_T_camera is None else scene.base_T_camera

@@ -123,7 +123,7 @@ def evidence_of(facts: Facts) -> list[KeyFigure]:
 
 
 def next_steps_of(facts: Facts) -> list[tuple[str, str]]:
-    """Return what to do next: purposes with their commands."""
+    """Return the suggested next steps as purposes with commands."""
     run = shlex.quote(with_urls(str(facts.log.path.parent)))
     if facts.result.status == "refused":
         return [("Find the cause", f"flangeye doctor {run}/{facts.log.path.name}")]

@@ -40,14 +40,14 @@ class WeldDrawing:
     """The figures of one weld.
 
     Attributes:
-        report: The weld.
-        summary: The figure's content in words.
-        paths: In the plane of the work.
-        offsets: From the plan, along it.
-        deviation: Distance of the torch from the seam as felt, and in a simulation as it is.
+        report: Report of the weld.
+        summary: Text that describes the figures.
+        paths: Paths in the plane of the work.
+        offsets: Offsets from the plan, along the seam.
+        deviation: Distance of the torch from the felt seam, and from the true one in a simulation.
         contact: Deflection over time, with the controller's phases.
-        speeds: Over time.
-        loop: How the loop kept time: name, value with unit.
+        speeds: Speeds over time.
+        loop: Timing of the control loop: name, value with unit.
     """
 
     report: WeldReport
@@ -73,7 +73,7 @@ def weld_drawing(facts: Facts) -> WeldDrawing | None:
 
 
 def _truth(facts: Facts) -> Floats | None:
-    """Return the true seam (M, 3) of a simulation, where it has one."""
+    """Return the true seam (M, 3) of a simulation; empty without one."""
     scan = facts.log.last(WorkpieceScan)
     lines = list(scan.truth.values()) if scan else []
     return np.asarray(lines[0]) if len(lines) == 1 else None
@@ -126,7 +126,7 @@ def _offsets(weld: WeldReport, plane: WeldPlane) -> Figure:
 
 
 def _deviation(weld: WeldReport, plane: WeldPlane, truth: Floats | None) -> Figure:
-    """Plot the estimated torch position with its 95 % band, and the true one where it is known."""
+    """Return a plot of the estimated torch with its 95 % band, and the true one if known."""
     true_torch = weld.true_torch if len(weld.true_torch) else weld.torch
     traces = []
     for name, line, torch, colour in (
@@ -273,7 +273,7 @@ def _drawn(seam: t.Seam) -> list[Trace]:
 
 
 def _widened(seam: t.Seam, scale: float) -> list[Floats]:
-    """Return the tube's rings, drawn too wide: it would not be seen beside the part."""
+    """Return the tube's rings, exaggerated to be visible beside the part."""
     # Circles of the tube
     rings = tube_rings(seam, 60)
     middles = rings[:, :-1].mean(axis=1, keepdims=True)
@@ -281,7 +281,7 @@ def _widened(seam: t.Seam, scale: float) -> list[Floats]:
 
 
 def _profile(seam: t.Seam, truth: list[Floats]) -> dict[str, Any]:
-    """Return the tube's radius along the seam, and the true error where it is known."""
+    """Return a plot of the tube's radius along the seam, and the true error if known."""
     along = seam.arc_length * 1e3
     traces = [curve(along, tube_radii(seam) * 1e3, "tube, 95 %", SERIES["used"], width=2)]
     if truth:

@@ -69,12 +69,12 @@ def calibrated_pose(
 
     Args:
         result: Result of a run.
-        anyway: Give a refused one too; its remarks say so.
-        camera: For a cell, the one camera to give.
+        anyway: Return a refused calibration too; its remarks say so.
+        camera: The camera of a cell to return.
 
     Raises:
         StageError: There is no calibration, or no such camera.
-        CalibrationRefused: It was refused, and ``anyway`` is not given.
+        CalibrationRefused: The calibration was refused, and ``anyway`` is false.
     """
     if not result.transforms:
         raise StageError(f"there is no calibration to export: {result.refused or result.status}")
@@ -100,11 +100,11 @@ def cameras_of(result: Result) -> dict[str, str]:
 
 
 def result_of_camera(result: Result, camera: str | None) -> Result:
-    """Return the part of a result that one camera of a cell has: its pose, sightings and work.
+    """Return one camera's part of a cell's result: pose, observations and workspace.
 
     Args:
-        result: Of a run; returned as it is where that had one camera.
-        camera: Which.
+        result: Result of a run; returned unchanged for a run with one camera.
+        camera: Name of the camera.
 
     Raises:
         StageError: The run is of a cell and no camera is chosen, or there is no such camera.

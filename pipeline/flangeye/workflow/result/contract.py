@@ -59,7 +59,7 @@ class TransformResult(_Part):
 
     @property
     def sigma(self) -> list[float | None]:
-        """Deviations about and along the parent's axes [rad, m]; None where not measured."""
+        """Standard deviations about and along the parent's axes [rad, m]; None if unknown."""
         free = [max(map(abs, column)) for column in zip(*(self.unobservable or []), strict=True)]
         # An axis with a larger share in a direction that was not measured has no deviation of its
         # own

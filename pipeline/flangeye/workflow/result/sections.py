@@ -86,10 +86,10 @@ def standing_warnings(result: Result) -> list[WarningResult]:
 
 
 def _unlike(result: Result) -> str | None:
-    """Return how the expected and the held-out error differ by more than chance; else None.
+    """Return a text if expected and held-out error differ significantly; else None.
 
-    Nineteen errors of twenty are below the bound that is expected of each: the root mean square of
-    all is not above it by chance, nor the measured bound below the expected root mean square.
+    95 % of the errors should be below the expected bound. So the measured rms is not above that
+    bound by chance, nor the measured 95 % quantile below the expected rms.
     """
     expected, held = result.expected_error, result.holdout
     if expected is None or held is None or (expected.rms <= held.p95 and held.rms <= expected.p95):
@@ -102,7 +102,7 @@ def _unlike(result: Result) -> str | None:
 
 
 def expected_error(result: Result) -> tuple[float, float] | None:
-    """Return the error to expect at the work, rms and 95 % bound [m]; None where not estimated."""
+    """Return the expected error at the work, rms and 95 % bound [m]; None if not estimated."""
     found = result.expected_error
     return None if found is None else (found.rms, found.p95)
 
@@ -125,7 +125,7 @@ def answers_result(
 
     Args:
         calibration: The estimate.
-        holdout: What poses held out showed of it, if a step measured that.
+        holdout: Its cross-validation, if a step computed one.
     """
     if calibration is None:
         return None
@@ -151,7 +151,7 @@ def _answer(calibration: t.HandEye, of_all: float | None) -> AnswerResult:
 def observations_result(
     pairs: Sequence[t.Pair], rejections: Sequence[t.Rejection]
 ) -> list[ObservationResult]:
-    """Return the section ``observations``: every capture, those set aside early included."""
+    """Return the section ``observations`` with every capture, including those rejected early."""
     early = [ObservationResult(id=r.id, used=False, reason=str(r)) for r in rejections]
     return sorted([*map(_observation, pairs), *early], key=lambda o: o.id)
 
@@ -188,13 +188,13 @@ def truth_result(
 ) -> TruthResult:
     """Return the mapping error of the estimate over the workspace, against the truth.
 
-    What is marked as unobservable does not count.
+    Directions marked as unobservable do not count.
 
     Args:
         calibration: The estimate.
         truth: True values from the simulation.
         box: The workspace.
-        cell: What stands on what; needed where truth has poses that took no part.
+        cell: Structure of the cell; needed if the truth has poses that were not used.
     """
     error = calibration.camera.transform.matrix @ truth.camera.inverse().matrix
     known = {x.name: x for x in (truth.camera, *truth.others)}
@@ -215,7 +215,7 @@ def truth_result(
 def _at_work(
     calibration: t.HandEye | None, unseen: Sequence[t.Observation], cell: Cell | None
 ) -> float | None:
-    """Return the rms distance of what is seen from where the (corrected) arm has it [m]."""
+    """Return the rms distance between the target by camera and by (corrected) arm [m]."""
     if calibration is None or cell is None or not unseen:
         return None
     corrected = cell.corrected(unseen, calibration)
@@ -225,7 +225,7 @@ def _at_work(
 
 
 def _error(estimate: t.TransformEstimate, truth: t.Transform) -> TransformErrorResult:
-    """Return how far off one transform is, unobservable directions aside."""
+    """Return the error of one transform, without its unobservable directions."""
     error = estimate.transform.matrix @ truth.inverse().matrix
     shift = error[:3, :3] @ estimate.about + error[:3, 3] - estimate.about
     twist = np.concatenate([rotation_log(error[:3, :3]), shift])
@@ -236,7 +236,7 @@ def _error(estimate: t.TransformEstimate, truth: t.Transform) -> TransformErrorR
 
 
 def _displacement(error: t.Array, points: Any, free: t.Array) -> Any:
-    """Return how far points are moved across the rows of ``free``, which do not count."""
+    """Return the points' displacements perpendicular to the rows of ``free``."""
     moved = points @ error[:3, :3].T + error[:3, 3] - points
     return np.linalg.norm(moved - moved @ free.T @ free, axis=-1)
 

@@ -20,8 +20,8 @@ class Done:
     """A finished call: its result or exception, and its duration.
 
     Attributes:
-        value: What it gave; None if it raised.
-        error: What it raised.
+        value: Returned value; None if it raised.
+        error: Raised exception; None if it returned.
         seconds: Duration [s].
     """
 

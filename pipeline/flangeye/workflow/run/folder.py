@@ -80,8 +80,8 @@ class RunFolder:
         """Write everything but the log and the report.
 
         Args:
-            result: The run's.
-            recipe: Name -> text of the resolved recipe and what it needs.
+            result: Result of the run.
+            recipe: Contents of the resolved recipe and its files, by name.
 
         Raises:
             FolderError: A file cannot be written.
@@ -107,10 +107,10 @@ class RunFolder:
 
 
 def calibration_yaml(result: Result) -> str:
-    """Return the calibration as other programs take it: translation, quaternion, rpy, matrix.
+    """Return the calibration for other programs: translation, quaternion, rpy, matrix.
 
-    The poses are those for the arm as its controller reports it. Where an error of the arm was
-    found, ``corrected_arm`` has the poses for it corrected, and the correction they hold with.
+    The poses are for the arm as its controller reports it. If errors of the arm were estimated,
+    ``corrected_arm`` has the poses for the corrected arm, with the correction.
     """
     document: dict[str, Any] = {"status": result.status, **_poses(result.transforms)}
     answers = result.answers
@@ -176,17 +176,17 @@ def _pose(name: str, estimate: TransformResult) -> dict[str, Any]:
 def recipe_of_log(
     log: RunLog, registry: Registry, overrides: Sequence[str] = (), name: str | None = None
 ) -> Recipe:
-    """Return the recipe of a run, with the models of its own that its log carries.
+    """Return the recipe of a run, with the user-defined models from its log.
 
     Args:
-        log: The run's; it may be going on, killed or done.
-        registry: The plugins on offer.
-        overrides: Changes to it.
-        name: What to call it; the log's name if not given.
+        log: Log of the run, which may be running, killed or finished.
+        registry: The installed plugins.
+        overrides: Changes to the recipe.
+        name: Name of the recipe; by default the log's.
 
     Raises:
         StageError: The log holds no recipe.
-        RecipeError: It does not fit the plugins that are installed here.
+        RecipeError: The recipe is invalid with the installed plugins.
     """
     text = log.text("recipe.resolved.yaml") or log.text("recipe.yaml")
     if text is None:

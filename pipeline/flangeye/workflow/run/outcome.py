@@ -26,10 +26,10 @@ class Outcome:
 
     Attributes:
         source: Source of the captures.
-        calibration: What the solver gave; a ``VerifiedHandEye`` when every verification passed.
+        calibration: The solver's result; a ``VerifiedHandEye`` if every verification passed.
         verifications: Results of verification, by step label.
         rejections: Captures set aside before solving.
-        refused: Why the calibration was refused.
+        refused: Reason why the calibration was refused.
         seen: The observations that reached the solver.
         scan: The scan of the workpiece.
         seam: The planned seam.
@@ -150,7 +150,7 @@ class Stopwatch:
     Attributes:
         seconds: Duration of each step by label [s].
         calls: Number of calls of each step by label.
-        idle: By label, share of the time in which an arm had nothing to do; None without an arm.
+        idle: Share of the time in which an arm was idle, by label; None without an arm.
     """
 
     def __init__(self) -> None:

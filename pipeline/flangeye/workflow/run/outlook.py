@@ -19,14 +19,14 @@ from flangeye.workflow.run.runner import Runner
 
 @dataclass(frozen=True, eq=False)
 class Outlook:
-    """The calibration that the poses so far would give.
+    """The calibration from the poses so far.
 
     Attributes:
-        residuals: By pose, of those that the solver used [m].
-        set_aside: Why the solver did not use a pose, by pose.
+        residuals: Residuals of the used poses [m], by pose.
+        set_aside: Reason why a pose was not used, by pose.
         error: Predicted 95 % error at the work [m]; None where unknown.
-        missing: What the solver lacks, in its own words: the motion that is missing; else empty.
-        coverage: What of the work the poses have been in, where it is known.
+        missing: The solver's message on the missing motion; empty if there is none.
+        coverage: Part of the workspace covered by the poses, if known.
     """
 
     residuals: dict[str, float] = field(default_factory=dict)
@@ -67,7 +67,7 @@ def outlook(
         recipe: The run's recipe.
         registry: The registry it was checked with.
         seen: Observations so far.
-        source: Where it comes from.
+        source: Provenance of the observations.
     """
     # The truth of a simulation is no business of the solver's.
     runner = Runner(_of_all(recipe), registry, t.ArchivePath())

@@ -17,9 +17,9 @@ class ReplayedStep:
     """Comparison of repeated decisions with those in the log.
 
     Attributes:
-        what: Text of what was decided.
-        same: Whether they are the same.
-        figures: How far they differ, by name with its unit.
+        what: Text that describes the decisions.
+        same: Whether repeated and logged decisions are the same.
+        figures: Differences by name with unit.
     """
 
     what: str
@@ -35,12 +35,12 @@ class Repeat(Protocol):
 
 
 def replay_steps(log: Path, registry: Registry) -> Iterator[tuple[str, ReplayedStep]]:
-    """Yield each step of a log that can be decided again, and how that compares.
+    """Yield the comparison of each step of a log whose decisions can be repeated.
 
-    A step ``weld.tactile`` can, where a plugin offers a part ``replay.tactile``.
+    A step ``weld.tactile`` can be repeated if a plugin has a part ``replay.tactile``.
 
     Raises:
-        StageError: The file cannot be read, or there is no such step in it.
+        StageError: The file cannot be read, or has no such step.
     """
     log = log_of(log)
     steps = dict.fromkeys(note.step for note in read_notes(log))

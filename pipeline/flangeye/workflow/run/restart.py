@@ -1,7 +1,7 @@
 """Starting points of a run: nothing, a log of an earlier run, or a run that ended early.
 
-The runner asks a starting point for what it has; what it has not is done. A log is a source like
-any other.
+The runner asks the starting point for existing results and computes those that are missing. A log
+is a source of captures like any other.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class FromNothing:
 
     @property
     def resumed(self) -> t.Resumed | None:
-        """The captures an earlier run took, whatever became of them."""
+        """All captures of an earlier run, used or not."""
         return None
 
     @property
@@ -82,7 +82,7 @@ class FromNothing:
         return t.Views()
 
     def rejections(self) -> list[t.Rejection]:
-        """Return the captures that were set aside by steps that are not done again."""
+        """Return the captures rejected by steps that are not repeated."""
         return []
 
     def gathered(self) -> Iterator[Gathered]:
@@ -98,7 +98,7 @@ class FromLog(FromNothing):
         log: The log.
         at: Index of the first step to do again.
         kind: Kind of that step.
-        left_out: Captures that take no part.
+        left_out: Captures to leave out.
     """
 
     log: RunLog
@@ -123,7 +123,7 @@ class FromLog(FromNothing):
         """Return the logged inputs of the step ``at``.
 
         Raises:
-            StageError: The log does not hold it.
+            StageError: The log does not contain them.
         """
         if self.kind == "acquire":
             raise StageError("--at the acquire step: that is the whole recipe; leave out --from")
@@ -177,7 +177,7 @@ class FromLog(FromNothing):
         return t.Views() if again else t.Views(self._kept(self.log.views()))
 
     def rejections(self) -> list[t.Rejection]:
-        """Return the captures that were set aside by the steps that are not done again."""
+        """Return the captures rejected by the steps that are not repeated."""
         order = list(KINDS)
         earlier = order[: order.index(self.kind)]
         why = "left out by --leave-out"
@@ -191,9 +191,9 @@ class FromEarlierRun(FromNothing):
     """A run that ended early and is resumed (``--resume``).
 
     Attributes:
-        log: Its log.
-        segments: Whether the recipe segments.
-        retaken: Captures that are taken again; what it had of them is left out.
+        log: Log of the earlier run.
+        segments: Whether the recipe has a segment step.
+        retaken: Captures to repeat; their earlier data are ignored.
     """
 
     log: RunLog
@@ -239,16 +239,16 @@ class FromEarlierRun(FromNothing):
 
 
 def restart_at(log: RunLog, recipe: Recipe, at: str, left_out: Collection[str] = ()) -> FromLog:
-    """Return the starting point that does the step ``at``, and those after it.
+    """Return a starting point from which step ``at`` and the later ones are run.
 
     Args:
-        log: Holds what the steps before gave.
+        log: Log with the results of the earlier steps.
         recipe: The recipe.
         at: A step's index, name or label.
-        left_out: Captures that take no part.
+        left_out: Captures to leave out.
 
     Raises:
-        StageError: There is no such step, or no such capture; names those there are.
+        StageError: There is no such step or capture; the message lists the existing ones.
     """
     for step in recipe.steps:
         if at in (str(step.index), step.stage.name, step.label):
@@ -278,16 +278,15 @@ def earlier_run(
 ) -> tuple[Recipe, FromNothing]:
     """Return the recipe and captures of a run that ended early.
 
-    A run that was stopped in its weld is gone on with at the weld, which goes back and overlaps.
+    A run that stopped in its weld is resumed there; the weld then overlaps the bead.
 
     Args:
         path: The run's folder, or its log.
-        registry: The plugins on offer.
-        retaken: Captures to take again; then the run may have come to its end.
+        registry: The installed plugins.
+        retaken: Captures to repeat; the run may then have finished.
 
     Raises:
-        StageError: There is no such log, it holds no recipe, or the run came to its end; or it has
-            no such capture.
+        StageError: There is no log or no recipe in it, the run finished, or it has no such capture.
     """
     log = read_run(path / "run.mcap" if path.is_dir() else path)
     ended = log.result is not None and not _stopped_in_weld(log.result)
@@ -332,8 +331,8 @@ def restart_hint(recipe: Recipe, called: str, log: Path) -> str:
 
     Args:
         recipe: The recipe of the run.
-        called: Name or path by which the recipe was given.
-        log: The run's log.
+        called: Name or path of the recipe as the user gave it.
+        log: Log of the run.
     """
     later = [step.stage for step in recipe.steps if step.stage.kind != "acquire"]
     whole = recipe.header.log.clouds == "full"

@@ -68,7 +68,7 @@ class Runner:
             start: Starting point: nothing, a log, or a run that ended early.
 
         Raises:
-            StageError: A step cannot do its work with the input it was given.
+            StageError: A step failed on its input.
         """
         _take_buffers()
         truths = Truths()  # nothing that a stage can reach from its arguments holds them
@@ -96,7 +96,7 @@ class Runner:
 
     @property
     def rejections(self) -> Sequence[t.Rejection]:
-        """Captures set aside so far."""
+        """Captures rejected so far."""
         return self._outcome.rejections
 
     def take(self, count: int | None) -> list[t.Observation]:
@@ -152,7 +152,7 @@ class Runner:
             yield observation
 
     def _gathered(self) -> Iterator[t.Observation]:
-        """Log again what an earlier run gathered, so that this log stands by itself."""
+        """Copy the captures of an earlier run to this log, so that it is complete by itself."""
         acquire = self._steps("acquire")[0]
         for capture, flange, observation in self._start.gathered():
             self._hooks.flangeye_captured(step=acquire.label, capture=capture, seconds=0.0)
@@ -165,7 +165,7 @@ class Runner:
                 yield observation
 
     def _finish_acquiring(self) -> None:
-        """Close the source at once, which stops the arm when a solver has enough poses."""
+        """Close the source, which stops the arm once the solver has enough poses."""
         if self._working is not None:  # here, for the collector may do it in one of its threads
             self._working.close()
         if self._captures is not None:
@@ -207,9 +207,9 @@ class Runner:
             yield from self._disambiguated(stream)
 
     def _disambiguated(self, stream: t.Captures, last: bool = False) -> Iterator[t.Observation]:
-        """Yield held-back captures whose pose the arm's motion has decided by now.
+        """Yield ambiguous captures whose pose has been decided by the arm's motion.
 
-        Those of which it does not are set aside after the last capture.
+        Those still undecided after the last capture are rejected.
         """
         from flangeye.estimation.alike import ambiguous, disambiguated
 
@@ -231,10 +231,10 @@ class Runner:
         yield from (one for one in found if one is not None)
 
     def _require_seen(self) -> None:
-        """Refuse captures of which none shows the target, by the reason that most of them share.
+        """Refuse the run if no capture shows the target, with the most frequent reason.
 
         Raises:
-            NothingSeen: None does; with verification views alone there was none to look at.
+            NothingSeen: No capture shows the target.
         """
         why = self._outcome.rejections
         if self._outcome.seen or self._values[t.Views] or not why:
@@ -273,9 +273,9 @@ class Runner:
         return found
 
     def _through(self, capture: t.Capture) -> list[t.Observation]:
-        """Take one capture through segment and fit, and return it with each pose it may show.
+        """Segment and fit one capture, and return it with each pose that it may show.
 
-        It is none where it was set aside, or is kept for verifying.
+        There is no pose if it was rejected or is kept for verification.
         """
         given: dict[Any, Any] = {t.Capture: capture}
         flange = None
@@ -301,7 +301,7 @@ class Runner:
     def _each_fitted(
         self, capture: str, flange: t.FlangeCloud | None, given: dict[Any, Any]
     ) -> list[Any]:
-        """Return what is fitted to each pose that explains a scan; several are not logged yet."""
+        """Return the fit for each pose that explains a scan; ambiguous ones are logged later."""
         if flange is not None and len(flange.others):
             step = self._steps("fit")[0]
             with self._watch.timing(step.label):
@@ -357,14 +357,14 @@ class Runner:
         self._values[t.HandEye] = self._outcome.calibration = found
 
     def _with_expected_error(self, found: t.HandEye) -> t.HandEye:
-        """Return it with the mixed model's expected error, where its solver states none."""
+        """Return a calibration with the mixed model's expected error, if its solver gives none."""
         from flangeye.estimation.calibrate import with_expected_error
 
         cell, given = cell_in(self._values), self._values.get
         return with_expected_error(found, cell, given(ScannerModel), given(t.Box))
 
     def _once(self, step: Step) -> Any:
-        """Do a step that runs once, or take what the starting point says it gave."""
+        """Return the result of a step that runs once: from the starting point, or by running it."""
         if self._start.does(step):
             return self._call(step)
         value = self._start.given(step)
@@ -411,7 +411,7 @@ class Runner:
             self._outcome.exports.append(file)
 
     def _weld(self, truths: Truths) -> None:
-        """Scan the workpiece, plan the seam, weld; what a simulation knows stays in ``truths``."""
+        """Scan the workpiece, plan the seam, and weld; a simulation's truth stays in ``truths``."""
         for step in self._steps("scan"):
             if self._start.does(step) and self._start.simulated:
                 self._acquire()  # the simulated cell is set up again, to scan with
@@ -466,9 +466,9 @@ class Runner:
 
 
 def _take_buffers() -> None:
-    """Make NumPy's and SciPy's OpenBLAS allocate their buffers of 32 MB, which they keep.
+    """Make NumPy's and SciPy's OpenBLAS allocate their permanent buffers of 32 MB now.
 
-    An OpenBLAS that gets no buffer later retries without end, or ends the process.
+    If an allocation fails later, OpenBLAS retries for ever or ends the process.
     """
     from scipy.linalg import cholesky
 
@@ -478,7 +478,7 @@ def _take_buffers() -> None:
 
 
 def _given(step: Step, need: Any, value: Any) -> Any:
-    """Return what a stage asked for; what it cannot do without must be there."""
+    """Return the values that a stage takes; raise if a required one is missing."""
     if value is None and bare(need) is need:
         name = getattr(need, "__name__", str(need))
         raise StageError(f"{step.label}: needs a {name}, and nothing in this run gives one")
@@ -486,13 +486,13 @@ def _given(step: Step, need: Any, value: Any) -> Any:
 
 
 def _refined(found: t.HandEye, before: t.HandEye | None) -> t.HandEye:
-    """Return what a step made of an answer; what the solver knows is not of what it became."""
+    """Return a step's changed calibration, without solver data that no longer applies."""
     stale = before is not None and found.without is before.without
     return replace(found, without=None) if stale else found
 
 
 def _unread_joint(capture: t.Capture) -> str | None:
-    """Return which joint angle is not a number: a driver that had none to give leaves NaN."""
+    """Return a message about a joint angle that is not finite; None if all are finite."""
     joints = () if capture.joints is None else capture.joints.tolist()
     for number, angle in enumerate(joints, 1):
         if not math.isfinite(angle):

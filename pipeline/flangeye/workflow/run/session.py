@@ -27,7 +27,7 @@ class Start:
 
     Attributes:
         archive: Recordings to run on, if any.
-        point: Starting point: nothing, a log, or a run that ended early.
+        point: Source of earlier results: nothing, a log, or a run that ended early.
         motion: Whether the arm may be moved.
     """
 
@@ -57,8 +57,7 @@ def record_run(
         library: A copy of plotly.js that several reports share, if they do.
 
     Raises:
-        FlangeyeError: The run could not come to a result; the log stays once anything was
-            recorded in it.
+        FlangeyeError: The run failed; its log is kept if anything was recorded.
     """
     runner = Runner(recipe, registry, start.archive, start.motion)
     with _logged(recipe, registry, folder):
@@ -72,7 +71,7 @@ def record_run(
 def record_scans(
     recipe: Recipe, registry: Registry, folder: RunFolder, motion: MotionAllowed, count: int
 ) -> None:
-    """Log the first ``count`` flanges that a recipe finds, and solve nothing.
+    """Log the first ``count`` flanges found by a recipe, without solving.
 
     Raises:
         FlangeyeError: As :func:`record_run`.
@@ -85,7 +84,7 @@ def record_scans(
 
 @contextmanager
 def _logged(recipe: Recipe, registry: Registry, folder: RunFolder) -> Iterator[Recorder]:
-    """Log what happens into a folder; remove it when nothing was gathered."""
+    """Log a run into a folder; remove the folder if nothing was recorded."""
     texts = {"recipe.yaml": recipe.text, **recipe.files}
     recorder = None
     try:

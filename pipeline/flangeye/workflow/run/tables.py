@@ -32,18 +32,18 @@ WRITTEN: Mapping[str, Any] = {"number": "number", "rotation": "xyzw", "length": 
 def write_tables(log: RunLog, folder: Path, registry: Registry) -> list[Path]:
     """Write a table for each moving carrier and each camera, and a recipe that reads them.
 
-    The camera tables name whole scans if the log holds them, else the features found in them.
+    Camera tables name the whole scans if the log has them; otherwise they contain the features.
 
     Args:
         log: A run of a recipe with a cell.
-        folder: Where to; made where it is missing.
+        folder: Output folder; created if missing.
         registry: The plugins, to read the run's recipe with.
 
     Returns:
-        The files, the recipe last; beside them a mark where a simulator made them.
+        The files, the recipe last, with a marker file for simulated data.
 
     Raises:
-        StageError: The run is not of a cell, or it holds no sightings.
+        StageError: The run is not of a cell, or has no observations.
     """
     recipe = recipe_of_log(log, registry) if log.has_recipe else None
     if recipe is None or Cell not in recipe.context:
@@ -81,7 +81,7 @@ def _write_scans(log: RunLog, folder: Path) -> dict[str, str]:
 
 
 def _pairs(seen: Sequence[Observation]) -> dict[tuple[str, str], list[Observation]]:
-    """Return the sightings by who saw whom."""
+    """Return the observations by camera and target."""
     pairs: dict[tuple[str, str], list[Observation]] = {}
     for o in seen:
         pairs.setdefault((o.camera, o.target), []).append(o)
@@ -89,7 +89,7 @@ def _pairs(seen: Sequence[Observation]) -> dict[tuple[str, str], list[Observatio
 
 
 def _number(observation: Observation) -> str:
-    """Return the moment of a sighting, which others may share."""
+    """Return the number of an observation's moment, which others may share."""
     return observation.id.removesuffix(f"-{observation.camera}-{observation.target}")
 
 
@@ -103,7 +103,7 @@ def _moved(name: str, cell: Cell, seen: Sequence[Observation]) -> Iterator[Seque
 
 
 def _joints(name: str, seen: Sequence[Observation]) -> list[str]:
-    """Return the columns of an arm's joint angles; none where they were not recorded."""
+    """Return the columns of an arm's joint angles; empty if not recorded."""
     return [f"j{i}_rad" for i, _ in enumerate(seen[0].arm_joints.get(name, ()), 1)]
 
 

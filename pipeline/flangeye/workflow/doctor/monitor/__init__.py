@@ -1,4 +1,4 @@
-"""Check by check, whether a stored calibration still holds."""
+"""Monitoring: a series of checks whether a stored calibration is still valid."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ def from_archive(
             segmented and fitted as the calibration's own recipe did.
         stored: The calibration.
         registry: The plugins on offer.
-        overrides: Where the recordings are read in another way than the calibration's were.
+        overrides: Changes to the calibration's recipe for reading these recordings.
 
     Raises:
-        StageError: It cannot be read, is of another robot, holds scans of the calibration itself,
-            or shows the flange in no scan.
+        StageError: The recordings cannot be read, are of another robot, contain scans of the
+            calibration itself, or show no flange.
     """
     log = log_of(path)
     if log.suffix == ".mcap" and log.is_file():
@@ -61,10 +61,10 @@ def from_arm(
 ) -> MonitorCheck:
     """Return one check from new scans, driving the arm as the calibration's recipe does.
 
-    They are kept in ``checks/<time>`` beside the calibration's log, as those of any run.
+    The scans are stored as a run in ``checks/<time>`` beside the calibration's log.
 
     Raises:
-        NothingMoved: ``move`` is false; the plan.
+        NothingMoved: ``move`` is false; the message is the plan.
         StageError: The recipe drives no arm, or the flange is in none of the scans.
     """
     first = str(_steps(stored)["steps"][0])

@@ -51,13 +51,13 @@ class CheckFinding:
     Attributes:
         check: Index of the check, from 0.
         state: OK, DEGRADED or MOVED.
-        shift: How far the work is off by it, at its worst corner [m].
-        motion: (6,) as a motion of the camera (rotation [rad], translation [m]).
-        since: The first check after the change, if there was one.
-        statistic: The test's, over its threshold.
-        part: What explains it best, in words; empty while nothing changed.
+        shift: Shift of the work at its worst corner [m].
+        motion: (6,) change as a motion of the camera (rotation [rad], translation [m]).
+        since: First check after the change, if there was one.
+        statistic: Test statistic over its threshold.
+        part: Text: the part that explains the change best; empty without a change.
         probability: Probability of that part, among scanner, arm and flange.
-        set_aside: Ids of the scans in which something else than the flange was found.
+        set_aside: Ids of scans in which another object than the flange was found.
     """
 
     check: int
@@ -92,7 +92,7 @@ class History:
         """Read the history file, or return an empty history if it does not exist.
 
         Raises:
-            StageError: It cannot be read, was changed, or is the history of another calibration.
+            StageError: The file cannot be read, was changed, or belongs to another calibration.
         """
         history = cls(path, key)
         if not path.exists():
@@ -119,7 +119,7 @@ class History:
         return history
 
     def sightings(self) -> tuple[list[t.Observation], NDArray[np.intp]]:
-        """Return every sighting, and which check each belongs to."""
+        """Return all observations, and the check of each."""
         seen = [o for check in self.checks for o in check.seen]
         return seen, np.repeat(np.arange(len(self.checks)), [len(c.seen) for c in self.checks])
 

@@ -67,7 +67,7 @@ class StoredCalibration:
         """Refuse a run whose arm has other kinematics.
 
         Raises:
-            StageError: Its flange stands elsewhere with every joint at zero.
+            StageError: Its flange has another pose with all joints at zero.
         """
         ours, theirs = self.arm, _arm_of(log)
         if ours and theirs and not _alike(ours, theirs):
@@ -136,14 +136,14 @@ class StoredCalibration:
         return corrected_flange(seen.base_T_flange.matrix, seen.joints, correction, self.arm)
 
     def _carried(self, seen: t.Observation) -> Floats:
-        """Return where the flange carries what was seen (4, 4)."""
+        """Return the target's pose in the flange (4, 4)."""
         if isinstance(seen.feature, t.PoseFeature):
             return self._mounted
         return rigid(np.eye(3), seen.centre_in_mount)
 
     @cached_property
     def _mounted(self) -> Floats:
-        """Where the flange carries a target of which poses are seen (4, 4), by the calibration."""
+        """Return the pose in the flange (4, 4) of a target with full poses, by the calibration."""
         base_T_camera = self.estimate.transform.matrix
         found = [
             invert(self._flange(o)) @ base_T_camera @ o.feature.camera_T_target.matrix
@@ -182,7 +182,7 @@ def stored_calibration(path: Path) -> StoredCalibration:
 
 
 def _arm_of(log: RunLog) -> Arm | None:
-    """Return the kinematics of a run's arm, where its recipe names a model that is known here."""
+    """Return the kinematics of a run's arm, if its model is available here."""
     recipe = log.text("recipe.resolved.yaml")
     header = parse_yaml(recipe, "recipe").data if recipe else {}
     model = (header.get("robot") or {}).get("model")

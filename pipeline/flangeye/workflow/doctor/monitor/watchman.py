@@ -45,9 +45,10 @@ def take(
 def _without_misfits(
     stored: StoredCalibration, history: History, check: MonitorCheck, test: DriftTest
 ) -> tuple[MonitorCheck, tuple[str, ...]]:
-    """Return a check without scans in which something else was found, and their ids.
+    """Return a check without scans of other objects, and the ids of those scans.
 
-    Only where most of its scans agree that nothing moved: a real move shows in all of them.
+    Scans are removed only if most others agree that nothing moved, as a real move shows in all
+    scans.
 
     Raises:
         StageError: No single change of the cell explains all scans of the check.
@@ -85,7 +86,7 @@ def judge(stored: StoredCalibration, history: History, test: DriftTest) -> Check
 
     Args:
         stored: The calibration.
-        history: Every check, of which the last has no finding yet.
+        history: All checks; the last has no finding yet.
         test: Settings of the test.
     """
     sightings = stored.sightings(*history.sightings())

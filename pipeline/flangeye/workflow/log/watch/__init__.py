@@ -37,11 +37,11 @@ class WaitingFile(io.RawIOBase):
     """A file that is still written: reading at its end waits for more."""
 
     def __init__(self, file: BinaryIO, wait: Callable[[], None]) -> None:
-        """Take a file; ``wait`` is called while there is nothing new, and may raise to give up."""
+        """Wrap a growing file; ``wait`` is called without new data, and may raise to give up."""
         self._file, self._wait = file, wait
 
     def readinto(self, buffer: Buffer) -> int:
-        """Fill the buffer with what is available; wait for one byte at least."""
+        """Read the available bytes into the buffer, waiting for at least one."""
         while not (new := self._file.read(len(memoryview(buffer)))):
             self._wait()
         memoryview(buffer)[: len(new)] = new
@@ -64,7 +64,7 @@ def follow(
 
     Args:
         path: The log.
-        wait: Called while there is nothing new; whatever it raises ends the reading.
+        wait: Called while there is no new data; an exception from it ends the reading.
         note: Called with a sentence about each damaged part.
 
     Raises:
@@ -87,15 +87,15 @@ class RunView:
 
     Attributes:
         name: The run's folder.
-        total: Captures that are expected at most, when known.
-        captures: Captures that arrived.
-        fitted: Those that became an observation.
-        arm: Where the arm was last: position [m], and when [s].
-        progress: What the solver last knew of its error.
-        next: Where the arm goes, and why there: the capture's id, and what it promises.
-        events: The latest lines of the log.
-        newest_ns: When the last message was logged.
-        ended: Whether the run came to its end.
+        total: Largest expected number of captures, if known.
+        captures: Number of captures so far.
+        fitted: Number of captures that became an observation.
+        arm: Last position of the arm [m], with its time [s].
+        progress: The solver's last estimate of its error.
+        next: Next capture's id, and the reason for its pose.
+        events: Latest lines of the log.
+        newest_ns: Time of the last message [ns].
+        ended: Whether the run has ended.
     """
 
     name: str
@@ -313,7 +313,7 @@ def may_look(head: bytes) -> bool:
 
 
 def hidden_address() -> tuple[str, int]:
-    """Return a free loopback address and port, of so many that a web page cannot guess them."""
+    """Return a random free loopback address and port, which a web page cannot guess."""
     host = str(ipaddress.IPv4Address("127.0.0.0") + secrets.randbelow(1 << 24))
     try:
         found = socket.create_server((host, 0))
@@ -352,14 +352,14 @@ def watch_run(run: Path | None, port: int | None, console: Console, patience: fl
     """Show a run until it ends.
 
     Args:
-        run: Its folder or log, which may be still to come; of a folder with later checks of the
-            calibration, the newest. The newest in ``runs/`` when not given.
-        port: Serve Foxglove there, if given.
-        console: Where to show it.
-        patience: Give up when nothing new came for so long [s].
+        run: Folder or log of the run, which need not exist yet; in a folder with later checks the
+            newest one. By default the newest run in ``runs/``.
+        port: Port for serving Foxglove; None does not serve.
+        console: Console for the output.
+        patience: Time without new data after which to give up [s].
 
     Raises:
-        StageError: There is no run, or nothing new came in time.
+        StageError: There is no run, or no new data arrived in time.
     """
     from rich.live import Live
 
@@ -387,7 +387,7 @@ def watch_run(run: Path | None, port: int | None, console: Console, patience: fl
 
 
 def _log_to_come(run: Path | None, patience: float) -> Path:
-    """Return the log as soon as it is there."""
+    """Return the path of the log once it exists."""
     since = time.monotonic()
     while (log := _log_of(run)) is None:
         if time.monotonic() - since > patience:

@@ -32,13 +32,13 @@ def draft_live(cell: RunningCell, questions: Questions, out: Path) -> Draft:
     """Return a recipe for a running arm whose flange, or what it carries, faces a camera beside it.
 
     Args:
-        cell: What runs.
-        questions: For what cannot be seen: the plate, the printed target of a camera of images, the
-            camera's model, where it stands, and the box that the flange may move in.
-        out: Where the recipe will be; the files it names are beside it.
+        cell: The running arm and camera.
+        questions: Answers to what cannot be detected: the plate, the printed target, the camera's
+            model and rough pose, and the box in which the flange may move.
+        out: Path of the recipe; the files it names are beside it.
 
     Raises:
-        RecipeError: An answer is missing, or is none.
+        RecipeError: An answer is missing or invalid.
     """
     plate = questions.ask("plate", "which plate the flange is ('flangeye standards')", PLATE)
     name = questions.ask("scanner", "which scanner ('flangeye scanners')", None, "realsense-d435")
@@ -78,9 +78,9 @@ def _box(flange: Floats, questions: Questions) -> dict[str, Any]:
 
 
 def _view(cell: RunningCell, scanner: ScannerModel, questions: Questions) -> dict[str, Any]:
-    """Return where the camera roughly stands: as the graph has it, else as is answered.
+    """Return the camera's rough pose, from the graph or from an answer.
 
-    Of its direction nothing is asked: it looks at where the flange is now.
+    Its direction is not asked: the camera is assumed to look at the flange's present position.
     """
     if cell.camera is None:
         eye, why = middle_of_view(scanner, cell.flange), "the flange faces it now"

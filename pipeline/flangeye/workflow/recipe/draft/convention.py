@@ -61,13 +61,14 @@ def table_params(
     """Return the parameters with which ``reader.table`` reads the poses of a folder.
 
     Args:
-        tables: Those of the folder.
-        questions: For what they do not show; what the data show is noted there as likely.
-        robot: The arm, if it is known.
-        scans: Whether there are scans beside them.
+        tables: Tables of the folder.
+        questions: Answers to what the tables do not show; likely answers from the data are stored
+            there.
+        robot: The arm, if known.
+        scans: Whether there are scans beside the tables.
 
     Raises:
-        RecipeError: There are no columns of a pose; names the option that says where.
+        RecipeError: There are no columns of a pose; the message names the option for them.
     """
     found = [pose for table in tables for pose in poses_of(table)[0]]
     arm = _arm(tables, found, questions)
@@ -97,7 +98,7 @@ def table_params(
 
 
 def _row_names(table: Table, other: Table | None) -> Column | None:
-    """Return the column that calls the rows; None where all tables merely count theirs."""
+    """Return the column with the rows' names; None if tables only number their rows."""
     tables = [table, *([other] if other and other is not table else [])]
     rests = [poses_of(each)[1] for each in tables]
     column = rests[0].index
@@ -115,7 +116,7 @@ def _of_joints(arm: PoseColumns, questions: Questions, robot: RobotModel | None)
     """Return the parameters of joint angles, which the arm's kinematics turn into poses.
 
     Raises:
-        RecipeError: The arm is not known.
+        RecipeError: The arm is unknown.
     """
     if robot is None:
         raise RecipeError(
@@ -161,7 +162,7 @@ def _alone(arm: PoseColumns) -> str:
 def _arm(
     tables: Sequence[Table], found: Sequence[PoseColumns], questions: Questions
 ) -> PoseColumns:
-    """Return which columns are the arm's."""
+    """Return the columns of the arm's poses."""
     asked = questions.given.get("table")
     given, joints = questions.given.get("columns"), questions.given.get("rotation") == JOINTS[0]
     if given is not None:
@@ -186,7 +187,7 @@ def _arm(
 
 
 def _likeliest(poses: Sequence[PoseColumns], questions: Questions) -> PoseColumns:
-    """Return the poses that are the arm's by their name; of several, of which one says so."""
+    """Return the pose columns that are the arm's, judged by name."""
     named = [p for p in poses if p.role == "arm"]
     nobody = [p for p in poses if p.role is None]
     likely = named or nobody
@@ -217,7 +218,7 @@ def _likeliest(poses: Sequence[PoseColumns], questions: Questions) -> PoseColumn
 
 
 def _in_order(likely: Sequence[PoseColumns]) -> bool:
-    """Return whether poses stand in one text beside or above each other, without any name."""
+    """Return whether unnamed poses are in one text, side by side or one above the other."""
     unnamed = all(not p.called for p in likely)
     return unnamed and len({p.table.files for p in likely}) == 1
 
@@ -277,7 +278,7 @@ def _target(
     arm: PoseColumns,
     questions: Questions,
 ) -> PoseColumns | None:
-    """Return the target's columns: by their name, else others with as many rows."""
+    """Return the target's columns: by name, or else others with the same number of rows."""
     given = questions.given.get("target-columns")
     if given is not None:
         named = [p.table for p in found if p.table is not arm.table and p.role == "target"]
@@ -342,12 +343,12 @@ def _numbers(pose: PoseColumns) -> Floats:
 def _seen_together(
     arm: PoseColumns, target: PoseColumns | None, questions: Questions, robot: RobotModel | None
 ) -> tuple[PoseColumns, PoseColumns | None]:
-    """Return both columns, noting what the arm's poses and the target's show as likely answers.
+    """Return arm's and target's columns, and store likely answers inferred from their poses.
 
-    Numbers without names that turn with the target as joint angles only are joint angles.
+    Unnamed numbers are joint angles if only this interpretation agrees with the target's rotation.
 
     Raises:
-        RecipeError: Numbers without names are neither; halves of a table are not arm and target.
+        RecipeError: Unnamed numbers fit neither, or the halves of a table are not arm and target.
     """
     if target is None or not target.is_pose or len(arm.table.rows) != len(target.table.rows):
         return _within_reach(arm, robot), target
@@ -403,7 +404,7 @@ def _orders(pose: PoseColumns, questions: Questions, prefix: str) -> list[PoseCo
 
 
 def _both(arm: PoseColumns, target: PoseColumns) -> tuple[Floats, Floats]:
-    """Return the numbers of both, row by row, where both have all of them."""
+    """Return the numbers of arm and target in rows where both are complete."""
     order, _ = rows_together(arm.table, target.table, _row_names(arm.table, target.table))
     numbers, seen = _numbers(arm), _numbers(target)[order]
     kept = np.isfinite(numbers).all(axis=1) & np.isfinite(seen).all(axis=1)
@@ -466,7 +467,7 @@ def _writings(
 
 
 def _as_angles(pose: PoseColumns, numbers: Floats, robot: RobotModel | None) -> list[Writing]:
-    """Return joint angles as what numbers may mean, where the arm has as many joints."""
+    """Return joint angles as a hypothesis, if the arm has this number of joints."""
     if robot is None or len(robot.joints) != numbers.shape[1] or not pose.may_be_joints:
         return []
     angles = as_joints(pose)
@@ -489,7 +490,7 @@ def _has_angles(rotation: str) -> bool:
 def _written(
     pose: PoseColumns, questions: Questions, prefix: str, maker: str | None
 ) -> dict[str, Any]:
-    """Return how a pose or a point is written: rotation, units, columns, and which way round."""
+    """Return the notation of a pose or point: rotation, units, columns, and direction."""
     numbers = _numbers(pose)
     rotation = questions.given.get(f"{prefix}rotation") or _rotation(pose, questions, prefix, maker)
     length = questions.given.get(f"{prefix}length") or _length(numbers, pose)
@@ -572,7 +573,7 @@ def _angle(numbers: Floats, pose: PoseColumns) -> str:
 
 
 def _direction(pose: PoseColumns, questions: Questions, prefix: str) -> str:
-    """Return which way round poses are: as asked, or by the data, or by a name."""
+    """Return the direction of poses: by an answer, by the data, or by a name."""
     ways = WAYS[prefix]
     named = ways[is_inverse(pose.frames)] if pose.frames else None
     likely = questions.likely.get(f"{prefix}pose")

@@ -1,8 +1,8 @@
-"""Infer from numbers alone which are poses, in which convention, and where the camera is mounted.
+"""Infer poses, their convention and the camera's mounting from the numbers alone.
 
-Between two captures arm and target turn by the same angle, whatever the frames: a convention in
-which they do not is the wrong one. A camera in the hand and one beside the robot, and a target's
-pose either way round, leave different residuals of A X = X B.
+Between two captures arm and target rotate by the same angle, in any frames. A convention in which
+they do not is wrong. The residual of A X = X B distinguishes a camera on the flange from one beside
+the robot, and a target's pose from its inverse.
 """
 
 from __future__ import annotations
@@ -155,7 +155,7 @@ def _of_seven(table: Table, part: list[int], numbers: Floats, told: str) -> Pose
 
 
 def _quaternion_at(numbers: Floats) -> int | None:
-    """Return where in seven columns a quaternion begins; None where none does."""
+    """Return the index in seven columns at which a quaternion begins; None without one."""
     for first in (3, 0):
         norms = np.linalg.norm(numbers[:, first : first + 4], axis=1)
         if np.nanmax(np.abs(norms - 1)) < ROUNDED:
@@ -166,7 +166,7 @@ def _quaternion_at(numbers: Floats) -> int | None:
 def _of_six(table: Table, part: list[int], numbers: Floats, told: str) -> PoseColumns:
     """Return which three of six numbers are the position.
 
-    They are the only ones that exceed any angle, otherwise the first three.
+    These are the three that exceed any angle; if that is not unique, the first three.
     """
     if "joint" in table.name.lower():
         return PoseColumns(table, tuple(part), JOINTS, guess=told)
@@ -210,11 +210,11 @@ class Writing(NamedTuple):
 
 @dataclass(frozen=True)
 class Choice:
-    """The best hypothesis, and by how much it beats the next.
+    """The best hypothesis, with its evidence.
 
     Attributes:
-        arm: How the arm's poses are written.
-        target: How the target's are.
+        arm: Notation of the arm's poses.
+        target: Notation of the target's poses.
         told: Text that states the evidence for the choice.
     """
 
@@ -230,9 +230,9 @@ def writing_of(
 
     Args:
         arm: (N, k) numbers of the arm's poses.
-        arms: What they may mean.
-        target: (N, m) numbers of the target's.
-        targets: What those may mean.
+        arms: Hypotheses for these numbers.
+        target: (N, m) numbers of the target's poses.
+        targets: Hypotheses for these numbers.
     """
     if len(arm) != len(target) or len(arm) < FEWEST_PAIRS:
         return None
@@ -260,9 +260,9 @@ def writing_of(
 def _by_places(
     arm: Floats, target: Floats, alike: Sequence[tuple[Writing, Writing]]
 ) -> Choice | None:
-    """Return which of several writings leaves the target in one place; None where none does best.
+    """Return the notation with the smallest scatter of the target's position; None if undecided.
 
-    Quaternions whose numbers are all permuted turn by the same angles, so angles decide nothing.
+    Permuted quaternions rotate by the same angles, so angles alone cannot decide.
     """
     some = np.linspace(0, len(arm) - 1, min(len(arm), MOST_PAIRS)).astype(int)
     tried = []
@@ -280,9 +280,9 @@ def _by_places(
 
 
 def _apart(one: Floats, other: Floats) -> float:
-    """Return the median difference of angles [rad], as for turns of a radian.
+    """Return the median relative difference of angles, scaled to rotations of 1 rad [rad].
 
-    Radians that are read as degrees turn by next to nothing, and would differ by less than that.
+    Without scaling, radians misread as degrees would give tiny angles with tiny differences.
     """
     size = float(np.median(one))
     return float(np.median(np.abs(one - other))) / min(max(size, 1e-6), 1.0)
@@ -309,18 +309,18 @@ class Mounting(NamedTuple):
 def mounting_of(
     arm: Floats, seen: Floats, cameras: Sequence[str], targets: Sequence[str]
 ) -> Mounting | None:
-    """Return the mounting that fits; None where none does, or several do.
+    """Return the mounting that fits the data; None if none or several fit.
 
     A camera on the flange with ``camera_T_target`` and one beside the robot with
-    ``target_T_camera`` are one equation with its unknowns exchanged, so no data can decide:
-    of such twins it is the one whose target is written as ``targets`` begins.
+    ``target_T_camera`` give the same equation with exchanged unknowns, so data cannot distinguish
+    them. The one whose target's direction comes first in ``targets`` is returned.
 
     Args:
-        arm: (N, 4, 4) base_T_flange [m].
-        seen: (N, 4, 4) poses of the target as they stand in the file, or (N, 3) its centres [m].
-        cameras: What may carry the camera: base, flange.
-        targets: What the target's poses may be, the likelier first: camera_T_target,
-            target_T_camera.
+        arm: (N, 4, 4) ``base_T_flange`` [m].
+        seen: (N, 4, 4) poses of the target as written in the file, or (N, 3) its centres [m].
+        cameras: Possible carriers of the camera: base, flange.
+        targets: Possible directions of the target's poses, the more likely first:
+            ``camera_T_target``, ``target_T_camera``.
     """
     if len(arm) < FEWEST_PAIRS:
         return None
@@ -373,9 +373,9 @@ def _residual_of_centres(arm: Floats, seen: Floats, in_hand: bool) -> float:
 
 
 def _residual(carried: Floats, seen: Floats) -> float | None:
-    """Return the median distance of the target's places from one another [m].
+    """Return the median distance between the target's positions [m].
 
-    None where the motions do not determine it.
+    None if the motions do not determine it.
     """
     try:
         motions = motions_of(carried, seen)

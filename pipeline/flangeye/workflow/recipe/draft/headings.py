@@ -1,9 +1,7 @@
-"""What the columns of a table are called, and the poses, points and joint angles they hold.
+"""Infer the meaning of a table's columns from their names: poses, points, joint angles.
 
-What a name reveals about poses: whose they are, and which way round.
-
-A name of two frames says both: ``gripper2base`` is a pose of the arm, ``camera_T_target``,
-``T_cam_board`` and ``cHt`` are the target's as the camera sees it.
+A name of two frames gives owner and direction of a pose: ``gripper2base`` is a pose of the arm, and
+``camera_T_target``, ``T_cam_board`` and ``cHt`` are the target's pose in the camera.
 """
 
 from __future__ import annotations
@@ -103,14 +101,14 @@ class PoseColumns:
     """Columns that hold a pose, a point or joint angles, inferred from names and numbers.
 
     Attributes:
-        table: Where.
-        columns: Names or numbers from 1; position first, then the rotation.
-        rotations: What the rotation may be written as; one where it is known, ``point`` for none,
-            :data:`JOINTS` for joint angles.
-        called: What names it: the columns' common name; empty where they have none.
-        length: Unit of the position that a name states.
-        angle: The same for angles.
-        guess: Text of what was concluded from the numbers alone; empty if names decide.
+        table: Table with the columns.
+        columns: Names or numbers from 1: position first, then rotation.
+        rotations: Possible notations of the rotation; ``point`` without one, :data:`JOINTS` for
+            joint angles.
+        called: Common name of the columns; empty without one.
+        length: Unit of the position, if stated in a name.
+        angle: Unit of the angles, if stated in a name.
+        guess: Text on what was inferred from the numbers alone; empty if names decide.
         parent_first: Whether base_to_tool names the tool's pose in the base, as ROS does.
     """
 
@@ -188,15 +186,15 @@ class Group:
 
 @dataclass(frozen=True)
 class Headings:
-    """What a table's heading names beside poses: times, scans, joints.
+    """Columns of a table other than poses: times, scans, joints.
 
     Attributes:
         scan: Column of the scans' names.
-        index: Column of whole numbers that count the rows, or that call them.
+        index: Column of whole numbers that number or name the rows.
         time: Column of the time.
-        time_unit: Its unit.
+        time_unit: Unit of the time.
         joints: Columns of joint angles.
-        joint_unit: Their unit, from a name.
+        joint_unit: Unit of the joint angles, if stated in a name.
     """
 
     scan: Column | None = None
@@ -276,17 +274,17 @@ def _is_file(table: Table, index: int) -> bool:
 
 
 def _is_quaternion(table: Table, name: str) -> bool:
-    """Return whether q1 is of a quaternion, q1 to q4 as ABB has it, or q0 to q3."""
+    """Return whether q1 belongs to a quaternion: q1 to q4 (as in ABB), or q0 to q3."""
     alike = re.compile(re.escape(name.lower()[:-1]) + r"\d")
     called = sorted(each[-1] for each in table.heading if alike.fullmatch(each.lower()))
     return name.lower()[-2:-1] == "q" and "".join(called) in ("1234", "0123")
 
 
 def lists_in(names: Sequence[str]) -> dict[str, str]:
-    """Return the list of each column that is an entry of one: ``pose`` of ``pose.3.3``.
+    """Return the list name of each column that is an entry of a list: ``pose`` of ``pose.3.3``.
 
-    Columns of text that are counted are one too, where they are as many as a pose, or a part of
-    one, has numbers: ``tvec`` of ``tvec_0`` or ``tvec[0]``.
+    Numbered columns form a list too, if their number is that of a pose or a part of one: ``tvec``
+    of ``tvec_0`` or ``tvec[0]``.
     """
     found = {name: entry for name in names if (entry := entry_of_list(name))}
     sizes = Counter(listed for listed, _ in found.values())
@@ -339,9 +337,9 @@ def _time(words: Sequence[str]) -> tuple[bool, str | None]:
 def _put(
     groups: dict[str, Group], name: str, words: list[str], listed: bool, ordered: bool
 ) -> None:
-    """Put a column where it belongs: ``robot_x_mm`` is the x of ``robot``, in millimetres.
+    """Assign a column by its name: ``robot_x_mm`` is the x of ``robot`` in millimetres.
 
-    Four listed numbers are a quaternion, whatever they are called.
+    A list of four numbers is a quaternion, whatever its name.
     """
     last = words[-1].lower()
     unit = words.pop().lower() if last in (*LENGTHS, *ANGLES) and len(words) > 1 else None
@@ -373,7 +371,7 @@ def _is_axis(word: str) -> bool:
 
 
 def _without(words: list[str], parts: Sequence[str]) -> tuple[str, list[str]]:
-    """Return which part of a pose the last or the first word says, and the others."""
+    """Return the part of a pose named by the last or first word, and the other words."""
     for at in (len(words) - 1, 0):
         if words and words[at].lower() in parts:
             return words[at].lower(), words[:at] + words[at + 1 :]
@@ -391,7 +389,7 @@ def _put_list(groups: dict[str, Group], words: list[str], listed: str, size: int
 
 
 def _pose(table: Table, group: Group) -> PoseColumns | None:
-    """Return what a group of columns holds; None where it has no position."""
+    """Return a group of columns as a pose or point; None without a position."""
     stated = (group.words, group.length, group.angle)
     if group.whole is not None:
         usual = _POSES[group.many]
@@ -437,7 +435,7 @@ def _matrix_entries(group: Group) -> tuple[Column, ...]:
 
 
 def _counted(group: Group) -> dict[str, tuple[Column, ...]]:
-    """Return the columns that a letter and a number call, by the letter, where none is missing."""
+    """Return complete series of columns named by a letter and a number, by the letter."""
     found: dict[str, dict[int, Column]] = {}
     for name, column in group.columns.items():
         if match := re.fullmatch(r"([a-z]+)(\d+)", name):
@@ -465,7 +463,7 @@ def frames_in(name: str) -> tuple[str, str] | None:
 
 
 def named_parent_first(*poses: PoseColumns) -> bool:
-    """Return whether poses would all be inverse if base_to_tool meant what base2tool does."""
+    """Return whether ``base_to_tool`` must mean the tool in the base, unlike ``base2tool``."""
     named = all(_TO.search(pose.name) for pose in poses)
     return named and all(pose.frames and is_inverse(pose.frames) for pose in poses)
 

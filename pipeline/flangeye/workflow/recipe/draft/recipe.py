@@ -45,9 +45,9 @@ class Draft:
     """A drafted recipe, and the notes about it.
 
     Attributes:
-        text: YAML.
+        text: The recipe as YAML.
         told: Lines about what was found in the archive.
-        files: Texts of files that it names.
+        files: Contents of the files that it names.
     """
 
     text: str
@@ -61,13 +61,13 @@ def draft_recipe(
     """Return a recipe for a surveyed folder.
 
     Args:
-        survey: What the folder holds.
-        out: Where the recipe will be; its paths start there.
-        questions: For what cannot be seen.
-        registry: The plugins on offer.
+        survey: Contents of the folder.
+        out: Path of the recipe, to which its paths are relative.
+        questions: Answers to what cannot be detected.
+        registry: The installed plugins.
 
     Raises:
-        FlangeyeError: Something is missing that no answer gives; the message has the line to add.
+        FlangeyeError: Required information is missing; the message has the line to add.
     """
     unread = _convertible(survey, 1)
     read = survey.tables or survey.clouds or survey.of((*IMAGES, ".mcap", ".db3"))
@@ -193,7 +193,7 @@ def _missing(survey: FolderSurvey, reason: StageError) -> str:
 
 
 def _convertible(survey: FolderSurvey, count: int) -> RecipeError | None:
-    """Return the error that recordings have to be converted; None where there are not as many."""
+    """Return an error if recordings must be converted first; None if not."""
     bag = (
         "is a ROS 1 bag; convert it: pip install rosbags && rosbags-convert --src {file} "
         "--dst {stem}"
@@ -243,9 +243,10 @@ def _what(archive: Archive, questions: Questions) -> tuple[str, dict[str, Any]]:
 
 
 def _shows_print(records: Sequence[Recording], questions: Questions) -> bool:
-    """Whether a printed target in images is meant: they are alone, or beside depth images.
+    """Return whether the target is a printed one in images.
 
-    Beside these it is what was asked for, or what an image shows where nothing was.
+    It is if there are only images. Beside depth images the answer decides, or without one the
+    content of an image.
     """
     from flangeye.models.corners import board_seen
 
@@ -300,7 +301,7 @@ def printed_target(images: Iterable[tuple[str, Any]], questions: Questions) -> d
 
 
 def _some_images(records: Sequence[Recording]) -> Iterator[tuple[str, Any]]:
-    """Yield name and pixels of the first, middle and last image, where they can be read."""
+    """Yield name and pixels of the first, middle and last image, if readable."""
     import cv2
 
     paths = [r.image for r in records if r.image is not None]
@@ -397,7 +398,7 @@ def _has_plate(robot: Mapping[str, Any]) -> bool:
 
 
 def _configuration(target: Mapping[str, Any], questions: Questions) -> dict[str, Any]:
-    """Return who carries what; empty for a camera beside the robot that sees its flange."""
+    """Return the configuration section; empty for a camera that sees the flange."""
     question = "where the camera is mounted (base or flange)"
     carried = questions.ask("camera", question, "base", check=one_of("base", "flange"))
     if carried not in ("base", "flange"):

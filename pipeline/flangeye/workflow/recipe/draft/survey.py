@@ -1,4 +1,4 @@
-"""Survey a folder of recordings, and ask a person what it does not show."""
+"""Survey a folder of recordings, and ask the user what it does not show."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ def one_of(*choices: str) -> Check:
 
 @dataclass
 class Questions:
-    """Answers to questions: from options, evidence, or a person.
+    """Answers to questions: from options, from the data, or from the user.
 
     Attributes:
-        given: Answers by option, from the command line or a person; None where not given.
-        prompt: Asks a person; None where there is no terminal.
-        assumed: Lines on the defaults that were used, to print at the end.
-        likely: By option, the answer that the data suggest, and the evidence for it.
+        given: Answers by option, from the command line or the user; None if not given.
+        prompt: Asks the user; None without a terminal.
+        assumed: Lines on the defaults used, to print at the end.
+        likely: Likely answers from the data with their evidence, by option.
     """
 
     given: dict[str, str | None] = field(default_factory=dict)
@@ -108,11 +108,11 @@ class FolderSurvey:
     """The contents of a folder of recordings.
 
     Attributes:
-        folder: Where.
-        files: All files of the folder, and of the folders in it.
-        tables: Those that are tables of numbers.
-        points: Texts and archives of arrays that hold a cloud each.
-        cameras: Calibrations of a camera.
+        folder: Path of the folder.
+        files: All files of the folder and its subfolders.
+        tables: Files that are tables of numbers.
+        points: Text files and archives of arrays with one cloud each.
+        cameras: Calibration files of a camera.
     """
 
     folder: Path
@@ -190,10 +190,10 @@ def look(folder: Path) -> FolderSurvey:
 
 
 def _where_files_are(folder: Path) -> Path:
-    """Return a folder, or the one in it, and in that, which alone holds anything.
+    """Return a folder, or its only non-empty subfolder, recursively.
 
     Raises:
-        RecipeError: Files stand only in several folders below; names one.
+        RecipeError: There are files in several subfolders only; the message names one.
     """
     inner = [path for path in folder.iterdir() if not path.name.startswith(".")]
     while len(inner) == 1 and inner[0].is_dir():
@@ -209,7 +209,7 @@ def _where_files_are(folder: Path) -> Path:
 
 
 def places(folder: Path, files: Sequence[Path]) -> Iterator[tuple[str, list[Path]]]:
-    """Yield files as a recipe names them; files named alike share one pattern."""
+    """Yield files as named in a recipe; files with similar names share one pattern."""
     groups: dict[str, list[Path]] = defaultdict(list)
     known = (
         ".csv", ".txt", ".dat", ".tsv", ".tum", ".log", ".mod", ".src", ".ls", ".script", *KINDS,
@@ -231,10 +231,10 @@ def places(folder: Path, files: Sequence[Path]) -> Iterator[tuple[str, list[Path
 
 
 def _series(folder: Path, files: Sequence[Path]) -> Iterator[tuple[str, list[Path]]]:
-    """Yield files named alike but for numbers, by pattern; those of several cameras apart.
+    """Yield groups of files whose names differ in numbers only, by pattern.
 
-    Numbers before the last part them where the last are the same in two parts, ``cam0_7`` and
-    ``cam1_7``; those of dates and times do not.
+    Files of several cameras form separate groups: an earlier number separates them if the last
+    number occurs twice (``cam0_7`` and ``cam1_7``), unless it belongs to a date or time.
     """
     runs = [re.split(r"(\d+)", file.stem) for file in files]
     parts: dict[tuple[str, ...], list[int]] = defaultdict(list)
@@ -257,7 +257,7 @@ def _series(folder: Path, files: Sequence[Path]) -> Iterator[tuple[str, list[Pat
 
 
 def _tables(folder: Path, place: str, files: int) -> list[Table]:
-    """Return the tables of poses in a file, or the one that files with a pose each are together."""
+    """Return the tables of poses in a file, or one table for files with one pose each."""
     try:
         found = [read_table(folder, place)] if files > 1 else tables_in(folder, place)
     except FlangeyeError:
@@ -267,7 +267,7 @@ def _tables(folder: Path, place: str, files: int) -> list[Table]:
 
 
 def _by_whom(folder: Path, table: Table) -> list[Table]:
-    """Return the rows of the arm and those of the target, where a column says whose each row is."""
+    """Return the rows of arm and target, if a column names the owner of each row."""
     for column in range(len(table.heading)):
         called = [str(name) for name in dict.fromkeys(table.texts(column))]
         few = len(called) * MIN_CAPTURES <= len(table.rows)
@@ -284,9 +284,9 @@ def _holds_numbers(table: Table) -> bool:
 
 
 def _whole(folder: Path, tables: Sequence[Table]) -> list[Table]:
-    """Return tables with rotations joined to the positions that are named as they are.
+    """Return tables with rotations joined to positions of the same name.
 
-    Points without as many poses beside them are left out.
+    Points without the same number of poses are left out.
     """
     keys = {table.name: _key(table.name) for table in tables if _width(table) in (3, 9)}
     joined: list[Table] = []

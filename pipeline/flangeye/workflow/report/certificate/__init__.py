@@ -42,13 +42,13 @@ def write_certificate(
 
     Args:
         run: The run's folder or its ``run.mcap``.
-        path: The file; by default ``certificate.html`` beside the log.
-        conditions: Conditions of the place, as stated by the user.
-        camera: For a cell, the camera that is certified.
+        path: Path of the file; by default ``certificate.html`` beside the log.
+        conditions: Ambient conditions stated by the user.
+        camera: The certified camera, for a cell.
 
     Raises:
-        StageError: There is no log, no calibration in it, it is of a cell and no camera was
-            chosen, or the file cannot be written.
+        StageError: There is no log or no calibration in it, no camera of a cell was chosen, or the
+            file cannot be written.
     """
     log = run / "run.mcap" if run.is_dir() else run
     facts = facts_of(read_run(log))
@@ -60,10 +60,10 @@ def write_certificate(
 
 
 def print_pdf(page: Path) -> Path | None:
-    """Print a page to a PDF beside it, with Chromium; None where there is none.
+    """Print a page to a PDF beside it with Chromium; return None if Chromium is not installed.
 
     Raises:
-        StageError: Chromium is there and does not print, or not all of it.
+        StageError: Chromium fails to print the complete page.
     """
     names = ("chromium", "chromium-browser", "google-chrome", "chrome")
     browser = next(filter(None, map(shutil.which, names)), None)
@@ -107,7 +107,7 @@ def standard_text(row: Contribution | Share) -> str:
 
 
 def part_text(metres: float) -> str:
-    """Return how far one contribution moves the point along an axis [mm]."""
+    """Return one contribution's displacement of the point along an axis, as text [mm]."""
     if metres == 0:
         return "–"
     return millimetres(metres) if abs(metres) >= LEAST_LENGTH / 2 else "< 0.001"
@@ -133,7 +133,7 @@ def _content(facts: Facts, conditions: Conditions) -> dict[str, Any]:
 
 
 def _objects(facts: Facts, scanner: ScannerModel | None) -> list[tuple[str, str]]:
-    """Return what was calibrated with what: name and value."""
+    """Return names and values of the calibrated devices and the target."""
     rows = {
         "Robot": str(facts.section("robot").get("model", "")),
         "Scanner": f"{scanner.maker} {scanner.model}" if scanner else "",
@@ -145,7 +145,7 @@ def _objects(facts: Facts, scanner: ScannerModel | None) -> list[tuple[str, str]
 
 
 def _target(facts: Facts) -> str:
-    """Return what was seen, in words."""
+    """Return a text that describes the target."""
     if targets := facts.section("cell").get("targets"):
         return ", ".join(map(str, targets)) if isinstance(targets, dict) else ""
     if body := facts.section("target").get("body"):

@@ -3,7 +3,8 @@ r"""The uncertainty of a point that the calibration maps, contribution by contri
 The calibration's own uncertainty is that of six correlated quantities, a rotation
 :math:`\varphi` and a translation :math:`\tau` about the point :math:`q` of ``result.json``. A
 point :math:`p` is moved by :math:`\varphi \times (p - q) + \tau`, so the sensitivities are
-:math:`-[p - q]_\times` and one. Whoever *uses* the matrix adds what happens anew at every point.
+:math:`-[p - q]_\times` and one. A user of the matrix has to add contributions that occur anew at
+every point, such as the robot's repeatability.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ def propagated(sensitivities: Floats, standard: Floats, correlation: Floats) -> 
     Args:
         sensitivities: (m, n) derivatives of the results by the inputs.
         standard: (n,) standard uncertainties of the inputs.
-        correlation: (n, n) of the inputs.
+        correlation: (n, n) correlation matrix of the inputs.
     """
     scaled = np.asarray(sensitivities) * standard
     return np.asarray(scaled @ correlation @ scaled.T)
@@ -50,7 +51,7 @@ def effective_freedom(contributions: Floats, freedoms: Floats) -> float:
 
     Args:
         contributions: (n,) standard uncertainties of the parts, in the unit of the result.
-        freedoms: (n,) degrees of freedom of each; infinite where it is known.
+        freedoms: (n,) degrees of freedom of each part; infinite for a known one.
     """
     fourth = float(np.sum(np.asarray(contributions) ** 4 / freedoms))
     total = float(np.sum(np.asarray(contributions) ** 2))
@@ -58,7 +59,7 @@ def effective_freedom(contributions: Floats, freedoms: Floats) -> float:
 
 
 def coverage_factor(freedom: float, probability: float = 0.95) -> float:
-    """Return k with which k times the standard uncertainty holds ``probability`` (Student's t)."""
+    """Return the coverage factor k for a coverage probability (Student's t)."""
     from scipy.special import ndtri, stdtrit
 
     upper = 0.5 * (1.0 + probability)
@@ -67,13 +68,13 @@ def coverage_factor(freedom: float, probability: float = 0.95) -> float:
 
 @dataclass(frozen=True)
 class Conditions:
-    """Conditions that a person states, for they are not measured.
+    """Ambient conditions stated by the user, as they are not measured.
 
     Attributes:
         temperature: Temperature of the air [°C], or None.
-        spread: Between the coldest and the warmest moment of use [K], or None.
-        place: Where it was done.
-        operator: Who did it.
+        spread: Difference between highest and lowest temperature during use [K], or None.
+        place: Place of the calibration.
+        operator: Name of the operator.
     """
 
     temperature: float | None = None
@@ -87,14 +88,14 @@ class Contribution:
     """One row of a budget.
 
     Attributes:
-        name: The input quantity.
-        kind: How it was evaluated: A from a series of measurements, B otherwise.
-        standard: Its standard uncertainty [rad or m].
+        name: Name of the input quantity.
+        kind: Type of evaluation: A from a series of measurements, B otherwise.
+        standard: Standard uncertainty [rad or m].
         unit: ``rad`` or ``m``.
         sensitivity: (3,) derivative of the point's coordinates by it.
-        freedom: Degrees of freedom; infinite where it is taken as known.
+        freedom: Degrees of freedom; infinite for a known uncertainty.
         evidence: Source of the figure.
-        bound: Whether no such error was seen: ``standard`` is then the size that could stay unseen.
+        bound: Whether no such error was detected; ``standard`` is then the detection limit.
     """
 
     name: str
@@ -134,7 +135,7 @@ class Budget:
 
     @property
     def standard(self) -> Floats:
-        """(3,) combined standard uncertainty along x, y, z [m]."""
+        """Combined standard uncertainty (3,) along x, y, z [m]."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     @property
@@ -169,10 +170,10 @@ class Budget:
 
 
 def budget_of(result: Result) -> Budget:
-    """Return the budget of the calibration alone, at the least certain corner of the work.
+    """Return the calibration's own budget at the least certain corner of the workspace.
 
     Raises:
-        StageError: The run gave no calibration, or nothing says where the work is.
+        StageError: The run has no calibration, or the workspace is unknown.
     """
     _, estimate = _estimate_of(result)
     point = _worst_corner(result, estimate)
@@ -214,11 +215,11 @@ def use_budget_of(
 
 @dataclass(frozen=True)
 class Share:
-    """How much of the calibration's variance at the work one cause explains.
+    """The part of the calibration's uncertainty at the work due to one cause.
 
     Attributes:
         cause: The cause.
-        standard: Its part, one standard uncertainty [m].
+        standard: Standard uncertainty due to it [m].
         evidence: Source of the figure.
     """
 
