@@ -74,8 +74,7 @@ class ArcedArm(Device):
 
     def _watch(self, now: int) -> None:
         # None comes from a source that does not measure it: only a clear no counts
-        burning = self.arc.burning()
-        if burning is not False:
+        if self.arc.burning() is not False:
             self._out_ns = now
             return
         begun = now - self._lit_ns > self._times.ignition * 1e9
@@ -106,11 +105,11 @@ class ArcedArm(Device):
         """End the arc at once; the gas flows on for its post-flow time."""
         if self._level == OFF:
             return
-        # After an arc gas shields the bead while it cools; without one there is nothing to shield
         burned, self._level = self._level == BURN, OFF
         self.arc.burn(False)
-        after = self._times.gas_after * burned
-        self._flows_until = self._robot.state().time_ns + round(after * 1e9)
+        self._flows_until = self._robot.state().time_ns
+        if burned:  # gas shields the bead while it cools; without an arc there is none
+            self._flows_until += round(self._times.gas_after * 1e9)
 
     def move_joints(self, joints: Floats, speed: float, acceleration: float) -> None:
         """Move to joint angles, without an arc."""

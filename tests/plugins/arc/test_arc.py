@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import time
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -74,10 +75,12 @@ def test_gas_comes_before_the_arc_and_flows_on_after_it() -> None:
     lead(arm, BURN, 3)
     assert arc.history == [("gas", True), ("burn", False), ("gas", True), ("burn", True)]
     del arc.history[:]
-    lead(arm, OFF)
+    lead(arm, OFF, round(0.05 / arm.period))
     assert arc.history == [("burn", False)]
-    lead(arm, OFF, round(0.05 / arm.period) + 1)
+    lead(arm, OFF)
     assert arc.history == [("burn", False), ("gas", False)]
+    lead(arm, OFF, 5)
+    assert len(arc.history) == 2
 
 
 def test_gas_that_no_arc_followed_flows_no_longer() -> None:
@@ -108,14 +111,48 @@ def test_whatever_else_the_arm_is_told_ends_the_arc(stop: Any) -> None:
     assert not arc.burning()
 
 
-def test_an_arc_that_goes_out_is_no_weld() -> None:
+@pytest.mark.parametrize(
+    ("ignition", "burns", "noticed"),
+    [("0.3 s", 0.0, 0.3), ("0 s", 0.0, 0.2), ("0.3 s", 0.05, 0.3), ("0.3 s", 0.4, 0.6)],
+)
+def test_an_arc_that_goes_out_is_no_weld(ignition: str, burns: float, noticed: float) -> None:
     arc = SimulatedArc()
-    arm = arced(arc, ignition="0 s")
-    lead(arm, BURN, 20)
+    arm = arced(arc, ignition=ignition)
+    lead(arm, GAS, 200)
+    lead(arm, BURN)
+    lead(arm, BURN, round(burns / arm.period))
     arc.burn(False)
+    lead(arm, BURN, round((noticed - burns) / arm.period))
     with pytest.raises(DeviceError, match="simulated power source: the arc does not burn"):
-        lead(arm, BURN, 400)
-    assert not arm.arc.burning()
+        lead(arm, BURN)
+    assert arc.history[-1] == ("burn", False)
+    lead(arm, OFF, 2000)
+    assert arc.history[-1] == ("gas", False)
+
+
+def test_an_arm_that_nobody_told_of_an_arc_leaves_the_gas_shut() -> None:
+    arc = SimulatedArc()
+    arm = arced(arc)
+    for _ in range(3):
+        arm.wait_cycle()
+        arm.move_velocity(STILL, 0.5)
+    arm.stop()
+    assert arc.history == []
+
+
+@pytest.mark.parametrize(("gas_after", "flows"), [("50 ms", 0.05), ("30 s", 1.5)])
+def test_an_arm_that_is_let_go_of_shields_its_bead_as_long_as_a_guard_may_take(
+    gas_after: str, flows: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arc = SimulatedArc()
+    arm = arced(arc, gas_after=gas_after)
+    lead(arm, BURN)
+    since = arm.cycles
+    clock = SimpleNamespace(monotonic=lambda: 100.0 + arm.cycles * arm.period)
+    monkeypatch.setattr("flangeye.motion.arc.time", clock)
+    arm.close()
+    assert (arm.cycles - since) * arm.period == pytest.approx(flows, abs=1.1 * arm.period)
+    assert arc.history[-1] == ("gas", False)
 
 
 def test_an_arm_that_cannot_be_told_to_stop_has_no_arc_all_the_same() -> None:
