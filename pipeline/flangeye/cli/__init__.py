@@ -21,11 +21,7 @@ def main() -> None:
     # wait for each other, which costs a run twice its seconds. Read when numpy is imported
     for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
-    end_in_words(_command)
-
-
-def _command() -> None:
-    commands()()
+    end_in_words(lambda: commands()())
 
 
 def commands() -> Typer:

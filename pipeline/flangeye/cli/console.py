@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from flangeye.errors import FlangeyeError, NothingMoved, StageError
-from flangeye.files.processes import keep_current_folder_out
+from flangeye.files.processes import keep_current_folder_out, require_memory
 from flangeye.files.words import printable
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Sequence
 
     from rich.console import Console
 
@@ -93,6 +93,8 @@ def end_in_words(command: Callable[[], object]) -> None:
     _open_streams()
     try:
         try:
+            # With less the libraries do not load: each fails, or never ends, in a way of its own
+            require_memory("numerical libraries need it")
             command()
         finally:
             sys.stdout.flush()

@@ -33,3 +33,17 @@ def test_memory_that_cannot_be_given_is_said_with_what_needs_it() -> None:
     require_memory("a little")
     with pytest.raises(MemoryError, match=r"^too much; fewer than 1073741824 MB are left$"):
         require_memory("too much", 1 << 30)
+
+
+@pytest.mark.parametrize("megabytes", [120, 200])
+def test_a_command_without_room_for_its_libraries_says_so_in_one_line(megabytes: int) -> None:
+    def bounded() -> None:  # at 200 one of them once tried without an end
+        resource.setrlimit(resource.RLIMIT_AS, (megabytes * 1_000_000,) * 2)
+
+    done = subprocess.run(
+        python_command("-m", "flangeye.cli", "check", "ur5_phoxi-m_sample"),
+        preexec_fn=bounded, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.count("\n") == 1
+    assert done.stderr.startswith("error: not enough memory:")
