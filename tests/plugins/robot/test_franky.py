@@ -87,14 +87,37 @@ def test_a_silent_host_on_which_the_real_library_hangs_is_one_line_too() -> None
 def test_a_connection_is_made_where_the_library_makes_it_and_says_nothing(
     does: str, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "franky.py").write_text(
+    try_on(tmp_path, does, monkeypatch)
+    with pytest.raises(DeviceError, match=re.escape(f"franka: {why}:")) if why else nullcontext():
+        require_answer("franka", "10.0.0.1", realtime=False)
+
+
+def try_on(folder: Path, does: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the process that tries the connection find a library that does so on connecting."""
+    (folder / "franky.py").write_text(
         "import os\nfrom types import SimpleNamespace\n"
         "RealtimeConfig = SimpleNamespace(Enforce=True, Ignore=False)\n"
         f"def Robot(host, realtime_config):\n    {does}\n"
     )
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    with pytest.raises(DeviceError, match=re.escape(f"franka: {why}:")) if why else nullcontext():
-        require_answer("franka", "10.0.0.1", realtime=False)
+    monkeypatch.setenv("PYTHONPATH", str(folder))
+
+
+def test_a_connection_that_was_tried_and_is_then_refused_is_one_line_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    try_on(tmp_path, "pass", monkeypatch)
+    refused = re.escape("cannot connect (libfranka: Connection to FCI refused.")
+    with in_time(), pytest.raises(DeviceError, match=refused):
+        robot_franky(PANDA, FrankyParams(host=free_address(), realtime=False))
+
+
+@pytest.mark.parametrize("realtime", [False, True])
+def test_a_connection_is_tried_with_the_kernel_that_is_asked_for(
+    realtime: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    try_on(tmp_path, "raise RuntimeError(f'{host} {realtime_config}')", monkeypatch)
+    with pytest.raises(DeviceError, match=re.escape(f"(10.0.0.1 {realtime})")):
+        require_answer("franka", "10.0.0.1", realtime)
 
 
 def test_a_missing_library_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:

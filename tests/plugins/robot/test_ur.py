@@ -6,8 +6,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import nullcontext
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -320,15 +318,3 @@ def test_a_program_that_is_not_let_run_for_a_while_still_reads_the_arm(
     monkeypatch.setattr(robot._link, "sample", read_and_be_held_up)
     assert robot.state().mode == "ready"
     robot.wait_cycle()
-
-
-@pytest.mark.parametrize("taken", [True, False])
-def test_an_arm_whose_controller_does_not_take_the_watchdog_is_not_opened(
-    taken: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    control = SimpleNamespace(setWatchdog=lambda hz: taken and hz == 5.0)
-    library = SimpleNamespace(RTDEControlInterface=lambda host: control)
-    monkeypatch.setitem(sys.modules, "rtde_control", library)
-    refused = pytest.raises(worker.WorkerRefused, match="did not take the watchdog")
-    with nullcontext() if taken else refused:
-        assert worker.connect("10.0.0.1") is control
