@@ -49,10 +49,14 @@ acquired: list[str] = []
 
 
 class AcquireParams(Params):
-    count: int = Field(6, ge=0, description="How many captures.")
-    noise: Length = param("0 mm", ge=0, description="Standard deviation of a centre.")
-    bad: int = Field(0, description="How many captures show nothing.")
-    verification: int = Field(0, description="How many are kept from the solver.")
+    count: int = Field(6, ge=0)
+    """How many captures."""
+    noise: Length = param("0 mm", ge=0)
+    """Standard deviation of a centre."""
+    bad: int = 0
+    """How many captures show nothing."""
+    verification: int = 0
+    """How many are kept from the solver."""
 
 
 @stage("acquire.toy")
@@ -91,9 +95,8 @@ def segment(capture: Capture) -> FlangeCloud | Rejected:
 
 
 class FitParams(Params):
-    inlier: Length = param(
-        "0.3 mm", gt=0, description="Largest distance of a rim point from the circle."
-    )
+    inlier: Length = param("0.3 mm", gt=0)
+    """Largest distance of a rim point from the circle."""
 
 
 @stage("fit.toy")
@@ -111,7 +114,8 @@ def toy_cost(error: PoseError) -> float:
 
 
 class ScaledParams(Params):
-    radius: Length = param("300 mm", description="Work radius.")
+    radius: Length = param("300 mm")
+    """Work radius."""
 
 
 @part("cost.scaled")
@@ -121,8 +125,10 @@ def scaled_cost(error: PoseError, params: ScaledParams) -> float:
 
 
 class SolveParams(Params):
-    at_most: int = Field(100, description="Stop pulling after so many.")
-    cost: Annotated[BoundPart, Choose("cost")] = param({"toy": {}}, description="What to minimise.")
+    at_most: int = 100
+    """Stop pulling after so many."""
+    cost: Annotated[BoundPart, Choose("cost")] = param({"toy": {}})
+    """What to minimise."""
 
 
 @stage("solve.toy")
@@ -147,7 +153,8 @@ def refine(calibration: HandEye) -> HandEye:
 
 
 class VerifyParams(Params):
-    max_rms: Length = param("1 mm", gt=0, description="Largest root mean square residual.")
+    max_rms: Length = param("1 mm", gt=0)
+    """Largest root mean square residual."""
 
 
 @stage("verify.toy")

@@ -16,6 +16,7 @@ from typer.main import get_command
 
 from flangeye.cli import commands
 from flangeye.cli.app import GROUPS
+from flangeye.files.described import descriptions_of
 from flangeye.plugin.registry import load_registry
 from flangeye.plugin.stage import KINDS, PARTS, Plugin
 from flangeye.workflow.report.look import DARK, LIGHT, LOGO, MONO, SANS
@@ -97,16 +98,16 @@ def _plugin(plugin: Plugin, owners: dict[str, str]) -> list[str]:
         f"From plugin `{owners[plugin.name]}`.",
         "",
     ]
-    fields = plugin.params.model_fields if plugin.params else {}
-    if fields:
+    if plugin.params and plugin.params.model_fields:
         lines += ["| parameter | default | meaning |", "|---|---|---|"]
-        for name, field in fields.items():
+        described = descriptions_of(plugin.params)
+        for name, field in plugin.params.model_fields.items():
             default = (
                 "required"
                 if field.is_required()
                 else f"`{_cell(field.get_default(call_default_factory=True))}`"
             )
-            lines.append(f"| `{name}` | {default} | {_cell(field.description or '')} |")
+            lines.append(f"| `{name}` | {default} | {_cell(described[name])} |")
         lines.append("")
     return lines
 

@@ -98,8 +98,8 @@ def _quantity(kind: str) -> tuple[BeforeValidator, PlainSerializer, WithJsonSche
 def param(default: Any = ..., *, description: str = "", **limits: Any) -> Any:
     """Declare a field of a model: pydantic's ``Field``, for defaults written as text with a unit.
 
-    ``inlier: Length = param("0.3 mm", gt=0, description="…")``: the text is parsed like a
-    recipe's, the limits are in SI, and type checkers see the field's own type.
+    ``inlier: Length = param("0.3 mm", gt=0)``: the text is parsed like a recipe's, the limits are
+    in SI, and type checkers see the field's own type. What it means stands in the text below it.
     """
     return Field(default, description=description or None, validate_default=True, **limits)
 

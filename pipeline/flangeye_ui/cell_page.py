@@ -12,6 +12,7 @@ from typing import Any, get_args
 from nicegui import ui
 
 from flangeye.errors import FlangeyeError, RecipeError
+from flangeye.files.described import descriptions_of
 from flangeye.files.paths import bundled
 from flangeye.files.regular import read_text
 from flangeye.files.yaml_lines import flow, parse_yaml, read_yaml
@@ -185,11 +186,11 @@ class Form:
 
     def _fields(self, name: str, stage: Stage | None) -> list[str]:
         """Return the parameters of a step that have what was searched for."""
-        known = stage.params.model_fields if stage and stage.params else {}
+        known = descriptions_of(stage.params) if stage and stage.params else {}
         return [
             field
-            for field, info in known.items()
-            if self._wanted in f"{name} {field.replace('_', ' ')} {info.description}".lower()
+            for field, text in known.items()
+            if self._wanted in f"{name} {field.replace('_', ' ')} {text}".lower()
         ]
 
     def _parameters(
@@ -200,13 +201,14 @@ class Form:
         if stage.params is None:
             return
         schema = stage.params.model_json_schema()["properties"]
+        described = descriptions_of(stage.params)
         for field in fields:
             info = stage.params.model_fields[field]
             text = "; ".join(m.text for m in wrong if _within(m, index, name, field))
             box = _field(field, schema[field], given.get(field), info.is_required())
             event = "change" if isinstance(box, ui.input) else "update:model-value"
             box.on(event, self._setter(["steps", index, name, field], box))
-            box.classes("w-full").props("dense stack-label").tooltip(info.description or "")
+            box.classes("w-full").props("dense stack-label").tooltip(described[field])
             if text:
                 box.props["error"], box.props["error-message"] = True, text
 

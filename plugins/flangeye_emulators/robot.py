@@ -33,19 +33,15 @@ from flangeye_emulators.world import bench
 class SimulatedRobotParams(Params):
     """Parameters of ``robot.simulated``."""
 
-    joints: tuple[Angle, ...] | None = param(
-        None,
-        description="Initial joint angles; by default flange down, half a metre from the base.",
-    )
-    period: Duration = param("2 ms", gt=0, description="Control cycle time.")
+    joints: tuple[Angle, ...] | None = param(None)
+    """Initial joint angles; by default flange down, half a metre from the base."""
+    period: Duration = param("2 ms", gt=0)
+    """Control cycle time."""
     # Maximum joint speed [rad/s]
     joint_speed: ClassVar[float] = float(np.pi)
-    joint_errors: int | None = param(
-        None,
-        ge=0,
-        description="Seed of the errors of its joints' zeros, as large as the model's "
-        "joint_accuracy; none when not given.",
-    )
+    joint_errors: int | None = param(None, ge=0)
+    """Seed of the errors of its joints' zeros, as large as the model's joint_accuracy; none when
+    not given."""
 
 
 class SimulatedRobot(Device):
@@ -169,22 +165,17 @@ def robot_simulated(model: RobotModel, params: SimulatedRobotParams) -> Robot:
 class LoopbackRobotParams(Params):
     """Parameters of ``robot.emulator``."""
 
-    driver: Annotated[BoundPart, Choose("robot")] = Field(
-        description="The arm's own driver, for example {ur_rtde: {host: auto}}; auto is an address "
-        "of this run alone."
-    )
-    host: str | None = Field(
-        None, description="Address the controller listens on; the driver's host when not given."
-    )
-    joints: tuple[Angle, ...] | None = Field(
-        None, description="Initial joint angles; the controller's default if not given."
-    )
-    joint_errors: int | None = Field(
-        None, ge=0, description="Seed of the joint zero errors; none if not given."
-    )
-    faults: tuple[str, ...] = Field(
-        (), description="Faults to inject, for example 'protective-stop@moving'."
-    )
+    driver: Annotated[BoundPart, Choose("robot")]
+    """The arm's own driver, for example {ur_rtde: {host: auto}}; auto is an address of this run
+    alone."""
+    host: str | None = None
+    """Address the controller listens on; the driver's host when not given."""
+    joints: tuple[Angle, ...] | None = None
+    """Initial joint angles; the controller's default if not given."""
+    joint_errors: int | None = Field(None, ge=0)
+    """Seed of the joint zero errors; none if not given."""
+    faults: tuple[str, ...] = ()
+    """Faults to inject, for example 'protective-stop@moving'."""
 
 
 @part("robot.emulator")

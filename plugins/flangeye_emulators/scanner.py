@@ -41,7 +41,8 @@ class MountedParams(ScannerQuality, BenchParams):
 
     # The scanner's true position in ``flange`` [m]
     mount: ClassVar[tuple[float, float, float]] = (0.06, 0.0, 0.04)
-    seed: int = Field(0, ge=0, description="Draws noise, distortion and what lies about.")
+    seed: int = Field(0, ge=0)
+    """Draws noise, distortion and what lies about."""
 
     @property
     def flange_T_camera(self) -> Floats:
@@ -102,29 +103,28 @@ class MountedScanner(OpenScanner):
 class LoopbackScannerParams(Params):
     """Parameters of ``scanner.emulator``."""
 
-    host: str = Field(
-        "auto", description="Address of the controller; auto: that of this run's emulator."
-    )
-    robot: str = Field(
-        "ur5e", description="Robot model of the controller: one of data/robots, or a file."
-    )
-    camera: CameraPose = Field(default_factory=CameraPose, description="The scanner's true pose.")
+    host: str = "auto"
+    """Address of the controller; auto: that of this run's emulator."""
+    robot: str = "ur5e"
+    """Robot model of the controller: one of data/robots, or a file."""
+    camera: CameraPose = Field(default_factory=CameraPose)
+    """The scanner's true pose."""
     # The wall and the stand are beside this box [m]
     workspace: ClassVar[tuple[float, float, float]] = (0.3, 0.3, 0.2)
-    seed: int = Field(0, ge=0, description="Draws noise, distortion and dropped frames.")
+    seed: int = Field(0, ge=0)
+    """Draws noise, distortion and dropped frames."""
     # Scale of the scanner's noise and distortion
     noise: ClassVar[float] = 1.0
-    resolution: float = Field(
-        0.35, gt=0, le=1, description="Scale of columns and rows; at 1 a scan takes seconds."
-    )
+    resolution: float = Field(0.35, gt=0, le=1)
+    """Scale of columns and rows; at 1 a scan takes seconds."""
     # Exposure time, during which the arm must stand still [s]
     exposure: ClassVar[float] = 0.3
     # Time from the end of the exposure to the data [s]
     latency: ClassVar[float] = 0.2
-    dropped: float = Field(0.0, ge=0, le=1, description="Share of exposures that are lost.")
-    lost_after: int | None = Field(
-        None, ge=0, description="Exposures after which the scanner is gone, as if unplugged."
-    )
+    dropped: float = Field(0.0, ge=0, le=1)
+    """Share of exposures that are lost."""
+    lost_after: int | None = Field(None, ge=0)
+    """Exposures after which the scanner is gone, as if unplugged."""
 
 
 @part("scanner.emulator")

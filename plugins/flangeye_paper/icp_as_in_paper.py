@@ -22,23 +22,16 @@ from flangeye_plugins.solve.observations import residuals_of
 class PaperIcpParams(Params):
     """How the verification cloud is registered with the CAD cloud."""
 
-    normals: Normals = Field(
-        "open3d_0_7_normals",
-        description="Normals of the CAD cloud: as Open3D up to 0.7 computed them, with its defect "
-        "on flat faces, or sound ones.",
-    )
-    iterations: int = Field(
-        30, ge=1, le=10_000, description="Iterations of ICP at most; 30 was the default."
-    )
-    change: float = Field(
-        1e-6,
-        ge=0,
-        description="Stop once share and rms of the matches change by less. The default of 1e-6 "
-        "is in the file's unit: a micrometre for clouds in m, a nanometre for those in mm.",
-    )
-    distance: float = Field(
-        1.0, gt=0, description="Pairs further apart do not match, in the file's unit (m or mm)."
-    )
+    normals: Normals = "open3d_0_7_normals"
+    """Normals of the CAD cloud: as Open3D up to 0.7 computed them, with its defect on flat faces,
+    or sound ones."""
+    iterations: int = Field(30, ge=1, le=10_000)
+    """Iterations of ICP at most; 30 was the default."""
+    change: float = Field(1e-6, ge=0)
+    """Stop once share and rms of the matches change by less. The default of 1e-6 is in the file's
+    unit: a micrometre for clouds in m, a nanometre for those in mm."""
+    distance: float = Field(1.0, gt=0)
+    """Pairs further apart do not match, in the file's unit (m or mm)."""
 
 
 @part("error.icp_as_in_paper")
@@ -150,13 +143,12 @@ def _summary(figures: dict[str, float]) -> str:
 class ByIterationParams(Params):
     """Parameters of ``verify.algorithm_1_by_iteration``: those of ``solve.iterative``."""
 
-    pool: int = Field(4, ge=3, le=1000, description="Number of poses in the pool.")
-    error: Annotated[BoundPart, Choose("error")] = param(
-        {"icp_as_in_paper": {}}, description="Measure of a candidate's error."
-    )
-    cost: Annotated[BoundPart, Choose("cost")] = param(
-        {"translation": {"at": "camera"}}, description="Cost of that error, to be minimised."
-    )
+    pool: int = Field(4, ge=3, le=1000)
+    """Number of poses in the pool."""
+    error: Annotated[BoundPart, Choose("error")] = param({"icp_as_in_paper": {}})
+    """Measure of a candidate's error."""
+    cost: Annotated[BoundPart, Choose("cost")] = param({"translation": {"at": "camera"}})
+    """Cost of that error, to be minimised."""
 
 
 @stage("verify.algorithm_1_by_iteration")

@@ -141,11 +141,12 @@ def bound(tcps: Floats, noise: float, points: Floats) -> dict[str, float]:
 class PointsParams(Params):
     """Parameters of ``acquire.points_as_in_paper``."""
 
-    noise: Length = param(
-        "1 mm", gt=0, description="Standard deviation of each coordinate, equation (18)."
-    )
-    outliers: float = Field(0.0, ge=0, lt=1, description="Share of centres 50 to 150 mm off.")
-    poses: int = Field(POSES, ge=3, le=POSES, description="Number of the grid's poses to use.")
+    noise: Length = param("1 mm", gt=0)
+    """Standard deviation of each coordinate, equation (18)."""
+    outliers: float = Field(0.0, ge=0, lt=1)
+    """Share of centres 50 to 150 mm off."""
+    poses: int = Field(POSES, ge=3, le=POSES)
+    """Number of the grid's poses to use."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from flangeye import Params, StageError, stage
 from flangeye.files.arrays import read_npz
@@ -88,7 +87,8 @@ class PublishedView(VerificationView):
 class PublishedParams(CentresParams):
     """Parameters of ``acquire.published_centres``."""
 
-    shuffle: bool = Field(False, description="Shuffle the poses with the seed.")
+    shuffle: bool = False
+    """Shuffle the poses with the seed."""
 
 
 @stage("acquire.published_centres")
@@ -166,7 +166,8 @@ def _truth_folder(root: Path) -> Path:
 class StoredParams(Params):
     """Parameters of ``verify.stored_results_as_in_paper``."""
 
-    robot: Literal["aubo", "ur5", "franka"] = Field(description="Whose results.")
+    robot: Literal["aubo", "ur5", "franka"]
+    """Whose results."""
 
 
 @stage("verify.stored_results_as_in_paper")

@@ -38,9 +38,8 @@ from flangeye_paper.points import (
 class RealisationsParams(Params):
     """Parameters of ``verify.realisations``."""
 
-    count: int = Field(
-        100, ge=2, le=100_000, description="Number of realisations of poses and noise."
-    )
+    count: int = Field(100, ge=2, le=100_000)
+    """Number of realisations of poses and noise."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -69,14 +69,14 @@ HEADER = struct.Struct(">HB")
 class UrDigitalParams(ArcTimes, Params):
     """Parameters of ``arc.ur_digital``."""
 
-    host: str = Field(min_length=1, description="Address of the controller: 192.168.1.10.")
-    output: int = Field(ge=0, le=7, description="Standard digital output that starts the arc.")
-    gas: int | None = Field(
-        None, ge=0, le=7, description="Output of the gas valve, where the power source has none."
-    )
-    established: int | None = Field(
-        None, ge=0, le=7, description="Standard digital input that is high while the arc burns."
-    )
+    host: str = Field(min_length=1)
+    """Address of the controller: 192.168.1.10."""
+    output: int = Field(ge=0, le=7)
+    """Standard digital output that starts the arc."""
+    gas: int | None = Field(None, ge=0, le=7)
+    """Output of the gas valve, where the power source has none."""
+    established: int | None = Field(None, ge=0, le=7)
+    """Standard digital input that is high while the arc burns."""
 
 
 class UrDigitalArc(Device):

@@ -18,25 +18,22 @@ Place = Literal["work", "camera"]
 class TranslationParams(Params):
     """Parameters of ``cost.translation``."""
 
-    at: Place = Field(
-        "work",
-        description="Where the translation is taken: at the work, or at the camera's origin as in "
-        "the paper.",
-    )
+    at: Place = "work"
+    """Where the translation is taken: at the work, or at the camera's origin as in the paper."""
 
 
 class AxesParams(TranslationParams):
     """Parameters of ``cost.axes``."""
 
-    axes: tuple[Literal["x", "y", "z"], ...] = Field(
-        ("x", "y"), min_length=1, description="Axes of the base to use."
-    )
+    axes: tuple[Literal["x", "y", "z"], ...] = Field(("x", "y"), min_length=1)
+    """Axes of the base to use."""
 
 
 class WorkRadiusParams(TranslationParams):
     """Parameters of ``cost.work_radius``."""
 
-    radius: Length = param("300 mm", ge=0, description="Radius of the work about that point.")
+    radius: Length = param("300 mm", ge=0)
+    """Radius of the work about that point."""
 
 
 @part("cost.translation")

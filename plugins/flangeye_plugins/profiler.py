@@ -34,19 +34,24 @@ from flangeye.units import Duration, Length, param
 class TcpParams(Params):
     """Parameters of ``profiler.tcp``."""
 
-    host: str = Field(min_length=1, description="Name or address of the sensor.")
-    port: int = Field(ge=1, le=65535, description="Its TCP port that sends what is measured.")
-    behind: Length = param(gt=0, le=0.2, description="How far behind the torch it looks.")
-    sigma: Length = param("0.05 mm", gt=0, description="Standard deviation of one look.")
-    column: int = Field(1, ge=1, description="Which column of a line is the bead's offset.")
-    separator: str = Field(",", min_length=1, max_length=1, description="Between two columns.")
-    unit: Literal["m", "mm", "um"] = Field("mm", description="Of that column.")
-    positive: Literal["left", "right"] = Field(
-        "left", description="To which side of the joint, along the weld, it is positive."
-    )
-    latency: Duration = param(
-        "10 ms", ge=0, description="Time from the exposure to the arrival of its line."
-    )
+    host: str = Field(min_length=1)
+    """Name or address of the sensor."""
+    port: int = Field(ge=1, le=65535)
+    """Its TCP port that sends what is measured."""
+    behind: Length = param(gt=0, le=0.2)
+    """How far behind the torch it looks."""
+    sigma: Length = param("0.05 mm", gt=0)
+    """Standard deviation of one look."""
+    column: int = Field(1, ge=1)
+    """Which column of a line is the bead's offset."""
+    separator: str = Field(",", min_length=1, max_length=1)
+    """Between two columns."""
+    unit: Literal["m", "mm", "um"] = "mm"
+    """Of that column."""
+    positive: Literal["left", "right"] = "left"
+    """To which side of the joint, along the weld, it is positive."""
+    latency: Duration = param("10 ms", ge=0)
+    """Time from the exposure to the arrival of its line."""
 
 
 class TcpProfiler(Device):

@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Annotated, ClassVar
 
 import numpy as np
-from pydantic import Field
 
 from flangeye import BoundPart, CalibrationRefused, Choose, Params, StageError, stage
 from flangeye.estimation.arm_parameters import ArmParameters, most_telling_poses, parameters_of
@@ -42,14 +41,11 @@ from flangeye.units import param
 class CompensateParams(Params):
     """Parameters of ``refine.compensate``."""
 
-    error: Annotated[BoundPart, Choose("error")] = param(
-        {"icp": {}}, description="How the remaining error is measured, on a verification view."
-    )
-    rotation: bool = Field(
-        True,
-        description="Apply the error's rotation too, as the paper does. A flange 60 mm across "
-        "knows a rotation badly, and over the workspace it counts ten times as much.",
-    )
+    error: Annotated[BoundPart, Choose("error")] = param({"icp": {}})
+    """How the remaining error is measured, on a verification view."""
+    rotation: bool = True
+    """Apply the error's rotation too, as the paper does. A flange 60 mm across knows a rotation
+    badly, and over the workspace it counts ten times as much."""
 
 
 @stage("refine.compensate")

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from pydantic import Field
 
 from flangeye import Params, RecipePath, StageError, stage
 from flangeye.devices import KnowsSeams, MotionAllowed, RobotDriver, ScannerDriver
@@ -34,10 +33,10 @@ from flangeye.workflow.recipe.header import LimitsSection
 class FileScanParams(Params):
     """Parameters of ``scan.file``."""
 
-    path: RecipePath = Field(
-        description="A cloud (PCD, PLY, NPY, XYZ, CSV), or a folder of several, which are joined."
-    )
-    unit: LengthUnit = Field(description="Unit of the coordinates; files do not say.")
+    path: RecipePath
+    """A cloud (PCD, PLY, NPY, XYZ, CSV), or a folder of several, which are joined."""
+    unit: LengthUnit
+    """Unit of the coordinates; files do not say."""
 
 
 @stage("scan.file")
@@ -87,17 +86,16 @@ STAGE = "scan.along"
 class AlongParams(Params):
     """Parameters of ``scan.along``."""
 
-    start: tuple[Length, Length, Length] = Field(
-        description="Where the seam roughly begins, in the base: to a few centimetres."
-    )
-    end: tuple[Length, Length, Length] = Field(description="Where it roughly ends.")
-    opening: tuple[float, float, float] = Field(
-        (0.0, 0.0, 1.0), description="Out of the work, in the base: the scanner looks against it."
-    )
-    distance: Length = param("650 mm", gt=0, description="From the seam to the scanner.")
-    step: Length = param(
-        "250 mm", gt=0, description="Largest way from one place to the next, along the seam."
-    )
+    start: tuple[Length, Length, Length]
+    """Where the seam roughly begins, in the base: to a few centimetres."""
+    end: tuple[Length, Length, Length]
+    """Where it roughly ends."""
+    opening: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """Out of the work, in the base: the scanner looks against it."""
+    distance: Length = param("650 mm", gt=0)
+    """From the seam to the scanner."""
+    step: Length = param("250 mm", gt=0)
+    """Largest way from one place to the next, along the seam."""
 
 
 @stage("scan.along")

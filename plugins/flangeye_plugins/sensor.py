@@ -29,17 +29,11 @@ from flangeye_plugins.weld.touch.tag_observation import ImageRegion, shifted
 class OpenCVParams(Params):
     """Parameters of ``sensor.opencv``."""
 
-    device: str = param(
-        "0",
-        pattern=r"^(\d{1,3}|/dev/video\d{1,3}|(rtsp|https?)://\S+)$",
-        description="Number of the camera, its device /dev/videoN, or the URL of its stream "
-        "(rtsp, http, https).",
-    )
-    latency: Duration = param(
-        "15 ms",
-        ge=0,
-        description="Time from the middle of the exposure to the arrival of its image.",
-    )
+    device: str = param("0", pattern=r"^(\d{1,3}|/dev/video\d{1,3}|(rtsp|https?)://\S+)$")
+    """Number of the camera, its device /dev/videoN, or the URL of its stream (rtsp, http,
+    https)."""
+    latency: Duration = param("15 ms", ge=0)
+    """Time from the middle of the exposure to the arrival of its image."""
 
 
 class OpenCVCamera(Device):
@@ -138,14 +132,17 @@ def sensor_opencv(
 class ImageFolderParams(Params):
     """Parameters of ``sensor.image_folder``."""
 
-    path: RecipePath = param(description="Folder of images; they are taken in order of their names")
-    period: Duration = param("33 ms", gt=0, description="Time between two images.")
+    path: RecipePath
+    """Folder of images; they are taken in order of their names"""
+    period: Duration = param("33 ms", gt=0)
+    """Time between two images."""
 
 
 class McapParams(Params):
     """Parameters of ``sensor.mcap``."""
 
-    path: RecipeFile = param(description="The run.mcap of a weld; its images, at their times.")
+    path: RecipeFile
+    """The run.mcap of a weld; its images, at their times."""
 
 
 class RecordedImages(Device):

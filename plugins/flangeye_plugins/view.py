@@ -19,12 +19,10 @@ from flangeye.units import Angle, Length, param
 class GuessParams(PlaceParams):
     """Parameters of ``view.guess``."""
 
-    position: tuple[Length, Length, Length] = Field(
-        description="Rough position of the scanner in the base."
-    )
-    rpy: tuple[Angle, Angle, Angle] = param(
-        ("180 deg", "0 deg", "-90 deg"), description="Roll, pitch, yaw; the default looks down."
-    )
+    position: tuple[Length, Length, Length]
+    """Rough position of the scanner in the base."""
+    rpy: tuple[Angle, Angle, Angle] = param(("180 deg", "0 deg", "-90 deg"))
+    """Roll, pitch, yaw; the default looks down."""
 
 
 @part("view.guess")
@@ -40,11 +38,9 @@ def view_guess(arm: Arm, scanner: ScannerModel, params: GuessParams) -> Floats:
 class ShownParams(Params):
     """Parameters of ``view.shown``."""
 
-    joints: tuple[tuple[Angle, ...], ...] = Field(
-        min_length=3,
-        description="Joint angles of three or more poses at which the flange faces the scanner, "
-        "as the pendant shows them.",
-    )
+    joints: tuple[tuple[Angle, ...], ...] = Field(min_length=3)
+    """Joint angles of three or more poses at which the flange faces the scanner, as the pendant
+    shows them."""
 
 
 @part("view.shown")

@@ -22,9 +22,11 @@ Row = tuple[float, float, float]
 class Tag(Model):
     """The ArUco tag on the finger."""
 
-    dictionary: str = Field("DICT_4X4_50", description="OpenCV's name of the dictionary.")
+    dictionary: str = "DICT_4X4_50"
+    """OpenCV's name of the dictionary."""
     id: int = Field(0, ge=0)
-    side: Length = param(gt=0, description="Side of the black square.")
+    side: Length = param(gt=0)
+    """Side of the black square."""
 
 
 class Lens(Model):
@@ -47,16 +49,18 @@ class Lens(Model):
 class Calibration(Model):
     """Result of ``flangeye tactile calibrate``."""
 
-    rest: tuple[Length, Length, Length] = Field(description="The tag in the camera, undeformed.")
-    rotation: tuple[Angle, Angle, Angle] = Field(description="Its rotation vector there.")
-    gain: tuple[Row, Row, Row] = Field(
-        description="Displacement of the tip, in the tool's axes, per displacement of the tag."
-    )
-    noise: tuple[Length, Length, Length] = Field(
-        description="Standard deviation of one measurement of the tip, in the tool's axes."
-    )
-    lateral: Stiffness | None = Field(None, description="Across the finger, at its tip.")
-    axial: Stiffness | None = Field(None, description="Along the finger.")
+    rest: tuple[Length, Length, Length]
+    """The tag in the camera, undeformed."""
+    rotation: tuple[Angle, Angle, Angle]
+    """Its rotation vector there."""
+    gain: tuple[Row, Row, Row]
+    """Displacement of the tip, in the tool's axes, per displacement of the tag."""
+    noise: tuple[Length, Length, Length]
+    """Standard deviation of one measurement of the tip, in the tool's axes."""
+    lateral: Stiffness | None = None
+    """Across the finger, at its tip."""
+    axial: Stiffness | None = None
+    """Along the finger."""
     source: str
 
 
@@ -66,14 +70,18 @@ class FingerGeometry(Model):
     model: str
     tag: Tag
     camera: Lens
-    tip: tuple[Length, Length, Length] = Field(description="Undeformed, in the flange's frame.")
-    direction: Angle = param(
-        "0 deg", description="From the flange's x to the direction from the torch to the tip."
-    )
-    torch: Length = param(gt=0, description="How far the torch is behind the tip (||d||).")
-    torch_aside: Length = param("0 mm", description="How far the torch is left of the tool's x.")
-    torch_up: Length = param("0 mm", description="How far the torch's end is above the tip.")
-    radius: Length = param(gt=0, description="Radius of the tip's ball.")
+    tip: tuple[Length, Length, Length]
+    """Undeformed, in the flange's frame."""
+    direction: Angle = param("0 deg")
+    """From the flange's x to the direction from the torch to the tip."""
+    torch: Length = param(gt=0)
+    """How far the torch is behind the tip (||d||)."""
+    torch_aside: Length = param("0 mm")
+    """How far the torch is left of the tool's x."""
+    torch_up: Length = param("0 mm")
+    """How far the torch's end is above the tip."""
+    radius: Length = param(gt=0)
+    """Radius of the tip's ball."""
     source: str
 
     @property
@@ -92,17 +100,16 @@ class FingerGeometry(Model):
 class Finger(FingerGeometry):
     """Calibrated geometry of a tactile finger and its torch, with standard deviations."""
 
-    torch_sigma: Length = param(
-        "0.05 mm", ge=0, description="Standard deviation of the torch across the tool."
-    )
-    along_sigma: Length = param(
-        "0.3 mm", ge=0, description="Standard deviation of the distance from the torch to the tip."
-    )
-    tip_sigma: Length = param(
-        "0.1 mm", ge=0, description="Standard deviation of the tip, along each axis of the flange."
-    )
-    travel: Length = param("6 mm", gt=0, description="How far the tip may be displaced.")
-    largest_force: Force = param("10 N", gt=0, description="Largest force the tip may press with.")
+    torch_sigma: Length = param("0.05 mm", ge=0)
+    """Standard deviation of the torch across the tool."""
+    along_sigma: Length = param("0.3 mm", ge=0)
+    """Standard deviation of the distance from the torch to the tip."""
+    tip_sigma: Length = param("0.1 mm", ge=0)
+    """Standard deviation of the tip, along each axis of the flange."""
+    travel: Length = param("6 mm", gt=0)
+    """How far the tip may be displaced."""
+    largest_force: Force = param("10 N", gt=0)
+    """Largest force the tip may press with."""
     calibration: Calibration | None = None
 
     def force(self, displacement: Floats) -> float | None:

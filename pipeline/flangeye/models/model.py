@@ -11,7 +11,6 @@ from typing import Any, TypeVar
 
 from pydantic import (
     AfterValidator,
-    BaseModel,
     ConfigDict,
     TypeAdapter,
     ValidationError,
@@ -19,11 +18,12 @@ from pydantic import (
 )
 
 from flangeye.errors import RecipeError
+from flangeye.files.described import Described
 from flangeye.files.validation import sentence
 from flangeye.files.yaml_lines import read_yaml
 
 
-class Model(BaseModel):
+class Model(Described):
     """Base of everything read from ``data/``: frozen, and an unknown key is an error."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True, defer_build=True)

@@ -24,9 +24,12 @@ UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wr
 class Recess(Model):
     """A slot milled into the face along a circle, with round ends, such as Franka's three."""
 
-    angle: Angle = param(description="Direction of its middle, about the flange's z.")
-    radius: Length = param(gt=0, description="Radius of the circle its centre line follows.")
-    half_span: Angle = param(description="Half the angle its centre line covers, ends aside.")
+    angle: Angle
+    """Direction of its middle, about the flange's z."""
+    radius: Length = param(gt=0)
+    """Radius of the circle its centre line follows."""
+    half_span: Angle
+    """Half the angle its centre line covers, ends aside."""
     width: Length = param(gt=0)
     depth: Length = param(gt=0)
 
@@ -37,20 +40,29 @@ Finish = Literal["painted", "metal", "anodised"]
 class FlangeDetails(Model):
     """Details of one robot's flange that its standard does not fix."""
 
-    standard: str | None = Field(None, description="Designation: ISO 9409-1-50-4-M6 or the like.")
-    rim_chamfer: Length = param("0 mm", description="Radial width of the chamfer at the rim.")
-    bore_chamfer: Length = param("0 mm", description="Radial width of the chamfer at the bore.")
-    bore_depth: Length = param("6 mm", description="Depth of the centring bore.")
-    thickness: Length = param("6 mm", description="Height of the plate above the wrist.")
-    pin_angle: Angle | None = param(
-        None, description="Where the pin hole is, about the flange's z; without it no flange roll."
-    )
-    wrist: Length = param("75 mm", description="Diameter of the wrist's housing behind the plate.")
-    wrist_length: Length = param("40 mm", description="Length of that housing, from the face.")
-    countersink: Length = param("0 mm", description="Radial width of the chamfer at the holes.")
-    hole_depth: Length = param("9 mm", description="Depth of the threaded holes and the pin hole.")
+    standard: str | None = None
+    """Designation: ISO 9409-1-50-4-M6 or the like."""
+    rim_chamfer: Length = param("0 mm")
+    """Radial width of the chamfer at the rim."""
+    bore_chamfer: Length = param("0 mm")
+    """Radial width of the chamfer at the bore."""
+    bore_depth: Length = param("6 mm")
+    """Depth of the centring bore."""
+    thickness: Length = param("6 mm")
+    """Height of the plate above the wrist."""
+    pin_angle: Angle | None = param(None)
+    """Where the pin hole is, about the flange's z; without it no flange roll."""
+    wrist: Length = param("75 mm")
+    """Diameter of the wrist's housing behind the plate."""
+    wrist_length: Length = param("40 mm")
+    """Length of that housing, from the face."""
+    countersink: Length = param("0 mm")
+    """Radial width of the chamfer at the holes."""
+    hole_depth: Length = param("9 mm")
+    """Depth of the threaded holes and the pin hole."""
     recesses: tuple[Recess, ...] = ()
-    finish: Finish = Field("metal", description="What the face is made of, as a scanner sees it.")
+    finish: Finish = "metal"
+    """What the face is made of, as a scanner sees it."""
     source: str = ""
 
 
@@ -60,18 +72,16 @@ class Joint(Model):
     a: Length = param("0 mm")
     alpha: Angle = param("0 deg")
     d: Length = param("0 mm")
-    theta: Angle = param("0 deg", description="Offset added to the joint's angle.")
-    xyz: tuple[Length, Length, Length] = param(
-        ("0 mm",) * 3,
-        description="Convention urdf: its frame's origin in the frame of the link before.",
-    )
-    rpy: tuple[Angle, Angle, Angle] = param(
-        ("0 deg",) * 3, description="Convention urdf: roll, pitch, yaw of its frame in that frame."
-    )
-    axis: tuple[float, float, float] = Field(
-        (0.0, 0.0, 1.0), description="Convention urdf: what it turns about, in its own frame."
-    )
-    slides: bool = Field(False, description="Whether it slides, as a rail does; it turns else.")
+    theta: Angle = param("0 deg")
+    """Offset added to the joint's angle."""
+    xyz: tuple[Length, Length, Length] = param(("0 mm",) * 3)
+    """Convention urdf: its frame's origin in the frame of the link before."""
+    rpy: tuple[Angle, Angle, Angle] = param(("0 deg",) * 3)
+    """Convention urdf: roll, pitch, yaw of its frame in that frame."""
+    axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """Convention urdf: what it turns about, in its own frame."""
+    slides: bool = False
+    """Whether it slides, as a rail does; it turns else."""
     lower: JointPosition = param("-360 deg")
     upper: JointPosition = param("360 deg")
 
@@ -88,13 +98,15 @@ class Placement(Model):
     """Where a frame is in another."""
 
     xyz: tuple[Length, Length, Length] = param(("0 mm",) * 3)
-    rpy: tuple[Angle, Angle, Angle] = param(("0 deg",) * 3, description="Roll, pitch, yaw.")
+    rpy: tuple[Angle, Angle, Angle] = param(("0 deg",) * 3)
+    """Roll, pitch, yaw."""
 
 
 class Volume(Model):
     """A capsule that bounds a part of the arm, fixed to a link."""
 
-    link: int = Field(ge=0, description="0 is the base, n the last link.")
+    link: int = Field(ge=0)
+    """0 is the base, n the last link."""
     start: tuple[Length, Length, Length]
     end: tuple[Length, Length, Length]
     radius: Length = param(gt=0)
@@ -120,28 +132,22 @@ class RobotModel(Model):
 
     model: str
     maker: str
-    convention: Literal["standard", "modified", "urdf"] = Field(
-        description="Denavit-Hartenberg, standard or modified (Craig); urdf: origins and axes."
-    )
+    convention: Literal["standard", "modified", "urdf"]
+    """Denavit-Hartenberg, standard or modified (Craig); urdf: origins and axes."""
     joints: tuple[Joint, ...]
-    flange_offset: Length = param("0 mm", description="Last link to the flange's face, along z.")
-    flange_frame: Placement = Field(
-        Placement(), description="The flange in the last link's frame, before flange_offset."
-    )
+    flange_offset: Length = param("0 mm")
+    """Last link to the flange's face, along z."""
+    flange_frame: Placement = Placement()
+    """The flange in the last link's frame, before flange_offset."""
     flange: FlangeDetails = FlangeDetails()
     volumes: tuple[Volume, ...] = ()
-    volumes_missing: str = Field("", description="Why there are none, where a plan needs them.")
+    volumes_missing: str = ""
+    """Why there are none, where a plan needs them."""
     repeatability: Length = param("0.1 mm")
-    joint_speed: AngularSpeed = param(
-        "180 deg/s",
-        gt=0,
-        description="Of the slowest joint, as the maker has it: no recipe may ask for more.",
-    )
-    joint_accuracy: Angle = param(
-        "0.3 mrad",
-        description="Standard deviation of a joint's zero; makers do not publish it, so it is "
-        "assumed.",
-    )
+    joint_speed: AngularSpeed = param("180 deg/s", gt=0)
+    """Of the slowest joint, as the maker has it: no recipe may ask for more."""
+    joint_accuracy: Angle = param("0.3 mrad")
+    """Standard deviation of a joint's zero; makers do not publish it, so it is assumed."""
     source: str
     _bodies: Bodies | None = PrivateAttr(None)
     _notes: tuple[Note, ...] = PrivateAttr(())

@@ -45,24 +45,24 @@ class ScannerModel(ScannerData):
     principle: Literal["structured light", "active stereo", "time of flight", "laser line"]
     columns: int = Field(gt=0)
     rows: int = Field(gt=0)
-    field_of_view: tuple[Angle, Angle] = Field(description="Horizontal, vertical; full angles.")
+    field_of_view: tuple[Angle, Angle]
+    """Horizontal, vertical; full angles."""
     near: Length
     far: Length
-    baseline: Length = param("0 mm", description="Camera to projector, along the image's x.")
-    convergence: Angle = param(
-        "0 deg",
-        description="From the baseline's normal to the camera's axis, towards the projector.",
-    )
-    projection: tuple[Angle, Angle] | None = Field(
-        None,
-        description="The projector's field, horizontal and vertical; all of space if not given.",
-    )
-    temporal_noise: Length = param(description="Standard deviation of depth at mid range.")
-    noise_grain: float = Field(
-        0.0, ge=0, description="Filter that correlates neighbouring noise, standard deviation [px]."
-    )
-    edge_loss: float = Field(0.0, ge=0, description="Width lost along a step in depth [px].")
-    calibration_error: Length = param(description="Smooth distortion over the volume, rms.")
+    baseline: Length = param("0 mm")
+    """Camera to projector, along the image's x."""
+    convergence: Angle = param("0 deg")
+    """From the baseline's normal to the camera's axis, towards the projector."""
+    projection: tuple[Angle, Angle] | None = None
+    """The projector's field, horizontal and vertical; all of space if not given."""
+    temporal_noise: Length
+    """Standard deviation of depth at mid range."""
+    noise_grain: float = Field(0.0, ge=0)
+    """Filter that correlates neighbouring noise, standard deviation [px]."""
+    edge_loss: float = Field(0.0, ge=0)
+    """Width lost along a step in depth [px]."""
+    calibration_error: Length
+    """Smooth distortion over the volume, rms."""
     source: str
 
 

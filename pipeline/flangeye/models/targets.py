@@ -15,7 +15,7 @@ from flangeye.maths.circles import distances
 from flangeye.models.model import Model, read_model
 from flangeye.models.robots import FlangeDetails, RobotModel
 from flangeye.types import Floats
-from flangeye.units import Length, param
+from flangeye.units import Length
 
 
 class Flange(BaseModel):
@@ -140,14 +140,21 @@ class FlangeStandard(Model):
     """One row of ISO 9409-1: the plate's nominal dimensions. Diameters, as the standard gives."""
 
     designation: str
-    pitch_circle: Length = param(description="d1, diameter of the circle the threads lie on.")
-    outer: Length = param(description="d2, outer diameter.")
-    centring: Length = param(description="d3, diameter of the centring bore.")
-    threads: int = Field(ge=0, description="N, number of threaded holes.")
-    thread: Length = param(description="d4, nominal diameter of the thread.")
-    pin: Length = param(description="d5, diameter of the locating-pin hole on the pitch circle.")
+    pitch_circle: Length
+    """d1, diameter of the circle the threads lie on."""
+    outer: Length
+    """d2, outer diameter."""
+    centring: Length
+    """d3, diameter of the centring bore."""
+    threads: int = Field(ge=0)
+    """N, number of threaded holes."""
+    thread: Length
+    """d4, nominal diameter of the thread."""
+    pin: Length
+    """d5, diameter of the locating-pin hole on the pitch circle."""
     source: str
-    verified: bool = Field(description="Whether two independent sources agree on every value.")
+    verified: bool
+    """Whether two independent sources agree on every value."""
 
 
 def load_standard(designation: str) -> FlangeStandard:

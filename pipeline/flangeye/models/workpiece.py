@@ -46,20 +46,24 @@ class SeamLine(Model):
     """One seam as the file has it."""
 
     name: str
-    points: tuple[Vector, ...] = Field(min_length=2, description="Along the root, in order.")
-    opening: Vector | tuple[Vector, ...] = Field(
-        description="Direction out of the groove, towards the torch: one for all, or one a point."
-    )
-    half_angle: Angle | None = Field(None, description="Between a wall and the opening.")
-    half_width: Length | None = Field(None, description="From the root to a shoulder, sideways.")
+    points: tuple[Vector, ...] = Field(min_length=2)
+    """Along the root, in order."""
+    opening: Vector | tuple[Vector, ...]
+    """Direction out of the groove, towards the torch: one for all, or one a point."""
+    half_angle: Angle | None = None
+    """Between a wall and the opening."""
+    half_width: Length | None = None
+    """From the root to a shoulder, sideways."""
 
 
 class WorkpieceFile(Model):
     """The file."""
 
     title: str
-    cad: str = Field(description="File with triangles, beside this one: STL, PLY, …")
-    unit: LengthUnit = Field(description="Unit of the CAD's coordinates and of the seams' points.")
+    cad: str
+    """File with triangles, beside this one: STL, PLY, …"""
+    unit: LengthUnit
+    """Unit of the CAD's coordinates and of the seams' points."""
     seams: tuple[SeamLine, ...] = Field(min_length=1)
     source: str = ""
 

@@ -8,6 +8,7 @@ from typing import Any, get_args
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
+from flangeye.files.described import descriptions_of
 from flangeye.files.words import nearest
 from flangeye.plugin.registry import PluginNotFoundError, Registry
 from flangeye.plugin.stage import KINDS, PARTS, Choose, Plugin
@@ -53,13 +54,13 @@ def describe_one(registry: Registry, name: str) -> str:
 
 def parameter_lines(params: type[BaseModel], prefix: str = "") -> list[str]:
     """Return two lines a parameter: name, unit, default, limits; then its description."""
-    lines = []
+    lines, described = [], descriptions_of(params)
     for name, field in params.model_fields.items():
         kind = _kind(params, name, field)
         default = "required" if field.is_required() else _default(field)
         lines.append(f"  {prefix}{name}: {kind} = {default}{_limits(field, kind)}")
-        if field.description:
-            lines.append(f"      {field.description}")
+        if described[name]:
+            lines.append(f"      {described[name]}")
         for nested in _models_in(field.annotation):
             lines += parameter_lines(nested, f"{prefix}{name}.")
     return lines

@@ -19,10 +19,11 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationError, ValidationInfo
+from pydantic import ConfigDict, GetCoreSchemaHandler, ValidationError, ValidationInfo
 from pydantic_core import InitErrorDetails, PydanticCustomError, core_schema
 
 from flangeye import types as t
+from flangeye.files.described import Described
 from flangeye.files.validation import EXPLAINED, sentence
 from flangeye.models.configuration import CELL, EVERY
 from flangeye.models.robots import RobotModel
@@ -30,7 +31,7 @@ from flangeye.types.geometry import rigid, rotation_from_rpy
 from flangeye.units import Angle, Length, param
 
 
-class Params(BaseModel):
+class Params(Described):
     """Base of every plugin's parameters: frozen, and a misspelt key is an error."""
 
     model_config = ConfigDict(
@@ -51,10 +52,8 @@ class PlaceParams(Params):
     """A pose in the frame of its carrier."""
 
     position: tuple[Length, Length, Length] = param(("0 mm", "0 mm", "0 mm"))
-    rpy: tuple[Angle, Angle, Angle] = param(
-        ("0 deg", "0 deg", "0 deg"),
-        description="Roll, pitch, yaw; a target's z points towards the scanner.",
-    )
+    rpy: tuple[Angle, Angle, Angle] = param(("0 deg", "0 deg", "0 deg"))
+    """Roll, pitch, yaw; a target's z points towards the scanner."""
 
     @property
     def matrix(self) -> t.Floats:

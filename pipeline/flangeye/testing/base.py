@@ -15,6 +15,7 @@ import numpy as np
 from flangeye import types as t
 from flangeye.devices import MotionAllowed
 from flangeye.errors import FlangeyeError
+from flangeye.files.described import descriptions_of
 from flangeye.models.loading import load_model
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerData, ScannerModel
@@ -158,8 +159,8 @@ class Conformance:
             f"{plugin.name}: the docstring's first line has {len(summary)} characters, at most "
             f"{longest} fit a line",
         )
-        for name, field in (plugin.params.model_fields if plugin.params else {}).items():
-            require(field.description, f"{plugin.name}: parameter '{name}' has no description")
+        for name, text in (descriptions_of(plugin.params) if plugin.params else {}).items():
+            require(text, f"{plugin.name}: parameter '{name}' has no description")
 
 
 def require(holds: object, message: str) -> None:

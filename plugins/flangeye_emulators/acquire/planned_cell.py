@@ -33,32 +33,21 @@ from flangeye_emulators.world.session import DRAWS, CameraView, disturbed
 class CellSessionParams(ArmsParams):
     """Common parameters of simulated cell sessions."""
 
-    sightings: int = Field(
-        60,
-        ge=3,
-        le=100_000,
-        description="Number of sightings, evenly distributed over the pairs of camera and target.",
-    )
-    places: dict[str, PlaceParams] = Field(
-        default_factory=dict,
-        description="Where everything that the cell leaves unknown truly is, by frame; the base of "
-        "an arm called two is two_base.",
-    )
-    home: dict[str, tuple[Angle, ...]] = Field(
-        default_factory=dict,
-        description="Joints of an arm at the middle of its poses, by its name.",
-    )
-    plan: Literal["random", "grid", "next_best"] = Field(
-        "random",
-        description="Which moments are taken: drawn at random, or a grid of joints, in turn for "
-        "each camera and target; or always the camera, the target and the joints that "
-        "are most informative for the whole cell, given the sightings so far.",
-    )
-    spread: Angle = param("30 deg", gt=0, description="Largest change of a joint from there.")
-    joints: bool = Field(
-        True,
-        description="Whether the arms report their joint angles; a camera on a link needs them.",
-    )
+    sightings: int = Field(60, ge=3, le=100_000)
+    """Number of sightings, evenly distributed over the pairs of camera and target."""
+    places: dict[str, PlaceParams] = Field(default_factory=dict)
+    """Where everything that the cell leaves unknown truly is, by frame; the base of an arm called
+    two is two_base."""
+    home: dict[str, tuple[Angle, ...]] = Field(default_factory=dict)
+    """Joints of an arm at the middle of its poses, by its name."""
+    plan: Literal["random", "grid", "next_best"] = "random"
+    """Which moments are taken: drawn at random, or a grid of joints, in turn for each camera and
+    target; or always the camera, the target and the joints that are most informative for the whole
+    cell, given the sightings so far."""
+    spread: Angle = param("30 deg", gt=0)
+    """Largest change of a joint from there."""
+    joints: bool = True
+    """Whether the arms report their joint angles; a camera on a link needs them."""
 
 
 Sighting = tuple[int, str, str]

@@ -69,48 +69,42 @@ FIELD = float(np.radians(50.0)), float(np.radians(40.0))
 class ArmsParams(Params):
     """Common parameters of simulated arms."""
 
-    arm: ArmErrors = Field(
-        default_factory=ArmErrors,
-        description="How far the arms are from what their controllers report; by default by the "
-        "noise of the pose alone.",
-    )
+    arm: ArmErrors = Field(default_factory=ArmErrors)
+    """How far the arms are from what their controllers report; by default by the noise of the pose
+    alone."""
 
 
 class SessionParams(ArmsParams):
     """Common parameters of simulated sessions."""
 
-    poses: int = Field(20, ge=3, le=100_000, description="Number of captures.")
-    spread: Angle = param("17 deg", gt=0, description="Largest change of a joint from there.")
-    camera: PlaceParams | None = Field(
-        None,
-        description="The camera's true place in what carries it; by default wherever it has to be "
-        "to see the target at the first pose.",
-    )
-    place: PlaceParams = Field(
-        default_factory=PlaceParams,
-        description="The target's true place in what carries it, where the recipe does not know "
-        "it; with camera it follows from the first pose.",
-    )
-    motion: Literal["together", "in_turns", "four_axes"] = Field(
-        "together",
-        description="together: two arms move at once; in_turns: only one of them moves at a time, "
-        "and the other rests at its first pose; four_axes: the first arm is a SCARA, whose flange "
-        "turns about the vertical.",
-    )
+    poses: int = Field(20, ge=3, le=100_000)
+    """Number of captures."""
+    spread: Angle = param("17 deg", gt=0)
+    """Largest change of a joint from there."""
+    camera: PlaceParams | None = None
+    """The camera's true place in what carries it; by default wherever it has to be to see the
+    target at the first pose."""
+    place: PlaceParams = Field(default_factory=PlaceParams)
+    """The target's true place in what carries it, where the recipe does not know it; with camera it
+    follows from the first pose."""
+    motion: Literal["together", "in_turns", "four_axes"] = "together"
+    """together: two arms move at once; in_turns: only one of them moves at a time, and the other
+    rests at its first pose; four_axes: the first arm is a SCARA, whose flange turns about the
+    vertical."""
 
 
 class ViewParams(SessionParams):
     """Common parameters of simulated sessions with area cameras."""
 
-    distance: Length = param(
-        "650 mm", gt=0, description="Distance from camera to target at the first pose."
-    )
+    distance: Length = param("650 mm", gt=0)
+    """Distance from camera to target at the first pose."""
 
 
 class OutlierParams(Params):
     """Rate and size of outliers of simulated cameras."""
 
-    outliers: float = Field(0.0, ge=0, lt=0.5, description="Share of sightings that are outliers.")
+    outliers: float = Field(0.0, ge=0, lt=0.5)
+    """Share of sightings that are outliers."""
 
 
 def noise_free(

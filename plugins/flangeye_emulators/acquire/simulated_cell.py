@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from pydantic import Field
 
 from flangeye.errors import StageError
 from flangeye.maths.kinematics import Arm
@@ -46,11 +45,9 @@ from flangeye_emulators.world.session import CameraView
 class SimulatedCellParams(OutlierParams, CellSessionParams):
     """Parameters of ``acquire.simulated_cell``."""
 
-    wide: bool = Field(
-        False,
-        description="The cameras see 60 x 50 deg, to 2.5 m, and targets turned away by up to "
-        "65 deg; else 50 x 40 deg, to 2 m and 50 deg.",
-    )
+    wide: bool = False
+    """The cameras see 60 x 50 deg, to 2.5 m, and targets turned away by up to 65 deg; else 50 x 40
+    deg, to 2 m and 50 deg."""
 
     @property
     def view(self) -> CameraView:

@@ -68,26 +68,17 @@ BOARDS: Mapping[str, Board] = {
 class SimulatedImagesParams(ViewParams):
     """Parameters of ``acquire.simulated_images``."""
 
-    board: Literal["charuco", "checkerboard", "marker"] = Field(
-        "charuco",
-        description="What is really printed; the step that fits it states its assumed size. "
-        "charuco: 7 x 5 squares of 30 mm, markers of 22 mm from 4X4_50; checkerboard: 8 x 5 "
-        "squares of 25 mm; marker: number 7 of APRILTAG_36h11, 100 mm.",
-    )
-    depth: bool = Field(
-        False,
-        description="The recipe's scanner scans the target too: each image is its own, and comes "
-        "with an organised cloud.",
-    )
-    resolution: float = Field(
-        1.0, gt=0, le=1, description="Scale of the camera's and the scanner's columns and rows."
-    )
-    covered: float = Field(
-        0.15,
-        ge=0,
-        le=1,
-        description="Share of captures in which one side of the target is occluded.",
-    )
+    board: Literal["charuco", "checkerboard", "marker"] = "charuco"
+    """What is really printed; the step that fits it states its assumed size. charuco: 7 x 5 squares
+    of 30 mm, markers of 22 mm from 4X4_50; checkerboard: 8 x 5 squares of 25 mm; marker: number 7
+    of APRILTAG_36h11, 100 mm."""
+    depth: bool = False
+    """The recipe's scanner scans the target too: each image is its own, and comes with an organised
+    cloud."""
+    resolution: float = Field(1.0, gt=0, le=1)
+    """Scale of the camera's and the scanner's columns and rows."""
+    covered: float = Field(0.15, ge=0, le=1)
+    """Share of captures in which one side of the target is occluded."""
 
 
 def camera_at(resolution: float) -> BoardCamera:

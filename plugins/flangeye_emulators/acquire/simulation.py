@@ -57,23 +57,16 @@ from flangeye_plugins.acquire.itinerary import as_plan, left_out, row_at
 class SimulatedParams(ScannerQuality):
     """Parameters of ``acquire.simulated``."""
 
-    poses: Annotated[BoundPart, Choose("plan")] = param(
-        {"grid": {}}, description="Poses the robot visits."
-    )
-    camera: CameraPose = Field(default_factory=CameraPose, description="The scanner's true pose.")
-    verification: int = Field(
-        1,
-        ge=0,
-        le=1000,
-        description="Captures that are kept from solving, near the workspace's middle.",
-    )
-    arm: ArmErrors = Field(
-        default_factory=ArmErrors,
-        description="Errors of the arm that its controller does not know of.",
-    )
-    outliers: float = Field(
-        0.0, ge=0, le=1, description="Share of the captures in which the flange is covered."
-    )
+    poses: Annotated[BoundPart, Choose("plan")] = param({"grid": {}})
+    """Poses the robot visits."""
+    camera: CameraPose = Field(default_factory=CameraPose)
+    """The scanner's true pose."""
+    verification: int = Field(1, ge=0, le=1000)
+    """Captures that are kept from solving, near the workspace's middle."""
+    arm: ArmErrors = Field(default_factory=ArmErrors)
+    """Errors of the arm that its controller does not know of."""
+    outliers: float = Field(0.0, ge=0, le=1)
+    """Share of the captures in which the flange is covered."""
 
 
 class Setting(NamedTuple):

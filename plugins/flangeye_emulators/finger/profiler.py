@@ -19,7 +19,8 @@ from flangeye_emulators.weld_world.world import Shutter, WeldWorld
 class SimulatedProfilerParams(Params):
     """Parameters of ``profiler.simulated``."""
 
-    behind: Length = param("30 mm", gt=0, le=0.2, description="How far behind the torch it looks.")
+    behind: Length = param("30 mm", gt=0, le=0.2)
+    """How far behind the torch it looks."""
 
 
 class SimulatedProfiler(Device):

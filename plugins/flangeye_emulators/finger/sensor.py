@@ -32,28 +32,23 @@ from flangeye_plugins.weld.touch.tag_observation import dictionary_of
 class SimulatedFingerParams(LaidParams):
     """Parameters of ``sensor.simulated_finger``: the true world of the finger."""
 
-    tool: ToolPath = param(
-        "srm", description="The true finger and torch: one of data/tools, or a .yaml file."
-    )
-    seam: str = Field("groove", description="Name of the seam in that file.")
-    leg: int | None = Field(None, ge=1, description="Leg of a seam with sharp corners.")
-    plate: Length | None = param(
-        None,
-        gt=0,
-        description="Thickness of the upper plate of a lap joint or fillet, in place of a groove.",
-    )
-    world: WorldPath = param(
-        "as_filed",
-        description="What is true and differs from the controller's files: arm, tool, finger, "
-        "clock, workpiece, heat. One of data/worlds, or a .yaml file.",
-    )
-    hidden: tuple[Duration, Duration] | None = param(
-        None, description="The tag is out of sight from the first time to the second."
-    )
-    held: bool = Field(
-        False, description="To calibrate: the tip stays where it first touches, as in a punch mark."
-    )
-    fails: Duration | None = param(None, description="When the camera is lost.")
+    tool: ToolPath = param("srm")
+    """The true finger and torch: one of data/tools, or a .yaml file."""
+    seam: str = "groove"
+    """Name of the seam in that file."""
+    leg: int | None = Field(None, ge=1)
+    """Leg of a seam with sharp corners."""
+    plate: Length | None = param(None, gt=0)
+    """Thickness of the upper plate of a lap joint or fillet, in place of a groove."""
+    world: WorldPath = param("as_filed")
+    """What is true and differs from the controller's files: arm, tool, finger, clock, workpiece,
+    heat. One of data/worlds, or a .yaml file."""
+    hidden: tuple[Duration, Duration] | None = param(None)
+    """The tag is out of sight from the first time to the second."""
+    held: bool = False
+    """To calibrate: the tip stays where it first touches, as in a punch mark."""
+    fails: Duration | None = param(None)
+    """When the camera is lost."""
 
 
 class SimulatedFinger(Device):

@@ -24,8 +24,10 @@ T = TypeVar("T")
 class ToolFile(FingerGeometry):
     """True finger and torch of a world, from a file that no controller reads."""
 
-    lateral: Stiffness = param(gt=0, description="Across the finger, at its tip.")
-    axial: Stiffness = param(gt=0, description="Along the finger.")
+    lateral: Stiffness = param(gt=0)
+    """Across the finger, at its tip."""
+    axial: Stiffness = param(gt=0)
+    """Along the finger."""
 
 
 ToolPath = Annotated[

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Literal, NamedTuple
 
 import numpy as np
-from pydantic import Field
 
 from flangeye.models.robots import Joint, RobotModel
 from flangeye.plugin.stage import Params
@@ -33,15 +32,12 @@ plain fit: 0.35 to 0.7 mm rms, most of it smooth over the workspace."""
 class ArmErrors(Params):
     """Errors of the simulated arm against its controller's model."""
 
-    quality: Literal["exact", "kind", "real"] = Field(
-        "kind",
-        description="kind: joint zeros as small as the robot's joint_accuracy, nothing else; "
-        "exact: no errors, and poses that repeat; real: as published recordings show arms to be. "
-        "The size below replaces its own.",
-    )
-    zeros: Angle | None = param(
-        None, ge=0, description="Standard deviation of the joints' zeros; real: 1 mrad."
-    )
+    quality: Literal["exact", "kind", "real"] = "kind"
+    """kind: joint zeros as small as the robot's joint_accuracy, nothing else; exact: no errors, and
+    poses that repeat; real: as published recordings show arms to be. The size below replaces its
+    own."""
+    zeros: Angle | None = param(None, ge=0)
+    """Standard deviation of the joints' zeros; real: 1 mrad."""
 
     def sizes(self, robot: RobotModel) -> ErrorSizes:
         """Return the standard deviations for a robot model."""

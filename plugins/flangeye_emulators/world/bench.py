@@ -34,16 +34,12 @@ CLUTTER = 6
 class LaidParams(Params):
     """The true pose of a workpiece."""
 
-    workpiece: WorkpiecePath = param(
-        "v-straight", description="One of data/workpieces, or a .yaml file of one's own."
-    )
-    position: tuple[Length, Length, Length] = param(
-        ("600 mm", "0 mm", "250 mm"),
-        description="Position of the workpiece's CAD origin in the base.",
-    )
-    rpy: tuple[Angle, Angle, Angle] = param(
-        ("0 deg", "0 deg", "20 deg"), description="Roll, pitch, yaw of its CAD, in base."
-    )
+    workpiece: WorkpiecePath = param("v-straight")
+    """One of data/workpieces, or a .yaml file of one's own."""
+    position: tuple[Length, Length, Length] = param(("600 mm", "0 mm", "250 mm"))
+    """Position of the workpiece's CAD origin in the base."""
+    rpy: tuple[Angle, Angle, Angle] = param(("0 deg", "0 deg", "20 deg"))
+    """Roll, pitch, yaw of its CAD, in base."""
 
     @property
     def base_T_part(self) -> Floats:
@@ -54,9 +50,8 @@ class LaidParams(Params):
 class BenchParams(LaidParams):
     """Parameters of a workpiece on a bench."""
 
-    covered: float = Field(
-        0.0, ge=0, lt=1, description="Share of the workpiece covered by a sheet, at one end."
-    )
+    covered: float = Field(0.0, ge=0, lt=1)
+    """Share of the workpiece covered by a sheet, at one end."""
 
     def true_seams(self, workpiece: Workpiece) -> dict[str, Floats]:
         """Return the workpiece's true seams by name, (N, 3) in ``base`` [m]."""

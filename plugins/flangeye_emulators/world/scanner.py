@@ -562,12 +562,10 @@ def _digits(depth: Image) -> Image:
 class CameraPose(PlaceParams):
     """The scanner's pose in ``base``."""
 
-    position: tuple[Length, Length, Length] = param(
-        ("600 mm", "-12.5 mm", "1000 mm"), description="The paper's (17): 1 m above the table."
-    )
-    rpy: tuple[Angle, Angle, Angle] = param(
-        ("180 deg", "0 deg", "-90 deg"), description="Roll, pitch, yaw; the default looks down."
-    )
+    position: tuple[Length, Length, Length] = param(("600 mm", "-12.5 mm", "1000 mm"))
+    """The paper's (17): 1 m above the table."""
+    rpy: tuple[Angle, Angle, Angle] = param(("180 deg", "0 deg", "-90 deg"))
+    """Roll, pitch, yaw; the default looks down."""
 
     @property
     def base_T_camera(self) -> Floats:
@@ -578,10 +576,10 @@ class CameraPose(PlaceParams):
 class ScannerQuality(Params):
     """Errors of a simulated scanner beyond its model."""
 
-    noise: float = Field(1.0, ge=0, description="Scale of the scanner's noise and distortion.")
-    resolution: float = Field(
-        1.0, gt=0, le=1, description="Scale of the scanner's columns and rows."
-    )
+    noise: float = Field(1.0, ge=0)
+    """Scale of the scanner's noise and distortion."""
+    resolution: float = Field(1.0, gt=0, le=1)
+    """Scale of the scanner's columns and rows."""
 
 
 def scanner_of(

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import Field
 
 from flangeye import StageError, stage
 from flangeye.files.clouds import PER_METRE, LengthUnit
@@ -53,30 +52,21 @@ StatedUnit = Literal["auto", "m", "mm", "in"]
 class ArchiveParams(OpeningParams):
     """Parameters of ``acquire.archive``: layout, unit, and checks."""
 
-    unit: StatedUnit = Field(
-        "auto",
-        description="Unit of the clouds. auto: what the layout states, else metres or millimetres, "
-        "whichever fits the scanner's range; either is reported.",
-    )
-    stretch: tuple[float, float, float] = Field(
-        (1.0, 1.0, 1.0),
-        description="Factors of the clouds' coordinates along x, y and z: -1 where an axis is "
-        "mirrored, 0.99 where distances are 1 % too long.",
-    )
-    viewpoint: bool = Field(
-        False, description="Whether a PCD's points are in the frame in which its VIEWPOINT gives "
-        "the scanner's pose; they are then transformed into the scanner's frame."
-    )  # fmt: skip
-    unreadable: Literal["refuse", "reject"] = Field(
-        "refuse",
-        description="What to do about a cloud that cannot be read: refuse the archive, or set the "
-        "capture aside and report it.",
-    )
-    camera: CameraParams | None = Field(
-        None,
-        description="The camera that took the images beside the clouds; not needed where a cloud "
-        "is organised as its image, whose pixels then show it.",
-    )
+    unit: StatedUnit = "auto"
+    """Unit of the clouds. auto: what the layout states, else metres or millimetres, whichever fits
+    the scanner's range; either is reported."""
+    stretch: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Factors of the clouds' coordinates along x, y and z: -1 where an axis is mirrored, 0.99 where
+    distances are 1 % too long."""
+    viewpoint: bool = False
+    """Whether a PCD's points are in the frame in which its VIEWPOINT gives the scanner's pose; they
+    are then transformed into the scanner's frame."""
+    unreadable: Literal["refuse", "reject"] = "refuse"
+    """What to do about a cloud that cannot be read: refuse the archive, or set the capture aside
+    and report it."""
+    camera: CameraParams | None = None
+    """The camera that took the images beside the clouds; not needed where a cloud is organised as
+    its image, whose pixels then show it."""
 
 
 @stage("acquire.archive")

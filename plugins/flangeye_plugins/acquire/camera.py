@@ -21,11 +21,12 @@ Grey = NDArray[np.uint8]
 class CameraParams(Params):
     """Intrinsic calibration of the camera that took the images."""
 
-    focal_length: tuple[float, float] = Field(description="fx and fy of the camera's matrix [px].")
-    principal_point: tuple[float, float] = Field(description="cx and cy [px].")
-    distortion: tuple[float, ...] = Field(
-        (), max_length=14, description="OpenCV's coefficients k1, k2, p1, p2, k3, …; none if given."
-    )
+    focal_length: tuple[float, float]
+    """fx and fy of the camera's matrix [px]."""
+    principal_point: tuple[float, float]
+    """cx and cy [px]."""
+    distortion: tuple[float, ...] = Field((), max_length=14)
+    """OpenCV's coefficients k1, k2, p1, p2, k3, …; none if given."""
 
     def image(self, pixels: Grey) -> Image:
         """Return the pixels as an image with this camera."""

@@ -38,11 +38,8 @@ from flangeye_plugins.acquire.opening import (
 class CentresParams(OpeningParams):
     """Parameters of ``acquire.centres``."""
 
-    centre_noise: Length = param(
-        "0.3 mm",
-        gt=0,
-        description="Standard deviation of a centre along each axis; files of centres do not say.",
-    )
+    centre_noise: Length = param("0.3 mm", gt=0)
+    """Standard deviation of a centre along each axis; files of centres do not say."""
 
 
 @stage("acquire.centres")
@@ -120,12 +117,10 @@ def _circle(centre: Floats, noise: float, behind: float) -> CircleFeature:
 class SamplesParams(OpeningParams):
     """Parameters of ``acquire.samples``."""
 
-    position_noise: Length = param(
-        "0.5 mm", gt=0, description="Standard deviation of a marker's position along each axis."
-    )
-    angle_noise: Angle = param(
-        "0.2 deg", gt=0, description="Standard deviation of the marker's rotation about each axis."
-    )
+    position_noise: Length = param("0.5 mm", gt=0)
+    """Standard deviation of a marker's position along each axis."""
+    angle_noise: Angle = param("0.2 deg", gt=0)
+    """Standard deviation of the marker's rotation about each axis."""
 
 
 @stage("acquire.samples")

@@ -55,14 +55,18 @@ Grey = NDArray[np.uint8]
 class SeenBoardParams(Params):
     """The board for calibrating the camera, with the parameters of its fit step."""
 
-    kind: Kind = Field("charuco", description="charuco, checkerboard, or circles.")
-    columns: int = Field(
-        ge=3, le=200, description="Squares, or circles of a row, from left to right."
-    )
-    rows: int = Field(ge=3, le=200, description="Squares, or rows of circles, from top to bottom.")
-    square: Length = param(gt=0, description="Edge of a square, or distance of rows of circles.")
-    marker: Length = param("0 mm", ge=0, description="Edge of a ChArUco board's markers.")
-    dictionary: Dictionary = Field("4X4_50", description="Family of the markers.")
+    kind: Kind = "charuco"
+    """charuco, checkerboard, or circles."""
+    columns: int = Field(ge=3, le=200)
+    """Squares, or circles of a row, from left to right."""
+    rows: int = Field(ge=3, le=200)
+    """Squares, or rows of circles, from top to bottom."""
+    square: Length = param(gt=0)
+    """Edge of a square, or distance of rows of circles."""
+    marker: Length = param("0 mm", ge=0)
+    """Edge of a ChArUco board's markers."""
+    dictionary: Dictionary = "4X4_50"
+    """Family of the markers."""
 
     @model_validator(mode="after")
     def _is_whole(self) -> Self:
@@ -335,28 +339,21 @@ Camera = tuple[Floats, Floats] | tuple[Floats, Floats, Floats]
 class ImagesParams(OpeningParams):
     """Parameters of ``acquire.images``."""
 
-    focal_length: tuple[float, float] | None = Field(
-        None, description="fx and fy of the camera's matrix [px]; the archive's own if not given."
-    )
-    principal_point: tuple[float, float] | None = Field(
-        None, description="cx and cy [px]; goes with focal_length."
-    )
-    distortion: tuple[float, ...] = Field(
-        (), max_length=14, description="OpenCV's coefficients k1, k2, p1, p2, k3, …; none if given."
-    )
-    camera_file: str | None = Field(
-        None, description="The camera's calibration, beside the images: camera_info, OpenCV's "
-        "storage, kalibr's camchain, COLMAP's cameras.txt, RealSense's or Zivid's intrinsics, "
-        ".npz; the only one there if not given."
-    )  # fmt: skip
-    board: SeenBoardParams | None = Field(
-        None,
-        description="Find the camera by the views of this board; refine focal_length, if given.",
-    )
-    cloud_unit: LengthUnit | None = Field(
-        None, description="Unit of the clouds that lie beside the images, where the archive's "
-        "layout does not say; metres or millimetres, whichever scanners can see, if not given."
-    )  # fmt: skip
+    focal_length: tuple[float, float] | None = None
+    """fx and fy of the camera's matrix [px]; the archive's own if not given."""
+    principal_point: tuple[float, float] | None = None
+    """cx and cy [px]; goes with focal_length."""
+    distortion: tuple[float, ...] = Field((), max_length=14)
+    """OpenCV's coefficients k1, k2, p1, p2, k3, …; none if given."""
+    camera_file: str | None = None
+    """The camera's calibration, beside the images: camera_info, OpenCV's storage, kalibr's
+    camchain, COLMAP's cameras.txt, RealSense's or Zivid's intrinsics, .npz; the only one there if
+    not given."""
+    board: SeenBoardParams | None = None
+    """Find the camera by the views of this board; refine focal_length, if given."""
+    cloud_unit: LengthUnit | None = None
+    """Unit of the clouds that lie beside the images, where the archive's layout does not say;
+    metres or millimetres, whichever scanners can see, if not given."""
 
     def camera(self, recording: Recording) -> Camera | None:
         """Return the recipe's camera matrix (3, 3) [px] and distortion, else the archive's."""

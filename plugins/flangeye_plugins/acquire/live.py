@@ -89,26 +89,17 @@ class Idle:
 class LiveParams(Params):
     """Parameters of ``acquire.live``."""
 
-    view: Annotated[BoundPart, Choose("view")] = Field(
-        description="Where the scanner roughly is: {guess: {position: …}} or {shown: {joints: …}}."
-    )
-    poses: Annotated[BoundPart, Choose("plan")] = param(
-        {"next_best": {}}, description="Poses the robot visits."
-    )
-    verification: int = Field(
-        1,
-        ge=0,
-        le=1000,
-        description="Captures that are kept from solving, near the workspace's middle.",
-    )
-    home: tuple[JointPosition, ...] | None = Field(
-        None,
-        description="Joint angles of the arm before a run; a plan that does not ask "
-        "the arm (--offline) begins there.",
-    )
-    moved: Length = param(
-        "0.05 mm", gt=0, description="A scan during which the flange moved by more is set aside."
-    )
+    view: Annotated[BoundPart, Choose("view")]
+    """Where the scanner roughly is: {guess: {position: …}} or {shown: {joints: …}}."""
+    poses: Annotated[BoundPart, Choose("plan")] = param({"next_best": {}})
+    """Poses the robot visits."""
+    verification: int = Field(1, ge=0, le=1000)
+    """Captures that are kept from solving, near the workspace's middle."""
+    home: tuple[JointPosition, ...] | None = None
+    """Joint angles of the arm before a run; a plan that does not ask the arm (--offline) begins
+    there."""
+    moved: Length = param("0.05 mm", gt=0)
+    """A scan during which the flange moved by more is set aside."""
 
 
 @stage("acquire.live")

@@ -51,19 +51,14 @@ if TYPE_CHECKING:
 class OpeningParams(Params):
     """Common parameters: the archive and its layout."""
 
-    path: RecipePath | None = Field(
-        None, description="The archive; --archive on the command line comes before it."
-    )
-    reader: Annotated[BoundPart, Choose("reader")] = param(
-        "auto", description="Layout of the archive; auto detects and reports it."
-    )
-    leave_out: tuple[str, ...] = Field((), description="Ids of poses to leave out.")
-    fewest: int = Field(
-        MIN_CAPTURES,
-        ge=1,
-        description="Refuse fewer captures; of fewer than three no calibration is made, but one "
-        "can be checked.",
-    )
+    path: RecipePath | None = None
+    """The archive; --archive on the command line comes before it."""
+    reader: Annotated[BoundPart, Choose("reader")] = param("auto")
+    """Layout of the archive; auto detects and reports it."""
+    leave_out: tuple[str, ...] = ()
+    """Ids of poses to leave out."""
+    fewest: int = Field(MIN_CAPTURES, ge=1)
+    """Refuse fewer captures; of fewer than three no calibration is made, but one can be checked."""
 
 
 def archive_path(stage: str, given: ArchivePath, params: OpeningParams) -> Path:

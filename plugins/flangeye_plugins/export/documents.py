@@ -189,14 +189,10 @@ def matrix(pose: CalibratedPose, params: LengthParams) -> ExportedFile:
 class OpticalParams(Params):
     """Where the optical frame is in the mount link."""
 
-    position: tuple[Length, Length, Length] = param(
-        ("0 mm", "0 mm", "0 mm"),
-        description="Position of the optical frame's origin in the mount link.",
-    )
-    rpy: tuple[Angle, Angle, Angle] = param(
-        ("-90 deg", "0 deg", "-90 deg"),
-        description="Roll, pitch, yaw; by default z ahead along the mount's x, as in REP 103.",
-    )
+    position: tuple[Length, Length, Length] = param(("0 mm", "0 mm", "0 mm"))
+    """Position of the optical frame's origin in the mount link."""
+    rpy: tuple[Angle, Angle, Angle] = param(("-90 deg", "0 deg", "-90 deg"))
+    """Roll, pitch, yaw; by default z ahead along the mount's x, as in REP 103."""
 
     @property
     def matrix(self) -> Floats:
@@ -207,21 +203,15 @@ class OpticalParams(Params):
 class UrdfParams(FramesParams):
     """The frames, and how the camera's mount link and its optical frame lie to each other."""
 
-    mount: str | None = Field(
-        None, pattern=FRAME, description="The camera's mount link; camera_link if not given."
-    )
-    child: str | None = Field(
-        None,
-        pattern=FRAME,
-        description="The camera's optical frame; camera_optical_frame if not given, and in a cell "
-        "the frame's own name.",
-    )
-    mount_T_optical: OpticalParams | None = Field(
-        None, description="Where the optical frame is in the mount link, if that is known."
-    )
-    camera_urdf: RecipeFile | None = Field(
-        None, description="The camera's URDF (xacro already run); gives the same transform."
-    )
+    mount: str | None = Field(None, pattern=FRAME)
+    """The camera's mount link; camera_link if not given."""
+    child: str | None = Field(None, pattern=FRAME)
+    """The camera's optical frame; camera_optical_frame if not given, and in a cell the frame's own
+    name."""
+    mount_T_optical: OpticalParams | None = None
+    """Where the optical frame is in the mount link, if that is known."""
+    camera_urdf: RecipeFile | None = None
+    """The camera's URDF (xacro already run); gives the same transform."""
 
 
 def urdf(pose: CalibratedPose, params: UrdfParams) -> ExportedFile:

@@ -22,11 +22,8 @@ FRAME = r"^[A-Za-z_][A-Za-z0-9_/]*$"
 class NamedParams(Params):
     """The name of the pose."""
 
-    name: str = Field(
-        "camera",
-        pattern=NAME,
-        description="Name of the pose in the other program, and of the file.",
-    )
+    name: str = Field("camera", pattern=NAME)
+    """Name of the pose in the other program, and of the file."""
 
     def require_unnamed(self, pose: CalibratedPose) -> None:
         """Refuse names of two frames for the many of a cell.
@@ -45,23 +42,18 @@ class NamedParams(Params):
 class NumberedParams(NamedParams):
     """The name of the pose, and its number in the controller."""
 
-    number: int = Field(
-        1, ge=0, le=999, description="Number of the frame or tool in the controller."
-    )
+    number: int = Field(1, ge=0, le=999)
+    """Number of the frame or tool in the controller."""
 
 
 class FramesParams(NamedParams):
     """The names of the two frames in the other program."""
 
-    parent: str | None = Field(
-        None, pattern=FRAME, description="Frame that carries the camera; base or flange if not "
-        "given. ROS drivers call the controller's own base by several names: for UR it is base, "
-        "not base_link.",
-    )  # fmt: skip
-    child: str | None = Field(
-        None, pattern=FRAME, description="The camera's own frame, z its view; camera, or in a cell "
-        "the camera's name, if not given.",
-    )  # fmt: skip
+    parent: str | None = Field(None, pattern=FRAME)
+    """Frame that carries the camera; base or flange if not given. ROS drivers call the controller's
+    own base by several names: for UR it is base, not base_link."""
+    child: str | None = Field(None, pattern=FRAME)
+    """The camera's own frame, z its view; camera, or in a cell the camera's name, if not given."""
 
     def carrier(self, pose: CalibratedPose) -> str:
         """Return the name of the frame that carries the camera."""
@@ -75,7 +67,8 @@ class FramesParams(NamedParams):
 class LengthParams(NamedParams):
     """The name of the pose, and its unit."""
 
-    length: Literal["m", "mm"] = Field("m", description="Unit of the translation.")
+    length: Literal["m", "mm"] = "m"
+    """Unit of the translation."""
 
     def matrix(self, pose: CalibratedPose) -> list[list[float]]:
         """Return the rows of the pose (4, 4), its translation in that unit, to nine places."""
@@ -87,7 +80,8 @@ class LengthParams(NamedParams):
 class ZividExportParams(LengthParams):
     """The name of the pose, and its unit."""
 
-    length: Literal["m", "mm"] = Field("mm", description="Unit; Zivid's points are in mm.")
+    length: Literal["m", "mm"] = "mm"
+    """Unit; Zivid's points are in mm."""
 
 
 def require_identifier(name: str, reserved: Iterable[str] = ()) -> str:

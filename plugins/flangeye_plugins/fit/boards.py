@@ -30,11 +30,8 @@ from flangeye_plugins.fit.uncertainty import ScannerErrorParams
 class PrintedTargetParams(ScannerErrorParams):
     """Common parameters of fits of printed targets."""
 
-    depth: Literal["auto", "off", "only"] = Field(
-        "auto",
-        description="Use the organised cloud under the image: where it gives the better pose, "
-        "never, or always.",
-    )
+    depth: Literal["auto", "off", "only"] = "auto"
+    """Use the organised cloud under the image: where it gives the better pose, never, or always."""
     # Expected standard deviation of a corner's coordinate [px] [px]
     corner_noise: ClassVar[float] = 0.1
     # Largest standard deviation of the reprojection [px] [px]
@@ -44,23 +41,26 @@ class PrintedTargetParams(ScannerErrorParams):
 class DictionaryParams(PrintedTargetParams):
     """Common parameters of fits of targets with markers."""
 
-    dictionary: Dictionary = Field(
-        "4X4_50", description="Family of the markers, as OpenCV names it."
-    )
+    dictionary: Dictionary = "4X4_50"
+    """Family of the markers, as OpenCV names it."""
 
 
 class SquaresParams(PrintedTargetParams):
     """Common parameters of fits of boards of squares."""
 
-    columns: int = Field(ge=3, le=200, description="Squares from left to right, inner and outer.")
-    rows: int = Field(ge=3, le=200, description="Squares from top to bottom.")
-    square: Length = param(gt=0, description="Edge of a square, measured on the print.")
+    columns: int = Field(ge=3, le=200)
+    """Squares from left to right, inner and outer."""
+    rows: int = Field(ge=3, le=200)
+    """Squares from top to bottom."""
+    square: Length = param(gt=0)
+    """Edge of a square, measured on the print."""
 
 
 class CharucoParams(SquaresParams, DictionaryParams):
     """Parameters of ``fit.charuco``."""
 
-    marker: Length = param(gt=0, description="Edge of a marker, measured on the print.")
+    marker: Length = param(gt=0)
+    """Edge of a marker, measured on the print."""
 
     @model_validator(mode="after")
     def _fits(self) -> CharucoParams:
@@ -79,8 +79,10 @@ class CheckerboardParams(SquaresParams):
     """Parameters of ``fit.checkerboard``."""
 
     # OpenCV finds no grid of fewer than three inner corners a side
-    columns: int = Field(ge=4, le=200, description="Squares from left to right, inner and outer.")
-    rows: int = Field(ge=4, le=200, description="Squares from top to bottom.")
+    columns: int = Field(ge=4, le=200)
+    """Squares from left to right, inner and outer."""
+    rows: int = Field(ge=4, le=200)
+    """Squares from top to bottom."""
 
     @model_validator(mode="after")
     def _asymmetric(self) -> CheckerboardParams:
@@ -100,12 +102,14 @@ class CheckerboardParams(SquaresParams):
 class CirclesParams(PrintedTargetParams):
     """Parameters of ``fit.circles``."""
 
-    columns: int = Field(ge=2, le=200, description="Circles per row.")
-    rows: int = Field(
-        ge=3, le=200, description="Rows, every other one shifted by half a step; odd."
-    )
-    spacing: Length = param(gt=0, description="Distance of two rows, measured on the print.")
-    diameter: Length = param(gt=0, description="Diameter of the circles, measured on the print.")
+    columns: int = Field(ge=2, le=200)
+    """Circles per row."""
+    rows: int = Field(ge=3, le=200)
+    """Rows, every other one shifted by half a step; odd."""
+    spacing: Length = param(gt=0)
+    """Distance of two rows, measured on the print."""
+    diameter: Length = param(gt=0)
+    """Diameter of the circles, measured on the print."""
 
     @model_validator(mode="after")
     def _asymmetric(self) -> CirclesParams:
@@ -125,8 +129,10 @@ class CirclesParams(PrintedTargetParams):
 class MarkerParams(DictionaryParams):
     """Parameters of ``fit.aruco``."""
 
-    id: int = Field(0, ge=0, description="Which marker of the dictionary.")
-    size: Length = param(gt=0, description="Edge of the black square, measured on the print.")
+    id: int = Field(0, ge=0)
+    """Which marker of the dictionary."""
+    size: Length = param(gt=0)
+    """Edge of the black square, measured on the print."""
 
     @property
     def board(self) -> Board:

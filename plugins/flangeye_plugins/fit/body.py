@@ -32,22 +32,15 @@ if TYPE_CHECKING:
 class FitBodyParams(Params):
     """Parameters of ``fit.body``."""
 
-    model_error: Length = param(
-        "0.1 mm",
-        ge=0,
-        description="Standard deviation of the body's surface against its CAD along each axis, "
-        "smooth over it: make, coating, play; added to the covariance.",
-    )
-    scanner_error: Length = param(
-        "0.06 mm",
-        ge=0,
-        description="Standard deviation along each axis of the scanner's own distortion, which a "
-        "single scan cannot show; added to the covariance. Where the recipe names the scanner's "
-        "model, its calibration error over its volume counts instead.",
-    )
-    max_rms: Length = param(
-        "4 mm", gt=0, description="Largest robust deviation of the scan from the body's surface."
-    )
+    model_error: Length = param("0.1 mm", ge=0)
+    """Standard deviation of the body's surface against its CAD along each axis, smooth over it:
+    make, coating, play; added to the covariance."""
+    scanner_error: Length = param("0.06 mm", ge=0)
+    """Standard deviation along each axis of the scanner's own distortion, which a single scan
+    cannot show; added to the covariance. Where the recipe names the scanner's model, its
+    calibration error over its volume counts instead."""
+    max_rms: Length = param("4 mm", gt=0)
+    """Largest robust deviation of the scan from the body's surface."""
 
 
 @stage("fit.body")

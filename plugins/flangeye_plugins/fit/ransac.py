@@ -21,11 +21,8 @@ from flangeye_plugins.fit.uncertainty import plane_covariance
 class RansacCircleParams(Params):
     """Parameters of ``fit.ransac_circle``; the defaults are the paper's (section 3.2.2)."""
 
-    radius: Length | None = param(
-        None,
-        gt=0,
-        description="R, the largest radius a circle may have; the flange's if not given.",
-    )
+    radius: Length | None = param(None, gt=0)
+    """R, the largest radius a circle may have; the flange's if not given."""
     # Largest difference of a radius below R [m]
     e_r: ClassVar[float] = 1e-3
     # Largest distance of a point from the sphere about the centre [m]

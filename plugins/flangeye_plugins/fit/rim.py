@@ -39,17 +39,13 @@ LEAST_NOISE = 3e-5
 class RimParams(ScannerErrorParams):
     """Parameters of ``fit.rim``."""
 
-    inlier: Length = param(
-        "0.3 mm", gt=0, description="Largest distance of a rim point from the circle."
-    )
+    inlier: Length = param("0.3 mm", gt=0)
+    """Largest distance of a rim point from the circle."""
     # Smallest share of the rim's circumference, and of the bore's, to be seen
     min_coverage: ClassVar[float] = 0.3
-    radius_tolerance: Length = param(
-        "1.5 mm",
-        gt=0,
-        description="Largest difference of a fitted radius from the flange's: room for chamfers "
-        "and for what the scanner wears off an edge.",
-    )
+    radius_tolerance: Length = param("1.5 mm", gt=0)
+    """Largest difference of a fitted radius from the flange's: room for chamfers and for what the
+    scanner wears off an edge."""
     # Standard deviation of what shifts a whole edge unseen (chamfer, shadow); added to the
     # centre's covariance in the face [m]
     edge_bias: ClassVar[float] = 0.05e-3

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
-from pydantic import Field
 
 from flangeye import stage
 from flangeye.maths.circles import sectors
@@ -27,12 +26,9 @@ LEAST_SCALE = 1e-6
 class SphereParams(ScannerErrorParams):
     """Parameters of ``fit.sphere``."""
 
-    radius: Literal["known", "free"] = Field(
-        "known",
-        description="Hold the radius at that of the recipe's sphere, or fit it, as where the "
-        "diameter is unknown. On a cap a free radius costs the depth of the centre most of its "
-        "accuracy.",
-    )
+    radius: Literal["known", "free"] = "known"
+    """Hold the radius at that of the recipe's sphere, or fit it, as where the diameter is unknown.
+    On a cap a free radius costs the depth of the centre most of its accuracy."""
     # Points seen more obliquely than this are left out [rad]
     max_incidence: ClassVar[float] = float(np.radians(60))
     # Smallest share of the cap within that angle to be seen

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
-from pydantic import Field
 
 from flangeye import Params, stage
 from flangeye.maths.circles import sectors
@@ -29,10 +28,9 @@ FEWEST_POINTS = 20
 class SphereProfileParams(Params):
     """Parameters of ``fit.sphere_profile``."""
 
-    side: Literal["+y", "-y"] = Field(
-        description="On which side of the laser's plane, in the scanner's frame, the centre of "
-        "the sphere is. One profile cannot show it; keep all poses of a session on one side.",
-    )
+    side: Literal["+y", "-y"]
+    """On which side of the laser's plane, in the scanner's frame, the centre of the sphere is. One
+    profile cannot show it; keep all poses of a session on one side."""
     # Least and largest distance of the centre from the plane, in radii. Near the middle the
     # distance follows badly from the circle's size, near the edge the circle is small; the best
     # is 0.7 to 0.97

@@ -18,12 +18,9 @@ residuals on the published clouds."""
 class ScannerErrorParams(Params):
     """Common parameters of fits to a scan."""
 
-    scanner_error: Length = param(
-        "0.06 mm",
-        ge=0,
-        description="Standard deviation along each axis of the scanner's own distortion, which a "
-        "single scan cannot show: its calibration accuracy over root 3; added to the covariance.",
-    )
+    scanner_error: Length = param("0.06 mm", ge=0)
+    """Standard deviation along each axis of the scanner's own distortion, which a single scan
+    cannot show: its calibration accuracy over root 3; added to the covariance."""
 
 
 def clustered_covariance(

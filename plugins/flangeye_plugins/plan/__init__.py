@@ -25,28 +25,22 @@ Point = tuple[Length, Length, Length]
 class PlanParams(Params):
     """The region in which plans look for poses."""
 
-    centre: Point | None = Field(
-        None, description="Centre of the work; before the scanner if not given."
-    )
-    size: Point = param(
-        ("300 mm", "300 mm", "200 mm"),
-        description="Edges of the work along the base's axes: where the matrix has to be right.",
-    )
-    tilt: Angle = param(
-        "0.3 rad", ge=0, description="Largest roll, pitch and yaw away from facing the scanner."
-    )
-    facing: Angle = param(
-        "35 deg",
-        gt=0,
-        description="Largest angle between the view and the flange's normal; for a body, the "
-        "flange's axis along which the body is shown.",
-    )
+    centre: Point | None = None
+    """Centre of the work; before the scanner if not given."""
+    size: Point = param(("300 mm", "300 mm", "200 mm"))
+    """Edges of the work along the base's axes: where the matrix has to be right."""
+    tilt: Angle = param("0.3 rad", ge=0)
+    """Largest roll, pitch and yaw away from facing the scanner."""
+    facing: Angle = param("35 deg", gt=0)
+    """Largest angle between the view and the flange's normal; for a body, the flange's axis along
+    which the body is shown."""
 
 
 class GridParams(PlanParams):
     """Parameters of ``plan.grid``."""
 
-    counts: tuple[int, int, int] = Field((3, 3, 2), description="Grid points along each edge.")
+    counts: tuple[int, int, int] = (3, 3, 2)
+    """Grid points along each edge."""
 
 
 @part("plan.grid")
@@ -90,7 +84,8 @@ def _pose_at(
 class NextBestParams(PlanParams):
     """Parameters of ``plan.next_best``."""
 
-    count: int = Field(30, ge=3, le=10_000, description="Number of poses.")
+    count: int = Field(30, ge=3, le=10_000)
+    """Number of poses."""
     # Candidate poses compared for each choice
     candidates: ClassVar[int] = 400
     # Expected standard deviation of a centre per axis: scanner, fit and arm [m]

@@ -46,17 +46,19 @@ from flangeye_plugins.reader.pairing import MatchedPose, PairingParams, pair
 class JoinedParams(Params):
     """A further table, joined with the others."""
 
-    file: str = Field(description="The table's name, beside the others.")
-    number: Column | None = Field(
-        None, description="Column of the pose's number, or name, by which tables are joined."
-    )
+    file: str
+    """The table's name, beside the others."""
+    number: Column | None = None
+    """Column of the pose's number, or name, by which tables are joined."""
 
 
 class SeenParams(JoinedParams):
     """Columns of one target as one camera measured it."""
 
-    camera: str = Field(description="Name of the camera in the recipe's cell.")
-    target: str = Field(description="Name of the target in the recipe's cell.")
+    camera: str
+    """Name of the camera in the recipe's cell."""
+    target: str
+    """Name of the target in the recipe's cell."""
 
 
 class OwnTableParams(JoinedParams, ColumnsParams):
@@ -76,8 +78,10 @@ class ArmTableParams(FlangePoseParams, OwnTableParams, JointsParams):
 class AxisTableParams(JoinedParams, TimesParams):
     """Columns of a rail's or positioner's pose, as its controller reports it."""
 
-    column: Column = Field(description="Column of the value.")
-    unit: Literal["m", "mm", "rad", "deg"] = Field(description="Unit of the value.")
+    column: Column
+    """Column of the value."""
+    unit: Literal["m", "mm", "rad", "deg"]
+    """Unit of the value."""
 
 
 class SightingsParams(SeenParams, SeenPoseParams, OwnTableParams):
@@ -87,24 +91,23 @@ class SightingsParams(SeenParams, SeenPoseParams, OwnTableParams):
 class ScansParams(SeenParams):
     """The scans that one camera took of one target: a table that names them."""
 
-    scan: Column = Field("scan", description="Column of the scans' files, beside the table.")
+    scan: Column = "scan"
+    """Column of the scans' files, beside the table."""
 
 
 class CellParams(Params):
     """Which tables there are, each in a stated convention."""
 
-    arms: dict[str, ArmTableParams] = Field(
-        default_factory=dict,
-        description="Tables of the arms' poses, by arm name in the recipe's cell.",
-    )
-    axes: dict[str, AxisTableParams] = Field(
-        default_factory=dict, description="Tables of the rails and positioners, by name."
-    )
-    sightings: tuple[SightingsParams, ...] = Field(
-        (), description="Tables of target poses or points measured by cameras."
-    )
-    scans: tuple[ScansParams, ...] = Field((), description="Tables of scans taken by cameras.")
-    join: PairingParams = param(PairingParams(), description="How tables with times are joined.")
+    arms: dict[str, ArmTableParams] = Field(default_factory=dict)
+    """Tables of the arms' poses, by arm name in the recipe's cell."""
+    axes: dict[str, AxisTableParams] = Field(default_factory=dict)
+    """Tables of the rails and positioners, by name."""
+    sightings: tuple[SightingsParams, ...] = ()
+    """Tables of target poses or points measured by cameras."""
+    scans: tuple[ScansParams, ...] = ()
+    """Tables of scans taken by cameras."""
+    join: PairingParams = param(PairingParams())
+    """How tables with times are joined."""
 
     @model_validator(mode="after")
     def _says_what_was_seen(self) -> CellParams:

@@ -37,10 +37,10 @@ class WrittenParams(Params):
         "(xyz: fixed, ZYX: turned), matrix (12 or 16 numbers, row by row), 3x3 (9 numbers behind "
         "the position), or a maker's way: " + ", ".join(CONVENTIONS) + ".",
     )
-    length: PoseLength = Field(description="Unit of the positions.")
-    angle: Literal["deg", "rad"] | None = Field(
-        None, description="Unit of the angles, or of the rotation vector's length."
-    )
+    length: PoseLength
+    """Unit of the positions."""
+    angle: Literal["deg", "rad"] | None = None
+    """Unit of the angles, or of the rotation vector's length."""
 
     @field_validator("rotation")
     @classmethod
@@ -81,43 +81,39 @@ class WrittenParams(Params):
 class CloudUnitParams(Params):
     """The unit of clouds that lie beside poses."""
 
-    cloud_unit: LengthUnit | None = Field(
-        None, description="Unit of the clouds; found by the scanner's range if not given."
-    )
+    cloud_unit: LengthUnit | None = None
+    """Unit of the clouds; found by the scanner's range if not given."""
 
 
 class TimesParams(Params):
     """Which column holds the time."""
 
-    time: Column | None = Field(None, description="Column of the time.")
-    time_unit: Literal["s", "ms", "us", "ns"] = Field("s", description="Unit of the times.")
+    time: Column | None = None
+    """Column of the time."""
+    time_unit: Literal["s", "ms", "us", "ns"] = "s"
+    """Unit of the times."""
 
 
 class ColumnsParams(TimesParams, WrittenParams):
     """Which columns hold a pose, and how it is written."""
 
-    columns: tuple[Column, ...] = Field(
-        (), description="Names in the heading, or numbers from 1, in the order of the convention: "
-        "position first; of JSON and YAML also a list's, by its own name; all that nothing else "
-        "takes if not given.",
-    )  # fmt: skip
+    columns: tuple[Column, ...] = ()
+    """Names in the heading, or numbers from 1, in the order of the convention: position first; of
+    JSON and YAML also a list's, by its own name; all that nothing else takes if not given."""
 
 
 class FlangePoseParams(ColumnsParams):
     """Columns of an arm's flange pose, as its controller reports it."""
 
-    pose: Literal["base_T_flange", "flange_T_base"] = Field(
-        "base_T_flange",
-        description="Whose pose it is: the flange's in the base, as controllers show, or inverse.",
-    )
+    pose: Literal["base_T_flange", "flange_T_base"] = "base_T_flange"
+    """Whose pose it is: the flange's in the base, as controllers show, or inverse."""
 
 
 class SeenPoseParams(ColumnsParams):
     """A target as a camera measured it; empty cells, and a pose of zeros, mean not seen."""
 
-    pose: Literal["camera_T_target", "target_T_camera"] = Field(
-        "camera_T_target", description="Whose pose it is. rotation: point gives its place alone."
-    )
+    pose: Literal["camera_T_target", "target_T_camera"] = "camera_T_target"
+    """Whose pose it is. rotation: point gives its place alone."""
 
     @classmethod
     def more(cls) -> tuple[str, ...]:
@@ -128,14 +124,11 @@ class SeenPoseParams(ColumnsParams):
 class JointsParams(Params):
     """Which columns hold the joint angles of the same poses."""
 
-    joints: tuple[Column, ...] = Field(
-        (),
-        description="Columns of the joint angles, from the base, where they were recorded: what is "
-        "wrong with an arm is estimated from them, and a link's place needs them.",
-    )
-    joint_unit: Literal["rad", "deg"] = Field(
-        "rad", description="Unit of the joint angles; with rad, joints that slide are in m."
-    )
+    joints: tuple[Column, ...] = ()
+    """Columns of the joint angles, from the base, where they were recorded: what is wrong with an
+    arm is estimated from them, and a link's place needs them."""
+    joint_unit: Literal["rad", "deg"] = "rad"
+    """Unit of the joint angles; with rad, joints that slide are in m."""
 
     def angles(self, text: Table) -> Floats | None:
         """Return (N, n) joint angles [rad] of a table's rows; None where none are named."""

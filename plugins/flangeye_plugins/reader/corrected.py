@@ -38,21 +38,20 @@ from flangeye.workflow.doctor.diagnosis import Arms
 class PoseMistake(Params):
     """Mistakes of poses, undone in the order of this list."""
 
-    axes: Axes | None = Field(
-        None, description="Axes of the camera's frame, where z is not forward: opengl or ros."
-    )
+    axes: Axes | None = None
+    """Axes of the camera's frame, where z is not forward: opengl or ros."""
     rotation: tuple[str, str] | None = Field(
         None, description="Conventions of the rotations: the one in which that reader read them, "
         f"then the one in which they were written; {', '.join(PLAIN[:3])}, or axes.",
     )  # fmt: skip
-    transposed: bool = Field(False, description="The rotations' matrices were transposed.")
-    inverted: bool = Field(
-        False, description="The poses are flange_T_base; of markers, target_T_camera."
-    )
-    scale: float = Field(1.0, gt=0, description="Factor for the positions.")
-    mirrored: Literal["x", "y", "z"] | None = Field(
-        None, description="Axis along which the positions have the wrong sign."
-    )
+    transposed: bool = False
+    """The rotations' matrices were transposed."""
+    inverted: bool = False
+    """The poses are flange_T_base; of markers, target_T_camera."""
+    scale: float = Field(1.0, gt=0)
+    """Factor for the positions."""
+    mirrored: Literal["x", "y", "z"] | None = None
+    """Axis along which the positions have the wrong sign."""
 
     @field_validator("rotation")
     @classmethod
@@ -83,32 +82,26 @@ class PoseMistake(Params):
 class CorrectedParams(Params):
     """The mistakes of an archive, undone in the order of this list."""
 
-    reader: Annotated[BoundPart, Choose("reader")] = param(
-        description="Reader of the archive as it was recorded."
-    )
-    arms: Arms = Field(
-        "both", description="Whose poses, where there are two arms; one arm alone is 'both'."
-    )
-    robot: PoseMistake = Field(
-        default_factory=PoseMistake, description="What was wrong with the robot's poses."
-    )
-    target: PoseMistake = Field(
-        default_factory=PoseMistake,
-        description="What was wrong with ready-made markers and centres.",
-    )
-    exchanged: bool = Field(
-        False, description="The robot's poses were read for the markers', and these for those."
-    )
-    offset: tuple[Length, Length, Length] = param(
-        ("0 mm", "0 mm", "0 mm"),
-        description="What was seen, from the point whose poses were recorded, in its frame.",
-    )
-    shift: int = Field(0, description="Number of poses by which each scan's pose follows it.")
-    shift_from: str | None = Field(None, description="Id of the first scan that is shifted.")
-    backwards: bool = Field(
-        False, description="The poses stand in the opposite order of the scans."
-    )
-    delay: Duration = param("0 ms", description="Time from a pose to its scan.")
+    reader: Annotated[BoundPart, Choose("reader")]
+    """Reader of the archive as it was recorded."""
+    arms: Arms = "both"
+    """Whose poses, where there are two arms; one arm alone is 'both'."""
+    robot: PoseMistake = Field(default_factory=PoseMistake)
+    """What was wrong with the robot's poses."""
+    target: PoseMistake = Field(default_factory=PoseMistake)
+    """What was wrong with ready-made markers and centres."""
+    exchanged: bool = False
+    """The robot's poses were read for the markers', and these for those."""
+    offset: tuple[Length, Length, Length] = param(("0 mm", "0 mm", "0 mm"))
+    """What was seen, from the point whose poses were recorded, in its frame."""
+    shift: int = 0
+    """Number of poses by which each scan's pose follows it."""
+    shift_from: str | None = None
+    """Id of the first scan that is shifted."""
+    backwards: bool = False
+    """The poses stand in the opposite order of the scans."""
+    delay: Duration = param("0 ms")
+    """Time from a pose to its scan."""
 
 
 @part("reader.corrected")

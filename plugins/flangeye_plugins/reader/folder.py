@@ -62,9 +62,8 @@ _JOINT = re.compile(r"j[1-9]\d?_rad")
 class FolderParams(Params):
     """How to read a folder of clouds and poses."""
 
-    unit: Literal["m", "mm"] | None = Field(
-        None, description="Unit of the positions, where the file of poses does not say."
-    )
+    unit: Literal["m", "mm"] | None = None
+    """Unit of the positions, where the file of poses does not say."""
 
 
 @part("reader.folder")

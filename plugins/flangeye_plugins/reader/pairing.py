@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from pydantic import Field
 
 from flangeye import Params, StageError
 from flangeye.files.recording import MIN_CAPTURES
@@ -31,13 +30,10 @@ Signal = tuple[Floats, Floats]
 class PairingParams(Params):
     """Parameters for pairing poses with measurements."""
 
-    clock_offset: Duration | None = Field(
-        None,
-        description="To add to the camera's times to come to the arm's; estimated if not given.",
-    )
-    tolerance: Duration = param(
-        "100 ms", gt=0, description="Largest time between a measurement and the arm's next pose."
-    )
+    clock_offset: Duration | None = None
+    """To add to the camera's times to come to the arm's; estimated if not given."""
+    tolerance: Duration = param("100 ms", gt=0)
+    """Largest time between a measurement and the arm's next pose."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from pydantic import Field
 
 from flangeye import Params, StageError, part
 from flangeye.files.recording import Archive, Recording
@@ -51,24 +50,27 @@ ARM = "robot: NAME ('flangeye robots' lists them) or robot: {urdf: arm.urdf} in 
 class BagParams(Params):
     """Topics and frames in the bag; each is found if it is the only one of its type."""
 
-    clouds: str | None = Field(None, description="Topic of the clouds (PointCloud2).")
-    images: str | None = Field(None, description="Topic of the images (Image, CompressedImage).")
-    camera_info: str | None = Field(None, description="Topic of the images' CameraInfo.")
-    base: str | None = Field(None, description="Frame of the arm's base, in which its poses are.")
-    flange: str | None = Field(None, description="Frame of the flange, origin in its face.")
-    robot: str | None = Field(
-        None, description="Topic of the arm, in place of tf: PoseStamped, or JointState, whose "
-        "angles become poses by the kinematics of the recipe's robot.",
-    )  # fmt: skip
-    joints: tuple[str, ...] = Field(
-        (), description="Names of the joints from base to flange, where JointState mixes them."
-    )
-    target: str | None = Field(
-        None, description="The target as somebody has measured it: a PoseStamped topic, or a frame "
-        "of tf with camera.",
-    )  # fmt: skip
-    camera: str | None = Field(None, description="The camera's frame, for a target in tf.")
-    join: PairingParams = param(PairingParams(), description="Pairing of poses and clouds by time.")
+    clouds: str | None = None
+    """Topic of the clouds (PointCloud2)."""
+    images: str | None = None
+    """Topic of the images (Image, CompressedImage)."""
+    camera_info: str | None = None
+    """Topic of the images' CameraInfo."""
+    base: str | None = None
+    """Frame of the arm's base, in which its poses are."""
+    flange: str | None = None
+    """Frame of the flange, origin in its face."""
+    robot: str | None = None
+    """Topic of the arm, in place of tf: PoseStamped, or JointState, whose angles become poses by
+    the kinematics of the recipe's robot."""
+    joints: tuple[str, ...] = ()
+    """Names of the joints from base to flange, where JointState mixes them."""
+    target: str | None = None
+    """The target as somebody has measured it: a PoseStamped topic, or a frame of tf with camera."""
+    camera: str | None = None
+    """The camera's frame, for a target in tf."""
+    join: PairingParams = param(PairingParams())
+    """Pairing of poses and clouds by time."""
 
 
 @dataclass

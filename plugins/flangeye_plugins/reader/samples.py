@@ -19,8 +19,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field
-
 from flangeye import Params, StageError, part
 from flangeye.files.recording import Archive, NotThisLayout
 from flangeye.files.scans import natural
@@ -32,16 +30,16 @@ from flangeye_plugins.reader.table import TableParams, table
 class EasyHandeyeParams(Params):
     """The direction of the robot's poses."""
 
-    calibration: Literal["eye_on_base", "eye_in_hand"] = Field(
-        description="The type it was sampled for: with eye_on_base the tool writes the robot's "
-        "poses the other way round (effector_T_base)."
-    )
+    calibration: Literal["eye_on_base", "eye_in_hand"]
+    """The type it was sampled for: with eye_on_base the tool writes the robot's poses the other way
+    round (effector_T_base)."""
 
 
 class ZividSamplesParams(CloudUnitParams):
     """Unit of the poses, which Zivid's samples do not state."""
 
-    length: Literal["m", "mm"] = Field(description="Unit of the positions; Zivid's own are mm.")
+    length: Literal["m", "mm"]
+    """Unit of the positions; Zivid's own are mm."""
 
 
 @part("reader.easy_handeye")

@@ -20,7 +20,7 @@ from pathlib import Path, PurePath
 from typing import Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import model_validator
 
 from flangeye import StageError, part
 from flangeye.files.recording import Archive, NotThisLayout, Recording
@@ -55,13 +55,11 @@ JOINTS = "joints"
 class OtherParams(ColumnsParams):
     """Further measurements: in the same rows, or in a table of their own."""
 
-    file: str | tuple[str, ...] | None = Field(
-        None, description="A table of its own, or tables side by side; joined by time, by the "
-        "numbers in the names of files, or row by row.",
-    )  # fmt: skip
-    columns: tuple[Column, ...] = Field(
-        (), description="As for the arm; required when the target is in the same table."
-    )
+    file: str | tuple[str, ...] | None = None
+    """A table of its own, or tables side by side; joined by time, by the numbers in the names of
+    files, or row by row."""
+    columns: tuple[Column, ...] = ()
+    """As for the arm; required when the target is in the same table."""
 
     @model_validator(mode="after")
     def _found_somewhere(self) -> OtherParams:
@@ -77,35 +75,31 @@ class TargetParams(SeenPoseParams, OtherParams):
 class SecondParams(OtherParams):
     """The second arm."""
 
-    pose: Literal["base2_T_flange2", "flange2_T_base2"] = Field(
-        "base2_T_flange2", description="Direction of the pose."
-    )
+    pose: Literal["base2_T_flange2", "flange2_T_base2"] = "base2_T_flange2"
+    """Direction of the pose."""
 
 
 class TableParams(FlangePoseParams, JointsParams, CloudUnitParams):
     """File, columns and convention of the poses. Everything is stated by the recipe."""
 
-    file: str | tuple[str, ...] = Field(
-        "poses.csv",
-        description="The table: FILE (text, JSON, YAML, OpenCV's storage, .npz, .npy, .mat, a "
-        "robot program); FILE:PART, an array or a block of it, or FILE:1/2, half of its rows; "
-        "a pattern of files with a row each, poses/*.json; or several, side by side.",
-    )
-    rotation: str = Field(
-        JOINTS, description="How the rotations are written, see below; joints: there are the "
-        "joint angles alone, and the recipe's robot gives the poses.",
-    )  # fmt: skip
-    length: PoseLength = Field("m", description="Unit of the positions.")
-    scan: Column | None = Field(
-        None,
-        description="Column of the scans' file names, or of row names shared with the target's "
-        "table. Default: the column called scan, or the first column if it holds text.",
-    )
-    target: TargetParams | None = Field(
-        None, description="The target as the camera measured it, in place of scans."
-    )
-    second: SecondParams | None = Field(None, description="A second arm's pose.")
-    join: PairingParams = param(PairingParams(), description="Joining of separate tables by time.")
+    file: str | tuple[str, ...] = "poses.csv"
+    """The table: FILE (text, JSON, YAML, OpenCV's storage, .npz, .npy, .mat, a robot program);
+    FILE:PART, an array or a block of it, or FILE:1/2, half of its rows; a pattern of files with a
+    row each, poses/*.json; or several, side by side."""
+    rotation: str = JOINTS
+    """How the rotations are written, see below; joints: there are the joint angles alone, and the
+    recipe's robot gives the poses."""
+    length: PoseLength = "m"
+    """Unit of the positions."""
+    scan: Column | None = None
+    """Column of the scans' file names, or of row names shared with the target's table. Default: the
+    column called scan, or the first column if it holds text."""
+    target: TargetParams | None = None
+    """The target as the camera measured it, in place of scans."""
+    second: SecondParams | None = None
+    """A second arm's pose."""
+    join: PairingParams = param(PairingParams())
+    """Joining of separate tables by time."""
 
     @classmethod
     def more(cls) -> tuple[str, ...]:

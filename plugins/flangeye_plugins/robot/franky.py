@@ -15,7 +15,6 @@ import time
 from typing import Any
 
 import numpy as np
-from pydantic import Field
 
 from flangeye.devices import GRACE, SILENT, Device, DeviceError, Mode, Robot, RobotState, load_sdk
 from flangeye.files.processes import python_command
@@ -103,9 +102,8 @@ def one_line(text: str) -> str:
 class FrankyParams(ControllerParams):
     """Parameters of ``robot.franky``."""
 
-    realtime: bool = Field(
-        True, description="Require a real-time kernel; without one, moves may be aborted."
-    )
+    realtime: bool = True
+    """Require a real-time kernel; without one, moves may be aborted."""
 
 
 @part("robot.franky")

@@ -74,9 +74,8 @@ class ManualParams(Params):
     convention: str = Field(
         description=f"How the pendant shows a pose: {', '.join(CONVENTIONS)}.",
     )
-    length: LengthUnit | None = Field(
-        None, description="Unit of the pendant's positions, where it is not the usual one."
-    )
+    length: LengthUnit | None = None
+    """Unit of the pendant's positions, where it is not the usual one."""
     # Distance from the requested pose beyond which the entry is queried [m]
     distance: ClassVar[float] = 0.02
     # Rotation from the requested pose beyond which the entry is queried [rad]

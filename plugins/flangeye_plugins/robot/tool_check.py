@@ -19,9 +19,8 @@ class ToolOffset(Params):
     """Tool offset from the flange that the controller must have set."""
 
     position: tuple[Length, Length, Length] = param(("0 mm", "0 mm", "0 mm"))
-    rotation: tuple[Angle, Angle, Angle] = param(
-        ("0 rad", "0 rad", "0 rad"), description="Orientation as shown on the pendant."
-    )
+    rotation: tuple[Angle, Angle, Angle] = param(("0 rad", "0 rad", "0 rad"))
+    """Orientation as shown on the pendant."""
 
     def flange_T_tool(self, convention: PoseConvention) -> Floats:
         """Return the offset as a matrix (4, 4) [m]; its rotation is given in a convention."""
@@ -31,11 +30,10 @@ class ToolOffset(Params):
 class ControllerParams(Params):
     """Common parameters of controller drivers."""
 
-    host: str = Field(min_length=1, description="Address of the controller: 192.168.1.10.")
-    tool: ToolOffset = Field(
-        default_factory=ToolOffset,
-        description="Tool (TCP) set in the controller; none if not given.",
-    )
+    host: str = Field(min_length=1)
+    """Address of the controller: 192.168.1.10."""
+    tool: ToolOffset = Field(default_factory=ToolOffset)
+    """Tool (TCP) set in the controller; none if not given."""
 
 
 def require_tool(

@@ -40,22 +40,19 @@ HOST = Path(__file__).with_name("kinect_host.py")
 class AzureKinectParams(Params):
     """Parameters of ``scanner.azure_kinect``."""
 
-    recording: RecipeFile | None = Field(
-        None, description="An MKV recording to play instead, one capture an exposure."
-    )
-    device: int = Field(
-        0, ge=0, description="Serial number or index of the camera, if there are several."
-    )
+    recording: RecipeFile | None = None
+    """An MKV recording to play instead, one capture an exposure."""
+    device: int = Field(0, ge=0)
+    """Serial number or index of the camera, if there are several."""
     depth_mode: Literal["NFOV_UNBINNED", "NFOV_2X2BINNED", "WFOV_UNBINNED", "WFOV_2X2BINNED"] = (
-        Field("NFOV_UNBINNED", description="Depth mode of the camera; a recording has its own.")
+        "NFOV_UNBINNED"
     )
+    """Depth mode of the camera; a recording has its own."""
     # Longest wait for a frame [s]
     timeout: ClassVar[float] = 2.0
-    python: MachineName = Field(
-        "kinect",
-        description="The Python that has pyk4a, where this one cannot have it: a name under "
-        "[programs] of this machine's settings; this Python where they have no 'kinect'.",
-    )
+    python: MachineName = "kinect"
+    """The Python that has pyk4a, where this one cannot have it: a name under [programs] of this
+    machine's settings; this Python where they have no 'kinect'."""
 
 
 @part("scanner.azure_kinect")

@@ -6,8 +6,6 @@ import time
 from collections.abc import Callable
 from typing import Any, ClassVar
 
-from pydantic import Field
-
 from flangeye.devices import DeviceError, Scan, Scanner, load_sdk
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import Params, part
@@ -19,9 +17,8 @@ NAME = "scanner.mech_eye"
 class MechEyeParams(Params):
     """Parameters of ``scanner.mech_eye``."""
 
-    address: str | None = Field(
-        None, description="IP address of the camera; the only one found if not given."
-    )
+    address: str | None = None
+    """IP address of the camera; the only one found if not given."""
     # Longest wait for a connection, and for a frame [s]
     timeout: ClassVar[float] = 3.0
 

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from flangeye.devices import Device, DeviceError, Scan
 from flangeye.models.scanners import (
@@ -92,9 +91,8 @@ class DepthView:
 class SerialParams(Params):
     """Selection of a camera by its serial number."""
 
-    serial: str | None = Field(
-        None, description="Serial number of the camera, if there are several."
-    )
+    serial: str | None = None
+    """Serial number of the camera, if there are several."""
 
 
 def cloud_of(xyz: NDArray[Any], per_metre: float) -> PointCloud:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from pydantic import Field
 
 from flangeye.devices import PATIENCE, DeviceError, Scan, Scanner, load_sdk
 from flangeye.files.paths import RecipeFile
@@ -23,9 +22,8 @@ NAME = "scanner.realsense"
 class RealsenseParams(SerialParams):
     """Parameters of ``scanner.realsense``."""
 
-    recording: RecipeFile | None = Field(
-        None, description="A .db3 or .bag recording to play instead, one frame an exposure."
-    )
+    recording: RecipeFile | None = None
+    """A .db3 or .bag recording to play instead, one frame an exposure."""
     # Longest wait for a frame [s]
     timeout: ClassVar[float] = 2.0
 

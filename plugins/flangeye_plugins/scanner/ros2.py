@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import model_validator
 
 from flangeye.devices import DeviceError, FrameDropped, Scan, Scanner
 from flangeye.errors import StageError
@@ -35,20 +35,20 @@ NAME = "scanner.ros2"
 class Ros2ScannerParams(Params):
     """Parameters of ``scanner.ros2``: topic of a cloud, a depth image, or an image only."""
 
-    cloud: str | None = Field(None, description="Topic of the clouds (PointCloud2).")
-    depth: str | None = Field(None, description="Topic of depth images (Image), not of clouds.")
-    image: str | None = Field(
-        None, description="Topic of images (Image, CompressedImage), for markers; of the same "
-        "camera as the depths, or alone.",
-    )  # fmt: skip
-    camera_info: str | None = Field(
-        None, description="CameraInfo of depth or image; camera_info beside them if not given."
-    )
-    trigger: str | None = Field(
-        None, description="Service (std_srvs/Trigger) or topic (std_msgs/Empty) that takes a scan; "
-        "without one the camera runs by itself.",
-    )  # fmt: skip
-    sim_time: bool = Field(False, description="Stamps are simulated time, of the topic /clock.")
+    cloud: str | None = None
+    """Topic of the clouds (PointCloud2)."""
+    depth: str | None = None
+    """Topic of depth images (Image), not of clouds."""
+    image: str | None = None
+    """Topic of images (Image, CompressedImage), for markers; of the same camera as the depths, or
+    alone."""
+    camera_info: str | None = None
+    """CameraInfo of depth or image; camera_info beside them if not given."""
+    trigger: str | None = None
+    """Service (std_srvs/Trigger) or topic (std_msgs/Empty) that takes a scan; without one the
+    camera runs by itself."""
+    sim_time: bool = False
+    """Stamps are simulated time, of the topic /clock."""
 
     @model_validator(mode="after")
     def _looks_at_something(self) -> Ros2ScannerParams:

@@ -10,8 +10,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from pydantic import Field
-
 from flangeye.devices import DeviceError, Scan, Scanner
 from flangeye.errors import StageError
 from flangeye.files.clouds import CLOUD_FILES, LengthUnit, read_cloud
@@ -26,15 +24,16 @@ from flangeye_plugins.scanner.opened import OpenScanner
 class WatchedFolderParams(Params):
     """Parameters of ``scanner.watched_folder``."""
 
-    path: RecipePath = Field(description="Folder that the scanner's software exports into.")
-    unit: LengthUnit = Field(description="Unit of the files' coordinates; files do not say.")
-    pattern: str = Field("*", description="File name pattern, for example 'scan_*.ply'.")
-    settle: Duration = param(
-        "500 ms",
-        ge=0,
-        description="Time without change after which a file is taken to be complete.",
-    )
-    timeout: Duration = param("60 s", gt=0, description="Longest wait for the next file.")
+    path: RecipePath
+    """Folder that the scanner's software exports into."""
+    unit: LengthUnit
+    """Unit of the files' coordinates; files do not say."""
+    pattern: str = "*"
+    """File name pattern, for example 'scan_*.ply'."""
+    settle: Duration = param("500 ms", ge=0)
+    """Time without change after which a file is taken to be complete."""
+    timeout: Duration = param("60 s", gt=0)
+    """Longest wait for the next file."""
 
 
 @part("scanner.watched_folder")

@@ -7,8 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field
-
 from flangeye.devices import DeviceError, Scan, Scanner, load_sdk
 from flangeye.files.paths import RecipeFile
 from flangeye.models.scanners import ScannerModel
@@ -19,12 +17,10 @@ from flangeye_plugins.scanner.opened import OpenScanner, SerialParams
 class ZividParams(SerialParams):
     """Parameters of ``scanner.zivid``."""
 
-    settings: RecipeFile | None = Field(
-        None, description="Settings saved by Zivid Studio (.yml); one default acquisition if none."
-    )
-    file_camera: RecipeFile | None = Field(
-        None, description="A file camera (.zfc) to capture from instead."
-    )
+    settings: RecipeFile | None = None
+    """Settings saved by Zivid Studio (.yml); one default acquisition if none."""
+    file_camera: RecipeFile | None = None
+    """A file camera (.zfc) to capture from instead."""
 
 
 @part("scanner.zivid")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from pydantic import Field
 
 from flangeye import CalibrationRefused, StageError, stage
 from flangeye.estimation.effects.scanner import DistortionField
@@ -30,22 +29,17 @@ from flangeye_plugins.seam.stitched import seen_in_base
 class CadParams(SeamParams):
     """Parameters of ``seam.cad``."""
 
-    workpiece: WorkpiecePath = Field(
-        description="One of data/workpieces, or a .yaml file of one's own with CAD and seams."
-    )
-    seam: str | None = Field(None, description="Name of the seam, if the workpiece has several.")
-    model_error: Length = param(
-        "0.05 mm",
-        ge=0,
-        description="Standard deviation of the workpiece's surface against its CAD "
-        "along each axis, smooth over it.",
-    )
-    max_residual: Length = param(
-        "0.5 mm", gt=0, description="Largest robust deviation of the scan from the CAD."
-    )
-    max_deviation: Length = param(
-        "2 mm", gt=0, description="Largest standard deviation of the registration at the seam."
-    )
+    workpiece: WorkpiecePath
+    """One of data/workpieces, or a .yaml file of one's own with CAD and seams."""
+    seam: str | None = None
+    """Name of the seam, if the workpiece has several."""
+    model_error: Length = param("0.05 mm", ge=0)
+    """Standard deviation of the workpiece's surface against its CAD along each axis, smooth over
+    it."""
+    max_residual: Length = param("0.5 mm", gt=0)
+    """Largest robust deviation of the scan from the CAD."""
+    max_deviation: Length = param("2 mm", gt=0)
+    """Largest standard deviation of the registration at the seam."""
 
 
 @stage("seam.cad")

@@ -43,25 +43,19 @@ STAGE = "seam.joint"
 class JointParams(SeamParams):
     """Parameters of ``seam.joint``."""
 
-    joint: Literal["vee", "bevel", "butt", "lap", "fillet", "corner"] = Field(
-        description="vee and bevel: a V-groove or half of one; butt: square edges with a gap; "
-        "corner: an outside corner, open or closed."
-    )
-    line: tuple[tuple[Length, Length, Length], ...] | None = Field(
-        None,
-        min_length=2,
-        description="Rough points along the seam in base, in welding order; else an earlier seam.",
-    )
-    closed: bool = Field(False, description="The line comes back to its first point.")
-    reach: Length = param(
-        "15 mm", gt=0, description="Largest distance of the seam and its ends from the line."
-    )
-    max_residual: Length = param(
-        "0.5 mm", gt=0, description="Largest distance of points from the joint's surfaces, median."
-    )
-    max_deviation: Length = param(
-        "0.5 mm", gt=0, description="Largest standard deviation of the seam across it, in the scan."
-    )
+    joint: Literal["vee", "bevel", "butt", "lap", "fillet", "corner"]
+    """vee and bevel: a V-groove or half of one; butt: square edges with a gap; corner: an outside
+    corner, open or closed."""
+    line: tuple[tuple[Length, Length, Length], ...] | None = Field(None, min_length=2)
+    """Rough points along the seam in base, in welding order; else an earlier seam."""
+    closed: bool = False
+    """The line comes back to its first point."""
+    reach: Length = param("15 mm", gt=0)
+    """Largest distance of the seam and its ends from the line."""
+    max_residual: Length = param("0.5 mm", gt=0)
+    """Largest distance of points from the joint's surfaces, median."""
+    max_deviation: Length = param("0.5 mm", gt=0)
+    """Largest standard deviation of the seam across it, in the scan."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from pydantic import Field
 
 from flangeye import StageError, stage
 from flangeye.files.clouds import PER_METRE, LengthUnit
@@ -33,21 +32,19 @@ STAGE = "seam.line"
 class LineParams(SeamParams, PlaceParams):
     """Parameters of ``seam.line``; ``position`` and ``rpy`` are the file's frame in the base."""
 
-    path: RecipeFile = Field(
-        description="Points or taught poses in order (CSV, YAML, JSON), a drawing (DXF), or CAD "
-        "whose sharp edges are lines (STL, PLY, OBJ, STEP)."
-    )
-    unit: LengthUnit = Field(description="Unit of the coordinates.")
-    near: tuple[Length, Length, Length] | None = Field(
-        None, description="Point in the file's frame; of several lines the nearest to it is used."
-    )
-    angle: Angle = param("30 deg", gt=0, description="CAD: smallest bend of a sharp edge.")
-    opening: tuple[float, float, float] = Field(
-        (0.0, 0.0, 1.0), description="Out of the work towards the torch, in the file's frame."
-    )
-    deviation: Length = param(
-        "3 mm", gt=0, description="Standard deviation of the line across it, in the base."
-    )
+    path: RecipeFile
+    """Points or taught poses in order (CSV, YAML, JSON), a drawing (DXF), or CAD whose sharp edges
+    are lines (STL, PLY, OBJ, STEP)."""
+    unit: LengthUnit
+    """Unit of the coordinates."""
+    near: tuple[Length, Length, Length] | None = None
+    """Point in the file's frame; of several lines the nearest to it is used."""
+    angle: Angle = param("30 deg", gt=0)
+    """CAD: smallest bend of a sharp edge."""
+    opening: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """Out of the work towards the torch, in the file's frame."""
+    deviation: Length = param("3 mm", gt=0)
+    """Standard deviation of the line across it, in the base."""
 
 
 @stage(STAGE)

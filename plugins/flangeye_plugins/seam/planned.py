@@ -6,7 +6,6 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
-from pydantic import Field
 
 from flangeye import CalibrationRefused, Params
 from flangeye.maths.arm_correction import reported_flange
@@ -24,15 +23,11 @@ SPACING = 2e-3
 class SeamParams(Params):
     """Common parameters of the seam stages."""
 
-    arm: Literal["as-reported", "corrected"] = Field(
-        "as-reported",
-        description="as-reported: with the pose that is best for the arm as its controller has "
-        "it; corrected: with that of the corrected arm, each point moved to the command that "
-        "brings the tool to the seam.",
-    )
-    tool: Length = param(
-        "0 mm", ge=0, description="corrected: from the flange to the tool's tip, along its z."
-    )
+    arm: Literal["as-reported", "corrected"] = "as-reported"
+    """as-reported: with the pose that is best for the arm as its controller has it; corrected: with
+    that of the corrected arm, each point moved to the command that brings the tool to the seam."""
+    tool: Length = param("0 mm", ge=0)
+    """corrected: from the flange to the tool's tip, along its z."""
 
 
 def scanner_covariance(scanner: ScannerModel | None, distance: float) -> Floats:

@@ -39,18 +39,15 @@ radians: what fits by chance is seldom held in all directions, and a corner fits
 class SegmentBodyParams(Params):
     """Parameters of ``segment.body``."""
 
-    near: Length = param("100 mm", ge=0, description="Points nearer to the scanner are left out.")
-    far: Length = param("3 m", gt=0, description="Points farther from the scanner are left out.")
-    min_coverage: float = param(
-        0.3, gt=0, le=1, description="Smallest share of the body's view to be seen."
-    )
-    min_trust: float = param(
-        0.99,
-        gt=0,
-        le=1,
-        description="Of what is seen where the body should be and right beside it, the smallest "
-        "share that is as the body makes it.",
-    )
+    near: Length = param("100 mm", ge=0)
+    """Points nearer to the scanner are left out."""
+    far: Length = param("3 m", gt=0)
+    """Points farther from the scanner are left out."""
+    min_coverage: float = param(0.3, gt=0, le=1)
+    """Smallest share of the body's view to be seen."""
+    min_trust: float = param(0.99, gt=0, le=1)
+    """Of what is seen where the body should be and right beside it, the smallest share that is as
+    the body makes it."""
 
     def passed_by(self, found: FoundPose) -> bool:
         """Return whether a candidate pose satisfies these parameters."""

@@ -13,8 +13,10 @@ from flangeye.units import Length, param
 class RangeParams(Params):
     """Range of distances from the scanner in which the target is searched."""
 
-    near: Length = param("100 mm", ge=0, description="Points nearer to the scanner are left out.")
-    far: Length = param("3 m", gt=0, description="Points farther from the scanner are left out.")
+    near: Length = param("100 mm", ge=0)
+    """Points nearer to the scanner are left out."""
+    far: Length = param("3 m", gt=0)
+    """Points farther from the scanner are left out."""
 
 
 def check_scale(xyz: NDArray[np.float32], where: str) -> None:

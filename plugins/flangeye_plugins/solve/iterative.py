@@ -39,21 +39,18 @@ from flangeye_plugins.solve.observations import (
 class IterativeParams(Params):
     """Parameters of ``solve.iterative``."""
 
-    pool: int = Field(4, ge=3, le=1000, description="Number of poses in the pool.")
-    required: Length = param(
-        "0.3 mm", ge=0, description="Stop acquiring once the cost is this small."
-    )
+    pool: int = Field(4, ge=3, le=1000)
+    """Number of poses in the pool."""
+    required: Length = param("0.3 mm", ge=0)
+    """Stop acquiring once the cost is this small."""
     # Largest number of poses tried after the initial pool
     k_max: ClassVar[int] = 100
-    reserve: int = Field(
-        0, ge=0, description="First poses kept from the pool, for error.holdout to measure on."
-    )
-    error: Annotated[BoundPart, Choose("error")] = param(
-        {"icp": {}}, description="Measure of a candidate's error."
-    )
-    cost: Annotated[BoundPart, Choose("cost")] = param(
-        {"translation": {}}, description="Cost of that error, to be minimised."
-    )
+    reserve: int = Field(0, ge=0)
+    """First poses kept from the pool, for error.holdout to measure on."""
+    error: Annotated[BoundPart, Choose("error")] = param({"icp": {}})
+    """Measure of a candidate's error."""
+    cost: Annotated[BoundPart, Choose("cost")] = param({"translation": {}})
+    """Cost of that error, to be minimised."""
 
 
 Evaluate = Callable[[Transform], float]

@@ -24,11 +24,8 @@ from flangeye.units import Angle, param
 class LimitsParams(Params):
     """Limits beyond which a calibration counts as not observable."""
 
-    rotation_limit: Angle = param(
-        "2 deg",
-        gt=0,
-        description="Refuse when rotation about some axis has a larger standard deviation.",
-    )
+    rotation_limit: Angle = param("2 deg", gt=0)
+    """Refuse when rotation about some axis has a larger standard deviation."""
 
     @property
     def limits(self) -> tuple[float, float]:

@@ -23,36 +23,23 @@ if TYPE_CHECKING:
 class RobustParams(LimitsParams):
     """Parameters of ``solve.robust``."""
 
-    normals: Literal["auto", "off"] = Field(
-        "auto", description="Use the flange's measured normals where there are any."
-    )
-    unobservable: Literal["refuse", "mark"] = Field(
-        "refuse",
-        description="What to do about translations that are not observable, such as the height "
-        "with an arm of four joints: refuse, or solve for the rest and mark them.",
-    )
-    size_limit: float = Field(
-        0.005,
-        gt=0,
-        description="Largest relative error of a marker's size, as estimated from the arm's "
-        "motion; beyond it the calibration is refused.",
-    )
-    target_size: Literal["known", "unknown"] = Field(
-        "known",
-        description="Whether the fit step states a marker's size, or all its distances have one "
-        "unknown factor, as those of a single moving camera; the arm's motion then determines it.",
-    )
-    certify: bool = Field(
-        False,
-        description="Try to certify the answer as globally optimal, by a dual certificate; if "
-        "that finds a better answer, it is given.",
-    )
-    required: Length | None = param(
-        None,
-        gt=0,
-        description="Stop acquiring once the predicted 95 % error at the work is below this. By "
-        "default every pose is used.",
-    )
+    normals: Literal["auto", "off"] = "auto"
+    """Use the flange's measured normals where there are any."""
+    unobservable: Literal["refuse", "mark"] = "refuse"
+    """What to do about translations that are not observable, such as the height with an arm of four
+    joints: refuse, or solve for the rest and mark them."""
+    size_limit: float = Field(0.005, gt=0)
+    """Largest relative error of a marker's size, as estimated from the arm's motion; beyond it the
+    calibration is refused."""
+    target_size: Literal["known", "unknown"] = "known"
+    """Whether the fit step states a marker's size, or all its distances have one unknown factor, as
+    those of a single moving camera; the arm's motion then determines it."""
+    certify: bool = False
+    """Try to certify the answer as globally optimal, by a dual certificate; if that finds a better
+    answer, it is given."""
+    required: Length | None = param(None, gt=0)
+    """Stop acquiring once the predicted 95 % error at the work is below this. By default every pose
+    is used."""
 
     @property
     def corrects_arm(self) -> bool:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import ClassVar
 
 import numpy as np
-from pydantic import Field
 
 from flangeye import Params, stage
 from flangeye.estimation.watch.drift import DriftTest, information_of, verdict
@@ -18,8 +17,10 @@ from flangeye.workflow.doctor.monitor.stored import stored_calibration
 class DriftParams(Params):
     """Parameters of ``verify.drift``."""
 
-    reference: RecipeFile = Field(description="The run.mcap of the earlier calibration.")
-    limit: Length = param("0.4 mm", gt=0, description="Largest shift at the work that passes.")
+    reference: RecipeFile
+    """The run.mcap of the earlier calibration."""
+    limit: Length = param("0.4 mm", gt=0)
+    """Largest shift at the work that passes."""
     # Probability that a cell that did not move is refused
     false_alarms: ClassVar[float] = 2e-4
 

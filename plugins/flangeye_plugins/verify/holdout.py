@@ -34,11 +34,12 @@ from flangeye.units import Length, param
 class HoldoutParams(Params):
     """Parameters of ``verify.holdout``."""
 
-    folds: int = Field(5, ge=2, description="Number of folds; each is held out once.")
-    max_rms: Length = param("1 mm", gt=0, description="Largest held-out error that passes, rms.")
-    optical: bool = Field(
-        True, description="Whether markers are seen in a camera's own frame, z forward."
-    )
+    folds: int = Field(5, ge=2)
+    """Number of folds; each is held out once."""
+    max_rms: Length = param("1 mm", gt=0)
+    """Largest held-out error that passes, rms."""
+    optical: bool = True
+    """Whether markers are seen in a camera's own frame, z forward."""
     # Largest held-out angle between measured and expected faces that passes, rms. Positions alone
     # can fit while every angle was read wrongly [rad]
     max_tilt: ClassVar[float] = float(np.radians(2))

@@ -8,7 +8,6 @@ from functools import lru_cache
 from typing import ClassVar
 
 import numpy as np
-from pydantic import Field
 
 from flangeye import Params, StageError, stage
 from flangeye.files.clouds import LengthUnit
@@ -32,24 +31,21 @@ from flangeye_plugins.verify.registration import (
 class CadCloud(Params):
     """A point cloud of the flange's CAD model."""
 
-    file: RecipeFile = Field(
-        description="PCD, PLY, XYZ, CSV or NPY; rows that are not finite are left out."
-    )
-    unit: LengthUnit = Field(description="Unit of the file's coordinates.")
-    offset: tuple[Length, Length, Length] = param(
-        ("0 mm", "0 mm", "0 mm"), description="Origin of the file's frame in the flange's."
-    )
-    rpy: tuple[Angle, Angle, Angle] = param(
-        ("0 deg", "0 deg", "0 deg"), description="Roll, pitch, yaw of the file's frame."
-    )
+    file: RecipeFile
+    """PCD, PLY, XYZ, CSV or NPY; rows that are not finite are left out."""
+    unit: LengthUnit
+    """Unit of the file's coordinates."""
+    offset: tuple[Length, Length, Length] = param(("0 mm", "0 mm", "0 mm"))
+    """Origin of the file's frame in the flange's."""
+    rpy: tuple[Angle, Angle, Angle] = param(("0 deg", "0 deg", "0 deg"))
+    """Roll, pitch, yaw of the file's frame."""
 
 
 class IcpSettings(Params):
     """Common settings of comparisons with the flange's shape."""
 
-    cad: CadCloud | None = Field(
-        None, description="The flange's shape; by default made from its dimensions."
-    )
+    cad: CadCloud | None = None
+    """The flange's shape; by default made from its dimensions."""
     # Largest initial error from which ICP is started [m]
     reach: ClassVar[float] = 20e-3
     # Points further from the surface are not the flange, in the end [m]

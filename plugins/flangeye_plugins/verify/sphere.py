@@ -19,25 +19,24 @@ from flangeye.units import Length, param
 class BallBar(Params):
     """Two balls at a known distance, with their centres measured in one scan."""
 
-    first: tuple[Length, Length, Length] = Field(
-        description="Centre of one ball, in the camera frame."
-    )
-    second: tuple[Length, Length, Length] = Field(description="Centre of the other ball.")
-    length: Length = Field(gt=0, description="Calibrated distance of the centres.")
+    first: tuple[Length, Length, Length]
+    """Centre of one ball, in the camera frame."""
+    second: tuple[Length, Length, Length]
+    """Centre of the other ball."""
+    length: Length = Field(gt=0)
+    """Calibrated distance of the centres."""
 
 
 class SphereCheckParams(Params):
     """Parameters of ``verify.sphere``."""
 
-    bars: tuple[BallBar, ...] = Field(
-        (),
-        description="Two balls at a known distance, at several places and in several directions: "
-        "then the scanner alone is checked, and the arm's poses are not looked at.",
-    )
-    max_error: Length = param(
-        "1 mm", gt=0, description="Largest error of a distance that passes, 95 % of the pairs."
-    )
-    shortest: Length = param("50 mm", gt=0, description="Pairs closer than this are not used.")
+    bars: tuple[BallBar, ...] = ()
+    """Two balls at a known distance, at several places and in several directions: then the scanner
+    alone is checked, and the arm's poses are not looked at."""
+    max_error: Length = param("1 mm", gt=0)
+    """Largest error of a distance that passes, 95 % of the pairs."""
+    shortest: Length = param("50 mm", gt=0)
+    """Pairs closer than this are not used."""
 
 
 @stage("verify.sphere")

@@ -20,7 +20,8 @@ CELLS = 48
 class StitchParams(Params):
     """Parameters of ``verify.stitch``."""
 
-    max_spread: Length = param("0.5 mm", gt=0, description="Largest spread that passes, rms.")
+    max_spread: Length = param("0.5 mm", gt=0)
+    """Largest spread that passes, rms."""
 
 
 @stage("verify.stitch")

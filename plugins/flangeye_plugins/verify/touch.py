@@ -15,27 +15,23 @@ from flangeye.units import Angle, Length, param
 class TouchedPoint(Params):
     """A point measured by the scanner and touched by the tip."""
 
-    seen: tuple[Length, Length, Length] = Field(
-        description="Point in the camera frame, from a scan."
-    )
-    position: tuple[Length, Length, Length] = Field(
-        description="Position of the flange in the base, by the pendant, with the tip on the point."
-    )
-    rpy: tuple[Angle, Angle, Angle] = Field(
-        description="Orientation of the flange: roll, pitch, yaw."
-    )
+    seen: tuple[Length, Length, Length]
+    """Point in the camera frame, from a scan."""
+    position: tuple[Length, Length, Length]
+    """Position of the flange in the base, by the pendant, with the tip on the point."""
+    rpy: tuple[Angle, Angle, Angle]
+    """Orientation of the flange: roll, pitch, yaw."""
 
 
 class TouchParams(Params):
     """Parameters of ``verify.touch``."""
 
-    tip: tuple[Length, Length, Length] = Field(
-        description="Tool tip in the flange frame, from the tool's own calibration."
-    )
-    touches: tuple[TouchedPoint, ...] = Field(
-        min_length=1, description="Use three or more at different places and heights."
-    )
-    max_error: Length = param("1 mm", gt=0, description="Largest distance that passes.")
+    tip: tuple[Length, Length, Length]
+    """Tool tip in the flange frame, from the tool's own calibration."""
+    touches: tuple[TouchedPoint, ...] = Field(min_length=1)
+    """Use three or more at different places and heights."""
+    max_error: Length = param("1 mm", gt=0)
+    """Largest distance that passes."""
 
 
 @stage("verify.touch")

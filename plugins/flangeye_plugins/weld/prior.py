@@ -25,11 +25,14 @@ class WeldPrior(Model):
     """Estimates of one weld, used as the prior of the next, with standard deviations."""
 
     finger: str
-    ahead: Length = param(description="The tip is ahead of where the finger's file has it.")
+    ahead: Length
+    """The tip is ahead of where the finger's file has it."""
     ahead_sigma: Length = param(gt=0)
-    play: Length = param(description="Half the width of play and hysteresis.")
+    play: Length
+    """Half the width of play and hysteresis."""
     play_sigma: Length = param(gt=0)
-    stamp: Duration = param(description="The images' timestamps are late.")
+    stamp: Duration
+    """The images' timestamps are late."""
     stamp_sigma: Duration = param(gt=0)
 
 

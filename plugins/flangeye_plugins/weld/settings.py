@@ -25,12 +25,12 @@ INSIDE = 1.5e-3
 class PassParams(Params):
     """A pass after the root pass: it follows the estimated seam without touch."""
 
-    across: Length = param("0 mm", ge=-0.03, le=0.03, description="Offset to the left of the seam.")
-    up: Length = param(
-        "3 mm", gt=0, le=0.05, description="Higher than the root pass, the finger too; it must "
-        "clear what was welded.",
-    )  # fmt: skip
-    weave_width: Length = param("0 mm", ge=0, le=0.03, description="As in the root pass.")
+    across: Length = param("0 mm", ge=-0.03, le=0.03)
+    """Offset to the left of the seam."""
+    up: Length = param("3 mm", gt=0, le=0.05)
+    """Higher than the root pass, the finger too; it must clear what was welded."""
+    weave_width: Length = param("0 mm", ge=0, le=0.03)
+    """As in the root pass."""
 
 
 class Following(Params):
@@ -67,92 +67,63 @@ class Following(Params):
     # Standard deviation of the walls' angles [rad].
     joint_sigma: ClassVar[float] = math.radians(1.0)
 
-    speed: Speed = param("5 mm/s", gt=0, le=0.05, description="Speed of the tip along the seam.")
-    side: Literal["left", "right"] = Field(
-        "left", description="Which wall of the groove to press, seen along the seam."
-    )
-    deflection: Length = param(
-        "2 mm", gt=0, le=0.01, description="Deflection of the tip against the wall (delta_d)."
-    )
-    preload: Length = param(
-        "1.5 mm", gt=0, le=0.01, description="Displacement of the tip into the groove."
-    )
-    turn_rate: AngularSpeed = param(
-        "20 deg/s", gt=0, le=2.0, description="Largest angular velocity of the tool."
-    )
-    reach: Length = param(
-        "8 mm", gt=0, description="How far from the plan the wall is sought at the start."
-    )
-    friction: float = Field(
-        0.3, ge=0, le=1, description="Largest coefficient of the tip on the work to reckon with."
-    )
-    max_error: Length = param(
-        "1 mm", gt=0, description="The weld is refused or stopped where the torch's stated bound "
-        "exceeds this.",
-    )  # fmt: skip
-    sigmas: float = Field(
-        3.0, gt=0, le=6, description="The torch's bound: its control error and so many standard "
-        "deviations. True errors are beyond 3 in one weld of 370, beyond 4 in one of 16,000.",
-    )  # fmt: skip
-    arm_sigma: Length = param(
-        "0.03 mm", ge=0, description="Standard deviation of what the arm is off by, across the "
-        "seam, when the tip passes a place; the torch's passing has the same.",
-    )  # fmt: skip
-    distortion: Length = param(
-        "0.05 mm", ge=0, description="Standard deviation of how far heat moves the seam between "
-        "the tip's and the torch's passing one place.",
-    )  # fmt: skip
-    gain_drift: float = Field(
-        0.05, ge=0, le=1, description="Standard deviation of the finger's gain after a minute."
-    )
-    joint: JointKind = Field(
-        "groove",
-        description="groove, butt and corner hold the tip between two walls; in a fillet or lap "
-        "joint it lies on a flat plate against a wall on its side. Where the plan knows a "
-        "half_angle both walls lean by it from the opening.",
-    )
-    root_gap: Length = param(
-        "0 mm", ge=0, description="Between the plates of a butt joint with square edges: the tip "
-        "rests on these.",
-    )  # fmt: skip
-    work_angle: Angle = param(
-        "0 deg", ge=-np.pi / 3, le=np.pi / 3,
-        description="The tool's upper end leans away from the pressed wall by this.",
-    )  # fmt: skip
-    travel_angle: Angle = param(
-        "0 deg", ge=-np.pi / 6, le=np.pi / 6,
-        description="The tool's upper end leans forwards along the seam by this.",
-    )  # fmt: skip
-    offset_across: Length = param(
-        "0 mm", ge=-0.02, le=0.02,
-        description="How far to the left of the seam the torch is led.",
-    )  # fmt: skip
-    ends: Length | None = param(
-        None, ge=0, le=0.03, description="How far the seam's ends may be off along the plan. Where "
-        "it is given the tip feels for both: it goes back until it falls off the start, and, "
-        "between two walls, on until it falls off the end. Where it does not, the torch welds so "
-        "far beyond.",
-    )  # fmt: skip
-    overlap: Length = param(
-        "30 mm", gt=0, description="How far before the stop the torch begins again, to go on; a "
-        "seam that goes once around is welded so far over its start.",
-    )  # fmt: skip
-    weave_width: Length = param(
-        "0 mm", ge=0, le=0.03,
-        description="The torch swings across the seam by this from side to side, the tool turning "
-        "about its tip.",
-    )  # fmt: skip
-    weave_frequency: float = Field(1.0, gt=0, le=10, description="How often it does in a second.")
-    passes: tuple[PassParams, ...] = Field(
-        (), max_length=20, description="Passes after the root's, in their order."
-    )
-    blind: Duration = param(
-        "500 ms",
-        gt=0,
-        description="Without an image of the tag for longer while the arc burns, or for four times "
-        "as long before, the weld is stopped. After a fifth of this it slows down, after three "
-        "tenths the arm stands until one comes.",
-    )
+    speed: Speed = param("5 mm/s", gt=0, le=0.05)
+    """Speed of the tip along the seam."""
+    side: Literal["left", "right"] = "left"
+    """Which wall of the groove to press, seen along the seam."""
+    deflection: Length = param("2 mm", gt=0, le=0.01)
+    """Deflection of the tip against the wall (delta_d)."""
+    preload: Length = param("1.5 mm", gt=0, le=0.01)
+    """Displacement of the tip into the groove."""
+    turn_rate: AngularSpeed = param("20 deg/s", gt=0, le=2.0)
+    """Largest angular velocity of the tool."""
+    reach: Length = param("8 mm", gt=0)
+    """How far from the plan the wall is sought at the start."""
+    friction: float = Field(0.3, ge=0, le=1)
+    """Largest coefficient of the tip on the work to reckon with."""
+    max_error: Length = param("1 mm", gt=0)
+    """The weld is refused or stopped where the torch's stated bound exceeds this."""
+    sigmas: float = Field(3.0, gt=0, le=6)
+    """The torch's bound: its control error and so many standard deviations. True errors are beyond
+    3 in one weld of 370, beyond 4 in one of 16,000."""
+    arm_sigma: Length = param("0.03 mm", ge=0)
+    """Standard deviation of what the arm is off by, across the seam, when the tip passes a place;
+    the torch's passing has the same."""
+    distortion: Length = param("0.05 mm", ge=0)
+    """Standard deviation of how far heat moves the seam between the tip's and the torch's passing
+    one place."""
+    gain_drift: float = Field(0.05, ge=0, le=1)
+    """Standard deviation of the finger's gain after a minute."""
+    joint: JointKind = "groove"
+    """groove, butt and corner hold the tip between two walls; in a fillet or lap joint it lies on a
+    flat plate against a wall on its side. Where the plan knows a half_angle both walls lean by it
+    from the opening."""
+    root_gap: Length = param("0 mm", ge=0)
+    """Between the plates of a butt joint with square edges: the tip rests on these."""
+    work_angle: Angle = param("0 deg", ge=-np.pi / 3, le=np.pi / 3)
+    """The tool's upper end leans away from the pressed wall by this."""
+    travel_angle: Angle = param("0 deg", ge=-np.pi / 6, le=np.pi / 6)
+    """The tool's upper end leans forwards along the seam by this."""
+    offset_across: Length = param("0 mm", ge=-0.02, le=0.02)
+    """How far to the left of the seam the torch is led."""
+    ends: Length | None = param(None, ge=0, le=0.03)
+    """How far the seam's ends may be off along the plan. Where it is given the tip feels for both:
+    it goes back until it falls off the start, and, between two walls, on until it falls off the
+    end. Where it does not, the torch welds so far beyond."""
+    overlap: Length = param("30 mm", gt=0)
+    """How far before the stop the torch begins again, to go on; a seam that goes once around is
+    welded so far over its start."""
+    weave_width: Length = param("0 mm", ge=0, le=0.03)
+    """The torch swings across the seam by this from side to side, the tool turning about its
+    tip."""
+    weave_frequency: float = Field(1.0, gt=0, le=10)
+    """How often it does in a second."""
+    passes: tuple[PassParams, ...] = Field((), max_length=20)
+    """Passes after the root's, in their order."""
+    blind: Duration = param("500 ms", gt=0)
+    """Without an image of the tag for longer while the arc burns, or for four times as long before,
+    the weld is stopped. After a fifth of this it slows down, after three tenths the arm stands
+    until one comes."""
 
     @property
     def stale(self) -> float:
@@ -191,47 +162,30 @@ class WeldTactileParams(Following):
     approach_joint_speed: ClassVar[float] = math.radians(20.0)
     clearance: ClassVar[float] = 15e-3
 
-    finger: FingerPath = param(
-        "srm", description="One of data/fingers, or a .yaml file of one's own."
-    )
-    sensor: Annotated[BoundPart, Choose("sensor")] = Field(
-        description="What gives the finger's images, for example {opencv: {device: 0}}."
-    )
-    look: Annotated[BoundPart, Choose("profiler")] | None = Field(
-        None,
-        description="A profile sensor that sees the bead behind the torch, for example {tcp: "
-        "{host: 192.168.1.20, port: 9000, behind: 30 mm}}. The thermal distortion and torch "
-        "offset that it measures are compensated.",
-    )
-    arc: Annotated[BoundPart, Choose("arc")] | None = Field(
-        None,
-        description="The power source, for example {ur_digital: {host: 192.168.1.10, output: 3}}: "
-        "it is switched as the torch's bound allows, and goes off with any stop of the arm.",
-    )
-    mode: Mode = Field(
-        "tactile",
-        description="tactile: follow the seam by touch. For comparison: vision follows the plan "
-        "alone and touches nothing; any other name is that of a controller plugin.",
-    )
-    leg: int | None = Field(
-        None, ge=1,
-        description="Number of the leg between sharp corners of the plan that this step welds.",
-    )  # fmt: skip
-    corner_radius: Length | None = param(
-        None,
-        gt=0,
-        description="Tip and torch go round the plan's sharp corners without a stop, on arcs of "
-        "this radius. Without it the torch stops there: each leg is a step.",
-    )
-    resume: RecipeFile | None = Field(
-        None,
-        description="The run.mcap of a weld that was stopped: goes on with what was felt.",
-    )
-    prior: RecipePath | None = Field(
-        None,
-        description="A .yaml file of what earlier welds have found of tip, play and clock: read "
-        "where it exists, written when a weld is done; delete it to begin anew.",
-    )
+    finger: FingerPath = param("srm")
+    """One of data/fingers, or a .yaml file of one's own."""
+    sensor: Annotated[BoundPart, Choose("sensor")]
+    """What gives the finger's images, for example {opencv: {device: 0}}."""
+    look: Annotated[BoundPart, Choose("profiler")] | None = None
+    """A profile sensor that sees the bead behind the torch, for example {tcp: {host: 192.168.1.20,
+    port: 9000, behind: 30 mm}}. The thermal distortion and torch offset that it measures are
+    compensated."""
+    arc: Annotated[BoundPart, Choose("arc")] | None = None
+    """The power source, for example {ur_digital: {host: 192.168.1.10, output: 3}}: it is switched
+    as the torch's bound allows, and goes off with any stop of the arm."""
+    mode: Mode = "tactile"
+    """tactile: follow the seam by touch. For comparison: vision follows the plan alone and touches
+    nothing; any other name is that of a controller plugin."""
+    leg: int | None = Field(None, ge=1)
+    """Number of the leg between sharp corners of the plan that this step welds."""
+    corner_radius: Length | None = param(None, gt=0)
+    """Tip and torch go round the plan's sharp corners without a stop, on arcs of this radius.
+    Without it the torch stops there: each leg is a step."""
+    resume: RecipeFile | None = None
+    """The run.mcap of a weld that was stopped: goes on with what was felt."""
+    prior: RecipePath | None = None
+    """A .yaml file of what earlier welds have found of tip, play and clock: read where it exists,
+    written when a weld is done; delete it to begin anew."""
 
     @model_validator(mode="after")
     def _follows_by_touch(self) -> Self:

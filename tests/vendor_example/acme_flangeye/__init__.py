@@ -12,7 +12,8 @@ from flangeye.units import Length, param
 
 
 class HullParams(Params):
-    tolerance: Length = param("1 mm", gt=0, description="Largest error of the rim's radius.")
+    tolerance: Length = param("1 mm", gt=0)
+    """Largest error of the rim's radius."""
 
 
 @stage("fit.acme_hull")

@@ -4,7 +4,6 @@ import socket
 import time
 
 import numpy as np
-from pydantic import Field
 
 from flangeye import Params, part
 from flangeye.devices import PATIENCE, DeviceError, Scan, Scanner
@@ -13,8 +12,10 @@ from flangeye.types import CAMERA, PointCloud
 
 
 class AcmeParams(Params):
-    host: str = Field("192.168.0.10", description="Address of the scanner.")
-    port: int = Field(7700, description="Its port.")
+    host: str = "192.168.0.10"
+    """Address of the scanner."""
+    port: int = 7700
+    """Its port."""
 
 
 @part("scanner.acme")

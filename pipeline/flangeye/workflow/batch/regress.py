@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from pydantic import Field
-
 from flangeye.errors import FlangeyeError, RecipeError
 from flangeye.files.paths import place_at
 from flangeye.models.model import Model, read_model
@@ -173,30 +171,32 @@ class Expected(Model):
     """The accepted result of a recording, which later runs are compared with."""
 
     status: Literal["verified", "unverified", "refused"] = "verified"
-    closure: Length | None = Field(None, description="Median held-out error.")
-    tolerance: Length | None = Field(None, description="How far the closure may be from that.")
-    findings: tuple[str, ...] | None = Field(
-        None,
-        description="Names of what flangeye doctor finds, in any order. Default: not compared.",
-    )
+    closure: Length | None = None
+    """Median held-out error."""
+    tolerance: Length | None = None
+    """How far the closure may be from that."""
+    findings: tuple[str, ...] | None = None
+    """Names of what flangeye doctor finds, in any order. Default: not compared."""
 
 
 class Manifest(Model):
     """One recording."""
 
-    title: str = Field(description="One line shown in reports.")
-    recording: str = Field(
-        description="The folder or file, from the manifest's folder, or from ~; skipped if absent."
-    )
-    recipe: str = Field(description="A bundled recipe, or a file, from the manifest's folder.")
-    reader: Any = Field(
-        None, description="The reader and its conventions, as a recipe has them; the recipe's own "
-        "if not given.",
-    )  # fmt: skip
-    overrides: tuple[str, ...] = Field((), description="As --set: fit.rim.inlier=0.2 mm.")
+    title: str
+    """One line shown in reports."""
+    recording: str
+    """The folder or file, from the manifest's folder, or from ~; skipped if absent."""
+    recipe: str
+    """A bundled recipe, or a file, from the manifest's folder."""
+    reader: Any = None
+    """The reader and its conventions, as a recipe has them; the recipe's own if not given."""
+    overrides: tuple[str, ...] = ()
+    """As --set: fit.rim.inlier=0.2 mm."""
     expected: Expected
-    source: str = Field(description="Where others find the recording.")
-    licence: str = Field(description="Under which licence, or that none is stated.")
+    source: str
+    """Where others find the recording."""
+    licence: str
+    """Under which licence, or that none is stated."""
 
 
 def read_manifests(folder: Path) -> dict[Path, Manifest]:

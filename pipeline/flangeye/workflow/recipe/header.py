@@ -33,15 +33,16 @@ class BoxSection(RecipeSection):
 class LimitsSection(RecipeSection):
     """The arm's motion limits; required with a driver, which may move a real arm."""
 
-    box: BoxSection = Field(description="The flange's centre stays inside, in the robot's base.")
-    speed: Speed = param("100 mm/s", gt=0, le=1.0, description="Largest speed of the flange.")
-    acceleration: Acceleration = param(
-        "300 mm/s^2", gt=0, le=3.0, description="Largest acceleration of the flange."
-    )
-    joint_speed: AngularSpeed = param("30 deg/s", gt=0, description="Largest speed of any joint.")
-    joints: tuple[tuple[Angle, Angle], ...] | None = Field(
-        None, description="Lower and upper angle of each joint; the model's own when not given."
-    )
+    box: BoxSection
+    """The flange's centre stays inside, in the robot's base."""
+    speed: Speed = param("100 mm/s", gt=0, le=1.0)
+    """Largest speed of the flange."""
+    acceleration: Acceleration = param("300 mm/s^2", gt=0, le=3.0)
+    """Largest acceleration of the flange."""
+    joint_speed: AngularSpeed = param("30 deg/s", gt=0)
+    """Largest speed of any joint."""
+    joints: tuple[tuple[Angle, Angle], ...] | None = None
+    """Lower and upper angle of each joint; the model's own when not given."""
 
     def for_robot(self, robot: RobotModel) -> MotionLimits:
         """Return these limits, within those of a robot itself.
@@ -88,44 +89,38 @@ class NamedSection(RecipeSection):
     ) -> dict[str, Any]:
         what = "A model's name." if cls.word == "model" else "Its parent frame."
         word = {"type": "string", "description": what}
-        return {"anyOf": [handler(core_schema), word]}
+        section = super().__get_pydantic_json_schema__(core_schema, handler)
+        return {"anyOf": [section, word]}
 
 
 class SecondRobotSection(NamedSection):
     """The arm that carries the target before the first one's camera."""
 
-    model: str = Field(
-        description="A model that 'flangeye robots' lists, or a .yaml file of your own."
-    )
+    model: str
+    """A model that 'flangeye robots' lists, or a .yaml file of your own."""
 
 
 class RobotSection(NamedSection):
     """Which arm, and how to reach it; its plate alone where an archive has the flange's poses."""
 
-    model: str | None = Field(
-        None, description="A model that 'flangeye robots' lists, or a .yaml file of your own."
-    )
-    urdf: str | None = Field(None, description="A URDF file, instead of a model; xacro expanded.")
-    base: str | None = Field(
-        None, description="With urdf: the link that is the controller's base; found if not given."
-    )
-    flange: str | None = Field(
-        None,
-        description="Designation of the plate, such as ISO 9409-1-50-4-M6. With urdf: the link at "
-        "the plate's face, z outwards, found if not given; the plate is feature's standard.",
-    )
-    packages: dict[str, str] = Field(
-        default_factory=dict, description="With urdf: folders of the packages its meshes are in."
-    )
-    factory: str | None = Field(
-        None,
-        description="A UR's factory calibration, so that the arm is as it was built: the "
-        "controller's calibration.conf, or the ROS driver's kinematics .yaml.",
-    )
-    driver: Annotated[BoundPart, Choose("robot")] | None = Field(
-        None, description="How to reach the real arm, for example {ur_rtde: {host: 192.168.1.10}}."
-    )
-    limits: LimitsSection | None = Field(None, description="What the arm must keep to.")
+    model: str | None = None
+    """A model that 'flangeye robots' lists, or a .yaml file of your own."""
+    urdf: str | None = None
+    """A URDF file, instead of a model; xacro expanded."""
+    base: str | None = None
+    """With urdf: the link that is the controller's base; found if not given."""
+    flange: str | None = None
+    """Designation of the plate, such as ISO 9409-1-50-4-M6. With urdf: the link at the plate's
+    face, z outwards, found if not given; the plate is feature's standard."""
+    packages: dict[str, str] = Field(default_factory=dict)
+    """With urdf: folders of the packages its meshes are in."""
+    factory: str | None = None
+    """A UR's factory calibration, so that the arm is as it was built: the controller's
+    calibration.conf, or the ROS driver's kinematics .yaml."""
+    driver: Annotated[BoundPart, Choose("robot")] | None = None
+    """How to reach the real arm, for example {ur_rtde: {host: 192.168.1.10}}."""
+    limits: LimitsSection | None = None
+    """What the arm must keep to."""
 
     @model_validator(mode="after")
     def _names_something(self) -> RobotSection:
@@ -151,16 +146,14 @@ class RobotSection(NamedSection):
 class ScannerSection(NamedSection):
     """Which scanner, and how to reach it; a name and a range do for an archive."""
 
-    model: str | None = Field(
-        None, description="A model that 'flangeye scanners' lists, or a .yaml file of your own."
-    )
-    name: str | None = Field(None, description="What to call a scanner that has no model.")
-    range: tuple[Length, Length] | None = Field(
-        None, description="Nearest and farthest it sees; archives in another unit are noticed."
-    )
-    driver: Annotated[BoundPart, Choose("scanner")] | None = Field(
-        None, description="How to reach the real scanner, for example {watched_folder: {path: …}}."
-    )
+    model: str | None = None
+    """A model that 'flangeye scanners' lists, or a .yaml file of your own."""
+    name: str | None = None
+    """What to call a scanner that has no model."""
+    range: tuple[Length, Length] | None = None
+    """Nearest and farthest it sees; archives in another unit are noticed."""
+    driver: Annotated[BoundPart, Choose("scanner")] | None = None
+    """How to reach the real scanner, for example {watched_folder: {path: …}}."""
 
     @model_validator(mode="after")
     def _names_something(self) -> ScannerSection:
@@ -177,27 +170,22 @@ class ScannerSection(NamedSection):
 class SphereSection(RecipeSection):
     """A calibration sphere."""
 
-    diameter: Annotated[Length, Field(gt=0)] | Literal["unknown"] = Field(
-        description="unknown costs the depth of its centre most of its accuracy."
-    )
-    centre: tuple[Length, Length, Length] = Field(
-        description="Where its centre is in the frame that carries it; in the flange frame the "
-        "origin is in the face and z points outwards."
-    )
+    diameter: Annotated[Length, Field(gt=0)] | Literal["unknown"]
+    """unknown costs the depth of its centre most of its accuracy."""
+    centre: tuple[Length, Length, Length]
+    """Where its centre is in the frame that carries it; in the flange frame the origin is in the
+    face and z points outwards."""
 
 
 class FeatureSection(RecipeSection):
     """The circle to look for; by default the flange in the robot's file."""
 
-    standard: str | None = Field(
-        None, description="Designation such as ISO 9409-1-50-4-M6, or a .yaml file of your own."
-    )
-    wrist_circle: Length | None = Field(
-        None, description="Diameter of the wrist's outer circle, for scanners too coarse for a rim."
-    )
-    sphere: SphereSection | None = Field(
-        None, description="A calibration sphere on the flange, to be looked for in its place."
-    )
+    standard: str | None = None
+    """Designation such as ISO 9409-1-50-4-M6, or a .yaml file of your own."""
+    wrist_circle: Length | None = None
+    """Diameter of the wrist's outer circle, for scanners too coarse for a rim."""
+    sphere: SphereSection | None = None
+    """A calibration sphere on the flange, to be looked for in its place."""
 
 
 class TargetSection(NamedSection):
@@ -205,23 +193,17 @@ class TargetSection(NamedSection):
 
     word: ClassVar[str] = "body"
 
-    body: str = Field(
-        description="A mesh beside the recipe (STL, PLY, OBJ, GLB, 3MF, STEP), a bundled body, or "
-        "robot: the arm's own links at its joint angles, by its URDF's meshes."
-    )
-    links: dict[int, str] = Field(
-        {},
-        description="robot: meshes in metres, by the number of the joint whose frame each is drawn "
-        "in, the base's 0; those of the URDF if not given.",
-    )
-    unit: LengthUnit | None = Field(
-        None, description="Of the mesh's coordinates; judged by its size if not given."
-    )
-    at: Literal["flange", "base", "unknown"] = Field(
-        "flange",
-        description="The frame the mesh is drawn in; unknown: fixed to the arm's flange, drawn in "
-        "a frame of its own, and its place is found.",
-    )
+    body: str
+    """A mesh beside the recipe (STL, PLY, OBJ, GLB, 3MF, STEP), a bundled body, or robot: the arm's
+    own links at its joint angles, by its URDF's meshes."""
+    links: dict[int, str] = Field({})
+    """robot: meshes in metres, by the number of the joint whose frame each is drawn in, the base's
+    0; those of the URDF if not given."""
+    unit: LengthUnit | None = None
+    """Of the mesh's coordinates; judged by its size if not given."""
+    at: Literal["flange", "base", "unknown"] = "flange"
+    """The frame the mesh is drawn in; unknown: fixed to the arm's flange, drawn in a frame of its
+    own, and its place is found."""
 
 
 Place = Literal["known", "unknown"] | PlaceParams
@@ -231,19 +213,13 @@ class ConfigurationSection(RecipeSection):
     """Who carries the camera and the target; the unknown transforms follow."""
 
     name: Literal["eye-on-base", "eye-in-hand", "eye-on-arm", "two-arms"] = "eye-on-base"
-    camera: str | None = Field(
-        None,
-        description="Frame that carries the camera: base, flange, or link1, link2, … for "
-        "eye-on-arm.",
-    )
-    target: str | None = Field(
-        None, description="Frame that carries the target: flange, base or flange2."
-    )
-    place: Place = Field(
-        "known",
-        description="Where the target is in that frame: known (at the origin, as the robot's own "
-        "circles are), unknown (a marker), or its position and rpy.",
-    )
+    camera: str | None = None
+    """Frame that carries the camera: base, flange, or link1, link2, … for eye-on-arm."""
+    target: str | None = None
+    """Frame that carries the target: flange, base or flange2."""
+    place: Place = "known"
+    """Where the target is in that frame: known (at the origin, as the robot's own circles are),
+    unknown (a marker), or its position and rpy."""
 
 
 FrameName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", min_length=1)]
@@ -252,16 +228,11 @@ FrameName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", min_length=1)]
 class MountedSection(RecipeSection):
     """Where something of a cell is mounted, by default at a known place."""
 
-    on: str = Field(
-        "base",
-        description="What it is mounted on: base, or an arm, a rail or a positioner of the cell by "
-        "name.",
-    )
-    place: Place = Field(
-        "known",
-        description="Where its base is on that: known (at its origin), unknown (to be found), or "
-        "position and rpy.",
-    )
+    on: str = "base"
+    """What it is mounted on: base, or an arm, a rail or a positioner of the cell by name."""
+    place: Place = "known"
+    """Where its base is on that: known (at its origin), unknown (to be found), or position and
+    rpy."""
 
 
 class CellArmSection(SecondRobotSection, MountedSection):
@@ -271,7 +242,8 @@ class CellArmSection(SecondRobotSection, MountedSection):
 class AxisSection(MountedSection):
     """Common section of rails and positioners."""
 
-    axis: tuple[float, float, float] = Field(description="Its direction in its base.")
+    axis: tuple[float, float, float]
+    """Its direction in its base."""
 
     @field_validator("axis")
     @classmethod
@@ -284,13 +256,15 @@ class AxisSection(MountedSection):
 class RailSection(AxisSection):
     """A rail of a cell."""
 
-    travel: tuple[Length, Length] = param(("-1 m", "1 m"), description="Lowest and highest.")
+    travel: tuple[Length, Length] = param(("-1 m", "1 m"))
+    """Lowest and highest."""
 
 
 class PositionerSection(AxisSection):
     """A positioner of a cell: a plate that turns."""
 
-    travel: tuple[Angle, Angle] = param(("-180 deg", "180 deg"), description="Lowest and highest.")
+    travel: tuple[Angle, Angle] = param(("-180 deg", "180 deg"))
+    """Lowest and highest."""
 
 
 class StandingSection(NamedSection, MountedSection):
@@ -298,12 +272,10 @@ class StandingSection(NamedSection, MountedSection):
 
     word: ClassVar[str] = "on"
 
-    link: int | None = Field(
-        None, ge=1, description="Which link of that arm it is on, from 1; its flange if not given."
-    )
-    place: Place = Field(
-        "unknown", description="Where it is on that: unknown (to be found), or known."
-    )
+    link: int | None = Field(None, ge=1)
+    """Which link of that arm it is on, from 1; its flange if not given."""
+    place: Place = "unknown"
+    """Where it is on that: unknown (to be found), or known."""
 
 
 class CellSection(RecipeSection):
@@ -323,16 +295,17 @@ class WorkspaceSection(BoxSection):
 class LogSection(RecipeSection):
     """What run.mcap holds besides the results."""
 
-    clouds: Literal["preview", "full"] = Field(
-        "preview", description="Raw scans: thinned for viewing, or whole, to segment again later."
-    )
+    clouds: Literal["preview", "full"] = "preview"
+    """Raw scans: thinned for viewing, or whole, to segment again later."""
 
 
 class Header(RecipeSection):
     """A recipe, its steps not yet checked."""
 
-    title: str = Field(description="One line shown in reports.")
-    description: str = Field("", description="A longer description.")
+    title: str
+    """One line shown in reports."""
+    description: str = ""
+    """A longer description."""
     robot: RobotSection | None = None
     second_robot: SecondRobotSection | None = None
     scanner: ScannerSection | None = None
@@ -341,6 +314,8 @@ class Header(RecipeSection):
     feature: FeatureSection = Field(default_factory=FeatureSection)
     target: TargetSection | None = None
     workspace: WorkspaceSection | None = None
-    seed: int = Field(0, ge=0, description="The only source of randomness.")
+    seed: int = Field(0, ge=0)
+    """The only source of randomness."""
     log: LogSection = Field(default_factory=LogSection)
-    steps: list[Any] = Field(min_length=1, description="Stages in order, each with parameters.")
+    steps: list[Any] = Field(min_length=1)
+    """Stages in order, each with parameters."""

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
+from flangeye.files.described import Described
 from flangeye.types import Transform
 
 
@@ -20,28 +21,26 @@ Point = Annotated[Vector, Field(min_length=3, max_length=3)]
 Matrix = Annotated[list[list[float]], BeforeValidator(_listed)]
 
 
-class _Part(BaseModel):
+class _Part(Described):
     model_config = ConfigDict(extra="forbid", defer_build=True, from_attributes=True)
 
 
 class TransformResult(_Part):
     """An estimated transform."""
 
-    matrix: Matrix = Field(description="4x4, maps child coordinates to parent coordinates.")
-    covariance: Matrix = Field(
-        description="6x6, order (rotation [rad], translation [m]), of a left perturbation in the "
-        "parent frame, the translation taken at `about`."
-    )
-    about: Point = Field(description="Point in the parent frame [m].")
-    unobservable: Matrix | None = Field(
-        None,
-        description="Directions (rotation, translation), about the same point, along which the "
-        "estimate is arbitrary and the covariance says nothing.",
-    )
-    shares: dict[str, Matrix] = Field(
-        {}, description="6x6 parts of the covariance by cause; the remainder is the uncertainty of "
-        "the causes' sizes."
-    )  # fmt: skip
+    matrix: Matrix
+    """4x4, maps child coordinates to parent coordinates."""
+    covariance: Matrix
+    """6x6, order (rotation [rad], translation [m]), of a left perturbation in the parent frame, the
+    translation taken at `about`."""
+    about: Point
+    """Point in the parent frame [m]."""
+    unobservable: Matrix | None = None
+    """Directions (rotation, translation), about the same point, along which the estimate is
+    arbitrary and the covariance says nothing."""
+    shares: dict[str, Matrix] = Field({})
+    """6x6 parts of the covariance by cause; the remainder is the uncertainty of the causes'
+    sizes."""
 
     @model_validator(mode="after")
     def _are_of_a_transform(self) -> Self:
@@ -86,16 +85,24 @@ class ObservationResult(_Part):
     centre_in_camera: Point | None = None
     normal_in_camera: Point | None = None
     radii: dict[str, float] | None = None
-    covariance: Matrix | None = Field(None, description="3x3, of the centre [m^2].")
-    arc_coverage: float | None = Field(None, description="Share of the rim that was seen.")
-    clocking: float | None = Field(None, description="Angle of the hole pattern [rad], if seen.")
+    covariance: Matrix | None = None
+    """3x3, of the centre [m^2]."""
+    arc_coverage: float | None = None
+    """Share of the rim that was seen."""
+    clocking: float | None = None
+    """Angle of the hole pattern [rad], if seen."""
     tcp_in_base: Point | None = None
-    camera: str | None = Field(None, description="Which camera of a cell saw it.")
-    target: str | None = Field(None, description="Which target of a cell it saw.")
-    residual: float | None = Field(None, description="Distance of mapped centre and TCP [m].")
-    residual_in_base: Point | None = Field(None, description="Mapped centre minus TCP [m].")
+    camera: str | None = None
+    """Which camera of a cell saw it."""
+    target: str | None = None
+    """Which target of a cell it saw."""
+    residual: float | None = None
+    """Distance of mapped centre and TCP [m]."""
+    residual_in_base: Point | None = None
+    """Mapped centre minus TCP [m]."""
     used: bool
-    reason: str | None = Field(None, description="Why it was not used.")
+    reason: str | None = None
+    """Why it was not used."""
 
     @model_validator(mode="after")
     def _are_of_space(self) -> Self:
@@ -119,7 +126,8 @@ class HoldoutResult(_Part):
     rms: float
     median: float
     p95: float
-    figures: dict[str, float] = Field(description="Everything else verify.holdout reports.")
+    figures: dict[str, float]
+    """Everything else verify.holdout reports."""
 
 
 class VerificationResult(_Part):
@@ -128,7 +136,8 @@ class VerificationResult(_Part):
     passed: bool
     reason: str
     figures: dict[str, float]
-    errors: dict[str, float] = Field(description="Per pose, by observation id [m].")
+    errors: dict[str, float]
+    """Per pose, by observation id [m]."""
 
 
 class WorkspaceResult(_Part):
@@ -141,63 +150,74 @@ class WorkspaceResult(_Part):
 class ExpectedErrorResult(_Part):
     """Expected error when the arm is sent to a scanned point."""
 
-    rms: float = Field(description="Root mean square over the work [m].")
-    p95: float = Field(description="95 % of the errors are below [m].")
+    rms: float
+    """Root mean square over the work [m]."""
+    p95: float
+    """95 % of the errors are below [m]."""
 
 
 class TransformErrorResult(_Part):
     """Simulation only: true error of one transform."""
 
-    rotation: float = Field(description="[rad]")
-    translation: float = Field(description="Error of the point its covariance is taken about [m].")
+    rotation: float
+    """[rad]"""
+    translation: float
+    """Error of the point its covariance is taken about [m]."""
 
 
 class TruthResult(_Part):
     """Simulation only: the calibration's true error."""
 
-    base_T_camera: Matrix | None = Field(None, description="Where the camera is, if it stands.")
-    transforms: dict[str, Matrix] = Field(
-        default_factory=dict, description="Every unknown, as it really is."
-    )
-    errors: dict[str, TransformErrorResult] = Field(
-        default_factory=dict, description="Error of every unknown, where its covariance is taken."
-    )
-    error_at_centroid: float = Field(description="At the workspace's centre [m].")
-    rms_over_workspace: float = Field(description="Over the workspace box [m].")
-    rotation_error: float = Field(description="[rad]")
-    at_work: float | None = Field(
-        None,
-        description="Where the arm is not what it reports: rms distance, at poses that took no "
-        "part, between where the camera says the target is and where the controller has it, the "
-        "correction of the circle's place applied if there is one [m].",
-    )
-    at_work_corrected: float | None = Field(
-        None, description="The same of the pose for the corrected arm, and that arm [m]."
-    )
+    base_T_camera: Matrix | None = None
+    """Where the camera is, if it stands."""
+    transforms: dict[str, Matrix] = Field(default_factory=dict)
+    """Every unknown, as it really is."""
+    errors: dict[str, TransformErrorResult] = Field(default_factory=dict)
+    """Error of every unknown, where its covariance is taken."""
+    error_at_centroid: float
+    """At the workspace's centre [m]."""
+    rms_over_workspace: float
+    """Over the workspace box [m]."""
+    rotation_error: float
+    """[rad]"""
+    at_work: float | None = None
+    """Where the arm is not what it reports: rms distance, at poses that took no part, between where
+    the camera says the target is and where the controller has it, the correction of the circle's
+    place applied if there is one [m]."""
+    at_work_corrected: float | None = None
+    """The same of the pose for the corrected arm, and that arm [m]."""
 
 
 class SeamTruthResult(_Part):
     """Simulation only: true error of the planned seam."""
 
-    rms: float = Field(description="Distance of the planned points from the true seam [m].")
+    rms: float
+    """Distance of the planned points from the true seam [m]."""
     max: float
-    inside: float = Field(description="Share of the planned points whose tube holds it.")
+    inside: float
+    """Share of the planned points whose tube holds it."""
 
 
 class SeamResult(_Part):
     """The planned seam, in the base."""
 
     source: str
-    length: float = Field(description="[m]")
-    points: Matrix = Field(description="(N, 3) along the root of the groove [m].")
-    openings: Matrix = Field(description="(N, 3) unit vectors towards the torch.")
-    covariance: list[Matrix] = Field(description="(N, 3, 3) of the points [m^2].")
-    tube: Vector = Field(description="(N) with 95 % the seam is not further off than this [m].")
-    half_angle: float | None = Field(None, description="Half angle of the groove [rad].")
-    half_width: float | None = Field(
-        None, description="Half width of the groove at its shoulders [m]."
-    )
-    figures: dict[str, float] = Field(description="What the seam step reports.")
+    length: float
+    """[m]"""
+    points: Matrix
+    """(N, 3) along the root of the groove [m]."""
+    openings: Matrix
+    """(N, 3) unit vectors towards the torch."""
+    covariance: list[Matrix]
+    """(N, 3, 3) of the points [m^2]."""
+    tube: Vector
+    """(N) with 95 % the seam is not further off than this [m]."""
+    half_angle: float | None = None
+    """Half angle of the groove [rad]."""
+    half_width: float | None = None
+    """Half width of the groove at its shoulders [m]."""
+    figures: dict[str, float]
+    """What the seam step reports."""
     notes: list[str]
     truth: SeamTruthResult | None = None
 
@@ -205,7 +225,8 @@ class SeamResult(_Part):
 class WeldTruthResult(_Part):
     """Simulation only: the torch's true distance across the seam, after the lead-in."""
 
-    rms: float = Field(description="[m]")
+    rms: float
+    """[m]"""
     max: float
 
 
@@ -214,12 +235,14 @@ class WeldResult(_Part):
 
     mode: str
     completed: bool
-    reason: str = Field(description="Why it ended early; empty when it did not.")
-    seconds: float = Field(description="From the first cycle to the last.")
-    correction_rms: float | None = Field(
-        None, description="From the plan to the seam as it was felt, across it [m]."
-    )
-    phases: dict[str, float] = Field(description="Time in each phase of the controller [s].")
+    reason: str
+    """Why it ended early; empty when it did not."""
+    seconds: float
+    """From the first cycle to the last."""
+    correction_rms: float | None = None
+    """From the plan to the seam as it was felt, across it [m]."""
+    phases: dict[str, float]
+    """Time in each phase of the controller [s]."""
     figures: dict[str, float]
     truth: WeldTruthResult | None = None
 
@@ -227,51 +250,50 @@ class WeldResult(_Part):
 class FieldResult(_Part):
     """A smooth displacement over the workspace; flangeye.maths.arm_correction evaluates it."""
 
-    about: Point = Field(description="Middle of the calibration's poses, in the base [m].")
-    length: float = Field(description="Correlation length of the field [m].")
-    weights: Vector = Field(description="Weights of the K features [m].")
+    about: Point
+    """Middle of the calibration's poses, in the base [m]."""
+    length: float
+    """Correlation length of the field [m]."""
+    weights: Vector
+    """Weights of the K features [m]."""
 
 
 class CorrectionResult(_Part):
     """Estimated errors of the arm, with which its poses can be corrected."""
 
-    tool_offset: Point = Field(description="The circle's centre in the flange frame [m].")
-    joint_offsets: Vector | None = Field(None, description="To add to the joint angles [rad].")
-    joints: Vector | None = Field(
-        None, description="A configuration on the branch of the arm that was calibrated [rad]."
-    )
-    lengths: Matrix | None = Field(
-        None, description="nx3, to add to each joint's a, d [m] and alpha [rad]."
-    )
-    field: FieldResult | None = Field(
-        None, description="Smooth displacement of the flange, to add to where the arm reports it."
-    )
+    tool_offset: Point
+    """The circle's centre in the flange frame [m]."""
+    joint_offsets: Vector | None = None
+    """To add to the joint angles [rad]."""
+    joints: Vector | None = None
+    """A configuration on the branch of the arm that was calibrated [rad]."""
+    lengths: Matrix | None = None
+    """nx3, to add to each joint's a, d [m] and alpha [rad]."""
+    field: FieldResult | None = None
+    """Smooth displacement of the flange, to add to where the arm reports it."""
 
 
 class AnswerResult(_Part):
     """The pose for one arm: as its controller reports it, or corrected."""
 
     transforms: dict[str, TransformResult]
-    correction: CorrectionResult | None = Field(
-        None, description="The arm correction that these poses require."
-    )
-    arms: dict[str, CorrectionResult] = Field(
-        default_factory=dict, description="The same of a cell's arms, by their names."
-    )
-    expected_rms: float | None = Field(
-        None,
-        description="Error to expect at the work, rms [m].",
-    )
-    holdout_rms: float | None = Field(None, description="On poses held out, over all of them [m].")
+    correction: CorrectionResult | None = None
+    """The arm correction that these poses require."""
+    arms: dict[str, CorrectionResult] = Field(default_factory=dict)
+    """The same of a cell's arms, by their names."""
+    expected_rms: float | None = None
+    """Error to expect at the work, rms [m]."""
+    holdout_rms: float | None = None
+    """On poses held out, over all of them [m]."""
 
 
 class AnswersResult(_Part):
     """The two answers, side by side: never mix the pose of one with the arm of the other."""
 
-    as_reported: AnswerResult = Field(description="For the arm as its controller reports it.")
-    corrected: AnswerResult | None = Field(
-        None, description="For the arm with its error corrected; null: no error was found."
-    )
+    as_reported: AnswerResult
+    """For the arm as its controller reports it."""
+    corrected: AnswerResult | None = None
+    """For the arm with its error corrected; null: no error was found."""
 
 
 class StageTiming(_Part):
@@ -279,17 +301,17 @@ class StageTiming(_Part):
 
     seconds: float
     calls: int
-    idle: float | None = Field(
-        None,
-        description="Share of a live session in which the arm stood while nothing was exposed.",
-    )
+    idle: float | None = None
+    """Share of a live session in which the arm stood while nothing was exposed."""
 
 
 class WarningResult(_Part):
     """A warning, and what to do about it."""
 
-    text: str = Field(description="What is wrong, one line.")
-    fix: str = Field(description="A command, a line of the recipe, or what to do at the cell.")
+    text: str
+    """What is wrong, one line."""
+    fix: str
+    """A command, a line of the recipe, or what to do at the cell."""
 
 
 class Provenance(_Part):
@@ -298,41 +320,39 @@ class Provenance(_Part):
     versions: dict[str, str]
     plugins: dict[str, str]
     recipe: str
-    recipe_hash: str = Field(description="SHA-256 of recipe.resolved.yaml.")
-    input_hash: str = Field(description="Hash of everything the captures are made from.")
+    recipe_hash: str
+    """SHA-256 of recipe.resolved.yaml."""
+    input_hash: str
+    """Hash of everything the captures are made from."""
     seed: int
-    notes: list[str] = Field(description="Notes of the source and the steps.")
+    notes: list[str]
+    """Notes of the source and the steps."""
 
 
 class Result(_Part):
     """The whole document."""
 
-    format: int = Field(1, description="Version of this contract.")
+    format: int = 1
+    """Version of this contract."""
     title: str
-    status: Literal["verified", "unverified", "refused", "incomplete"] = Field(
-        description="unverified: there was no verify step; incomplete: of a run that was killed."
-    )
-    refused: str | None = Field(None, description="Why.")
-    method: str | None = Field(None, description="The solve step.")
-    transforms: dict[str, TransformResult] = Field(
-        description="The best for the arm as its controller reports it."
-    )
-    correction: CorrectionResult | None = Field(
-        None, description="Where on the flange the circle is, if not at its origin."
-    )
-    answers: AnswersResult | None = Field(
-        None, description="The transforms for the arm as it reports, and those for it corrected."
-    )
-    expected_error: ExpectedErrorResult | None = Field(
-        None,
-        description="The error to expect at the work, with the transforms for the arm as its "
-        "controller reports it; null where the solver does not estimate it.",
-    )
-    true: dict[str, TransformResult] = Field(
-        default_factory=dict,
-        description="The transforms in the arm's true base, for metrology: their covariances "
-        "include arm errors common to all poses.",
-    )
+    status: Literal["verified", "unverified", "refused", "incomplete"]
+    """unverified: there was no verify step; incomplete: of a run that was killed."""
+    refused: str | None = None
+    """Why."""
+    method: str | None = None
+    """The solve step."""
+    transforms: dict[str, TransformResult]
+    """The best for the arm as its controller reports it."""
+    correction: CorrectionResult | None = None
+    """Where on the flange the circle is, if not at its origin."""
+    answers: AnswersResult | None = None
+    """The transforms for the arm as it reports, and those for it corrected."""
+    expected_error: ExpectedErrorResult | None = None
+    """The error to expect at the work, with the transforms for the arm as its controller reports
+    it; null where the solver does not estimate it."""
+    true: dict[str, TransformResult] = Field(default_factory=dict)
+    """The transforms in the arm's true base, for metrology: their covariances include arm errors
+    common to all poses."""
     observations: list[ObservationResult]
     workspace: WorkspaceResult | None = None
     holdout: HoldoutResult | None = None
@@ -340,16 +360,14 @@ class Result(_Part):
     truth: TruthResult | None = None
     seam: SeamResult | None = None
     weld: WeldResult | None = None
-    simulated: bool = Field(
-        False, description="The captures are a simulator's: nothing real has been calibrated."
-    )
-    warnings: list[WarningResult] = Field(
-        default_factory=list, description="What is to be done, and the line that does it."
-    )
-    notes: list[str] = Field(default_factory=list, description="Notes of the steps.")
-    exports: dict[str, str] = Field(
-        default_factory=dict, description="What export steps wrote: file name -> content."
-    )
+    simulated: bool = False
+    """The captures are a simulator's: nothing real has been calibrated."""
+    warnings: list[WarningResult] = Field(default_factory=list)
+    """What is to be done, and the line that does it."""
+    notes: list[str] = Field(default_factory=list)
+    """Notes of the steps."""
+    exports: dict[str, str] = Field(default_factory=dict)
+    """What export steps wrote: file name -> content."""
     timing: dict[str, StageTiming]
     provenance: Provenance
 

@@ -8,7 +8,6 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from pydantic import Field
 
 from flangeye.devices import GRACE, Device, DeviceError, Mode, Robot, RobotState, load_sdk
 from flangeye.models.robots import RobotModel
@@ -48,10 +47,10 @@ SAFETY: dict[str, tuple[Mode, str]] = {
 class AuboParams(ControllerParams):
     """Parameters of ``robot.aubo``."""
 
-    user: str = Field("aubo", description="Account on the controller.")
-    password: str = Field(
-        "123456", description="Password of that account; the default is the factory's."
-    )
+    user: str = "aubo"
+    """Account on the controller."""
+    password: str = "123456"
+    """Password of that account; the default is the factory's."""
 
 
 @part("robot.aubo")

@@ -7,7 +7,6 @@ import time
 from typing import ClassVar
 
 import numpy as np
-from pydantic import Field
 
 from flangeye.devices import SILENT, DeviceError, Mode, Robot
 from flangeye.models.robots import RobotModel
@@ -29,10 +28,9 @@ BEGINNING = pieces.BEHIND + 2 * RENEWAL
 class Ros2RobotParams(ListenParams):
     """Parameters of ``robot.ros2``."""
 
-    trajectory: str = Field(
-        description="Topic on which the controller takes joint trajectories: "
-        "/joint_trajectory_controller/joint_trajectory."
-    )
+    trajectory: str
+    """Topic on which the controller takes joint trajectories:
+    /joint_trajectory_controller/joint_trajectory."""
 
 
 class FreedriveParams(ListenParams):

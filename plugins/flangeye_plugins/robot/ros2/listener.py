@@ -25,25 +25,25 @@ from flangeye_plugins.ros2.messages import Type, decoded, positions_of
 class TfParams(Params):
     """Frames of the flange's pose in tf."""
 
-    base: str = Field("base_link", description="Frame of the arm's base.")
-    flange: str = Field("tool0", description="Frame of the flange, origin in its face, z outwards.")
+    base: str = "base_link"
+    """Frame of the arm's base."""
+    flange: str = "tool0"
+    """Frame of the flange, origin in its face, z outwards."""
 
 
 class ListenParams(Params):
     """Source of the arm's pose in ROS 2."""
 
-    joints: tuple[str, ...] = Field(
-        min_length=1,
-        description="Names of the joints from base to flange, prefix included; the messages may "
-        "hold others and any order.",
-    )
-    joint_states: str = Field("/joint_states", description="Topic of the joint states.")
-    tf: TfParams | None = Field(
-        None,
-        description="Take the flange's pose from tf instead of the model's kinematics; needs "
-        "tf2_msgs, which every ROS 2 distribution has.",
-    )
-    sim_time: bool = Field(False, description="Stamps are simulated time, of the topic /clock.")
+    joints: tuple[str, ...] = Field(min_length=1)
+    """Names of the joints from base to flange, prefix included; the messages may hold others and
+    any order."""
+    joint_states: str = "/joint_states"
+    """Topic of the joint states."""
+    tf: TfParams | None = None
+    """Take the flange's pose from tf instead of the model's kinematics; needs tf2_msgs, which every
+    ROS 2 distribution has."""
+    sim_time: bool = False
+    """Stamps are simulated time, of the topic /clock."""
 
 
 class JointSample(NamedTuple):
