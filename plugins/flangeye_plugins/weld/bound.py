@@ -1,24 +1,26 @@
-"""Predict the torch's error bound along the whole plan, before anything moves.
+"""Predict the torch's error bound along the whole plan, before the arc is struck.
 
-The variance of the torch across the seam is summed at each place of the plan, as the follower sums
-it during the weld. It has the terms that are known beforehand: torch, arm and heat (from the
-files); the distance from torch to tip, where the tool is at an angle to the seam; the tip's
-position on the tool, times the angle by which the tool turns between feeling a place and welding
-it; the drift of the finger's gain; the weave. Play, noise and gaps are known only from touch and
-come on top.
+The variance of the torch across the seam, at each place of the plan, is the follower's own sum, as
+far as it is known beforehand: what the files state of torch, arm and heat; the torch's distance to
+the tip where the tool stands askew; the tip on the tool, of which only what the tool turns between
+feeling a place and welding it counts; the drift of the finger's gain; the weave. After the sweep
+at the start the same sum is taken again, with the play and the gain that it found. What only
+following shows (a gap, a bend of the seam, the control error) comes on top.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
 from flangeye.errors import StageError
 from flangeye.types import Floats
-from flangeye_plugins.weld.following.belief import Belief
+from flangeye_plugins.weld.following.belief import Belief, Learned
 from flangeye_plugins.weld.following.probing import PIVOTED, SOFTER
+from flangeye_plugins.weld.following.refined import SLOPE
 from flangeye_plugins.weld.following.steering import Weave
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following
@@ -27,9 +29,26 @@ REMEDIES = {
     "fixed": ("torch_sigma, arm_sigma and distortion", "calibrate the tool, or 'look' behind it"),
     "askew": ("along_sigma, as the tool stands askew there", "measure it: flangeye tactile tool"),
     "tip": ("tip_sigma, as the tool turns there", "measure it: flangeye tactile tool"),
-    "felt": ("gain_drift and the weave", "weld faster, or lower 'deflection'"),
+    "felt": ("the finger's gain and play, and the weave", "weld faster, or lower 'deflection'"),
 }
 """For each part of the variance: what it consists of, and how to reduce it."""
+
+
+Number = TypeVar("Number", float, Floats)
+
+
+class Stance(NamedTuple, Generic[Number]):
+    """How the tool stands to the seam, with the torch at one place or at many.
+
+    Attributes:
+        sine: Sine of its angle to the seam.
+        turned: Chord of the angle by which it has turned since the tip passed there.
+        minutes: Time since the sweep [min].
+    """
+
+    sine: Number
+    turned: Number
+    minutes: Number
 
 
 class Predicted(NamedTuple):
@@ -41,7 +60,7 @@ class Predicted(NamedTuple):
         askew: Variance from the distance of torch and tip, where the tool is at an angle to the
             seam.
         tip: Variance from the tip's position on the tool, while the tool turns.
-        felt: Variance from the finger's drift and the weave.
+        felt: Variance from the finger's gain, its drift and play, and the weave.
     """
 
     s: Floats
@@ -60,30 +79,68 @@ class Predicted(NamedTuple):
         return max(REMEDIES, key=lambda name: float(getattr(self, name)[at]))
 
 
-def predicted(plan: Path, belief: Belief, settings: Following) -> Predicted:
-    """Predict the variances of the torch's position across the seam, along the plan."""
-    s = np.arange(0.0, plan.length + 1e-3, 2e-3)  # every 2 mm
-    lets_go = (
-        plan.length - settings.ending - settings.speed * settings.deflection / settings.release
+def varying(
+    belief: Belief, settings: Following, learned: Learned, press: float, stance: Stance[Number]
+) -> tuple[Number, Number, Number]:
+    """Return the variances that change along the seam: askew, tip and felt of :class:`Predicted`.
+
+    Args:
+        belief: Tool, finger and joint as their files have them.
+        settings: How to follow.
+        learned: Calibration from the sweep, or what is expected of it.
+        press: Deflection of the tip [m].
+        stance: How the tool stands, at one place or at many.
+    """
+    ahead = min(learned.ahead_sigma, belief.tip_sigma)
+    gain = (learned.gain_sigma + settings.gain_drift * stance.minutes) * press
+    weave = Weave(settings.weave_width, settings.weave_frequency)
+    # A tip that is e ahead of its file is off across by e times the sine of what the tool turns
+    # between the tip's passing and the torch's; one that is e aside, by e (1 - cos).
+    # Of a chord c these are c (1 - c^2 / 4)^(1/2) and c^2 / 2
+    square = stance.turned**2
+    return (
+        (belief.along_sigma * stance.sine) ** 2,
+        ahead**2 * square * (1.0 - square / 4.0) + (belief.tip_sigma * square / 2.0) ** 2,
+        gain**2 + learned.systematic + weave.variance,
     )
-    sine, turned = _stances(plan, s, belief.distance, settings.sign * settings.deflection)
-    free, _ = _stances(plan, s, belief.distance, 0.0)
+
+
+def predicted(
+    plan: Path,
+    belief: Belief,
+    settings: Following,
+    learned: Learned,
+    press: float,
+    offsets: Callable[[Floats], Floats] = np.zeros_like,
+) -> Predicted:
+    """Predict the variances of the torch's position across the seam, along the plan.
+
+    Args:
+        plan: The planned seam.
+        belief: Tool, finger and joint as their files have them.
+        settings: How to follow.
+        learned: Calibration from the sweep, or what is expected of it.
+        press: Deflection of the tip [m].
+        offsets: How far to the left of the plan the seam is, (K,) at arc lengths (K,) [m].
+    """
+    s = np.arange(0.0, plan.length + 1e-3, 2e-3)  # every 2 mm
+    lets_go = plan.length - settings.ending - settings.speed * press / settings.release
+    sine, turned = _stances(plan, s, belief.distance, settings.sign * press, offsets)
+    free, _ = _stances(plan, s, belief.distance, 0.0, offsets)
     # Near its end the tip is released, which swings the tool from the one stance to the other
     least = np.minimum(np.abs(sine), np.abs(free))
     sine = np.where(s + belief.distance < lets_go, sine, least)
-    minutes = (s + belief.distance) / settings.speed / 60.0
-    weave = Weave(settings.weave_width, settings.weave_frequency)
-    # Between two walls the sweep at the start measures how far ahead the tip is.
+    stance = Stance(sine, turned, (s + belief.distance) / settings.speed / 60.0)
+    fixed = np.full(len(s), belief.fixed_variance(settings))
+    return Predicted(s, fixed, *varying(belief, settings, learned, press, stance))
+
+
+def beforehand(belief: Belief, settings: Following) -> tuple[Learned, float]:
+    """Return what the sweep at the start will teach at best, and the deflection asked [m]."""
+    # Between two walls it measures how far ahead the tip is.
     ahead = min(belief.ahead_known, PIVOTED if belief.two_walls else math.inf)
     press = settings.deflection / (SOFTER if belief.two_walls else 1.0)
-    drift = settings.gain_drift * minutes * press
-    # A tip that is e ahead of its file is off across by e times what the tool turns between the
-    # tip's passing and the torch's; one that is e aside, by e (1 - cos), about e turned^2 / 2
-    return Predicted(
-        s, np.full(len(s), belief.fixed_variance(settings)), (belief.along_sigma * sine) ** 2,
-        (ahead * turned) ** 2 + (belief.tip_sigma * turned**2 / 2.0) ** 2,
-        drift**2 + weave.variance,
-    )  # fmt: skip
+    return Learned(gain_sigma=0.0, ahead_sigma=ahead), press
 
 
 def check_bound(plan: Path, belief: Belief, settings: Following) -> None:
@@ -92,7 +149,7 @@ def check_bound(plan: Path, belief: Belief, settings: Following) -> None:
     Raises:
         StageError: The message names the worst place, the largest part there and a remedy.
     """
-    found = predicted(plan, belief, settings)
+    found = predicted(plan, belief, settings, *beforehand(belief, settings))
     worst = int(np.argmax(found.variance))
     bound = settings.sigmas * float(np.sqrt(found.variance[worst]))
     if bound <= settings.max_error:
@@ -105,21 +162,29 @@ def check_bound(plan: Path, belief: Belief, settings: Following) -> None:
     )
 
 
-def _stances(plan: Path, s: Floats, distance: float, aside: float) -> tuple[Floats, Floats]:
-    """Return the sine of the angle between tool and seam (K,), and the tool's turn (K,).
+def _stances(
+    plan: Path, s: Floats, distance: float, aside: float, offsets: Callable[[Floats], Floats]
+) -> tuple[Floats, Floats]:
+    """Return the sine of the tool to the seam (K,) at arc lengths, and what the tool turns (K,).
 
-    The turn is the chord of the angle through which the tool rotates after the tip has passed a
-    place and before the torch does. The torch is on the plan at arc lengths ``s``; the undeformed
-    tip is ``aside`` to the left of the plan [m].
+    That is the chord of the angle by which it turns between the tip's and the torch's passing. The
+    torch is on the seam, the undeformed tip ``aside`` to the left of it [m].
     """
-    here, tangents = plan.evaluate(s)
-    there, along = plan.evaluate(plan.other_end(s, distance))
+    here, tangents = _seam(plan, s, offsets)
+    there, along = _seam(plan, plan.other_end(s, distance), offsets)
+    behind, _ = _seam(plan, plan.other_end(s, -distance), offsets)
     pressed = aside * np.stack([-along[:, 1], along[:, 0]], axis=1)
-    now = (there - here)[:, :2] + pressed
-    behind, _ = plan.evaluate(plan.other_end(s, -distance))
-    then = (here - behind)[:, :2] + pressed
+    now, then = there - here + pressed, here - behind + pressed
     now, then = (tool / np.linalg.norm(tool, axis=1, keepdims=True) for tool in (now, then))
     sine = tangents[:, 0] * now[:, 1] - tangents[:, 1] * now[:, 0]
-    turned = np.linalg.norm(now - then, axis=1)
-    # Until the torch is on the seam the tool stands as it was set down, not along the plan.
-    return sine, np.where(s < distance, 0.0, turned)
+    return sine, np.linalg.norm(now - then, axis=1)
+
+
+def _seam(plan: Path, s: Floats, offsets: Callable[[Floats], Floats]) -> tuple[Floats, Floats]:
+    """Return points (K, 2) of the seam at arc lengths of its plan, and unit tangents (K, 2)."""
+    points, along = (found[:, :2] for found in plan.evaluate(s))
+    normals = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    slopes = (offsets(s + SLOPE) - offsets(s - SLOPE)) / (2.0 * SLOPE)
+    tangents = along + slopes[:, None] * normals
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    return points + offsets(s)[:, None] * normals, tangents

@@ -12,7 +12,7 @@ FLAT = math.tan(math.radians(40.0))
 
 
 def contact(steady=2.5 / 1.5, flat=FLAT, slides=0.3e-3, noise=NOISE):
-    found = Contact(flat, slides, noise)
+    found = Contact(flat, slides, 1.5e-3, noise)
     found.seat(0.0, 0.8e-3, 1.5e-3)
     found.steady = steady
     return found
@@ -104,4 +104,25 @@ def test_a_tip_strained_beyond_what_it_was_seen_to_stand_is_doubted_the_more() -
         Tip(found, spread=0.3e-3).feel(60, compression=compression)
         doubts.append(max(doubt for _, doubt in found.settled(9.0)))
     assert doubts[1] > 5 * doubts[0]
-    assert not math.isfinite(Contact(1.0, 0.0, NOISE).steady)  # an upright wall is not climbed
+    assert not math.isfinite(
+        Contact(1.0, 0.0, 1.5e-3, NOISE).steady
+    )  # an upright wall is not climbed
+
+
+def test_a_tip_that_falls_off_the_end_was_seated_until_then() -> None:
+    """Pressed down alone, its deflection says nothing: its compression does."""
+    found = contact()
+    tip = Tip(found)
+    tip.feel(60, deflection=0.0)
+    assert found.bears
+    assert tip.feel(6, up=-1.4e-3, deflection=0.0, compression=0.0)[Mode.FALLEN] > 0.9
+    assert not found.bears and found.free > 0.9
+    assert len(list(found.settled(9.0))) >= 59
+
+
+def test_a_tip_whose_walls_end_is_borne_by_the_joint_s_bottom() -> None:
+    found = contact()
+    tip = Tip(found)
+    tip.feel(60)
+    assert tip.feel(12, aside=-2e-3, deflection=0.0)[Mode.FREE] > 0.9
+    assert found.bears

@@ -1,11 +1,13 @@
 """Estimate the tip's contact with the joint by a hidden Markov model.
 
-A tip is seated between the walls, up the pressed wall, up the other wall, or free and moving with
-the arm. Each measurement is compared with the extrapolated seam:
+A tip is seated between the walls, up the pressed wall, up the other wall, free and moving with the
+arm on the joint's bottom, or fallen off the joint. Each measurement is compared with the
+extrapolated seam:
 
-* seated: the tip is on the seam, at its former height or lifted by a tack weld;
-* up a wall: the tip has risen by about :data:`RISE` and moved aside by ``flat`` times that;
-* free: the tip is hardly deflected, at any height.
+* seated, the tip is on the seam, at its former height or lifted by a tack weld;
+* up a wall, the tip has risen by about :data:`RISE` and is aside by ``flat`` times that;
+* free, the tip is hardly deflected, at any height;
+* fallen, it is hardly compressed either.
 
 The tip may climb a wall if its ratio of side force to preload nears the largest one at which it
 stayed seated in the initial sweep. A measurement is used after a short delay, smoothed by a
@@ -26,9 +28,9 @@ from flangeye.types import Floats
 
 
 class Mode(IntEnum):
-    """Contact of the tip: seated between the walls, up the pressed one, up the other, or free."""
+    """Contact of the tip: between the walls, up the pressed one, up the other, no wall, nothing."""
 
-    SEATED, PRESSED, OTHER, FREE = range(4)
+    SEATED, PRESSED, OTHER, FREE, FALLEN = range(5)
 
 
 LOST = 0.9
@@ -80,11 +82,11 @@ class _Weighed(NamedTuple):
     """A measurement, and its likelihood in each mode.
 
     Attributes:
-        felt: The measurement.
-        likely: (4,) probability of each mode, given all measurements up to this one.
-        moves: (4, 4) transition probabilities from each former mode to each present one.
-        chances: (4,) likelihood of the measurement in each mode.
-        climbed: Height that the tip has risen, if it has climbed [m].
+        felt: As it was taken.
+        likely: (5,) of the modes, by all up to it.
+        moves: (5, 5) from each mode before to each now.
+        chances: (5,) densities in each mode.
+        climbed: How far it has risen, if it has climbed [m].
     """
 
     felt: Felt
@@ -98,45 +100,53 @@ class Contact:
     """Filter for the tip's contact mode.
 
     Attributes:
-        likely: (4,) probability of each mode.
-        deflection: Filtered deflection, positive towards the pressed side [m].
-        compression: Filtered compression into the joint [m].
+        likely: (5,) how likely each mode is.
+        deflection: Filtered, positive towards the pressed side [m].
+        compression: Filtered [m].
         at: Arc length of the newest measurement [m].
         steady: Largest ratio of deflection to compression at which the tip stayed seated.
         play: Deflection that a free tip shows after having been pressed [m].
     """
 
-    def __init__(self, flat: float, slides: float, noise: tuple[float, float]) -> None:
-        """Start with a seated tip.
+    def __init__(
+        self, flat: float, slides: float, preload: float, noise: tuple[float, float]
+    ) -> None:
+        """Begin seated.
 
         Args:
-            flat: Lateral motion of the tip per unit of height when it climbs a wall.
-            slides: Largest deflection that friction alone can cause [m].
+            flat: How far a tip goes aside that climbs a wall by one.
+            slides: Deflection that friction alone can give [m].
+            preload: Compression of a tip that the joint bears [m].
             noise: Standard deviations of one measurement across and up [m].
         """
-        self.likely = np.array([1.0, 0.0, 0.0, 0.0])
+        self.likely = only(Mode.SEATED)
         self.deflection = self.compression = 0.0
         self.steady, self.play = math.inf, 0.0
         self.noise = noise
-        self._flat, self._slides = flat, slides
+        self._flat, self._slides, self._preload = flat, slides, preload
         self._time, self.at = -math.inf, math.inf
         self._height, self._spread = 0.0, math.inf
         self._newest: deque[_Weighed] = deque()
 
     def seat(self, time: float, deflection: float, compression: float) -> None:
-        """Set the state to seated, with this deflection and compression [m]."""
-        self.likely = np.array([1.0, 0.0, 0.0, 0.0])
+        """Set the state: the tip is seated and pressed [m], and its safe deflection is known."""
+        self.likely = only(Mode.SEATED)
         self.deflection, self.compression, self._time = deflection, compression, time
         self._spread = math.inf
 
     def lose(self) -> None:
-        """Set the state to free: no wall holds the tip."""
-        self.likely, self.deflection = np.array([0.0, 0.0, 0.0, 1.0]), 0.0
+        """Set the state: no wall holds the tip."""
+        self.likely, self.deflection = only(Mode.FREE), 0.0
 
     @property
     def free(self) -> float:
         """Probability that no wall holds the tip."""
-        return float(self.likely[Mode.FREE])
+        return float(self.likely[Mode.FREE] + self.likely[Mode.FALLEN])
+
+    @property
+    def bears(self) -> bool:
+        """Whether the joint supports the tip, if only by its bottom."""
+        return float(self.likely[Mode.FALLEN]) < 0.5
 
     @property
     def strained(self) -> float:
@@ -172,8 +182,8 @@ class Contact:
 
     def settled(self, until: float) -> Iterator[tuple[Felt, float]]:
         """Yield valid measurements up to a time [s], each with its extra variance [m^2]."""
-        # Backward pass: `since` is the likelihood of all later measurements, given each mode
-        since, off = np.ones(4), []
+        # Backward pass: `since` is how likely each mode makes all that was measured later
+        since, off = np.ones(len(Mode)), []
         for weighed in reversed(self._newest):
             likely = weighed.likely * since
             off.append(likely / likely.sum())
@@ -181,28 +191,23 @@ class Contact:
             since /= since.sum()
         while self._newest and self._newest[0].felt.time <= until:
             weighed, likely = self._newest.popleft(), off.pop()
-            # A free tip moves with the arm and would drag the path along: 10 % probability is too
-            # much.
-            if likely[Mode.FREE] < 0.1:
+            # A tip that may be free would lead the path after it: a chance of a tenth is too much.
+            if likely[Mode.FREE] + likely[Mode.FALLEN] < 0.1:
                 climbs = float(likely[Mode.PRESSED] + likely[Mode.OTHER])
                 yield weighed.felt, climbs * (self._flat * weighed.climbed) ** 2
 
     def _moves(self, share: float, soon: float) -> Floats:
-        """Return the transition probabilities (4, 4) of the modes.
-
-        ``share`` and ``soon`` are the probabilities of a change within the travel since the last
-        measurement, for changes over STRIDE and over 1 mm.
-        """
+        """Return how likely each mode becomes each (5, 5), over shares of STRIDE and of 1 mm."""
         climbing = share * RARE + soon * min(max(self.strained - STRAINED, 0.0) ** 2, 0.9)
-        moves = np.diag([1.0, 1.0 - share, 1.0 - share, 1.0 - share])
-        moves[:, Mode.SEATED] += [0.0, share, share, share]
+        moves = np.diag(np.full(len(Mode), 1.0 - share))
+        moves[:, Mode.SEATED] += share
         moves[Mode.SEATED, Mode.PRESSED if self.deflection > 0.0 else Mode.OTHER] = climbing
-        moves[Mode.SEATED, Mode.FREE] = share * RARE * 10.0
-        moves[Mode.SEATED, Mode.SEATED] -= climbing + share * RARE * 10.0
+        moves[Mode.SEATED, [Mode.FREE, Mode.FALLEN]] = share * RARE * 10.0
+        moves[Mode.SEATED, Mode.SEATED] -= climbing + 2.0 * share * RARE * 10.0
         return moves
 
     def _chances(self, felt: Felt, side: float) -> tuple[Floats, float]:
-        """Return a measurement's likelihood in each mode (4,), and the height climbed [m]."""
+        """Return the densities (5,) of a measurement in each mode, and how far it has climbed."""
         up, tall = felt.height - self._height, self._spread + self.noise[1] ** 2
         # Tack welds lift the tip on 10 % of a seam; 2 % of a seam bend in a way not planned.
         seated = _mostly(up, tall, 0.1) * _mostly(felt.aside, felt.spread, 0.02)
@@ -211,9 +216,18 @@ class Contact:
         ]
         free = self._let_go(felt.deflection) * _normal(up, tall + LIFTS**2)
         climbed = walls[0][1] if felt.deflection > 0.0 else walls[1][1]
-        chances = np.array([seated, walls[0][0], walls[1][0], free]) + 1e-12
-        # Neighbouring measurements share the error of the expectation: each counts as half a one.
+        borne, hangs = self._compressed(felt.compression)
+        held = np.array([seated, walls[0][0], walls[1][0], free]) * borne
+        chances = np.array([*held, free * hangs]) + 1e-12
+        # Neighbours see the same error of what is expected: one measurement in two is new.
         return chances**0.5, max(climbed, RISE)
+
+    def _compressed(self, compression: float) -> tuple[float, float]:
+        """Return the densities of a compression [m] if the joint bears the tip, and if nothing."""
+        # The preload's control errs by a third of it at a tack weld or a dip, play by a tenth.
+        up = self.noise[1] ** 2
+        borne = _normal(compression - self._preload, up + (self._preload / 3.0) ** 2)
+        return borne, _normal(compression, up + (self._preload / 10.0) ** 2)
 
     def _let_go(self, deflection: float) -> float:
         """Return the likelihood of a deflection [m], given that the tip is free.
@@ -224,6 +238,11 @@ class Contact:
         noise, play = self.noise[0] ** 2, self.play
         held = _normal(deflection, noise) + _normal(deflection - play, noise + (0.3 * play) ** 2)
         return 0.25 * held + 0.5 * _normal(deflection, noise + self._slides**2)
+
+
+def only(mode: Mode) -> Floats:
+    """Return the probabilities (5,) of a mode that is certain."""
+    return np.array([float(mode is each) for each in Mode])
 
 
 def _mostly(off: float, variance: float, seldom: float) -> float:

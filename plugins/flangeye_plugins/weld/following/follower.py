@@ -218,12 +218,12 @@ class Follower:
         if not self._inside:
             return
         seam, pressing, preload = self.seam, self.pressing, self.task.settings.preload
-        if seam.bears and seam.contact.deflection > 0.9 * pressing.most:
+        if seam.contact.bears and seam.contact.deflection > 0.9 * pressing.most:
             seam.contact.seat(self.sensing.seen, self.wanted, preload)
             self.phase = "following"
             return
         # Images are late: it may rest there already.
-        hangs = not seam.bears and seam.contact.compression < preload / 3.0
+        hangs = not seam.contact.bears and seam.contact.compression < preload / 3.0
         fell = seam.lost is not None and hangs and self._over(pose) < -0.9 * preload
         room = pressing.most + pressing.feeler(seam.refined.variance(self.tip))
         aside = self.side * (self.progress.lateral(pose) - seam.refined.offset(self.tip))
@@ -255,8 +255,8 @@ class Follower:
         sensing, seam, task = self.sensing, self.seam, self.task
         sensing.learned = found
         self.arm.dead_time, self.arm.lag = found.dead_time, found.lag
-        self.welding.begin(self.now or 0.0)
         self.pressing.learn(found, seam.stands(found))
+        self.welding.begin(self.now or 0.0)
         swept = [
             sensing.locate(sensing.true(pose), touch, self.phase)
             for pose, touch in sensing.swept_last()
@@ -377,7 +377,7 @@ class Follower:
             self.seam.lost_for(self.now or 0.0) > self.task.settings.sure,
         )
         # Where the joint is felt farther back than the seam may begin, it goes on there.
-        on = contact.at < -self.task.beyond - INSIDE and self.seam.bears
+        on = contact.at < -self.task.beyond - INSIDE and self.seam.contact.bears
         if lost or on:
             self.seam.arrive(self.sensing.learned, self.torch, lost)
             if self.seam.start is not None:
@@ -402,7 +402,8 @@ class Follower:
         speed = min(settings.speed, self._agility())
         along = self.progress.place.tangent
         steered = self.lead.steering.pace(speed, pose.direction, normal, along)
-        return steered * sight * self._firmness()
+        ease = min(max(self.welding.ease, SLOWEST), 1.0)
+        return steered * sight * min(self._firmness(), ease)
 
     @property
     def _delay(self) -> float:
@@ -452,7 +453,7 @@ class Follower:
         settings, place, felt = self.task.settings, self.progress.place, self._seam_at_tip()
         lateral = self.progress.lateral(pose)
         deflection = self.side * (lateral - felt.offset)
-        if self.phase == "entering" and self._inside and self.seam.bears:
+        if self.phase == "entering" and self._inside and self.seam.contact.bears:
             deflection = self.seam.contact.deflection
         most = settings.lateral_speed
         # Equation (14): pressed too hard the end point backs off, too softly it approaches the wall

@@ -229,12 +229,12 @@ class RefinedPath:
     # --- what follows from it -------------------------------------------------------------------
 
     def offset(self, s: float) -> float:
-        """Return the seam's offset from the plan at one arc length [m]."""
-        return float(self._offsets(np.array([s]))[0])
+        """Return the seam's offset from the plan at one arc length."""
+        return float(self.offsets(np.array([s]))[0])
 
     def slope(self, s: float) -> float:
-        """Return the seam's slope relative to the plan just before ``s``, positive to the left."""
-        before, here = self._offsets(np.array([s - SLOPE, s])).tolist()
+        """Return the seam's slope to the left of the plan, before ``s``."""
+        before, here = self.offsets(np.array([s - SLOPE, s])).tolist()
         return float((here - before) / SLOPE)
 
     def variance(self, s: float) -> float:
@@ -258,17 +258,13 @@ class RefinedPath:
         """Weights (M,) of the filters; they sum to 1."""
         return np.asarray(np.exp(self._likely))
 
-    def worst(self, first: float, last: float) -> tuple[float, float]:
-        """Return the arc length of largest variance between two [m], and the variance there [m^2].
+    @property
+    def settled(self) -> float:
+        """Arc length up to which later measurements hardly change the path [m].
 
-        Only places at least the shortest correlation length behind the tip count, as later
-        measurements hardly change them.
+        That is the shortest field's length short of the tip.
         """
-        last = min(last, self._at - LENGTHS[0])
-        places = np.arange(first, max(first, last) + PATH_SPACING, SLOPE)
-        variances = [self.variance(s) for s in places.tolist()]
-        worst = int(np.argmax(variances))
-        return float(places[worst]), variances[worst]
+        return self._at - LENGTHS[0]
 
     def angle(self, s: float, otherwise: float) -> float:
         """Return the tool's angle [rad] at the measurement nearest to ``s``, or ``otherwise``."""
@@ -279,15 +275,15 @@ class RefinedPath:
 
     def frame(self, s: float) -> tuple[Floats, Floats]:
         """Return the point (2,) and the unit normal (2,) of the refined path at ``s``."""
-        before, here, after = self._offsets(np.array([s - SLOPE, s, s + SLOPE])).tolist()
+        before, here, after = self.offsets(np.array([s - SLOPE, s, s + SLOPE])).tolist()
         place = self._plan.at(s)
         slope = (after - before) / (2 * SLOPE)
         (tx, ty), (nx, ny), norm = place.tangent, place.normal, math.hypot(1.0, slope)
         normal = np.array([(nx - slope * tx) / norm, (ny - slope * ty) / norm])
         return place.point + here * place.normal, normal
 
-    def _offsets(self, s: Floats) -> Floats:
-        """Return the estimated offsets (K,) at arc lengths (K,) [m]."""
+    def offsets(self, s: Floats) -> Floats:
+        """Return the seam's offsets (K,) from the plan at arc lengths [m]."""
         if self.empty:
             return np.zeros(len(s))
         return np.asarray(self._weights @ self._expected(s))

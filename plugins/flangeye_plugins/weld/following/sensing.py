@@ -231,11 +231,11 @@ class SeamEstimate:
         self.lost: tuple[float, float] | None = None
         self._task, belief, settings = task, task.belief, task.settings
         self.contact = Contact(
-            belief.flat(settings.sign), belief.sliding(settings) / SOFTER, belief.noise
-        )
+            belief.flat(settings.sign), belief.sliding(settings) / SOFTER, settings.preload,
+            belief.noise,
+        )  # fmt: skip
         self.refined = self._path()
         self._heights: deque[float] = deque(maxlen=20)
-        self._pressed: deque[float] = deque(maxlen=10)
         self._backed: list[_Sample] | None = None
         self._sat: list[_Sample] = []
         self._moved: list[float] = []
@@ -329,18 +329,12 @@ class SeamEstimate:
 
         A tip that has lost only its wall is still supported by the joint's bottom.
         """
-        return None if self.lost is None or self.bears else self.lost[1]
+        return None if self.lost is None or self.contact.bears else self.lost[1]
 
     @property
     def height(self) -> float:
         """Mean height above the plan of the last accepted, seated touches [m]."""
         return float(np.mean(self._heights or [0.0]))
-
-    @property
-    def bears(self) -> bool:
-        """Whether the joint supports the tip, by the mean compression of the last touches."""
-        pressed = float(np.mean(self._pressed or [0.0]))
-        return pressed > self._task.settings.preload / 2.0
 
     def weigh(self, time: float, found: Located, learned: Learned, side: float) -> None:
         """Update the contact modes by a touch.
@@ -358,7 +352,6 @@ class SeamEstimate:
         spread = variance + (learned.noise / (1.0 + learned.gain)) ** 2 + STEADY**2
         expected = time, s, seam.offset, found.angle, aside, spread, seam.height
         self.contact.take(Felt(*expected, found.deflection, found.compression), side)
-        self._pressed.append(found.compression)
         if self.contact.free <= LOST:
             self.lost = None
         elif self.lost is None:

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from flangeye.devices import WeldProfile
 from flangeye.motion.seam_following import ToolPose
+from flangeye_plugins.weld.bound import Stance, predicted, varying
 from flangeye_plugins.weld.following.belief import BAND
 from flangeye_plugins.weld.following.bias import Bias, Trail
 from flangeye_plugins.weld.following.sensing import SeamEstimate, Sensing
@@ -79,19 +82,13 @@ class Welding:
             slant: Sine of the angle between the tool and the path.
             pose: Pose of the tool.
         """
-        belief, settings, learned = self._task.belief, self._task.settings, self._sensing.learned
-        refined, torch = self._seam.refined, self._progress.torch
+        belief, settings, refined = self._task.belief, self._task.settings, self._seam.refined
+        torch = self._progress.torch
         minutes = 0.0 if self._swept is None else (pose.time - self._swept) / 60.0
-        # An error of the finger's gain displaces the tip by that share of its deflection
-        gain = (learned.gain_sigma + settings.gain_drift * minutes) * self._pressing.most
-        fixed = self._unseen() + (belief.along_sigma * slant) ** 2
-        # The tip's error shifts the felt seam and the torch by the same, except for the rotation of
-        # the tool between the tip's passing of a place and the torch's.
-        turned_by = pose.angle - refined.angle(torch, pose.angle)
-        ahead = min(learned.ahead_sigma, belief.tip_sigma) * math.sin(turned_by)
-        tip = ahead**2 + (belief.tip_sigma * (1.0 - math.cos(turned_by))) ** 2
-        felt = refined.variance(torch) + self._lead.weave.variance
-        return fixed + gain**2 + learned.systematic + tip + felt
+        turned = 2.0 * math.sin((pose.angle - refined.angle(torch, pose.angle)) / 2.0)
+        stance = Stance(slant, turned, minutes)
+        parts = varying(belief, settings, self._sensing.learned, self._pressing.most, stance)
+        return self._unseen() + sum(parts) + refined.variance(torch)
 
     def _unseen(self) -> float:
         """Return the part of the torch's variance that touch ahead of it cannot reduce [m^2]."""
@@ -127,6 +124,15 @@ class Welding:
         return fixed / max(self.sigma**2, fixed)
 
     # --- whether it may weld ----------------------------------------------------------------------
+
+    @property
+    def ease(self) -> float:
+        """Share of its speed that the torch may keep: less where its error may reach the bound."""
+        room = self._task.settings.max_error - self._task.settings.sigmas * self.sigma
+        if self.arc_from is None or room <= 0.0:
+            return 1.0
+        # At speed up to half of what the bound leaves for the control error; slower it shrinks.
+        return 2.0 - 2.0 * (self.bound - self._task.settings.sigmas * self.sigma) / room
 
     @property
     def share(self) -> float:
@@ -181,7 +187,7 @@ class Welding:
             self._trail.pass_by(now, torch, raw, variance - self._unseen())
         worst, bound = torch, self.bound
         if self.arc_from is None and bound <= task.settings.max_error:
-            worst, bound = self._ahead(variance)
+            worst, bound = self._ahead()
         if bound > task.settings.max_error:
             return self._too_far(worst, bound)
         if self.arc_from is None:
@@ -189,16 +195,20 @@ class Welding:
             self.striking.strike(now)
         return ""
 
-    def _ahead(self, variance: float) -> tuple[float, float]:
-        """Return the least certain place ahead on the felt seam, and the torch's bound there [m].
-
-        Args:
-            variance: Variance of the torch's position at present [m^2].
-        """
-        refined, torch = self._seam.refined, self._progress.torch
-        place, felt = refined.worst(torch, self.ends)
-        variance += felt - refined.variance(torch)
-        return place, self._task.settings.sigmas * math.sqrt(max(variance, 0.0))
+    def _ahead(self) -> tuple[float, float]:
+        """Return where on the rest of the plan the torch will be known least, and its bound [m]."""
+        task, refined = self._task, self._seam.refined
+        foreseen = predicted(
+            task.plan, task.belief, task.settings, self._sensing.learned, self._pressing.most,
+            refined.offsets,
+        )  # fmt: skip
+        rest = (self._progress.torch <= foreseen.s) & (foreseen.s <= self.ends)
+        places = foreseen.s[rest]
+        felt = [refined.variance(s) if s <= refined.settled else 0.0 for s in places.tolist()]
+        variances = foreseen.variance[rest] + np.array(felt)
+        worst = int(np.argmax(variances))
+        bound = self._task.settings.sigmas * math.sqrt(float(variances[worst]))
+        return float(places[worst]), bound
 
     def _too_far(self, place: float, bound: float) -> str:
         """Return the reason to stop a torch whose bound is too large, or "" to go on.
