@@ -118,6 +118,7 @@ def test_a_tip_that_falls_off_the_end_was_seated_until_then() -> None:
     assert tip.feel(6, up=-1.4e-3, deflection=0.0, compression=0.0)[Mode.FALLEN] > 0.9
     assert not found.bears and found.free > 0.9
     assert len(list(found.settled(9.0))) >= 59
+    assert found.fell == pytest.approx(60.5 * 0.2e-3, abs=0.2e-3)
 
 
 def test_a_tip_whose_walls_end_is_borne_by_the_joint_s_bottom() -> None:

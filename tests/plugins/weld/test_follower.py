@@ -713,8 +713,7 @@ def test_a_tip_that_finds_no_way_back_into_the_seam_stops_the_weld() -> None:
 def test_the_seam_ends_where_the_tip_falls_off_it(compressed: float, at: float, ends: bool) -> None:
     """Not where a wall alone is missing, nor where the plan cannot end."""
     found = make("ending", ends="3 mm", belief=Belief(DISTANCE, along_sigma=0.4e-3))
-    found.now, found.seam.lost = 1.0, (0.6, at)
-    found.seam.contact.likely = only(Mode.SEATED if compressed else Mode.FALLEN)
+    found.now, found.seam.contact.fell = 1.0, None if compressed else at
     judged(found)
     assert found.seam.end == (at if ends else None)
     assert found.welding.ends == pytest.approx((at if ends else LENGTH + 3e-3) + 0.8e-3)

@@ -104,8 +104,10 @@ class Contact:
         deflection: Filtered, positive towards the pressed side [m].
         compression: Filtered [m].
         at: Arc length of the newest measurement [m].
-        steady: Largest ratio of deflection to compression at which the tip stayed seated.
-        play: Deflection that a free tip shows after having been pressed [m].
+        steady: Largest deflection for its compression that the tip stands, as far as was seen.
+        play: What a finger that was pressed shows when its tip is free [m].
+        fell: Arc length at which the tip fell off the joint, half way between the last measurement
+            that it bore and the next; None while it bears [m].
     """
 
     def __init__(
@@ -127,6 +129,8 @@ class Contact:
         self._time, self.at = -math.inf, math.inf
         self._height, self._spread = 0.0, math.inf
         self._newest: deque[_Weighed] = deque()
+        self.fell: float | None = None
+        self._borne = 0.0
 
     def seat(self, time: float, deflection: float, compression: float) -> None:
         """Set the state: the tip is seated and pressed [m], and its safe deflection is known."""
@@ -191,10 +195,18 @@ class Contact:
             since /= since.sum()
         while self._newest and self._newest[0].felt.time <= until:
             weighed, likely = self._newest.popleft(), off.pop()
+            self._part(weighed.felt.s, float(likely[Mode.FALLEN]))
             # A tip that may be free would lead the path after it: a chance of a tenth is too much.
             if likely[Mode.FREE] + likely[Mode.FALLEN] < 0.1:
                 climbs = float(likely[Mode.PRESSED] + likely[Mode.OTHER])
                 yield weighed.felt, climbs * (self._flat * weighed.climbed) ** 2
+
+    def _part(self, s: float, fallen: float) -> None:
+        """Note where the joint stops bearing the tip, by a measurement's probability of that."""
+        if fallen < 0.5:
+            self.fell, self._borne = None, s
+        elif self.fell is None:
+            self.fell = (self._borne + s) / 2.0
 
     def _moves(self, share: float, soon: float) -> Floats:
         """Return how likely each mode becomes each (5, 5), over shares of STRIDE and of 1 mm."""

@@ -204,7 +204,7 @@ class Follower:
             self.phase = "following"
         elif self.phase == "bridging" and pressing.since_turned(self.tip) > STRIDE:
             pressing.turn_over(self.tip)
-        self.seam.leave(self.phase, self.now or 0.0)
+        self.seam.leave(self.phase)
         if self.torch >= self.welding.ends and self.phase != "stopped":
             self._finish()
         if self.phase not in ("done", "stopped"):
@@ -223,8 +223,7 @@ class Follower:
             self.phase = "following"
             return
         # Images are late: it may rest there already.
-        hangs = not seam.contact.bears and seam.contact.compression < preload / 3.0
-        fell = seam.lost is not None and hangs and self._over(pose) < -0.9 * preload
+        fell = not seam.contact.bears and self._over(pose) < -0.9 * preload
         room = pressing.most + pressing.feeler(seam.refined.variance(self.tip))
         aside = self.side * (self.progress.lateral(pose) - seam.refined.offset(self.tip))
         if fell or aside > room:

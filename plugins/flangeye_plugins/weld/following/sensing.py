@@ -301,8 +301,8 @@ class SeamEstimate:
             torch: Arc length of the torch [m].
             lost: Whether the tip fell off the start.
         """
-        self.start = self._fell_at() if lost else None
         self.keep(math.inf)
+        self.start = self.contact.fell if lost else None
         self.refined = self._path(math.sqrt(found.variance))
         self._sat = sorted([*self._sat, *(self._backed or [])])
         for sample in self._sat:
@@ -310,26 +310,15 @@ class SeamEstimate:
         self.refined.renew(torch, 10 * len(self._sat))
         self._backed = None
 
-    def leave(self, phase: Phase, now: float) -> None:
-        """Take the place where the tip fell off as the seam's end, if it is plausible."""
-        if (
-            self.end is not None
-            or phase != "ending"
-            or self.lost_for(now) <= self._task.settings.sure
-        ):
+    def leave(self, phase: Phase) -> None:
+        """Accept the place where the tip fell off as the seam's end, if it is plausible."""
+        task, at = self._task, self.contact.fell
+        if self.end is not None or phase != "ending" or at is None:
             return
-        task, at = self._task, self._fell_at()
-        if at is None or not task.feels_ends or not task.belief.two_walls:
+        if not task.feels_ends or not task.belief.two_walls:
             return
         if abs(at - task.plan.length) <= task.beyond + INSIDE:
             self.end = at
-
-    def _fell_at(self) -> float | None:
-        """Return the arc length at which the tip fell off the seam [m]; None if it did not.
-
-        A tip that has lost only its wall is still supported by the joint's bottom.
-        """
-        return None if self.lost is None or self.contact.bears else self.lost[1]
 
     @property
     def height(self) -> float:
