@@ -164,7 +164,9 @@ class TipContact:
         """
         root = self._groove.root
         self._s = root.foot(rest[:2], self._s)
-        if not root.first <= self._s <= root.last:
+        # The ball, which friction drags along behind the finger, falls off where it is itself.
+        ball = self._s if self._stuck is None else self._stuck
+        if not root.first <= ball <= root.last:
             return self._free(rest)
         place = root.at(self._s)
         fill, aside, wider = self._groove.relief.at(self._s)

@@ -1,11 +1,12 @@
 """Predict the torch's error bound along the whole plan, before the arc is struck.
 
-The variance of the torch across the seam, at each place of the plan, is the follower's own sum, as
-far as it is known beforehand: what the files state of torch, arm and heat; the torch's distance to
-the tip where the tool stands askew; the tip on the tool, of which only what the tool turns between
-feeling a place and welding it counts; the drift of the finger's gain; the weave. After the sweep
-at the start the same sum is taken again, with the play and the gain that it found. What only
-following shows (a gap, a bend of the seam, the control error) comes on top.
+The variance of the torch across the seam is summed at each place of the plan, as the follower sums
+it during the weld. It has the terms that are known beforehand: torch, arm and heat (from the
+files); the distance from torch to tip, where the tool is at an angle to the seam; the tip's
+position on the tool, times the angle by which the tool turns between feeling a place and welding
+it; the drift of the finger's gain; the weave. The sweep at the start measures gain and play, and
+the tip has felt the first of the seam by then: the sum is taken again with both before the arc is
+struck. Gaps and control errors are known only later and come on top.
 """
 
 from __future__ import annotations
@@ -38,11 +39,11 @@ Number = TypeVar("Number", float, Floats)
 
 
 class Stance(NamedTuple, Generic[Number]):
-    """How the tool stands to the seam, with the torch at one place or at many.
+    """Orientation of the tool relative to the seam, with the torch at one place or at several.
 
     Attributes:
-        sine: Sine of its angle to the seam.
-        turned: Chord of the angle by which it has turned since the tip passed there.
+        sine: Sine of the angle between tool and seam.
+        turned: Chord of the angle by which the tool has turned since the tip passed there.
         minutes: Time since the sweep [min].
     """
 
@@ -82,21 +83,21 @@ class Predicted(NamedTuple):
 def varying(
     belief: Belief, settings: Following, learned: Learned, press: float, stance: Stance[Number]
 ) -> tuple[Number, Number, Number]:
-    """Return the variances that change along the seam: askew, tip and felt of :class:`Predicted`.
+    """Return the variances that vary along the seam: askew, tip and felt of :class:`Predicted`.
 
     Args:
-        belief: Tool, finger and joint as their files have them.
-        settings: How to follow.
-        learned: Calibration from the sweep, or what is expected of it.
+        belief: Tool, finger and joint as stated by their files.
+        settings: Parameters of the follower.
+        learned: Calibration from the sweep, or the expected one.
         press: Deflection of the tip [m].
-        stance: How the tool stands, at one place or at many.
+        stance: Orientation of the tool.
     """
     ahead = min(learned.ahead_sigma, belief.tip_sigma)
     gain = (learned.gain_sigma + settings.gain_drift * stance.minutes) * press
     weave = Weave(settings.weave_width, settings.weave_frequency)
-    # A tip that is e ahead of its file is off across by e times the sine of what the tool turns
-    # between the tip's passing and the torch's; one that is e aside, by e (1 - cos).
-    # Of a chord c these are c (1 - c^2 / 4)^(1/2) and c^2 / 2
+    # An error e of the tip along the tool shifts the torch across the seam by e times the sine of
+    # the angle that the tool turns between the tip's passing and the torch's; an error across the
+    # tool, by e (1 - cos). For a chord c, sin^2 = c^2 (1 - c^2 / 4) and 1 - cos = c^2 / 2
     square = stance.turned**2
     return (
         (belief.along_sigma * stance.sine) ** 2,
@@ -117,17 +118,17 @@ def predicted(
 
     Args:
         plan: The planned seam.
-        belief: Tool, finger and joint as their files have them.
-        settings: How to follow.
-        learned: Calibration from the sweep, or what is expected of it.
+        belief: Tool, finger and joint as stated by their files.
+        settings: Parameters of the follower.
+        learned: Calibration from the sweep, or the expected one.
         press: Deflection of the tip [m].
-        offsets: How far to the left of the plan the seam is, (K,) at arc lengths (K,) [m].
+        offsets: Returns the seam's offsets (K,) to the left of the plan at arc lengths (K,) [m].
     """
     s = np.arange(0.0, plan.length + 1e-3, 2e-3)  # every 2 mm
     lets_go = plan.length - settings.ending - settings.speed * press / settings.release
     sine, turned = _stances(plan, s, belief.distance, settings.sign * press, offsets)
     free, _ = _stances(plan, s, belief.distance, 0.0, offsets)
-    # Near its end the tip is released, which swings the tool from the one stance to the other
+    # Near the end the tip is released, which turns the tool from the one angle to the other
     least = np.minimum(np.abs(sine), np.abs(free))
     sine = np.where(s + belief.distance < lets_go, sine, least)
     stance = Stance(sine, turned, (s + belief.distance) / settings.speed / 60.0)
@@ -136,8 +137,8 @@ def predicted(
 
 
 def beforehand(belief: Belief, settings: Following) -> tuple[Learned, float]:
-    """Return what the sweep at the start will teach at best, and the deflection asked [m]."""
-    # Between two walls it measures how far ahead the tip is.
+    """Return the best calibration that the sweep can give, and the deflection of the tip [m]."""
+    # Between two walls the sweep measures the tip's position along the tool.
     ahead = min(belief.ahead_known, PIVOTED if belief.two_walls else math.inf)
     press = settings.deflection / (SOFTER if belief.two_walls else 1.0)
     return Learned(gain_sigma=0.0, ahead_sigma=ahead), press
@@ -165,10 +166,11 @@ def check_bound(plan: Path, belief: Belief, settings: Following) -> None:
 def _stances(
     plan: Path, s: Floats, distance: float, aside: float, offsets: Callable[[Floats], Floats]
 ) -> tuple[Floats, Floats]:
-    """Return the sine of the tool to the seam (K,) at arc lengths, and what the tool turns (K,).
+    """Return the sine of the angle between tool and seam (K,), and the tool's turn (K,).
 
-    That is the chord of the angle by which it turns between the tip's and the torch's passing. The
-    torch is on the seam, the undeformed tip ``aside`` to the left of it [m].
+    The turn is the chord of the angle through which the tool rotates after the tip has passed a
+    place and before the torch does. The torch is on the seam at arc lengths ``s``; the undeformed
+    tip is ``aside`` to the left of the seam [m].
     """
     here, tangents = _seam(plan, s, offsets)
     there, along = _seam(plan, plan.other_end(s, distance), offsets)

@@ -4,10 +4,10 @@ A tip is seated between the walls, up the pressed wall, up the other wall, free 
 arm on the joint's bottom, or fallen off the joint. Each measurement is compared with the
 extrapolated seam:
 
-* seated, the tip is on the seam, at its former height or lifted by a tack weld;
-* up a wall, the tip has risen by about :data:`RISE` and is aside by ``flat`` times that;
-* free, the tip is hardly deflected, at any height;
-* fallen, it is hardly compressed either.
+* seated: the tip is on the seam, at its former height or lifted by a tack weld;
+* up a wall: the tip has risen by about :data:`RISE` and moved aside by ``flat`` times that;
+* free: the tip is hardly deflected, at any height;
+* fallen: the tip is hardly compressed either.
 
 The tip may climb a wall if its ratio of side force to preload nears the largest one at which it
 stayed seated in the initial sweep. A measurement is used after a short delay, smoothed by a
@@ -28,7 +28,7 @@ from flangeye.types import Floats
 
 
 class Mode(IntEnum):
-    """Contact of the tip: between the walls, up the pressed one, up the other, no wall, nothing."""
+    """Contact of the tip: between the walls, up the pressed one, up the other, free, or fallen."""
 
     SEATED, PRESSED, OTHER, FREE, FALLEN = range(5)
 
@@ -82,11 +82,11 @@ class _Weighed(NamedTuple):
     """A measurement, and its likelihood in each mode.
 
     Attributes:
-        felt: As it was taken.
-        likely: (5,) of the modes, by all up to it.
-        moves: (5, 5) from each mode before to each now.
-        chances: (5,) densities in each mode.
-        climbed: How far it has risen, if it has climbed [m].
+        felt: The measurement.
+        likely: (5,) probability of each mode, given all measurements up to this one.
+        moves: (5, 5) transition probabilities from each former mode to each present one.
+        chances: (5,) likelihood of the measurement in each mode.
+        climbed: Height that the tip has risen, if it has climbed [m].
     """
 
     felt: Felt
@@ -100,14 +100,13 @@ class Contact:
     """Filter for the tip's contact mode.
 
     Attributes:
-        likely: (5,) how likely each mode is.
-        deflection: Filtered, positive towards the pressed side [m].
-        compression: Filtered [m].
+        likely: (5,) probability of each mode.
+        deflection: Filtered deflection, positive towards the pressed side [m].
+        compression: Filtered compression into the joint [m].
         at: Arc length of the newest measurement [m].
-        steady: Largest deflection for its compression that the tip stands, as far as was seen.
-        play: What a finger that was pressed shows when its tip is free [m].
-        fell: Arc length at which the tip fell off the joint, half way between the last measurement
-            that it bore and the next; None while it bears [m].
+        steady: Largest ratio of deflection to compression at which the tip stayed seated.
+        play: Deflection that a free tip shows after having been pressed [m].
+        fell: Arc length at which the tip fell off the joint [m]; None while the joint bears it.
     """
 
     def __init__(
@@ -116,9 +115,9 @@ class Contact:
         """Begin seated.
 
         Args:
-            flat: How far a tip goes aside that climbs a wall by one.
-            slides: Deflection that friction alone can give [m].
-            preload: Compression of a tip that the joint bears [m].
+            flat: Lateral motion of the tip per unit of height when it climbs a wall.
+            slides: Largest deflection that friction alone can cause [m].
+            preload: Compression of a tip on the joint [m].
             noise: Standard deviations of one measurement across and up [m].
         """
         self.likely = only(Mode.SEATED)
@@ -130,16 +129,16 @@ class Contact:
         self._height, self._spread = 0.0, math.inf
         self._newest: deque[_Weighed] = deque()
         self.fell: float | None = None
-        self._borne = 0.0
+        self._borne = 0.0, 0.0
 
     def seat(self, time: float, deflection: float, compression: float) -> None:
-        """Set the state: the tip is seated and pressed [m], and its safe deflection is known."""
+        """Set the state to seated, with this deflection and compression [m]."""
         self.likely = only(Mode.SEATED)
         self.deflection, self.compression, self._time = deflection, compression, time
         self._spread = math.inf
 
     def lose(self) -> None:
-        """Set the state: no wall holds the tip."""
+        """Set the state to free: no wall holds the tip."""
         self.likely, self.deflection = only(Mode.FREE), 0.0
 
     @property
@@ -149,7 +148,7 @@ class Contact:
 
     @property
     def bears(self) -> bool:
-        """Whether the joint supports the tip, if only by its bottom."""
+        """Whether the joint supports the tip, by its walls or by its bottom."""
         return float(self.likely[Mode.FALLEN]) < 0.5
 
     @property
@@ -186,7 +185,7 @@ class Contact:
 
     def settled(self, until: float) -> Iterator[tuple[Felt, float]]:
         """Yield valid measurements up to a time [s], each with its extra variance [m^2]."""
-        # Backward pass: `since` is how likely each mode makes all that was measured later
+        # Backward pass: `since` is the likelihood of all later measurements, given each mode
         since, off = np.ones(len(Mode)), []
         for weighed in reversed(self._newest):
             likely = weighed.likely * since
@@ -196,20 +195,28 @@ class Contact:
         while self._newest and self._newest[0].felt.time <= until:
             weighed, likely = self._newest.popleft(), off.pop()
             self._part(weighed.felt.s, float(likely[Mode.FALLEN]))
-            # A tip that may be free would lead the path after it: a chance of a tenth is too much.
+            # A free tip moves with the arm and would drag the path along: 10 % probability is too
+            # much.
             if likely[Mode.FREE] + likely[Mode.FALLEN] < 0.1:
                 climbs = float(likely[Mode.PRESSED] + likely[Mode.OTHER])
                 yield weighed.felt, climbs * (self._flat * weighed.climbed) ** 2
 
     def _part(self, s: float, fallen: float) -> None:
-        """Note where the joint stops bearing the tip, by a measurement's probability of that."""
+        """Note whether the tip has fallen at a measurement, given the probability of it."""
         if fallen < 0.5:
-            self.fell, self._borne = None, s
+            self.fell, self._borne = None, (self._borne[1], s)
         elif self.fell is None:
-            self.fell = (self._borne + s) / 2.0
+            # Friction has held the tip back: falling, it springs ahead. The joint ended on the way
+            # from the last measurement on it to the next, which is as long as the way before.
+            before, last = self._borne
+            self.fell = last + (last - before) / 2.0
 
     def _moves(self, share: float, soon: float) -> Floats:
-        """Return how likely each mode becomes each (5, 5), over shares of STRIDE and of 1 mm."""
+        """Return the transition probabilities (5, 5) of the modes.
+
+        ``share`` and ``soon`` are the probabilities of a change within the travel since the last
+        measurement, for changes over STRIDE and over 1 mm.
+        """
         climbing = share * RARE + soon * min(max(self.strained - STRAINED, 0.0) ** 2, 0.9)
         moves = np.diag(np.full(len(Mode), 1.0 - share))
         moves[:, Mode.SEATED] += share
@@ -219,7 +226,7 @@ class Contact:
         return moves
 
     def _chances(self, felt: Felt, side: float) -> tuple[Floats, float]:
-        """Return the densities (5,) of a measurement in each mode, and how far it has climbed."""
+        """Return a measurement's likelihood in each mode (5,), and the height climbed [m]."""
         up, tall = felt.height - self._height, self._spread + self.noise[1] ** 2
         # Tack welds lift the tip on 10 % of a seam; 2 % of a seam bend in a way not planned.
         seated = _mostly(up, tall, 0.1) * _mostly(felt.aside, felt.spread, 0.02)
@@ -231,12 +238,12 @@ class Contact:
         borne, hangs = self._compressed(felt.compression)
         held = np.array([seated, walls[0][0], walls[1][0], free]) * borne
         chances = np.array([*held, free * hangs]) + 1e-12
-        # Neighbours see the same error of what is expected: one measurement in two is new.
+        # Neighbouring measurements share the error of the expectation: each counts as half a one.
         return chances**0.5, max(climbed, RISE)
 
     def _compressed(self, compression: float) -> tuple[float, float]:
-        """Return the densities of a compression [m] if the joint bears the tip, and if nothing."""
-        # The preload's control errs by a third of it at a tack weld or a dip, play by a tenth.
+        """Return the likelihoods of a compression [m], for a tip on the joint and a fallen one."""
+        # At a tack weld or a dip the preload is off by a third until it is controlled again.
         up = self.noise[1] ** 2
         borne = _normal(compression - self._preload, up + (self._preload / 3.0) ** 2)
         return borne, _normal(compression, up + (self._preload / 10.0) ** 2)
@@ -253,7 +260,7 @@ class Contact:
 
 
 def only(mode: Mode) -> Floats:
-    """Return the probabilities (5,) of a mode that is certain."""
+    """Return the probabilities (5,) of the modes where one of them is certain."""
     return np.array([float(mode is each) for each in Mode])
 
 

@@ -229,11 +229,11 @@ class RefinedPath:
     # --- what follows from it -------------------------------------------------------------------
 
     def offset(self, s: float) -> float:
-        """Return the seam's offset from the plan at one arc length."""
+        """Return the seam's offset from the plan at one arc length [m]."""
         return float(self.offsets(np.array([s]))[0])
 
     def slope(self, s: float) -> float:
-        """Return the seam's slope to the left of the plan, before ``s``."""
+        """Return the seam's slope relative to the plan just before ``s``, positive to the left."""
         before, here = self.offsets(np.array([s - SLOPE, s])).tolist()
         return float((here - before) / SLOPE)
 
@@ -262,7 +262,7 @@ class RefinedPath:
     def settled(self) -> float:
         """Arc length up to which later measurements hardly change the path [m].
 
-        That is the shortest field's length short of the tip.
+        It is the shortest correlation length behind the tip.
         """
         return self._at - LENGTHS[0]
 
@@ -283,7 +283,7 @@ class RefinedPath:
         return place.point + here * place.normal, normal
 
     def offsets(self, s: Floats) -> Floats:
-        """Return the seam's offsets (K,) from the plan at arc lengths [m]."""
+        """Return the seam's offsets (K,) from the plan at arc lengths (K,) [m]."""
         if self.empty:
             return np.zeros(len(s))
         return np.asarray(self._weights @ self._expected(s))

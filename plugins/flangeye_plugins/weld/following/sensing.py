@@ -311,7 +311,7 @@ class SeamEstimate:
         self._backed = None
 
     def leave(self, phase: Phase) -> None:
-        """Accept the place where the tip fell off as the seam's end, if it is plausible."""
+        """Take the place where the tip fell off as the seam's end, if it is plausible."""
         task, at = self._task, self.contact.fell
         if self.end is not None or phase != "ending" or at is None:
             return

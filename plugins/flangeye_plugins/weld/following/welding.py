@@ -127,11 +127,11 @@ class Welding:
 
     @property
     def ease(self) -> float:
-        """Share of its speed that the torch may keep: less where its error may reach the bound."""
+        """Share of the speed to keep: below 1 where the control error may reach ``max_error``."""
         room = self._task.settings.max_error - self._task.settings.sigmas * self.sigma
         if self.arc_from is None or room <= 0.0:
             return 1.0
-        # At speed up to half of what the bound leaves for the control error; slower it shrinks.
+        # A slower torch has a smaller control error; half of the room is left for surprises.
         return 2.0 - 2.0 * (self.bound - self._task.settings.sigmas * self.sigma) / room
 
     @property
@@ -196,13 +196,18 @@ class Welding:
         return ""
 
     def _ahead(self) -> tuple[float, float]:
-        """Return where on the rest of the plan the torch will be known least, and its bound [m]."""
+        """Return the least certain place on the rest of the plan, and the torch's bound there [m].
+
+        Where the tip has been, the seam is taken as it was felt.
+        """
         task, refined = self._task, self._seam.refined
         foreseen = predicted(
             task.plan, task.belief, task.settings, self._sensing.learned, self._pressing.most,
             refined.offsets,
         )  # fmt: skip
         rest = (self._progress.torch <= foreseen.s) & (foreseen.s <= self.ends)
+        if not rest.any():  # a closed seam that is welded over its start
+            return self._progress.torch, self.bound
         places = foreseen.s[rest]
         felt = [refined.variance(s) if s <= refined.settled else 0.0 for s in places.tolist()]
         variances = foreseen.variance[rest] + np.array(felt)
