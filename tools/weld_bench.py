@@ -13,9 +13,9 @@ from flangeye.types import Floats
 from flangeye_emulators.weld_world.groove import GrooveSection, Tip
 from flangeye_emulators.weld_world.truth import WeldTruth
 from flangeye_emulators.weld_world.world import Nominal, WeldWorld
-from flangeye_plugins.weld.bound import check_bound
 from flangeye_plugins.weld.checks import check_tool
 from flangeye_plugins.weld.following.belief import Belief, belief_of
+from flangeye_plugins.weld.following.bound import check_bound
 from flangeye_plugins.weld.following.follower import Follower
 from flangeye_plugins.weld.following.task import WeldTask
 from flangeye_plugins.weld.frame import LeaningTool, body_from

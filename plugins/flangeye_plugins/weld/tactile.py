@@ -20,12 +20,12 @@ from flangeye.plugin.stage import stage
 from flangeye.types import Note, Seam, Seed, StageLog, VerifiedHandEye, Warn, WeldReport
 from flangeye.workflow.recipe.header import LimitsSection
 from flangeye_plugins.weld import checks
-from flangeye_plugins.weld.bound import check_bound
 from flangeye_plugins.weld.camera_process import CameraProcess
 from flangeye_plugins.weld.corners import leg_of
 from flangeye_plugins.weld.execution import Bounds, WeldCell, approach, follow, undisturbed
 from flangeye_plugins.weld.finger_camera import CameraJob, FingerCameraReader, SteppedReader
 from flangeye_plugins.weld.following.belief import Belief, belief_of, body_of
+from flangeye_plugins.weld.following.bound import check_bound
 from flangeye_plugins.weld.following.follower import Follower
 from flangeye_plugins.weld.following.task import ResumePoint, Start
 from flangeye_plugins.weld.frame import LeaningTool, Tool, WorkSurface

@@ -10,8 +10,8 @@ import pytest
 
 from flangeye.errors import StageError
 from flangeye_emulators.weld_world.truth import WeldTruth
-from flangeye_plugins.weld.bound import Predicted, beforehand, check_bound, predicted
 from flangeye_plugins.weld.following.belief import Belief
+from flangeye_plugins.weld.following.bound import Predicted, beforehand, check_bound, predicted
 from flangeye_plugins.weld.following.probing import SOFTER
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following

@@ -563,7 +563,7 @@ def test_a_seam_that_has_moved_by_two_tenths_since_the_stop_is_another_one(
 
 
 def judged(found: Any, **state: Any) -> str:
-    put(found, **state)._judge(pose(0.05))
+    put(found, **state)._judge(pose(0.05), pose(0.05))
     return str(found.phase)
 
 

@@ -64,7 +64,7 @@ class Follower:
         for touch in touches:
             self._feel(touch)
         coming = self.arm.ahead(pose)
-        self._judge(coming)
+        self._judge(pose, coming)
         waiting = self.phase == "seeking" and self.sensing.search.resting
         if self.phase in ("done", "stopped") or self.sensing.felt is None or waiting:
             return STILL
@@ -185,7 +185,7 @@ class Follower:
 
     # --- what follows from it ---------------------------------------------------------------------
 
-    def _judge(self, pose: ToolPose) -> None:
+    def _judge(self, pose: ToolPose, coming: ToolPose) -> None:
         """Change the phase of the weld according to the measurements."""
         sensing, pressing = self.sensing, self.pressing
         if self.phase in ("following", "bridging") and self.tip >= pressing.ends:
@@ -208,7 +208,7 @@ class Follower:
         if self.torch >= self.welding.ends and self.phase != "stopped":
             self._finish()
         if self.phase not in ("done", "stopped"):
-            self._stop(self._blind(pose))
+            self._stop(self._blind(coming))
 
     def _enter(self, pose: ToolPose) -> None:
         """Start to follow once the tip, set down inside the felt start, is seated again.
@@ -223,7 +223,8 @@ class Follower:
             self.phase = "following"
             return
         # Images are late: it may rest there already.
-        fell = not seam.contact.bears and self._over(pose) < -0.9 * preload
+        hangs = not seam.contact.bears and seam.contact.compression < preload / 3.0
+        fell = hangs and self._over(pose) < -0.9 * preload
         room = pressing.most + pressing.feeler(seam.refined.variance(self.tip))
         aside = self.side * (self.progress.lateral(pose) - seam.refined.offset(self.tip))
         if fell or aside > room:

@@ -8,9 +8,9 @@ import numpy as np
 
 from flangeye.devices import WeldProfile
 from flangeye.motion.seam_following import ToolPose
-from flangeye_plugins.weld.bound import Stance, predicted, varying
 from flangeye_plugins.weld.following.belief import BAND
 from flangeye_plugins.weld.following.bias import Bias, Trail
+from flangeye_plugins.weld.following.bound import Stance, predicted, varying
 from flangeye_plugins.weld.following.sensing import SeamEstimate, Sensing
 from flangeye_plugins.weld.following.steering import Striking, TorchLead
 from flangeye_plugins.weld.following.task import WeldTask
