@@ -126,8 +126,7 @@ def predicted(
     """
     s = np.arange(0.0, plan.length + 1e-3, 2e-3)  # every 2 mm
     lets_go = plan.length - settings.ending - settings.speed * press / settings.release
-    sine, turned = _stances(plan, s, belief.distance, settings.sign * press, offsets)
-    free, _ = _stances(plan, s, belief.distance, 0.0, offsets)
+    sine, free, turned = _stances(plan, s, belief.distance, settings.sign * press, offsets)
     # Near the end the tip is released, which turns the tool from the one angle to the other
     least = np.minimum(np.abs(sine), np.abs(free))
     sine = np.where(s + belief.distance < lets_go, sine, least)
@@ -165,28 +164,34 @@ def check_bound(plan: Path, belief: Belief, settings: Following) -> None:
 
 def _stances(
     plan: Path, s: Floats, distance: float, aside: float, offsets: Callable[[Floats], Floats]
-) -> tuple[Floats, Floats]:
-    """Return the sine of the angle between tool and seam (K,), and the tool's turn (K,).
+) -> tuple[Floats, Floats, Floats]:
+    """Return sines of the angle between tool and seam (K,), pressed and free, and its turn (K,).
 
     The turn is the chord of the angle through which the tool rotates after the tip has passed a
     place and before the torch does. The torch is on the seam at arc lengths ``s``; the undeformed
-    tip is ``aside`` to the left of the seam [m].
+    tip, while it is pressed, is ``aside`` to the left of the seam [m].
     """
-    here, tangents = _seam(plan, s, offsets)
-    there, along = _seam(plan, plan.other_end(s, distance), offsets)
+    here, normals = _seam(plan, s, offsets)
+    there, left = _seam(plan, plan.other_end(s, distance), offsets)
     behind, _ = _seam(plan, plan.other_end(s, -distance), offsets)
-    pressed = aside * np.stack([-along[:, 1], along[:, 0]], axis=1)
-    now, then = there - here + pressed, here - behind + pressed
-    now, then = (tool / np.linalg.norm(tool, axis=1, keepdims=True) for tool in (now, then))
-    sine = tangents[:, 0] * now[:, 1] - tangents[:, 1] * now[:, 0]
-    return sine, np.linalg.norm(now - then, axis=1)
+    slopes = (offsets(s + SLOPE) - offsets(s - SLOPE)) / (2.0 * SLOPE)
+    along = np.stack([normals[:, 1], -normals[:, 0]], axis=1)
+    across = _units(normals - slopes[:, None] * along)
+    free, pressed, before = (
+        _units(tool)
+        for tool in (there - here, there - here + aside * left, here - behind + aside * left)
+    )
+    sine, loose = ((across * tool).sum(axis=1) for tool in (pressed, free))
+    return sine, loose, np.linalg.norm(pressed - before, axis=1)
 
 
 def _seam(plan: Path, s: Floats, offsets: Callable[[Floats], Floats]) -> tuple[Floats, Floats]:
-    """Return points (K, 2) of the seam at arc lengths of its plan, and unit tangents (K, 2)."""
+    """Return points (K, 2) of the seam at arc lengths of its plan, and the plan's normals there."""
     points, along = (found[:, :2] for found in plan.evaluate(s))
     normals = np.stack([-along[:, 1], along[:, 0]], axis=1)
-    slopes = (offsets(s + SLOPE) - offsets(s - SLOPE)) / (2.0 * SLOPE)
-    tangents = along + slopes[:, None] * normals
-    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
-    return points + offsets(s)[:, None] * normals, tangents
+    return points + offsets(s)[:, None] * normals, normals
+
+
+def _units(vectors: Floats) -> Floats:
+    """Return vectors (K, 2) of unit length."""
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
