@@ -1,8 +1,8 @@
-"""A year of checks in a cell whose temperature goes up and down: sightings, and the truth.
+"""Simulate a year of monitor checks in a cell with daily and seasonal temperature changes.
 
-The arm and the scanner's stand grow with temperature, by the day and by the season; each scan has
-noise, each check its own pose error of the arm. What the monitor is told is the calibration, its
-covariance and what the maker says of the noise; what happens is drawn here.
+The arm and the scanner's stand expand with temperature. Each scan has noise, and each check its own
+pose error of the arm. The monitor gets the calibration, its covariance and the maker's noise
+figures, and the simulated observations.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ Change = Callable[[NDArray[np.intp]], Floats]
 
 @dataclass(frozen=True)
 class Year:
-    """What the cell does.
+    """Parameters of the simulated year.
 
     Attributes:
-        checks: How many, three a day.
+        checks: Number of checks, three a day.
         scans: Scans of the flange at each.
         centre_noise: Standard deviation of a fitted centre per axis [m].
         normal_noise: Standard deviation of a fitted normal [rad].
         arm_noise: Repeatability per axis [m].
-        daily: Amplitude of the day's temperature [K].
-        seasonal: Amplitude of the year's [K].
+        daily: Amplitude of the daily temperature cycle [K].
+        seasonal: Amplitude of the seasonal temperature cycle [K].
         calibration: Standard deviation of the stored calibration, at the work [m].
     """
 
@@ -54,12 +54,12 @@ class Year:
 
 @dataclass(frozen=True, eq=False)
 class Happening:
-    """What changes, and when: each a function of the check's index.
+    """Changes of the cell, each as a function of the check's index.
 
     Attributes:
         motion: (n,) checks to (n, 6) motions of the scanner about itself.
-        joints: To (n, 6) errors of the joints' zeros [rad].
-        tool: To (n, 3) places of the circle on the flange [m].
+        joints: (n,) checks to (n, 6) errors of the joint zeros [rad].
+        tool: (n,) checks to (n, 3) displacements of the circle on the flange [m].
     """
 
     motion: Change = lambda k: np.zeros((len(k), 6))
@@ -69,12 +69,12 @@ class Happening:
 
 @dataclass(frozen=True, eq=False)
 class Watched:
-    """What the monitor gets of a year.
+    """Input of the monitor from a simulated year.
 
     Attributes:
-        sightings: Sightings of every check.
+        sightings: Observations of every check.
         prior: (6, 6) covariance of the calibration about :data:`ABOUT`.
-        scanner: (3,) where the scanner stands, by the calibration [m].
+        scanner: (3,) position of the scanner by the calibration [m].
     """
 
     sightings: CheckSightings
@@ -83,17 +83,17 @@ class Watched:
 
 
 def step_at(check: int, size: Floats) -> Change:
-    """Return what is zero before a check and ``size`` from it on."""
+    """Return a step function: zero before a check, ``size`` from it on."""
     return lambda k: np.where(k[:, None] >= check, size, 0.0)
 
 
 def ramp_to(size: Floats, start: int, end: int) -> Change:
-    """Return what grows evenly from zero to ``size``."""
+    """Return a ramp from zero to ``size``."""
     return lambda k: np.clip((k[:, None] - start) / (end - start), 0.0, 1.0) * size
 
 
 def watch(year: Year, happening: Happening, rng: np.random.Generator) -> Watched:
-    """Draw a year and return what the monitor sees of it."""
+    """Return the monitor's input for a random year."""
     arm, stations = _arm()
     check = np.asarray(np.repeat(np.arange(year.checks), year.scans), dtype=np.intp)
     joints = stations[np.arange(len(check)) % year.scans]
@@ -116,7 +116,7 @@ def _seen(
     rng: np.random.Generator,
     cell: tuple[Arm, Floats, NDArray[np.intp], Floats],
 ) -> tuple[Floats, Floats]:
-    """Return centres and normals in the camera, as they are scanned."""
+    """Return the measured centres and normals in the camera."""
     arm, joints, check, truth = cell
     warm = _temperature(year, rng)[check]
     flanges = arm.flange(joints + happening.joints(check))
@@ -145,7 +145,7 @@ def _temperature(year: Year, rng: np.random.Generator) -> Floats:
 
 @lru_cache(maxsize=1)
 def _arm() -> tuple[Arm, Floats]:
-    """Return the arm and (3, 6) joint angles at which it shows the flange, tilted each way."""
+    """Return the arm, and joint angles (3, 6) that show the flange with different tilts."""
     arm, poses = Arm(load_model("robots", "ur5")), []
     for tilt, at in zip(
         [(0.25, 0.0), (-0.2, 0.2), (0.0, -0.3)],
@@ -157,7 +157,7 @@ def _arm() -> tuple[Arm, Floats]:
 
 
 def scanner_pose() -> Floats:
-    """Return base_T_camera of the cell, as it is calibrated."""
+    """Return the calibrated ``base_T_camera`` of the cell."""
     return rigid(rotation_from_rpy(np.pi - 0.1, 0.1, 0.4), np.array([0.5, 0.1, 1.05]))
 
 

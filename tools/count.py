@@ -31,7 +31,7 @@ LAYOUT = (
 
 @dataclass
 class Module:
-    """What one file holds. `imports` are names of modules, or of things in them."""
+    """Measurements of one file; `imports` are names of modules or of objects in them."""
 
     name: str
     code: int
@@ -162,7 +162,7 @@ def _read(path, name, is_package):
 
 
 def _code_lines(text, tree):
-    """Numbers of the lines that hold code: no blanks, comments or docstrings."""
+    """Return the numbers of the lines with code, without blanks, comments and docstrings."""
     lines: set[int] = set()
     for token in tokenize.generate_tokens(io.StringIO(text).readline):
         if token.type not in LAYOUT and token.type != tokenize.COMMENT:

@@ -1,7 +1,7 @@
-"""Which test runs which line: python -m tools.covering SOURCE OUT TESTS, from the repository.
+"""Record which test runs which line: python -m tools.covering SOURCE OUT TESTS
 
-The fast tests of a file run once under coverage.py, each a context of its own, or where it has none,
-those in real time. OUT (JSON) gets the processor time of every test that passes, and per file and
+The fast tests of a file (or, without any, those in real time) run once under coverage.py, each in
+its own context. OUT (JSON) gets the processor time of every passing test, and for each file and
 line the tests that run it.
 """
 
@@ -43,7 +43,7 @@ class Covering:
             self._coverage.switch_context("")
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Leave out what does not pass as it is."""
+        """Exclude tests that do not pass."""
         if not report.passed:
             self._failed.add(report.nodeid)
 

@@ -80,7 +80,7 @@ def steps(part: str, size, trials: int) -> tuple[int, float, list[float]]:
 
 
 def first_alarm(watched: Watched, begin: int) -> int | None:
-    """Return the first check from ``begin`` on at which something is said, if any."""
+    """Return the first check from ``begin`` on with an alarm; None without one."""
     told = information_of(watched.sightings, TEST.daily)
     for n in range(begin + 1, len(told.matrix) + 1):
         if (
@@ -97,7 +97,7 @@ def first_alarm(watched: Watched, begin: int) -> int | None:
 
 
 def false_alarms(years: int) -> tuple[int, int]:
-    """Return alarms in years in which only the temperature changes, each counted once, and checks."""
+    """Return the numbers of false alarms and of checks in years with temperature changes only."""
     alarms = checks = 0
     for seed in range(years):
         watched = watch(Year(), Happening(), np.random.default_rng([seed, 99]))

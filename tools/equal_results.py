@@ -1,14 +1,16 @@
-"""Runs every recipe at two states of the code and compares what came out, to the last bit.
+"""Run every recipe with two versions of the code and compare the results bit by bit.
 
     python -m tools.equal_results COMMIT [WORD ...]
 
-COMMIT is checked out into a temporary folder and run by the same interpreter and libraries; the
-other state is this folder as it stands, or another commit (``--to``). Recipes that have one of the
-words in their names are run, or all that both states have. Timing, versions and the names of folders do not count.
+COMMIT is checked out into a temporary folder and run by the same interpreter and libraries. The
+other version is this folder, or another commit (``--to``). Recipes with one of the words in their
+names are run, by default all that both versions have. Timing, versions and names of folders are
+ignored.
 
-A line a recipe: ``equal``; or how many values differ, of which names, and the first. What follows an emulator in
-real time (``--move``) differs from run to run by itself and is left out, and the paper's studies
-are run by tests/paper. Archives are those of ``--archive`` (../shared/data/ancorasir).
+One line per recipe is printed: ``equal``, or the number of different values with their names and
+the first one. Recipes with an emulator in real time (``--move``) are left out, as they differ from
+run to run; the paper's studies are run by tests/paper. Archives are those of ``--archive``
+(../shared/data/ancorasir).
 """
 
 import argparse
@@ -65,7 +67,7 @@ def _printed(line: str) -> str:
 
 
 def _checked_out(commit: str, folder: Path) -> Path:
-    """Return a folder with the code of a commit, and what names its plugins."""
+    """Return a folder with the code of a commit and its plugins' metadata."""
     archive = subprocess.run(
         ["git", "archive", commit], cwd=HERE, check=True, capture_output=True
     ).stdout
@@ -88,7 +90,7 @@ def _wanted(name: str, words: list[str]) -> bool:
 
 
 def _line(name: str, before: Path, after: Path, archive: Path) -> str:
-    """Return what a recipe's two results differ in."""
+    """Return the line that compares a recipe's two results."""
     with TemporaryDirectory() as place:
         old, new = (
             _result(name, code, Path(place) / code.name, archive) for code in (before, after)
@@ -101,7 +103,7 @@ def _line(name: str, before: Path, after: Path, archive: Path) -> str:
 
 
 def _summary(apart: list[str]) -> str:
-    """Return how many values differ, of which names, and the first."""
+    """Return a text with the number of different values, their names, and the first one."""
     if not apart:
         return "equal"
     places = (re.sub(r"\[\d+\]", "", line.partition(":")[0]) for line in apart)
@@ -132,7 +134,7 @@ def _result(name: str, code: Path, out: Path, archive: Path) -> Any:
 
 
 def _environment(code: Path, out: Path) -> dict[str, str]:
-    """Return an environment in which the packages and the list of plugins are those of `code`."""
+    """Return an environment that imports the packages and plugins of `code`."""
     named = out / "plugins"
     for file in (code / "pyproject.toml", code / "plugins" / "flangeye_paper" / "pyproject.toml"):
         if file.is_file():
@@ -142,7 +144,7 @@ def _environment(code: Path, out: Path) -> dict[str, str]:
 
 
 def _name_plugins(project: dict[str, Any], named: Path) -> None:
-    """Write the metadata by which installed plugins are found, ahead of what is installed."""
+    """Write plugin metadata that takes precedence over the installed one."""
     info = named / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
     info.mkdir(parents=True, exist_ok=True)
     (info / "METADATA").write_text(

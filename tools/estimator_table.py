@@ -1,11 +1,11 @@
-"""How wrong the mixed model is, and how wrong it says: python -m tools.estimator_table
+"""Compare the mixed model's errors with its stated covariance: python -m tools.estimator_table
 
-Sessions by a generator that shares no code with the project (tests/estimation/foreign.py): UR5e and
-Panda in turn, with joints recorded, or `--no-joints`. With `--mrad 0` each arm is as good or bad as
-the estimator expects arms to be: no other row says whether a region is right where the poses do not
-tell the arm's quality. Of the true camera pose and of the one as reported, each against
-its own truth: mean of NEES over 6, share inside the stated 95 %, stated over true rms, and the true
-rms over the box [mm]; beside it, of circles, that of least squares on centres (SVD).
+Sessions come from a generator that shares no code with the project (tests/estimation/foreign.py):
+UR5e and Panda in turn, with recorded joints or `--no-joints`. With `--mrad 0` each arm's quality is
+drawn from the estimator's prior; only this row tests the coverage when the poses do not determine
+the arm's quality. For the true and the reported camera pose, each against its own truth, the table
+has: mean NEES over 6, share inside the stated 95 %, stated over true rms, and true rms over the box
+[mm]; for circles also that of least squares on centres (SVD).
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def row(kind: str, poses: int, mrad: float, seeds: range, joints: bool) -> str:
 
 
 def _drawn(arm: dict[str, Any], seed: int) -> float:
-    """Return the size of the joint zeros [rad] of an arm that is drawn from the prior."""
+    """Return the standard deviation of joint zeros [rad] of an arm drawn from the prior."""
     model, _ = robot(arm["name"])
     times = np.random.default_rng(seed).standard_normal()
     return float(model.joint_accuracy * QUALITY**times)

@@ -1,13 +1,15 @@
-"""Every fault under an arm that moves: python -m tools.faults [TIMES] [--seed N] [--kind NAME …].
+"""Inject every fault while an arm moves: python -m tools.faults [TIMES] [--seed N] [--kind NAME …]
 
-A calibration, or a program that leads the arm as a weld does, runs against a controller on loopback
-through the maker's client. The fault is the controller's, or befalls the run's own processes
-(``tools.strokes``): killed, held for three seconds and let go of, interrupted at its terminal. It
-comes while the arm moves, at a random moment. By the controller's clock the arm rests within 0.5 s
-and does not move again; what was finished is in the log; the program ends within 3 s, not counting
-how long it or its guard, the longer of both, waited for a core of a busy machine; it says how to go
-on, and after the first of the trials it does go on. Under a fault that hinders nothing (a network late by 20 ms, a wall clock that is set) it may go on
-to its end.
+A calibration, or a program that servos the arm like a weld, runs against an emulated controller on
+loopback through the maker's client. The fault is one of the controller, or of the run's own
+processes (``tools.strokes``): killed, suspended for three seconds, or interrupted at its terminal.
+It occurs at a random moment while the arm moves.
+
+Checked are: by the controller's clock the arm is at rest within 0.5 s and does not move again;
+finished captures are in the log; the program ends within 3 s, not counting the time that it or its
+supervisor waited for a processor core; it says how to resume, and resuming works (after the first
+trial). Under a harmless fault (network latency of 20 ms, a changed wall clock) it may run to its
+end.
 """
 
 from __future__ import annotations
@@ -60,7 +62,7 @@ MOVES, STANDS = 0.02, 1e-4
 
 
 def main() -> None:
-    """Cause each fault so many times, and print a line for each."""
+    """Inject each fault the given number of times, and print a line for each."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("times", nargs="?", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
@@ -103,7 +105,7 @@ class Trial:
         self._ends = [End(0.0, 0.0, 0.0)]
 
     def once(self) -> None:
-        """Start a controller and a program, cause the fault, and look."""
+        """Start a controller and a program, inject the fault, and check the outcome."""
         self._times += 1
         with (
             tempfile.TemporaryDirectory() as folder,
@@ -155,7 +157,7 @@ class Trial:
         return self._kind != "leading"
 
     def _cause(self, cell: Any, program: subprocess.Popen[str]) -> None:
-        """Let the fault happen."""
+        """Inject the fault."""
         if strike := {**STROKES, **OF_A_CLIENT, **OF_A_BRIDGE}.get(self._fault):
             strike(program.pid, self._terminal)
         elif shift := SHIFTS.get(self._fault):
@@ -164,7 +166,7 @@ class Trial:
             cell.control.fault(self._fault)
 
     def _faults(self, cell: Any, program: subprocess.Popen[str]) -> Iterator[str]:
-        """Cause the fault while the arm moves, and yield what is wrong afterwards."""
+        """Inject the fault while the arm moves, and yield the failed checks."""
         for _ in range(self._chance.randrange(4) if self._calibrates else 0):
             cell.wait_until(lambda: _speed(cell) > MOVES or _over(program), STARTING)
             cell.wait_until(lambda: _speed(cell) < STANDS or _over(program), STARTING)
@@ -191,7 +193,7 @@ class Trial:
             yield from self._goes_on(cell, program)
 
     def _goes_on(self, cell: Any, program: subprocess.Popen[str]) -> Iterator[str]:
-        """Yield what is wrong with how a run that was struck says how to go on, and does."""
+        """Yield the failures of a run's hint to resume, and of resuming."""
         told = program.communicate()[1]
         if "--resume" not in told and self._fault != "program killed":
             yield f"it does not say how to go on: {told.splitlines()[-1:]}"
@@ -208,7 +210,7 @@ class Trial:
             yield f"it does not go on by --resume: {told.splitlines()[-1:]}"
 
     def _through(self, program: subprocess.Popen[str], moved: float) -> Iterator[str]:
-        """Yield what is wrong with a program that went on under a fault."""
+        """Yield the failures of a program that continued under a fault."""
         if self._calibrates:
             _, told = program.communicate(timeout=WHOLE)
             if program.returncode not in (0, 1):
@@ -226,7 +228,7 @@ def _over(program: subprocess.Popen[str]) -> bool:
 
 
 def _watched(cell: Any, program: subprocess.Popen[str], began: float) -> End:
-    """Look at an arm and its program until both have come to an end, or go on in spite of all."""
+    """Observe arm and program until both have ended, or continue in spite of the fault."""
     moved = now = 0.0
     ended, waited, before = None, 0.0, _queued(program.pid)
     while now < PATIENCE and (ended is None or now < ended + RESTS):

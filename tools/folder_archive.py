@@ -12,11 +12,11 @@ from flangeye_plugins.reader.folder import SECOND
 
 
 def write_folder(path: Path, captures: Iterable[Capture]) -> None:
-    """Write captures as such a folder: binary PCD clouds and ``poses.csv``, all in metres.
+    """Write captures as a folder of binary PCD clouds and ``poses.csv``, in metres.
 
     Args:
-        path: Folder to write into; it is made.
-        captures: At least one; with or without joint angles and a second arm, all of them alike.
+        path: Folder to write into; it is created.
+        captures: At least one capture; either all or none have joint angles and a second arm.
     """
     path.mkdir(parents=True, exist_ok=True)
     rows: list[dict[str, Any]] = []

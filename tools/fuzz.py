@@ -1,10 +1,10 @@
 """Fuzz every reader: python -m tools.fuzz [CASES] [--target NAME] [--seed N] [--coverage SECONDS].
 
-Each target runs in a process of its own, in a folder with canaries: a Python module of a library's
-name and a program. What counts as a find: any exception but a FlangeyeError, a signal, more than
-20 s of CPU time, ten minutes by the clock or 2 GB for one input, a canary that ran. Finds are kept in tests/fuzz/seeds/TARGET/, where the
-fast tests read them again. With --coverage, atheris guides the search instead, for so long for each
-target (pip install 'flangeye[fuzz]').
+Each target runs in its own process, in a folder with canaries: a Python module with a library's
+name, and a program. A find is any exception but FlangeyeError, a signal, more than 20 s of CPU
+time, ten minutes of wall-clock time or 2 GB for one input, or an executed canary. Finds are stored
+in tests/fuzz/seeds/TARGET/, where the fast tests read them again. With --coverage, atheris guides
+the search for this time per target (pip install 'flangeye[fuzz]').
 """
 
 from __future__ import annotations
@@ -154,7 +154,7 @@ def _lay_canaries(folder: Path) -> None:
 
 
 def _covered(name: str, folder: Path, seconds: int, seed: int, counts) -> None:
-    """Let atheris look for inputs that reach new code."""
+    """Run atheris, which searches for inputs that reach new code."""
     target, corpus = TARGETS[name], folder / "corpus"
     _lay_canaries(folder)
     corpus.mkdir()

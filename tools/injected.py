@@ -1,9 +1,9 @@
-"""What is made of faults in recordings: python -m tools.injected [--seed N] [FAULT …]
+"""Test the detection of faults in recordings: python -m tools.injected [--seed N] [FAULT …]
 
-Two sets of marker poses of a sound arm, by the generator of tests/estimation/foreign.py, one with the
-marker in the hand and one with the camera; each is written as two tables with one fault in them, run,
-examined by the doctor, and run again with the line pasted that the doctor prints. A pose is right
-when it takes what the camera sees to within 1 mm rms of where the true one does.
+Two sets of marker poses of a correct arm come from the generator of tests/estimation/foreign.py:
+with the marker on the flange, and with the camera on it. Each set is written as two tables with one
+fault, run, examined by ``flangeye doctor``, and run again with the line that the doctor prints. A
+pose is right if it maps the observations to within 1 mm rms of the true pose.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ POSES, ARM, RIGHT = 24, 0.1e-3, 1e-3
 
 
 class Rows(NamedTuple):
-    """Two tables as they are written, and how the recipe states they are."""
+    """Two tables as written, and their notation as stated in the recipe."""
 
     arm: np.ndarray
     marker: np.ndarray
@@ -61,7 +61,7 @@ def plain(arm: np.ndarray, marker: np.ndarray) -> Rows:
 
 
 def read_as(who: int, how: str, said: str) -> Fault:
-    """Return the fault that one table's rotations are written in one way and said in another."""
+    """Return a fault: a table's rotations are written in another convention than stated."""
 
     def fault(arm: np.ndarray, marker: np.ndarray) -> Rows:
         rows, names = [written(arm), written(marker)], ["xyzw", "xyzw"]
@@ -253,7 +253,7 @@ def recipe_of(rows: Rows, in_hand: bool) -> str:
 
 
 class Ran(NamedTuple):
-    """What a run came to: its status, by how much its pose is wrong [m], and what it named."""
+    """Outcome of a run: status, error of its pose [m], and named mistake."""
 
     status: str
     error: float
@@ -261,7 +261,7 @@ class Ran(NamedTuple):
 
 
 def run(recipe: Path, session: foreign.Session) -> Ran:
-    """Run a recipe and hold its pose against the true one."""
+    """Run a recipe and compare its pose with the true one."""
     out = recipe.parent / f"out_{recipe.stem}"
     done = _flangeye("run", recipe, "--out", out)
     told = [x for x in done.stdout.splitlines() if x.startswith(("What is wrong", "or   ", "Next"))]
@@ -281,14 +281,14 @@ def _error(found: np.ndarray, s: foreign.Session) -> float:
 
 
 class Said(NamedTuple):
-    """What a command wrote."""
+    """Output of a command."""
 
     stdout: str
     stderr: str
 
 
 def doctored(recipe: Path) -> tuple[str, Path | None]:
-    """Return what the doctor names first, and the recipe with its last line pasted."""
+    """Return the doctor's first finding, and the recipe with its last line inserted."""
     done = _flangeye("doctor", recipe, "--json")
     if not done.stdout.startswith("{"):
         return f"error: {done.stderr.strip().splitlines()[-1][-160:]}", None
@@ -311,7 +311,7 @@ def doctored(recipe: Path) -> tuple[str, Path | None]:
 
 
 def _flangeye(*words: object) -> Said:
-    """Run a command in this process: a hundred of them import the same modules."""
+    """Run a command in this process, which saves importing the modules each time."""
     said, why = io.StringIO(), io.StringIO()
     with redirect_stdout(said), redirect_stderr(why), suppress(SystemExit):
         end_in_words(lambda: commands()(list(map(str, words))))

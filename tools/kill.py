@@ -1,10 +1,9 @@
 """Kill runs at random moments: python -m tools.kill [COUNT] [--seed N] [--kind NAME …].
 
-Each run is killed (-9), alone or with its process group, at a random moment after its log is there
-(of a monitor: after its history's lock is). Afterwards: what was finished before is in the log and
-can be read; the run is gone on with (``--resume``, ``--from``, or the batch's or monitor's own
-command); and of the killed one no process, no temporary file and no shared memory is left, and so no
-port.
+Each run is killed (-9), alone or with its process group, at a random moment after its log exists
+(for a monitor: after its history's lock exists). Checked are: finished captures are in the log and
+readable; the run can be resumed (``--resume``, ``--from``, or the batch's or monitor's own
+command); and no process, port, temporary file or shared memory of the killed run is left.
 """
 
 from __future__ import annotations
@@ -48,10 +47,10 @@ FEWER = ("--set", "acquire.live.poses={next_best: {count: 6}}")
 
 
 class Kind(NamedTuple):
-    """A kind of run: its command, the one that goes on from a folder, and what it writes first.
+    """A kind of run: its command, the command that resumes it, and the file it writes first.
 
-    ``OUT`` in a command is its folder, ``PARENT`` that one's; a run is given it by ``--out``. A
-    command that begins with ``-c`` is Python's, of a program that starts a run in its folder.
+    ``OUT`` in a command is the run's folder (given by ``--out``), ``PARENT`` the folder above it. A
+    command that begins with ``-c`` is a Python program that starts a run in its folder.
     """
 
     command: tuple[str, ...]
@@ -80,7 +79,7 @@ def _recorded(recipe: str, *options: str) -> Kind:
 
 
 def _checked_again(out: Path) -> tuple[str, ...] | None:
-    """Return the same check, where its history does not have it yet; the history can be read."""
+    """Return the command of the same check, unless the (readable) history has it already."""
     stored = stored_calibration(out.parent / "calibration")
     checks = History.read(out / "h.jsonl", stored.key).checks
     return None if checks else MONITOR
@@ -115,7 +114,7 @@ sys.exit(run.code)
 
 
 def _of_page(out: Path) -> tuple[str, ...] | None:
-    """Return what goes on from the run that a page's server started."""
+    """Return the command that resumes a run started by the page's server."""
     return _solved_again("ur5_phoxi-m_sample")(next(out.glob("runs/*")))
 
 
@@ -131,7 +130,7 @@ KINDS = {
 
 
 def main() -> None:
-    """Kill, look, and print a line for each kind."""
+    """Kill runs, check them, and print a line for each kind."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("count", nargs="?", type=int, default=500)
     parser.add_argument("--seed", type=int, default=0)
@@ -151,7 +150,7 @@ def main() -> None:
 
 
 class Trial:
-    """The kills of one kind, and what came of them."""
+    """The kills of one kind of run, with their outcomes."""
 
     def __init__(self, kind: Kind, folder: Path, chance: random.Random) -> None:
         self.faults: list[str] = []
@@ -160,7 +159,7 @@ class Trial:
         self._duration = 0.0
 
     def kill(self, count: int) -> None:
-        """Time one whole run, then kill ``count`` of them."""
+        """Measure the duration of one complete run, then kill ``count`` runs."""
         began = time.monotonic()
         whole = self._start(self._kind.command, self._folder / "whole")
         if whole.wait() not in (0, 1):
@@ -198,7 +197,7 @@ class Trial:
         yield from self._stuck(out)
 
     def _left(self, out: Path, shared: set[str]) -> Iterator[str]:
-        """Yield what is left of a killed run besides its folder."""
+        """Yield the remains of a killed run outside its folder."""
         until = time.monotonic() + LINGER
         while (left := _marked(str(out))) and time.monotonic() < until + _queued(left):
             time.sleep(0.1)
@@ -223,7 +222,7 @@ class Trial:
         yield from (f"{path}: {capture} is empty" for capture in set(log.finished) - told)
 
     def _stuck(self, out: Path) -> Iterator[str]:
-        """Go on, and yield why it did not."""
+        """Resume a run, and yield the reason if that fails."""
         try:
             command = self._kind.goes_on(out) if any(out.rglob(self._kind.writes)) else None
         except FlangeyeError as error:
@@ -242,7 +241,7 @@ class Trial:
     def _start(
         self, command: tuple[str, ...], out: Path, stderr: int = subprocess.DEVNULL
     ) -> subprocess.Popen[bytes]:
-        """Start a command; what it starts has the folder's name in its environment."""
+        """Start a command, with the folder's name in its environment and its children's."""
         _temporary(out).mkdir(exist_ok=True)
         environment = {**os.environ, MARK: str(out), "TMPDIR": str(_temporary(out))}
         words = [w.replace("OUT", str(out)).replace("PARENT", str(out.parent)) for w in command]
@@ -273,7 +272,7 @@ def _finished(log: Path) -> list[str]:
 
 
 def _processes(out: str) -> Iterator[Path]:
-    """Yield what the system tells of each process that a run started and that still lives."""
+    """Yield the system's data on each surviving process that a run started."""
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
             if f"{MARK}={out}".encode() in (process / "environ").read_bytes().split(b"\0"):

@@ -1,9 +1,9 @@
-"""Welds in real time, struck in their middle: python -m tools.kill_weld [--times N] [--only NAME].
+"""Inject faults into welds in real time: python -m tools.kill_weld [--times N] [--only NAME]
 
-`flangeye run` welds through the maker's client on a controller on loopback. While the torch follows
-the seam, at a random moment, the program, its controller or its camera is struck. Printed is how
-long the arm then goes on moving, by where the controller has it: of a struck program or controller
-from the stroke on, of a camera from the last image that showed the tag; and what the run said.
+`flangeye run` welds through the maker's client on an emulated controller on loopback. At a random
+moment while the torch follows the seam, a fault is injected into the program, the controller or the
+camera. Printed are the time until the arm is at rest by the controller's position (from the fault,
+or for a camera from the last image of the tag), and the run's message.
 """
 
 from __future__ import annotations
@@ -57,12 +57,12 @@ class Trial:
     reason: str = ""
 
     def notes(self, name: str) -> Iterator[Any]:
-        """Yield what the weld has logged under a name so far."""
+        """Yield the values that the weld has logged under a name so far."""
         with suppress(FlangeyeError):
             yield from (n.value for n in read_notes(self.log) if n.name == name)
 
     def phase(self) -> str:
-        """Return what the controller was doing last."""
+        """Return the controller's last logged phase."""
         blocks = list(self.notes("cycles"))
         return str(blocks[-1]["phase"][-1]) if blocks else ""
 
@@ -85,7 +85,7 @@ class Trial:
         return float(next(moment for moment, phase in cycles if phase == "following") - first)
 
     def rests(self) -> float:
-        """Return how long the arm goes on moving from now on, by the controller's clock [s]."""
+        """Return the time from now until the arm is at rest, by the controller's clock [s]."""
         began = self.controller.control.truth()
         last = began.time
         until = time.monotonic() + ENDING
@@ -152,7 +152,7 @@ def faulted(trial: Trial) -> float:
 
 
 def frozen(trial: Trial) -> float:
-    """The controller sends nothing any more for three seconds."""
+    """Freeze the controller for three seconds, in which it sends nothing."""
     trial.controller.control.fault("freeze=3 s")
     taken = trial.rests()
     trial.reason = trial.told()
@@ -160,7 +160,7 @@ def frozen(trial: Trial) -> float:
 
 
 def powerless(trial: Trial) -> float:
-    """The controller itself is killed; with it the arm stands. How long until the run says so."""
+    """Kill the controller, which stops the arm; measure the time until the run reports it."""
     trial.controller.send(signal.SIGKILL)
     began = time.monotonic()
     trial.reason = trial.told()
@@ -168,7 +168,7 @@ def powerless(trial: Trial) -> float:
 
 
 def camera(trial: Trial) -> float:
-    """The camera falls silent, or is lost, as its parameters say."""
+    """Let the camera fall silent or fail, by its parameters."""
     control, last = trial.controller.control, time.monotonic()
     while trial.run.poll() is None:
         last = time.monotonic() if control.truth().speed > MOVES else last
@@ -179,7 +179,7 @@ def camera(trial: Trial) -> float:
 
 @dataclass(frozen=True)
 class Stroke:
-    """What is done to a weld, and with what parameters it is started."""
+    """A fault for a weld, with the weld's parameters."""
 
     strike: Strike
     given: Callable[[float], tuple[str, ...]] = lambda after: PATIENT
@@ -222,7 +222,7 @@ class Bench:
         self._controller = Process("--joints", HOME, model="ur10e")
 
     def struck(self, stroke: Stroke, lead: float) -> tuple[float, str]:
-        """Return how long the arm went on moving in one weld [s], and what the run said."""
+        """Return the time until the arm was at rest in one weld [s], and the run's message."""
         after = self._chance.uniform(*AFTER)
         trial = self._begin(stroke.given(lead + after))
         try:
@@ -271,7 +271,7 @@ def main(
     only: Annotated[str, typer.Option(help="Strokes with this in their names.")] = "",
     seed: Annotated[int, typer.Option(help="Draws the moments.")] = 0,
 ) -> None:
-    """Strike welds, and print how soon the arm rested and what was said."""
+    """Inject faults into welds; print the time until the arm is at rest, and the messages."""
     chosen = {name: stroke for name, stroke in STROKES.items() if only in name}
     with (
         tempfile.TemporaryDirectory() as folder,

@@ -92,7 +92,7 @@ def is_normal(sequence):
 
 
 def redrawn(sequence, seed):
-    """Return a sequence as another draw of its noise would have it."""
+    """Return a sequence with newly drawn noise."""
     from kinhec import noise
 
     row, rng = sequence.manifest, np.random.default_rng(seed)
@@ -111,9 +111,9 @@ def redrawn(sequence, seed):
 
 
 def compared_again(name, sequence, redraws):
-    """Return the line of medians and rms over draws: ours, and those of the references' least.
+    """Return a line with medians and rms over draws: ours and the best reference's.
 
-    Where a reference's is less, that is told over more draws: of few it may be luck.
+    If a reference is better, more draws are made, as with few it may be chance.
     """
     found, theirs = zip(*(drawn_again(sequence, seed) for seed in range(redraws)), strict=True)
     least = [each for size in (np.median, rms) for each in least_over(size, found, theirs)]
@@ -126,14 +126,14 @@ def compared_again(name, sequence, redraws):
 
 
 def drawn_again(sequence, seed):
-    """Return our error and the references' of another draw."""
+    """Return our error and the references' errors for another draw."""
     draw = redrawn(sequence, seed)
     found = error(draw)
     return np.nan if isinstance(found, str) else found[0], references(draw)
 
 
 def least_over(size, found, theirs):
-    """Return the size of our errors, the least of any one reference's, and which that is."""
+    """Return our error, the smallest error of a reference, and that reference's name."""
     sizes = {k: size([each[k] for each in theirs]) for k in theirs[0]}
     best = min(sizes, key=sizes.__getitem__)
     return size([each for each in found if np.isfinite(each)]), sizes[best], best

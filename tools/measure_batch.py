@@ -1,12 +1,11 @@
 """What a batch costs beyond its work: ``python -m tools.measure_batch [SESSIONS] [MANY]``.
 
-Overhead: the wall time of a batch on one running worker, less the time its sessions took, a
-session; and what command and worker use of the processor, less what the same sessions use in a
-loop: on a machine that does other things besides, only this means something. The start of the
-cluster, and of the plugins in its first session, are told apart.
-Speed: the same batch on two workers. Many: MANY sessions that do nothing but have rows, what each
-costs, and the memory of client and scheduler early and at most. 0 leaves either out. Each line
-comes when it is known.
+Overhead per session: the wall time of a batch on one running worker minus its sessions' time; and
+the processor time of command and worker minus that of the same sessions in a loop, which alone is
+meaningful on a busy machine. The start of the cluster, and of the plugins in the first session, are
+reported separately. Speed: the same batch on two workers. Many: cost of MANY empty sessions with
+rows, and the memory of client and scheduler, early and largest. 0 leaves either out. Each line is
+printed when it is known.
 """
 
 import os
@@ -100,7 +99,7 @@ class Bench:
 
 
 class Memory(threading.Thread):
-    """Samples the resident memory [MB] of this process, which is client and scheduler."""
+    """Samples the resident memory [MB] of this process: client and scheduler."""
 
     def __init__(self):
         super().__init__(daemon=True)
@@ -114,7 +113,7 @@ class Memory(threading.Thread):
 
 
 def empty_chunk(job, chunk):
-    """Stand in for a worker's chunk: sessions that do nothing, whose rows are written."""
+    """Replace a worker's chunk by empty sessions, whose rows are written."""
     begun = time.perf_counter()
     told = work.write_rows(job, chunk, [OUTCOME] * len(chunk.sessions))
     return replace(told, seconds=time.perf_counter() - begun)
@@ -128,7 +127,7 @@ def used():
 
 
 def measure_overhead(bench, sessions):
-    """Say the overhead of one worker, and how much faster two are."""
+    """Print the overhead of one worker, and the speed-up by two."""
     before = used()
     bench.loop(sessions)
     alone, each = used() - before, 1e3 / sessions
@@ -149,7 +148,7 @@ def measure_overhead(bench, sessions):
 
 
 def measure_many(bench, sessions):
-    """Say what sessions that do nothing cost, and the memory of client and scheduler over them."""
+    """Print the cost of empty sessions, and the memory of client and scheduler."""
     memory = Memory()
     with bench.workers(1) as client, patch.object(cluster, "run_chunk", empty_chunk):
         bench.batch("few", 200, client, wait=0)

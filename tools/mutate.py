@@ -67,7 +67,9 @@ MEMORY = 16 << 30
 
 
 class Mutation(NamedTuple):
-    """One change: of which room, file, line, statement's lines and node, in words, and how."""
+    """One mutation: room, file, line, the statement's lines, the node, a description, and the
+    change.
+    """
 
     room: str
     file: str
@@ -135,7 +137,7 @@ def _changes(node: Any) -> Iterator[tuple[str, Callable[[Any], Any]]]:
 
 
 class Tests:
-    """The fast tests of a room: what each takes [CPU s], and which run a line."""
+    """The fast tests of a room: processor time of each [s], and the tests that run a line."""
 
     def __init__(self) -> None:
         self._seconds: dict[str, float] = {}
@@ -154,10 +156,10 @@ class Tests:
                 known.setdefault(int(line) if same else 0, set()).update(tests)
 
     def of(self, file: str, lines: range, budget: float) -> dict[str, float]:
-        """Return the tests that run one of the lines and what each takes, the file's own first.
+        """Return the tests that run one of the lines with their times, the file's own first.
 
-        What runs at import only, or in another process, is given to all tests of its file, or to
-        all. No more are taken than a budget allows [CPU s].
+        For lines that run at import or in another process only, all tests of the file (or all) are
+        returned. The total is limited by a budget of processor time [s].
         """
         of_file = self._lines.get(file, {})
         run = {test for line in lines for test in of_file.get(line, ())}
@@ -166,7 +168,7 @@ class Tests:
         return self._within(run | own, budget, own)
 
     def but(self, tried: Collection[str], budget: float) -> dict[str, float]:
-        """Return the other tests in the same way: what is worked out at import is none's line."""
+        """Return further tests in the same way, for values that are computed at import."""
         return self._within(set(self._seconds) - set(tried), budget)
 
     def _within(
@@ -182,7 +184,7 @@ class Tests:
 
 
 class Copy:
-    """A copy of the repository in which one change at a time is tried."""
+    """A copy of the repository for trying one mutation at a time."""
 
     def __init__(self, folder: Path) -> None:
         self._root = folder / "copy"
@@ -193,7 +195,7 @@ class Copy:
         self._trying: subprocess.Popen[str] | None = None
 
     def tests(self, room: str) -> Tests:
-        """Return a room's fast tests; what was found of a file before is taken as it is."""
+        """Return a room's fast tests; earlier results for a file are reused."""
         found, (source, *places) = Tests(), ROOMS[room]
         KEPT.mkdir(parents=True, exist_ok=True)
         for file in (file for place in places for file in _test_files(ROOT / place)):
@@ -210,19 +212,19 @@ class Copy:
         return found
 
     def collect(self, room: str) -> None:
-        """Let the tests of a room be collected, for :meth:`killed_in_fork`."""
+        """Collect the tests of a room in a process, for :meth:`killed_in_fork`."""
         self.close()
         words = ["-m", "tools.trying", *ROOMS[room][1:]]
         self._trying = self._start(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
     def close(self) -> None:
-        """Let go of the process that has tests collected."""
+        """End the process with the collected tests."""
         if self._trying:
             self._trying.communicate()
             self._trying = None
 
     def killed_in_fork(self, mutation: Mutation, tests: dict[str, float]) -> bool:
-        """Return whether a changed function fails tests in a fork of where they are collected."""
+        """Return whether a changed function fails tests in a fork of the collecting process."""
         assert self._trying is not None and self._trying.stdin and self._trying.stdout
         bounds = {test: SLOWER * seconds + STARTS for test, seconds in tests.items()}
         asked = {"code": mutation.code(self._root), "tests": bounds, "idle": IDLE}
@@ -273,7 +275,7 @@ class Copy:
 
 
 def main() -> None:
-    """Try a sample of each room, and print who survived."""
+    """Try a sample of mutations of each room, and print the survivors."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("sample", nargs="?", type=int, default=300)
     parser.add_argument("--seed", type=int, default=0)

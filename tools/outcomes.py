@@ -20,7 +20,7 @@ FIELDS = ("recipe", "captures", "used", "held_out_mm", "expected_mm", "true_mm")
 
 
 def outcome(name, result):
-    """Return a recipe's row: what was held out, what is expected and what is true, rms."""
+    """Return a recipe's row: held-out, expected and true error, rms."""
     figures = (
         result.holdout.rms,
         result.expected_error and result.expected_error.rms,
@@ -32,7 +32,7 @@ def outcome(name, result):
 
 
 def run(name, folder):
-    """Return the result of a recipe as it is shipped."""
+    """Return the result of an unchanged recipe."""
     registry = load_registry()
     recipe = load_recipe(recipe_names()[name], registry)
     return record_run(

@@ -1,4 +1,4 @@
-"""Pivots of tip and torch on arms that are not where they say: how far off, and how well stated.
+"""Errors of pivot calibrations of tip and torch on arms with joint-zero errors.
 
 python -m tools.pivots [--arms 200] [--zeros 0.2] [--placed 0.1]
 """
@@ -30,7 +30,7 @@ def pivots(
     zeros: Annotated[float, typer.Option(help="Sigma of their joints' zeros, mrad.")] = 0.2,
     placed: Annotated[float, typer.Option(help="Sigma of bringing a point there, mm.")] = 0.1,
 ) -> None:
-    """Print errors of both points and how many standard deviations they are."""
+    """Print the errors of both points, also in standard deviations."""
     for name, point in POINTS.items():
         rng = np.random.default_rng(len(name))
         trials = [_pivoted(point, zeros * 1e-3, placed * 1e-3, rng) for _ in range(arms)]
@@ -45,7 +45,7 @@ def pivots(
 
 
 def _pivoted(point: Floats, zeros: float, placed: float, rng: np.random.Generator) -> Pivot:
-    """Return the pivot of one arm: the point truly comes to the mark, the arm says where it is."""
+    """Return the pivot of one arm: the point is truly at the mark, the poses are reported ones."""
     arm = Arm(load_model("robots", "ur10e"))
     wrong = zeros * rng.standard_normal(len(HOME))
     home = arm.flange(HOME + wrong)

@@ -40,13 +40,13 @@ MILLION = 1_000_000
 
 @dataclass(frozen=True)
 class Site:
-    """Where sessions run.
+    """Resources on which sessions run.
 
     Attributes:
-        cores: Workers, one core each.
-        store: What the store gives to all together [B/s].
-        link: What it gives to one worker at most [B/s].
-        lost: Workers lost in an hour of one core; another takes the place at once.
+        cores: Number of workers with one core each.
+        store: Total bandwidth of the store [B/s].
+        link: Largest bandwidth for one worker [B/s].
+        lost: Worker failures per core and hour; a failed worker is replaced at once.
     """
 
     cores: int
@@ -57,12 +57,12 @@ class Site:
 
 @dataclass(frozen=True)
 class Session:
-    """What one session asks for.
+    """Requirements of one session.
 
     Attributes:
-        bytes: To read.
-        compute: Seconds of a core; a session's own share is drawn within 20 % of it.
-        schedule: Seconds of the scheduler and the client.
+        bytes: Amount of data to read.
+        compute: Time on one core [s]; varies randomly by 20 % between sessions.
+        schedule: Time of scheduler and client [s].
     """
 
     bytes: float
@@ -72,7 +72,7 @@ class Session:
 
 @dataclass(frozen=True)
 class Told:
-    """What a simulation came to: hours on the clock, and shares of them."""
+    """Result of a simulation: wall-clock hours, and utilisation as shares of them."""
 
     hours: float
     cores: float
@@ -82,7 +82,7 @@ class Told:
 
 
 class Store:
-    """A store whose readers share what it gives; all have had the same since any moment."""
+    """A store whose bandwidth is shared equally by all readers."""
 
     def __init__(self, site: Site) -> None:
         self._site = site
@@ -90,12 +90,12 @@ class Store:
         self._ends: list[tuple[float, int]] = []
 
     def begin(self, now: float, worker: int, size: float) -> None:
-        """Let a worker read from now on."""
+        """Start reading for a worker."""
         self._advance(now)
         heapq.heappush(self._ends, (self._given + size, worker))
 
     def next_end(self) -> float:
-        """Return when the next reader is through, if nobody else begins."""
+        """Return the time at which the next reader finishes, if no other begins."""
         if not self._ends:
             return np.inf
         return self._time + (self._ends[0][0] - self._given) / self._rate()
@@ -166,14 +166,14 @@ class Cluster:
         heapq.heappush(self._events, (now + min(seconds, until_lost), end, core))
 
     def _lose(self, now: float, core: int) -> None:
-        """Let another core begin the session again."""
+        """Restart a session on another core."""
         self._left += 1
         self._again += 1
         self._ask(now, core)
 
 
 def do_nothing(job: Any, chunk: Any) -> ChunkTold:
-    """Stand in for the work of a chunk: one session, as long as a chunk is to be."""
+    """Replace the work of a chunk by one session of the chunk's duration."""
     return ChunkTold(Counter({"verified": 1}), [], cluster.CHUNK_SECONDS)
 
 
@@ -190,7 +190,7 @@ def scheduling_seconds() -> float:
 
 
 def main(count: int) -> None:
-    """Print how long a million sessions take, by so many."""
+    """Print the time for a million sessions, from a simulation of fewer."""
     compute = SCANS * SCAN_SECONDS + SOLVE_SECONDS
     session = Session(SCANS * SCAN_BYTES, compute, scheduling_seconds())
     print(

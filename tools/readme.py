@@ -22,7 +22,7 @@ STAMP = "flangeye"
 
 
 def output_of(command: str, picture: Path | None = None) -> str:
-    """Return what a command prints, as the README quotes it; optionally photograph its report."""
+    """Return a command's output as quoted in the README; optionally take a picture of its report."""
     words = shlex.split(command)[1:]
     run = words[words.index("--out") + 1]
     with tempfile.TemporaryDirectory() as folder:
@@ -37,14 +37,14 @@ def output_of(command: str, picture: Path | None = None) -> str:
 
 
 def stamp(quote: str) -> str:
-    """Return a hash of all that the picture shows: the run's output, and what draws its report."""
+    """Return a hash of everything that the picture depends on: output and report code."""
     drawn = ("report.html.j2", "report.css", "report.js", "look.py", "summary.py", "still.py")
     texts = [(ROOT / "pipeline/flangeye/workflow/report" / name).read_text() for name in drawn]
     return hashlib.sha256("".join([quote, *texts]).encode()).hexdigest()
 
 
 def photograph(page: Path, picture: Path, text: str) -> None:
-    """Write what a browser shows of a page, with a text in the PNG."""
+    """Write a browser's picture of a page as PNG, with an embedded text."""
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
     from playwright.sync_api import sync_playwright
@@ -71,11 +71,11 @@ def shown() -> dict[str, str]:
 
 
 def same(shown: str, printed: str) -> bool:
-    """Tell whether two outputs are equal but for the last digits of their numbers.
+    """Return whether two outputs are equal except for the last digits of their numbers.
 
-    Linear algebra rounds differently from one processor to the next, and a fit that stops by a
-    tolerance carries that into the fourth digit: 2 % and 0.002 are more than that ever does, and
-    less than what any change of method makes.
+    Linear algebra rounds differently on different processors, and a fit with a stopping tolerance
+    amplifies that to the fourth digit. 2 % and 0.002 are more than these differences, and less than
+    any change of method.
     """
     words, numbers = NUMBER.split(shown), [float(n) for n in NUMBER.findall(shown)]
     others = [float(n) for n in NUMBER.findall(printed)]

@@ -32,7 +32,7 @@ def _save(name, draw):
 
 
 def _robots(axes):
-    """Draw each arm with all joints at zero, seen from the side on which it is longest."""
+    """Return a drawing of each arm with all joints at zero, from its longest side."""
     for i, name in enumerate(model_names("robots")):
         arm = Arm(load_model("robots", name))
         zero = np.zeros(arm.n)
@@ -47,7 +47,7 @@ def _robots(axes):
 
 
 def _scanners(axes):
-    """Draw each scanner's range and the width of its field there."""
+    """Return a drawing of each scanner's range with the width of its field of view."""
     for name in model_names("scanners"):
         scanner = load_model("scanners", name)
         half = np.tan(scanner.field_of_view[0] / 2)
@@ -61,7 +61,7 @@ def _scanners(axes):
 
 
 def _standards(axes):
-    """Draw each plate: rim, centring, threads."""
+    """Return a drawing of each plate: rim, centring, threads."""
     from matplotlib.patches import Circle
 
     x = 0.0

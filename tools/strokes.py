@@ -1,7 +1,7 @@
-"""What may befall the processes of a run while its arm moves; see ``tools.faults`` and ``kill_weld``.
+"""Faults of a run's processes while its arm moves, for ``tools.faults`` and ``tools.kill_weld``.
 
-A process that is held (SIGSTOP), or a group of them, is let go of (SIGCONT) after :data:`HELD`: the
-arm must not move again then.
+A suspended process or group (SIGSTOP) is continued (SIGCONT) after :data:`HELD`; the arm must not
+move again then.
 """
 
 from __future__ import annotations
@@ -64,15 +64,15 @@ def guard_of(run: int) -> int:
 
 
 def worker_of(run: int) -> int:
-    """Return the process that holds the client library ur_rtde."""
+    """Return the process that runs the client library ur_rtde."""
     return _child(guard_of(run), "worker.py")
 
 
 class Terminal:
-    """A terminal of its own for a program, to press keys on.
+    """A pseudo-terminal for a program, in which keys can be pressed.
 
     Attributes:
-        given: What ``subprocess.Popen`` is given to start the program in it.
+        given: Arguments of ``subprocess.Popen`` that start the program in it.
     """
 
     def __init__(self) -> None:
@@ -87,7 +87,7 @@ class Terminal:
         os.write(self._keys, key)
 
     def close(self) -> None:
-        """Hang up."""
+        """Close the terminal."""
         os.close(self._keys)
         os.close(self._line)
 
@@ -101,7 +101,7 @@ def _killed(find: Callable[[int], int]) -> Stroke:
 
 
 def _held(find: Callable[[int], int], signals: Callable[[int, int], None] = os.kill) -> Stroke:
-    """Return what holds a process, or a group of them, and lets go of it later."""
+    """Return a function that suspends a process or a group, and continues it later."""
 
     def stroke(run: int, _: Terminal) -> None:
         process = find(run)

@@ -70,12 +70,12 @@ SESSION = 8
 
 
 def eye(rng):
-    """A scanner with a distortion of its own."""
+    """Return a scanner with a random distortion."""
     return scanner_of(SCANNER, 0.35, 1.0, rng)
 
 
 def as_made(body, rng):
-    """A body as it is made: off its CAD by a smooth field, a sum of random waves."""
+    """Return a manufactured body, which differs from its CAD by a sum of random smooth waves."""
     whole = trimesh.Trimesh(body.vertices, body.triangles)
     points, triangles = trimesh.remesh.subdivide_to_size(whole.vertices, whole.faces, body.size / 8)
     waves = rng.normal(0, 1 / (ALIKE * body.size), (200, 3))
@@ -134,9 +134,9 @@ def scene(rng, body):
 
 
 class Trial(NamedTuple):
-    """One scan: the poses found or why none, the true one, and CPU time [s].
+    """One scan: the poses found (or the reason for none), the true pose, and CPU time [s].
 
-    ``there`` is whether the scan has the body, drawn as it is or mirrored: a mirrored mesh has its pose.
+    ``there`` is whether the body is in the scan, with a correct or a mirrored mesh.
     """
 
     there: bool
@@ -295,7 +295,7 @@ def summary(name, trials):
 
 
 def _what(one, taken):
-    """What was wrong with a scan: which pose was taken, or why none, and how far off the nearest is."""
+    """Return a text on a failure: the chosen pose or the reason for none, and the smallest error."""
     offs = [error(each.camera_T_target.matrix, one.pose) for each in one.found]
     why = "WRONG" if taken else one.why or f"{len(offs)} poses"
     why = why if one.there else f"{why}, without it"

@@ -27,7 +27,7 @@ GRID_SIGHTINGS = 40
 
 
 def stream(cell, plan, seed):
-    """Return the cell, what is seen by a plan, as it is asked for, and the true places."""
+    """Return the cell, a lazy stream of observations by a plan, and the true poses."""
     registry, name = load_registry(), f"configurations/{cell}_marker_most-likely_simulated"
     recipe = load_recipe(
         recipe_names()[name],
@@ -40,7 +40,7 @@ def stream(cell, plan, seed):
 
 
 def levels(cell, plan, seed, every=1):
-    """Yield after each sighting how many there were, what is stated and what is true [m]."""
+    """Yield after each observation their number, the stated and the true error [m]."""
     model, sightings, truth = stream(cell, plan, seed)
     seen, found = [], None
     for sighting in sightings:
@@ -53,7 +53,7 @@ def levels(cell, plan, seed, every=1):
 
 
 def true_errors(found, cell, seen, truth):
-    """Yield by unknown frame the largest distance between where its work is and where it is put."""
+    """Yield the largest true error at the work for each unknown frame [m]."""
     for name, points in work_of_frames(found, cell, seen).items():
         off = truth[name] @ np.linalg.inv(found.places[name])
         yield np.linalg.norm(points @ off[:3, :3].T + off[:3, 3] - points, axis=1).max()

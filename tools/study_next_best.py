@@ -33,7 +33,7 @@ GRID_POSES = 20
 
 
 class Level(NamedTuple):
-    """What is known after some poses: the 95 % error at the work, and the true rms error [m]."""
+    """Uncertainty after some poses: the stated 95 % error at the work, and the true rms [m]."""
 
     poses: int
     stated: float
@@ -41,7 +41,7 @@ class Level(NamedTuple):
 
 
 def observe(joints, base_T_flange, arm, rng):
-    """Return what a scan of the flange at a pose would give."""
+    """Return the simulated observation of the flange at a pose."""
     camera_T_flange = np.linalg.inv(BASE_T_CAMERA) @ arm.stand(joints, rng)[1]
     normal = camera_T_flange[:3, 2] + rng.normal(0.0, NORMAL_NOISE, 3)
     normal /= np.linalg.norm(normal)

@@ -21,7 +21,7 @@ HEAD = """\
 
 
 def lock() -> None:
-    """Let pip resolve what the two README commands install, and keep versions and hashes."""
+    """Write versions and hashes of the packages that the README's two commands install."""
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder) / "report.json"
         command = ["install", "--dry-run", "--ignore-installed", "--quiet", "--report", str(report)]
@@ -47,7 +47,7 @@ def pinned() -> dict[str, str]:
 
 
 def licence_of(name: str) -> str:
-    """Return what a package says of its licence; empty where it is not installed or silent."""
+    """Return a package's licence from its metadata; empty if unknown or not installed."""
     try:
         facts = distribution(name).metadata
     except PackageNotFoundError:
@@ -66,7 +66,7 @@ def licences() -> None:
 
 
 def weaknesses() -> None:
-    """Let pip-audit look every package up, and say of how many anything is known."""
+    """Check every package with pip-audit, and print the number of known vulnerabilities."""
     tool = shutil.which("pip-audit")
     if tool is None:
         sys.exit("pip-audit is not in PATH: pipx install pip-audit")

@@ -84,10 +84,10 @@ def try_condition(
 
 
 def could_be_welded(condition: Condition, seed: int, length: float, period: float) -> bool:
-    """Return whether one who knew all that is true could weld within ``max_error``.
+    """Return whether a controller with perfect knowledge could weld within ``max_error``.
 
-    The same steering is given the seam as it truly lies and a tool, an arm's path and heat that are
-    as their files say; what is left to it are the arm's delay, backlash and repeatability.
+    The same steering gets the true seam, and tool, arm path and heat as in their files. The
+    remaining errors are the arm's delay, backlash and repeatability.
     """
     settings = Following.model_validate(condition.settings)
     body = built_for(settings)

@@ -1,4 +1,4 @@
-"""The conditions under which a weld is judged: what is wrong in the world, and by how much."""
+"""Conditions for evaluating a weld: errors of the simulated world and their sizes."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ class Condition(NamedTuple):
     """A simulated world, and the parameters of the weld in it.
 
     Attributes:
-        truth: What is true.
-        settings: Settings of the controller, beside its defaults.
+        truth: True values of the world.
+        settings: Controller settings that differ from the defaults.
         planned: Shift [m] and turn [rad] of the plan.
-        belief: What the files state of the tool, beside its defaults.
-        half_angle: Half angle of the groove [rad], as planned too, where it is not the usual one.
-        section: Cross-section of another joint; the controller knows its kind alone.
-        look: A look behind the torch, if there is one.
+        belief: Prior values of the tool that differ from the defaults.
+        half_angle: Half angle of groove and plan [rad]; None for the default.
+        section: Cross-section of another joint, of which the controller knows the type only.
+        look: Profile sensor behind the torch; None without one.
     """
 
     truth: WeldTruth = WeldTruth()

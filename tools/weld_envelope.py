@@ -50,7 +50,7 @@ def _row(name: str, condition: Condition, seeds: int) -> tuple[str, ...]:
 
 
 def _errors(welded: list[Trial]) -> tuple[str, str]:
-    """Return rms and largest distance of what was welded, also of a weld that stopped later."""
+    """Return rms and largest error of the welded part, also of a weld that stopped later."""
     if not welded:
         return "", ""
     errors = np.concatenate([trial.errors for trial in welded])

@@ -19,17 +19,17 @@ class Row(NamedTuple):
     """One cycle; lengths [m], angles [rad], times [s], all but ``advance`` and ``bound`` true.
 
     Attributes:
-        time: [s].
+        time: Time [s].
         torch_s: Arc length of the torch on the true seam.
-        torch: How far it is to the left of it.
-        tip: How far the tip is to the left of the seam.
-        robot: How far the reported end point is to the left of the seam.
-        turn: Angular velocity commanded.
-        advance: The tip's progress, as the controller has it.
+        torch: Offset of the torch to the left of the seam.
+        tip: Offset of the tip to the left of the seam.
+        robot: Offset of the reported end point to the left of the seam.
+        turn: Commanded angular velocity.
+        advance: Progress of the tip by the controller.
         bound: The controller's bound of the torch's error.
-        band: The same for 95 % of the seam.
-        aim: How far to the left of the seam the torch is to be.
-        arc_on: 1 where the torch could weld: after it first was within ``max_error``.
+        band: The controller's bound that holds for 95 % of the seam.
+        aim: Target of the torch, to the left of the seam.
+        arc_on: 1 once the torch was within ``max_error`` and could weld; 0 before.
     """
 
     time: float
@@ -73,14 +73,14 @@ class Trial:
 
     @property
     def errors(self) -> Floats:
-        """(M,) the torch's distances from where it was to be, where it was beside the seam [m]."""
+        """Return the torch's distances (M,) from its target, within the seam's extent [m]."""
         return np.asarray(np.abs(self.column("torch") - self.column("aim"))[self.beside])
 
     @property
     def share_welded(self) -> float:
         """Share of the true seam on which the torch welded within its bound, ends included.
 
-        What was not welded counts as not welded.
+        Parts that were not welded count as outside the bound.
         """
         s = np.clip(self.column("torch_s"), 0.0, self.length)
         off = np.abs(self.column("torch") - self.column("aim"))
@@ -99,14 +99,14 @@ class Trial:
 
 @dataclass(frozen=True)
 class Start:
-    """How a trial begins and how its time passes.
+    """Start and timing of a trial.
 
     Attributes:
-        position: (3,) of the tip, undeformed, as reported [m].
+        position: (3,) reported position of the undeformed tip [m].
         angle: Angle of the tool [rad].
         period: Period of a cycle [s].
-        longest: When it is broken off [s].
-        look: A look behind the torch, if there is one.
+        longest: Time limit [s].
+        look: Profile sensor behind the torch; None without one.
     """
 
     position: tuple[float, float, float]
@@ -119,7 +119,7 @@ class Start:
 def run_trial(
     controller: Controller, nominal: Nominal, truth: WeldTruth, start: Start, seed: int
 ) -> Trial:
-    """Let a controller weld in a world, and watch where the torch really is."""
+    """Run a controller in a simulated world, and record the true torch."""
     world = WeldWorld(nominal, truth, [seed, 0])
     rng = np.random.default_rng([seed, 1])
     shutter: Shutter[Floats] = Shutter(truth.clock, rng)

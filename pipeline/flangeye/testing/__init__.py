@@ -84,7 +84,7 @@ class CheckConformance(Conformance):
     kind = "check"
 
     def found(self, recordings: RecordedSession) -> list[Finding]:
-        """Return the check's findings; none if it does not apply."""
+        """Return the check's findings; empty if it does not apply."""
         try:
             findings = list(self.call({}, recordings))
         except NotApplicable:

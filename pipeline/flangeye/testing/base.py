@@ -31,14 +31,14 @@ T = TypeVar("T")
 class Conformance:
     """Base of every class of the kit.
 
-    Set ``stage`` (or ``part``, the same) to the plugin. ``params`` are its parameters, their
-    defaults where it has any. Where it asks for more than a recipe's usual header gives, let
-    :meth:`context` give that by type.
+    Set ``stage`` (or ``part``, the same) to the plugin, and ``params`` to its parameters if not all
+    have defaults. If it needs values that a usual recipe's header does not provide, return them by
+    type from :meth:`context`.
 
     Attributes:
         stage: The plugin, as the decorator returned it.
         part: The same, for parts.
-        params: What it is called with: a Params, or a mapping as a recipe writes it.
+        params: Parameters of the plugin: a Params, or a mapping as in a recipe.
         kind: The kind this class is for.
     """
 

@@ -55,13 +55,13 @@ LATE = 1.0
 
 
 class DriverConformance(Conformance):
-    """Base of the four.
+    """Base of the conformance classes of drivers.
 
-    ``params`` say how to reach the device. Where something must be started first, or a test's own
-    fixture gives the parameters, override :meth:`open`.
+    ``params`` describe the connection. If something must be started first, or a fixture provides
+    the parameters, override :meth:`open`.
 
     Attributes:
-        unreachable: Parameters with which nothing can be reached; the refusal is tested with them.
+        unreachable: Parameters of an unreachable device, for testing the refusal.
     """
 
     unreachable: ClassVar[Any] = None
@@ -85,7 +85,7 @@ class DriverConformance(Conformance):
             device.close()
 
     def test_a_device_that_is_not_there_is_one_line(self) -> None:
-        """A missing device raises within PATIENCE: which device, why, and what to do."""
+        """A missing device raises within PATIENCE, with device, reason and remedy in one line."""
         if self.unreachable is None:
             return
         began = time.monotonic()
@@ -200,7 +200,7 @@ class RobotConformance(DriverConformance):
             robot.wait_cycle()
 
     def _watch(self, robot: Robot, seconds: float) -> list[RobotState]:
-        """Look at it in each of its cycles, and return what was seen."""
+        """Read the arm's state in each of its cycles, and return the states."""
         seen = []
         for _ in range(round(seconds / robot.period)):
             robot.wait_cycle()
@@ -208,7 +208,7 @@ class RobotConformance(DriverConformance):
         return seen
 
     def _under_way(self, robot: Robot, start: t.Floats) -> RobotState:
-        """Send it off and look at it for 0.3 s; again where a busy machine's look came too late."""
+        """Start a motion and read the state for 0.3 s; repeat if a busy machine read too late."""
         for _ in range(3):
             away = np.eye(len(start))[-1] * 4 * TESTED_TURN
             robot.move_joints(start + away, SPEED, ACCELERATION)
@@ -220,7 +220,7 @@ class RobotConformance(DriverConformance):
         raise AssertionError("the move has not begun")
 
     def _until_still(self, robot: Robot) -> tuple[float, RobotState]:
-        """Return the highest joint speed on the way, and where it came to rest."""
+        """Return the highest joint speed until rest, and the final joint angles."""
         fastest, still = 0.0, 0
         for _ in range(round(10.0 / robot.period)):
             robot.wait_cycle()
@@ -234,7 +234,7 @@ class RobotConformance(DriverConformance):
 
 
 class ScannerConformance(DriverConformance):
-    """A ``scanner`` part. It must look at something that gives points."""
+    """A ``scanner`` part; there must be something measurable in its view."""
 
     kind = "scanner"
 
@@ -326,7 +326,7 @@ class StreamConformance(DriverConformance):
         require(times == sorted(set(times)), f"{self.gives}s are not in order, or one came twice")
 
     def test_asking_does_not_wait(self) -> None:
-        """It returns at once: the control loop asks 500 times a second."""
+        """The call returns at once, as the control loop makes it 500 times a second."""
         with self.opened() as device:
             self.given(device, 1)
             for _ in range(20):
@@ -392,7 +392,7 @@ class ArcConformance(DriverConformance):
                     require(took < 0.05 + LATE / 5, f"switching took {took:.3f} s")
 
     def test_it_says_whether_it_burns_or_that_it_does_not_know(self) -> None:
-        """None is not False: an arc that nothing watches is not one that went out."""
+        """An arc without feedback returns None, not False, which would mean that it went out."""
         with self.opened() as arc:
             says = arc.burning()
         require(says in (True, False, None), f"burning() returned {says!r}")

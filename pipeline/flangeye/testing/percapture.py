@@ -84,9 +84,9 @@ class Scene:
     """A scan and its truth, in ``camera``.
 
     Attributes:
-        xyz: (H, W, 3) organised points [m], NaN where there is none.
-        centre: (3,) of the flange's face, or of the ball [m].
-        normal: (3,) of the face, towards the camera.
+        xyz: (H, W, 3) organised points [m]; missing ones are NaN.
+        centre: (3,) centre of the flange's face, or of the ball [m].
+        normal: (3,) normal of the face, towards the camera.
         radius: Radius of the rim, or of the ball [m].
     """
 
@@ -181,11 +181,11 @@ BALL = Sphere(size=0.03, centre_in_flange=(0.0, 0.0, 0.1))
 
 
 class PerCaptureConformance(Conformance):
-    """Base of the two.
+    """Base of the conformance classes of segment and fit stages.
 
     Attributes:
-        feature: What the stage looks for: the flange, or a ball on it.
-        tolerance: How far the centre may be off, on scans without noise [m].
+        feature: The stage's target: the flange, or a ball on it.
+        tolerance: Largest error of the centre on scans without noise [m].
     """
 
     feature: ClassVar[Literal["flange", "sphere"]] = "flange"

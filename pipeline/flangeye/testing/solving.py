@@ -128,7 +128,7 @@ class SolvingConformance(Conformance):
         }
 
     def _require_pose(self, answer: t.HandEye, expected: Floats, within: float, what: str) -> None:
-        """Compare where the work is, not the camera's origin: that is what a pose is for."""
+        """Compare poses by their error at the work, which matters, not at the camera's origin."""
         found = answer.base_T_camera.transform
         true = t.Transform(t.BASE, t.CAMERA, expected)
         corners = true.inverse().apply(np.array([o.observation.tcp_in_base for o in answer.pairs]))
@@ -147,7 +147,7 @@ class SolveConformance(SolvingConformance):
     """A ``solve`` stage: Observations in, HandEye out.
 
     Attributes:
-        tolerance: How far the work may be off, with 0.05 mm of noise at 16 poses [m].
+        tolerance: Largest error at the work with 0.05 mm of noise at 16 poses [m].
     """
 
     kind = "solve"
@@ -220,7 +220,7 @@ class RefineConformance(SolvingConformance):
     """A ``refine`` stage: HandEye in, HandEye out.
 
     Attributes:
-        tolerance: How far the work may be off after refining a good calibration [m].
+        tolerance: Largest error at the work after refining a good calibration [m].
     """
 
     kind = "refine"

@@ -41,7 +41,7 @@ class AcquireConformance(Conformance):
     """An ``acquire`` stage: a lazy stream of captures, or of observations.
 
     Attributes:
-        archive: The recordings it is run on, where it needs any.
+        archive: Recordings to run on, if the stage needs any.
     """
 
     kind = "acquire"
@@ -217,7 +217,7 @@ class PlanConformance(Conformance):
         require_close(there[:, :3, 3], here[:, :3, 3] + shift, 1e-6, "a pose of a moved site [m]")
 
     def test_a_site_that_shows_nothing_is_no_crash(self) -> None:
-        """If the arm can show its flange nowhere, the plan is empty or says why."""
+        """If the arm cannot show its flange anywhere, the plan is empty or gives the reason."""
         site = Site(
             centre=np.zeros(3), eye=np.ones(3), facing=lambda p: None, joints=lambda p: None
         )

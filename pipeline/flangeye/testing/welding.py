@@ -103,10 +103,10 @@ def straight_task() -> FollowingTask:
 
 
 class ControllerConformance(Conformance):
-    """A ``controller`` part: pose and touches in, one command a cycle out.
+    """A ``controller`` part: poses and touches in, one command per cycle out.
 
-    It is led along the plan for ten seconds, the tip deflected as was asked; where it would go is
-    not judged.
+    The test moves the tool along the plan for ten seconds with the requested deflection; the
+    commands' path is not judged.
     """
 
     kind = "controller"
