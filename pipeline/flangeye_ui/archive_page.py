@@ -1,4 +1,4 @@
-"""Archive: the sessions of a folder compared, a log looked at capture by capture, batches."""
+"""Archive page: compares the sessions of a folder, shows logs by capture, and batches."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def _reports(project: Project) -> None:
 
 
 def link(project: Project, path: Path) -> None:
-    """Show a link that opens a file of the folder, in a tab and an origin of its own."""
+    """Show a link that opens a file of the folder in a new tab with a separate origin."""
     name = path.relative_to(project.folder).as_posix()
     ui.link(name, address_of(project.folder, path), new_tab=True)
 
@@ -163,7 +163,7 @@ class Scrubber:
 
 
 def _columns() -> list[dict[str, Any]]:
-    """Return the table's columns; the wide ones, which the run's result has, are not for phones."""
+    """Return the table's columns; wide ones, also found in the result, are hidden on phones."""
     return [
         {"name": key, "label": label, "field": key, "align": "left", "sortable": True}
         | (dict.fromkeys(("classes", "headerClasses"), "gt-xs") if wide else {})

@@ -72,7 +72,7 @@ class Form:
 
     @ui.refreshable_method
     def picture(self) -> None:
-        """Draw the cell as the recipe has it."""
+        """Draw the cell of the recipe."""
         drawing = drawing_of(self._project)
         if drawing:
             svg(drawing).classes("picture")
@@ -185,7 +185,7 @@ class Form:
                 mistake(each.text)
 
     def _fields(self, name: str, stage: Stage | None) -> list[str]:
-        """Return the parameters of a step that have what was searched for."""
+        """Return the parameters of a step that match the search."""
         known = descriptions_of(stage.params) if stage and stage.params else {}
         return [
             field
@@ -197,7 +197,7 @@ class Form:
         self, index: int, name: str, stage: Stage, fields: list[str], given: dict[str, Any],
         wrong: list[Mistake],
     ) -> None:  # fmt: skip
-        """Show a field for each parameter, as the recipe's schema has it, with what is wrong."""
+        """Show a field for each parameter of the recipe's schema, with its mistakes."""
         if stage.params is None:
             return
         schema = stage.params.model_json_schema()["properties"]
@@ -305,16 +305,16 @@ class Import:
 async def draft(
     project: Project, form: Form, words: Callable[[str], list[str]], stem: str
 ) -> tuple[str, bool]:
-    """Let a command write a recipe, and take it over as the cell's.
+    """Run a command that writes a recipe, and use the recipe for the cell.
 
     Args:
         project: Project that the page shows.
-        form: Shows the recipe.
-        words: Gives the command's, for the name of the file that it is to write.
-        stem: That name; a free one is made of it.
+        form: Form that shows the recipe.
+        words: Returns the command's words, given the file's name.
+        stem: Preferred name of the file; a free name is derived from it.
 
     Returns:
-        What the command said, and whether there is a new recipe.
+        The command's output, and whether there is a new recipe.
     """
     names = (f"{stem}{i or ''}" for i in count())
     name = next(n for n in names if not any(project.folder.glob(f"{n}.*")))
@@ -329,7 +329,7 @@ async def draft(
 
 
 class Recordings:
-    """Scans and poses in a folder; ``flangeye init`` looks at them and writes the recipe."""
+    """Form for recordings in a folder, from which ``flangeye init`` writes the recipe."""
 
     def __init__(self, project: Project, form: Form) -> None:
         self._project, self._form = project, form
@@ -349,12 +349,12 @@ class Recordings:
         self._button.set_enabled(bool(self._folder.value))
 
     def _words(self, stem: str) -> list[str]:
-        """Return the command's words, with what was answered so far."""
+        """Return the command's words with the answers so far."""
         answers = [w for option, answer in self._given.items() for w in (option, answer)]
         return ["init", self._folder.value or "FOLDER", "--yes", *answers, "--out", f"{stem}.yaml"]
 
     async def _look(self) -> None:
-        """Run the command on the archive; show what it found, and its assumptions to change."""
+        """Run the command on the archive; show its findings, and its assumptions for changes."""
         self._line.text = self._project.command(*self._words("recorded"))
         self._button.disable()
         said, drafted = await draft(self._project, self._form, self._words, "recorded")
@@ -388,7 +388,7 @@ def _words_of(option: str) -> str:
 
 
 class WhatRuns:
-    """Choose from what runs under ROS 2; ``flangeye init --ros2`` then writes the recipe."""
+    """Form for running ROS 2 devices, from which ``flangeye init --ros2`` writes the recipe."""
 
     def __init__(self, project: Project, form: Form) -> None:
         self._project, self._form = project, form
@@ -453,7 +453,7 @@ class WhatRuns:
         self._line.text = self._project.command(*self._words("running"))
 
     def _words(self, stem: str) -> list[str]:
-        """Return the command's words, with what was chosen."""
+        """Return the command's words with the choices."""
         given = {"scanner": self._project.section("scanner").get("model"), **self._chosen}
         options = [w for flag, answer in given.items() if answer for w in (f"--{flag}", answer)]
         return ["init", "--ros2", "--yes", *options, "--out", f"{stem}.yaml"]
@@ -502,7 +502,7 @@ def _within(mistake: Mistake, index: int, name: str, field: str) -> bool:
 
 
 def _field(name: str, schema: dict[str, Any], value: Any, required: bool) -> ui.input | ui.select:
-    """Return what a parameter is given by: a list of what is allowed, or a line of YAML."""
+    """Return a parameter's input field: a list of allowed values, or a line of YAML."""
     default = schema.get("default")
     told = "required" if required else "" if default is None else f"default {_shown(default)}"
     allowed = ["false", "true"] if schema.get("type") == "boolean" else schema.get("enum")
@@ -519,7 +519,7 @@ def _field(name: str, schema: dict[str, Any], value: Any, required: bool) -> ui.
 
 
 def _shown(value: Any) -> str:
-    """Return a value as it would stand in the recipe, on one line."""
+    """Return a value as one line of YAML."""
     if value is None or isinstance(value, str):
         return value or ""
     return flow(value)
@@ -536,7 +536,7 @@ def _put_step(steps: list[Any], path: list[Any], value: Any) -> None:
 
 
 def _plain(text: str) -> Any:
-    """Return what is typed as YAML would have it; text that is not YAML stays text."""
+    """Return typed text parsed as YAML; text that is not YAML stays text."""
     try:
         return parse_yaml(text, "field").data
     except RecipeError:
@@ -545,7 +545,7 @@ def _plain(text: str) -> Any:
 
 @cache
 def _models(kind: str) -> dict[str, str]:
-    """Return the bundled arms or scanners: by name, the name and who makes it."""
+    """Return labels (name and maker) of the bundled arms or scanners, by name."""
     return {
         path.stem: f"{path.stem} · {read_yaml(path).data.get('maker', '')}"
         for path in sorted((bundled("data") / kind).glob("*.yaml"))

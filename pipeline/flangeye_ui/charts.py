@@ -14,7 +14,7 @@ from flangeye.workflow.report.look import LIGHT
 def residual_chart(
     sizes: Mapping[str, float], aside: Mapping[str, str], limit: float | None = None
 ) -> dict[str, Any]:
-    """Return a bar for the error of each pose [m] and the limit; those set aside are marked."""
+    """Return a bar chart of the poses' errors [m] with the limit; unused poses are marked."""
     names = sorted({*sizes, *aside})
     bars = [round(1e3 * sizes[n], 4) if n in sizes else None for n in names]
     series: dict[str, Any] = {
@@ -49,7 +49,7 @@ def bar_chart(names: Sequence[str], series: Sequence[Any]) -> dict[str, Any]:
 
 
 def place_chart(places: Mapping[str, list[float]], aside: Set[str]) -> dict[str, Any]:
-    """Return the flange's places from above: used ones green, those set aside red."""
+    """Return a chart of the flange's positions from above: used ones green, unused ones red."""
     axis = {"type": "value", "scale": True, "axisLabel": {"color": LIGHT["axis"]}}
     axis["splitLine"] = {"lineStyle": {"opacity": 0.3}}
     series = []

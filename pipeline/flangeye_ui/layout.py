@@ -1,4 +1,4 @@
-"""Layout of every page: the five steps, what is done, and the button to go on."""
+"""Layout of every page: the five steps, their status, and the primary button."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class ActionBar:
     """The bar below a page: the status line, and the primary button.
 
     Attributes:
-        simulated: The line above the page that says that the cell is simulated.
+        simulated: Line at the top that marks a simulated cell.
     """
 
     def __init__(self, simulated: ui.label) -> None:
@@ -91,7 +91,7 @@ def page(project: Project, title: str) -> Iterator[ActionBar]:
 
 
 def _header(project: Project, title: str) -> ui.label:
-    """Show the steps; return the line that says that the cell is simulated."""
+    """Show the steps; return the line that marks a simulated cell."""
     done = project.done()
     with ui.header().classes("head"):
         with ui.element("nav").props('aria-label="Steps"').classes("ways"):
@@ -160,5 +160,5 @@ def code(text: str) -> ui.label:
 
 
 def svg(text: str) -> ui.html:
-    """Show a drawing that this program made; its words were escaped when it was made."""
+    """Show an SVG drawing made by this program, with its text already escaped."""
     return ui.html(text, sanitize=False)

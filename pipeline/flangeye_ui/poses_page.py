@@ -1,4 +1,4 @@
-"""Poses: the arm, its box, the scanner and the poses in 3D; nothing moves."""
+"""Poses page: arm, workspace box, scanner and planned poses in 3D; nothing moves."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def add(project: Project) -> None:
 
 
 class PosePlanner:
-    """The drawing of the planned poses, and their list."""
+    """Drawing and list of the planned poses."""
 
     def __init__(self, project: Project, recipe: Recipe, bar: ActionBar) -> None:
         self._project, self._recipe, self._bar = project, recipe, bar
@@ -92,7 +92,7 @@ class PosePlanner:
 
     @property
     def _simulated(self) -> Any:
-        """Where a simulated scanner stands, by its recipe; None where that is not given."""
+        """Return a simulated scanner's pose from its recipe; None if not given."""
         camera = getattr(self._recipe.steps[0].params, "camera", None)
         return camera if hasattr(camera, "base_T_camera") else None
 
@@ -153,7 +153,7 @@ class PosePlanner:
         ui.navigate.reload()
 
     async def _plan(self) -> None:
-        """Ask the command line for the plan: without --move it shows it and nothing moves."""
+        """Get the plan from the command line without --move, so that nothing moves."""
         self._check.disable()
         self._bar.say("Checking every pose and every path …")
         text = await asyncio.to_thread(self._project.run_command, self._words)
@@ -173,7 +173,7 @@ class PosePlanner:
             self._bar.say("There is no plan yet: see what is wrong above.")
 
     def _show_poses(self, rows: list[dict[str, Any]]) -> None:
-        """Draw every pose; say which are left out, and why when one is pointed at or chosen."""
+        """Draw every pose; mark those left out, with the reason when one is hovered or selected."""
         self._rows = rows
         for number, row in enumerate(rows):
             self._scene.pose(row["place"], not row["why_not"], f"pose {number}")

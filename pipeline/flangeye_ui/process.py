@@ -31,19 +31,19 @@ from flangeye.workflow.run.outlook import Outlook, outlook
 
 
 class RunProcess:
-    """``flangeye run``, started, followed and stopped.
+    """A ``flangeye run`` process: started, followed and stopped.
 
     Attributes:
-        path: The run's folder.
+        path: Folder of the run.
         moves: Whether it may move an arm.
-        view: What its log has said so far.
-        log: The same as values, clouds of whole scans aside.
-        outlook: Expected quality from its poses so far; None before the first was judged.
+        view: State of the run from its log.
+        log: Values of its log, without the clouds of whole scans.
+        outlook: Expected quality from the poses so far; None before the first estimate.
         cloud: (N, 3) the newest scan, thinned, in the camera [m]; and the flange in it.
-        places: (3,) of the flange in the base [m], by capture.
-        shots: A small picture of each scan with its flange, by capture, as a data URL.
-        began: When it was started, by time.monotonic [s].
-        stopped: Why it was stopped from here; empty where it was not.
+        places: (3,) positions of the flange in the base [m], by capture.
+        shots: Small pictures of the scans with their flange as data URLs, by capture.
+        began: Start time on time.monotonic [s].
+        stopped: Reason for stopping it from the page; empty if it was not.
     """
 
     def __init__(self, folder: Path, words: Sequence[str], move: bool, registry: Registry) -> None:
@@ -72,12 +72,12 @@ class RunProcess:
 
     @property
     def code(self) -> int | None:
-        """The exit code; None while it goes."""
+        """Exit code of the process; None while it runs."""
         return self._process.poll()
 
     @property
     def set_aside(self) -> dict[str, str]:
-        """Why captures were set aside, by a stage or by the solver, by capture."""
+        """Reasons for rejections by a stage or by the solver, by capture."""
         by_stages = {each.id: f"{each.stage}: {each.reason}" for each in self.log.rejections}
         return {**(self.outlook.set_aside if self.outlook else {}), **by_stages}
 

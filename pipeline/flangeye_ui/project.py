@@ -26,12 +26,12 @@ from flangeye_ui.process import RunProcess
 
 @dataclass(frozen=True)
 class Mistake:
-    """One thing that is wrong with the recipe.
+    """A mistake in the recipe.
 
     Attributes:
-        line: In the YAML, from 1; 0 where none is named.
-        path: The field, such as ``steps.2.fit.rim.inlier``; empty where none is named.
-        text: What is wrong.
+        line: Line of the YAML, from 1; 0 if unknown.
+        path: Path of the field, such as ``steps.2.fit.rim.inlier``; empty if unknown.
+        text: Text of the mistake.
     """
 
     line: int
@@ -43,13 +43,13 @@ class Project:
     """The state behind the pages; one per server, so that all browsers show the same.
 
     Attributes:
-        folder: Where recipes and runs are.
-        registry: The plugins.
-        codes: What the terminal shows and a move asks for.
-        run: The run that was started here last, if any.
+        folder: Folder of recipes and runs.
+        registry: The installed plugins.
+        codes: Confirmation codes for motions, shown in the terminal.
+        run: The run started last from a page, if any.
         owner: The page that started it.
-        ran: The recipe that it was started with.
-        planned: The recipe whose poses were checked last, and its poses.
+        ran: The recipe with which it was started.
+        planned: The recipe whose poses were checked last, with these poses.
     """
 
     def __init__(self, folder: Path, registry: Registry, codes: MoveCodes) -> None:
@@ -76,7 +76,7 @@ class Project:
         write_whole(self.recipe_path, text)
 
     def data(self) -> dict[str, Any]:
-        """Return the recipe as data; empty while it is not a mapping."""
+        """Return the recipe as data; empty if it is not a mapping."""
         try:
             data = parse_yaml(self.text, self.recipe_path.name).data
         except RecipeError:
@@ -91,16 +91,16 @@ class Project:
         return {"model": given} if isinstance(given, str) else {}
 
     def steps(self) -> list[tuple[str, dict[str, Any]]]:
-        """Return name and given parameters of every step; of what is not a step, empty ones."""
+        """Return name and given parameters of every step; empty ones for an invalid step."""
         given = self.data().get("steps")
         return [_step_of(entry) for entry in given] if isinstance(given, list) else []
 
     def edit(self, data: dict[str, Any]) -> None:
-        """Write only what differs from the recipe on disk; comments are kept."""
+        """Write the changes to the recipe's file; comments are kept."""
         self.text = edited(self.text if self.data() else "", data)
 
     def start_from(self, recipe: Path) -> None:
-        """Take over another recipe; the files that it names stay where they are."""
+        """Use another recipe; the files that it names are not copied."""
         text = read_text(recipe)
         for name in set(re.findall(r"[\w./-]+", text)):
             beside = (recipe.parent / name).resolve()
@@ -139,9 +139,9 @@ class Project:
         return [p.parent for p in sorted(logs, key=lambda p: p.stat().st_mtime, reverse=True)]
 
     def found(self, pattern: str) -> list[Path]:
-        """Return files of the folder by a pattern, sorted; without those whose names are not text.
+        """Return the folder's files that match a pattern, sorted, without undecodable names.
 
-        A page cannot show those: Python stands half a UTF-16 pair in for a byte that is not UTF-8.
+        Python represents a byte that is not UTF-8 by a lone surrogate, which a page cannot show.
         """
         paths = sorted(self.folder.glob(pattern))
         here = len(str(self.folder))
@@ -164,7 +164,7 @@ class Project:
         return shlex.join(["flangeye", *words])
 
     def run_command(self, words: Sequence[str], patience: float = 300.0) -> str:
-        """Run a flangeye command in the folder and return its output; it moves nothing."""
+        """Run a flangeye command that moves nothing in the folder, and return its output."""
         line = [sys.executable, "-P", "-m", "flangeye.cli", *words]
         try:
             done = subprocess.run(
@@ -176,7 +176,7 @@ class Project:
         return (done.stdout + done.stderr).strip()
 
     def write_line(self, name: str, params: Mapping[str, Any]) -> None:
-        """Put a line into the recipe: parameters into a step, else a section into the header."""
+        """Insert a line into the recipe: parameters into a step, or a section into the header."""
         if "." in name:
             self.write_step(name, params)
         else:
@@ -228,8 +228,8 @@ class Project:
 
         Args:
             words: Words of the command, without ``--move``.
-            owner: The page.
-            code: From the terminal, which lets the run move an arm; without one nothing moves.
+            owner: The page that starts it.
+            code: Confirmation code from the terminal that permits motion; None moves nothing.
 
         Raises:
             StageError: The code does not belong to this command and page.
@@ -246,7 +246,7 @@ class Project:
 
 
 def _step_of(entry: Any) -> tuple[str, dict[str, Any]]:
-    """Return name and parameters of a step as it stands in a recipe."""
+    """Return name and parameters of a step as written in a recipe."""
     if isinstance(entry, dict) and len(entry) == 1:
         ((name, given),) = entry.items()
         return str(name), given if isinstance(given, dict) else {}
@@ -285,10 +285,10 @@ class MoveCodes:
         self._show(f"code {code} moves the arm: {line}   (asked for by the page, {life:.0f} s)")
 
     def spend(self, given: str, words: Sequence[str], page: str) -> None:
-        """Take the code back.
+        """Use up a confirmation code.
 
         Raises:
-            StageError: It is not the one that was shown for this, or is used up.
+            StageError: The code does not belong to this command, or was used already.
         """
         # Wrong codes of one server, by mistyping; guessing that often meets 5 of 10^6.
         if self._wrong >= 5:

@@ -73,7 +73,7 @@ class TouchBox:
         return {key: [x.strip() for x in text.split(",")] for key, text in texts.items() if text}
 
     def _look(self) -> None:
-        """Show what follows from the answers given so far."""
+        """Show the consequences of the answers so far."""
         given = self._given()
         examples = {key: example for key, (_, example) in ASKED.items()}
         # Those of them that ``flangeye touch`` takes: it reads the arm itself.
@@ -142,7 +142,7 @@ def add(project: Project) -> None:
 
 
 def chosen_run(project: Project, run: str, address: str, bar: ActionBar, show: Show) -> None:
-    """Let a run be chosen, the newest at first, and show it."""
+    """Show a run that the user selects; initially the newest."""
     runs = project.runs()
     chosen = next((r for r in runs if r.name == run), runs[0] if runs else None)
     if chosen is None:
@@ -205,7 +205,7 @@ def _show(project: Project, run: Path, facts: Facts, bar: ActionBar) -> None:
 
 
 def _light(facts: Facts) -> None:
-    """Show one light and one number: what it means, its 95 %, and the limit."""
+    """Show a status light with one number, its meaning, its 95 % value and the limit."""
     found = banner_of(facts)
     tone, sign, words = LIGHTS[found.kind]
     with ui.element("div").classes(f"card w-full {tone}"):
@@ -233,7 +233,7 @@ def _number(facts: Facts) -> None:
 
 
 def limit_of(facts: Facts) -> float | None:
-    """Return the largest error on poses held out that the recipe lets pass [m], if it has one."""
+    """Return the recipe's limit of the held-out error [m]; None without one."""
     held = facts.result.holdout
     return held.figures.get("limit") if held else None
 
@@ -282,7 +282,7 @@ def _warnings(project: Project, facts: Facts) -> None:
 
 
 def _line_of(project: Project, fix: str) -> dict[str, Any] | None:
-    """Return a warning's cure as a line of the recipe, where it is one."""
+    """Return a warning's remedy if it is a line of the recipe; else None."""
     try:
         found = parse_yaml(fix, "fix").data
     except RecipeError:
@@ -350,7 +350,7 @@ def _in_3d(project: Project, box: ui.expansion, facts: Facts) -> None:
 
 
 def _cell(project: Project, scene: Scene3D, facts: Facts) -> None:
-    """Draw scanner and arm; the arm where it is the recipe's, whose shape is served."""
+    """Draw the scanner, and the arm if it is the recipe's, whose shape is available."""
     found, (recipe, _) = scene_of(facts), project.check()
     if found is None:
         return
@@ -361,7 +361,7 @@ def _cell(project: Project, scene: Scene3D, facts: Facts) -> None:
 
 
 def _residuals(scene: Scene3D, facts: Facts) -> float:
-    """Draw each pose's residual as an arrow; return by how much its length is scaled up."""
+    """Draw each pose's residual as an arrow; return the arrows' scale factor."""
     left = [(o.tcp_in_base, o.residual_in_base, o.used) for o in facts.measured]
     arrows = [(np.array(p), np.array(r), used) for p, r, used in left if p and r]
     longest = max((float(np.linalg.norm(r)) for _, r, used in arrows if used), default=0.0)

@@ -103,7 +103,7 @@ class RunPanel:
             self._rows = ui.column().classes("gap-1 w-full")
 
     def _watch(self, client: Client) -> None:
-        """Look at the run, and at whether this page still lives."""
+        """Check the run, and whether this page is still open."""
         ui.on("beat", self._beat)
         client.on_disconnect(lambda: self._project.page_gone(self._me))
         ui.timer(
@@ -226,7 +226,7 @@ class RunPanel:
                 ui.label(line).classes("note")
 
     def _judge(self, run: RunProcess) -> None:
-        """Show what the poses so far are worth, and each scan with its verdict."""
+        """Show the expected quality from the poses so far, and each scan with its status."""
         found = run.outlook
         self._worth.clear()
         with self._worth:
@@ -342,7 +342,7 @@ def verdict_on(run: RunProcess, capture: str) -> tuple[str, str]:
 
 
 def _nothing(left: Path | None, other: Path | None) -> str:
-    """Return what the page shows while no run of this server is under way."""
+    """Return the page's text while no run of this server is in progress."""
     if other:
         return f"{other.name} runs elsewhere: flangeye watch runs/{other.name}"
     if left:

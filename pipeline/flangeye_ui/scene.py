@@ -82,7 +82,7 @@ def _picture(kind: str, name: str) -> str:
 
 
 def _mesh(robot: RobotModel, joints: Floats) -> bytes:
-    """Return the arm as STL, in the base: by meshes, its own or published, or else by capsules."""
+    """Return the arm as STL in the base: from its own or published meshes, or from capsules."""
     import trimesh
 
     drawn = next((arm for arm in (robot, _published(robot, joints)) if arm and arm.meshes()), None)
@@ -96,7 +96,7 @@ def _mesh(robot: RobotModel, joints: Floats) -> bytes:
 
 
 def _published(robot: RobotModel, joints: Floats) -> RobotModel | None:
-    """Return the arm of ``example-robot-data`` that stands as this one does, if there is one."""
+    """Return the arm of ``example-robot-data`` with the same kinematics; None without one."""
     found = _published_arm(robot.model)
     if found is None or len(found.joints) != len(robot.joints):
         return None
@@ -149,12 +149,12 @@ class Scene3D(ui.scene):
         views: Mapping[str, View] | None = None,
         hovered: Callable[[str], None] | None = None,
     ) -> None:
-        """Make one as wide as its column.
+        """Create a scene as wide as its column.
 
         Args:
-            height: Its height [pixels].
-            views: To look from, by name; None for those of a cell.
-            hovered: Hears which named thing is pointed at.
+            height: Height [px].
+            views: Viewpoints by name; None for those of a cell.
+            hovered: Called with the name of the object under the pointer.
         """
         # At night what is light is dark and colours keep their hue: a scene has one background
         # only.
@@ -196,7 +196,7 @@ class Scene3D(ui.scene):
         self.run_method("resize")
 
     def frame(self, places: Floats) -> None:
-        """Look at a cell from where all of the places (N, 3) fill the picture [m]."""
+        """Move the viewpoint such that all positions (N, 3) [m] fill the picture."""
         self._of = views_of(places)
         self.look(next(iter(self._of)))
 
@@ -212,20 +212,20 @@ class Scene3D(ui.scene):
             self._hovered(name)
 
     def arm(self, robot: RobotModel, joints: Floats | None = None) -> None:
-        """Draw the arm, with these joint values or ready to be scanned."""
+        """Draw the arm, with these joint values or in a typical pose."""
         with self:
             body = self.stl(address_of_arm(ready(robot) if joints is None else joints))
             body.material("#aab4c3")
 
     def box_of(self, centre: Floats, size: Floats) -> None:
-        """Draw the edges of the box that the arm keeps to [m]."""
+        """Draw the edges of the arm's allowed box [m]."""
         width, depth, height = np.asarray(size).tolist()
         with self:
             box = self.box(width, depth, height, wireframe=True)
             box.move(*np.asarray(centre).tolist()).material(SERIES["unused"])
 
     def sees(self, scanner: ScannerModel, base_T_camera: Floats) -> Any:
-        """Draw the scanner's field of view; return the ball that marks the scanner."""
+        """Draw the scanner's field of view; return the ball that represents the scanner."""
         near, far = frustum(scanner, base_T_camera)
         rays = [np.stack([base_T_camera[:3, 3], corner]) for corner in far[:4]]
         for line in (near, far, *rays):
@@ -235,7 +235,7 @@ class Scene3D(ui.scene):
         return ball.material(SERIES["used"])
 
     def lines(self, points: Floats, colour: str) -> None:
-        """Draw lines from point to point."""
+        """Draw a polyline through points."""
         with self:
             for start, end in pairwise(np.asarray(points).tolist()):
                 self.line(start, end).material(colour)
@@ -268,7 +268,7 @@ class Scene3D(ui.scene):
                 shown.with_name("said").move(x, y, z + 0.05)
 
     def cloud(self, points: Floats, colour: str, size: float = 0.002) -> None:
-        """Draw a cloud, thinned and to 0.1 mm, in one colour, its points of a size [m]."""
+        """Draw a cloud, thinned and rounded to 0.1 mm, in one colour and point size [m]."""
         # Points of a cloud that are sent: 20,000 held a browser up for a second on two busy cores
         most_sent = 2_500
         few = np.round(points[:: 1 + len(points) // most_sent], 4)
@@ -352,7 +352,7 @@ class ScanView:
     """A 3D scene, with a line on the outcome of its scan.
 
     Attributes:
-        log: What the scans are of; None until it was read.
+        log: Log of the scans; None until it was read.
     """
 
     def __init__(self, log: RunLog | None = None) -> None:

@@ -1,10 +1,9 @@
-"""The server: one address, a token for each browser, five pages.
+"""The server of the pages, with its access control.
 
-Who may speak to the page: Host, Origin, method, and a secret that a browser holds.
-
-The terminal prints an address with a token that works once. It is exchanged for a cookie whose name
-and path are random, so that no program on another port of this machine gets it or can put one of
-its own in its place. Nothing behind the gate sees cookies.
+A request is accepted by its Host, Origin, method, and a secret cookie. The terminal prints an
+address with a one-time token, which is exchanged for a cookie with random name and path, so that no
+program on another port of this machine receives or replaces it. The pages behind the access control
+do not see cookies.
 """
 
 from __future__ import annotations
@@ -63,14 +62,14 @@ def serve(folder: Path, registry: Registry, host: str, port: int, browser: bool)
     """Serve the pages until Ctrl-C.
 
     Args:
-        folder: Where recipes and runs are.
+        folder: Folder of recipes and runs.
         registry: The plugins.
         host: Address to listen on.
         port: Port to listen on.
-        browser: Open one, where there is one.
+        browser: Whether to open a browser.
 
     Raises:
-        StageError: The port is taken, or the folder is not there or cannot be written.
+        StageError: The port is in use, or the folder does not exist or is not writable.
     """
     if not folder.is_dir():
         raise StageError(f"{folder}: is not a folder")
@@ -107,17 +106,17 @@ def say(line: str) -> None:
 
 
 def in_words(record: logging.LogRecord) -> bool:
-    """Return True; a foreseen mistake in the record becomes one line, as a command says it."""
+    """Return True, after reducing an expected error in a log record to one line."""
     if record.exc_info and isinstance(error := record.exc_info[1], FlangeyeError):
         record.msg, record.exc_info = printable(f"error: {error}"), None
     return True
 
 
 def way_in(folder: Path, address: str) -> Path:
-    """Write a file that leads to an address which other users of the machine must not see.
+    """Write a file that redirects to an address which other users must not see.
 
-    What a program is started with can be read by everybody, so a browser is started with a file
-    that only its user can read, in the folder, where a confined browser may read it too.
+    Command lines are readable by everybody, so the browser is started with a file that only its
+    user can read. The file is in the folder, where a sandboxed browser can read it too.
 
     Raises:
         StageError: The folder cannot be written.
@@ -166,8 +165,8 @@ class Keys:
     """The secrets of one server.
 
     Attributes:
-        path: Under which the page lives, such as ``/q3V…``.
-        token: The one that lets the next browser in.
+        path: Random path prefix of the pages, such as ``/q3V…``.
+        token: One-time token for the next browser.
     """
 
     def __init__(self, issued: Callable[[str], None]) -> None:
@@ -178,7 +177,7 @@ class Keys:
         self._sessions: list[bytes] = []
 
     def exchange(self, given: str) -> str | None:
-        """Return the cookie to set for the token, which is used up by this; None for another."""
+        """Return the cookie for the valid token, which is used up; None for another token."""
         if not secrets.compare_digest(given.encode(), self.token.encode()):
             return None
         self.token = secrets.token_urlsafe(16)
@@ -223,7 +222,7 @@ class Gate:
             await send({"type": "websocket.close", "code": 1008})
 
     def _answer(self, scope: Scope, headers: Headers) -> Response | None:
-        """Return why a request goes no further, or what lets a browser in; None to hand it on."""
+        """Return a refusal or the sign-in response; None to forward the request."""
         if not self.is_ours(headers.get("host", "")):
             return PlainTextResponse("this server has another name\n", 421)
         if not _same_origin(scope, headers):
@@ -256,7 +255,7 @@ class Gate:
         return name in self._names or (self._any and _is_address(name.strip("[]")))
 
     def _inside(self, scope: Scope) -> Scope:
-        """Return the request as the page may see it: no cookies, no say in its own prefix."""
+        """Return the request for the pages, without cookies and with the server's prefix."""
         hidden = (b"cookie", b"x-forwarded-prefix")
         headers = [(k, v) for k, v in scope["headers"] if k.lower() not in hidden]
         return {**scope, "headers": headers, "root_path": self._keys.path}
@@ -270,10 +269,10 @@ def _is_address(name: str) -> bool:
 
 
 def _same_origin(scope: Scope, headers: Headers) -> bool:
-    """Return whether a request comes from this page, or from a person who opened the address.
+    """Return whether a request comes from these pages, or from a user who opened the address.
 
-    A web socket is not held to its origin by browsers and has to name it. The first visit comes
-    from elsewhere, with a token as its proof.
+    Browsers do not restrict web sockets to their origin, so these must state it. The first visit
+    has another origin and is authenticated by its token.
     """
     origin, site = headers.get("origin"), headers.get("sec-fetch-site", "none")
     if scope["type"] == "websocket":

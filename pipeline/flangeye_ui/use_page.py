@@ -56,7 +56,7 @@ def _show(project: Project, run: Path, facts: Facts, bar: ActionBar) -> None:
 
 
 class Systems:
-    """The systems that take the calibration: searched, looked at, copied, downloaded."""
+    """List of the systems that can use the calibration: search, preview, copy, download."""
 
     def __init__(
         self,
@@ -106,7 +106,7 @@ class Systems:
                 return
 
     def _choose(self, name: str) -> None:
-        """Show what this system takes."""
+        """Show the file for the selected system."""
         for each, item in self._items.items():
             item.props(
                 add="active" if each == name else "", remove="" if each == name else "active"
@@ -167,7 +167,7 @@ class CertificateForm:
         return ["certificate", where, *(f"--{key}={value}" for key, value in given.items())]
 
     async def _preview(self) -> None:
-        """Show what it will say: without scripts, in an origin of its own."""
+        """Show a preview, without scripts and in a separate origin."""
         self._line.text = self._project.command(*self._words())
         given = {key: box.value or "" for key, box in self._boxes.items()}
         try:
@@ -188,7 +188,7 @@ class CertificateForm:
 
 
 def _number(key: str, text: str) -> float | None:
-    """Return what was typed as a number, None where nothing was; raises ValueError otherwise."""
+    """Return typed text as a number, None for empty text; raise ValueError otherwise."""
     try:
         return float(text) if text else None
     except ValueError:
@@ -198,8 +198,9 @@ def _number(key: str, text: str) -> float | None:
 def exported(result: r.Result, exports: Sequence[Stage]) -> dict[str, ExportedFile]:
     """Return the files of a calibration by format, with default parameters.
 
-    Nothing of one that was refused or not finished; formats whose parameters have no defaults, or
-    that cannot write this pose, or of a cell carry one transform alone, are left out.
+    A refused or unfinished calibration has no files. Formats are left out if their parameters have
+    no defaults, they cannot write this pose, or they carry one transform but the calibration is of
+    a cell.
     """
     if result.status not in ("verified", "unverified") or not result.transforms:
         return {}

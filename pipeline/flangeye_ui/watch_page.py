@@ -1,4 +1,4 @@
-"""Watch: whether stored calibrations still hold, by the checks of ``flangeye monitor``."""
+"""Watch page: validity of stored calibrations by the checks of ``flangeye monitor``."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def add(project: Project) -> None:
 
 
 class Watch:
-    """Holds new scans against a stored calibration, and shows the state of each."""
+    """Compares new scans with stored calibrations, and shows the state of each."""
 
     def __init__(self, project: Project, stored: list[str], bar: ActionBar) -> None:
         self._project, self._stored, self._bar = project, stored, bar
@@ -74,7 +74,7 @@ class Watch:
         self._check.set_enabled(bool(self._new.value))
 
     async def _begin(self) -> None:
-        """Run the command that checks, and show what it found."""
+        """Run the monitoring command, and show its result."""
         self._check.disable()
         self._bar.say("Looking for the flange in the new scans …")
         said = await asyncio.to_thread(self._project.run_command, self._words)
@@ -123,10 +123,10 @@ def _charts(project: Project) -> None:
 
 
 def _history(run: Path) -> History:
-    """Return the checks of a run's calibration, of which there is one at least.
+    """Return the checks of a run's calibration; there is at least one.
 
     Raises:
-        FlangeyeError: The run or its history cannot be read, or holds no check.
+        FlangeyeError: The run or its history cannot be read, or has no check.
     """
     stored = stored_calibration(run)
     history = History.read(history_beside(stored.path), stored.key)

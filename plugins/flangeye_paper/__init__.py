@@ -1,6 +1,6 @@
-"""The paper's studies, done again: a plugin of its own, installed with the extra ``paper``.
+"""Reproduction of the paper's studies: a separate plugin, installed with the extra ``paper``.
 
-No solver for a real cell is here.
+It has no solver for real cells.
 """
 
 from collections.abc import Mapping

@@ -68,7 +68,7 @@ def _page(readme: Annotated[Path, typer.Argument(help="The page to renew.")]) ->
 
 
 def main() -> None:
-    """Run a command; what a person can mend is one line, exit code 2."""
+    """Run a command; an expected error is printed as one line, with exit code 2."""
     try:
         app()
     except FlangeyeError as error:

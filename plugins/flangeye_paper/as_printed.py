@@ -38,12 +38,12 @@ class AsPrinted:
     """The paper's controller.
 
     Attributes:
-        mode: Shown in messages and reports.
-        phase: Following until the torch is at the end of the plan.
-        reason: Always empty: it knows no reason to stop.
+        mode: Name in messages and reports.
+        phase: "following" until the torch reaches the end of the plan.
+        reason: Always empty, as it never stops by itself.
         tip: Arc length of the plan's point nearest to the robot's end point [m].
         torch: Arc length of the plan's point nearest to the torch [m].
-        wanted: Deflection asked of the tip, always the same [m].
+        wanted: Constant set point of the tip's deflection [m].
     """
 
     def __init__(self, task: FollowingTask) -> None:

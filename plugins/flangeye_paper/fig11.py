@@ -86,7 +86,7 @@ def _rows(robot: str, source: str, runs: Runs) -> list[Row]:
 
 
 def _summary(robot: str, source: str, runs: Runs) -> Row:
-    """Return what the last answers of all runs come to."""
+    """Return a summary of the final results of all runs."""
     last = runs.errors[:, -1]
     norms = np.linalg.norm(last[:, :3], axis=1)
     deviations = last.std(axis=0)
@@ -123,7 +123,7 @@ def _draw(runs: Mapping[tuple[str, str], Runs]) -> Any:
 
 
 def _spread(panel: Any, rows: Sequence[Row], axes: Sequence[str], filled: bool) -> None:
-    """Draw mean and deviation of each axis as a band, or its two edges alone."""
+    """Draw mean and standard deviation of each axis as a band, or as its two edges."""
     for axis in axes:
         poses, mean, deviation = map(
             np.array, columns(rows, "poses", f"{axis}_mean", f"{axis}_std")

@@ -1,4 +1,4 @@
-"""Figure 13 and what the paper does not measure: how far the torch is from the true seam."""
+"""Figure 13, and a quantity the paper does not measure: the torch's distance from the true seam."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ FOLLOWED = {
 
 @dataclass(frozen=True, eq=False)
 class SeenWeld:
-    """A weld and the truth.
+    """A simulated weld with its truth.
 
     Attributes:
-        report: What was logged of it.
-        truth: (N, 3) the true seam, in base [m].
+        report: Report of the weld from its log.
+        truth: (N, 3) the true seam in base [m].
     """
 
     report: WeldReport
@@ -39,7 +39,7 @@ class SeenWeld:
 
     @property
     def torch(self) -> Floats:
-        """(K, 3) where the torch really was, in base [m]; as believed in logs that do not say."""
+        """True positions (K, 3) of the torch in base [m]; estimated ones without truth."""
         return self.report.true_torch if len(self.report.true_torch) else self.report.torch
 
     def deviation(self, part: tuple[float, float] = (0.0, np.inf)) -> Floats:
@@ -83,7 +83,7 @@ class SeenWeld:
         return float(np.max(steps, initial=0.0))
 
     def _seen(self, points: Floats) -> tuple[Floats, Floats]:
-        """Return arc lengths (K,) of points (K, 3) and how far they are to the left (K,) [m]."""
+        """Return arc lengths (K,) and offsets to the left (K,) of points (K, 3) [m]."""
         plane = WeldPlane(self.truth, self.report.opening)
         return plane.beside(self.truth, points)
 
@@ -92,7 +92,7 @@ def seen(session: SessionRow) -> SeenWeld:
     """Return the weld of a session.
 
     Raises:
-        FlangeyeError: It did not get so far.
+        FlangeyeError: The session ended before the weld.
     """
     log = read_run(session.folder / "run.mcap")
     weld, scan = log.last(WeldReport), log.last(WorkpieceScan)

@@ -85,7 +85,7 @@ def _summary(rows: Sequence[Row], method: str) -> dict[str, Any]:
 
 
 def _pool(session: SessionRow) -> dict[str, Any]:
-    """Return what a pool of so many poses makes of the paper's claim of one seventh."""
+    """Return a text that compares a pool of this size with the paper's claim of one seventh."""
     row = realised(session)
     return {
         "pool": int(session.number("steps.1.pool")),

@@ -38,7 +38,7 @@ class CentreSet(NamedTuple):
     """One set of centres.
 
     Attributes:
-        name: Shown in messages and reports.
+        name: Name in messages and reports.
         stored: Name of the stored results that belong to these centres.
     """
 

@@ -24,7 +24,7 @@ class AsLaidParams(LaidParams):
 
 @stage("scan.as_laid")
 def scan_as_laid(params: AsLaidParams) -> WorkpieceScan:
-    """Nothing is scanned: where the workpiece lies is known, for a study of the weld alone."""
+    """Return the workpiece at its known pose without scanning, for a study of the weld alone."""
     points, _, _ = params.seam()
     cloud = PointCloud(CAMERA, points.astype(np.float32))
     return WorkpieceScan(cloud, f"{params.workpiece.stem}, as laid", (), {"groove": points})

@@ -23,11 +23,12 @@ Normals = Literal["open3d_0_7_normals", "sound"]
 
 @dataclass(frozen=True)
 class IcpStop:
-    """When ICP ends: few steps, or changes of share and rms below a limit.
+    """Stopping criteria of ICP.
 
     Attributes:
-        iterations: At most so many.
-        change: Least change of the matched share, and of their rms distance in the cloud's unit.
+        iterations: Largest number of iterations.
+        change: Limit of the changes of the matched share, and of the rms distance in the cloud's
+            unit.
     """
 
     iterations: int
@@ -38,8 +39,8 @@ def normals_of(points: Floats, radius: float, kind: Normals) -> Floats:
     """Return the (N, 3) normals of a cloud from each point's neighbours.
 
     Args:
-        points: (N, 3).
-        radius: Neighbours lie within it; at most 30 are used.
+        points: (N, 3) positions.
+        radius: Largest distance of neighbours, of which at most 30 are used.
         kind: Open3D's up to 0.7, or the direction in which the neighbourhood is thinnest.
     """
     covariances = _covariances(points, radius)

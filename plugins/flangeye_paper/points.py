@@ -52,10 +52,10 @@ class Realisation:
     """One draw of poses and noise.
 
     Attributes:
-        tcps: (N, 3) in ``base`` [m].
-        rotations: (N, 3, 3) base_R_flange.
-        centres: (N, 3) as measured, in ``camera`` [m].
-        gross: (N,) which of them are gross outliers.
+        tcps: (N, 3) flange centres in ``base`` [m].
+        rotations: (N, 3, 3) ``base_R_flange``.
+        centres: (N, 3) measured centres in ``camera`` [m].
+        gross: (N,) mask of gross outliers.
     """
 
     tcps: Floats
@@ -74,15 +74,15 @@ def grid() -> Floats:
 
 
 def realise(rng: np.random.Generator, noise: float, outliers: float, poses: int) -> Realisation:
-    """Draw the grid's poses in random order, and their centres by equation (18).
+    """Return the grid's poses in random order, with measured centres by equation (18).
 
-    The whole grid is drawn whatever ``poses`` is, so that fewer poses are the first of more.
+    The whole grid is always drawn, so that fewer poses are a prefix of more.
 
     Args:
-        rng: Source of everything random.
+        rng: Random generator.
         noise: Standard deviation of each coordinate [m].
         outliers: Share of gross outliers among the poses.
-        poses: How many of the 75 are used.
+        poses: Number of the 75 poses that are used.
     """
     tcps = rng.permutation(grid())
     tilt = 0.3  # largest roll, pitch and yaw of a pose [rad]
@@ -102,28 +102,28 @@ def realise(rng: np.random.Generator, noise: float, outliers: float, poses: int)
 
 
 def errors_of(base_T_camera: Floats) -> Floats:
-    """Return an estimate's error as the paper has it: camera'_T_camera, (4, 4).
+    """Return an estimate's error as defined in the paper: ``camera'_T_camera`` (4, 4).
 
-    It takes what was measured onto what the estimate predicts, in ``camera``.
+    It maps measured to predicted points in ``camera``.
     """
     estimate = rigid(base_T_camera[:3, :3].T, -base_T_camera[:3, :3].T @ base_T_camera[:3, 3])
     return np.asarray(estimate @ BASE_T_CAMERA)
 
 
 def rms_over_workspace(base_T_camera: Floats, points: Floats) -> float:
-    """Return how far an estimate maps (N, 3) points of the workspace off, rms [m]."""
+    """Return the rms error of workspace points (N, 3) mapped by an estimate [m]."""
     error = base_T_camera @ np.linalg.inv(BASE_T_CAMERA)
     moved = points @ error[:3, :3].T + error[:3, 3] - points
     return float(np.sqrt((moved**2).sum(axis=1).mean()))
 
 
 def bound(tcps: Floats, noise: float, points: Floats) -> dict[str, float]:
-    """Return the least standard deviations any unbiased estimate can have (Cramér-Rao).
+    """Return the Cramér-Rao bound: the smallest standard deviations of an unbiased estimate.
 
     Args:
-        tcps: (N, 3) of the poses that are not outliers [m].
+        tcps: (N, 3) flange centres of the poses that are not outliers [m].
         noise: Standard deviation of each coordinate [m].
-        points: (M, 3) of the workspace, for ``workspace_rms`` [m].
+        points: (M, 3) workspace points for ``workspace_rms`` [m].
     """
     covariance, about = kabsch_covariance(tcps, noise), tcps.mean(axis=0)
     rotation, origin = BASE_T_CAMERA[:3, :3], BASE_T_CAMERA[None, :3, 3]
@@ -151,13 +151,13 @@ class PointsParams(Params):
 
 @dataclass(frozen=True, eq=False)
 class PointSource(Source):
-    """Where simulated points come from: enough to draw them again with other noise.
+    """Provenance of simulated points, sufficient to draw them again with other noise.
 
     Attributes:
         noise: Standard deviation of each coordinate [m].
         outliers: Share of gross outliers.
-        poses: How many poses.
-        seed: The recipe's.
+        poses: Number of poses.
+        seed: Seed of the recipe.
     """
 
     noise: float = 0.0
@@ -168,7 +168,8 @@ class PointSource(Source):
     def draw(self, index: int) -> Realisation:
         """Return one of any number of realisations; the recipe itself runs on the first, 0.
 
-        Every noise has draws of its own; poses, outliers and solvers meet the same draws.
+        The draws depend on the noise, but are the same for all numbers of poses, outlier shares and
+        solvers.
         """
         nanometres = round(self.noise * 1e9)
         rng = np.random.default_rng([self.seed, nanometres, index])

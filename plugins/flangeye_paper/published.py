@@ -65,10 +65,10 @@ class PublishedView(VerificationView):
     """A published verification cloud with its CAD cloud, both in the unit of their files.
 
     Attributes:
-        per_metre: The unit: 1 or 1000 to a metre.
-        measured: (N, 3) in ``camera``.
-        shape: (M, 3) in the CAD's own frame, where its face is exactly flat along an axis.
-        flange_T_shape: (4, 4).
+        per_metre: Units per metre: 1 or 1000.
+        measured: (N, 3) points in ``camera``.
+        shape: (M, 3) points in the CAD's frame, in which its face is exactly flat along an axis.
+        flange_T_shape: (4, 4) pose of the CAD's frame.
     """
 
     per_metre: float
@@ -182,7 +182,7 @@ def verify_stored_results(
     the 50 imply, and ``x_std``, ...: how far the 50 disagree, for their ICP had not converged.
 
     Raises:
-        StageError: The stored results are not where the published folder has them.
+        StageError: The stored results are not in the published folder.
     """
     matrices, motions = stored_results(archive.path or Path(), params.robot)
     transform = calibration.base_T_camera.transform

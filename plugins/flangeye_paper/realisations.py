@@ -103,7 +103,7 @@ def _outcomes(source: PointSource, solve: Solver, count: int) -> Iterator[Realis
 
 
 def outcome_of(base_T_camera: Floats, drawn: Realisation, noise: float) -> RealisationOutcome:
-    """Return how far an estimate is off."""
+    """Return the errors of an estimate."""
     error, good = errors_of(base_T_camera), ~drawn.gross
     at = BASE_T_CAMERA[:3, :3].T @ (WORKSPACE.centre - BASE_T_CAMERA[:3, 3])
     alone = rigid(*kabsch(drawn.centres[good], drawn.tcps[good]))

@@ -1,4 +1,4 @@
-"""Read what ``flangeye batch`` left, draw and write what the page shows, as the paper prints it."""
+"""Read the results of ``flangeye batch``, and write figures and tables in the paper's style."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class SessionRow:
     """One session of a batch.
 
     Attributes:
-        row: Its row of ``sessions.csv``.
-        folder: Where its ``result.json`` is.
+        row: Row of ``sessions.csv``.
+        folder: Folder with ``result.json``.
     """
 
     row: Mapping[str, str]
@@ -36,7 +36,7 @@ class SessionRow:
         """Return the document ``result.json``.
 
         Raises:
-            FlangeyeError: It is not there.
+            FlangeyeError: The file does not exist.
         """
         path = self.folder / "result.json"
         try:
@@ -128,7 +128,7 @@ GROWTH = 1 / 7
 
 
 class Look(NamedTuple):
-    """How a method is called and drawn."""
+    """Label and style of a method in plots."""
 
     label: str
     colour: str

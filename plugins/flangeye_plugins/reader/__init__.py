@@ -1,1 +1,1 @@
-"""``reader.*``: layouts of archives and tables of poses. Add a layout: a new module here."""
+"""``reader.*`` parts: layouts of archives and tables of poses, one module per layout."""

@@ -76,7 +76,7 @@ def read_ur(folder: Path) -> Archive:
 
 
 def read_franka(folder: Path) -> Archive:
-    """Read the Franka before a PhoXi M: poses it was sent to, centres in millimetres."""
+    """Read the Franka before a PhoXi M: commanded poses, centres in millimetres."""
     poses_file = folder / "calibration_robot_pose_data.npy"
     rows = read_npy(poses_file, (None, 7))
     poses = {
@@ -89,7 +89,7 @@ def read_franka(folder: Path) -> Archive:
 
 
 def _in_millimetres(folder: Path, poses_file: Path, poses: Poses) -> Archive:
-    """Return poses with the clouds and centres that are numbered as they are."""
+    """Return poses with the clouds and centres of the same numbers."""
     clouds = _clouds(folder)
     _refuse_unpaired(clouds, poses, poses_file)
     recordings = _with_centres(folder, poses, clouds, MM)
@@ -154,7 +154,7 @@ def _sample_recording(where: str, key: str, entry: Any, cloud: Path) -> Recordin
 
 
 def _sample_clouds(folder: Path) -> list[Path]:
-    """Return one cloud a number; the coloured copies hold the same points in another order."""
+    """Return one cloud per number; coloured copies have the same points in another order."""
     chosen: dict[str, Path] = {}
     for ending in ("_tool.ply", "_tool_valid.pcd", "_tool_valid.ply"):
         for path in folder.glob(f"*{ending}"):
@@ -260,7 +260,7 @@ Robot = Literal["aubo", "ur5", "ur10e", "franka", "kinect", "sample-2019"]
 
 @dataclass(frozen=True)
 class _Place:
-    """Where a recording is in the repository, and the file that gives it away."""
+    """Location of a recording in the repository, and the file by which it is recognised."""
 
     folder: PurePosixPath
     marker: str
@@ -280,7 +280,7 @@ _PLACES: Mapping[str, _Place] = {
 
 
 class AncorasirParams(Params):
-    """Which of the recordings."""
+    """Selection of a recording."""
 
     robot: Robot | None = Field(
         None,
@@ -319,7 +319,7 @@ def _chosen(path: Path, robot: str, found: Mapping[str, Path]) -> Path:
 
 
 def _recordings_in(path: Path) -> dict[str, Path]:
-    """Return every recording at or below ``path``; a folder counts once, by its own name."""
+    """Return the recordings at or below ``path``, by name, one for each folder."""
     found: dict[str, Path] = {}
     for robot in _PLACES:
         folder = _locate(path, robot)
@@ -329,7 +329,7 @@ def _recordings_in(path: Path) -> dict[str, Path]:
 
 
 def _locate(path: Path, robot: str) -> Path | None:
-    """Return the recording's folder when ``path`` is the repository or a folder on the way."""
+    """Return a recording's folder, given the repository or a folder between; else None."""
     place = _PLACES[robot]
     parts = place.folder.parts
     others = {p.folder.name for p in _PLACES.values()} - {place.folder.name}

@@ -1,4 +1,4 @@
-"""Find out which reader knows a path: the built-in ones, and those of every installed plugin."""
+"""``reader.auto``: choose the reader that fits a path, among all installed ones."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def _bound(reader: Part) -> BoundPart | None:
 def _tried(
     readers: Mapping[str, BoundPart], path: Path, kinematics: RobotModel | None
 ) -> tuple[dict[str, Archive], list[str]]:
-    """Return what each reader gave that knows the path, and the others' reasons."""
+    """Return the archives by readers that fit the path, and the other readers' reasons."""
     found: dict[str, Archive] = {}
     missed: list[str] = []
     for name, reader in readers.items():

@@ -1,6 +1,6 @@
-"""Tables of a cell: one for each arm, rail or positioner, and one for each camera.
+"""``reader.cell``: tables of a cell, one per arm, rail or positioner and one per camera.
 
-They are joined by the number of the pose, by time, or, where tables have neither, row by row.
+They are joined by the pose's number, by time, or, without these, row by row.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from flangeye_plugins.reader.pairing import MatchedPose, PairingParams, pair
 
 
 class JoinedParams(Params):
-    """A further table, joined with the others."""
+    """An additional table, joined with the others."""
 
     file: str
     """The table's name, beside the others."""
@@ -85,18 +85,18 @@ class AxisTableParams(JoinedParams, TimesParams):
 
 
 class SightingsParams(SeenParams, SeenPoseParams, OwnTableParams):
-    """One target as one camera measured it; empty cells mean not seen."""
+    """One target measured by one camera; empty cells mean not seen."""
 
 
 class ScansParams(SeenParams):
-    """The scans that one camera took of one target: a table that names them."""
+    """One camera's scans of one target: a table that names the files."""
 
     scan: Column = "scan"
     """Column of the scans' files, beside the table."""
 
 
 class CellParams(Params):
-    """Which tables there are, each in a stated convention."""
+    """The tables of a cell, each in a stated convention."""
 
     arms: dict[str, ArmTableParams] = Field(default_factory=dict)
     """Tables of the arms' poses, by arm name in the recipe's cell."""
@@ -121,12 +121,12 @@ class Moved:
     """Recorded poses of one controller.
 
     Attributes:
-        name: Name of the frame that moves.
+        name: Name of the moving frame.
         text: The table.
-        values: (N, 4, 4) poses, or (N,) values of an axis [m or rad].
-        keys: Number of each row's pose, by its position in the table; None where it has a time.
-        times: (N,) [s], or None.
-        joints: (N, n) of an arm whose joints were recorded [rad], or None.
+        values: (N, 4, 4) poses, or (N,) positions of an axis [m or rad].
+        keys: Row index by the pose's number; None for a table with times.
+        times: (N,) times [s], or None.
+        joints: (N, n) joint angles of an arm [rad], or None.
     """
 
     name: str
@@ -139,7 +139,7 @@ class Moved:
 
 @dataclass(frozen=True, eq=False)
 class CameraTable:
-    """Recorded targets of a camera: (4, 4), (3,) or a scan each; None if not seen."""
+    """A camera's recorded targets: a pose (4, 4), a point (3,) or a scan each; None if not seen."""
 
     given: SightingsParams | ScansParams
     text: Table
@@ -156,7 +156,7 @@ class Moment:
         at: Pose (4, 4) of each carrier by name, or the position of an axis [m or rad].
         joints: (n,) joint angles of each arm that reported them [rad].
         time: Time of the moment [s].
-        motion: How everything passed it.
+        motion: Motions of all carriers around this moment; None at rest.
     """
 
     at: Mapping[str, Floats]
@@ -167,7 +167,7 @@ class Moment:
 
 @part("reader.cell")
 def cell(path: Path, params: CellParams) -> Archive:
-    """Read the tables of a cell: of what each controller reported, and of what each camera saw."""
+    """Read the tables of a cell: controllers' poses, and cameras' measurements."""
     files = {given.file for given in params.sightings} | {given.file for given in params.scans}
     if not any(files_at(path, file) for file in files):
         raise NotThisLayout(f"{path}: holds no {' or '.join(sorted(files))}")
@@ -235,7 +235,7 @@ def _taken(given: OwnTableParams) -> list[Column]:
 
 
 def _keys(text: Table, number: Column | None, times: Floats | None) -> dict[str, int] | None:
-    """Return where the row of each number is, or of each row where there are no numbers.
+    """Return the row index by number, or by row if there are no numbers.
 
     Raises:
         StageError: A number is given twice.
@@ -291,7 +291,7 @@ def _by_number(seen: CameraTable, moved: Sequence[Moved]) -> Iterator[Recording]
 def _by_time(
     seen: CameraTable, moved: Sequence[Moved], params: PairingParams
 ) -> tuple[list[Recording], list[str]]:
-    """Pair with the first arm's standstills; the others must stand still as well."""
+    """Pair measurements with the first arm's standstills, at which all others must be at rest."""
     first = next((each for each in moved if each.values.ndim == 3), None)
     if first is None or first.times is None:
         raise StageError(f"{seen.text.file}: joining by time needs the table of an arm")
@@ -323,7 +323,7 @@ def _moment(first: Moved, moved: Sequence[Moved], found: MatchedPose) -> Moment:
 
 
 def _motion(first: Moved, moved: Sequence[Moved], found: MatchedPose) -> Motion | None:
-    """Return how all arms, rails and positioners passed; None where the first stood still."""
+    """Return the motions of all arms, rails and positioners; None if the first was at rest."""
     if found.motion is None or first.times is None:
         return None
     streams = {m.name: (np.asarray(m.times), m.values) for m in moved}
@@ -356,7 +356,7 @@ def _at(each: Moved, time: float) -> Floats:
 
 
 def _stands(each: Moved, found: MatchedPose, events: Floats) -> bool:
-    """Whether something stands still while the measurements of one standstill are taken."""
+    """Return whether a carrier is at rest during the measurements of one standstill."""
     half = np.ptp(events[list(found.events)]) / 2
     before, after = (_at(each, found.time + side) for side in (-half, half))
     if each.values.ndim == 1:

@@ -1,4 +1,4 @@
-"""Columns of a text table: which hold a pose, a point or a time, and in which convention."""
+"""Columns of a table with a pose, a point or a time, and their conventions."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ POINT = "point"
 
 
 class WrittenParams(Params):
-    """How poses are written: rotation, units, columns; all stated by the recipe."""
+    """Notation of poses: rotation, units, columns; all stated in the recipe."""
 
     rotation: str = Field(
         description="How the rotations are written: xyzw or wxyz (quaternions), vector, three axes "
@@ -59,14 +59,14 @@ class WrittenParams(Params):
 
     @classmethod
     def more(cls) -> tuple[str, ...]:
-        """Return what may be written here other than full poses."""
+        """Return the notations allowed in addition to full poses."""
         return ()
 
     def value(self, where: str, numbers: Floats) -> Floats:
         """Return the pose (4, 4) or the point (3,) [m] of a row of numbers.
 
         Raises:
-            StageError: They are not a pose in this convention.
+            StageError: The numbers are not a pose in this convention.
         """
         if self.rotation == POINT:
             if numbers.size != 3 or not np.isfinite(numbers).all():
@@ -79,14 +79,14 @@ class WrittenParams(Params):
 
 
 class CloudUnitParams(Params):
-    """The unit of clouds that lie beside poses."""
+    """Unit of the clouds that belong to poses."""
 
     cloud_unit: LengthUnit | None = None
     """Unit of the clouds; found by the scanner's range if not given."""
 
 
 class TimesParams(Params):
-    """Which column holds the time."""
+    """Column of the time."""
 
     time: Column | None = None
     """Column of the time."""
@@ -95,7 +95,7 @@ class TimesParams(Params):
 
 
 class ColumnsParams(TimesParams, WrittenParams):
-    """Which columns hold a pose, and how it is written."""
+    """Columns and notation of a pose."""
 
     columns: tuple[Column, ...] = ()
     """Names in the heading, or numbers from 1, in the order of the convention: position first; of
@@ -110,19 +110,19 @@ class FlangePoseParams(ColumnsParams):
 
 
 class SeenPoseParams(ColumnsParams):
-    """A target as a camera measured it; empty cells, and a pose of zeros, mean not seen."""
+    """A target measured by a camera; empty cells and an all-zero pose mean not seen."""
 
     pose: Literal["camera_T_target", "target_T_camera"] = "camera_T_target"
     """Whose pose it is. rotation: point gives its place alone."""
 
     @classmethod
     def more(cls) -> tuple[str, ...]:
-        """A point has no rotation."""
+        """Return also "point", which has no rotation."""
         return (POINT,)
 
 
 class JointsParams(Params):
-    """Which columns hold the joint angles of the same poses."""
+    """Columns of the joint angles of the same poses."""
 
     joints: tuple[Column, ...] = ()
     """Columns of the joint angles, from the base, where they were recorded: what is wrong with an
@@ -131,14 +131,14 @@ class JointsParams(Params):
     """Unit of the joint angles; with rad, joints that slide are in m."""
 
     def angles(self, text: Table) -> Floats | None:
-        """Return (N, n) joint angles [rad] of a table's rows; None where none are named."""
+        """Return the joint angles (N, n) of a table's rows [rad]; None if no columns are given."""
         if not self.joints:
             return None
         return text.numbers(text.indices(self.joints)) * ANGLES[self.joint_unit]
 
 
 class Readings(NamedTuple):
-    """Poses or points of a table, None where cells are empty; their times [s], if given."""
+    """Poses or points of a table (None for empty cells), and their times [s], if given."""
 
     table: Table
     values: list[Floats | None]
@@ -146,10 +146,10 @@ class Readings(NamedTuple):
 
 
 def table_with_rows(folder: Path, name: str | Sequence[str]) -> Table:
-    """Return a table that holds something.
+    """Return a table that has rows.
 
     Raises:
-        StageError: It cannot be read, or holds no rows.
+        StageError: The file cannot be read, or has no rows.
     """
     text = read_table(folder, name)
     if not text.rows:
@@ -158,12 +158,12 @@ def table_with_rows(folder: Path, name: str | Sequence[str]) -> Table:
 
 
 def readings_of(own: Table, given: ColumnsParams, taken: Sequence[Column] = ()) -> Readings:
-    """Return the values of one thing in a table.
+    """Return the poses or points of one object in a table.
 
     Args:
         own: The table.
-        given: Its columns, all but those ``taken`` and that of the time where none are named.
-        taken: Columns that hold something else.
+        given: Columns of the object; by default all but ``taken`` and the time.
+        taken: Columns of other objects.
 
     Raises:
         StageError: A cell is not a number, or the times do not ascend.
@@ -182,7 +182,7 @@ def readings_of(own: Table, given: ColumnsParams, taken: Sequence[Column] = ()) 
 
 
 def _is_unseen(cells: Sequence[Cell], columns: Sequence[int], whole: bool) -> bool:
-    """Return whether nothing was measured: cells are empty, or a ``whole`` pose is all zeros."""
+    """Return whether a row has no measurement: empty cells, or an all-zero ``whole`` pose."""
     filled = [cells[c] for c in columns if c < len(cells)]
     if all(str(cell).strip().lower() in ("", "nan") for cell in filled):
         return True
@@ -195,10 +195,10 @@ def _value(own: Table, row: int, columns: Sequence[int], given: ColumnsParams) -
 
 
 def times_of(text: Table, column: Column | None, unit: str) -> Floats | None:
-    """Return the times of a column [s], None without one; they ascend.
+    """Return the ascending times of a column [s]; None without a column.
 
     Raises:
-        StageError: They do not.
+        StageError: The times do not ascend.
     """
     if column is None:
         return None

@@ -1,4 +1,4 @@
-"""``reader.corrected``: an archive whose poses contain a known mistake, which is undone.
+"""``reader.corrected``: read an archive and correct a known mistake of its poses.
 
 ``flangeye doctor`` names the mistake and gives the line to put into the recipe::
 
@@ -36,7 +36,7 @@ from flangeye.workflow.doctor.diagnosis import Arms
 
 
 class PoseMistake(Params):
-    """Mistakes of poses, undone in the order of this list."""
+    """Mistakes of poses, corrected in the order of this list."""
 
     axes: Axes | None = None
     """Axes of the camera's frame, where z is not forward: opengl or ros."""
@@ -63,11 +63,11 @@ class PoseMistake(Params):
 
     @property
     def factors(self) -> Floats:
-        """(3,) factors of the positions."""
+        """Factors (3,) of the positions."""
         return self.scale * np.array([-1.0 if axis == self.mirrored else 1.0 for axis in "xyz"])
 
     def undone(self, poses: Floats) -> Floats:
-        """Return poses (N, 4, 4) as they should be."""
+        """Return corrected poses (N, 4, 4)."""
         if self.axes:
             poses = rigid(optical(self.axes), np.zeros(3)) @ poses
         if self.rotation:
@@ -80,7 +80,7 @@ class PoseMistake(Params):
 
 
 class CorrectedParams(Params):
-    """The mistakes of an archive, undone in the order of this list."""
+    """Mistakes of an archive, corrected in the order of this list."""
 
     reader: Annotated[BoundPart, Choose("reader")]
     """Reader of the archive as it was recorded."""
@@ -106,7 +106,7 @@ class CorrectedParams(Params):
 
 @part("reader.corrected")
 def corrected(path: Path, params: CorrectedParams) -> Archive:
-    """Read an archive with another reader, and undo a mistake in its poses."""
+    """Read an archive with another reader, and correct a mistake of its poses."""
     archive: Archive = params.reader(path)
     recordings = [_alone(recording, params) for recording in archive.recordings]
     if params.shift:
@@ -122,7 +122,7 @@ def corrected(path: Path, params: CorrectedParams) -> Archive:
 
 
 def _alone(recording: Recording, params: CorrectedParams) -> Recording:
-    """Undo what concerns each pose by itself."""
+    """Return a recording with the mistakes of single poses corrected."""
     if params.exchanged:
         recording = _exchanged(recording)
     spared = {"first": FLANGE2, "second": FLANGE}.get(params.arms)
@@ -151,10 +151,10 @@ def _alone(recording: Recording, params: CorrectedParams) -> Recording:
 
 
 def _exchanged(recording: Recording) -> Recording:
-    """Exchange the robot's pose and the marker's.
+    """Return a recording with robot's and marker's pose exchanged.
 
     Raises:
-        StageError: One of the two is missing.
+        StageError: One of the two poses is missing.
     """
     marker = recording.camera_T_target
     if marker is None or FLANGE not in recording.poses:
@@ -165,7 +165,7 @@ def _exchanged(recording: Recording) -> Recording:
 
 
 def _corrected(poses: Floats, params: CorrectedParams) -> Floats:
-    """Return one arm's poses (N, 4, 4) as they should be."""
+    """Return one arm's corrected poses (N, 4, 4)."""
     return without_tool(params.robot.undone(poses), -np.array(params.offset))
 
 
@@ -200,7 +200,7 @@ def _delay(
 
 
 def _passing_later(recording: Recording, delay: float) -> Recording | None:
-    """Return a recording with the flange where it was later; None beyond what was recorded."""
+    """Return a recording with a later flange pose; None beyond the recorded motion."""
     motion = recording.motion and later(recording.motion, delay)
     if motion is None:
         return None
@@ -211,12 +211,12 @@ def _passing_later(recording: Recording, delay: float) -> Recording | None:
 def _replaced(
     recordings: Sequence[Recording], change: Callable[[Floats], Floats], kept: Mask, arms: Arms
 ) -> list[Recording]:
-    """Change what the arms reported, in its order; samples that get nothing are left out.
+    """Return recordings with changed robot poses; samples without one are left out.
 
     Args:
-        recordings: Those to calibrate with are changed.
-        change: Gives poses (N, 4, 4), or joints (N, n), of other moments.
-        kept: (N,) which of them have one.
+        recordings: Recordings, of which those for calibration are changed.
+        change: Returns poses (N, 4, 4), or joint angles (N, n), of other moments.
+        kept: (N,) mask of samples that have one.
         arms: Names of the arms.
     """
     calibration = [r for r in recordings if r.role == "calibration"]

@@ -1,4 +1,4 @@
-"""The simplest layout, for one's own recordings: a folder of scans and a file of poses.
+"""``reader.folder``, the simplest layout for own recordings: scans and a file of poses.
 
 ``poses.csv`` has a heading and a row for each cloud or image::
 
@@ -60,7 +60,7 @@ _JOINT = re.compile(r"j[1-9]\d?_rad")
 
 
 class FolderParams(Params):
-    """How to read a folder of clouds and poses."""
+    """Parameters of ``reader.folder``."""
 
     unit: Literal["m", "mm"] | None = None
     """Unit of the positions, where the file of poses does not say."""
@@ -160,7 +160,7 @@ class ArmPose(BaseModel):
 
 
 class PoseRow(ArmPose):
-    """One pose, as ``poses.yaml`` has it; ``second`` is that of a second arm, in its own base."""
+    """One pose of ``poses.yaml``; ``second`` is the second arm's pose in its own base."""
 
     cloud: str | None = Field(None, min_length=1)
     image: str | None = Field(None, min_length=1)
@@ -178,7 +178,7 @@ class PoseRow(ArmPose):
 
 
 class PosesFile(BaseModel):
-    """The whole file, as ``poses.yaml`` has it."""
+    """Content of ``poses.yaml``."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
 
@@ -194,7 +194,7 @@ def read_poses(file: Path) -> tuple[PosesFile, list[int]]:
     """Return the poses of a file, and the line of each.
 
     Raises:
-        StageError: It cannot be read, or says something that is not a pose; names the line.
+        StageError: The file cannot be read, or an entry is invalid; the message names the line.
     """
     return _from_csv(file) if file.suffix == ".csv" else _from_yaml(file)
 
@@ -226,7 +226,7 @@ def _from_csv(file: Path) -> tuple[PosesFile, list[int]]:
 
 
 def _cells(file: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Return the heading, and the cells of every other row that is not blank with its line."""
+    """Return the heading, and line number and cells of every further row that is not blank."""
     text = read_text(file)
     try:
         mark = ";" if ";" in text.partition("\n")[0] else ","
@@ -268,7 +268,7 @@ def _refuse_unknown(file: Path, heading: Sequence[str]) -> None:
 
 
 def _unit_stated(heading: Sequence[str]) -> LengthUnit | Literal["none"] | None:
-    """Return the unit that position columns name, ``none`` where there are no such columns."""
+    """Return the unit in the position columns' names; ``none`` without such columns."""
     for unit, names in _POSITIONS.items():
         if set(names) <= set(heading):
             return unit
@@ -278,7 +278,7 @@ def _unit_stated(heading: Sequence[str]) -> LengthUnit | Literal["none"] | None:
 def _row(
     cells: Mapping[str, str], unit: LengthUnit | None, joints: Sequence[str]
 ) -> dict[str, Any]:
-    """Return a CSV row, its empty cells left out, in the shape a YAML entry has."""
+    """Return a CSV row in the structure of a YAML entry, without empty cells."""
     row: dict[str, Any] = {name: cells[name] for name in _OTHERS if name in cells}
     row |= _grouped(cells, {**_columns_of_pose(unit), "joints_rad": joints})
     second = {n.removeprefix(SECOND): c for n, c in cells.items() if n.startswith(SECOND)}
@@ -297,7 +297,7 @@ def _columns_of_pose(unit: LengthUnit | None) -> dict[str, Sequence[str]]:
 def _grouped(
     cells: Mapping[str, str], several: Mapping[str, Sequence[str]]
 ) -> dict[str, list[str]]:
-    """Return the cells of columns that belong together, under the name YAML has for them."""
+    """Return the cells of related columns, by their name in YAML."""
     return {
         key: [cells.get(name, "") for name in names]
         for key, names in several.items()

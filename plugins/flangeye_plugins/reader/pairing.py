@@ -1,4 +1,4 @@
-"""Pair an arm's recorded poses with a camera's records of another clock."""
+"""Pair an arm's recorded poses with a camera's measurements on another clock."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ class PairingParams(Params):
 
 @dataclass(frozen=True, eq=False)
 class MatchedPose:
-    """A pose of the arm, and which measurements belong to it.
+    """A pose of the arm with its measurements.
 
     Attributes:
-        time: When [s], by the arm's clock.
-        pose: (4, 4) [m].
-        events: Which measurements, by their index; at least one.
-        motion: How the arm passed; None where it stood still.
+        time: Time on the arm's clock [s].
+        pose: (4, 4) pose [m].
+        events: Indices of the measurements, at least one.
+        motion: Motion of the arm; None at rest.
     """
 
     time: float
@@ -53,7 +53,7 @@ class MatchedPose:
     motion: Motion | None = None
 
     def mean(self, measured: Sequence[Any]) -> Floats:
-        """Return the mean of its measurements, of all points (3,) or poses (4, 4)."""
+        """Return the mean of this pose's measurements, points (3,) or poses (4, 4)."""
         seen = np.array([measured[i] for i in self.events])
         return mean_pose(seen) if seen.ndim == 3 else np.asarray(seen.mean(axis=0))
 
@@ -64,16 +64,16 @@ def pair(
     signals: tuple[Signal, Signal] | None,
     params: PairingParams,
 ) -> tuple[list[MatchedPose], list[str]]:
-    """Return the pairs in time, and notes on how they were made.
+    """Return the matched pairs, and notes on the matching.
 
     Args:
         arm: Times (N,) [s] and poses (N, 4, 4) [m] of the arm.
-        events: (M,) times of the measurements, by the camera's clock [s].
-        signals: How the arm moved and how what the camera saw moved, if that is known.
-        params: The parameters.
+        events: (M,) times of the measurements on the camera's clock [s].
+        signals: Motion signals of arm and camera for estimating the clocks' offset, if known.
+        params: Parameters of the pairing.
 
     Raises:
-        StageError: The two have no time in common.
+        StageError: The recordings do not overlap in time.
     """
     spans = standstills(*arm)
     offset, told = _offset(spans, events, signals, params)

@@ -20,7 +20,7 @@ def pose_from_quaternion(where: str, position: Numbers, xyzw: Numbers) -> Floats
     Args:
         where: Prefix of messages: the file and the pose's name.
         position: (3,) [m].
-        xyzw: (4,).
+        xyzw: (4,) quaternion.
 
     Raises:
         StageError: A value is not finite, or the quaternion's norm is not 1.
@@ -47,7 +47,7 @@ def pose_from_matrix(where: str, matrix: Floats) -> Floats:
     """Return a (4, 4) pose [m], validated.
 
     Raises:
-        StageError: A value is not finite, or the rotation is not one.
+        StageError: A value is not finite, or the rotation matrix is invalid.
     """
     try:
         return pose_of_numbers(_finite(where, matrix).ravel(), MATRIX, "m")

@@ -1,9 +1,9 @@
 """ROS 2 bags, MCAP or SQLite, read without ROS.
 
-What the arm did comes from ``tf`` (``base`` and ``flange``), a ``PoseStamped`` topic, or joint
-angles with the recipe's ``robot``; what the camera saw from ``PointCloud2``, ``Image`` with
-``CameraInfo``, a ``PoseStamped`` of the target, or ``tf`` of the target's frame. The standstills
-are found in the arm's motion, and clouds and poses are paired by time.
+The arm's poses come from ``tf`` (``base`` and ``flange``), a ``PoseStamped`` topic, or joint angles
+with the recipe's ``robot``. The camera's measurements come from ``PointCloud2``, ``Image`` with
+``CameraInfo``, a ``PoseStamped`` of the target, or ``tf`` of the target's frame. Standstills are
+detected in the arm's motion, and clouds and poses are paired by time.
 """
 
 from __future__ import annotations
@@ -78,15 +78,15 @@ class Bag:
     """Contents of a bag from a first pass.
 
     Attributes:
-        path: The bag.
-        files: Its files.
-        topics: Topic -> type, of those with messages.
+        path: Path of the bag.
+        files: Files of the bag.
+        topics: Types of the topics with messages.
         frames: Transforms from tf.
-        poses: Topic -> times and poses, of PoseStamped.
-        joints: Topic -> times and, each, name -> angle.
-        stamps: Topic -> times of clouds and images.
-        seen_from: Topic -> frame, of images and their cameras.
-        cameras: Topic -> camera matrix (3, 3) [px] and distortion.
+        poses: Times and poses of PoseStamped, by topic.
+        joints: Times and joint angles by name, by topic.
+        stamps: Times of clouds and images, by topic.
+        seen_from: Frames of images and cameras, by topic.
+        cameras: Camera matrix (3, 3) [px] and distortion, by topic.
     """
 
     path: Path
@@ -107,7 +107,7 @@ class Bag:
         """Return the named topic, or the only one of its types; None without one.
 
         Raises:
-            StageError: It does not exist, or there are several and none was named.
+            StageError: The topic does not exist, or there are several and none is named.
         """
         found = self.of_type(*types)
         if given is not None:
@@ -125,7 +125,7 @@ class Bag:
 
 @part("reader.ros2_bag")
 def ros2_bag(path: Path, params: BagParams, kinematics: RobotModel | None = None) -> Archive:
-    """Read a ROS 2 bag, MCAP or .db3, without ROS: standstills with their clouds or images."""
+    """Read the standstills with their clouds or images from a ROS 2 bag (MCAP or .db3)."""
     bag = _first_look(path)
     try:
         arm, arm_told, joints = _arm(bag, params, kinematics)
@@ -186,10 +186,10 @@ def _joint_angles(message: Any) -> dict[str, float]:
 def _arm(
     bag: Bag, params: BagParams, robot: RobotModel | None
 ) -> tuple[Stream, str, Stream | None]:
-    """Return the flange's poses, how they were found, and the joints, if their order is known.
+    """Return the flange's poses, a text on their source, and the joints, if their order is known.
 
     Raises:
-        StageError: Nothing in the bag gives the flange's poses, or several things do.
+        StageError: The bag has no source of the flange's poses, or several.
     """
     joints = _joints(bag, params)
     if params.robot in bag.of_type(Type.JOINT_STATE):
@@ -215,7 +215,7 @@ def _arm(
 
 
 def _by_kinematics(bag: Bag, joints: Stream | None, robot: RobotModel | None) -> tuple[Stream, str]:
-    """Return the flange's poses at the recorded joint angles, and how they were found."""
+    """Return the flange's poses from recorded joint angles, and a text on their source."""
     if robot is None:
         raise StageError(
             f"{bag.path}: joint angles become poses by the arm's kinematics; write {ARM}"
@@ -233,12 +233,12 @@ def _by_kinematics(bag: Bag, joints: Stream | None, robot: RobotModel | None) ->
 
 
 def _names(bag: Bag, topic: str) -> str:
-    """Return the joints that a topic reports."""
+    """Return a text with the names of a topic's joints."""
     return ", ".join(bag.joints[topic][1][0])
 
 
 def _ways(bag: Bag) -> str:
-    """Return what to write so that the flange's poses are found in the bag."""
+    """Return a text on the parameters that select the flange's poses in the bag."""
     ways = {
         "base: …, flange: …": bag.frames.names and f"frames of tf: {', '.join(bag.frames.names)}",
         "robot: …": bag.poses and f"PoseStamped topics: {', '.join(bag.poses)}",
@@ -288,7 +288,7 @@ class Target:
         return (turning(*arm), turning(self.times, self.poses)) if enough else None
 
     def recordings(self, pairs: Sequence[MatchedPose], joints: Stream | None) -> list[Recording]:
-        """Return a recording a pair."""
+        """Return one recording for each pair."""
         return [
             replace(
                 _recording(i, found, joints),
@@ -300,7 +300,7 @@ class Target:
 
 @dataclass
 class Scans:
-    """Clouds, images, or clouds with the images taken nearest to them."""
+    """Recorded clouds, images, or clouds with their nearest images."""
 
     bag: Bag
     clouds: str | None
@@ -310,7 +310,7 @@ class Scans:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes on damaged messages: for each topic their number, and the first."""
+        """Notes on damaged messages: their number and the first one, for each topic."""
         return tuple(
             f"set aside {len(errors)} of {len(self.bag.stamps[topic])} messages of {topic}, the "
             f"first of them number {min(errors)}: {errors[min(errors)]}"
@@ -324,7 +324,7 @@ class Scans:
 
     @property
     def times(self) -> Floats:
-        """When its messages were taken [s]."""
+        """Times of its messages [s]."""
         return np.array(self.bag.stamps[self.first])
 
     def signals(self, arm: Stream) -> tuple[Signal, Signal] | None:
@@ -342,7 +342,7 @@ class Scans:
     def _sound(
         self, topic: str, wanted: Container[int], use: Callable[[int, Any], T]
     ) -> dict[int, T]:
-        """Return what a function makes of some messages, by number; damaged ones are set aside.
+        """Return a function's results on some messages, by number, without damaged ones.
 
         Raises:
             StageError: All of them are damaged.
@@ -359,7 +359,7 @@ class Scans:
         return found
 
     def recordings(self, pairs: Sequence[MatchedPose], joints: Stream | None) -> list[Recording]:
-        """Return a recording a pair, its cloud and image written as files."""
+        """Return one recording for each pair, with cloud and image written as files."""
         chosen = [self._middle(found.events) for found in pairs]
         files = self._files(self.first, chosen)
         images = files if self.clouds is None else self._beside(chosen)
@@ -375,7 +375,7 @@ class Scans:
         ]
 
     def _middle(self, events: Sequence[int]) -> int:
-        """Return the middle one of a standstill's messages, of those not known to be damaged."""
+        """Return the middle one of a standstill's undamaged messages."""
         damaged = self.damaged.get(self.first, {})
         sound = [event for event in events if event not in damaged] or events
         return sound[len(sound) // 2]
@@ -390,21 +390,21 @@ class Scans:
         return {event: files[image] for event, image in nearest.items() if image in files}
 
     def _files(self, topic: str, wanted: Sequence[int]) -> dict[int, Path]:
-        """Write some messages of a topic as files; return them by the message's number."""
+        """Write some messages of a topic as files; return the paths by the message's number."""
         save = save_cloud if self.bag.topics[topic] == Type.CLOUD else save_image
         name = scratch(self.bag.path) / topic.strip("/").replace("/", "_")
         return self._sound(topic, wanted, lambda i, told: save(Path(f"{name}-{i:05}"), told))
 
 
 def _look(message: Any) -> Floats:
-    """Return a coarse look at a cloud's depths or an image's pixels."""
+    """Return a coarse sample of a cloud's depths or an image's pixels."""
     if hasattr(message, "fields"):
         return np.asarray(np.nan_to_num(cloud_of(message)[..., 2].ravel()[::97]), dtype=float)
     return np.asarray(pixels_of(message)[::16, ::16], dtype=float)
 
 
 def _seen(bag: Bag, params: BagParams) -> tuple[Target | Scans, str]:
-    """Return what the camera saw, and how it was found."""
+    """Return the camera's measurements, and a text on their source."""
     if params.target is not None:
         return _target(bag, params), f"the target from {params.target}"
     clouds = bag.only("clouds", params.clouds, Type.CLOUD)
@@ -420,7 +420,7 @@ def _seen(bag: Bag, params: BagParams) -> tuple[Target | Scans, str]:
 
 
 def _info(bag: Bag, params: BagParams, images: str) -> str | None:
-    """Return the CameraInfo as named, beside the images, in their frame, or the only one."""
+    """Return the CameraInfo topic: the named one, or that of the images by name or frame."""
     beside = f"{images.removesuffix('/compressed').rpartition('/')[0]}/camera_info"
     frame = bag.seen_from[images]
     same = [topic for topic in bag.cameras if frame and bag.seen_from[topic] == frame]
@@ -442,7 +442,7 @@ def _target(bag: Bag, params: BagParams) -> Target:
 
 
 def _recording(number: int, found: MatchedPose, joints: Stream | None) -> Recording:
-    """Return where the arm stood, or how it passed, with its joints where they were recorded."""
+    """Return a recording of the arm's pose, at rest or moving, with its joints if recorded."""
     angles, motion = None, found.motion
     if joints is not None:
         angles = rows_at(found.time, *joints)

@@ -32,11 +32,11 @@ class Raw:
     """A message, not yet decoded.
 
     Attributes:
-        file: The bag's file.
+        file: File of the bag.
         topic: Name of the topic.
-        received: When it was recorded [s].
-        data: CDR.
-        decode: Gives the message.
+        received: Time of recording [s].
+        data: Serialised message (CDR).
+        decode: Returns the decoded message.
     """
 
     file: Path
@@ -49,7 +49,7 @@ class Raw:
         """Return the result of a function on the message.
 
         Raises:
-            StageError: It is damaged, or not what its type says.
+            StageError: The message is damaged, or not of its type.
         """
         try:
             return use(self.decode())
@@ -148,10 +148,10 @@ def _mcap_messages(file: Path, topics: Collection[str]) -> Iterator[Raw]:
 
 @contextmanager
 def _opened(file: Path) -> Iterator[sqlite3.Connection]:
-    """Give a bag's database; views, whose queries need not end, are not tables of a bag.
+    """Yield a bag's open database; views are refused, as their queries may never end.
 
     Raises:
-        StageError: It is a database of something else.
+        StageError: The database is not a ROS 2 bag.
     """
     with closing(sqlite3.connect(f"file:{file}?mode=ro", uri=True)) as database:
         tables = database.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
@@ -180,7 +180,7 @@ def _db3_messages(file: Path, topics: Collection[str]) -> Iterator[Raw]:
 
 @cache
 def _scratch() -> TemporaryDirectory[str]:
-    """Clouds and images taken out of bags, until the program ends."""
+    """Return the temporary folder for files extracted from bags, deleted at exit."""
     return TemporaryDirectory(prefix="flangeye-bag-")
 
 
@@ -203,7 +203,7 @@ def save_image(path: Path, message: Any) -> Path:
 
     Raises:
         StageError: The image's encoding is not known.
-        ImageError: It is compressed, and damaged.
+        ImageError: The compressed image is damaged.
     """
     import cv2
 
@@ -228,7 +228,7 @@ def pose_of(where: str, position: Any, turn: Any) -> Floats:
 
 
 def in_order(times: Sequence[float], values: Sequence[Floats]) -> Stream:
-    """Return a stream sorted by time, one value a moment."""
+    """Return a stream sorted by time, with one value for each time."""
     moments, first = np.unique(np.array(times), return_index=True)
     return moments, np.array(values)[first]
 
@@ -238,9 +238,9 @@ class BagFrames:
     """The transforms of a bag's ``/tf`` and ``/tf_static``.
 
     Attributes:
-        parents: Frame -> the frame it hangs in.
-        samples: Frame -> times and poses in its parent.
-        static: The frames that never move.
+        parents: Parent frame of each frame.
+        samples: Times and poses in the parent, by frame.
+        static: Frames that never move.
     """
 
     parents: dict[str, str] = field(default_factory=dict)
@@ -262,11 +262,11 @@ class BagFrames:
 
     @property
     def names(self) -> list[str]:
-        """Every frame there is."""
+        """Names of all frames."""
         return sorted({*self.parents, *self.parents.values()})
 
     def chain(self, frame: str) -> list[str]:
-        """Return the frame and those it hangs in, up to the root."""
+        """Return a frame and its ancestors, up to the root."""
         found = [frame]
         while found[-1] in self.parents and self.parents[found[-1]] not in found:
             found.append(self.parents[found[-1]])
@@ -276,7 +276,7 @@ class BagFrames:
         """Return ``parent_T_child`` over time.
 
         Raises:
-            StageError: A frame does not exist, or nothing joins the two.
+            StageError: A frame does not exist, or the two are not connected.
         """
         for name in (parent, child):
             if name not in self.names:
@@ -295,7 +295,7 @@ class BagFrames:
         return max(moving, key=len) if moving else np.zeros(1)
 
     def _at(self, leg: Sequence[str], times: Floats) -> Floats:
-        """Return the pose of a leg's first frame in the frame that its last hangs in."""
+        """Return the poses of a chain's first frame in the parent of its last."""
         pose = np.tile(np.eye(4), (len(times), 1, 1))
         for frame in leg:
             own, poses = in_order(*self.samples[frame])

@@ -106,7 +106,7 @@ def zivid(path: Path, params: ZividSamplesParams) -> Archive:
 
 
 def _tables(path: Path) -> Iterator[tuple[Path, Table]]:
-    """Yield the tables of a file, or of the documents of a folder; what is none is not an error."""
+    """Yield the tables of a file, or of the documents of a folder; other files are skipped."""
     files = [path] if path.is_file() else sorted(path.glob("*"), key=lambda p: natural(p.name))
     for file in files:
         if file.suffix in (".yaml", ".yml", ".samples", ".json"):

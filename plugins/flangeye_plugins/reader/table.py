@@ -1,4 +1,4 @@
-"""A table of poses in any stated convention, with scans beside it or targets in it.
+"""``reader.table``: a table of poses in any stated convention, with scans or targets.
 
 CSV and the like, one row a pose, with or without a heading, any separator, decimal points or
 commas: the scan's file name, if it is given, then the numbers of the pose; or whatever columns
@@ -53,7 +53,7 @@ JOINTS = "joints"
 
 
 class OtherParams(ColumnsParams):
-    """Further measurements: in the same rows, or in a table of their own."""
+    """Additional measurements: in the same rows, or in a separate table."""
 
     file: str | tuple[str, ...] | None = None
     """A table of its own, or tables side by side; joined by time, by the numbers in the names of
@@ -69,7 +69,7 @@ class OtherParams(ColumnsParams):
 
 
 class TargetParams(SeenPoseParams, OtherParams):
-    """The target as the camera measured it; empty cells, and a pose of zeros, mean not seen."""
+    """The target measured by the camera; empty cells and an all-zero pose mean not seen."""
 
 
 class SecondParams(OtherParams):
@@ -103,7 +103,7 @@ class TableParams(FlangePoseParams, JointsParams, CloudUnitParams):
 
     @classmethod
     def more(cls) -> tuple[str, ...]:
-        """Return joint angles: a table may have them in place of poses."""
+        """Return also joint angles, which a table may have in place of poses."""
         return (JOINTS,)
 
     @model_validator(mode="after")
@@ -119,7 +119,7 @@ class TableParams(FlangePoseParams, JointsParams, CloudUnitParams):
 
 @part("reader.table")
 def table(path: Path, params: TableParams, kinematics: RobotModel | None = None) -> Archive:
-    """Read a table of poses in the stated convention, with scans beside it or the target in it."""
+    """Read a table of poses in the stated convention, with scans or the target's poses."""
     folder, name = (path.parent, path.name) if path.is_file() else (path, params.file)
     for each in [name] if isinstance(name, str) else name:
         if not files_at(folder, each):
@@ -132,7 +132,7 @@ def table(path: Path, params: TableParams, kinematics: RobotModel | None = None)
 
 
 def _arm_poses(text: Table, params: TableParams, robot: RobotModel | None) -> Floats:
-    """Return the flange's poses (N, 4, 4) [m]: as written, or at the joint angles."""
+    """Return the flange's poses (N, 4, 4) [m]: as written, or from the joint angles."""
     if params.rotation == JOINTS:
         return _at_joints(text, params.angles(text), robot)
     values = text.numbers(_columns(text, params, _scan_column(text, params)))
@@ -165,7 +165,7 @@ def _scan_column(text: Table, params: TableParams) -> int | None:
 
 
 def _columns(text: Table, params: TableParams, scan: int | None) -> list[int]:
-    """Return the arm's columns: as the recipe states, or all that nothing else uses."""
+    """Return the arm's columns: those in the recipe, or all unused ones."""
     if params.columns:
         return text.indices(params.columns)
     others = [o for o in (params.target, params.second) if o and o.file is None]
@@ -201,9 +201,9 @@ def _with_scans(folder: Path, text: Table, poses: Floats, params: TableParams) -
 
 
 def _scans(folder: Path, text: Table, params: TableParams) -> tuple[list[list[Path]], list[str]]:
-    """Return the scans of each row: the named one, or those that belong to it; and notes.
+    """Return the scans of each row, and notes.
 
-    Names of which none is a file's call the rows, and belong to scans by the number in common.
+    A row names its scan's file, or row names and scans are matched by their common number.
     """
     column = _scan_column(text, params)
     files = text.files if len(text.files) == len(text.rows) > 1 else ()
@@ -229,7 +229,7 @@ def _scans(folder: Path, text: Table, params: TableParams) -> tuple[list[list[Pa
 
 
 def _named(folder: Path, name: str) -> Path | None:
-    """Return the scan of a name, in the folder or, where one has it only, in a folder in it."""
+    """Return the scan with a name, in the folder or in exactly one of its subfolders."""
     inner = sorted(folder.glob(f"*/{escape(name)}")) if name and Path(name).name == name else []
     if name and (folder / name).is_file():
         return folder / name
@@ -240,7 +240,7 @@ def _named(folder: Path, name: str) -> Path | None:
 
 
 def _measured(folder: Path, text: Table, poses: Floats, params: TableParams) -> Archive:
-    """Return poses with what was measured there, row by row or joined by time."""
+    """Return poses with their measurements, joined row by row or by time."""
     target = _target(folder, text, params)
     second = _second(folder, text, params)
     tables = [text, target.table, *([second.table] if second else [])]
@@ -300,7 +300,7 @@ def _joined(
 def _with_joints(
     recordings: list[Recording], times: Floats, joints: Floats | None
 ) -> list[Recording]:
-    """Return poses at which the arm stood with its joint angles; those it passed go without."""
+    """Return recordings with joint angles, except for poses in motion."""
     if joints is None:
         return recordings
     return [
@@ -312,7 +312,7 @@ def _with_joints(
 def _motion(
     arm: tuple[Floats, Floats], second: Readings | None, found: MatchedPose
 ) -> Motion | None:
-    """Return how the arms passed; None where they stood still."""
+    """Return the arms' motion; None at rest."""
     stream = None if second is None else _stream_of(second)
     if found.motion is None or stream is None:
         return found.motion
@@ -325,7 +325,7 @@ def _second_at(second: Readings | None, found: MatchedPose) -> Floats | None:
 
 
 def _stream_of(readings: Readings) -> tuple[Floats, Floats] | None:
-    """Return the times and poses that were read; None where there are no times."""
+    """Return times and poses; None without times."""
     if readings.times is None:
         return None
     known = [i for i, value in enumerate(readings.values) if value is not None]
@@ -361,7 +361,7 @@ def _second(folder: Path, text: Table, params: TableParams) -> Readings | None:
 
 
 def _other(folder: Path, text: Table, given: OtherParams, turned: bool) -> Readings:
-    """Return what stands in the same table or in one of its own, inverse poses turned round."""
+    """Return measurements from the same or a separate table, with inverse poses inverted."""
     own = text if given.file is None else table_with_rows(folder, given.file)
     found = readings_of(own, given)
     if not turned:
