@@ -60,10 +60,10 @@ class RobotState:
 
     Attributes:
         base_T_flange: Pose of the flange, any tool offset of the controller taken off.
-        joints: (n,) angles [rad].
-        joint_speeds: (n,) [rad/s].
-        time_ns: When the controller sampled the arm, by ``time.monotonic_ns``.
-        mode: What the controller is able to do; anything but ready and moving is a safety fault.
+        joints: (n,) joint angles [rad].
+        joint_speeds: (n,) joint speeds [rad/s].
+        time_ns: Time of the controller's sample on ``time.monotonic_ns`` [ns].
+        mode: State of the controller; all but ready and moving are safety faults.
         force: (6,) force and torque on the flange in the base's axes [N, N m], if it is measured.
         message: Text of the controller about a mode that is not ready.
     """
@@ -100,7 +100,7 @@ class Robot(Device, Protocol):
     Attributes:
         name: Model and address, as messages show it: ``ur5e at 192.168.1.10``.
         period: Duration of the controller's cycle [s].
-        flange_T_tool: The tool offset set in the controller; None where it cannot be read.
+        flange_T_tool: Tool offset set in the controller; None if it cannot be read.
     """
 
     name: str
@@ -192,8 +192,8 @@ class Scanner(Device, Protocol):
         thread ends that wait.
 
         Raises:
-            FrameDropped: This exposure gave nothing; the scanner is still there.
-            DeviceError: The scanner is lost, or gave nothing in time.
+            FrameDropped: This exposure gave no data, but the scanner still works.
+            DeviceError: The scanner is lost, or gave no data in time.
         """
 
 
@@ -234,10 +234,10 @@ class KnowsTruth(Protocol):
 
 @runtime_checkable
 class KnowsTorch(Protocol):
-    """The truth of a simulated finger, to score a finished weld; no stage can ask for it."""
+    """Interface of a simulated finger that knows the torch's true path, for scoring a weld."""
 
     def true_torch(self) -> tuple[Floats, Floats]:
-        """Return times (K,) [s] and where the torch really was then (K, 3), in base [m]."""
+        """Return times (K,) [s] and true positions of the torch (K, 3) in base [m]."""
 
 
 @runtime_checkable
@@ -298,9 +298,9 @@ class WeldProfile:
     """One measurement of the bead behind the torch.
 
     Attributes:
-        offset: Distance of the bead's middle to the left of the joint, seen along the weld [m].
+        offset: Offset of the bead's centre to the left of the joint, seen along the weld [m].
         sigma: Standard deviation of the offset [m].
-        time_ns: When the profile was taken, on the robot's clock.
+        time_ns: Time of the profile on the robot's clock [ns].
     """
 
     offset: float
@@ -313,8 +313,8 @@ class Profiler(Device, Protocol):
     """A profile sensor on the tool that measures the bead at a fixed distance behind the torch.
 
     Attributes:
-        name: Shown in messages and reports.
-        behind: How far behind the torch it looks [m].
+        name: Name in messages and reports.
+        behind: Distance of the profile behind the torch [m].
     """
 
     name: str

@@ -156,7 +156,7 @@ def name_damage(log: RunLog) -> None:
 
 
 def require_gathered(log: RunLog) -> None:
-    """Refuse a log in which nothing was recorded."""
+    """Refuse a log without captures or results."""
     if not log.gathered:
         log.require_sound()
         raise StageError(f"{log.path}: the run ended early; nothing was gathered yet")

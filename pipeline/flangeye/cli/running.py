@@ -1,4 +1,4 @@
-"""Run recipes: one, or many at once."""
+"""Commands that run recipes: ``run``, ``batch`` and ``regress``."""
 
 from __future__ import annotations
 

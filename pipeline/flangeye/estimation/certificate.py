@@ -42,11 +42,11 @@ class Certificate:
     """Result of :func:`certify`: a local minimum, and a bound on the cost of any better one.
 
     Attributes:
-        places: (K, 4, 4) at the local minimum.
-        cost: Their sum of squared errors.
-        missing: Largest possible decrease of the cost by any other answer.
+        places: (K, 4, 4) unknown transforms at the local minimum.
+        cost: Sum of squared errors there.
+        missing: Largest possible decrease of the cost by any other transforms.
         optimal: Whether that decrease is negligible.
-        better: (K, 4, 4) that cost less than ``places``, if such were found.
+        better: (K, 4, 4) transforms with a lower cost than ``places``; None if none were found.
     """
 
     places: Floats

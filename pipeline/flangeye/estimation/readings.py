@@ -140,7 +140,7 @@ def _odds(distance: float, median: float, spread: float) -> float:
 
 
 def _seen(places: Floats) -> float:
-    """Return the log odds that a camera sees targets at places (N, 3), in the best-fitting axes.
+    """Return the log odds that targets at places (N, 3) are in view, for the best camera axes.
 
     A camera's half angle of view is 20 to 35 degrees; beyond 60 all angles are equally unlikely.
     """

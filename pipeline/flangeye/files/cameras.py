@@ -37,7 +37,7 @@ class CameraFile(NamedTuple):
 
     Attributes:
         path: The file.
-        matrix: (3, 3) [px].
+        matrix: (3, 3) camera matrix [px].
         distortion: (k,) OpenCV's distortion coefficients.
         others: Number of further cameras in the file.
         lens_of: Name of the file with the distortion, if that is another file.

@@ -1,7 +1,7 @@
-"""An arc that burns only while the arm is led: switched in the process that guards the arm.
+"""A power source that is switched by the watchdog process, so that every stop ends the arc.
 
-The guard opens the power source with the arm. Commands to the arm carry what the arc is to do: a
-seventh number after the six of the twist. Every stop of the arm also ends the arc: by the guard, or
+The watchdog opens the power source with the arm. Each velocity command has a seventh number with
+the arc's commanded state. Every stop of the arm also ends the arc, whether by the watchdog or
 because the program is silent, hangs or has ended.
 """
 
@@ -102,7 +102,7 @@ class ArcedArm(Device):
         self._level = level
 
     def quench(self) -> None:
-        """End the arc at once; the gas flows on for its post-flow time."""
+        """End the arc at once; the gas flows for its post-flow time."""
         if self._level == OFF:
             return
         burned, self._level = self._level == BURN, OFF

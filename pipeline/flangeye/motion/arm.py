@@ -123,7 +123,7 @@ class WatchedArm:
         return samples
 
     def stop(self) -> None:
-        """Stop the arm where it is."""
+        """Stop the arm at once."""
         self._say("stop")
 
     def _say(self, request: str, content: Any = None) -> None:
@@ -222,7 +222,7 @@ def _alarmed(alarm: Connection) -> Iterator[None]:
     """Write every signal to the alarm at once, even while a long computation runs.
 
     Raises:
-        DeviceError: This is not the main thread, which alone hears of signals.
+        DeviceError: This is not the main thread, the only one that receives signals.
     """
     with alarm:
         if threading.current_thread() is not threading.main_thread():
@@ -239,7 +239,7 @@ def _alarmed(alarm: Connection) -> Iterator[None]:
 
 
 def _end_instead(*_: object) -> None:
-    """End the run at Ctrl-Z: an arm and its controller do not wait for who comes back."""
+    """End the run at Ctrl-Z instead of suspending it, as arm and controller would not wait."""
     raise KeyboardInterrupt("stopped by Ctrl-Z")
 
 

@@ -41,10 +41,11 @@ class Executor:
         limits: MotionLimits,
         told: Callable[[RobotState], None] = lambda state: None,
     ) -> None:
-        """Begin to watch an open arm.
+        """Start supervising an open arm.
 
         Raises:
-            DeviceError: It is not the model's, has an unknown tool set, or is moved by hand.
+            DeviceError: The arm differs from the model, has an unknown tool offset, or is moved by
+                hand.
         """
         if isinstance(robot, MovedByHand):
             raise DeviceError(f"{robot.name}: is moved by hand; an arm that drives is needed")
@@ -76,7 +77,7 @@ class Executor:
         """Drive a checked route and return when the arm has settled at its end.
 
         Raises:
-            DeviceError: The arm was stopped for a safety fault: the reason.
+            DeviceError: The arm was stopped by a safety fault, which the message names.
         """
         for leg in route.legs:
             self._supervisor.set_off(leg)
@@ -91,10 +92,10 @@ class Executor:
         self._supervisor.led()
 
     def shift(self, base_T_flange: Transform, speed: float) -> RobotState:
-        """Move the flange a small way in a straight line; return when the arm stands.
+        """Move the flange a short distance in a straight line; return when the arm is at rest.
 
         Raises:
-            DeviceError: The arm was stopped for a safety fault: the reason.
+            DeviceError: The arm was stopped by a safety fault, which the message names.
         """
         self._supervisor.led()
         self.robot.move_linear(
@@ -155,7 +156,7 @@ class LedArm(Device):
     RunStopped.
 
     Attributes:
-        flange_T_tool: None: what is set in the controller the driver has compared already.
+        flange_T_tool: None, as the driver has already checked the controller's tool offset.
     """
 
     flange_T_tool: Transform | None = None

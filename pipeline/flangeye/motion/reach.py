@@ -76,7 +76,7 @@ class Reach:
             margins: Safety margins of a real arm.
 
         Raises:
-            StageError: The space that the arm fills is not known, so no clearance can be checked.
+            StageError: The arm's collision shape is unknown, so no clearance can be checked.
         """
         body = target if isinstance(target, TargetBody) else None
         self.arm = Arm(robot)
@@ -155,7 +155,7 @@ class Reach:
         self._start = self.home = joints
 
     def _rolls(self, centre: Floats) -> list[Floats]:
-        """Return poses (4, 4) at a point that look at the scanner, turned about that view."""
+        """Return poses (4, 4) at a point that face the scanner, rotated about the line of sight."""
         poses = []
         # Directions of the flange's x axis that are tried, to find where the arm moves best
         rolls = 8
@@ -253,7 +253,7 @@ class Reach:
         return np.where(allowed, nearer, joints)
 
     def _too_near(self, joints: Floats) -> str | None:
-        """Return what a posture comes too near to; None if nothing."""
+        """Return the name of an obstacle too near to a posture; None if there is none."""
         if self._margins is None:
             return None
         limits, room, singularity = self._margins
@@ -309,14 +309,14 @@ class Site:
     """Arm, scanner and obstacles that a plan is made for.
 
     Attributes:
-        centre: (3,) in ``base``, middle of the work if the recipe gives none [m].
-        eye: (3,) in ``base``, position of the scanner [m].
-        facing: Gives the rotation (3, 3) of a flange at a point (3,) that faces the scanner, or
-            None where the arm cannot show it.
-        joints: Gives the joint angles for a flange pose (4, 4), or None where the arm cannot or
-            must not go.
-        lost: Gives the indices, in visiting order, of the poses that gave no capture.
-        shown: Gives the axis (3,) of the flange that faces the scanner where the target does.
+        centre: (3,) default centre of the workspace in ``base`` [m].
+        eye: (3,) position of the scanner in ``base`` [m].
+        facing: Returns the rotation (3, 3) of a flange at a point (3,) that faces the scanner; None
+            if the arm cannot reach it.
+        joints: Returns the joint angles for a flange pose (4, 4); None if it is unreachable or not
+            allowed.
+        lost: Returns the indices, in visiting order, of the poses without a capture.
+        shown: Returns the axis (3,) of the flange that faces the scanner when the target does.
     """
 
     centre: Floats
@@ -371,10 +371,10 @@ def poses_near(
     """Return up to so many reachable poses drawn around a point (3,).
 
     Args:
-        place: (3,) in ``base`` [m].
-        count: How many.
+        place: (3,) point in ``base`` [m].
+        count: Number of poses.
         site: The arm's reachable poses.
-        rng: Draws them.
+        rng: Random generator.
         spread: Largest distance from the point, (3,) or equal along each axis [m], and largest
             roll, pitch and yaw [rad].
     """

@@ -49,7 +49,7 @@ class Touch:
 
     Attributes:
         time: Middle of the image's exposure [s].
-        displacement: (3,) of the tip from where it rests, along the tool's axes [m].
+        displacement: (3,) displacement of the tip from its rest position, in the tool's axes [m].
     """
 
     time: float
@@ -77,11 +77,11 @@ class FollowingTask:
     """The task of a controller: which seam, with which tool and limits.
 
     Attributes:
-        points: (M, 3) of the planned seam, evenly spaced in the plane [m].
+        points: (M, 3) points of the planned seam, evenly spaced in the plane [m].
         tangents: (M, 2) its unit tangents in the plane.
         step: Arc length between two of the points [m].
-        torch_distance: From the torch to the tip in front of it [m].
-        side: 1 where the left wall is pressed, -1 for the right one.
+        torch_distance: Distance from the torch to the tip in front of it [m].
+        side: Side of the pressed wall: 1 left, -1 right.
         speed: Speed of the tip along the seam [m/s].
         deflection: Deflection of the tip against the wall [m].
         preload: Displacement of the tip into the groove [m].
@@ -114,7 +114,7 @@ class Controller(Protocol):
 
     @property
     def side(self) -> float:
-        """Which wall is pressed: 1 for the left one, -1 for the right."""
+        """Side of the pressed wall: 1 left, -1 right."""
 
     @property
     def phase(self) -> Phase:
@@ -138,7 +138,7 @@ class Controller(Protocol):
 
     @property
     def sigma(self) -> float:
-        """Standard deviation of the torch's place across the seam [m]."""
+        """Standard deviation of the torch's position across the seam [m]."""
 
     @property
     def bound(self) -> float:
@@ -146,7 +146,7 @@ class Controller(Protocol):
 
     @property
     def band(self) -> float:
-        """The bound that holds for 95 % of the seam [m]."""
+        """Bound of the torch's distance that holds for 95 % of the seam [m]."""
 
     def step(self, pose: ToolPose, touches: Sequence[Touch]) -> Command:
         """Return the command for this cycle; ``touches`` are measurements since the last one."""

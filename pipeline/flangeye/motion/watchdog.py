@@ -1,13 +1,14 @@
 """The watchdog process: owns the arm's connection and stops the arm on any safety fault.
 
-It runs in a process of its own, where no computation of the program can delay it. It hears of
-Ctrl-C and Ctrl-Z through a pipe that the interpreter's signal handler writes to at once, whatever
-the program is busy with; the space bar it reads itself; when the program dies its end of the wire
-closes. Each of these stops the arm within one cycle. Through the same pipe the program proves that
-it lives (:data:`BEAT`); when it is silent for SILENT on the way, or this process was itself, the
-arm is stopped for good. While this process is silent, the arm's driver stops it. A program that
-servos the arm is sent the state of each cycle; when it answers with no velocity, the arm is
-stopped too.
+It runs in a separate process, so no computation of the program can delay it. Ctrl-C and Ctrl-Z
+reach it through a pipe to which the interpreter's signal handler writes at once, whatever the
+program is doing; it reads the space bar itself; and if the program dies, its connection closes.
+Each of these stops the arm within one cycle.
+
+Through the same pipe the program sends a heartbeat (:data:`BEAT`). If program or watchdog was
+silent for SILENT during a motion, the arm is stopped permanently. While the watchdog itself is
+silent, the arm's driver stops it. A program that servos the arm gets the state of each cycle; if it
+does not answer with a velocity, the arm is stopped too.
 """
 
 from __future__ import annotations
@@ -171,10 +172,10 @@ class Watchdog:
             self._bar(str(fault))
 
     def _require_life(self) -> None:
-        """Refuse to go on if the program was silent, or this process was suspended.
+        """Raise SafetyFault if the program was silent, or this process was suspended.
 
         Raises:
-            SafetyFault: Who was silent, and for how long.
+            SafetyFault: The message says which process was silent, and for how long.
         """
         turned, self._turned = self._turned, time.monotonic()
         self._require_since("guard", turned)
@@ -242,7 +243,7 @@ class Watchdog:
             self._wire.send(Report("fault", reason))
 
     def _operator(self) -> str | None:
-        """Return who asked for a stop, None if nobody; take in the program's signs of life."""
+        """Return the source of a stop request, if any, and process the program's heartbeats."""
         watched = [fd for fd in (self._charge.alarm, self._charge.keyboard) if fd is not None]
         ready = select.select(watched, [], [], 0)[0] if watched else []
         said = {fd: os.read(fd, 64) for fd in ready}
@@ -255,7 +256,7 @@ class Watchdog:
         return "the space bar" if b" " in said.get(self._charge.keyboard or -1, b"") else None
 
     def _obey(self) -> bool:
-        """Do what the program asks; return whether it is still there."""
+        """Execute the program's requests; return whether it is still connected."""
         while self._wire.poll(self._listens):
             request, content = self._wire.recv()
             if request == "close":
@@ -319,7 +320,7 @@ def _during(samples: Any, start_ns: int, end_ns: int) -> list[RememberedState]:
 
 
 def _terminal(keyboard: int | None) -> int | None:
-    """Open the terminal again: a file descriptor means nothing in another process."""
+    """Reopen the terminal, because a file descriptor is not valid in another process."""
     if keyboard is None:
         return None
     try:

@@ -15,7 +15,7 @@ from flangeye.plugin.stage import KINDS, PARTS, Choose, Plugin
 
 
 def describe_all(registry: Registry) -> str:
-    """Return every stage and part, grouped by kind, a line each."""
+    """Return one line for every stage and part, grouped by kind."""
     return _kinds(registry, [*KINDS, *PARTS])
 
 
@@ -88,7 +88,7 @@ def _kind(params: type[BaseModel], name: str, field: FieldInfo) -> str:
 
 
 def _of_schema(described: dict[str, Any]) -> str:
-    """Return what a JSON Schema fragment means, in a word or two."""
+    """Return a short name for the type of a JSON Schema fragment."""
     if "x-flangeye-quantity" in described:
         return str(described["x-flangeye-quantity"])
     if "enum" in described:

@@ -67,7 +67,7 @@ class Offered(MutableMapping[str, Kind]):
 
         Raises:
             KeyError: No plugin offers this name.
-            PluginNotFoundError: It cannot be imported, or its entry point names nothing.
+            PluginNotFoundError: The plugin cannot be imported, or its entry point is invalid.
         """
         held = self._held[name]
         if isinstance(held, str):
@@ -95,11 +95,11 @@ class Registry:
 
     Attributes:
         hooks: The plugins themselves, whose hooks are called during runs.
-        stages: Name -> stage.
-        parts: Name -> part.
-        broken: Entry point name -> why it could not be loaded.
-        owners: Stage or part name -> entry point that offers it.
-        installed: Entry point name -> its package; None if unknown.
+        stages: Stages by name.
+        parts: Parts by name.
+        broken: Reason why a plugin failed to load, by entry point.
+        owners: Entry point of each stage or part, by name.
+        installed: Package of each entry point; None if unknown.
     """
 
     hooks: pluggy.PluginManager
@@ -224,8 +224,8 @@ class Lookup:
     """The context in which parameters are validated.
 
     Attributes:
-        registry: The parts on offer.
-        folder: Where relative paths start.
+        registry: The installed plugins.
+        folder: Folder to which relative paths refer.
         robot: The recipe's arm.
         needs_files: Whether named files must exist; those of a log may be gone.
     """
@@ -275,8 +275,8 @@ def _builtin_first(entry_point: EntryPoint) -> tuple[bool, str]:
 def installed_plugins() -> list[EntryPoint]:
     """Return the entry points of the group ``flangeye``, sorted by name.
 
-    Python finds packages in the current folder too, where it stands first in the search path; a
-    folder that somebody hands on must not bring code along.
+    The current folder is excluded, although Python may have it first in its search path: a folder
+    of recordings from others must not be able to bring code along.
     """
     found = [plugin for plugin in _found(tuple(sys.path)) if not _of_current_folder(plugin)]
     return sorted(found, key=lambda plugin: plugin.name)

@@ -184,7 +184,8 @@ class _Laying:
         shape: The body.
         spacing: Distance between neighbouring points at unit depth.
         raster: Standard deviation of a scan's end across its edge [m].
-        usual, prior: (7,) mean and (7, 7) information of the prior of lost widths and rounding.
+        usual: (7,) prior mean of the lost widths and the rounding.
+        prior: (7, 7) prior information matrix of these.
     """
 
     points: Floats

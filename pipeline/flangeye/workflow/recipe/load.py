@@ -345,7 +345,7 @@ def describe_recipe(path: Path, registry: Registry, overrides: Sequence[str] = (
 
     Raises:
         RecipeError: Names every mistake found.
-        StageError: A step moves the arm, and the space that it fills is not known.
+        StageError: A step moves the arm, but the arm's collision shape is unknown.
     """
     from flangeye.models.cell import Cell
     from flangeye.models.configuration import Configuration
