@@ -76,7 +76,7 @@ class WorldScore:
 
     @property
     def silent(self) -> bool:
-        """Whether the torch was beyond its stated bound, in a weld that was done or stopped."""
+        """Whether the torch's distance from the seam exceeded its stated bound anywhere."""
         return self.over_bound > 1.0
 
 

@@ -98,7 +98,7 @@ def _upper_eigenvalues(matrices: Floats) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True, eq=False)
 class IcpFit:
-    """Where ICP ended.
+    """Result of an ICP registration.
 
     Attributes:
         motion: (4, 4) that takes the source onto the target.

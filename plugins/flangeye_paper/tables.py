@@ -29,7 +29,7 @@ class SessionRow:
 
     @property
     def accepted(self) -> bool:
-        """Whether it gave a calibration."""
+        """Whether the session gave a calibration."""
         return self.row["status"] in ACCEPTED
 
     def result(self) -> dict[str, Any]:

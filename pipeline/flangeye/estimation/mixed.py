@@ -137,12 +137,12 @@ class Fit:
 
     @cached_property
     def mean(self) -> Floats:
-        """(P + K,) of places and effects."""
+        """Mean (P + K,) of places and effects."""
         return np.asarray(cho_solve((self.root, True), self.right, check_finite=False))
 
     @cached_property
     def covariance(self) -> Floats:
-        """(P + K, P + K) of places and effects."""
+        """Covariance (P + K, P + K) of places and effects."""
         # LAPACK's inverse from a factor has one triangle; the diagonal is in both halves
         half = dpotri(self.root, lower=1)[0]
         whole = half + half.T
@@ -302,12 +302,12 @@ class Posterior:
 
     @cached_property
     def mean(self) -> Floats:
-        """(P + K,) of places and effects."""
+        """Mean (P + K,) of places and effects."""
         return np.asarray(sum(c * f.mean for c, f in zip(self.chances, self.fits, strict=True)))
 
     @cached_property
     def covariance(self) -> Floats:
-        """(P + K, P + K) of the mixture about its mean."""
+        """Covariance (P + K, P + K) of the mixture about its mean."""
         within = sum(c * f.covariance for c, f in zip(self.chances, self.fits, strict=True))
         apart = np.array([f.mean - self.mean for f in self.fits])
         return np.asarray(within + (apart.T * self.chances) @ apart)

@@ -70,7 +70,7 @@ class Rough:
 
     @property
     def covariance(self) -> Floats:
-        """(P, P) of the places."""
+        """Covariance (P, P) of the places."""
         return self.fit.covariance[: self.model.p, : self.model.p]
 
 

@@ -205,12 +205,12 @@ class Cell:
         return {n: Transform(f"{n}_base", n, places[n]) for n in self.movers if n in places}
 
     def joints(self, observations: Sequence[Observation]) -> dict[str, Floats]:
-        """Return (N, n) of the arms that reported them at all N observations [rad]."""
+        """Return joint angles (N, n) [rad] of each arm that reported them at all N observations."""
         each = {name: [joints_of(o, name) for o in observations] for name in self.arms}
         return {n: np.array(q) for n, q in each.items() if all(x is not None for x in q)}
 
     def link_poses(self, name: str, joints: Floats) -> Floats:
-        """Return (N, 4, 4) of a link in its arm's base at (N, n) joints, by the arm's model."""
+        """Return the poses (N, 4, 4) of a link in its arm's base at joint angles (N, n)."""
         from flangeye.maths.kinematics import Arm
 
         link = self.links[name]

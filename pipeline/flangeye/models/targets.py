@@ -294,7 +294,7 @@ def _openings(flange: Flange) -> list[tuple[float, float]]:
 
 
 def _correlate(empty: Floats, pattern: Floats) -> Floats:
-    """Return, for every rotation, the emptiness inside the pattern less that outside it."""
+    """Return, for every rotation, the mean emptiness in the pattern's holes minus that beside."""
     # Circular correlation: the emptiness under the pattern, summed, at every rotation at once
     spectrum = np.fft.rfft(empty) * np.conj(np.fft.rfft(pattern))
     inside = np.fft.irfft(spectrum, TICKS)

@@ -320,7 +320,7 @@ class StreamConformance(DriverConformance):
         return found
 
     def test_it_gives_each_once_with_its_time(self) -> None:
-        """One after the other."""
+        """Items arrive in order of time, each exactly once."""
         with self.opened() as device:
             times = [one.time_ns for one in self.given(device, 5)]
         require(times == sorted(set(times)), f"{self.gives}s are not in order, or one came twice")

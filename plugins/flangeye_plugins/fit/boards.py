@@ -70,7 +70,7 @@ class CharucoParams(SquaresParams, DictionaryParams):
 
     @property
     def board(self) -> Board:
-        """The print."""
+        """The printed board."""
         size = self.columns, self.rows, self.square
         return Board("charuco", *size, self.marker, self.dictionary)
 
@@ -95,7 +95,7 @@ class CheckerboardParams(SquaresParams):
 
     @property
     def board(self) -> Board:
-        """The print."""
+        """The printed board."""
         return Board("checkerboard", self.columns, self.rows, self.square)
 
 
@@ -122,7 +122,7 @@ class CirclesParams(PrintedTargetParams):
 
     @property
     def board(self) -> Board:
-        """The print."""
+        """The printed board."""
         return Board("circles", self.columns, self.rows, self.spacing, self.diameter)
 
 
@@ -136,7 +136,7 @@ class MarkerParams(DictionaryParams):
 
     @property
     def board(self) -> Board:
-        """The print."""
+        """The printed board."""
         return Board("marker", 1, 1, self.size, dictionary=self.dictionary, marker_id=self.id)
 
 

@@ -97,7 +97,7 @@ class Tally:
 
     @property
     def counts(self) -> dict[Status, int]:
-        """Status -> sessions."""
+        """Number of sessions by status."""
         return _counts(np.concatenate(self._statuses)) if self._statuses else {}
 
     @property

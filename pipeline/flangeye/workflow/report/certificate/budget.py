@@ -129,7 +129,7 @@ class Budget:
 
     @cached_property
     def covariance(self) -> Floats:
-        """(3, 3) of the point [m^2]."""
+        """Covariance (3, 3) of the point [m^2]."""
         sensitivities = np.stack([c.sensitivity for c in self.contributions], axis=1)
         return propagated(sensitivities, self._standard, self.correlation)
 
