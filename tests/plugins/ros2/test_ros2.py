@@ -66,6 +66,12 @@ def test_a_move_keeps_its_speed_and_whatever_dies_the_arm_rests(env, latency):
         goal = start + 0.4 * np.eye(6)[0]
         assert drive(robot, goal) < 1.15 * 0.5
         assert np.abs(robot.state().joints - goal).max() < 1e-3
+        height, until = robot.state().base_T_flange.translation[2], time.monotonic() + 0.6
+        while time.monotonic() < until:
+            robot.move_velocity(np.array([0.0, 0.0, 0.05, 0.0, 0.0, 0.0]), 0.5)
+            robot.wait_cycle()
+        assert robot.state().base_T_flange.translation[2] - height > 0.01
+        robot.stop()
         under_way(robot)
         moment = time.monotonic()
         robot.stop()

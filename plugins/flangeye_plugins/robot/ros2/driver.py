@@ -123,11 +123,11 @@ class Ros2Arm(Listener):
         jacobian = self.arm.jacobian(joints)
         speeds = np.linalg.lstsq(jacobian, np.concatenate([twist[3:], twist[:3]]), rcond=None)[0]
         lever = float(np.linalg.norm(jacobian[3:], axis=0).max())
-        motion = self._motion
-        if not isinstance(motion, pieces.Velocity):
-            motion = pieces.Velocity(joints)
-            self._begin(motion)
+        going = self._motion
+        motion = going if isinstance(going, pieces.Velocity) else pieces.Velocity(joints)
         motion.ask(speeds, acceleration / max(lever, 1.0))
+        if motion is not going:  # asked before it begins: without speeds it would be over at once
+            self._begin(motion)
 
     def wait_cycle(self) -> None:
         """Wait for the next joint state and extend the motion, which otherwise ends."""
