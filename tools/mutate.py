@@ -61,18 +61,20 @@ COMPUTED = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.
 SLOWER, STARTS = 4.0, 8.0
 """A change is noticed, too, by tests that take so many times as long, and so much more [CPU s]."""
 IDLE = 3.0
-"""Or by tests that wait so many times longer than that [wall s a CPU s]."""
+"""Or by tests that wait so many times longer than that, on a machine that is not crowded [wall s a
+CPU s]."""
 MEMORY = 16 << 30
 """Or by tests that take so much of it [bytes]."""
 
 
 class Mutation(NamedTuple):
-    """One mutation: room, file, line, the statement's lines, the node, a description, and the
-    change.
+    """One mutation: room, file, its source when the mutation was made, line, the statement's lines,
+    the node, a description, and the change.
     """
 
     room: str
     file: str
+    source: str
     line: int
     lines: range
     node: int
@@ -89,7 +91,7 @@ class Mutation(NamedTuple):
         return base64.b64encode(marshal.dumps(code)).decode()
 
     def _tree(self) -> ast.Module:
-        tree = ast.parse((ROOT / self.file).read_text("utf-8"))
+        tree = ast.parse(self.source)
         self.change(list(ast.walk(tree))[self.node])
         return tree
 
@@ -97,12 +99,13 @@ class Mutation(NamedTuple):
 def mutations(room: str) -> Iterator[Mutation]:
     """Yield every change of a room's source."""
     for path in sorted((ROOT / ROOMS[room][0]).rglob("*.py")):
-        tree = ast.parse(path.read_text("utf-8"))
-        lines, file = _statements(tree), str(path.relative_to(ROOT))
+        source, file = path.read_text("utf-8"), str(path.relative_to(ROOT))
+        tree = ast.parse(source)
+        lines = _statements(tree)
         for number, node in enumerate(ast.walk(tree)):
             line = getattr(node, "lineno", 0)
             for words, change in _changes(node):
-                yield Mutation(room, file, line, lines[node], number, words, change)
+                yield Mutation(room, file, source, line, lines[node], number, words, change)
 
 
 def _statements(tree: ast.Module) -> dict[Any, range]:
@@ -227,7 +230,7 @@ class Copy:
         """Return whether a changed function fails tests in a fork of the collecting process."""
         assert self._trying is not None and self._trying.stdin and self._trying.stdout
         bounds = {test: SLOWER * seconds + STARTS for test, seconds in tests.items()}
-        asked = {"code": mutation.code(self._root), "tests": bounds, "idle": IDLE}
+        asked = {"code": mutation.code(self._root), "tests": bounds, "idle": _idle()}
         print(json.dumps(asked), file=self._trying.stdin, flush=True)
         if not (answer := self._trying.stdout.readline()):
             raise SystemExit("the process that has the tests collected has ended")
@@ -248,7 +251,7 @@ class Copy:
         """Run Python on the copy; a run that takes more than ``patience`` [CPU s] has failed."""
         child = self._start(words, patience, stdout=subprocess.DEVNULL)
         try:
-            return child.wait(patience and IDLE * patience)
+            return child.wait(patience and _idle() * patience)
         except subprocess.TimeoutExpired:
             return 1
         finally:
@@ -325,6 +328,14 @@ def _survivors(copy: Copy, chosen: list[Mutation], tests: Tests, budget: float) 
 def _chosen(room: str, count: int, seed: int, only: str) -> list[Mutation]:
     every = [m for m in mutations(room) if re.search(only, f"{m.file}:{m.line}:")]
     return every if only else random.Random(f"{room} {seed}").sample(every, min(count, len(every)))
+
+
+def _idle() -> float:
+    """Return how many times longer than their CPU time tests may take [wall s a CPU s].
+
+    Where more programs than cores are ready, one that waits for a core is not one that hangs.
+    """
+    return IDLE * max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
 
 
 def _test_files(place: Path) -> list[Path]:
