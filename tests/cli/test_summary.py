@@ -182,3 +182,27 @@ def test_what_is_said_is_bounded(
     with pytest.raises(SystemExit, match="2"):
         end_in_words(fails)
     assert capsys.readouterr().err.splitlines() == said
+
+
+@pytest.mark.parametrize("error", [ImportError("a.so: failed to map"), SystemError("a.so")])
+def test_a_library_that_does_not_load_is_a_lack_of_memory_where_there_is_none(
+    error: Exception, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails() -> None:
+        raise error
+
+    with pytest.raises(type(error)):
+        end_in_words(fails)
+
+    def runs_out() -> None:
+        monkeypatch.setattr("flangeye.files.processes.mmap.mmap", no_map)
+        raise error
+
+    def no_map(*_: object) -> None:
+        raise OSError
+
+    with pytest.raises(SystemExit, match="2"):
+        end_in_words(runs_out)
+    assert capsys.readouterr().err.splitlines() == [
+        f"error: not enough memory: {type(error).__name__}: {error}; fewer than 256 MB are left"
+    ]
