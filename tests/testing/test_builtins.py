@@ -39,8 +39,7 @@ from flangeye.types import (
     by_frame,
 )
 from flangeye.units import SI
-from flangeye_emulators.acquire.simulated import acquire_simulated
-from flangeye_emulators.acquire.simulation import SimulatedParams
+from flangeye_emulators.acquire.simulated import SimulatedParams, acquire_simulated
 from flangeye_emulators.robot import robot_simulated
 from flangeye_emulators.world.scanner import StructuredLight
 from flangeye_plugins.acquire.archive import ArchiveParams, acquire_archive

@@ -12,7 +12,7 @@ import typer
 
 from flangeye.cli.app import app, ask, load_plugins
 from flangeye.cli.console import at_work, say
-from flangeye.errors import RecipeError
+from flangeye.errors import FlangeyeError, NothingSeen, RecipeError
 
 if TYPE_CHECKING:
     from flangeye.plugin.registry import Registry
@@ -140,7 +140,6 @@ def _seen(
     draft: Draft, folder: Path, out: Path, registry: Registry, count: int
 ) -> list[Observation] | None:
     """Return the first scans that show a drafted recipe's target; None if it does not run."""
-    from flangeye.errors import FlangeyeError, NothingSeen
     from flangeye.types import ArchivePath
     from flangeye.workflow.recipe.load import parse_recipe
     from flangeye.workflow.run.runner import Runner

@@ -9,7 +9,7 @@ import typer
 
 from flangeye.cli.app import LogFile, Overrides, app, load_plugins, read_recipe
 from flangeye.cli.console import at_work, name_damage, of_foreign, require_gathered, say, say_notes
-from flangeye.errors import FlangeyeError, RecipeError
+from flangeye.errors import FlangeyeError, RecipeError, StageError
 
 if TYPE_CHECKING:
     from flangeye.workflow.log.read import RunLog
@@ -149,7 +149,6 @@ def layout(
     ] = None,
 ) -> None:
     """Write a layout for logs in Foxglove or Rerun."""
-    from flangeye.errors import StageError
     from flangeye.files.regular import write_whole
     from flangeye.workflow.log.foxglove import foxglove_layout, write_rerun_blueprint
 

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flangeye.cli.app import Overrides, RecipeName, app, load_plugins, read_recipe
-from flangeye.cli.console import at_work, say
-from flangeye.errors import FlangeyeError, NothingMoved
+from flangeye.cli.console import at_work, of_foreign, say
+from flangeye.errors import FlangeyeError, NothingMoved, StageError
 
 if TYPE_CHECKING:
     from flangeye.plugin.registry import Registry
@@ -153,7 +153,6 @@ def _plan_as_json() -> Iterator[None]:
 
 
 def _refuse(options: object, why: str) -> None:
-    from flangeye.errors import StageError
 
     if options:
         raise StageError(why)
@@ -199,7 +198,6 @@ def _after_verification(recipe: Recipe) -> list[str]:
 
 def _findings(log: Path, registry: Registry, recipe: Recipe) -> Sequence[Finding]:
     """Return the mistakes that the doctor finds in a run, the one that explains most first."""
-    from flangeye.cli.console import of_foreign
     from flangeye.workflow.doctor.cells import examine_cell, open_cell
     from flangeye.workflow.doctor.diagnosis import examine
     from flangeye.workflow.doctor.opening import open_session
@@ -226,7 +224,6 @@ def _recipe_of(
     overrides: Sequence[str],
 ) -> tuple[Recipe, FromNothing | None]:
     """Return the checked recipe, by name or from the run to resume, and the run to resume."""
-    from flangeye.errors import StageError
     from flangeye.workflow.run.restart import earlier_run
 
     resume, retake = going_on
@@ -242,7 +239,6 @@ def _recipe_of(
 def _point(
     recipe: Recipe, source: Path | None, at: str | None, leave_out: Sequence[str]
 ) -> FromNothing:
-    from flangeye.errors import StageError
     from flangeye.workflow.log.read import read_run
     from flangeye.workflow.run.restart import FromNothing, restart_at
 
@@ -265,7 +261,6 @@ def _record(
     from rich.console import Console
 
     from flangeye.cli.summary import RunProgress, print_summary
-    from flangeye.errors import StageError
     from flangeye.files.elsewhere import with_urls
     from flangeye.workflow.run.session import record_run
 

@@ -14,8 +14,6 @@ from flangeye.workflow.result.contract import Result
 from flangeye.workflow.result.sections import expected_error
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from rich.console import Console
 
 

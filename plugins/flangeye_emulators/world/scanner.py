@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,13 +26,11 @@ from flangeye_emulators.world.raycast import (
     Image,
     Pixels,
     RaycastScene,
+    SolidBody,
     bands,
     pixels_of,
     through,
 )
-
-if TYPE_CHECKING:
-    from flangeye_emulators.world.raycast import RaycastScene, SolidBody
 
 DEPTH_STEP = 5.0
 """A step is a change of depth between neighbours of more than this many widths of a pixel: a
@@ -592,7 +590,5 @@ def scanner_of(
 
 def before_camera(bodies: Sequence[SolidBody], base_T_camera: Floats) -> RaycastScene:
     """Return the scene of bodies given in ``base``, moved to ``camera``."""
-    from flangeye_emulators.world.raycast import RaycastScene
-
     camera_T_base = Transform(BASE, CAMERA, base_T_camera).inverse().matrix
     return RaycastScene([body.moved(camera_T_base) for body in bodies])

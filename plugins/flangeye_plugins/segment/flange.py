@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -19,15 +19,13 @@ from flangeye_plugins.segment.discs import (
     PlanarPiece,
     SurfacePiece,
     compare,
+    crop,
     flat_parts,
     in_box,
     of_size,
 )
-from flangeye_plugins.segment.grid import Grid, cells
+from flangeye_plugins.segment.grid import Grid, cells, coarse_view, nothing_before_scanner
 from flangeye_plugins.segment.scale import RangeParams, check_scale
-
-if TYPE_CHECKING:
-    from flangeye_plugins.segment.grid import Grid
 
 NOISE_GATE = 5.0
 """Robust standard deviations of the grid's own bending above which a point is not smooth."""
@@ -287,9 +285,6 @@ def segment_flange(
     Raises:
         StageError: The cloud's unit is wrong, for example millimetres.
     """
-    from flangeye_plugins.segment.discs import DiscLimits, crop
-    from flangeye_plugins.segment.grid import coarse_view, nothing_before_scanner
-
     view = coarse_view(capture.cloud.xyz, flange.rim / 15)
     if view is None:
         return Rejected(nothing_before_scanner(capture.cloud.xyz))

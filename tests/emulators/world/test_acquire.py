@@ -13,8 +13,7 @@ from flangeye.models.loading import load_model
 from flangeye.models.targets import plate_of, wrist_circle_of
 from flangeye.plugin.stage import KINDS
 from flangeye.types import CAMERA
-from flangeye_emulators.acquire.simulated import acquire_simulated
-from flangeye_emulators.acquire.simulation import SimulatedParams
+from flangeye_emulators.acquire.simulated import SimulatedParams, acquire_simulated
 from flangeye_emulators.world.arm import ArmErrors
 from flangeye_emulators.world.scanner import CameraPose
 from flangeye_plugins.plan import GridParams, grid

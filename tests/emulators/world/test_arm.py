@@ -13,9 +13,8 @@ from flangeye.models.loading import load_model
 from flangeye.models.targets import flange_of, load_standard
 from flangeye.types import BASE, FLANGE, TARGET, Source, Transform, Truth
 from flangeye_emulators.acquire.planned_session import plan_session
-from flangeye_emulators.acquire.simulated import acquire_simulated
+from flangeye_emulators.acquire.simulated import SimulatedParams, acquire_simulated
 from flangeye_emulators.acquire.simulated_session import SimulatedMarkerParams
-from flangeye_emulators.acquire.simulation import SimulatedParams
 from flangeye_emulators.world.arm import REAL, ArmErrors, ErrorSizes, ImperfectArm
 from flangeye_emulators.world.scanner import CameraPose
 from flangeye_emulators.world.session import CameraView

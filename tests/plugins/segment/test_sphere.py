@@ -12,8 +12,7 @@ from flangeye.models.loading import load_model
 from flangeye.models.targets import Sphere, plate_of
 from flangeye.types import CAMERA, Capture, FlangeCloud, PointCloud, Rejected, Transform, by_frame
 from flangeye.units import SI
-from flangeye_emulators.acquire.simulated import acquire_simulated
-from flangeye_emulators.acquire.simulation import SimulatedParams
+from flangeye_emulators.acquire.simulated import SimulatedParams, acquire_simulated
 from flangeye_emulators.world.arm import ArmErrors
 from flangeye_plugins.fit.sphere import SphereParams, fit_sphere
 from flangeye_plugins.plan import GridParams, grid

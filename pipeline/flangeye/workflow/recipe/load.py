@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Protocol, get_args
+from typing import Any, Protocol, get_args
 
 from pydantic import BaseModel, ValidationError
 
@@ -27,10 +27,6 @@ from flangeye.workflow.recipe.header import Header
 from flangeye.workflow.recipe.overrides import apply_override
 from flangeye.workflow.recipe.own_models import carried_files, sections, written_out
 from flangeye.workflow.recipe.steps import SECTIONS, Step, StepOrder
-
-if TYPE_CHECKING:
-    from flangeye.models.robots import RobotModel
-    from flangeye.plugin.registry import Registry
 
 PLACEHOLDERS: Mapping[Hashable, Any] = {"title": "untitled", "steps": ["none"]}
 """What stands for sections that a recipe must have, where they are wrong."""
@@ -349,7 +345,6 @@ def describe_recipe(path: Path, registry: Registry, overrides: Sequence[str] = (
     """
     from flangeye.models.cell import Cell
     from flangeye.models.configuration import Configuration
-    from flangeye.models.robots import RobotModel
     from flangeye.types.arrays import as_line
 
     checked = load_recipe(path, registry, overrides)

@@ -16,10 +16,10 @@ from contextlib import ExitStack, closing, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
-from rich.console import Console
+from rich.console import Console, Group, RenderableType
 from typing_extensions import Buffer
 
 from flangeye.errors import StageError
@@ -28,9 +28,6 @@ from flangeye.files.words import printable
 from flangeye.types import FLANGE
 from flangeye.workflow.log.read import decode_json
 from flangeye.workflow.log.records import Channel, LogFile, LogMessage, NotMcapError, reason_of
-
-if TYPE_CHECKING:
-    from rich.console import RenderableType
 
 
 class WaitingFile(io.RawIOBase):
@@ -168,7 +165,6 @@ class RunView:
 
     def rendered(self) -> RenderableType:
         """Return the view for the terminal."""
-        from rich.console import Group
         from rich.table import Table
         from rich.text import Text
 
