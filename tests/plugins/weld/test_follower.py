@@ -573,7 +573,11 @@ def test_phases_follow_from_what_was_felt() -> None:
     firm.seam.contact.deflection = PRESS
     assert judged(firm, tip=ends - 1e-5) == "following"
     # A finger that shows its play, not what is wanted, for 10 mm is on no wall.
-    for shown, phase in ((0.38e-3, "bridging"), (0.41e-3, "following")):
+    for shown, phase in (
+        (0.47e-3, "bridging"),
+        (0.5e-3, "following"),
+        (-0.5e-3, "following"),
+    ):
         slack = make()
         slack.pressing.wanted, slack.seam.contact.play = PRESS, 0.3e-3
         slack.seam.contact.deflection = shown
@@ -617,6 +621,7 @@ def felt_at(found: Any, time: float, s: float, offset: float, deflection: float 
 
 def test_what_was_felt_a_while_ago_by_a_tip_that_no_wall_lost_is_believed() -> None:
     found = make()
+    found.pressing.firm = 9.0
     for i in range(40):
         felt_at(found, 0.033 * i, 0.02 + 2e-4 * i, 1e-3)
     found.seam.refined.renew(-DISTANCE, 100_000)
@@ -701,6 +706,30 @@ def test_a_tip_that_falls_off_the_start_is_lifted_back_into_the_seam() -> None:
     assert found.seam.refined.samples()[:, 0].min() < 1.3e-3
 
 
+@pytest.mark.parametrize(("again", "kept"), [(True, 20e-3), (False, 8e-3)])
+def test_what_is_felt_while_the_wall_is_in_doubt_waits_until_one_holds(
+    again: bool, kept: float
+) -> None:
+    """A tip that shows little more than the finger's play may be led by the arm."""
+    found = make()
+    found.pressing.wanted = found.pressing.most = PRESS
+    found.seam.contact.play, found.seam.contact.noise = 0.3e-3, (20e-6, 60e-6)
+    found.seam.begin(Learned(width=0.2e-3), 60e-6, [], 0.0)
+    for i in range(140):
+        s, time = 5e-3 + 1e-4 * i, 0.02 * i
+        shown = 0.35e-3 if s > 8e-3 and not (again and s > 14e-3) else PRESS
+        at = pose(s, shown, -1.5e-3, time=time)
+        found.now = time
+        found.sensing.watch(at)
+        found._feel(Touch(time, np.array([0.0, -shown, 1.5e-3])))
+        found.progress.tip = s
+        found._judge(at, at)
+    found.seam.refined.renew(-DISTANCE, 10_000)
+    last = found.seam.refined.samples()[-1, 0]
+    assert found.phase == ("following" if again else "bridging")
+    assert last == pytest.approx(min(kept, 18.9e-3 - 15e-3 * 0.1), abs=1.5e-3)
+
+
 def test_a_tip_that_finds_no_way_back_into_the_seam_stops_the_weld() -> None:
     found = swept(ends="3 mm")
     driven(found, 1e-3, lambda: found.phase == "stopped", again=False)
@@ -751,6 +780,11 @@ def test_an_arm_that_would_go_on_blindly_is_stopped() -> None:
     bent = make("seeking")
     bent.sensing.search.bent = True
     assert refused(bent, seen=1.0) == "the tip is displaced though nothing should touch it"
+    # On the plate beside its groove, far above the plan, friction may hold a tip too.
+    for height, told in ((7.9e-3, ""), (8.1e-3, "no groove within 8 mm of the plan's start")):
+        held = make("seeking")
+        held.sensing.search.found, held.sensing.felt = True, SeamReading(0.0, height)
+        assert refused(held, seen=1.0) == told
     over = make("seeking")
     over.sensing.search.over = True
     assert refused(over, seen=1.0) == "no groove within 8 mm of the plan's start"

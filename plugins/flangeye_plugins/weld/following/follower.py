@@ -175,7 +175,10 @@ class Follower:
             elif self.seam.contact.free < 0.5:
                 sensing.smooth(found.seam, self.seam.refined.noise)
                 self._stop(self.seam.moved(found))
-            self.seam.keep(touch.time - self.task.settings.sure)
+            sure = touch.time - self.task.settings.sure
+            # What is felt while the tip may have lost its wall waits until a wall holds it again.
+            waits = self.phase == "following" and not self.seam.backs
+            self.seam.keep(min(sure, self.pressing.firm) if waits else sure)
 
     @property
     def _silence(self) -> float:
@@ -237,7 +240,8 @@ class Follower:
         contact = self.seam.contact
         if self.seam.backs or not self.task.touch:
             return False
-        if self.pressing.slack_for(self.tip, contact.deflection, contact.play) > STRIDE:
+        seen = self.sensing.seen
+        if self.pressing.slack_for(self.tip, contact.deflection, contact.play, seen) > STRIDE:
             contact.lose()
         return contact.free > LOST
 
@@ -298,7 +302,9 @@ class Follower:
         if sensing.search.bent:
             return "the tip is displaced though nothing should touch it"
         below = self.progress.place.height - float(pose.position[2])
-        if self.phase == "seeking" and (sensing.search.over or below > settings.reach):
+        # On the plate beside its groove friction may hold a tip as two walls do.
+        high = sensing.search.found and self._seam_at_tip().height > settings.reach
+        if self.phase == "seeking" and (sensing.search.over or below > settings.reach or high):
             return f"no groove within {settings.reach * 1e3:.0f} mm of the plan's start"
         return ""
 

@@ -61,6 +61,7 @@ class Pressing:
         most: Set point while the tip follows its wall [m].
         wanted: Present set point [m].
         side: Side of the pressed wall: 1 left, -1 right.
+        firm: Time of the newest touch by which a wall surely held the tip [s].
     """
 
     def __init__(self, task: WeldTask) -> None:
@@ -69,6 +70,7 @@ class Pressing:
         self.most = settings.deflection / (SOFTER if task.belief.two_walls else 1.0)
         self.wanted, self.side = 0.0, settings.sign
         self._lost = self._turned = self._firm = 0.0
+        self.firm = -math.inf
 
     def learn(self, found: Learned, swept: float) -> None:
         """Limit ``most`` by the sweep, in which the tip stayed seated up to ``swept`` [m]."""
@@ -113,20 +115,22 @@ class Pressing:
         release = task.settings.speed * self.most / task.settings.release
         return task.plan.length - max(task.settings.ending, task.beyond) - release
 
-    def slack_for(self, tip: float, deflection: float, play: float) -> float:
+    def slack_for(self, tip: float, deflection: float, play: float, seen: float) -> float:
         """Return the distance the tip has moved without contact with a wall [m].
 
-        A wall is in contact if the deflection follows its set point. Without a wall the finger
-        shows only its play.
+        A wall is in contact if the deflection follows its set point, or exceeds it on the other
+        side. Without a wall the finger shows only its play.
 
         Args:
             tip: Arc length of the tip [m].
             deflection: Measured deflection [m].
             play: Deflection that a free tip shows [m].
+            seen: Time of the newest touch [s].
         """
-        # A quarter of the way from the play to the set point: in a curve a late arm presses less.
-        if deflection > play + (self.wanted - play) / 4.0:
-            self._firm = tip
+        shown = abs(deflection) if self._task.belief.two_walls else deflection
+        # Half way from the play to the set point: in a curve a late arm presses less.
+        if shown > play + (self.wanted - play) / 2.0:
+            self._firm, self.firm = tip, seen
         return tip - self._firm
 
     # --- where a wall has ended -------------------------------------------------------------------
