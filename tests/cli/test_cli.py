@@ -233,7 +233,7 @@ def test_light_commands_import_nothing_heavy() -> None:
 def test_matrices_keep_to_one_thread_unless_told_otherwise(told: str | None, threads: str) -> None:
     code = (
         "import os, sys; from flangeye import cli; assert 'numpy' not in sys.modules; "
-        "cli._command = lambda: print(os.environ['OPENBLAS_NUM_THREADS']); cli.main()"
+        "cli.commands = lambda: lambda: print(os.environ['OPENBLAS_NUM_THREADS']); cli.main()"
     )
     environment = {k: v for k, v in os.environ.items() if k != "OPENBLAS_NUM_THREADS"}
     environment |= {"OPENBLAS_NUM_THREADS": told} if told else {}

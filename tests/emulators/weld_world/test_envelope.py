@@ -215,16 +215,11 @@ def test_worlds_are_drawn_again_as_they_were() -> None:
 
 @pytest.mark.slow
 def test_no_torch_is_beyond_its_stated_bound_whether_done_or_stopped() -> None:
-    verdicts = [judged(seed) for seed in range(2000, 2040) if seed != 2004]
+    verdicts = [judged(seed) for seed in range(2000, 2040)]
     assert len([v for v in verdicts if v.status == "done"]) >= 6
     assert not [v.seed for v in verdicts if v.silent]
     assert np.mean([v.inside for v in verdicts if v.largest]) >= 0.93
     assert f"{len(verdicts)} worlds" in summary(verdicts)[0]
-
-
-@pytest.mark.xfail(strict=True, reason="1.02 of its bound, where no image shows a missing wall")
-def test_a_torch_2_97_sigma_aside_is_in_its_bound_where_a_wall_is_missing_too() -> None:
-    assert not judged(2004).silent
 
 
 @pytest.mark.parametrize("seed", [995001, pytest.param(995109, marks=pytest.mark.slow)])

@@ -16,7 +16,7 @@ from flangeye.workflow.recipe.load import load_recipe, parse_recipe
 from flangeye.workflow.run import runner
 from flangeye.workflow.run.ahead import Done, cores, worked_ahead
 from flangeye.workflow.run.runner import Runner
-from flangeye_emulators.acquire import simulation
+from flangeye_emulators.acquire import simulated
 from flangeye_emulators.world.scanner import StructuredLight
 from tests import toy
 from tests.conftest import TOY_RECIPE, replaced
@@ -161,7 +161,7 @@ def test_simulated_scans_are_made_ahead_and_give_the_same_calibration(
 
     def run(cores):
         monkeypatch.setattr(runner, "cores", lambda: cores)
-        monkeypatch.setattr(simulation, "cores", lambda: cores)
+        monkeypatch.setattr(simulated, "cores", lambda: cores)
         threads.clear()
         makers.clear()
         with replaced(segment, watched):
