@@ -212,6 +212,25 @@ def test_the_torch_slows_down_where_its_error_comes_near_the_bound(
     assert found.welding.ease == 1.0  # nothing is spoiled before the arc
 
 
+def test_the_rest_of_the_seam_is_predicted_once_for_each_fifth_of_a_millimetre(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found = make(plan=straight(0.3))
+    felt_along(found, 0.0)
+    asked: list[float] = []
+
+    def ahead() -> tuple[float, float]:
+        asked.append(found.torch)
+        return 0.03, 9e-3
+
+    monkeypatch.setattr(found.welding, "_ahead", ahead)
+    for torch in np.arange(1e-3, 1.5e-3, 3e-5):
+        put(found, torch=float(torch))
+        found._estimate(pose(found.torch + DISTANCE))
+    assert asked == pytest.approx([1e-3, 1.21e-3, 1.42e-3])
+    assert found.phase == "following"
+
+
 def test_a_weld_whose_last_hundredth_is_not_known_is_done_there() -> None:
     long = straight(0.3)
     assert doubtful(0.296, 0.0, plan=long).phase == "stopped"
