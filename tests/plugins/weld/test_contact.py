@@ -127,3 +127,17 @@ def test_a_tip_whose_walls_end_is_borne_by_the_joint_s_bottom() -> None:
     tip.feel(60)
     assert tip.feel(12, aside=-2e-3, deflection=0.0)[Mode.FREE] > 0.9
     assert found.bears
+
+
+def test_a_tip_that_falls_after_one_measurement_fell_there() -> None:
+    """Seated anew, the way between two measurements is not known: not from the seat before."""
+    found = contact()
+    tip = Tip(found)
+    tip.feel(60, deflection=0.0)
+    list(found.settled(9.0))
+    tip.k += 200  # it is set down 40 mm farther
+    found.seat(tip.k / 30, 0.0, 1.5e-3)
+    tip.feel(1, deflection=0.0)
+    tip.feel(6, up=-1.4e-3, deflection=0.0, compression=0.0)
+    list(found.settled(99.0))
+    assert found.fell == pytest.approx(261 * 0.2e-3)

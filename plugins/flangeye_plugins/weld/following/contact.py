@@ -129,12 +129,13 @@ class Contact:
         self._height, self._spread = 0.0, math.inf
         self._newest: deque[_Weighed] = deque()
         self.fell: float | None = None
-        self._borne = 0.0, 0.0
+        self._borne: tuple[float, float] | None = None
 
     def seat(self, time: float, deflection: float, compression: float) -> None:
         """Set the state to seated, with this deflection and compression [m]."""
         self.likely = only(Mode.SEATED)
         self.deflection, self.compression, self._time = deflection, compression, time
+        self._borne = None
         self._spread = math.inf
 
     def lose(self) -> None:
@@ -204,8 +205,8 @@ class Contact:
     def _part(self, s: float, fallen: float) -> None:
         """Note whether the tip has fallen at a measurement, given the probability of it."""
         if fallen < 0.5:
-            self.fell, self._borne = None, (self._borne[1], s)
-        elif self.fell is None:
+            self.fell, self._borne = None, (self._borne[1] if self._borne else s, s)
+        elif self.fell is None and self._borne is not None:
             # Friction has held the tip back: falling, it springs ahead. The joint ended on the way
             # from the last measurement on it to the next, which is as long as the way before.
             before, last = self._borne

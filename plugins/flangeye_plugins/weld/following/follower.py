@@ -303,8 +303,9 @@ class Follower:
             return "the tip is displaced though nothing should touch it"
         below = self.progress.place.height - float(pose.position[2])
         # On the plate beside its groove friction may hold a tip as two walls do.
-        high = sensing.search.found and self._seam_at_tip().height > settings.reach
-        if self.phase == "seeking" and (sensing.search.over or below > settings.reach or high):
+        high = sensing.felt is not None and sensing.felt.height > settings.reach
+        missed = sensing.search.over or below > settings.reach or (sensing.search.found and high)
+        if self.phase == "seeking" and missed:
             return f"no groove within {settings.reach * 1e3:.0f} mm of the plan's start"
         return ""
 
@@ -378,12 +379,10 @@ class Follower:
             self.progress.advance(pose, coming)
             return
         self.progress.back(pose, coming)
-        contact, lost = (
-            self.seam.contact,
-            self.seam.lost_for(self.now or 0.0) > self.task.settings.sure,
-        )
+        contact = self.seam.contact
+        lost = self.seam.lost_for(self.now or 0.0) > self.task.settings.sure
         # Where the joint is felt farther back than the seam may begin, it goes on there.
-        on = contact.at < -self.task.beyond - INSIDE and self.seam.contact.bears
+        on = contact.at < -self.task.beyond - INSIDE and contact.bears
         if lost or on:
             self.seam.arrive(self.sensing.learned, self.torch, lost)
             if self.seam.start is not None:

@@ -222,13 +222,13 @@ class SeamEstimate:
         contact: The state of the tip's contact.
         start: Arc length of the seam's start as felt by the tip; None if not felt [m].
         end: Arc length of the seam's end as felt by the tip; None if not felt [m].
-        lost: Time and arc length at which the tip lost contact [s, m]; None in contact.
+        lost: Time at which the tip lost contact [s]; None in contact.
     """
 
     def __init__(self, task: WeldTask) -> None:
         self.start: float | None = None
         self.end: float | None = None
-        self.lost: tuple[float, float] | None = None
+        self.lost: float | None = None
         self._task, belief, settings = task, task.belief, task.settings
         self.contact = Contact(
             belief.flat(settings.sign), belief.sliding(settings) / SOFTER, settings.preload,
@@ -291,7 +291,7 @@ class SeamEstimate:
 
     def lost_for(self, now: float) -> float:
         """Return the time since the tip lost contact [s]; 0 in contact."""
-        return 0.0 if self.lost is None else now - self.lost[0]
+        return 0.0 if self.lost is None else now - self.lost
 
     def arrive(self, found: Learned, torch: float, lost: bool = False) -> None:
         """Rebuild the path from the touches of the sweep and of the way back to the start.
@@ -344,7 +344,7 @@ class SeamEstimate:
         if self.contact.free <= LOST:
             self.lost = None
         elif self.lost is None:
-            self.lost = time, s
+            self.lost = time
         if self._task.plan.closed and s >= self._task.plan.length:
             self._go_around()
 
