@@ -8,7 +8,7 @@ from typing import Any, TypeVar, cast
 
 from threadpoolctl import ThreadpoolController
 
-F = TypeVar("F", bound=Callable[..., Any])
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 @cache
@@ -16,7 +16,7 @@ def _controller() -> ThreadpoolController:
     return ThreadpoolController()
 
 
-def on_one_thread(function: F) -> F:
+def on_one_thread(function: Function) -> Function:
     """Return a function that calls BLAS on one thread."""
 
     @wraps(function)
@@ -24,4 +24,4 @@ def on_one_thread(function: F) -> F:
         with _controller().limit(limits=1):
             return function(*args, **kwargs)
 
-    return cast(F, limited)
+    return cast(Function, limited)

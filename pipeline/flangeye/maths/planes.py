@@ -16,7 +16,7 @@ from flangeye.maths.statistics import SIGMA_OF_MAD, median
 from flangeye.types import Floats, Indices, Mask, Singles
 from flangeye.types.geometry import basis_of_plane
 
-T = TypeVar("T", bound=np.generic)
+Number = TypeVar("Number", bound=np.generic)
 
 ROUNDS = 20
 """Times that a plane is fitted to the points it chooses, at most."""
@@ -68,7 +68,7 @@ def fit_plane(points: Floats, towards: Floats) -> Plane:
     return Plane(point, normal, SIGMA_OF_MAD * float(median(np.abs(normal @ offsets))))
 
 
-def thinned(points: NDArray[T], enough: int = ENOUGH) -> NDArray[T]:
+def thinned(points: NDArray[Number], enough: int = ENOUGH) -> NDArray[Number]:
     """Return every n-th of N points: enough to distinguish planes."""
     return points[:: 1 + len(points) // enough]
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from flangeye.types import Feature, Floats, Observation, PoseFeature, Transform
 from flangeye.types.geometry import levers, rotation_exp
 
-T = TypeVar("T", bound=np.floating)
+Real = TypeVar("Real", bound=np.floating)
 
 SIGMA_OF_MAD = 1.4826
 """Standard deviation of a normal variable over its median absolute deviation."""
@@ -20,7 +20,7 @@ MISFIT = 1e-6
 """Chance that a chi-square test takes noise for a misfit, or for a mistake that is then named."""
 
 
-def median(values: NDArray[T]) -> NDArray[T]:
+def median(values: NDArray[Real]) -> NDArray[Real]:
     """Return the medians (...) of (..., n) finite values, n at least 1, as ``np.median`` does.
 
     A partial sort makes it five to ten times as fast.

@@ -29,7 +29,7 @@ class Model(Described):
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True, defer_build=True)
 
 
-M = TypeVar("M")
+Kind = TypeVar("Kind")
 
 
 def readable(cls: type[Any]) -> AfterValidator:
@@ -43,7 +43,7 @@ def readable(cls: type[Any]) -> AfterValidator:
     return AfterValidator(read)
 
 
-def read_model(path: Path, cls: type[M]) -> M:
+def read_model(path: Path, cls: type[Kind]) -> Kind:
     """Read one YAML file into a model, or into a dataclass of checked fields.
 
     Raises:

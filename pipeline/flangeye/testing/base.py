@@ -25,7 +25,7 @@ from flangeye.plugin.stage import KINDS, PARTS, Params, Plugin
 from flangeye.workflow.log.read import read_run
 from flangeye.workflow.log.record import Recorder, adapter, clouds_of
 
-T = TypeVar("T")
+Kind = TypeVar("Kind")
 
 
 class Conformance:
@@ -169,10 +169,10 @@ def require(holds: object, message: str) -> None:
         raise AssertionError(message)
 
 
-def require_type(value: Any, kind: type[T]) -> T:
+def require_type(value: Any, kind: type[Kind]) -> Kind:
     """Return a plugin's answer; raise AssertionError unless it is of a type."""
     require(isinstance(value, kind), f"gave {type(value).__name__}, not a {kind.__name__}")
-    return cast("T", value)
+    return cast("Kind", value)
 
 
 def require_repeats(call: Callable[[], Any]) -> None:

@@ -15,10 +15,10 @@ Look = Callable[[Sequence[Any]], PointCloud]
 """Simulation only: scans bodies, given in ``base``, with the scanner that was calibrated, from
 where it stands; gives the cloud in ``camera``. The pose itself stays with the simulation."""
 
-T = TypeVar("T")
+Item = TypeVar("Item")
 
 
-class Stream(Generic[T]):
+class Stream(Generic[Item]):
     """Values pulled one at a time, of which those already pulled are kept.
 
     A solver that has reached its target simply stops iterating: nothing more is acquired.
@@ -30,14 +30,14 @@ class Stream(Generic[T]):
         whole: Whether all values were there from the start: pulling acquires nothing.
     """
 
-    def __init__(self, items: Iterable[T], source: Source, total: int | None = None) -> None:
+    def __init__(self, items: Iterable[Item], source: Source, total: int | None = None) -> None:
         self._items = iter(items)
         self.source = source
         self.total = total
-        self.seen: list[T] = []
+        self.seen: list[Item] = []
         self.whole = isinstance(items, Sequence)
 
-    def __iter__(self) -> Iterator[T]:
+    def __iter__(self) -> Iterator[Item]:
         yield from list(self.seen)
         for item in self._items:
             self.seen.append(item)

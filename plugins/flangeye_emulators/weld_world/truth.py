@@ -18,7 +18,7 @@ from flangeye.models.model import readable
 from flangeye.units import Angle, Duration, Length, Stiffness, param
 from flangeye_emulators.weld_world.groove import Gap
 
-T = TypeVar("T")
+Record = TypeVar("Record")
 
 
 class ToolFile(FingerGeometry):
@@ -37,7 +37,7 @@ ToolPath = Annotated[
 
 
 @dataclass_transform(frozen_default=True)
-def checked(cls: type[T]) -> type[T]:
+def checked(cls: type[Record]) -> type[Record]:
     """Make a class a frozen dataclass that is validated and refuses unknown keys."""
     return with_config(ConfigDict(extra="forbid"))(dataclass(frozen=True)(cls))
 

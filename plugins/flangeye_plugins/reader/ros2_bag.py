@@ -42,7 +42,7 @@ from flangeye_plugins.reader.ros2_messages import (
 )
 from flangeye_plugins.ros2.messages import Type, cloud_of, intrinsics_of, pixels_of
 
-T = TypeVar("T")
+Value = TypeVar("Value")
 ARM = "robot: NAME ('flangeye robots' lists them) or robot: {urdf: arm.urdf} in the recipe"
 """How a recipe names its arm."""
 
@@ -340,8 +340,8 @@ class Scans:
         return turning(*arm), ((times[1:] + times[:-1]) / 2, np.array(changes))
 
     def _sound(
-        self, topic: str, wanted: Container[int], use: Callable[[int, Any], T]
-    ) -> dict[int, T]:
+        self, topic: str, wanted: Container[int], use: Callable[[int, Any], Value]
+    ) -> dict[int, Value]:
         """Return a function's results on some messages, by number, without damaged ones.
 
         Raises:

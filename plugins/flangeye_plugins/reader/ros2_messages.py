@@ -24,7 +24,7 @@ from flangeye.workflow.log.records import LogFile
 from flangeye_plugins.reader.poses import pose_from_quaternion
 from flangeye_plugins.ros2.messages import cloud_of, frame_of, pixels_of, stamp_of, types
 
-T = TypeVar("T")
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Raw:
     data: bytes
     decode: Callable[[], Any]
 
-    def read(self, use: Callable[[Any], T]) -> T:
+    def read(self, use: Callable[[Any], Result]) -> Result:
         """Return the result of a function on the message.
 
         Raises:

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeVar
 
-T = TypeVar("T")
-R = TypeVar("R")
+Item = TypeVar("Item")
+Made = TypeVar("Made")
 
 
 @dataclass(frozen=True)
@@ -54,8 +54,8 @@ def cores() -> int:
 
 
 def worked_ahead(
-    items: Iterator[T], work: Callable[[T], R], workers: int
-) -> Generator[tuple[T, Callable[[], R]]]:
+    items: Iterator[Item], work: Callable[[Item], Made], workers: int
+) -> Generator[tuple[Item, Callable[[], Made]]]:
     """Yield each item in order with a function that returns or raises its result.
 
     Items are pulled in this thread and processed in worker threads. At most ``workers`` + 1 items
@@ -63,7 +63,7 @@ def worked_ahead(
     pending items are cancelled.
     """
     pool = ThreadPoolExecutor(workers, thread_name_prefix="flangeye")
-    waiting: deque[tuple[T, Future[R]]] = deque()
+    waiting: deque[tuple[Item, Future[Made]]] = deque()
     try:
         while (pulled := Done.of(partial(next, items))).error is None:
             waiting.append((pulled.value, pool.submit(work, pulled.value)))
@@ -77,6 +77,6 @@ def worked_ahead(
         pool.shutdown(cancel_futures=True)
 
 
-def _first(waiting: deque[tuple[T, Future[R]]]) -> tuple[T, Callable[[], R]]:
+def _first(waiting: deque[tuple[Item, Future[Made]]]) -> tuple[Item, Callable[[], Made]]:
     item, future = waiting.popleft()
     return item, future.result
