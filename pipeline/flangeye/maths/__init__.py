@@ -1,1 +1,1 @@
-"""Kinematics, statistics and fits that any room above may use. Arrays only."""
+"""Kinematics, statistics and fits on plain arrays, for all packages above this one."""

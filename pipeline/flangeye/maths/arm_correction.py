@@ -23,8 +23,9 @@ from flangeye.types import (
 )
 
 RADII = 1.5
-"""The length over which a field changes, in radii of the workspace: arms differ little from each
-other in it, for what bends their space are joints outside of it."""
+"""Correlation length of the error field, in radii of the workspace. One value serves most arms, as
+the joints whose errors bend the field lie outside the workspace.
+"""
 
 
 def field_over(places: Floats) -> SmoothField:
@@ -60,7 +61,7 @@ def features(scaled: Floats, exponents: Sequence[tuple[int, ...]]) -> Floats:
 
 
 def displacement(field: SmoothField, places: Floats) -> Floats:
-    """Return (..., 3) by how much a flange reported at (..., 3) places is elsewhere [m]."""
+    """Return the displacements (..., 3) of a flange that is reported at (..., 3) places [m]."""
     return np.asarray(effects(field, places) @ field.weights)
 
 
@@ -75,7 +76,7 @@ def corrected_flange(
     Args:
         base_T_flange: (4, 4) as reported.
         joints: (n,) as reported [rad], or None.
-        correction: What is wrong with the arm, if anything.
+        correction: The arm's errors that the calibration found, if any.
         arm: Its kinematics; needed when joint offsets are corrected.
 
     Raises:
@@ -93,7 +94,7 @@ def corrected_flange(
         angles = _near(arm, base_T_flange, correction.joints) if joints is None else joints
         built = arm if correction.lengths is None else arm.altered(np.asarray(correction.lengths))
         moved = built.flange(angles + correction.joint_offsets)
-        # Only what the change moves the flange by: the pose as reported need not be the model's
+        # Apply only the change between the two models: the reported pose need not equal the model's
         pose = pose @ np.linalg.inv(arm.flange(angles)) @ moved
     pose[:3, 3] += pose[:3, :3] @ correction.tool_offset
     return pose
@@ -105,13 +106,13 @@ def corrected_observation(
     arm: Arm | None,
     flange: str = FLANGE,
 ) -> Observation:
-    """Return an observation with the flange where the corrected arm has it; see above.
+    """Return an observation with the flange's pose corrected; see :func:`corrected_flange`.
 
     Args:
         observation: As it was recorded.
-        correction: What is wrong with the arm, if anything.
+        correction: The arm's errors that the calibration found, if any.
         arm: Its kinematics; needed when joint offsets are corrected.
-        flange: What its flange is called.
+        flange: Name of the arm's flange frame.
     """
     if correction is None:
         return observation
@@ -127,7 +128,7 @@ def corrected_observation(
 def corrected_view(
     view: VerificationView, correction: ArmCorrection | None, arm: Arm | None
 ) -> VerificationView:
-    """Return a view with the flange where the corrected arm has it."""
+    """Return a verification view with the flange's pose corrected."""
     pose = corrected_flange(view.base_T_flange.matrix, None, correction, arm)
     return replace(view, base_T_flange=replace(view.base_T_flange, matrix=pose))
 
@@ -139,8 +140,8 @@ def reported_flange(base_T_flange: Floats, correction: ArmCorrection, arm: Arm |
     substitution: a correction changes little over its own size.
 
     Args:
-        base_T_flange: (4, 4) where the flange shall really be.
-        correction: What is wrong with the arm.
+        base_T_flange: (4, 4) true pose that the flange shall reach.
+        correction: The arm's errors that the calibration found.
         arm: Its kinematics; needed when joint offsets are corrected.
 
     Raises:
@@ -148,7 +149,7 @@ def reported_flange(base_T_flange: Floats, correction: ArmCorrection, arm: Arm |
     """
     of_arm = replace(correction, tool_offset=np.zeros(3))
     commanded = np.array(base_T_flange)
-    # Each leaves about a hundredth of the error before it
+    # Each substitution leaves about a hundredth of the error before it
     for _ in range(4):
         joints = None
         if arm is not None and of_arm.joints is not None:
@@ -161,7 +162,8 @@ def reported_flange(base_T_flange: Floats, correction: ArmCorrection, arm: Arm |
 def _near(arm: Arm, base_T_flange: Floats, near: Floats) -> Floats:
     """Return joint angles (n,) that reach a pose: on the branch of ``near``, or closest to it.
 
-    An arm that was turned far has passed on to another branch where its own does not go on.
+    The branch of ``near`` may end before a pose that is far from it; then the closest solution of
+    any branch is taken.
 
     Raises:
         ValueError: No joint angles reach the pose.
@@ -203,11 +205,11 @@ def reached_from(arm: Arm, base_T_flange: Floats, near: Floats) -> tuple[Floats,
     wanted = base_T_flange.reshape(-1, 4, 4)
     joints = np.array(np.broadcast_to(near, (*shape, arm.n)), dtype=np.float64).reshape(-1, arm.n)
     far = np.arange(len(wanted))
-    # Newton steps, and the most that a joint moves in each [rad]
+    # Newton steps; no joint moves more than 0.2 rad in one, so that the arm stays on its branch
     for _ in range(200):
         frames = arm.frames(joints[far])
         twist = _twist(wanted[far], arm.flange_of(frames))
-        # Joint angles belong to a pose when they reach it this closely [rad, m]
+        # Converged: the joint angles reach the pose this closely [rad, m]
         left = np.abs(twist).max(axis=1) >= 1e-9
         far, frames, twist = far[left], frames[left], twist[left]
         if not len(far):
@@ -221,15 +223,15 @@ def reached_from(arm: Arm, base_T_flange: Floats, near: Floats) -> tuple[Floats,
 
 
 def _least_step(jacobian: Floats, twist: Floats) -> Floats:
-    """Return (N, n) the smallest motions of joints that make (N, 6) twists, by (N, 6, n)."""
+    """Return the smallest joint steps (N, n) that make twists (N, 6), by Jacobians (N, 6, n)."""
     across = np.swapaxes(jacobian, 1, 2)
-    # Where the arm is singular, so little keeps the equations solvable
+    # 1e-9 keeps the equations solvable where the arm is singular
     gram = jacobian @ across + 1e-9 * np.eye(6)
     return np.asarray((across @ np.linalg.solve(gram, twist[..., None]))[..., 0])
 
 
 def _twist(wanted: Floats, reached: Floats) -> Floats:
-    """Return (..., 6) that leads from one pose to another, exact when they are near."""
+    """Return the twist (..., 6) from one pose to another, exact in the limit of near poses."""
     turn = wanted[..., :3, :3] @ np.swapaxes(reached[..., :3, :3], -1, -2)
     # The skew part has the sine of the angle: the angle itself where Newton's method ends, but 0
     # for half a turn too, so that it must begin nearer than that

@@ -1,7 +1,6 @@
 """Circle detection in 2D points, shared by segmenting and fitting. Arrays only.
 
-Robust without drawing lots: every function gives the same answer whatever the order of the
-points, and there is no seed.
+Robust without random sampling: there is no seed, and the order of the points does not matter.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ def fringe(flat: Floats, centre: Floats, bins: int, depth: float, outer: bool = 
 def _fringe(
     flat: Floats, centre: Floats, bins: int, depth: float, outer: bool
 ) -> tuple[Indices, Indices]:
-    """Return what :func:`fringe` does, and the sectors of those points."""
+    """Return the points of :func:`fringe`, and their sectors."""
     offsets = flat - centre
     reach = distances(offsets) * (1 if outer else -1)
     sector = sectors(offsets, bins)
@@ -54,7 +53,7 @@ def _fringe(
 
 
 def sectors(offsets: Floats, bins: int) -> Indices:
-    """Return which of ``bins`` equal sectors each of (N, 2) offsets from a centre lies in."""
+    """Return for offsets (N, 2) from a centre in which of ``bins`` equal sectors each lies."""
     turn = np.arctan2(offsets[:, 1], offsets[:, 0]) / (2 * np.pi) + 0.5
     return np.minimum((turn * bins).astype(np.intp), bins - 1)
 
@@ -81,7 +80,7 @@ def vote_centre(edges: tuple[tuple[Floats, float], ...], start: Floats, reach: f
         x, y = (
             np.rint(np.add.outer(*each)).astype(np.int32) for each in zip(near, circle, strict=True)
         )
-        # Seen without a sign, what lies before the first cell lies beyond the last as well.
+        # As unsigned numbers negative cells are huge, so one comparison checks both ends.
         inside = np.maximum(x.view(np.uint32), y.view(np.uint32)) < size
         votes += np.bincount((x * size + y)[inside], minlength=size * size)
     return start + cell * (_peak(votes.reshape(size, size)) - half)

@@ -57,11 +57,11 @@ class JointAxis(Protocol):
 
     @property
     def axis(self) -> tuple[float, float, float]:
-        """Direction it turns about or slides along, in its own frame."""
+        """Direction the joint turns about or slides along, in its own frame."""
 
     @property
     def slides(self) -> bool:
-        """Whether it slides [m] instead of turning [rad]."""
+        """Whether the joint slides [m] instead of turning [rad]."""
 
     @property
     def lower(self) -> float:
@@ -77,7 +77,7 @@ class SerialChain(Protocol):
 
     @property
     def joints(self) -> Sequence[JointAxis]:
-        """Base to flange."""
+        """Joints in order from base to flange."""
 
     @property
     def convention(self) -> Literal["standard", "modified", "urdf"]:
@@ -85,13 +85,13 @@ class SerialChain(Protocol):
 
     @property
     def link_T_flange(self) -> Floats:
-        """(4, 4) the flange in the frame of the last link."""
+        """Pose (4, 4) of the flange in the frame of the last link."""
 
 
 def altered(joint: JointAxis, convention: str, lengths: Floats) -> dict[str, Any]:
     """Return a joint's parameters with (3,) added to ``a``, ``d`` [m] and ``alpha`` [rad].
 
-    A URDF's origin has the three as a step along its x and z, and a roll.
+    In a URDF the three are a shift of the joint's origin along x and z, and a roll.
     """
     a, d, alpha = (float(x) for x in lengths)
     if convention == "urdf":
@@ -213,7 +213,7 @@ class Arm:
         frames = self.frames(joints)
         moved = self.flange_of(frames) if link is None else frames[..., link, :, :]
         first, last = frames[..., :-1, :, :], frames[..., 1:, :, :]
-        # Along whose x and z it is longer, and about whose x it is twisted. A standard link is
+        # Frames along whose x and z a and d act, and about whose x alpha acts. A standard link is
         # Rz(q) Tz(d) Tx(a) Rx(alpha), a modified one Tx(a) Rx(alpha) Tz(d) Rz(q): what stands
         # left of the turn is in the frame before, what stands right of it in the frame after
         x, z, about = {
@@ -240,13 +240,15 @@ class Arm:
     def inverse(self, base_T_flange: Floats, starts: int = 48, iterations: int = 40) -> Floats:
         """Return the joint angles (K, n) within the limits that reach a pose; K may be zero.
 
-        In closed form where six joints allow it (:mod:`flangeye.maths.offset_wrist`); an arm that
-        differs a little from such a one, as a calibrated arm does, is polished from there. Six
-        joints whose wrist is not spherical are mostly solved by a search over one of them
-        (:mod:`flangeye.maths.offset_wrist`). Of the continuum of a seven-joint arm it gives a
-        sample: one joint is held at a row of angles, which leaves six; the next joint, where that
-        gives nothing. Else, and where a closed form fails, from many points of a fixed sequence,
-        so that all branches of a six-joint arm are normally found. Nothing random is in it.
+        Six joints are solved in closed form where their axes allow it, else mostly by a search over
+        joint 6 (both in :mod:`flangeye.maths.offset_wrist`). An arm that differs a little from such
+        a one, as a calibrated arm does, is refined from the nominal arm's solutions. A seven-joint
+        arm has a continuum of solutions; a sample of it is given by holding one joint at several
+        angles and solving the other six in closed form. If one held joint gives nothing, the next
+        is tried.
+
+        If all of these fail, iterations start at a fixed sequence of points, which normally finds
+        all branches of a six-joint arm. The result is deterministic.
 
         Args:
             base_T_flange: (4, 4) pose to reach.
@@ -269,13 +271,16 @@ class Arm:
         return self.inverse_near(base_T_flange, self._starting_points(starts), iterations)
 
     def _polished(self, base_T_flange: Floats, joints: Floats, each: bool = False) -> Floats:
-        """Return joints near a pose (M, n) as solutions; iterate if none, or not each, is one."""
+        """Return the solutions that joints (M, n) near a pose are or lead to.
+
+        They are refined if none of them reaches the pose; with ``each``, if any does not.
+        """
         error = np.abs(self.flange(joints) - base_T_flange).max(axis=(1, 2), initial=0.0)
         solved = error < self.solved
         if solved.all() or (solved.any() and not each):
             return self._distinct(self._within_limits(joints[solved]))
-        # Iterations from a closed form; a calibrated arm takes about five
-        # Farther from a pose than this [rad, m], what a closed form gives is not a start towards it
+        # Joints farther off than 0.1 [rad, m] are no start towards the pose. Eight iterations are
+        # enough from a closed form; a calibrated arm takes about five
         return self.inverse_near(base_T_flange, joints[error < 0.1], 8)
 
     def inverse_near(self, base_T_flange: Floats, joints: Floats, iterations: int = 40) -> Floats:
@@ -321,14 +326,14 @@ class Arm:
 
     @cached_property
     def _held(self) -> list[int]:
-        """Which of seven joints are held, those first with which most poses are solved."""
+        """Joints of a seven-joint arm to hold, first the one with which most poses are solved."""
         if self.n != 7 or self.slides.any():
             return []
         solved = [self._solved_when_held(joint) for joint in range(self.n)]
         return sorted(np.flatnonzero(solved).tolist(), key=lambda joint: -solved[joint])
 
     def _forms_holding(self, joint: int) -> list[ClosedForm]:
-        """Return the closed forms of the other six with a joint held at each angle of a row."""
+        """Return closed forms of the other six joints with one held at each of several angles."""
         if joint not in self._forms:
             low, high = max(self.lower[joint], -np.pi), min(self.upper[joint], np.pi)
             held = 8  # angles spread over the range of the redundant joint
@@ -338,7 +343,7 @@ class Arm:
         return self._forms[joint]
 
     def _solved_when_held(self, joint: int) -> int:
-        """Return how many solutions of a few poses there are with a joint held amid its range."""
+        """Return the number of solutions of a few poses with a joint held amid its range."""
         form = self._form_holding(joint, float(np.clip(self._middle[joint], -1.0, 1.0)))
         if form is None:
             return 0
@@ -364,7 +369,7 @@ class Arm:
         return lambda pose: np.insert(form(pose), joint, angle, axis=1)
 
     def _motions(self, joints: Floats) -> Floats:
-        """Return the (..., n, 4, 4) turns about z, or slides along it."""
+        """Return each joint's motion (..., n, 4, 4): a turn about its z, or a slide along it."""
         angles = joints * self._turns + self._zero
         out = np.zeros((*angles.shape, 4, 4))
         c, s = np.cos(angles), np.sin(angles)
@@ -379,6 +384,7 @@ class Arm:
         return moved[..., :3, 2], moved[..., :3, 3]
 
     def _columns(self, frames: Floats, flange: Floats) -> Floats:
+        # A turning joint moves the flange by (axis, axis x lever), a sliding one by (0, axis)
         axes, origins = self._axes(frames)
         swept = np.cross(axes, flange[..., None, :] - origins)
         slides = self.slides[:, None]
@@ -399,7 +405,7 @@ class Arm:
         return np.asarray(low + unit * (high - low))
 
     def _within_limits(self, joints: Floats) -> Floats:
-        """Take each angle modulo a turn as near to the middle of its range as it goes."""
+        """Return the joint vectors within the limits, each angle modulo 2 pi nearest mid-range."""
         turns = np.round((joints - self._middle) / (2 * np.pi)) * self._turns
         joints = joints - 2 * np.pi * turns
         inside = (joints >= self.lower) & (joints <= self.upper)
@@ -427,7 +433,7 @@ class Arm:
 
 
 def _solutions(forms: Sequence[ClosedForm], base_T_flange: Floats) -> Floats | None:
-    """Return what closed forms give for a pose, (K, n); None where each of them fails."""
+    """Return the solutions (K, n) of closed forms for a pose; None if every form fails."""
     found = []
     for form in forms:
         with suppress(Undecomposed):
@@ -468,6 +474,7 @@ def _pose_error(wanted: Floats, reached: Floats) -> Floats:
     axis = 0.5 * np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], axis=-1)
     sine = np.linalg.norm(axis, axis=-1, keepdims=True)
     cosine = 0.5 * (np.trace(turn, axis1=-2, axis2=-1)[..., None] - 1.0)
+    # The angle is exact up to half a turn; at half a turn itself the skew part has lost the axis
     angle = np.arctan2(sine, cosine)
     rotation = axis * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 1.0)
     return np.concatenate([rotation, wanted[:3, 3] - reached[..., :3, 3]], axis=-1)

@@ -1,16 +1,14 @@
 """Inverse kinematics of six revolute joints whose wrist is not spherical. Arrays only.
 
-Of most such arms axis 2 stands square to axis 1 and parallel to axis 3, and axis 5 meets axis 4.
-Where they meet is a point of link 3 and of link 5: with joint 6 held, the pose determines where it
-is. Joints 1 to 3 follow in closed form, in four ways; that axes 4 and 5 keep their angle is the one
-equation left, in joint 6. Its roots are bracketed on a row of angles and refined (a search in one
+In most such arms axis 2 is square to axis 1 and parallel to axis 3, and axis 5 intersects axis 4.
+The intersection is fixed in link 3 and in link 5, so with joint 6 held the pose determines its
+place. Joints 1 to 3 follow in closed form, on four branches. One equation is left, in joint 6: axes
+4 and 5 keep their angle. Its roots are bracketed on a grid of angles and refined (a search in one
 dimension over Paden-Kahan subproblems: Elias and Wen, "IK-Geo", Mechanism and Machine Theory 2025).
 
-Inverse kinematics of six revolute joints in closed form, by EAIK. Arrays only.
-
-EAIK decomposes an arm into Paden-Kahan subproblems (Ostermeier, Külz, Althoff, "Automatic Geometric
-Decomposition for Analytical Inverse Kinematics", IEEE RA-L 2025): spherical wrists, three parallel
-axes, and most arms sold are one or the other.
+Closed forms of other arms come from EAIK, which decomposes an arm into Paden-Kahan subproblems
+(Ostermeier, Külz, Althoff, "Automatic Geometric Decomposition for Analytical Inverse Kinematics",
+IEEE RA-L 2025): spherical wrists, three parallel axes, and most arms sold are one or the other.
 """
 
 from __future__ import annotations
@@ -35,20 +33,20 @@ class OffsetWrist:
     with a number of length one. For joint 1 likewise y - ix.
 
     Attributes:
-        to_axes: (4, 4) from the base's frame to that one, its origin on axis 1 as high as axis 2.
-        from_zero: (4, 4) from there to the flange, all joints at zero.
-        orbits: (4, 6) where axes 4 and 5 meet, homogeneous, and axis 5: what joint 6 turned back
-            makes of each is its three columns @ (cos, sin, 1).
-        shoulder: Axis 2 from axis 1 [m].
-        aside: Where axes 4 and 5 meet, along axis 2 [m].
-        upper: From axis 2 to axis 3, across them [m].
-        fore: From axis 3 to where axes 4 and 5 meet, across axis 3 [m].
-        sense: 1 or -1: axis 3 points as axis 2 does, or the other way.
-        fourth: (3,) axis 4.
-        meant: Cosine between axes 4 and 5.
-        about_fourth: (2, 3) axis 4 cross axis 5, and axis 5 across axis 4.
-        about_fifth: (6, 3) the same of axis 5 and axis 4, after a turn of joint 6: three pairs
-            of rows, to be taken (cos, sin, 1) times.
+        to_axes: (4, 4) from the base to that frame; its origin is on axis 1 at axis 2's height.
+        from_zero: (4, 4) inverse of the flange's pose in that frame, all joints at zero.
+        orbits: (4, 6) intersection of axes 4 and 5 (homogeneous), and direction of axis 5. Three
+            columns each: columns @ (cos, sin, 1) is the vector with joint 6 turned back.
+        shoulder: Offset of axis 2 from axis 1 [m].
+        aside: Coordinate of the intersection of axes 4 and 5 along axis 2 [m].
+        upper: Vector from axis 2 to axis 3, normal to them [m].
+        fore: Vector from axis 3 to the intersection of axes 4 and 5, normal to axis 3 [m].
+        sense: 1 if axis 3 points as axis 2 does, else -1.
+        fourth: (3,) direction of axis 4.
+        meant: Cosine of the angle between axes 4 and 5.
+        about_fourth: (2, 3) axis 4 cross axis 5, and the part of axis 5 normal to axis 4.
+        about_fifth: (6, 3) the same with axes 4 and 5 exchanged, as joint 6 turns: three pairs of
+            rows, to be weighted by (cos, sin, 1).
     """
 
     to_axes: Floats
@@ -81,16 +79,16 @@ class OffsetWrist:
     def _posture(
         self, orbits: Numbers, angles: Floats, way: Indices
     ) -> tuple[Floats, tuple[Numbers, Numbers], tuple[Numbers, Numbers, Numbers]]:
-        """Return how far axes 4 and 5 are from their angle, and of what that was made.
+        """Return the error of the angle between axes 4 and 5, and the steps that led to it.
 
         Args:
-            orbits: (4, 3) where they meet, and axis 5, as angles of joint 6 make them.
-            angles: (...) such angles.
-            way: (...) which of four ways the arm stands.
+            orbits: (4, 3) intersection of axes 4 and 5, and axis 5, by (cos, sin, 1) of joint 6.
+            angles: (...) angles of joint 6 [rad].
+            way: (...) branch of joints 1 to 3, 0 to 3.
 
         Returns:
-            Three of (...), NaN where the arm does not reach: the value; axis 5, two numbers; joints
-            1 to 3, as numbers whose arguments they are but for a constant.
+            The error, axis 5 as two numbers, and joints 1 to 3 as complex numbers whose arguments
+            are the angles plus a constant; each (...), NaN where the arm does not reach.
         """
         seen = orbits @ _circle(angles.ravel())
         place, height, axis, upwards = seen.reshape(4, *angles.shape)
@@ -114,12 +112,12 @@ class OffsetWrist:
         return value + self.fourth[1] * level.imag, (axis, upwards), (turn, lift, bend)
 
     def _brackets(self, orbits: Numbers) -> tuple[Floats, Floats]:
-        """Return where the equation changes sign, and where it may without having been seen to.
+        """Return the brackets in which the equation changes sign, and angles beside which it may.
 
-        Each row of samples is a way that the arm stands; what is doubtful is sampled more closely.
+        Each row of samples is one branch; doubtful places are sampled more closely.
 
         Returns:
-            (5, K) way, two angles and the values there; (2, S) way and angle.
+            (5, K) branch, two angles and the values there; (2, S) branch and angle.
         """
         # One sample more at each end: each has both its neighbours
         ways, starts = np.arange(4), np.array([-np.pi])
@@ -128,8 +126,7 @@ class OffsetWrist:
         pitch, row = 2 * np.pi / samples, np.arange(-1.0, samples + 1)
         doubts = np.zeros(0)
         found = []
-        # How often the samples are spaced, more closely each time
-        # Samples for one, where a root may hide.
+        # Each pass but the first puts so many samples for one where a root may hide
         finer = 16
         for _ in range(3):
             angles = starts[:, None] + pitch * row
@@ -139,8 +136,8 @@ class OffsetWrist:
             i, k = np.nonzero(here * after <= 0)
             places = angles[i, k + 1]
             found.append(np.array([ways[i], places, places + pitch, here[i, k], after[i, k]]))
-            # Where the reach ends, the equation may change by this, times the root of the pitch
-            # [rad]
+            # The law of cosines ends in a square root, so where the reach ends the equation may
+            # change by this over one pitch
             i, k = np.nonzero(_doubtful(values, 2.0 * np.sqrt(pitch)))
             ways, doubts = ways[i], angles[i, k + 1]
             if not len(ways):
@@ -149,13 +146,13 @@ class OffsetWrist:
         return np.hstack(found), np.array([ways, doubts])
 
     def _refined(self, orbits: Numbers, brackets: Floats) -> Floats:
-        """Return (K,) roots in (5, K) brackets.
+        """Return the roots (K,) in brackets (5, K).
 
-        By inverse quadratic interpolation, or half way where that leads out of a bracket.
+        By inverse quadratic interpolation, or bisection where that leads out of a bracket.
         """
         way, (a, b, fa, fb) = brackets[0].astype(int), brackets[1:]
         at = a + (b - a) * fa / (fa - fb)
-        # Steps from a bracket to a root at most; most take two
+        # Most roots take two steps
         root_steps = 12
         for _ in range(root_steps):
             value = self._posture(orbits, at, way)[0]
@@ -172,7 +169,7 @@ class OffsetWrist:
         return np.asarray(at)
 
     def _joints(self, turned: Floats, orbits: Numbers, angles: Floats, way: Indices) -> Floats:
-        """Return the (K, 6) joints for (K,) angles of joint 6 and ways."""
+        """Return joint angles (K, 6) for angles (K,) of joint 6 and branches (K,)."""
         _, (axis, upwards), (turn, lift, bend) = self._posture(orbits, angles, way)
         second = lift / self.upper
         third = bend * (abs(self.fore) * self.upper / (self.fore * abs(self.upper)))
@@ -196,7 +193,7 @@ class OffsetWrist:
 
 
 def offset_wrist(directions: Floats, points: Floats, flange: Floats) -> OffsetWrist | None:
-    """Return the search for an arm, or for the nominal one it differs from a little.
+    """Return the inverse kinematics of an arm, or of the nominal one it differs from a little.
 
     Args:
         directions: (6, 3) of the axes, all joints at zero.
@@ -204,7 +201,7 @@ def offset_wrist(directions: Floats, points: Floats, flange: Floats) -> OffsetWr
         flange: (4, 4) base_T_flange, all joints at zero.
 
     Returns:
-        None where the axes do not stand as it needs.
+        None if the axes are not arranged as this method needs.
     """
     searches = (_prepared(*axes, flange) for axes in as_meant(directions, points))
     return next((search for search in searches if search is not None), None)
@@ -248,9 +245,9 @@ def _prepared(directions: Floats, points: Floats, flange: Floats) -> OffsetWrist
 
 
 def _doubtful(values: Floats, change: float) -> Floats:
-    """Return at which of (M, S) samples, the first and last left out, roots may hide beside it.
+    """Return the mask of samples (M, S), without the first and last, beside which roots may hide.
 
-    Where the equation comes near zero and turns; and where the arm's reach ends.
+    These are where the equation comes near zero and turns, and where the arm's reach ends.
     """
     before, here, after = values[:, :-2], values[:, 1:-1], values[:, 2:]
     size, bent, slope = np.abs(here), before - 2 * here + after, after - before
@@ -265,7 +262,7 @@ def _circle(angles: Floats) -> Floats:
 
 
 def _orbit(axis: Floats, vector: Floats) -> Floats:
-    """Return the (4, 3) that makes (cos, sin, 1) a vector turned back about an axis."""
+    """Return columns (4, 3) that times (cos, sin, 1) are a vector turned back about an axis."""
     along = axis * (axis @ vector)
     return np.vstack([np.array([vector - along, -np.cross(axis, vector), along]).T, np.zeros(3)])
 
@@ -299,7 +296,7 @@ def closed_form(directions: Floats, points: Floats, flange: Floats) -> ClosedFor
 
 
 def as_meant(directions: Floats, points: Floats) -> Iterator[tuple[Floats, Floats]]:
-    """Yield (6, 3) directions and points of axes, and those of the arm they may be a copy of.
+    """Yield (6, 3) directions and points of the axes, then those of the nominal arm if one is near.
 
     A calibrated arm differs a little from one whose axes are parallel, meet or are in line.
     """
@@ -310,11 +307,11 @@ def as_meant(directions: Floats, points: Floats) -> Iterator[tuple[Floats, Float
 
 
 def _snapped(directions: Floats, points: Floats) -> Floats:
-    """Return (6, 3) points that agree in every coordinate in which axes nearly meet."""
+    """Return points (6, 3) with coordinates made equal where axes nearly meet."""
     snapped = points.copy()
     for i, k in np.argwhere(directions == 0):  # along its axis a point may be anywhere
         others = snapped[:i][directions[:i, k] == 0, k]
-        # Axes of a calibrated arm that were meant to meet or to be in line do so within this [m]
+        # Axes of a calibrated arm that nominally intersect or coincide do so within this [m]
         near = np.abs(others - points[i, k]) < 5e-3
         snapped[i, k] = others[near][0] if near.any() else points[i, k]
     return snapped
@@ -325,7 +322,7 @@ def _decomposed(directions: Floats, points: Floats, flange: Floats) -> ClosedFor
         from eaik.pybindings.EAIK import Robot
     except ImportError:
         return None
-    # EAIK's subproblems hold for axes that point alike where they are parallel.
+    # EAIK expects parallel axes to point the same way; a reversed axis reverses its angle.
     signs = np.sign(directions[np.arange(6), np.abs(directions).argmax(axis=1)])
     places = np.vstack([np.zeros(3), points, flange[:3, 3]])
     try:

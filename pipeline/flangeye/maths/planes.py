@@ -1,7 +1,6 @@
 """Plane fits shared by flange detection and rim fitting. Arrays only.
 
-Robust without drawing lots: every function gives the same answer whatever the order of the
-points, and there is no seed.
+Robust without random sampling: there is no seed, and the order of the points does not matter.
 """
 
 from __future__ import annotations
@@ -19,13 +18,13 @@ from flangeye.types.geometry import basis_of_plane
 Number = TypeVar("Number", bound=np.generic)
 
 ROUNDS = 20
-"""Times that a plane is fitted to the points it chooses, at most."""
+"""Most refits of a plane to the points it selects."""
 
 RESTLESS = 0.01
-"""Share of a thinned group's points that may still change sides before the whole group is asked."""
+"""Share of a thinned group's points that may still change before the whole group is used."""
 
 ENOUGH = 2000
-"""Points that distinguish one plane from another."""
+"""Number of points that suffices to distinguish one plane from another."""
 
 
 class Plane(NamedTuple):
@@ -34,7 +33,7 @@ class Plane(NamedTuple):
     Attributes:
         point: (3,) centroid of the points it was fitted to [m].
         normal: (3,) unit normal.
-        sigma: Robust standard deviation of their distances; none of a rough plane [m].
+        sigma: Robust standard deviation of their distances [m]; 0 for a rough plane.
     """
 
     point: Floats
@@ -48,8 +47,7 @@ class Plane(NamedTuple):
     def flatten(self, points: Floats) -> Floats:
         """Return the (N, 2) coordinates of (N, 3) points along the plane's two axes.
 
-        They lie in memory one axis after the other, in which numpy works on them several times
-        as fast.
+        In memory all of one axis come before the other, on which numpy is several times as fast.
         """
         axes = basis_of_plane(self.normal)[:2]
         return np.asarray(axes @ points.T - (axes @ self.point)[:, None]).T
@@ -74,24 +72,24 @@ def thinned(points: NDArray[Number], enough: int = ENOUGH) -> NDArray[Number]:
 
 
 def chosen(points: Floats, which: Mask) -> Floats:
-    """Return the chosen ones of N points, a column after the other in memory as in ``flatten``."""
+    """Return the selected ones of N points, in memory column by column as in ``flatten``."""
     return points.T.compress(which, axis=1).T
 
 
 def robust_plane(points: Floats, rough: Plane, gate: float) -> Plane | None:
-    """Return the plane most points near a rough one lie on; see :func:`robust_planes`."""
+    """Return the plane of most points near a rough plane; see :func:`robust_planes`."""
     return robust_planes([points], [rough], np.array([gate]))[0]
 
 
 def robust_planes(
     groups: Sequence[Floats | Singles], rough: Sequence[Plane], gates: Floats, sigmas: float = 3.0
 ) -> list[Plane | None]:
-    """Return the plane most points of each group near its rough one lie on, None if too few do.
+    """Return the plane of most points near each group's rough plane, None if there are too few.
 
-    First a plane turns to the half of the points in a slab that lie nearest to it, until it is
-    their own. Then least squares on all points in a slab that opens from there to ``sigmas`` times
-    the noise found. What is off the plane never has a say, were it a third of the points, as the
-    floors of recesses are: a slab that closes from outside would be tilted by them and keep them.
+    First each plane is refitted to the nearest half of the points in its slab, until these stay the
+    same. Then least squares uses all points in a slab that widens from there to ``sigmas`` times
+    the noise. So points off the plane, such as floors of recesses, never enter the fit, even if
+    they are a third of all. A slab that narrows from outside would be tilted by them and keep them.
 
     All groups go through each round together: fitting one plane is a few microseconds' arithmetic,
     and a hundred candidates a scan would cost mostly calls.
@@ -118,10 +116,9 @@ class _Rows(NamedTuple):
     """Groups of points side by side, the shorter ones filled up.
 
     Attributes:
-        moments: (P, 9, K) offsets from the rough planes' points [m], and their products
-            xx, xy, xz, yy, yz, zz [m^2]: what a plane takes of its points is then one product of
-            matrices.
-        there: (P, K) which are points.
+        moments: (P, 9, K) offsets from the rough planes' points [m], and their products xx, xy, xz,
+            yy, yz, zz [m^2]. The sums over selected points are then one product of matrices.
+        there: (P, K) mask of the entries that are points and no filling.
     """
 
     moments: Floats
@@ -139,7 +136,7 @@ class _Rows(NamedTuple):
         return cls(moments, np.arange(shape[2]) < sizes[:, None])
 
     def some(self, which: Mask) -> _Rows:
-        """Return the rows of some groups."""
+        """Return the rows of the groups in a mask."""
         return _Rows(self.moments[which], self.there[which])
 
 
@@ -197,7 +194,7 @@ class _Slabs:
 
 
 def _of_majority(rows: _Rows, slabs: _Slabs, restless: float) -> None:
-    """Turn each plane to the nearest half of the points in its own slab, until it is theirs.
+    """Refit each plane to the nearest half of the points in its slab until these stay the same.
 
     Concentration steps of least trimmed squares (Rousseeuw and Van Driessen 1999).
     """
@@ -220,7 +217,7 @@ def _of_majority(rows: _Rows, slabs: _Slabs, restless: float) -> None:
 
 
 def _opened(rows: _Rows, slabs: _Slabs, sigmas: float, restless: float) -> None:
-    """Fit each plane to all points in its slab, and open the slab to their noise, until at rest."""
+    """Refit each plane to all points in its slab, widened to their noise, until at rest."""
     going = np.flatnonzero(slabs.found)
     if len(going) < len(slabs.found):
         rows = rows.some(slabs.found)
@@ -244,17 +241,17 @@ def _opened(rows: _Rows, slabs: _Slabs, sigmas: float, restless: float) -> None:
 
 
 def _differ(chosen: Mask, before: Mask, few: NDArray[np.floating]) -> Mask:
-    """Return (P,) whether each of P planes gained more than a few points."""
+    """Return the mask (P,) of planes whose selected points changed by more than ``few`` (P,)."""
     return np.asarray(_counts(chosen != before) > few)
 
 
 def _within(off: Floats, halves: Floats) -> Mask:
-    # In their own precision distances are compared twice as fast.
+    # Compared in the distances' own precision, which is twice as fast.
     return np.asarray(off <= halves.astype(off.dtype)[:, None])
 
 
 def _counts(chosen: Mask) -> Indices:
-    """Return how many are chosen in each row; as bytes they add up in half the time."""
+    """Return the number selected in each row; as bytes they add up in half the time."""
     return np.asarray(np.add.reduce(chosen.view(np.uint8), axis=1, dtype=np.uint32), dtype=np.intp)
 
 
@@ -262,8 +259,8 @@ def _medians(values: Floats, which: Mask, count: Indices | None = None) -> Float
     """Return the (P,) medians of the values chosen in each of P rows, NaN where none is."""
     if len(values) == 1:
         return np.array([median(values[which]) if which.any() else np.nan])
-    # What is not chosen sorts to the end: infinite, or no number. A division makes it so in a
-    # tenth of the time of a choice, which the processor cannot foresee.
+    # Dividing by the mask makes what is not selected infinite or NaN, which sorts to the end. It
+    # takes a tenth of the time of a selection, whose branches the processor mispredicts.
     with np.errstate(divide="ignore", invalid="ignore"):
         ordered = values / which
     ordered.sort(axis=1)

@@ -77,7 +77,7 @@ def _xyzw_to(order: str) -> list[int]:
 
 
 def shifted(poses: Floats, by: int, start: int = 0) -> tuple[Floats, Mask]:
-    """Return the poses that belong to the samples, and which samples have one.
+    """Return the poses shifted by whole samples, and the mask of samples that have one.
 
     Args:
         poses: (N, 4, 4).
@@ -89,10 +89,10 @@ def shifted(poses: Floats, by: int, start: int = 0) -> tuple[Floats, Mask]:
 
 
 def sources(count: int, by: int, start: int = 0) -> tuple[NDArray[np.intp], Mask]:
-    """Return (N,) the sample from which each gets its pose, and which get one at all.
+    """Return the index (N,) of the sample whose pose each one gets, and the mask of those with one.
 
     Args:
-        count: Samples there are.
+        count: Number of samples N.
         by: A sample's pose is the one recorded so many samples later.
         start: Index of the first sample that is shifted; those before keep their own.
     """
@@ -103,13 +103,13 @@ def sources(count: int, by: int, start: int = 0) -> tuple[NDArray[np.intp], Mask
 
 
 def delayed(poses: Floats, times: Floats, delay: float) -> tuple[Floats, Mask]:
-    """Return the poses ``delay`` later, and for which samples they are known.
+    """Return the poses ``delay`` later, and the mask of the samples for which they are known.
 
-    Between two samples the arm is taken to move evenly.
+    Poses between samples are interpolated, as if the arm moved at constant velocity.
 
     Args:
         poses: (N, 4, 4).
-        times: (N,) when, rising [s].
+        times: (N,) of the poses, rising [s].
         delay: Negative for earlier [s].
     """
     return delaying(poses, times)(delay)
@@ -134,7 +134,7 @@ def delaying(poses: Floats, times: Floats) -> Callable[[float], tuple[Floats, Ma
 
 
 def without_tool(poses: Floats, offset: Floats) -> Floats:
-    """Return flange poses from poses of a point (3,) in ``flange`` [m]."""
+    """Return flange poses from poses of a tool centre at ``offset`` (3,) in ``flange`` [m]."""
     out = np.array(poses)
     out[..., :3, 3] -= poses[..., :3, :3] @ offset
     return out

@@ -1,4 +1,4 @@
-"""Polylines from pieces; frames, tube of uncertainty and errors of a planned seam."""
+"""Geometry of seams: polylines from segments, frames, tube of uncertainty, deviations."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from flangeye.types import Floats, Seam
 
 
 def tube_radii(seam: Seam, probability: float = 0.95) -> Floats:
-    """Return the (N,) radii within which the true seam passes each point [m].
+    """Return the (N,) radii within which the true seam passes each point, with a probability [m].
 
     Across the seam only: a shift along it is not an error of a line. The radius is that of a circle
     around the ellipse which holds the share, so the tube is never too thin.
@@ -43,10 +43,10 @@ def distances_to_line(points: Floats, line: Floats) -> Floats:
 
 
 def torch_deviation(points: Floats, line: Floats, openings: Floats) -> Floats:
-    """Return how far points (N, 3) are from a polyline (M, 3) across its openings (M, 3) [m].
+    """Return the distances of points from a polyline (M, 3), seen along its openings (M, 3) [m].
 
-    One opening (3,) stands for all. Only of the points that are beside the line: those before its
-    start and beyond its end, where nothing is welded, are left out.
+    One opening (3,) serves for all. Points (N, 3) before the line's start or beyond its end, where
+    nothing is welded, are left out.
     """
     up = np.broadcast_to(openings, line.shape)[:-1]
     start, step = line[:-1], np.diff(line, axis=0)
@@ -65,9 +65,9 @@ def torch_deviation(points: Floats, line: Floats, openings: Floats) -> Floats:
 
 
 class WeldPlane:
-    """The plane of the work: x from a line's start towards what is farthest on it, y to the left.
+    """The plane of the work: x from a line's start towards its farthest point, y to the left.
 
-    A seam that goes once around ends where it begins.
+    The farthest point, not the end: a closed seam ends where it begins.
     """
 
     def __init__(self, line: Floats, opening: Floats) -> None:
@@ -108,7 +108,7 @@ def off_line(line: Floats, points: Floats) -> tuple[Floats, Floats]:
 
 
 def seam_frames(seam: Seam) -> Floats:
-    """Return (N, 3, 3) ``base_R_seam``: x along the seam, z into the groove, y to the side."""
+    """Return ``base_R_seam`` (N, 3, 3): x along the seam, z into the groove, y to the side."""
     x = seam.tangents
     z = -(seam.openings_in_base - _along(seam.openings_in_base, x))
     z /= np.linalg.norm(z, axis=1, keepdims=True)
@@ -129,7 +129,7 @@ def tube_rings(seam: Seam, count: int = 25, segments: int = 24) -> Floats:
 
 
 def sharp_edges(vertices: Floats, triangles: NDArray[np.int32], angle: float) -> Floats:
-    """Return (E, 2, 3) the edges of a mesh at which its faces bend by more than an angle [rad].
+    """Return the edges (E, 2, 3) of a mesh where two faces meet at more than an angle [rad].
 
     Edges of one triangle alone are sharp too.
     """
@@ -189,7 +189,7 @@ def _next(
     pieces: Floats,
     left: set[int],
 ) -> int | None:
-    """Return the piece that goes on from a node, or None where the line ends."""
+    """Return the segment that continues a line at a node, or None where the line ends."""
     others = [k for k in at[node] if k != before]
     if len(others) != 1 or others[0] not in left:
         return None

@@ -17,7 +17,7 @@ Real = TypeVar("Real", bound=np.floating)
 SIGMA_OF_MAD = 1.4826
 """Standard deviation of a normal variable over its median absolute deviation."""
 MISFIT = 1e-6
-"""Chance that a chi-square test takes noise for a misfit, or for a mistake that is then named."""
+"""Significance level of chi-square tests: the chance that noise passes for a misfit."""
 
 
 def median(values: NDArray[Real]) -> NDArray[Real]:
@@ -69,9 +69,9 @@ def f_quantile(probability: float, freedom: int, noise_freedom: float) -> float:
 def covariance_inflation(freedom: float, parameters: int = 6, probability: float = 0.95) -> float:
     """Return the factor that keeps a region's coverage if its variance is only estimated.
 
-    People draw regions with the chi-square quantile, which takes the noise as known. When it was
-    estimated from ``freedom`` degrees of freedom, the squared distance follows
-    ``parameters * F(parameters, freedom)`` instead; the ratio of the quantiles makes up for it.
+    Regions are usually drawn with the chi-square quantile, which takes the noise as known. When it
+    was estimated from ``freedom`` degrees of freedom, the squared distance follows ``parameters *
+    F(parameters, freedom)`` instead; the ratio of the quantiles makes up for it.
     """
     honest = parameters * f_quantile(probability, parameters, freedom)
     return honest / chi2_quantile(probability, parameters)
@@ -87,8 +87,8 @@ def largest_error_quantile(covariance: Floats, about: Floats, corners: Floats) -
     """Return the 95 % quantile of the largest error anywhere in a box [m].
 
     The error of a small pose error is an affine function of the place, so its length is largest
-    in a corner. The distribution of the largest corner has no closed form: it is drawn, always
-    with the same draws.
+    in a corner. The distribution over the corners has no closed form: it is sampled, always with
+    the same draws.
 
     Args:
         covariance: (6, 6), order (rotation, translation), translation about ``about``.
@@ -109,7 +109,7 @@ def without_shared(observation: Observation, found: Floats) -> Observation:
 
     Args:
         observation: As it was measured.
-        found: (k,) of each error, in standard deviations; see :class:`HandEye`.
+        found: (k,) estimate of each error, in standard deviations; see :class:`HandEye`.
     """
     feature = observation.feature
     if not len(found) or not isinstance(feature, PoseFeature) or not feature.shared.size:

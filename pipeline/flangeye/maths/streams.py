@@ -13,12 +13,13 @@ import numpy as np
 from flangeye.types import Floats, Motion
 from flangeye.types.geometry import nearest_rotation, rigid, rotation_log, rows_at
 
+# An arm stands still while it stays within these of one pose [m, rad]
 STILL_DISTANCE = 0.5e-3
 STILL_ANGLE = np.radians(0.1)
 LARGEST_OFFSET = 2.0
-"""Of two clocks [s]: further apart than this, nothing is looked for."""
+"""Largest offset between two clocks that is searched for [s]."""
 PASSED_STEP = 0.02
-"""How far apart poses before and after a moment are kept of a stream [s]."""
+"""Spacing of the poses that are kept about a moment of a stream [s]."""
 
 
 @dataclass(frozen=True)
@@ -96,9 +97,15 @@ def passed(
 
 
 def with_joints(motion: Motion, at: float, of: str, stream: tuple[Floats, Floats]) -> Motion:
-    """Return the motion about a moment ``at`` [s] with the joints that move a frame.
+    """Return a motion about the time ``at`` [s] with joint values of a frame added.
 
-    It is cut to the stream's own times: (N,), with values (N, n), or (N,) of one axis.
+    The motion is cut to the times that the joints' stream covers.
+
+    Args:
+        motion: Motion of the flange, and of other frames.
+        at: Time of the motion's moment 0 [s].
+        of: Name of the frame that the joints move.
+        stream: Times (N,) [s] and joint values (N, n), or (N,) of one axis.
     """
     times, values = stream
     told = (at + motion.times >= times[0]) & (at + motion.times <= times[-1])
@@ -130,7 +137,7 @@ def joints_at(motion: Motion, time: float, of: str) -> Floats | None:
 
 
 def rates_of(motions: Sequence[Motion], of: str | None = None) -> Floats:
-    """Return the (N, 6) twists per second at N moments, in the base at the frame's origin."""
+    """Return a frame's velocities (N, 6) [rad/s, m/s] at N moments, in the base, at its origin."""
     before, after = (
         np.array([pose_at(each, end, of) for each in motions])
         for end in (-PASSED_STEP, PASSED_STEP)
@@ -147,7 +154,7 @@ def mean_pose(poses: Floats) -> Floats:
 
 
 def turning(times: Floats, poses: Floats) -> tuple[Floats, Floats]:
-    """Return times (N - 1,) and angular speeds [rad/s] there: the same in every frame."""
+    """Return mid-times (N - 1,) [s] and angular speeds [rad/s], the same in every frame."""
     steps = np.swapaxes(poses[:-1, :3, :3], -1, -2) @ poses[1:, :3, :3]
     spans = np.maximum(np.diff(times), 1e-9)
     return (times[1:] + times[:-1]) / 2, np.linalg.norm(rotation_log(steps), axis=1) / spans
@@ -173,7 +180,7 @@ def clock_offset(
     wanted = np.interp(grid, *first)
     alike = np.array([_correlation(wanted, grid, second, shift) for shift in shifts])
     best = int(np.argmax(alike))
-    # Of two signals of motion, below which their best shift means nothing
+    # A correlation below 0.7, or a maximum at the end of the range, is no clear offset
     if alike[best] < 0.7 or best in (0, len(shifts) - 1):
         return 0.0, 0.0
     # The top of the parabola through the best shift and its neighbours
@@ -199,7 +206,7 @@ def _correlation(
 def offset_into(spans: list[Span], at: Floats) -> float:
     """Return the smallest shift that brings most of the moments ``at`` into the spans [s]."""
     shifts = np.arange(-LARGEST_OFFSET, LARGEST_OFFSET, 0.01)
-    # By size: of shifts that do as well the first, and so the smallest, is taken
+    # Sorted by size, so that argmax takes the smallest of the best shifts
     shifts = shifts[np.argsort(np.abs(shifts), kind="stable")]
     starts, ends = (np.array([getattr(s, end) for s in spans]) for end in ("start", "end"))
     moved = at[None, :] + shifts[:, None]
@@ -209,7 +216,7 @@ def offset_into(spans: list[Span], at: Floats) -> float:
 
 
 def apart(poses: Floats, distance: float, angle: float) -> list[int]:
-    """Return the indices of poses that are far enough from the one kept before [m, rad]."""
+    """Return indices of poses at least ``distance`` [m] or ``angle`` [rad] from the last kept."""
     kept: list[int] = []
     for i, pose in enumerate(poses):
         if kept:
