@@ -65,7 +65,7 @@ def test_rows_without_names_say_with_what_they_were_paired() -> None:
     assert in_order("t.csv", 3, "poses", ["2.jpg", "9.jpg", "10.jpg"]).startswith(
         "poses without names are paired in order: row 1 with 2.jpg, …, row 3 with 10.jpg, without 3"
     )
-    with pytest.raises(StageError, match="has 4 poses, but the folder 3 scans, without 3, 4"):
+    with pytest.raises(StageError, match="has 4 poses, but the folder has 3 scans, without 3, 4"):
         in_order("t.csv", 4, "poses", ["1.jpg", "2.jpg", "5.jpg"])
 
 

@@ -23,13 +23,13 @@ from flangeye.types import Floats
 MATRICES = (
     "cameramatrix", "intrinsicmatrix", "intrinsics", "intrinsic", "mtx", "matrix", "k", "m",
 )  # fmt: skip
-"""Names of the camera's matrix, as all names here in small letters without what joins words."""
+"""Names of the camera matrix. Like all names here they are in lower case, without separators."""
 _FIRST = ("", "1", "left", "l")
-"""What stands behind the names of the camera, or of a stereo calibration's first."""
+"""Suffixes of the names of the only camera, or of the first of a stereo pair."""
 ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-"""OpenCV's coefficients."""
+"""OpenCV's distortion coefficients in their order."""
 LABELLED = (".txt", ".csv", ".ini", ".cfg", ".toml")
-"""Endings of texts with a matrix alone, or with numbers behind labels."""
+"""Endings of text files with a bare matrix, or with numbers behind labels."""
 
 
 class CameraFile(NamedTuple):
@@ -72,7 +72,7 @@ def cameras_in(folder: Path) -> list[CameraFile]:
     # A file that is larger [bytes] holds recordings, and is not looked into
     files = sorted(p for p in inside if p.is_file() and p.stat().st_size <= 1_000_000)
     alike = Counter(re.sub(r"\d+", "*", str(path)) for path in files)
-    # Files that are named alike but for a number hold a pose each
+    # Files whose names differ only in a number hold one pose each
     found = (camera_in(p) for p in files if alike[re.sub(r"\d+", "*", str(p))] < 3)
     return [camera for camera in found if camera is not None]
 
@@ -109,7 +109,7 @@ def camera_in(path: Path) -> CameraFile | None:
 
 
 def _document(path: Path) -> Any:
-    """Return what a file holds: mappings, a bare matrix, or COLMAP's camera; None for others."""
+    """Return a file's content: mappings, a bare matrix, or COLMAP's camera; None for others."""
     if path.suffix.lower() not in LABELLED:
         document = document_of(path)
         return None if document is None else document.data
@@ -163,7 +163,7 @@ def _mappings(data: Any) -> Iterator[dict[str, Any]]:
 
 
 def _plain(values: Mapping[Any, Any]) -> dict[str, Any]:
-    """Return values by their names in small letters: ``camera_matrix``, ``CameraMatrix``."""
+    """Return values with names in lower case without separators: ``cameramatrix``."""
     return {re.sub(r"[_ -]", "", str(name).lower()): value for name, value in values.items()}
 
 
@@ -176,7 +176,7 @@ def _matrix(values: Mapping[str, Any]) -> Floats | None:
 
 
 def _one_by_one(values: Mapping[str, Any]) -> Floats | None:
-    # One by one, the second as RealSense names them, the third as nerfstudio does
+    # Names of single values: the usual ones, RealSense's, nerfstudio's
     for names in (
         ("fx", "fy", "cx", "cy"),
         ("fx", "fy", "ppx", "ppy"),
@@ -231,13 +231,14 @@ def _distortion(values: Mapping[str, Any]) -> Floats:
 
 def _in_order(values: Mapping[str, Any]) -> list[Any]:
     """Return distortion coefficients that have one name each, such as ``k1``, in OpenCV's order."""
+    # OpenCV's vector has 4, 5, 8, 12 or 14 entries: with any of k4 to k6 it has eight
     count = len(ORDER) if any(values.get(name) for name in ORDER[5:]) else 5
     return [values.get(name, 0.0) for name in ORDER[:count]]
 
 
 def _require_opencv(path: Path, values: Mapping[str, Any]) -> None:
     named = [str(values.get(name, "")).lower() for name in ("distortionmodel", "model")]
-    # In the name of a model whose coefficients are not OpenCV's
+    # Words in the names of models whose coefficients are not OpenCV's
     words = ("equidistant", "fisheye", "kannala", "fov", "inverse", "omni", "ds", "eucm")
     other = next((name for name in named if any(word in name for word in words)), None)
     if other and _distortion(values).any():
@@ -277,7 +278,7 @@ def _colmap(path: Path, lines: list[str]) -> CameraFile | None:
 def _checked(path: Path, matrix: Floats, lens: Iterable[float]) -> CameraFile | None:
     """Return a calibration; None if the matrix is not a camera matrix."""
     coefficients = np.asarray(lens, dtype=np.float64).ravel()
-    # OpenCV's longest row of coefficients
+    # OpenCV's longest vector: k1 to k6, p1, p2, s1 to s4, tau_x, tau_y
     most_coefficients = 14
     sound = len(coefficients) <= most_coefficients and np.isfinite(coefficients).all()
     return CameraFile(path, matrix, coefficients) if sound and _is_camera(matrix) else None
@@ -286,6 +287,7 @@ def _checked(path: Path, matrix: Floats, lens: Iterable[float]) -> CameraFile | 
 def _is_camera(matrix: Floats) -> bool:
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
         return False
+    # Focal lengths and principal points are many pixels; entries of a rotation are at most 1
     (fx, _, cx), (zero, fy, cy), last = matrix.tolist()
     return bool(zero == 0 and last == [0, 0, 1] and min(fx, fy, cx, cy) > 1)
 

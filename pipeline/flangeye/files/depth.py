@@ -50,7 +50,10 @@ def check_scan(path: Path) -> int:
 
 
 def _depths(path: Path) -> tuple[Floats, CameraFile]:
-    """Return (H, W) depths along z in the file's own unit; 0 or less where no surface was seen."""
+    """Return depths (H, W) along z in the file's own unit, and the camera's calibration.
+
+    Depths are 0 or less where no surface was measured.
+    """
     import cv2
 
     if path.suffix.lower() == ".npy":
@@ -64,7 +67,7 @@ def _depths(path: Path) -> tuple[Floats, CameraFile]:
         raise StageError(
             f"{path}: is not a depth image: those have one channel, of 16 bits or of floats"
         )
-    # Of the folder as it is now: the page lives on while a file is put there
+    # The folders' times of change are keys of the cache: the page runs on while a file is added
     changed = path.parent.stat().st_mtime_ns, path.parent.parent.stat().st_mtime_ns
     camera = _camera_beside(path.parent, changed)
     if camera is None:
@@ -72,12 +75,12 @@ def _depths(path: Path) -> tuple[Floats, CameraFile]:
             f"{path}: needs the calibration of its camera: put its file beside the depth images, "
             "for example camera.yaml with {fx: 910.2, fy: 909.8, cx: 640.1, cy: 361.0}"
         )
-    # The axis of a depth camera hits its image about the middle
+    # The principal point of a depth camera is near the middle of its image
     if np.abs(camera.matrix[:2, 2] / pixels.shape[::-1] - 0.5).max() > 0.25:
         told = ", ".join(f"{value:.0f}" for value in camera.matrix[:2, 2])
         raise StageError(
-            f"{path}: has {pixels.shape[1]} x {pixels.shape[0]} px, but {camera.path.name} its "
-            f"principal point at {told}: it is of images of another size"
+            f"{path}: has {pixels.shape[1]} x {pixels.shape[0]} px, but {camera.path.name} has its "
+            f"principal point at {told}: it is for images of another size"
         )
     return np.nan_to_num(pixels.astype(np.float64)), camera
 

@@ -17,7 +17,7 @@ from pydantic_core import CoreSchema
 class Described(BaseModel):
     """Base of models whose fields are described by the text below each.
 
-    The source is looked at when a description is asked for, so that no run waits for it.
+    The source is parsed only when a description is needed, so that runs do not wait for it.
     """
 
     @classmethod

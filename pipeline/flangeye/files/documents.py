@@ -23,7 +23,7 @@ from flangeye.files.yaml_lines import MAX_BYTES, parse_yaml
 from flangeye.types import Floats
 
 MATRICES = ((4, 4), (3, 4), (3, 3))
-"""Shapes of a pose, of its rotation, and of a pose without its last row."""
+"""Shapes of a pose, of a pose without its last row, and of a rotation."""
 
 
 class TableDocument(NamedTuple):
@@ -190,7 +190,7 @@ def _plain(value: Any) -> Any:
 
 
 def stacked(rows: Floats) -> Floats | None:
-    """Return (N, r, c) matrices stacked in the rows of (N r, c); None if it is no such stack."""
+    """Return the matrices (N, r, c) of an array (N r, c) that stacks them; None if it does not."""
     for lines, width in MATRICES:
         if rows.ndim != 2 or rows.shape[1] != width or not len(rows) or len(rows) % lines:
             continue
@@ -198,7 +198,7 @@ def stacked(rows: Floats) -> Floats | None:
         with np.errstate(all="ignore"):  # numbers that are not a rotation's can be of any size
             gram = stack[:, :3, :3] @ stack[:, :3, :3].swapaxes(1, 2)
         last = lines == 3 or bool((stack[:, 3] == [0, 0, 0, 1]).all())
-        # By how much rows of a written rotation may differ from unit length, and from right angles
+        # Rows of a written rotation are rounded: so far they may be from orthonormal
         if last and np.abs(gram - np.eye(3)).max() < 2e-3:
             return stack
     return None
@@ -211,6 +211,6 @@ def _poses_first(array: Floats) -> Floats:
     shape = array.shape
     if len(shape) == 3 and shape[:2] in MATRICES and shape[1:] not in MATRICES:
         return np.moveaxis(array, 2, 0)
-    # Numbers of the longest row that is a pose; a wider array of few rows holds a pose a column
+    # A pose has at most 16 numbers; a wider array of few rows holds one pose a column
     wide = len(shape) == 2 and shape[0] in (3, 6, 7, 12, 16) and shape[1] > 16
     return array.T if wide else array

@@ -20,7 +20,7 @@ Group = tuple[int, str]
 Entity = tuple[str, list[Group]]
 
 MOST_PIECES = 200_000
-"""Straight pieces of one drawing."""
+"""Most line segments of one drawing."""
 
 
 def read_dxf(path: Path) -> tuple[Floats, str | None]:
@@ -102,6 +102,7 @@ def _upright(path: Path, name: str, groups: list[Group], line: Floats) -> Floats
         return line
     if abs(up + 1) > 1e-6:
         raise StageError(f"{path}: a {name} lies in an inclined plane; export it as lines")
+    # DXF's arbitrary axis algorithm: an extrusion along -z reverses x and z
     return line * [-1.0, 1.0, -1.0]
 
 
@@ -111,7 +112,7 @@ def _arc(radius: float, start: float, sweep: float) -> Floats:
 
 
 def _polyline(name: str, groups: list[Group], closed: bool) -> Floats:
-    """Return the line through vertices, arcs included: a bulge is the tangent of a quarter arc."""
+    """Return the line through vertices and arcs; a bulge is the tangent of a quarter angle."""
     height = next((float(v) for c, v in groups if c == 38), 0.0)
     first = (10,) if name == "LWPOLYLINE" else (0,)
     vertices: list[list[float]] = []

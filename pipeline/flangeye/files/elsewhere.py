@@ -148,13 +148,13 @@ class _StandIn:
         return {self._name_of(path): about for path, about in found.items()}
 
     def lay_out(self) -> None:
-        """Make every file's name, and fetch the small ones."""
+        """Create every file empty, and fetch the small ones and those that are no scans."""
         for name, about in self.listed().items():
             path = self._root / name if name else self._root
             path.parent.mkdir(parents=True, exist_ok=True)
             path.touch()
             self._names[path] = about["name"]
-            # Files up to so many bytes are fetched at once, whatever they are
+            # Small scans are fetched at once, as requests cost more than their bytes
             of_scans = path.suffix.lower() in (
                 ".pcd", ".ply", ".npy", ".xyz", ".csv", ".txt", ".png", ".jpg", ".jpeg", ".bmp",
                 ".tif", ".tiff",
@@ -165,7 +165,7 @@ class _StandIn:
                 self.fetch(path)
 
     def fetch(self, path: Path) -> None:
-        """Fetch a file."""
+        """Fetch the content of one file into the local folder."""
         with reaching(with_urls(str(path))):
             self._system.get_file(self._names[path], str(path))
 
@@ -207,7 +207,7 @@ def system_of(url: str) -> tuple[Any, str]:
         import fsspec
 
         with reaching(url):
-            # What it listed before may have changed since: it is asked again.
+            # A cached listing may be out of date, so the store is asked again.
             fresh = {"skip_instance_cache": True} if url.startswith("zip:") else {}
             system, path = fsspec.url_to_fs(url, **fresh)
             system.invalidate_cache()

@@ -15,7 +15,7 @@ from flangeye.files.clouds.plain import npy_shape
 from flangeye.files.regular import open_regular
 
 MAX_PIXELS = 1 << 26
-"""Largest image that is decoded; the largest scanner's has a tenth."""
+"""Largest image that is decoded [pixels]; the largest scanner's has a tenth of it."""
 
 # OpenCV reads both once, when it is loaded; its own bound is eight times as large.
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_PIXELS))
@@ -57,7 +57,7 @@ def decode_image(raw: bytes, flags: int) -> NDArray[Any]:
 
 
 def _stated_pixels(raw: bytes) -> int:
-    """Return how many pixels a PNG's or BMP's header states; OpenCV allocates these first."""
+    """Return the number of pixels that a PNG's or BMP's header states; OpenCV allocates these."""
     if raw.startswith(PNG) and len(raw) >= 24:
         width, height = struct.unpack_from(">II", raw, 16)
     elif raw[:2] == b"BM" and len(raw) >= 26:
@@ -96,5 +96,5 @@ def is_depth_image(path: Path) -> bool:
         return False
     with open_regular(path) as file:
         head = file.read(26)
-    # Bits of a pixel, and 0 for grey
+    # Of a PNG's header the bit depth, 16, and the colour type, 0 for grey
     return ending != ".png" or head[24:] == bytes([16, 0])

@@ -42,7 +42,7 @@ RecipePath = Annotated[Path, BeforeValidator(_beside_recipe), WHOLE]
 """A path in a parameter; a relative one starts at the recipe's folder."""
 
 RecipeFile = Annotated[RecipePath, AfterValidator(_there)]
-"""The same of a file that has to be there before a recipe runs."""
+"""The path of a file that must exist before a recipe runs; a relative one likewise."""
 
 
 def bundled_file(kind: str, folder: str) -> Callable[[Any, ValidationInfo], Path]:
@@ -115,15 +115,15 @@ class Storage(Protocol):
 
 
 def place_at(at: str) -> Storage:
-    """Return a folder by path or URL.
+    """Return the store at a path or URL.
 
     Raises:
-        StageError: The URL is of another kind, or what opens it is not installed.
+        StageError: The kind of URL is not supported, or its library is not installed.
     """
-    return _Elsewhere(at) if is_url(at) else _Here(Path(at))
+    return _RemoteStorage(at) if is_url(at) else _LocalStorage(Path(at))
 
 
-class _Here:
+class _LocalStorage:
     def __init__(self, root: Path) -> None:
         self._root = root
 
@@ -165,7 +165,7 @@ class _Here:
             shutil.rmtree(self._root / name, ignore_errors=True)
 
 
-class _Elsewhere:
+class _RemoteStorage:
     def __init__(self, url: str) -> None:
         self._url = url.rstrip("/")
         self._system, root = system_of(self._url)

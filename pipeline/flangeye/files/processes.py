@@ -135,6 +135,7 @@ class Pipe:
             chunk = self._chunks.get(timeout=patience)
         except queue.Empty:
             raise TimeoutError from None
+        # An empty chunk marks the end of the output; it is put back for later calls
         if not chunk:
             self._chunks.put(b"")
             raise PipeEndedError(self._ending())

@@ -86,7 +86,7 @@ class Recording:
 
     @property
     def base_T_flange(self) -> Floats:
-        """(4, 4) pose of the (first) arm's flange [m]."""
+        """Pose (4, 4) of the (first) arm's flange [m]."""
         return self.poses[FLANGE]
 
     @property
@@ -164,7 +164,7 @@ def check_poses(
 
 def _check_distinct(root: Path, recordings: Sequence[Recording]) -> None:
     poses = np.array([recording.base_T_flange for recording in recordings])
-    # The same poses stand beside each other in any order by their numbers
+    # Sorted by a weighted sum of their entries, equal poses are neighbours
     order = np.argsort(poses.reshape(-1, 16) @ np.sqrt(np.arange(1.0, 17.0)))
     steps = np.abs(np.diff(poses[order], axis=0)).max(axis=(1, 2), initial=0.0)
     for first in poses[np.sort(order[1:][steps <= SAME_POSE])][:1]:
@@ -177,7 +177,7 @@ def _repeated(names: Sequence[str], same: Indices, pose: Floats) -> str:
     if len(same) > max(2, len(names) / 2):
         made_up = "the identity" if np.abs(pose - np.eye(4)).max() < SAME_POSE else "the same"
         told = f"{len(same)} of {len(names)} robot poses are {made_up}"
-        return f"{told}: the driver had no others to give; record again"
+        return f"{told}: the driver did not read them from the robot; record again"
     return (
         f"poses '{names[same[0]]}' and '{names[same[1]]}' are the same; every capture needs a pose "
         "of its own; 'flangeye doctor' names those to leave out"

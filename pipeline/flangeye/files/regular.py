@@ -17,7 +17,7 @@ MAX_FILE = 1 << 28
 MAX_TEXT = 64_000_000
 """Longest table, list of poses or JSON file [bytes]: a million poses."""
 _POINTER = b"version https://git-lfs.github.com/spec/"
-"""How the stand-in of a file begins that Git Large File Storage keeps elsewhere."""
+"""First bytes of a Git LFS pointer, the small text that replaces a large file."""
 
 
 def open_regular(path: Path, error: type[FlangeyeError] = StageError) -> BinaryIO:
@@ -50,13 +50,13 @@ def is_pointer(path: Path) -> bool:
 def _stands_in(file: BufferedReader) -> bool:
     try:
         return file.peek(len(_POINTER)).startswith(_POINTER)
-    except OSError:  # said by who reads it
+    except OSError:  # reported when the content is read
         return False
 
 
 def _opened(path: Path, error: type[FlangeyeError]) -> BufferedReader:
     try:
-        # Not every system has all of them
+        # Flags that this system does not have count as 0
         flags = os.O_RDONLY | sum(
             getattr(os, name, 0) for name in ("O_NONBLOCK", "O_NOCTTY", "O_CLOEXEC", "O_BINARY")
         )
@@ -146,6 +146,7 @@ def write_whole(path: Path, content: str | bytes, error: type[FlangeyeError] = S
 
 
 def _replace(path: Path, raw: bytes) -> None:
+    # A rename is atomic within a file system, so the draft is written in the same folder
     number, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     draft = Path(name)
     try:
@@ -162,6 +163,7 @@ def _replace(path: Path, raw: bytes) -> None:
 
 
 def _umask() -> int:
+    # POSIX has no call that reads the mask without setting it
     mask = os.umask(0)
     os.umask(mask)
     return mask

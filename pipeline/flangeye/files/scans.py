@@ -84,8 +84,8 @@ def in_order(where: str, count: int, what: str, names: Sequence[str]) -> str:
     missing = f", without {_list([str(gap) for gap in gaps])}" if gaps else ""
     if count != len(names):
         raise StageError(
-            f"{where}: has {count} {what}, but the folder {len(names)} scans{missing}; name the "
-            "scan of each pose in a column called scan, or remove the surplus"
+            f"{where}: has {count} {what}, but the folder has {len(names)} scans{missing}; "
+            "name the scan of each pose in a column called scan, or remove the surplus"
         )
     last = f", …, row {count} with {names[-1]}" if count > 1 else ""
     return f"{what} without names are paired in order: row 1 with {names[0]}{last}{missing}"
@@ -141,7 +141,7 @@ def scans_in(folder: Path, stem: str = "*") -> list[Path]:
 
 
 def texts_of_points(files: Iterable[Path]) -> set[Path]:
-    """Return the texts and archives of arrays that hold a cloud each.
+    """Return the text and .npz files that hold one cloud each.
 
     They are at least three files whose names differ in a number only.
     """

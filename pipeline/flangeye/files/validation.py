@@ -10,7 +10,7 @@ from pydantic import BaseModel
 from flangeye.files.words import nearest
 
 EXPLAINED = "explained"
-"""Type of an error whose message went through :func:`sentence` already."""
+"""Type of an error whose message :func:`sentence` has already written."""
 
 
 def sentence(details: Any, model: type[Any], given: Any) -> str:

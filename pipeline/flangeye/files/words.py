@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from flangeye.errors import RecipeError
 
 LONGEST = 160
-"""What is quoted of a parser's message [characters]: some quote the file."""
+"""Most characters quoted of a parser's message; some messages quote the whole file."""
 
 
 def require_name(where: str, name: str) -> str:
@@ -17,7 +17,7 @@ def require_name(where: str, name: str) -> str:
     Raises:
         RecipeError: It has other characters than names have, or more than 128.
     """
-    # A link, joint or frame in another program's file: no quote, no line break, no markup.
+    # Exports write these names into other programs' files: no quotes, line breaks or markup.
     if not re.fullmatch(r"\w[\w ./:+()\-]{0,127}", name):
         raise RecipeError(
             f"{where}: {name[:LONGEST]!a} is not a valid name: letters, digits and _ . / : + - ( ) "
@@ -28,8 +28,8 @@ def require_name(where: str, name: str) -> str:
 
 def printable(text: str) -> str:
     """Return a text with its control characters written out as escapes."""
-    # All but tab and line feed: escape sequences begin with them, and directions hide what is
-    # said.
+    # All control characters but tab and line feed, as escape sequences begin with them; and marks
+    # of writing direction, which can hide text.
     return re.sub(
         "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]",
         lambda found: ascii(found[0])[1:-1],
@@ -47,12 +47,12 @@ def nearest(word: str, known: Iterable[str], n: int = 3, cutoff: float = 0.6) ->
     """Return the known words that are nearest to one, the nearest first.
 
     Args:
-        word: What was written.
-        known: What could have been.
-        n: How many at most.
-        cutoff: How alike they must be, from 0 to 1.
+        word: The word as written.
+        known: The valid words.
+        n: Largest number of words returned.
+        cutoff: Least similarity, from 0 to 1.
     """
     from difflib import get_close_matches  # a command without mistakes does not wait for it
 
-    # Of a word from a file, what is compared [characters]: it takes time with their product
+    # The time grows with the product of both lengths, and words from files can be long
     return get_close_matches(word[:200], list(known), n, cutoff)

@@ -32,10 +32,10 @@ Keys = tuple[Hashable, ...]
 
 @dataclass(frozen=True)
 class Document:
-    """A parsed file.
+    """A parsed YAML file.
 
     Attributes:
-        name: How messages call the file.
+        name: Name of the file in messages.
         data: Plain dicts, lists and scalars.
         lines: Path of keys -> line, counted from 1.
     """
@@ -92,7 +92,7 @@ def _composed(text: str, name: str) -> yaml.Node | None:
     """Return the root of a document; libyaml's parser is ten times as fast."""
     fast = getattr(yaml, "CSafeLoader", None)
     if fast is not None:
-        with suppress(yaml.YAMLError):  # its words for a mistake are others
+        with suppress(yaml.YAMLError):  # it words mistakes differently: parsed again
             _refuse_dangers(text, name, fast)
             return yaml.compose(text, Loader=fast)
     _refuse_dangers(text, name, yaml.SafeLoader)
@@ -105,7 +105,7 @@ def parse_value(text: str, name: str) -> Any:
 
 
 def _refuse_dangers(text: str, name: str, loader: type[yaml.SafeLoader]) -> None:
-    """Look at the events first: they are flat, so nothing can expand or recurse yet."""
+    """Refuse tags, anchors, aliases and deep nesting before anything can expand or recurse."""
     depth = 0
     deepest = 20
     for event in yaml.parse(text, Loader=loader):
@@ -175,7 +175,7 @@ def _scalar(text: str, plain: bool) -> Any:
         return words[text.lower()]
     if _INTEGER.fullmatch(text):
         return int(text)
-    # Linear, whatever follows
+    # This expression takes linear time on any text
     return float(text) if re.fullmatch(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?", text) else text
 
 
@@ -188,7 +188,7 @@ class Edit(NamedTuple):
 
 
 def edited(text: str, data: Mapping[Any, Any]) -> str:
-    """Return a YAML text that holds ``data``, written anew only where its values differ.
+    """Return a YAML text that holds ``data``, rewritten only where its values differ.
 
     Comments stay, but for those inside a value that is gone or is of another kind now.
 
@@ -209,7 +209,7 @@ def edited(text: str, data: Mapping[Any, Any]) -> str:
 
 
 def _holds(text: str, data: Mapping[Any, Any]) -> bool:
-    """Return whether edits came out right; lists in lists of blocks may leave no place for them."""
+    """Return whether the edited text holds ``data``; some nested lists have no room for edits."""
     try:
         return bool(parse_yaml(text, "recipe").data == data)
     except RecipeError:
@@ -328,7 +328,7 @@ def _line_start(text: str, index: int) -> int:
 
 
 def _end(node: Any) -> int:
-    """Return where a node's text ends; that of a block ends with its last entry."""
+    """Return the index at which a node's text ends; a block ends with its last entry."""
     block = getattr(node, "flow_style", None) is False
     if block and node.value:
         last = node.value[-1]

@@ -400,7 +400,7 @@ def test_a_pose_given_twice_is_refused(
 def test_poses_that_a_driver_made_up_are_refused_as_such(
     refused: Callable[..., Any], archive: Path, captures: Any
 ) -> None:
-    told = "the driver had no others to give; record again"
+    told = "the driver did not read them from the robot; record again"
     rewrite(archive, [moved(capture, np.eye(4)) for capture in captures])
     assert refused() == f"{archive}: 5 of 5 robot poses are the identity: {told}"
     stale = captures[0].base_T_flange.matrix

@@ -27,7 +27,7 @@ def mark_missing(xyz: Points) -> str:
     """Set the values by which scanners mark missing points to NaN, in place.
 
     A repeated point is missing if it is the scanner's origin, or farther than all others. Points of
-    one depth are missing if that depth is :data:`FARTHER` than all others.
+    one depth are missing if that depth is more than three times all others.
 
     Args:
         xyz: (N, 3) in the file's own unit.
@@ -38,8 +38,8 @@ def mark_missing(xyz: Points) -> str:
     some = xyz[:: max(1, len(xyz) // 4096)]
     some = some[np.isfinite(some).all(axis=1)]
     depths, counts = np.unique(some[:, 2], return_counts=True)
-    # Points at least: fewer do no harm, and small tables may repeat what was measured
-    # Measured points are not equal to the last bit so often: one in a hundred
+    # Measured points are not equal to the last bit this often. Fewer than 100 do no harm, and small
+    # tables may repeat measured values
     if not len(depths) or counts.max() < max(0.01 * len(some), 100):
         return ""
     depth = depths[counts.argmax()]
@@ -62,7 +62,7 @@ def _beyond(value: float, others: Points, times: float) -> bool:
 
 LengthUnit = Literal["m", "mm", "in"]
 PER_METRE: Mapping[LengthUnit, float] = {"m": 1, "mm": 1000, "in": 1 / 0.0254}
-"""How many of a unit are in a metre."""
+"""Number of each unit in a metre."""
 
 CLOUD_FILES: Mapping[str, Callable[[Path], PointTable]] = {
     ".asc": open_text,
@@ -75,9 +75,9 @@ CLOUD_FILES: Mapping[str, Callable[[Path], PointTable]] = {
     ".txt": open_text,
     ".xyz": open_text,
 }
-"""Files that can be read, by their ending."""
+"""Function that opens a file, by the file's ending."""
 VENDOR = {".zdf": "Zivid's SDK", ".praw": "Photoneo's PhoXi Control", ".mraw": "Mech-Mind's SDK"}
-"""Files that only their maker can read, and with what to turn them into others."""
+"""Endings of proprietary formats, and the program that converts such files."""
 CONVERSIONS: Mapping[str, str] = {
     **{end: f"only {by} reads it; export it as .ply or .pcd" for end, by in VENDOR.items()},
     **{

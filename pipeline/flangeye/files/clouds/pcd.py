@@ -57,7 +57,7 @@ class Viewpoint:
 
 
 def open_pcd(path: Path) -> PointTable:
-    """Return where a PCD file keeps its points.
+    """Return the layout of a PCD file's points, as its header states it.
 
     Raises:
         StageError: It is not a PCD file of points; the message says what is wrong with its header.

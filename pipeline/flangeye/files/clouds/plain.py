@@ -32,18 +32,18 @@ from flangeye.files.regular import MAX_FILE, open_regular
 from flangeye.files.words import reason_of
 
 HEADER_ERRORS = (ValueError, TypeError, SyntaxError, TokenError)
-"""What NumPy raises at a header that is none: it parses a Python literal."""
+"""Errors that NumPy raises at an invalid header, which it parses as a Python literal."""
 
 NUMBERS = "fiu"
-"""Kinds of NumPy's types that are numbers."""
+"""Codes of NumPy's numeric types: floating, signed and unsigned."""
 STATED = {"mm": 1e3, "cm": 1e2, "um": 1e6, "m": 1.0, "inch": 1 / 0.0254, "in": 1 / 0.0254}
-"""How many of a unit that a heading may state are in a metre."""
+"""Number of each unit in a metre, for the units that a heading may state."""
 WIDEST = 16
-"""Numbers of a point at most: x, y, z, then normals, colours, intensity."""
+"""Most numbers of one point: x, y, z, then normals, colours, intensity."""
 
 
 def open_npy(path: Path) -> PointTable:
-    """Return the points of an array.
+    """Return the layout of the points in a .npy file.
 
     The array is (N, 3) or (H, W, 3), (3, N) or (3, H, W), or has records with x, y and z; further
     columns are ignored.
@@ -229,7 +229,7 @@ class NpyTable(PointTable):
     axes_first: bool = False
 
     def decode(self) -> Points:
-        """Load the array."""
+        """Return the points of the array."""
         with np.errstate(over="ignore"):
             array = np.load(self.path, allow_pickle=False)
             if self.fields:
@@ -251,7 +251,7 @@ class LoadedTable(PointTable):
     xyz: NDArray[Any]
 
     def decode(self) -> Points:
-        """Return the points."""
+        """Return the points in single precision."""
         with np.errstate(over="ignore"):
             return self.xyz.astype(np.float32)
 
@@ -338,7 +338,7 @@ def _has_decimal_commas(row: str) -> bool:
 
 
 def _rows(path: Path) -> tuple[int, bool]:
-    """Return how many rows a text has, and whether it has remarks beside them."""
+    """Return the number of rows of a text, and whether there are comment lines between them."""
     with path.open(encoding="latin-1") as text:
         lines = [is_row(line) for line in text if not line.isspace()]
     return sum(lines), not all(lines)

@@ -46,7 +46,7 @@ class _Element:
 
 
 def open_ply(path: Path) -> PointTable:
-    """Return where a PLY file keeps its vertices.
+    """Return the layout of a PLY file's vertices, as its header states it.
 
     Raises:
         StageError: It is not a PLY file of points; the message says what is wrong with its header.

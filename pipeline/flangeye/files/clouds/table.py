@@ -26,7 +26,7 @@ def refuse(path: Path | str, what: str) -> NoReturn:
 
 
 def read_head(path: Path) -> bytes:
-    """Return the file's first bytes, up to :data:`HEADER_BYTES`.
+    """Return the file's first bytes, at most 65,536.
 
     Raises:
         StageError: There is no such file, or it is empty.
@@ -64,7 +64,7 @@ def split_header(path: Path, last: bytes, sort: str) -> tuple[list[list[str]], i
 
 
 def axes_of(path: Path, names: Iterable[str]) -> tuple[int, int, int]:
-    """Return where x, y and z are among ``names``.
+    """Return the indices of x, y and z in ``names``.
 
     Raises:
         StageError: One of them is missing.
@@ -103,10 +103,13 @@ def decompress(data: bytes, wanted: int) -> bytearray:
         while len(out) < wanted:
             control = data[at]
             at += 1
+            # LZF: a control byte below 32 begins that many literal bytes plus one
             if control < 32:
                 out += data[at : at + control + 1]
                 at += control + 1
                 continue
+            # Else a back reference: three bits of length, 13 bits of distance; length 7 is
+            # continued in the next byte
             length = control >> 5
             if length == 7:
                 length += data[at]
@@ -156,7 +159,7 @@ class PointTable(ABC):
     viewpoint: Any = field(default=None, kw_only=True)
 
     def check(self) -> None:  # noqa: B027  some have nothing left to check
-        """Raise StageError if the file is too short, where that was not seen when it was opened."""
+        """Raise StageError if the file is too short, unless opening it has checked that already."""
 
     @abstractmethod
     def decode(self) -> Points:
@@ -170,13 +173,13 @@ class TextTable(PointTable):
     Attributes:
         offset: Byte at which the rows begin.
         width: Values in a row.
-        axes: Where x, y and z are in a row.
+        axes: Indices of x, y and z in a row.
         skipped: Rows before the points.
         rows: Rows in all, points and others.
-        delimiter: What separates values, white space if None.
+        delimiter: Separator of values; white space if None.
         unit: Unit of the coordinates, where a heading states it; else empty.
-        comma: Whether decimals follow a comma.
-        remarks: Whether remarks stand between the rows.
+        comma: Whether numbers have decimal commas.
+        remarks: Whether there are comment lines between the rows.
     """
 
     offset: int
@@ -190,7 +193,7 @@ class TextTable(PointTable):
     remarks: bool = False
 
     def check(self) -> None:
-        """Count the rows, and the values of the last one."""
+        """Raise StageError if rows, or values of the last row, are missing or too many."""
         found, last = 0, ""
         with self._rows() as text:
             for line in filter(is_row, text):
@@ -263,7 +266,7 @@ class BinaryTable(PointTable):
             )
 
     def decode(self) -> Points:
-        """Read the records."""
+        """Return the points of all records."""
         n = math.prod(self.shape)
         records = np.fromfile(self.path, self.record, count=n, offset=self.offset)
         if len(records) != n:

@@ -77,7 +77,7 @@ def program_rows(file: Path, text: str) -> Rows | None:
 
 
 def files_at(folder: Path, name: str) -> list[Path]:
-    """Return the file of a name, or those of a pattern, ``*.json`` or ``*/pose.json``, in order.
+    """Return the file of a name, or those of a pattern such as ``*/pose.json``, in natural order.
 
     Raises:
         StageError: No file can have such a name, or the pattern would look through all folders.
@@ -98,8 +98,8 @@ def read_table(folder: Path, name: str | Sequence[str]) -> Table:
     """Read a table by its name, or tables side by side by several.
 
     Raises:
-        StageError: A file cannot be read, the part is not there, it has several and none is named,
-            the columns of two files differ, or tables side by side are not of one length.
+        StageError: A file cannot be read; the part does not exist, or none is named of several; the
+            columns of two files differ, or the lengths of tables side by side.
     """
     if not isinstance(name, str):
         return _beside([read_table(folder, each) for each in name])
@@ -128,13 +128,13 @@ def tables_in(folder: Path, name: str) -> list[Table]:
 def rows_together(
     table: Table, other: Table, column: Column | None = None
 ) -> tuple[list[int], list[str]]:
-    """Return which row of another table belongs to each of a table's, and notes of how.
+    """Return the index of the other table's row for each row, and notes on how they were paired.
 
-    They belong together by what both call their rows: the names of their files, or the cells of a
-    column that both have; else row by row.
+    Rows are paired by name: that of their files, or the cell in a column that both tables have.
+    Without names they are paired row by row.
 
     Raises:
-        StageError: The names differ, or there are not as many.
+        StageError: The names differ, or the numbers of rows.
     """
     if other is table:
         return list(range(len(table.rows))), []
@@ -285,7 +285,7 @@ class TextBlock:
 
     @property
     def width(self) -> int:
-        """Columns of the first row."""
+        """Number of columns of the first row."""
         return len(self.rows[0][1])
 
 
@@ -373,7 +373,7 @@ def _unfolded(block: TextBlock) -> TextBlock:
     if any(sizes):
         for at, (where, cells) in enumerate(block.rows):
             parts = (_list_in(cell) or (cell,) for cell in cells)
-            # A cell that is empty is as many empty ones
+            # An empty cell stands for as many empty entries
             full = (part * (size or 1) if len(part) == 1 else part
                     for part, size in zip(parts, sizes, strict=False))  # fmt: skip
             block.rows[at] = where, tuple(cell for part in full for cell in part)
@@ -407,7 +407,7 @@ def _or_nan(cell: str | float) -> float:
 
 
 def _merged(blocks: list[TextBlock]) -> list[TextBlock]:
-    """Return blocks of one table as one: short ones, and those that only a comment parts."""
+    """Return the blocks with those of one table merged: short ones, and those a comment parts."""
     sections: list[TextBlock] = []
     # Rows of a block; fewer between blank lines are a pose each
     short = [block for block in blocks if len(block.rows) < 3]
@@ -427,7 +427,7 @@ def _merged(blocks: list[TextBlock]) -> list[TextBlock]:
 
 
 def _in_turn(blocks: Sequence[TextBlock]) -> list[TextBlock]:
-    """Return a table of each title that takes turns: robot 0, marker 0, robot 1, a row each."""
+    """Return one table for each of the titles that alternate: robot 0, marker 0, robot 1, …."""
     sections: dict[str, TextBlock] = {}
     for block in blocks:
         title = re.sub(r"\W*\d+\W*$", "", block.title)
@@ -444,7 +444,7 @@ def _names(block: TextBlock, blocks: Sequence[TextBlock]) -> list[str]:
 
 
 class _splitter:  # noqa: N801  a function with a memory
-    """Splits lines at the mark that the first of them shows."""
+    """Splits lines at the separator found in the first of them."""
 
     def __init__(self, lines: Sequence[str]) -> None:
         # Where blanks separate, every comma is a decimal one: "1,5 2,0 3,25".
@@ -456,7 +456,7 @@ class _splitter:  # noqa: N801  a function with a memory
         self.wide = any(len(self(line)) > 2 for line in lines[:9])
 
     def __call__(self, line: str) -> tuple[str, ...]:
-        # What Python prints around an array's numbers: array([[…]], dtype=float32)
+        # Python prints arrays as array([[…]], dtype=float32): drop all but the numbers
         line = re.sub(r"^\s*[\w.]+\((?=[-\s\[(.\d])|,\s*dtype=\w+(?=\)+\s*$)", "", line).strip()
         line = line.strip("| ") if self.mark == "|" else line
         line = line.rstrip(", ") if line.startswith(("[", "(")) else line  # a list in a list

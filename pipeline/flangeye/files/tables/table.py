@@ -22,7 +22,7 @@ Column = str | int
 """A column by its name in the heading, or by its number from 1."""
 Cell = str | float
 Row = tuple[str, tuple[Cell, ...]]
-"""Where a row stands, as messages begin with it, and its cells."""
+"""Location of a row, with which messages begin, and its cells."""
 
 
 class Rows(NamedTuple):
@@ -31,8 +31,9 @@ class Rows(NamedTuple):
     Attributes:
         heading: Names of the columns; empty without a heading.
         rows: Location and cells of each row.
-        part: What names it within its file: an array's name, a block's title; empty for all of it.
-        names: What each row is called, where rows have names; else empty.
+        part: Its name within the file: an array's name or a block's title; empty for the whole
+            file.
+        names: Name of each row, if rows have names; else empty.
         convention: Convention of the poses, if the format shows it, as a robot program does.
     """
 
@@ -53,7 +54,7 @@ class Table:
         heading: Names of the columns; empty without a heading.
         rows: Location and cells of each row.
         files: The files that were read.
-        names: What each row is called, where rows have names; else empty.
+        names: Name of each row, if rows have names; else empty.
         convention: Convention of the poses, if the format shows it.
     """
 
@@ -98,7 +99,7 @@ class Table:
         """Return the numbers (N, k) of columns; NaN where cells may be ``empty`` and are.
 
         Raises:
-            StageError: A cell is none; names its line.
+            StageError: A cell is not a number; names its line.
         """
         rows = [self._row(row, columns, empty) for row in range(len(self.rows))]
         return np.array(rows, dtype=np.float64)
@@ -134,7 +135,7 @@ class Table:
 
 
 def entry_of_list(name: str) -> tuple[str, str] | None:
-    """Return the list of a column and which entry it is: pose.3.3, tvec_0, T[1,2]; else None."""
+    """Return the list's name and the entry of a column pose.3.3, tvec_0 or T[1,2]; else None."""
     match = re.fullmatch(r"(.{1,99}?)((?:\.\d+)+|(?:_\d+)+|(?:\[\d+(?:, ?\d+)*\])+)", name)
     return match and (match[1], match[2])
 
@@ -151,19 +152,19 @@ def number_of(cell: Cell) -> float | None:
 
 
 WIDEST = 1000
-"""Values of a record: one with more holds a scan."""
+"""Most values of a record; one with more holds a scan."""
 SCAN = "name"
-"""Column of the names under which records stand."""
+"""Column for the names under which records are stored."""
 _ENDING = re.compile(r"\.[A-Za-z]\w{1,4}$")
 
 
 def record_of(file: Path, document: TableDocument) -> Rows:
-    """Return a file that is one record as one row."""
+    """Return a document that is one record as a single row."""
     return _table([(str(file), document.data)])
 
 
 def rows_of(file: Path, document: TableDocument) -> list[Rows]:
-    """Return the tables of a document: of each length of its lists one, the commonest first.
+    """Return the tables of a document: one for each length of its lists, the commonest first.
 
     Raises:
         StageError: It holds no records.
@@ -215,7 +216,7 @@ def _is_record(value: Any) -> bool:
     if isinstance(value, Mapping) or (_are_records(value) and len(value) == 1):
         return True
     shape = _shape(value)
-    # Three or four numbers are a part of a pose, six and more a whole one
+    # Three or four numbers are a position or a rotation, six and more a whole pose
     return shape in MATRICES or (len(shape) == 1 and shape[0] in (3, 4, 6, 7, 12, 16)) or shape in (
         (3, 1), (4, 1), (6, 1), (1, 3), (1, 6)
     )  # fmt: skip
@@ -235,7 +236,7 @@ def _shape(value: Any) -> tuple[int, ...]:
 
 
 def _side_by_side(where: Callable[[int], str], data: Mapping[str, Any]) -> list[Rows]:
-    """Return lists of one length as columns; what has as many entries beside them belongs there."""
+    """Return a table of all lists of one length as columns, for each length that has a stack."""
     lists = dict(_lists("", data))
     records = [value for value in lists.values() if _are_records(value)]
     if len(records) == 1:
@@ -287,7 +288,7 @@ def _columns(where: Callable[[int], str], lists: Mapping[str, Any]) -> Rows:
 
 
 def _named(file: Path, data: Mapping[str, Any]) -> list[Rows]:
-    """Return records that stand under names of their own, those of scans."""
+    """Return records that are stored under names of their own, usually those of scans."""
     if not data or not all(isinstance(v, list | Mapping | np.ndarray) for v in data.values()):
         return []
     named = [(f"{file}: {key}", {SCAN: key, "": value}) for key, value in data.items()]
