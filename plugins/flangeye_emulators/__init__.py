@@ -17,13 +17,13 @@ def flangeye_stages() -> Mapping[str, str]:
     """Return the simulated stages: name to module and function."""
     return {
         "acquire.simulated": "flangeye_emulators.acquire.simulated:acquire_simulated",
-        "acquire.simulated_cell": "flangeye_emulators.acquire.simulated_cell:"
+        "acquire.simulated_cell": "flangeye_emulators.acquire.simulated_poses:"
         "acquire_simulated_cell",
-        "acquire.simulated_cell_scans": "flangeye_emulators.acquire.simulated_cell:"
+        "acquire.simulated_cell_scans": "flangeye_emulators.acquire.simulated_scans:"
         "acquire_simulated_cell_scans",
-        "acquire.simulated_marker": "flangeye_emulators.acquire.simulated_session:"
+        "acquire.simulated_marker": "flangeye_emulators.acquire.simulated_poses:"
         "acquire_simulated_marker",
-        "acquire.simulated_session": "flangeye_emulators.acquire.simulated_session:"
+        "acquire.simulated_session": "flangeye_emulators.acquire.simulated_scans:"
         "acquire_simulated_session",
         "acquire.simulated_images": "flangeye_emulators.acquire.simulated_images:"
         "acquire_simulated_images",

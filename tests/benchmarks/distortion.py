@@ -12,16 +12,15 @@ from typing import Any
 import numpy as np
 
 from flangeye.maths.statistics import chi2_quantile
-from flangeye.models.cell import cell_of
 from flangeye.models.configuration import ORIGIN, Configuration
 from flangeye.models.loading import load_model
-from flangeye.types import CircleFeature, Floats, HandEye, Observation, TransformEstimate
+from flangeye.types import CAMERA, CircleFeature, Floats, HandEye, Observation, TransformEstimate
 from flangeye.types.geometry import covariance_at, kabsch, rotation_exp, rotation_log
-from flangeye_emulators.acquire.planned_session import FACING, PlannedSession, plan_session
-from flangeye_emulators.acquire.simulated_session import ScanParams
+from flangeye_emulators.acquire.moments import FACING, CameraView, Moments
+from flangeye_emulators.acquire.planned_session import plan_session
+from flangeye_emulators.acquire.simulated_scans import ScanParams
 from flangeye_emulators.world.raycast import pixels_of
 from flangeye_emulators.world.scanner import Distortion
-from flangeye_emulators.world.session import CameraView, seen_from
 from flangeye_plugins.solve.robust import RobustParams, solve_cell
 
 ROBOT, SCANNER = load_model("robots", "ur5"), load_model("scanners", "phoxi-m")
@@ -60,7 +59,7 @@ def bent(distortion: Distortion, points: Floats) -> Floats:
     return np.array(out)
 
 
-def session(name: str, seed: int, scale: float = 1.0) -> tuple[PlannedSession, list[Observation]]:
+def session(name: str, seed: int, scale: float = 1.0) -> tuple[Moments, list[Observation]]:
     """Return a session, and what a scanner sees that bends by ``scale`` times its file's size."""
     configuration, given = CONFIGURATIONS[name]
     rng, params = np.random.default_rng(seed), ScanParams.model_validate(given)
@@ -68,24 +67,22 @@ def session(name: str, seed: int, scale: float = 1.0) -> tuple[PlannedSession, l
     planned = plan_session(ROBOT, None, configuration, (params, view), rng)
     size = max(scale * SCANNER.calibration_error, 1e-12)
     distortion, found = Distortion(SCANNER, PIXELS, size, rng), []
-    for i, seen in enumerate(seen_from(planned.actual, planned.places)):
+    for i, seen in enumerate(planned.seen()):
         turn, shift = kabsch(RING, bent(distortion, RING @ seen[:3, :3].T + seen[:3, 3]))
         normal = rotation_exp(NORMAL * rng.standard_normal(3)) @ turn[:, 2]
         spread = NORMAL**2 * (np.eye(3) - np.outer(normal, normal))
         centre = shift + CENTRE * rng.standard_normal(3)
         circle = CircleFeature(centre, normal, {}, CENTRE**2 * np.eye(3), spread, 0.0)
-        found.append(Observation(f"{i:02d}", circle, *planned.poses(i)))
+        found.append(Observation(f"{i:02d}", circle, **planned.recorded(i)))
     return planned, found
 
 
 def judged(name: str, seed: int, scale: float = 1.0, **params: str) -> tuple[float, float, float]:
     """Return the squared distance of the truth from a calibration, and stated and true error."""
     planned, seen = session(name, seed, scale)
-    found: HandEye = solve_cell(
-        seen, cell_of(planned.configuration, ROBOT), RobustParams.model_validate(params), SCANNER
-    )
+    found: HandEye = solve_cell(seen, planned.cell, RobustParams.model_validate(params), SCANNER)
     centres = np.array([o.feature.centre for o in seen])
-    return compared(found.camera, planned.truth.camera.matrix, centres)
+    return compared(found.camera, np.asarray(planned.actual[CAMERA].place), centres)
 
 
 def compared(known: TransformEstimate, truth: Floats, seen: Floats) -> tuple[float, float, float]:

@@ -50,8 +50,8 @@ class Frame:
     parent: str
     place: Floats | None = None
 
-    def at(self, times: Indices) -> Frame:
-        """Return the frame at some of the times only."""
+    def at(self, times: Indices | int) -> Frame:
+        """Return the frame at some of the times only, or at one."""
         if self.place is None or self.place.ndim == 2:
             return self
         return replace(self, place=self.place[times])

@@ -4,30 +4,30 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
 from flangeye.errors import StageError
 from flangeye.estimation.plan import Rough, best_next, foreseen, foreseen_poses, so_far
-from flangeye.models.cell import Axis, Cell, Frame, chain, composed
-from flangeye.models.robots import RobotModel
+from flangeye.maths.kinematics import Arm
+from flangeye.models.cell import Axis, Cell, chain
 from flangeye.plugin.stage import PlaceParams
-from flangeye.types import Floats, Mask, Observation, Poses, Source, Transform, Truth
-from flangeye.types.geometry import invert
+from flangeye.types import Floats, Mask, Observation, Source
 from flangeye.units import Angle, param
-from flangeye_emulators.acquire.planned_session import (
+from flangeye_emulators.acquire.moments import (
+    DRAWS,
     UNSEEN,
     UPRIGHT,
     ArmsParams,
-    fingerprint_of,
-    noise_free,
+    CameraView,
+    Moments,
+    Sighting,
+    carried,
 )
-from flangeye_emulators.world.arm import ImperfectArm
-from flangeye_emulators.world.session import DRAWS, CameraView, disturbed
 
 
 class CellSessionParams(ArmsParams):
@@ -48,10 +48,6 @@ class CellSessionParams(ArmsParams):
     """Largest change of a joint from there."""
     joints: bool = True
     """Whether the arms report their joint angles; a camera on a link needs them."""
-
-
-Sighting = tuple[int, str, str]
-"""A moment, a camera, a target."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +120,7 @@ class NextBest:
         # Moments that are compared for each camera and target
         drawn = self._rng.choice(DRAWS, 100, replace=False)
         reported = [
-            replace(like, id=str(i), poses=moments.poses(i), arm_joints=moments.joints_at(i))
+            replace(like, id=str(i), **moments.recorded(i))
             for i in map(int, drawn)
             if i not in self._taken
         ]
@@ -147,8 +143,9 @@ def plan_cell(
     chosen = _schedule(cell, moments, params.sightings, view)
     _require_seen(cell, chosen, params.sightings)
     sightings, unseen = chosen[: params.sightings], chosen[params.sightings :]
-    truth = Truth(*_true(cell, params), unseen=tuple(moments.exact(*each) for each in unseen))
-    source = replace(_source(cell, seed, params), truth=truth)
+    moments = replace(moments, unseen=tuple(moments.exact(*each) for each in unseen))
+    note = f"simulated: a cell, {params.sightings} sightings"
+    source = moments.source(seed, note, [cell.describe(), params.model_dump(mode="json")])
     return PlannedCell(moments, sightings, source, view, params.plan == "next_best")
 
 
@@ -161,127 +158,27 @@ def _require_places(cell: Cell, params: CellSessionParams) -> None:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Moments:
-    """The poses of a cell at N moments, as reported by controllers and true.
-
-    Attributes:
-        cell: Graph of the cell's frames.
-        reported: (N, 4, 4) reported poses, by name of the moving carrier.
-        actual: All frames with their true poses.
-        joints: (N, n) reported joint angles, by arm [rad]; empty if not reported.
-        angles: (N, n) true joint angles, by arm [rad].
-    """
-
-    cell: Cell
-    reported: Mapping[str, Floats]
-    actual: Mapping[str, Frame]
-    joints: Mapping[str, Floats]
-    angles: Mapping[str, Floats]
-
-    def seen(self, camera: str, target: str) -> Floats:
-        """Return ``camera_T_target`` at all moments (N, 4, 4)."""
-        return np.asarray(invert(_each(self.actual, camera)) @ _each(self.actual, target))
-
-    def place(self, i: int, name: str) -> Floats:
-        """Return a frame's pose (4, 4) in the root frame at one moment."""
-        frames = {
-            each: replace(frame, place=frame.place[i])
-            if frame.place is not None and frame.place.ndim == 3
-            else frame
-            for each, frame in self.actual.items()
-        }
-        return composed(frames, name)
-
-    def pose(self, i: int, camera: str, target: str) -> Floats:
-        """Return ``camera_T_target`` (4, 4) at one moment."""
-        return np.asarray(invert(self.place(i, camera)) @ self.place(i, target))
-
-    def poses(self, i: int) -> Poses:
-        """Return the poses reported at one moment."""
-        return {
-            name: Transform(f"{name}_base", name, places[i])
-            for name, places in self.reported.items()
-        }
-
-    def joints_at(self, i: int) -> dict[str, Floats]:
-        """Return the joint angles reported by the arms at one moment."""
-        return {name: joints[i] for name, joints in self.joints.items()}
-
-    def exact(self, i: int, camera: str, target: str) -> Observation:
-        """Return a noise-free observation of a target by a camera."""
-        return replace(
-            noise_free(self.pose(i, camera, target), i, self.poses(i), None),
-            id=name_of((i, camera, target)),
-            camera=camera,
-            target=target,
-            arm_joints=self.joints_at(i),
-        )
-
-
-def name_of(sighting: Sighting) -> str:
-    """Return the name of a sighting."""
-    i, camera, target = sighting
-    return f"{i:04d}-{camera}-{target}"
-
-
-def _each(frames: Mapping[str, Frame], name: str) -> Floats:
-    return np.broadcast_to(composed(frames, name), (DRAWS, 4, 4))
-
-
 def _draw(cell: Cell, params: CellSessionParams, rng: np.random.Generator) -> Moments:
     """Return random poses of everything that moves, reported and true."""
-    drawn = {name: _moved(name, mover, params, rng) for name, mover in cell.movers.items()}
-    reported = {name: each.reported for name, each in drawn.items()}
-    places = {name: each.actual for name, each in drawn.items()}
-    places |= {name: drawn[link.arm].links[:, link.number] for name, link in cell.links.items()}
+    angles, axes = {}, {}
+    for name, mover in cell.movers.items():
+        if isinstance(mover, Axis):
+            low, high = mover.travel
+            shares = (_changes(params.plan, 1, rng)[:, 0] + 1) / 2
+            axes[name] = np.array([mover.place(low + x * (high - low)) for x in shares])
+        elif mover is None:
+            raise StageError(f"a simulated cell: the model of '{name}' is not known")
+        else:
+            home = np.array(params.home.get(name, UPRIGHT))
+            angles[name] = home + params.spread * _changes(params.plan, len(home), rng)
+    arms = {name: Arm(model) for name, model in cell.arms.items()}
+    reported = axes | carried(cell, arms, angles)
+    still = {name: place.matrix for name, place in params.places.items()}
+    moments = Moments(cell, reported, cell.frames, angles if params.joints else {}, angles)
     # Of a reported pose, about and along each axis [rad, m]
     noise = math.pi / 18000, 0.05e-3
-    actual = {name: disturbed(each, noise, rng) for name, each in places.items()}
-    still = {name: place.matrix for name, place in params.places.items()}
-    frames = {
-        name: replace(frame, place=(still | actual).get(name, frame.place))
-        for name, frame in cell.frames.items()
-    }
-    joints = {name: drawn[name].joints for name in cell.arms if params.joints}
-    angles = {name: drawn[name].angles for name in cell.arms}
-    return Moments(cell, reported, frames, joints, angles)
-
-
-class Drawn(NamedTuple):
-    """The poses of a moving carrier at N moments.
-
-    Attributes:
-        reported: (N, 4, 4) reported poses.
-        actual: (N, 4, 4) true poses.
-        joints: (N, n) reported joint angles of an arm [rad].
-        angles: (N, n) true joint angles [rad].
-        links: (N, n + 1, 4, 4) true poses of base and links.
-    """
-
-    reported: Floats
-    actual: Floats
-    joints: Floats = np.zeros((0, 0))
-    angles: Floats = np.zeros((0, 0))
-    links: Floats = np.zeros((0, 0, 4, 4))
-
-
-def _moved(
-    name: str, mover: RobotModel | Axis | None, params: CellSessionParams, rng: np.random.Generator
-) -> Drawn:
-    """Return random poses of a moving carrier."""
-    if isinstance(mover, Axis):
-        low, high = mover.travel
-        shares = (_changes(params.plan, 1, rng)[:, 0] + 1) / 2
-        places = np.array([mover.place(low + x * (high - low)) for x in shares])
-        return Drawn(places, places)
-    if mover is None:
-        raise StageError(f"a simulated cell: the model of '{name}' is not known")
-    home = np.array(params.home.get(name, UPRIGHT))
-    joints = home + params.spread * _changes(params.plan, len(home), rng)
-    arm = ImperfectArm(mover, 0.0 if params.arm.is_default else 1.0, rng.spawn(1)[0], params.arm)
-    angles = arm.angles(joints)
-    return Drawn(arm.reported(joints), arm.flange(angles), joints, angles, arm.frames(angles))
+    built = moments.placed(still | axes).as_built(params.arm, rng)
+    return built.disturbed(cell.measured, noise, rng)
 
 
 def _changes(plan: str, joints: int, rng: np.random.Generator) -> Floats:
@@ -342,17 +239,3 @@ def _require_seen(cell: Cell, chosen: list[Sighting], wanted: int) -> None:
             f"a simulated cell: {len(chosen)} of {DRAWS} moments drawn give a sighting, and "
             f"{wanted} are needed; make spread smaller, or move cameras and targets"
         )
-
-
-def _true(cell: Cell, params: CellSessionParams) -> tuple[Transform, tuple[Transform, ...]]:
-    camera, *others = (
-        Transform.named(cell.name_of(name), params.places[name].matrix)
-        for name in cell.unknown_frames
-    )
-    return camera, tuple(others)
-
-
-def _source(cell: Cell, seed: int, params: CellSessionParams) -> Source:
-    made_of = [cell.describe(), params.model_dump(mode="json")]
-    note = f"simulated: a cell, {params.sightings} sightings"
-    return Source(fingerprint_of(seed, made_of), (note,), simulated=True)

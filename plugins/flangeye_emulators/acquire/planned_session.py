@@ -1,77 +1,41 @@
-"""Plan of a simulated session in any configuration: parameters, poses and true transforms."""
+"""Plan of a simulated session in any configuration, simulated as the cell that it is.
+
+The kinematic loop is closed at a first pose: given the poses of camera and target in the recipe,
+the remaining transform follows. Further joint angles are drawn around it at random, and those are
+kept at which the camera sees the target.
+"""
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from flangeye.errors import StageError
 from flangeye.maths.kinematics import Arm
+from flangeye.models.cell import Cell, cell_of
 from flangeye.models.configuration import Configuration
 from flangeye.models.robots import RobotModel, SecondRobot
 from flangeye.models.targets import Flange
 from flangeye.plugin.stage import Params, PlaceParams
-from flangeye.types import (
-    BASE,
-    BASE2,
-    CAMERA,
-    FLANGE,
-    FLANGE2,
-    TARGET,
-    Floats,
-    Observation,
-    PoseFeature,
-    Poses,
-    Source,
-    Transform,
-    Truth,
-    by_frame,
-)
-from flangeye.types.geometry import invert
+from flangeye.types import BASE, BASE2, CAMERA, FLANGE, TARGET, Floats, Source
+from flangeye.types.geometry import invert, rotation_exp
 from flangeye.units import Angle, Length, param
-from flangeye_emulators.world.arm import ArmErrors, ImperfectArm
-from flangeye_emulators.world.session import (
-    ArmPoses,
+from flangeye_emulators.acquire.moments import (
+    UNSEEN,
+    UPRIGHT,
+    ArmsParams,
     CameraView,
-    Cast,
-    Places,
-    as_built,
-    close_loop,
-    draw_arm_poses,
-    home_of,
-    seen_from,
-    visible,
-    with_noise,
+    Moments,
+    carried,
 )
 
-VERSION = 1
-"""Raised whenever the same parameters would give other captures or sessions."""
 REPORTED = float(np.radians(0.0115)), 0.05e-3
 """Standard deviation of a reported pose about and along each axis [rad, m]: half of what the data
 sheet of a UR5 gives for repeatability, 0.1 mm."""
-UNSEEN = 60
-"""Poses that take no part and show what a calibration is worth, where the arm has errors."""
-UPRIGHT = np.radians([0, -90, 90, -90, -90, 0])
-"""Joints of an arm at its first pose."""
-FACING = float(np.radians(50.0))
-"""A camera sees a target whose z is this far from the view at most [rad]."""
-FIELD = float(np.radians(50.0)), float(np.radians(40.0))
-"""Horizontal and vertical field of view of a camera that is not a scanner [rad]."""
-
-
-class ArmsParams(Params):
-    """Common parameters of simulated arms."""
-
-    arm: ArmErrors = Field(default_factory=ArmErrors)
-    """How far the arms are from what their controllers report; by default by the noise of the pose
-    alone."""
 
 
 class SessionParams(ArmsParams):
@@ -100,68 +64,13 @@ class ViewParams(SessionParams):
     """Distance from camera to target at the first pose."""
 
 
-class OutlierParams(Params):
-    """Rate and size of outliers of simulated cameras."""
-
-    outliers: float = Field(0.0, ge=0, lt=0.5)
-    """Share of sightings that are outliers."""
-
-
-def noise_free(
-    camera_T_target: Floats, index: int, poses: Poses, joints: Floats | None
-) -> Observation:
-    """Return a camera's noise-free observation at a pose, with the reported robot poses."""
-    seen = PoseFeature(Transform(CAMERA, TARGET, camera_T_target), np.zeros((6, 6)))
-    return Observation(f"exact-{index}", seen, poses, joints)
-
-
-@dataclass(frozen=True, eq=False)
-class PlannedSession:
-    """A planned session: reported poses, true poses, and the true transforms."""
-
-    configuration: Configuration
-    reported: ArmPoses
-    actual: ArmPoses
-    places: Places
-    unseen: tuple[Observation, ...] = ()
-
-    @property
-    def truth(self) -> Truth:
-        """True values of the unknowns."""
-        places = self.places
-        values = [places.x, *([places.y] if self.configuration.other_base else []), places.z]
-        camera, *others = (
-            Transform.named(name, value)
-            for name, value in zip(self.configuration.unknowns, values, strict=False)
-        )
-        return Truth(camera, tuple(others), self.unseen)
-
-    def where(self, chosen: NDArray[np.intp]) -> PlannedSession:
-        """Return the session with the chosen poses only."""
-        return replace(self, reported=self.reported.where(chosen), actual=self.actual.where(chosen))
-
-    def noise_free(self) -> tuple[Observation, ...]:
-        """Return the camera's noise-free observation at each pose, with reported robot poses."""
-        seen = seen_from(self.actual, self.places)
-        return tuple(noise_free(pose, i, *self.poses(i)) for i, pose in enumerate(seen))
-
-    def poses(self, i: int) -> tuple[Poses, Floats | None]:
-        """Return the reported poses and joints at a pose of the plan."""
-        reported = self.reported
-        second = None
-        if self.configuration.other_base:
-            second = Transform(BASE2, FLANGE2, reported.target[i])
-        joints = None if reported.joints is None else reported.joints[i]
-        return by_frame(Transform(BASE, FLANGE, reported.flange[i]), second), joints
-
-
 def plan_session(
     robot: RobotModel,
     second: SecondRobot | None,
     configuration: Configuration,
     given: tuple[SessionParams, CameraView],
     rng: np.random.Generator,
-) -> PlannedSession:
+) -> Moments:
     """Return a session with random arm poses, and camera and target placed to close the loop.
 
     Args:
@@ -172,62 +81,131 @@ def plan_session(
         rng: Random generator of poses and noise.
 
     Raises:
-        StageError: A second arm is missing, or the target is in view at too few poses.
+        StageError: A second arm is missing, the target is in view at too few poses, or an arm of
+            four axes is to have errors.
     """
     params, view = given
+    four_axes, exact = params.motion == "four_axes", params.arm.is_default
     if configuration.other_base and second is None:
         raise StageError("two arms need the recipe's 'second_robot' section: {model: …}")
-    other = Arm(second.model) if second and configuration.other_base else None
-    four_axes, in_turns = params.motion == "four_axes", params.motion == "in_turns"
-    cast = Cast(configuration, Arm(robot), other, four_axes, in_turns, view.draws)
+    if four_axes and not exact:
+        raise StageError("an arm of four axes has no joints to be wrong; leave 'arm' out")
+    cell = cell_of(configuration, robot, second.model if second else None)
+    arms = {name: Arm(model) for name, model in cell.arms.items()}
     known = configuration.place
     place = params.place.matrix if known is None else np.asarray(known)
     camera = params.camera.matrix if params.camera else None
     home = UPRIGHT
-    closed_by_arm = camera is not None and known is not None and other is None
-    if closed_by_arm and camera is not None:
-        home = home_of(cast.first, place @ invert(camera @ view.first()))
-    poses = draw_arm_poses(cast, (home, UPRIGHT), params.spread, rng)
-    places = close_loop(poses, view, configuration, camera, place)
-    if closed_by_arm and camera is not None:
-        places = Places(camera, np.eye(4), place)
-    found = visible(poses, places, view, params.poses)
-    planned = PlannedSession(configuration, found, found, places)
-    if not params.arm.is_default:
-        drawn = ImperfectArm(robot, 1.0, rng.spawn(1)[0], params.arm)
-        draw = rng.spawn(1)[0]
-        other_drawn = ImperfectArm(second.model, 1.0, draw, params.arm) if second else None
-        return _as_built(planned, (drawn, other_drawn), params, rng)
-    session = planned.where(np.arange(params.poses))
-    return replace(session, actual=with_noise(session.actual, configuration, REPORTED, rng))
+    if camera is not None and known is not None and not configuration.other_base:
+        home = _home_of(arms[FLANGE], place @ invert(camera @ view.first()))
+    angles = _drawn(cell, home, params, view.draws, rng)
+    reported = carried(cell, arms, angles)
+    if four_axes:
+        reported[FLANGE] = _of_four_axes(reported[FLANGE], params.spread, rng)
+    places = _closed(configuration, reported, view, camera, place)
+    joints = {} if four_axes else {FLANGE: angles[FLANGE]}
+    moments = Moments(cell, reported, cell.frames, joints, {} if four_axes else angles)
+    moments = _in_view(moments.placed(places | reported), params.poses, view)
+    if not exact:
+        moments = moments.as_built(params.arm, rng)
+        rest = range(params.poses, len(moments))
+        moments = replace(moments, unseen=tuple(map(moments.exact, rest)))
+    moments = moments.where(np.arange(params.poses))
+    carriers = [name for name in (configuration.camera, configuration.target) if name != BASE]
+    return moments.disturbed(carriers, REPORTED, rng)
 
 
-def _as_built(
-    planned: PlannedSession,
-    arms: tuple[ImperfectArm, ImperfectArm | None],
-    params: SessionParams,
-    rng: np.random.Generator,
-) -> PlannedSession:
-    """Return the session with the arms' true poses, and with additional unused poses."""
-    configuration, count = planned.configuration, params.poses
-    every = planned.where(np.arange(min(count + UNSEEN, len(planned.reported.camera))))
-    built = replace(every, actual=as_built(every.reported, configuration, arms))
-    session = built.where(np.arange(count))
-    shaken = with_noise(session.actual, configuration, REPORTED, rng)
-    return replace(session, actual=shaken, unseen=built.noise_free()[count:])
+def _drawn(
+    cell: Cell, home: Floats, params: SessionParams, draws: int, rng: np.random.Generator
+) -> dict[str, Floats]:
+    """Return joint angles (draws, n) of the arms: the first pose and random ones around it."""
+    angles = {}
+    for k, name in enumerate(cell.arms):
+        first = home if name == FLANGE else UPRIGHT
+        changes = rng.uniform(-params.spread, params.spread, (draws, len(first)))
+        changes[0] = 0.0
+        if params.motion == "in_turns":
+            changes[k::2] = 0.0
+        angles[name] = np.asarray(first + changes)
+    return angles
+
+
+def _of_four_axes(flange: Floats, spread: float, rng: np.random.Generator) -> Floats:
+    """Return poses of an arm whose flange translates and rotates about the vertical only."""
+    first, draws = flange[0], len(flange)
+    turns = rotation_exp(np.outer(rng.uniform(-spread, spread, draws), [0.0, 0.0, 1.0]))
+    out = np.tile(first, (draws, 1, 1))
+    out[1:, :3, :3] = turns[1:] @ first[:3, :3]
+    out[1:, :3, 3] += rng.uniform(-0.15, 0.15, (draws - 1, 3))
+    return out
+
+
+def _closed(
+    configuration: Configuration,
+    reported: Mapping[str, Floats],
+    view: CameraView,
+    camera: Floats | None,
+    place: Floats,
+) -> dict[str, Floats | None]:
+    """Return the places of what stands still, so that the target is in view at the first pose.
+
+    Args:
+        configuration: Determines which transform closes the loop.
+        reported: The arms' poses by frame; only the first one is used.
+        view: The camera's field of view.
+        camera: (4, 4) pose of the camera in its carrier; None to compute it.
+        place: (4, 4) pose of the target in its carrier, unless that closes the loop.
+    """
+    first = {BASE: np.eye(4), **{name: poses[0] for name, poses in reported.items()}}
+    a, b, seen = first[configuration.camera], first[configuration.target], view.first()
+    places = {CAMERA: camera, BASE2: np.eye(4), TARGET: place}
+    if camera is None:
+        places[CAMERA] = invert(a) @ b @ place @ invert(seen)
+    elif configuration.other_base:
+        places[BASE2] = a @ camera @ seen @ invert(b @ place)
+    elif configuration.place is None:
+        places[TARGET] = invert(b) @ a @ camera @ seen
+    return places
+
+
+def _home_of(arm: Arm, base_T_flange: Floats) -> Floats:
+    """Return joint angles (n,) that reach a pose [rad].
+
+    Raises:
+        StageError: The pose is out of reach.
+    """
+    found = arm.inverse(base_T_flange)
+    if not len(found):
+        raise StageError(
+            "the arm cannot reach a pose at which the camera sees the target; change camera:, "
+            "place: or distance:"
+        )
+    return np.asarray(found[0])
+
+
+def _in_view(moments: Moments, count: int, view: CameraView) -> Moments:
+    """Return the first moments at which the camera sees the target, and some more if possible.
+
+    Raises:
+        StageError: There are too few such poses.
+    """
+    found = np.flatnonzero(view.sees(moments.seen()))
+    if len(found) < count:
+        raise StageError(
+            f"the camera sees the target at {len(found)} of {view.draws} poses drawn, and {count} "
+            "are needed; make spread smaller, or move home, camera or place"
+        )
+    return moments.where(found[: count + UNSEEN])
 
 
 def source_of(
-    session: PlannedSession, robot: RobotModel, seed: int, *models: Params | Flange
+    moments: Moments,
+    given: tuple[RobotModel, Configuration],
+    seed: int,
+    *models: Params | Flange,
 ) -> Source:
     """Return the provenance of a session's captures, from its models and parameters."""
-    configuration = session.configuration
-    made_of = [robot.model, configuration.describe(), *(m.model_dump(mode="json") for m in models)]
-    note = f"simulated: {configuration.name}, {len(session.reported.camera)} poses"
-    return Source(fingerprint_of(seed, made_of), (note,), truth=session.truth, simulated=True)
-
-
-def fingerprint_of(seed: int, made_of: Sequence[Any]) -> str:
-    """Return the hash of a simulation, computed from its seed and its models' plain data."""
-    text = json.dumps([VERSION, seed, made_of], sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()
+    robot, configuration = given
+    dumped: list[Any] = [model.model_dump(mode="json") for model in models]
+    note = f"simulated: {configuration.name}, {len(moments)} poses"
+    return moments.source(seed, note, [robot.model, configuration.describe(), *dumped])

@@ -40,7 +40,7 @@ from flangeye.types import (
 from flangeye.types.geometry import invert
 from flangeye.units import in_mm, param
 from flangeye.workflow.run.ahead import cores, worked_ahead
-from flangeye_emulators.acquire.planned_session import UNSEEN, VERSION, fingerprint_of, noise_free
+from flangeye_emulators.acquire.moments import UNSEEN, VERSION, fingerprint_of, noise_free
 from flangeye_emulators.world.arm import ArmErrors, ImperfectArm
 from flangeye_emulators.world.cell import SimulatedCell
 from flangeye_emulators.world.raycast import Image, SolidBody
@@ -235,7 +235,9 @@ class _Session:
         joints, angles = self.joints[self.count :], self.angles[self.count :]
         reported = [by_frame(Transform(BASE, FLANGE, pose)) for pose in self.arm.reported(joints)]
         seen = invert(self.base_T_camera) @ self.arm.flange(angles)
-        return tuple(noise_free(seen[i], i, reported[i], joints[i]) for i in range(len(joints)))
+        features = map(noise_free, seen)
+        each = zip(features, reported, joints, strict=True)
+        return tuple(Observation(f"exact-{i}", *known) for i, known in enumerate(each))
 
     def captures(self, noise: np.random.SeedSequence, at_once: int) -> Iterator[Capture]:
         """Render the captures on demand, or up to ``at_once`` ahead of demand.

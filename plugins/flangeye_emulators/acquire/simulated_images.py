@@ -17,19 +17,12 @@ from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import stage
 from flangeye.types import CAMERA, Capture, Captures, Floats, Image, PointCloud, Seed
 from flangeye.types.geometry import invert
-from flangeye_emulators.acquire.planned_session import (
-    FACING,
-    VERSION,
-    PlannedSession,
-    ViewParams,
-    plan_session,
-    source_of,
-)
+from flangeye_emulators.acquire.moments import FACING, VERSION, CameraView
+from flangeye_emulators.acquire.planned_session import ViewParams, plan_session, source_of
 from flangeye_emulators.world.board_image import BoardCamera, Cover, render_board
 from flangeye_emulators.world.mesh import MATERIALS, box
 from flangeye_emulators.world.raycast import Pixels, RaycastScene, SolidBody
 from flangeye_emulators.world.scanner import StructuredLight, TimeOfFlight, scanner_of
-from flangeye_emulators.world.session import CameraView, seen_from
 
 
 def camera_of(pixels: Pixels, camera: BoardCamera) -> BoardCamera:
@@ -117,17 +110,17 @@ def acquire_simulated_images(
         camera = camera_of(eye.pixels, camera)
         near, far = eye.scanner.near, eye.scanner.far
     view = CameraView(params.distance, near, far, _field(camera), FACING)
-    session = plan_session(robot, second, configuration, (params, view), rng)
-    studio = _CellScene(BOARDS[params.board], camera, eye, session)
+    moments = plan_session(robot, second, configuration, (params, view), rng)
+    studio = _CellScene(BOARDS[params.board], camera, eye)
     covers = _covers(params, rng)
 
     def captures() -> Iterator[Capture]:
-        for i, target in enumerate(seen_from(session.actual, session.places)):
+        for i, target in enumerate(moments.seen()):
             image, cloud = studio.shot(target, covers[i], rng)
-            poses, joints = session.poses(i)
-            yield Capture(f"{i:04d}", cloud, poses, joints, image=image)
+            yield Capture(f"{i:04d}", cloud, image=image, **moments.recorded(i))
 
-    return Captures(captures(), source_of(session, robot, seed, params), params.poses)
+    source = source_of(moments, (robot, configuration), seed, params)
+    return Captures(captures(), source, params.poses)
 
 
 def _eye(
@@ -167,7 +160,6 @@ class _CellScene:
     board: Board
     camera: BoardCamera
     eye: StructuredLight | TimeOfFlight | None
-    session: PlannedSession
 
     def shot(
         self, camera_T_target: Floats, cover: Cover | None, rng: np.random.Generator

@@ -14,14 +14,8 @@ from flangeye.models.robots import RobotModel
 from flangeye.models.targets import Sphere
 from flangeye.plugin.stage import stage
 from flangeye.types import CAMERA, Capture, Captures, Floats, PointCloud, Seed
-from flangeye_emulators.acquire.planned_session import (
-    FACING,
-    VERSION,
-    SessionParams,
-    plan_session,
-    source_of,
-)
-from flangeye_emulators.world.session import CameraView, seen_from
+from flangeye_emulators.acquire.moments import FACING, VERSION, CameraView
+from flangeye_emulators.acquire.planned_session import SessionParams, plan_session, source_of
 
 FAN = float(np.radians(28.0))
 """Full angle of the laser's fan [rad]."""
@@ -80,17 +74,17 @@ def acquire_simulated_profiles(
     seen = (params.near + params.far) / 2, params.near, params.far, (FAN, 0.0), FACING
     # Joint vectors tried: a laser passes a small sphere at few of them
     view = ProfileView(*seen, 60_000, sphere.radius)
-    session = plan_session(robot, None, configuration, (params, view), rng)
-    up = session.actual.camera[:, :3, :3] @ session.places.x[:3, :3]
+    moments = plan_session(robot, None, configuration, (params, view), rng)
+    up = moments.each(CAMERA)[:, :3, :3]
 
     def captures() -> Iterator[Capture]:
-        for i, target in enumerate(seen_from(session.actual, session.places)):
+        for i, target in enumerate(moments.seen()):
             table = up[i].T @ np.array([0.0, 0.0, 1.0])
             xyz = profile_of(target[:3, 3], sphere.radius, table, params, rng)
-            poses, joints = session.poses(i)
-            yield Capture(f"{i:04d}", PointCloud(CAMERA, xyz), poses, joints)
+            yield Capture(f"{i:04d}", PointCloud(CAMERA, xyz), **moments.recorded(i))
 
-    return Captures(captures(), source_of(session, robot, seed, params), params.poses)
+    source = source_of(moments, (robot, configuration), seed, params)
+    return Captures(captures(), source, params.poses)
 
 
 def profile_of(

@@ -11,13 +11,13 @@ from flangeye.maths.kinematics import Arm
 from flangeye.models.configuration import ORIGIN, Configuration
 from flangeye.models.loading import load_model
 from flangeye.models.targets import flange_of, load_standard
-from flangeye.types import BASE, FLANGE, TARGET, Source, Transform, Truth
+from flangeye.types import BASE, CAMERA, FLANGE, TARGET, Source, Transform, Truth
+from flangeye_emulators.acquire.moments import CameraView
 from flangeye_emulators.acquire.planned_session import plan_session
 from flangeye_emulators.acquire.simulated import SimulatedParams, acquire_simulated
-from flangeye_emulators.acquire.simulated_session import SimulatedMarkerParams
+from flangeye_emulators.acquire.simulated_poses import SimulatedMarkerParams
 from flangeye_emulators.world.arm import REAL, ArmErrors, ErrorSizes, ImperfectArm
 from flangeye_emulators.world.scanner import CameraPose
-from flangeye_emulators.world.session import CameraView
 from flangeye_plugins.plan import GridParams, grid
 
 HOME = np.radians([0, -90, 90, -90, -90, 0])
@@ -143,8 +143,8 @@ def planned(errors, configuration=EYE_IN_HAND, **changes):
 
 def test_a_session_of_any_configuration_keeps_what_it_reports() -> None:
     kind, real = planned(ArmErrors()), planned(ArmErrors(quality="real"))
-    assert np.array_equal(kind.reported.flange, real.reported.flange)
-    off = np.linalg.norm((real.actual.camera - real.reported.camera)[:, :3, 3], axis=1)
+    assert np.array_equal(kind.reported[FLANGE], real.reported[FLANGE])
+    off = np.linalg.norm((real.each(FLANGE) - real.reported[FLANGE])[:, :3, 3], axis=1)
     assert 0.5e-3 < off.max() < 10e-3
     assert not kind.unseen
     assert len(real.unseen) == 60
@@ -152,7 +152,7 @@ def test_a_session_of_any_configuration_keeps_what_it_reports() -> None:
 
 def test_poses_that_took_no_part_show_the_arms_error_at_the_work() -> None:
     session = planned(ArmErrors(quality="real"))
-    camera, place = session.places.x, session.places.z
+    camera, place = session.actual[CAMERA].place, session.actual[TARGET].place
     for seen in session.unseen[:5]:
         mapped = seen.base_T_flange.matrix @ camera @ seen.feature.camera_T_target.matrix
         assert 1e-5 < np.linalg.norm((mapped - place)[:3, 3]) < 10e-3
@@ -161,7 +161,7 @@ def test_poses_that_took_no_part_show_the_arms_error_at_the_work() -> None:
 def test_a_link_that_carries_the_camera_is_off_too() -> None:
     on_link = Configuration("eye-on-arm", "link3", FLANGE, ORIGIN)
     session = planned(ArmErrors(quality="real"), on_link, distance="500 mm")
-    assert np.abs(session.actual.camera - session.reported.camera).max() > 1e-4
+    assert np.abs(session.each("link3") - session.reported["link3"]).max() > 1e-4
 
 
 def test_four_axes_have_no_joints_to_be_wrong() -> None:
