@@ -21,6 +21,7 @@ from flangeye.motion.arc import OFF
 from flangeye.motion.seam_following import STILL, Command, Controller, Phase, ToolPose, Touch
 from flangeye.types import Floats
 from flangeye_plugins.weld.following.belief import BAND
+from flangeye_plugins.weld.following.bound import along
 from flangeye_plugins.weld.following.follower import Follower
 from flangeye_plugins.weld.following.response import Response
 from flangeye_plugins.weld.following.steering import Striking, Weave, WeaveOffset
@@ -85,6 +86,7 @@ class Passes:
         self.root, self.number = root, 0
         self.mode, self.side = root.mode, root.side
         self._belief, self._settings = belief, settings
+        self._sigmas = along(plan, belief, settings)
         self._traced = Traced(root, plan, np.zeros((0, 3)) if before is None else before.traced)
         self._response = Response()
         self._path = plan
@@ -251,7 +253,7 @@ class Passes:
         again = (2.0 * settings.arm_sigma) ** 2 + settings.distortion**2 + self._weave.variance
         seam = self._traced.sigma(self.torch)
         self.sigma = math.sqrt(seam**2 + again)
-        self.band, self.bound = (abs(error) + k * self.sigma for k in (BAND, settings.sigmas))
+        self.band, self.bound = (abs(error) + k * self.sigma for k in (BAND, self._sigmas))
         if self.bound > settings.max_error:
             self.phase = "stopped"
             self.reason = (

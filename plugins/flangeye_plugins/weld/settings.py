@@ -84,8 +84,9 @@ class Following(Params):
     max_error: Length = param("1 mm", gt=0)
     """The weld is refused or stopped where the torch's stated bound exceeds this."""
     sigmas: float = Field(3.0, gt=0, le=6)
-    """The torch's bound: its control error and so many standard deviations. True errors are beyond
-    3 in one weld of 370, beyond 4 in one of 16,000."""
+    """The torch's bound holds along the whole seam as surely as a normal value is within so many
+    standard deviations: it fails in one weld of 370 for 3, in one of 16,000 for 4. On top comes the
+    control error."""
     arm_sigma: Length = param("0.03 mm", ge=0)
     """Standard deviation of what the arm is off by, across the seam, when the tip passes a place;
     the torch's passing has the same."""

@@ -254,9 +254,9 @@ def test_a_pass_is_known_as_the_root_was_and_by_what_arm_and_heat_do_since() -> 
     found._estimate(-0.2e-3)
     assert found.sigma == pytest.approx(sigma)
     assert found.band == pytest.approx(0.2e-3 + 2 * sigma)
-    assert found.bound == pytest.approx(0.2e-3 + 3 * sigma)
+    assert found.bound == pytest.approx(0.2e-3 + found._sigmas * sigma)
     assert found.phase == "passing"
-    found._estimate(1e-3 - 2.99 * sigma)
+    found._estimate(1e-3 - 0.999 * found._sigmas * sigma)
     assert found.phase == "stopped" and found.reason == (
         "in pass 2 the torch is known to 1.00 mm only, max_error is 1 mm"
     )

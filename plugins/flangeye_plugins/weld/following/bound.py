@@ -16,6 +16,7 @@ from collections.abc import Callable
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
+from scipy.special import ndtr, ndtri
 
 from flangeye.errors import StageError
 from flangeye.types import Floats
@@ -143,6 +144,17 @@ def beforehand(belief: Belief, settings: Following) -> tuple[Learned, float]:
     return Learned(gain_sigma=0.0, ahead_sigma=ahead), press
 
 
+def along(plan: Path, belief: Belief, settings: Following) -> float:
+    """Return how many standard deviations contain the torch's error along a whole plan.
+
+    They do so as surely as ``sigmas`` of them at a single place. Torch and tip are at one length
+    of the tool from each other: the plan has about one independent error for each such length, and
+    one more (Bonferroni's inequality).
+    """
+    places = 1.0 + plan.length / belief.distance
+    return -float(ndtri(ndtr(-settings.sigmas) / places))
+
+
 def check_bound(plan: Path, belief: Belief, settings: Following) -> None:
     """Refuse a weld whose predicted error bound exceeds ``max_error`` anywhere on the plan.
 
@@ -151,14 +163,16 @@ def check_bound(plan: Path, belief: Belief, settings: Following) -> None:
     """
     found = predicted(plan, belief, settings, *beforehand(belief, settings))
     worst = int(np.argmax(found.variance))
-    bound = settings.sigmas * float(np.sqrt(found.variance[worst]))
+    sigmas = along(plan, belief, settings)
+    bound = sigmas * float(np.sqrt(found.variance[worst]))
     if bound <= settings.max_error:
         return
     what, remedy = REMEDIES[found.largest(worst)]
     raise StageError(
         f"weld.tactile: the torch is known to {bound * 1e3:.2f} mm at best at "
-        f"{found.s[worst] * 1e3:.0f} mm of the seam ({settings.sigmas:.3g} sigma, most of it "
-        f"{what}), max_error is {settings.max_error * 1e3:.3g} mm; {remedy}, or raise 'max_error'"
+        f"{found.s[worst] * 1e3:.0f} mm of the seam ({settings.sigmas:.3g} sigma all along, "
+        f"most of it {what}), max_error is {settings.max_error * 1e3:.3g} mm; {remedy}, "
+        "or raise 'max_error'"
     )
 
 

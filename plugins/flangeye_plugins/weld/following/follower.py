@@ -204,7 +204,7 @@ class Follower:
             self.phase = "bridging"
             pressing.lose(self.tip)
         elif self.phase == "bridging" and self.seam.regained(pressing):
-            self.phase = "following"
+            self.phase, pressing.firm = "following", sensing.seen
         elif self.phase == "bridging" and pressing.since_turned(self.tip) > STRIDE:
             pressing.turn_over(self.tip)
         self.seam.leave(self.phase)
@@ -223,7 +223,7 @@ class Follower:
         seam, pressing, preload = self.seam, self.pressing, self.task.settings.preload
         if seam.contact.bears and seam.contact.deflection > 0.9 * pressing.most:
             seam.contact.seat(self.sensing.seen, self.wanted, preload)
-            self.phase = "following"
+            self.phase, pressing.firm = "following", self.sensing.seen
             return
         # Images are late: it may rest there already.
         hangs = not seam.contact.bears and seam.contact.compression < preload / 3.0
@@ -240,8 +240,9 @@ class Follower:
         contact = self.seam.contact
         if self.seam.backs or not self.task.touch:
             return False
-        seen = self.sensing.seen
-        if self.pressing.slack_for(self.tip, contact.deflection, contact.play, seen) > STRIDE:
+        doubt = self.pressing.doubt(contact.deflection, contact.play, self.sensing.seen)
+        # A tip that waits for its wall feels it within three time constants of the servo.
+        if doubt > 3.0 / self.task.settings.servo_gain + self._delay:
             contact.lose()
         return contact.free > LOST
 
@@ -269,7 +270,7 @@ class Follower:
         if swept:
             sensing.felt, self.pressing.wanted = swept[-1].seam, swept[-1].deflection
         seam.contact.seat(sensing.seen, self.wanted, task.settings.preload)
-        self.phase = "following"
+        self.phase, self.pressing.firm = "following", sensing.seen
         if task.before is None and task.feels_ends:
             seam.back()
 
@@ -302,10 +303,10 @@ class Follower:
         if sensing.search.bent:
             return "the tip is displaced though nothing should touch it"
         below = self.progress.place.height - float(pose.position[2])
+        missed = self.phase == "seeking" and (sensing.search.over or below > settings.reach)
         # On the plate beside its groove friction may hold a tip as two walls do.
         high = sensing.felt is not None and sensing.felt.height > settings.reach
-        missed = sensing.search.over or below > settings.reach or (sensing.search.found and high)
-        if self.phase == "seeking" and missed:
+        if missed or (self.phase == "probing" and high):
             return f"no groove within {settings.reach * 1e3:.0f} mm of the plan's start"
         return ""
 
@@ -443,11 +444,12 @@ class Follower:
         if self.phase not in ("following", "ending") or not self.task.touch:
             return 1.0
         contact = self.seam.contact
-        # The tip slows down below 70 % of the wanted deflection.
-        firm = contact.deflection / (0.7 * max(self.wanted, self.task.settings.probe))
+        # Full speed at 70 % of the wanted deflection; at half of it the wall is in doubt.
+        wanted = max(self.wanted - contact.play, self.task.settings.probe)
+        firm = (contact.deflection - contact.play) / wanted / 0.2 - 2.5
         held = (STRAINED - contact.strained) / 0.4
         firm = held if self.phase == "ending" else min(firm, held)
-        return min(max(firm, WAITING), 1.0)
+        return min(max(firm, SLOWEST), 1.0)
 
     def _velocity(self, pose: ToolPose, pace: float) -> Floats:
         """Return the velocity V_r of the end point (3,) [m/s].

@@ -69,7 +69,7 @@ class Pressing:
         # Until the sweep shows at which deflection the tip stays seated
         self.most = settings.deflection / (SOFTER if task.belief.two_walls else 1.0)
         self.wanted, self.side = 0.0, settings.sign
-        self._lost = self._turned = self._firm = 0.0
+        self._lost = self._turned = 0.0
         self.firm = -math.inf
 
     def learn(self, found: Learned, swept: float) -> None:
@@ -115,14 +115,13 @@ class Pressing:
         release = task.settings.speed * self.most / task.settings.release
         return task.plan.length - max(task.settings.ending, task.beyond) - release
 
-    def slack_for(self, tip: float, deflection: float, play: float, seen: float) -> float:
-        """Return the distance the tip has moved without contact with a wall [m].
+    def doubt(self, deflection: float, play: float, seen: float) -> float:
+        """Return for how long it has been in doubt whether a wall holds the tip [s].
 
         A wall is in contact if the deflection follows its set point, or exceeds it on the other
         side. Without a wall the finger shows only its play.
 
         Args:
-            tip: Arc length of the tip [m].
             deflection: Measured deflection [m].
             play: Deflection that a free tip shows [m].
             seen: Time of the newest touch [s].
@@ -130,8 +129,8 @@ class Pressing:
         shown = abs(deflection) if self._task.belief.two_walls else deflection
         # Half way from the play to the set point: in a curve a late arm presses less.
         if shown > play + (self.wanted - play) / 2.0:
-            self._firm, self.firm = tip, seen
-        return tip - self._firm
+            self.firm = seen
+        return seen - self.firm
 
     # --- where a wall has ended -------------------------------------------------------------------
 
@@ -142,7 +141,7 @@ class Pressing:
 
     def turn_over(self, tip: float) -> None:
         """Press towards the other side, in a joint with two walls."""
-        self._turned = self._firm = tip
+        self._turned = tip
         if self._task.belief.two_walls:
             self.side, self.wanted = -self.side, -self.wanted
 

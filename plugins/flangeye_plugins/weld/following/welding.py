@@ -10,7 +10,7 @@ from flangeye.devices import WeldProfile
 from flangeye.motion.seam_following import ToolPose
 from flangeye_plugins.weld.following.belief import BAND
 from flangeye_plugins.weld.following.bias import Bias, Trail
-from flangeye_plugins.weld.following.bound import Stance, predicted, varying
+from flangeye_plugins.weld.following.bound import Stance, along, predicted, varying
 from flangeye_plugins.weld.following.sensing import SeamEstimate, Sensing
 from flangeye_plugins.weld.following.steering import Striking, TorchLead
 from flangeye_plugins.weld.following.task import WeldTask
@@ -49,10 +49,12 @@ class Welding:
         self.bias = Bias(prior, settings.distortion, belief.distance)
         self.striking = Striking(belief.arc)
         self.sigma = self.bound = self.band = 0.0
+        self._sigmas = along(task.plan, belief, settings)
         self.arc_from: float | None = None
         self._trail = Trail()
         self._swept: float | None = None
         self._foreseen = -math.inf, 0.0, 0.0
+        self._usual = 0.0
 
     def begin(self, now: float) -> None:
         """Set the time of the sweep [s], from which the drift of the finger's gain counts."""
@@ -66,14 +68,16 @@ class Welding:
         Returns:
             The reason to stop the weld, or "".
         """
-        progress, settings = self._progress, self._task.settings
+        progress = self._progress
         point, normal = self._seam.refined.frame(progress.torch)
         raw = float((progress.torch_at(pose) - point) @ normal)
         error = abs(raw - (self._lead.aim - self.bias.value))
+        # A running mean over some twenty cycles.
+        self._usual += 0.05 * (error - self._usual)
         variance = self.variance(float(pose.direction @ normal), pose)
         self.sigma = math.sqrt(variance)
         self.band = error + BAND * self.sigma
-        self.bound = error + settings.sigmas * self.sigma
+        self.bound = error + self._sigmas * self.sigma
         return "" if self._swept is None else self._light(pose.time, raw, variance)
 
     def variance(self, slant: float, pose: ToolPose) -> float:
@@ -129,11 +133,11 @@ class Welding:
     @property
     def ease(self) -> float:
         """Share of the speed to keep: below 1 where the control error may reach ``max_error``."""
-        room = self._task.settings.max_error - self._task.settings.sigmas * self.sigma
+        room = self._task.settings.max_error - self._sigmas * self.sigma
         if self.arc_from is None or room <= 0.0:
             return 1.0
         # A slower torch has a smaller control error; half of the room is left for surprises.
-        return 2.0 - 2.0 * (self.bound - self._task.settings.sigmas * self.sigma) / room
+        return 2.0 - 2.0 * (self.bound - self._sigmas * self.sigma) / room
 
     @property
     def share(self) -> float:
@@ -182,7 +186,8 @@ class Welding:
         # The gas pre-flow is over when the torch reaches the start of the weld
         if self.begins - torch <= task.belief.arc[0] * task.settings.speed:
             self.striking.gas(now)
-        if not self.begins <= torch <= self.ends:
+        # Past an end that the tip has felt there is no seam to miss.
+        if not self.begins <= torch <= (self._seam.end or self.ends):
             return ""
         if self.arc_from is not None:
             self._trail.pass_by(now, torch, raw, variance - self._unseen())
@@ -202,7 +207,8 @@ class Welding:
     def _ahead(self) -> tuple[float, float]:
         """Return the least certain place on the rest of the plan, and the torch's bound there [m].
 
-        Where the tip has been, the seam is taken as it was felt.
+        Where the tip has been, the seam is taken as it was felt, and ahead of it as surely as where
+        it was felt last. The control error is taken as twice what it is as a rule.
         """
         task, refined = self._task, self._seam.refined
         foreseen = predicted(
@@ -213,11 +219,11 @@ class Welding:
         if not rest.any():  # a closed seam that is welded over its start
             return self._progress.torch, self.bound
         places = foreseen.s[rest]
-        felt = [refined.variance(s) if s <= refined.settled else 0.0 for s in places.tolist()]
+        felt = [refined.variance(min(s, refined.settled)) for s in places.tolist()]
         variances = foreseen.variance[rest] + np.array(felt)
         worst = int(np.argmax(variances))
-        bound = self._task.settings.sigmas * math.sqrt(float(variances[worst]))
-        return float(places[worst]), bound
+        bound = self._sigmas * math.sqrt(float(variances[worst]))
+        return float(places[worst]), bound + 2.0 * self._usual
 
     def _too_far(self, place: float, bound: float) -> str:
         """Return the reason to stop a torch whose bound is too large, or "" to go on.
