@@ -1,4 +1,4 @@
-"""A run as a child process, followed by its log."""
+"""A run or a live check as a child process, followed by its log."""
 
 from __future__ import annotations
 
@@ -26,15 +26,16 @@ from flangeye.workflow.log.read import RunLog, logged_image, read_run, take
 from flangeye.workflow.log.records import LogMessage
 from flangeye.workflow.log.watch import RunView, follow
 from flangeye.workflow.recipe.load import Recipe
-from flangeye.workflow.run.folder import recipe_of_log
+from flangeye.workflow.run.folder import CHECKS, recipe_of_log
 from flangeye.workflow.run.outlook import Outlook, outlook
 
 
 class RunProcess:
-    """A ``flangeye run`` process: started, followed and stopped.
+    """A process of ``flangeye run`` or ``flangeye monitor --live``: started, followed and stopped.
 
     Attributes:
-        path: Folder of the run.
+        checks: Whether it checks a stored calibration, and makes none.
+        path: Folder of the run; of a check, that of the calibration.
         moves: Whether it may move an arm.
         view: State of the run from its log.
         log: Values of its log, without the clouds of whole scans.
@@ -47,8 +48,11 @@ class RunProcess:
     """
 
     def __init__(self, folder: Path, words: Sequence[str], move: bool, registry: Registry) -> None:
-        """Start ``flangeye run`` in a folder with words of its command line."""
-        self.path = folder / "runs" / f"{time.strftime('%Y-%m-%dT%H-%M-%S')}_ui"
+        """Start a command in a folder with words of its command line, such as ``run cell.yaml``."""
+        self.checks = words[0] == "monitor"
+        stamped = f"runs/{time.strftime('%Y-%m-%dT%H-%M-%S')}_ui"
+        self.path = folder / (words[1] if self.checks else stamped)
+        self._before = set(self.path.glob(f"{CHECKS}/*"))
         self.moves, self.stopped = move, ""
         self.view, self.log = RunView(self.path.name), RunLog(self.path / "run.mcap")
         self.outlook: Outlook | None = None
@@ -58,8 +62,8 @@ class RunProcess:
         self.places: dict[str, list[float]] = {}
         self.shots: dict[str, str] = {}
         self.began, self._capture = time.monotonic(), ""
-        out = str(self.path.relative_to(folder))
-        self.words = ["run", *words, "--out", out, *(["--move"] if move else [])]
+        out = [] if self.checks else ["--out", stamped]
+        self.words = [*words, *out, *(["--move"] if move else [])]
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-m", "flangeye.cli", *self.words],
             cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
@@ -67,7 +71,8 @@ class RunProcess:
         )  # fmt: skip
         self.said: list[str] = []
         self._registry, self._fitted = registry, threading.Event()
-        for work in (self._listen, self._follow, self._judge):
+        judges = () if self.checks else (self._judge,)
+        for work in (self._listen, self._follow, *judges):
             threading.Thread(target=work, daemon=True).start()
 
     @property
@@ -103,7 +108,7 @@ class RunProcess:
 
     def _follow(self) -> None:
         held: dict[str, t.PointCloud] = {}
-        while not self.log.path.exists() and self.code is None:
+        while not self._begun() and self.code is None:
             time.sleep(0.05)
         try:
             for message in follow(self.log.path, self._wait):
@@ -116,6 +121,12 @@ class RunProcess:
             return
         finally:
             self._fitted.set()
+
+    def _begun(self) -> bool:
+        """Return whether there is a log; the command itself names that of a check."""
+        for new in set(self.path.glob(f"{CHECKS}/*")) - self._before if self.checks else ():
+            self.log.path = new / self.log.path.name
+        return self.log.path.exists()
 
     def _wait(self) -> None:
         if self.code is not None:

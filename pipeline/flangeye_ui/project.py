@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from flangeye.devices import RobotDriver
 from flangeye.errors import FlangeyeError, RecipeError, StageError
 from flangeye.files.regular import read_regular, read_text, write_whole
 from flangeye.files.yaml_lines import edited, flow, parse_yaml
@@ -224,10 +225,10 @@ class Project:
         return None
 
     def begin(self, words: Sequence[str], owner: str, code: str | None = None) -> None:
-        """Start ``flangeye run`` with words of its command line, for a page.
+        """Start ``flangeye run``, or a live check, for a page.
 
         Args:
-            words: Words of the command, without ``--move``.
+            words: Words of the command line, without ``--move``: ``run cell.yaml``.
             owner: The page that starts it.
             code: Confirmation code from the terminal that permits motion; None moves nothing.
 
@@ -243,6 +244,17 @@ class Project:
         """Stop an arm that moves for a page that is not there any more."""
         if self.run and self.run.moves and page == self.owner:
             self.run.stop(why)
+
+
+def is_live(recipe: Recipe) -> bool:
+    """Return whether a recipe scans with the cell's own arm and scanner."""
+    return recipe.steps[0].stage.name == "acquire.live"
+
+
+def moves(recipe: Recipe) -> bool:
+    """Return whether a run of a recipe moves an arm, which asks for a code."""
+    arm = recipe.context.get(RobotDriver)
+    return is_live(recipe) and not (arm and arm.passive)
 
 
 def _step_of(entry: Any) -> tuple[str, dict[str, Any]]:
@@ -281,7 +293,7 @@ class MoveCodes:
         # A code is good for so long [s]: time to walk to the terminal and back.
         life = 120.0
         self._open = (code, tuple(words), page, time.monotonic() + life)
-        line = shlex.join(["flangeye", "run", *words, "--move"])
+        line = shlex.join(["flangeye", *words, "--move"])
         self._show(f"code {code} moves the arm: {line}   (asked for by the page, {life:.0f} s)")
 
     def spend(self, given: str, words: Sequence[str], page: str) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from nicegui import Client, ui
 
 from flangeye.errors import StageError
-from flangeye.workflow.report.look import LIGHT, SERIES
+from flangeye.workflow.report.look import SERIES
 from flangeye_ui.charts import coverage_drawing, place_chart, residual_chart
 from flangeye_ui.layout import (
     ActionBar,
@@ -24,7 +24,7 @@ from flangeye_ui.layout import (
     weigh,
 )
 from flangeye_ui.process import RunProcess
-from flangeye_ui.project import Project
+from flangeye_ui.project import Project, is_live, moves
 from flangeye_ui.scene import SCANNED, Scene3D, drawing_of, outline_of
 
 
@@ -41,13 +41,13 @@ class RunPanel:
     """State of the run, with buttons to start and stop it."""
 
     def __init__(self, project: Project, client: Client, bar: ActionBar) -> None:
-        self._project, self._me, self._bar = project, client.id, bar
-        self._heard, self._shown, self._said = time.monotonic(), tuple[Any, ...](), list[Any]()
+        self._project, self._bar, self._control = project, bar, Control(project, client, bar)
+        self._shown, self._said = tuple[Any, ...](), list[Any]()
         self._shown_run: RunProcess | None = None
         self._cards: dict[str, Shot] = {}
         self._recipe, mistakes = project.check()
-        first = self._recipe.steps[0].stage.name if self._recipe else ""
-        self._live = first == "acquire.live"
+        self._live = self._recipe is not None and is_live(self._recipe)
+        self._moves = self._recipe is not None and moves(self._recipe)
         if mistakes:
             mistake("The recipe has mistakes: see step 1, Cell.")
         self._buttons(sound=not mistakes)
@@ -57,6 +57,9 @@ class RunPanel:
             before = (
                 "The arm moves its flange from pose to pose before the scanner. Keep people out of "
                 "its workspace. Starting asks for a code that the terminal shows."
+                if self._moves
+                else "Others move the arm, by hand or by a program. A scan is taken where it "
+                "stands, and the next one when it has moved on and stands again."
                 if self._live
                 else "No arm moves. Each scan is shown when it arrives, with what became of it."
             )
@@ -64,22 +67,20 @@ class RunPanel:
         self._during = ui.column().classes("w-full gap-3")
         with self._during:
             self._views()
-        words = [project.recipe_path.name, *(["--move"] if self._live else [])]
+        words = [project.recipe_path.name, *(["--move"] if self._moves else [])]
         self._line = command_line(project.command("run", *words))
-        self._watch(client)
+        self._look()
+        # Between two looks at the run [s].
+        ui.timer(0.25, self._look)
 
     def _buttons(self, sound: bool) -> None:
         offer = self._bar.offer
         self._resume_button = offer("Resume", self._resume, second=True)
-        self._take = offer("Take over", self._take_over, second=True)
-        label = "Start: the arm moves" if self._live else "Start scanning"
+        label = "Start: the arm moves" if self._moves else "Start scanning"
         self._start = offer(label, self._begin)
         self._start.set_enabled(sound)
         self._start_again = offer("Scan again", self._begin, second=True)
         self._on = self._bar.lead("Result", "See the result")
-        self._halt = offer("Stop (space bar)", self._stop)
-        self._halt.props('aria-keyshortcuts="Space"')
-        ui.keyboard(on_key=self._key)
 
     def _views(self) -> None:
         self._progress = ui.linear_progress(0.0, show_value=False, size="10px")
@@ -88,7 +89,10 @@ class RunPanel:
         with ui.row().classes("w-full gap-4 items-start"):
             with ui.column().classes("col-12 col-md-6 gap-1") as self._newest:
                 self._scene = Scene3D(330, SCANNED)
-                ui.label("The newest scan: flange blue, its rim as fitted red.").classes("note")
+                ui.label(
+                    "The newest scan, near yellow, far violet; its flange blue, the rim as fitted "
+                    "red, earlier rims grey."
+                ).classes("note")
             with ui.column().classes("col-12 col-md gap-1"):
                 self._worth = ui.column().classes("gap-1 w-full")
         ui.label("Scans").classes("part").props('role="heading" aria-level="2"')
@@ -102,72 +106,25 @@ class RunPanel:
             self._map = ui.echart(place_chart({}, set())).classes("w-full h-48")
             self._rows = ui.column().classes("gap-1 w-full")
 
-    def _watch(self, client: Client) -> None:
-        """Check the run, and whether this page is still open."""
-        ui.on("beat", self._beat)
-        client.on_disconnect(lambda: self._project.page_gone(self._me))
-        ui.timer(
-            0.1, lambda: ui.run_javascript("setInterval(() => emitEvent('beat'), 500)"), once=True
-        )
-        self._look()
-        # Between two looks at the run [s].
-        ui.timer(0.25, self._look)
-
-    def _beat(self, _: Any) -> None:
-        self._heard = time.monotonic()
-
-    def _key(self, event: Any) -> None:
-        if event.action.keydown and event.key == " ":
-            self._stop()
-
-    def _stop(self) -> None:
-        if self._project.run:
-            self._project.run.stop("stopped on this page")
-
-    def _take_over(self) -> None:
-        self._project.owner = self._me
-
     async def _begin(self) -> None:
-        await self.begin([self._project.recipe_path.name], self._live)
+        await self.begin([self._project.recipe_path.name], self._moves)
 
     async def _resume(self) -> None:
         if (run := self._project.unfinished()) is not None:
-            await self.begin(["--resume", f"runs/{run.name}"], self._live)
+            await self.begin(["--resume", f"runs/{run.name}"], self._moves)
 
     async def begin(self, words: Sequence[str], moves: bool) -> None:
         """Start ``flangeye run`` with these words; ask first, where an arm would move."""
-        if self._running or self._project.elsewhere():
-            ui.notify("a run is under way; stop it first", type="warning")
-            return
         self._line.text = self._project.command("run", *words, *["--move"] * moves)
-        code = None
-        if moves:
-            self._project.codes.ask(words, self._me)
-            code = await code_from_terminal()
-            if not code:
-                return
-        try:
-            self._project.begin(words, self._me, code)
-        except StageError as error:
-            ui.notify(str(error), type="negative")
-
-    @property
-    def _running(self) -> bool:
-        return bool(self._project.run) and self._project.run.code is None  # type: ignore[union-attr]
+        await self._control.begin(["run", *words], moves)
 
     def _look(self) -> None:
-        run, running = self._project.run, self._running
-        # A page that is not heard of for so long is taken for dead, and its arm is stopped [s].
-        silence = 5.0
-        if running and time.monotonic() - self._heard > silence:
-            self._project.page_gone(self._me, f"the page was silent for {silence:g} s")
+        self._control.look()
+        run, running = self._project.run, self._control.running
         left, other = self._project.unfinished(), self._project.elsewhere()
-        shown = run is not None and not (other and run.code is not None)
+        shown = run is not None and not run.checks and not (other and run.code is not None)
         ended = shown and run is not None and run.code in (0, 1)
         ended = ended and self._project.ran == self._project.text
-        self._halt.set_visibility(running)
-        _enlarge(self._halt, running and run is not None and run.moves)
-        self._take.set_visibility(running and self._project.owner != self._me)
         self._start.set_visibility(not running and not ended)
         self._start_again.set_visibility(bool(ended))
         self._on.set_visibility(bool(ended))
@@ -178,11 +135,12 @@ class RunPanel:
             ui.timer(0.1, self._scene.fit, once=True)
         self._newest.set_visibility(scanned)
         self._during.set_visibility(shown)
-        if run is None or not shown:
+        if run is not None and (shown or running):
+            self._bar.say(status_line(run, self._control.mine))
+        else:
             self._bar.say(_nothing(left, other))
-            return
-        self._bar.say(status_line(run, self._project.owner == self._me))
-        self._show(run)
+        if run is not None and shown:
+            self._show(run)
 
     def _show(self, run: RunProcess) -> None:
         seconds, view = run.left, run.view
@@ -244,7 +202,7 @@ class RunPanel:
 
     def _draw(self, run: RunProcess) -> None:
         self._scene.wipe()
-        self._scene.cloud(run.cloud, LIGHT["ink"], 0.006)
+        self._scene.cloud(run.cloud, size=0.006)
         self._scene.cloud(run.flange, SERIES["used"], 0.004)
         rims = [outline_of(entry.value) for entry in run.log.of_kind("fit")]
         if rims:
@@ -274,7 +232,7 @@ class RunPanel:
             self._mend("Leave out", capture, [*without, "--leave-out", capture], moves=False)
         if self._live:
             again = ["--resume", where, "--retake", capture]
-            self._mend("Take again", capture, again, moves=True)
+            self._mend("Take again", capture, again, moves=self._moves)
 
     def _mend(self, label: str, capture: str, words: list[str], moves: bool) -> None:
         async def go() -> None:
@@ -288,6 +246,73 @@ class RunPanel:
         """Name of the recipe's solve step."""
         steps = self._recipe.steps if self._recipe else ()
         return next((s.stage.name for s in steps if s.stage.kind == "solve"), "solve.robust")
+
+
+class Control:
+    """Starts and stops the project's process for one page, which has to stay open meanwhile."""
+
+    def __init__(self, project: Project, client: Client, bar: ActionBar) -> None:
+        self._project, self._me, self._heard = project, client.id, time.monotonic()
+        self._take = bar.offer("Take over", self._take_over, second=True)
+        self._halt = bar.offer("Stop (space bar)", self._stop)
+        self._halt.props('aria-keyshortcuts="Space"')
+        ui.keyboard(on_key=self._key)
+        ui.on("beat", self._beat)
+        client.on_disconnect(lambda: project.page_gone(self._me))
+        ui.timer(
+            0.1, lambda: ui.run_javascript("setInterval(() => emitEvent('beat'), 500)"), once=True
+        )
+
+    @property
+    def running(self) -> bool:
+        """Whether a process goes on, of this page or of another."""
+        return self._project.run is not None and self._project.run.code is None
+
+    @property
+    def mine(self) -> bool:
+        """Whether the process goes on for this page."""
+        return self._project.owner == self._me
+
+    async def begin(self, words: Sequence[str], moves: bool) -> None:
+        """Start a flangeye command with these words; ask first, where an arm would move."""
+        if self.running or self._project.elsewhere():
+            ui.notify("a run is under way; stop it first", type="warning")
+            return
+        code = None
+        if moves:
+            self._project.codes.ask(words, self._me)
+            code = await code_from_terminal()
+            if not code:
+                return
+        try:
+            self._project.begin(words, self._me, code)
+        except StageError as error:
+            ui.notify(str(error), type="negative")
+
+    def look(self) -> None:
+        """Stop an arm whose page is silent; show the buttons for what goes on."""
+        run = self._project.run
+        # A page that is not heard of for so long is taken for dead, and its arm is stopped [s].
+        silence = 5.0
+        if self.running and time.monotonic() - self._heard > silence:
+            self._project.page_gone(self._me, f"the page was silent for {silence:g} s")
+        self._halt.set_visibility(self.running)
+        _enlarge(self._halt, self.running and run is not None and run.moves)
+        self._take.set_visibility(self.running and not self.mine)
+
+    def _beat(self, _: Any) -> None:
+        self._heard = time.monotonic()
+
+    def _key(self, event: Any) -> None:
+        if event.action.keydown and event.key == " ":
+            self._stop()
+
+    def _stop(self) -> None:
+        if self._project.run:
+            self._project.run.stop("stopped on this page")
+
+    def _take_over(self) -> None:
+        self._project.owner = self._me
 
 
 class Shot(ui.element):
@@ -354,7 +379,7 @@ def status_line(run: RunProcess, mine: bool) -> str:
     """Return the run's status in one line."""
     if run.code is None:
         where = "" if mine else "; another page started it"
-        return f"{run.path.name} runs{where}."
+        return f"{run.path.name} {'is being checked' if run.checks else 'runs'}{where}."
     ended = {0: "Done", 1: "The calibration was refused; the result says why"}
     why = f": {run.stopped}" if run.stopped else ""
     early = f"{run.path.name} ended early{why} (exit code {run.code})"

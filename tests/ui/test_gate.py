@@ -327,34 +327,34 @@ def test_a_code_is_for_one_command_of_one_page_and_once() -> None:
     codes = MoveCodes(shown.append)
 
     def asked() -> str:
-        codes.ask(["cell.yaml"], "page")
+        codes.ask(["run", "cell.yaml"], "page")
         return shown[-1].split()[1]
 
     assert "flangeye run cell.yaml --move" in (asked(), shown[-1])[1]
-    codes.spend(asked(), ["cell.yaml"], "page")
-    for words, page in ((["other.yaml"], "page"), (["cell.yaml"], "another")):
+    codes.spend(asked(), ["run", "cell.yaml"], "page")
+    for words, page in ((["run", "other.yaml"], "page"), (["run", "cell.yaml"], "another")):
         with pytest.raises(StageError, match="expired"):
             codes.spend(asked(), words, page)
     code = asked()
-    codes.spend(code, ["cell.yaml"], "page")
+    codes.spend(code, ["run", "cell.yaml"], "page")
     with pytest.raises(StageError, match="expired"):
-        codes.spend(code, ["cell.yaml"], "page")
+        codes.spend(code, ["run", "cell.yaml"], "page")
     for _ in range(5):
         right = asked()
         with pytest.raises(StageError, match="not the code"):
-            codes.spend("x" + right, ["cell.yaml"], "page")
+            codes.spend("x" + right, ["run", "cell.yaml"], "page")
     with pytest.raises(StageError, match="too many wrong codes"):
-        codes.spend(asked(), ["cell.yaml"], "page")
+        codes.spend(asked(), ["run", "cell.yaml"], "page")
 
 
 def test_a_code_is_not_good_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
     shown: list[str] = []
     codes = MoveCodes(shown.append)
-    codes.ask(["cell.yaml"], "page")
+    codes.ask(["run", "cell.yaml"], "page")
     now = __import__("time").monotonic()
     monkeypatch.setattr("flangeye_ui.project.time.monotonic", lambda: now + 1000)
     with pytest.raises(StageError, match="expired"):
-        codes.spend(shown[-1].split()[1], ["cell.yaml"], "page")
+        codes.spend(shown[-1].split()[1], ["run", "cell.yaml"], "page")
 
 
 def test_pages_that_lie_in_a_folder_hold_themselves_to_it() -> None:

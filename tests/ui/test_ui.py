@@ -167,7 +167,7 @@ def test_from_an_empty_folder_to_an_exported_file(browser: Any, served: Served) 
     page.get_by_label("Who did it").fill("a person")
     page.get_by_role("button", name="Write the certificate").click()
     page.get_by_role("link", name="Open the certificate").wait_for()
-    page.get_by_label("Search your system").fill("urscript")
+    page.get_by_label("Search your system").fill("universal robots")
     page.get_by_role("button", name="kuka").wait_for(state="hidden")
     page.get_by_role("button", name="ur", exact=True).click()
     page.get_by_text("--to ur", exact=False).wait_for()
@@ -651,7 +651,7 @@ def test_a_run_that_goes_elsewhere_is_named_and_not_gone_on_with(tmp_path: Path)
 def test_a_run_that_was_killed_elsewhere_says_how_it_ended(tmp_path: Path) -> None:
     project = Project(tmp_path, load_registry(), MoveCodes(print))
     project.text = SMALL.replace("0.25", "1.0")
-    project.begin(["cell.yaml"], "page")
+    project.begin(["run", "cell.yaml"], "page")
     assert project.run is not None
     project.run._process.kill()
     project.run._process.wait(10)
@@ -661,7 +661,7 @@ def test_a_run_that_was_killed_elsewhere_says_how_it_ended(tmp_path: Path) -> No
 def test_the_servers_death_ends_its_run(tmp_path: Path) -> None:
     project = Project(tmp_path, load_registry(), MoveCodes(print))
     project.text = SMALL.replace("0.25", "1.0")
-    project.begin([project.recipe_path.name], "page")
+    project.begin(["run", project.recipe_path.name], "page")
     assert project.run is not None and project.run.code is None
     project.page_gone("page")
     assert not project.run.stopped  # nothing moves, so nothing is stopped
@@ -813,6 +813,22 @@ def test_residuals_are_arrows_in_3d(browser: Any, served: Served, finished: Path
         coloured(page, LIGHT["verified"]) > 300
     )  # nothing else in the picture is green but the y axis
     assert coloured(page, SERIES["circle"]) > 300
+    assert page.problems == []
+
+
+@pytest.mark.slow
+def test_a_bar_of_the_chart_opens_the_scan_of_its_pose(
+    browser: Any, served: Served, finished: Path
+) -> None:
+    page = opened(browser, served)
+    page.goto(f"{page.url}result?run={finished.name}")
+    bars = page.get_by_role("img", name="Error of each pose, held out")
+    bars.wait_for()
+    page.wait_for_timeout(1000)
+    box = bars.bounding_box()
+    wide = (box["width"] - 45 - 10) / 7  # between the chart's margins are the bars of 7 poses
+    bars.click(position={"x": 45 + 2.5 * wide, "y": box["height"] - 25 - 4})
+    page.get_by_text(re.compile("^capture 0003: used, residual ")).wait_for()
     assert page.problems == []
 
 

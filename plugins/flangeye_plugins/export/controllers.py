@@ -79,7 +79,7 @@ class ControllerFormat:
 
 CONTROLLERS = {
     "ur": ControllerFormat(
-        "Write the pose as a URScript variable, as features and pose_trans take it.",
+        "Write the pose as a URScript variable for Universal Robots' features and pose_trans.",
         "{name}.script",
         "#",
         "{remarks}{name} = p[{0}, {1}, {2}, {3}, {4}, {5}]\n",
