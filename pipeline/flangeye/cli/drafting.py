@@ -43,7 +43,8 @@ ANSWERS = {
     "trajectory": "With --ros2: topic of the controller that moves the arm, or none.",
     "scans": "With --ros2: topic of clouds, depth images or images.",
     "trigger": "With --ros2: service that takes a scan, or none.",
-    "view": "With --ros2: where the scanner roughly stands: '620, 0, 980 mm'.",
+    "view": "With --ros2: where the scanner, or a camera in hand's target, roughly stands: "
+    "'620, 0, 980 mm'.",
     "box": "With --ros2: the flange's box, centre; size: '450, 0, 300; 600, 600, 600 mm'.",
 }
 """Options of ``init`` that answer what a person is asked otherwise, with their help."""

@@ -60,6 +60,7 @@ class RunningCell:
             None for a camera of clouds or depths.
         files: Texts of the files that the sections name, by name.
         steps: Steps to add at the recipe's end.
+        steps_in_hand: The same, if the arm carries the camera.
         seen: Lines of text about what runs.
     """
 
@@ -70,6 +71,7 @@ class RunningCell:
     pixels: Any = None
     files: Mapping[str, str] = field(default_factory=dict)
     steps: Sequence[Any] = ()
+    steps_in_hand: Sequence[Any] = ()
     seen: Sequence[str] = ()
 
 

@@ -229,6 +229,7 @@ class Ros2Graph(Device):
             pixels=seen_by(scans) if scans.scans == "image" else None,
             files={path.name: text},
             steps=[{"export.ros2_launch": {"parent": base, "child": frame}}],
+            steps_in_hand=[{"export.ros2_launch": {"parent": found.flange, "child": frame}}],
             seen=[
                 f"{found.robot.model}: {base} to {found.flange}, {len(found.joints)} joints",
                 *(each.line for each in heard),

@@ -94,12 +94,12 @@ class Camera(Peer):
             "robot": "ur5e", "scanner": "phoxi-m", "layout": layout, "namespace": "/camera",
             "seed": 1, "resolution": 0.2, "prefix": "", "sim_time": False, "moved": [0.0, 0.0, 0.0],
             "refuses": "", "lens": "plumb_bob", "joints": FACING, "triggered": False,
-            "production": False,
+            "production": False, "in_hand": False,
         }  # fmt: skip
         super().__init__("camera", given | options, env)
 
     def pose(self):
-        """Where it really stands, base_T_camera (4, 4)."""
+        """Where it really stands, base_T_camera (4, 4); in hand, flange_T_camera."""
         return np.array(self.ask(pose=True)["pose"])
 
 

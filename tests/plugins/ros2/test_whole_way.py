@@ -43,10 +43,10 @@ def terminal(tmp_path):
     return Terminal(tmp_path, installed.environment(installed.free_domain()))
 
 
-def found(terminal, run="run"):
+def found(terminal, run="run", name="base_T_camera"):
     result = terminal.result(run)
     assert result["status"] == "verified"
-    return np.array(result["transforms"]["base_T_camera"]["matrix"])
+    return np.array(result["transforms"][name]["matrix"])
 
 
 def require_near(matrix, truth):
@@ -112,6 +112,29 @@ def test_an_arm_that_others_move_is_calibrated_and_then_watched(terminal):
             assert drift["reason"].startswith("the cell has moved since")
 
 
+@pytest.mark.parametrize("moved_by", ["the run", "hand"])
+def test_a_camera_in_hand_is_calibrated_before_a_fixed_board(terminal, moved_by):
+    installed.tf2_msgs()
+    env, words = terminal.env, ("run", "recipe.yaml", "--out", "run", *FEW)
+    controller = "arm_controller" if moved_by == "the run" else None
+    arm = Controller(env, seed=1, joints=TOWARDS, controller=controller)
+    with peers(arm, Camera(env, "image", in_hand=True), Frames(env)) as (arm, camera, tree):
+        out, _ = terminal.run("init", "--ros2", "--scanner", "phoxi-m", "--yes",
+                              "--camera", "flange", "--target", PRINTED)  # fmt: skip
+        assert "roughly where the printed target stands in the base" in out
+        if controller:
+            terminal.run(*words, "--move", *QUICK)
+        else:
+            by_hand(terminal, arm, leaning(0.2), *words)
+        matrix = found(terminal, name="flange_T_camera")
+        require_near(matrix, camera.pose())
+        with terminal.start("publish", "run") as publishing:
+            parent, pose = tree.heard_of("optical_frame")
+            publishing.send_signal(signal.SIGINT)
+        assert parent == "tool0"
+        assert np.allclose(pose, matrix, atol=1e-6)
+
+
 def check_a_running_cell(terminal, code):
     """Return what a check of a cell that goes on printed, and what watching it showed."""
     check = ("monitor", "run", "--live", "--scans", "2", *PRODUCTION)
@@ -136,12 +159,12 @@ def by_hand(terminal, arm, poses, *words):
     assert run.returncode == 0, told[-1]
 
 
-def leaning():
+def leaning(lean=0.35):
     """Joint angles (6,) [rad] at which the flange faces the camera, each leaning another way."""
     arm = Arm(load_model("robots", "ur5e"))
     start = np.radians(TOWARDS)
     for i in itertools.count():
-        turn, around = 0.35 * np.array([np.cos(2.4 * i), np.sin(2.4 * i), 0.0]), arm.flange(start)
+        turn, around = lean * np.array([np.cos(2.4 * i), np.sin(2.4 * i), 0.0]), arm.flange(start)
         shift = 0.06 * np.array([np.sin(1.9 * i), np.cos(1.3 * i), np.sin(2.9 * i)])
         pose = rigid(around[:3, :3] @ rotation_exp(turn), around[:3, 3] + shift)
         near = [q for q in arm.inverse(pose) if np.abs(q - start).max() < 1.0]

@@ -4,7 +4,8 @@
 ``realsense``: points of 20 bytes with a padded rgb, not organised, best effort, running by itself.
 ``zivid``: organised xyzrgba with NaN, reliable, captured by a service. ``phoxi``: organised, zeros
 where nothing was measured, captured by a service. ``depth``: 16-bit millimetres with CameraInfo.
-``image``: a ChArUco board on the flange as JPEG with CameraInfo. ``empty``: triggered by a topic.
+``image``: a ChArUco board on the flange as JPEG with CameraInfo; with ``in_hand`` the camera is on
+the flange, and the board where it stands otherwise. ``empty``: triggered by a topic.
 Their CameraInfo comes after the image; with ``triggered`` there is none before the first scan. With
 ``production`` the cell's own program captures, as soon as the arm stands at a new place.
 """
@@ -26,7 +27,7 @@ from flangeye.maths.kinematics import Arm
 from flangeye.models.boards import Board
 from flangeye.models.loading import load_model
 from flangeye.types import CAMERA, PointCloud
-from flangeye.types.geometry import invert, rigid
+from flangeye.types.geometry import invert, rigid, rotation_exp
 from flangeye_emulators.scanner import CellScene, TrueStance
 from flangeye_emulators.world.board_image import BoardCamera, render_board
 from flangeye_emulators.world.scanner import CameraPose, scanner_of
@@ -35,6 +36,7 @@ from tests.plugins.ros2.peers.node import SENSOR, rclpy, say, serve
 
 BOARD = Board("charuco", 6, 5, 0.018, 0.013, "4X4_50")
 FLANGE_T_BOARD = rigid(np.eye(3), np.array([-0.05, -0.04, 0.01]))
+FLANGE_T_CAMERA = rigid(rotation_exp(np.array([0.02, -0.03, 0.4])), np.array([0.06, 0.02, 0.05]))
 LENS = BoardCamera(
     np.array([[1400.0, 0, 639.5], [0, 1400.0, 511.5], [0, 0, 1]]),
     (1280, 1024),
@@ -94,7 +96,8 @@ class Camera:
         self.stamped = words.get("stamped", self.stamped)
         self.spoilt = words.get("info", self.spoilt)
         if "pose" in words:
-            say(pose=self.base_T_camera.tolist(), count=self.count)
+            pose = FLANGE_T_CAMERA if self.options["in_hand"] else self.base_T_camera
+            say(pose=pose.tolist(), count=self.count)
 
     def captures(self, _, answer):
         if self.options["refuses"]:
@@ -145,7 +148,11 @@ class Camera:
     def look(self, joints):
         pose = self.arm.flange(joints)
         if self.options["layout"] == "image":
-            target = invert(self.base_T_camera) @ pose @ FLANGE_T_BOARD
+            if self.options["in_hand"]:
+                eye, holder = pose @ FLANGE_T_CAMERA, self.base_T_camera
+            else:
+                eye, holder = self.base_T_camera, pose
+            target = invert(eye) @ holder @ FLANGE_T_BOARD
             # The board faces the camera: its z points towards it.
             return render_board(BOARD, target, LENS, np.random.default_rng(self.count)).pixels
         return self.scene.scan([TrueStance(joints, pose)], (self.options["seed"], self.count))

@@ -17,6 +17,7 @@ from flangeye.units import in_mm, parse_quantity
 from flangeye.workflow.recipe.draft.recipe import (
     PLATE,
     Draft,
+    configuration_of,
     draft_recipe,
     mounting_seen,
     printed_target,
@@ -29,12 +30,14 @@ __all__ = ["Draft", "Questions", "draft_live", "draft_recipe", "look", "mounting
 
 
 def draft_live(cell: RunningCell, questions: Questions, out: Path) -> Draft:
-    """Return a recipe for a running arm whose flange, or what it carries, faces a camera beside it.
+    """Return a recipe for a running arm that faces a camera beside it.
+
+    It shows its flange or a printed target; or it carries the camera, and faces a fixed target.
 
     Args:
         cell: The running arm and camera.
         questions: Answers to what cannot be detected: the plate, the printed target, the camera's
-            model and rough pose, and the box in which the flange may move.
+            model, mounting and rough pose, and the box in which the flange may move.
         out: Path of the recipe; the files it names are beside it.
 
     Raises:
@@ -46,21 +49,27 @@ def draft_live(cell: RunningCell, questions: Questions, out: Path) -> Draft:
     if not isinstance(scanner, ScannerModel):
         raise RecipeError(f"--scanner {name}: its file lacks what planning needs: what it sees")
     target: dict[str, Any] = {"flange": {}}
-    carried: dict[str, Any] = {}
+    stands: dict[str, Any] = {}
     if cell.pixels is not None:
         target = printed_target(
             [("the camera", cell.pixels)] if cell.pixels.size else [], questions
         )
-        carried = {"configuration": {"name": "eye-on-base", "place": "unknown"}}
+        stands = configuration_of(target, questions)
+    in_hand = stands.get("name") == "eye-in-hand"
     robot = {**cell.robot, "limits": {"box": _box(cell.flange, questions)}}
-    first = {"view": {"guess": _view(cell, scanner, questions)}}
-    data = {
-        "title": f"Calibration of {name} beside the arm",
+    first: dict[str, Any] = {"view": {"guess": _view(cell, scanner, questions, in_hand)}}
+    if in_hand:
+        # A fixed target leaves the view of a camera that moves or leans far: 0.6 m before it,
+        # these poses turn the line of sight by 11 deg each, together half a field of 45 deg
+        first["poses"] = {"next_best": {"size": ["150 mm"] * 3, "tilt": "0.2 rad"}}
+    steps = cell.steps_in_hand if in_hand else cell.steps
+    data: dict[str, Any] = {
+        "title": f"Calibration of {name} {'on' if in_hand else 'beside'} the arm",
         "robot": robot,
         "scanner": {"model": name, **cell.scanner},
         "feature": {"standard": plate},
-        **carried,
-        "steps": [{"acquire.live": first}, *steps_of(target), *cell.steps],
+        **({"configuration": stands} if stands else {}),
+        "steps": [{"acquire.live": first}, *steps_of(target), *steps],
     }
     return Draft(yaml_of(data), (), {out.with_name(n): text for n, text in cell.files.items()})
 
@@ -77,19 +86,23 @@ def _box(flange: Floats, questions: Questions) -> dict[str, Any]:
     return {"centre": _lengths("box", centre), "size": _lengths("box", size)}
 
 
-def _view(cell: RunningCell, scanner: ScannerModel, questions: Questions) -> dict[str, Any]:
-    """Return the camera's rough pose, from the graph or from an answer.
+def _view(
+    cell: RunningCell, scanner: ScannerModel, questions: Questions, in_hand: bool
+) -> dict[str, Any]:
+    """Return the rough pose of what the flange faces, from the graph or from an answer.
 
-    Its direction is not asked: the camera is assumed to look at the flange's present position.
+    It is the camera, or the target of a camera in hand. Its direction is not asked: it is assumed
+    to face the flange's present position.
     """
-    if cell.camera is None:
+    if cell.camera is None or in_hand:
         eye, why = middle_of_view(scanner, cell.flange), "the flange faces it now"
     else:
         eye, why = cell.camera[:3, 3], "the graph has it"
     questions.likely["view"] = in_mm(eye), why
-    answer = questions.ask("view", "roughly where the scanner stands in the base", None)
+    what = "printed target" if in_hand else "scanner"
+    answer = questions.ask("view", f"roughly where the {what} stands in the base", None)
     position = _lengths("view", answer)
-    if cell.camera is not None and answer == in_mm(eye):
+    if cell.camera is not None and not in_hand and answer == in_mm(eye):
         turn = cell.camera[:3, :3]
     else:
         turn = _looking(np.array([parse_quantity(x, "length") for x in position]), cell.flange)

@@ -348,7 +348,7 @@ def _head(
     scanner = questions.ask(
         "scanner", question, "none", check=lambda a: a == "none" or load_model("scanners", a)
     )
-    configuration = _configuration(target, questions)
+    configuration = configuration_of(target, questions)
     body = _body(str(target["body"]), out, configuration) if "body" in target else {}
     named: Any = robot["model"] if set(robot) == {"model"} else robot
     sections = {
@@ -397,7 +397,7 @@ def _has_plate(robot: Mapping[str, Any]) -> bool:
     return load_model("robots", robot["model"]).flange.standard is not None
 
 
-def _configuration(target: Mapping[str, Any], questions: Questions) -> dict[str, Any]:
+def configuration_of(target: Mapping[str, Any], questions: Questions) -> dict[str, Any]:
     """Return the configuration section; empty for a camera that sees the flange."""
     question = "where the camera is mounted (base or flange)"
     carried = questions.ask("camera", question, "base", check=one_of("base", "flange"))
