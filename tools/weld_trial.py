@@ -112,7 +112,7 @@ class Start:
     position: tuple[float, float, float]
     angle: float = 0.0
     period: float = 8e-3
-    longest: float = 120.0
+    longest: float = 240.0
     look: LookTruth | None = None
 
 
