@@ -23,7 +23,7 @@ from unittest.mock import patch
 import numpy as np
 
 from flangeye.workflow.batch import cluster
-from flangeye.workflow.batch.work import ChunkTold
+from flangeye.workflow.batch.work import ChunkDone
 
 MEASURED = 2000
 """Sessions that do nothing, to measure the scheduler by."""
@@ -172,9 +172,9 @@ class Cluster:
         self._ask(now, core)
 
 
-def do_nothing(job: Any, chunk: Any) -> ChunkTold:
+def do_nothing(job: Any, chunk: Any) -> ChunkDone:
     """Replace the work of a chunk by one session of the chunk's duration."""
-    return ChunkTold(Counter({"verified": 1}), [], cluster.CHUNK_SECONDS)
+    return ChunkDone(Counter({"verified": 1}), [], cluster.CHUNK_SECONDS)
 
 
 def scheduling_seconds() -> float:

@@ -14,9 +14,9 @@ from flangeye_emulators.weld_world.groove import GrooveSection, Tip
 from flangeye_emulators.weld_world.truth import WeldTruth
 from flangeye_emulators.weld_world.world import Nominal, WeldWorld
 from flangeye_plugins.weld.checks import check_tool
-from flangeye_plugins.weld.following.belief import Belief, belief_of
 from flangeye_plugins.weld.following.bound import check_bound
 from flangeye_plugins.weld.following.follower import Follower
+from flangeye_plugins.weld.following.model_prior import ModelPrior, model_prior_of
 from flangeye_plugins.weld.following.task import WeldTask
 from flangeye_plugins.weld.frame import LeaningTool, body_from
 from flangeye_plugins.weld.path import Path
@@ -69,16 +69,16 @@ def try_condition(
     plan = Path(misplanned(true, seed, *condition.planned))
     settings = Following.model_validate(condition.settings)
     body = built_for(settings)
-    section, belief = known(condition, body, settings)
-    check_tool(body, belief, settings)
-    check_bound(plan, belief, settings)
+    section, prior = known(condition, body, settings)
+    check_tool(body, prior, settings)
+    check_bound(plan, prior, settings)
     passes = 1 + len(settings.passes)
-    controller = controller_of(plan, belief, settings, "tactile")
+    controller = controller_of(plan, prior, settings, "tactile")
     watch(controller)
     nominal = Nominal(
         Path(true), section, Tip(), body.level_R_tool.T @ body.torch, body.level_R_tool
     )
-    start = start_at(plan, belief, settings, period)
+    start = start_at(plan, prior, settings, period)
     start = replace(start, longest=120.0 * passes, look=condition.look)
     return run_trial(controller, nominal, condition.truth, start, seed)
 
@@ -91,15 +91,15 @@ def could_be_welded(condition: Condition, seed: int, length: float, period: floa
     """
     settings = Following.model_validate(condition.settings)
     body = built_for(settings)
-    section, belief = known(condition, body, settings)
+    section, prior = known(condition, body, settings)
     torch = body.level_R_tool.T @ body.torch
     nominal = Nominal(Path(curved(length)), section, Tip(), torch, body.level_R_tool)
     plan = WeldWorld(nominal, condition.truth, [seed, 0]).groove.root
     arm = replace(condition.truth.arm, wave=0.0, scale=0.0, sag=0.0)
-    controller = Follower(WeldTask(plan, belief, settings, touch=False))
+    controller = Follower(WeldTask(plan, prior, settings, touch=False))
     truth = WeldTruth(arm)
     controller.arm.dead_time, controller.arm.lag = truth.arm.dead_time, truth.arm.lag
-    start = start_at(plan, belief, settings, period)
+    start = start_at(plan, prior, settings, period)
     trial = run_trial(controller, replace(nominal, seam=plan), truth, start, seed)
     s, off = trial.column("torch_s"), np.abs(trial.column("torch"))
     beside = (s > 0.0) & (s < trial.length)
@@ -115,20 +115,20 @@ def built_for(settings: Following) -> LeaningTool:
 
 def known(
     condition: Condition, body: LeaningTool, settings: Following
-) -> tuple[GrooveSection, Belief]:
+) -> tuple[GrooveSection, ModelPrior]:
     """Return the planned joint, and the controller's model of tool and joint."""
     section, half_angle = condition.section, None
     if section is None:
         half_angle = condition.half_angle or SECTION.half_angle
         section = GrooveSection(half_angle, SECTION.depth)
-    belief = belief_of(Finger.model_validate(FINGER), body, half_angle, settings)
+    prior = model_prior_of(Finger.model_validate(FINGER), body, half_angle, settings)
     behind = None if condition.look is None else condition.look.behind
-    return section, replace(belief, behind=behind, **condition.belief)
+    return section, replace(prior, behind=behind, **condition.prior)
 
 
-def start_at(plan: Path, belief: Belief, settings: Following, period: float) -> Start:
+def start_at(plan: Path, prior: ModelPrior, settings: Following, period: float) -> Start:
     """Return where a weld begins: above the plan's start."""
     first = plan.at(settings.set_down)
-    x, y = (first.point + belief.set_down(settings) * first.normal).tolist()
+    x, y = (first.point + prior.set_down(settings) * first.normal).tolist()
     angle = float(np.arctan2(first.tangent[1], first.tangent[0]))
     return Start((x, y, first.height + ABOVE), angle, period)

@@ -28,7 +28,7 @@ class Condition(NamedTuple):
         truth: True values of the world.
         settings: Controller settings that differ from the defaults.
         planned: Shift [m] and turn [rad] of the plan.
-        belief: Prior values of the tool that differ from the defaults.
+        prior: Prior values of the tool that differ from the defaults.
         half_angle: Half angle of groove and plan [rad]; None for the default.
         section: Cross-section of another joint, of which the controller knows the type only.
         look: Profile sensor behind the torch; None without one.
@@ -37,7 +37,7 @@ class Condition(NamedTuple):
     truth: WeldTruth = WeldTruth()
     settings: Mapping[str, Any] = {}
     planned: tuple[float, float] = (3e-3, 0.01745)
-    belief: Mapping[str, Any] = {}
+    prior: Mapping[str, Any] = {}
     half_angle: float | None = None
     section: GrooveSection | None = None
     look: LookTruth | None = None
@@ -69,10 +69,10 @@ CONDITIONS: Mapping[str, Condition] = {
     "finger play 0.3 mm": Condition(WeldTruth(finger=FingerTruth(play=0.3e-3))),
     "finger hysteresis 10 %": Condition(WeldTruth(finger=FingerTruth(hysteresis=0.1))),
     "torch 0.5 mm aside": Condition(
-        WeldTruth(tool=ToolTruth(torch=(0.0, 0.5e-3))), belief={"torch_sigma": 0.3e-3}
+        WeldTruth(tool=ToolTruth(torch=(0.0, 0.5e-3))), prior={"torch_sigma": 0.3e-3}
     ),
     "tool yaw 1 deg": Condition(
-        WeldTruth(tool=ToolTruth(yaw=np.radians(1.0))), belief={"torch_sigma": 0.35e-3}
+        WeldTruth(tool=ToolTruth(yaw=np.radians(1.0))), prior={"torch_sigma": 0.35e-3}
     ),
     "heat: seam moves 2 mm": Condition(
         WeldTruth(heat=HeatTruth(shift=2e-3)), {"distortion": "0.3 mm", "max_error": "2 mm"}

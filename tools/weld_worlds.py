@@ -144,11 +144,11 @@ def drawn(seed: int) -> Condition:
         "speed": f"{rng.choice([5, 10, 20])} mm/s", "max_error": f"{rng.choice([1, 2])} mm",
         "arm_sigma": _mm(arm), "distortion": _mm(heat),
     }  # fmt: skip
-    belief = {"torch_sigma": torch, "along_sigma": along, "tip_sigma": tip_sigma}
+    prior = {"torch_sigma": torch, "along_sigma": along, "tip_sigma": tip_sigma}
     planned = draw.some(12e-3), draw.some(0.1)
     # How far its ends may be off along it, a plan's file states.
     settings["ends"] = _mm(planned[0] + planned[1] * 12e-3)  # turned, an S of 12 mm is off too
-    return Condition(world, settings, planned, belief)
+    return Condition(world, settings, planned, prior)
 
 
 def _arm(draw: _Draw, sigma: float) -> ArmTruth:

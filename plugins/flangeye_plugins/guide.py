@@ -112,7 +112,7 @@ def _guided(
         pivoted = None
         if body:
             with arm.standing() as robot:
-                hand = Hand(robot, ask, lambda: readings(robot).take(EACH))
+                hand = HandGuide(robot, ask, lambda: readings(robot).take(EACH))
                 pivoted = Pivoted(hand.tip(finger, found), hand.torch())
     measured = found.lateral is not None
     if not measured and finger.calibration is not None:
@@ -239,7 +239,7 @@ class Pivoted(NamedTuple):
     torch: Pivot
 
 
-class Hand:
+class HandGuide:
     """Asks a person to bring a point to the mark, then reads the arm's pose."""
 
     def __init__(

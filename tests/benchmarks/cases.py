@@ -302,15 +302,15 @@ def finger() -> tuple[Work, Work]:
 def cycle() -> tuple[Work, Work]:
     """A cycle of the weld's controller with a new touch in it, the dearest one; 2 ms are allowed."""
     from flangeye.motion.seam_following import ToolPose, Touch
-    from flangeye_plugins.weld.following.belief import Belief, Learned
     from flangeye_plugins.weld.following.follower import Follower
+    from flangeye_plugins.weld.following.model_prior import ModelPrior, SweepFit
     from flangeye_plugins.weld.following.task import WeldTask
     from flangeye_plugins.weld.path import Path as Plan
     from flangeye_plugins.weld.settings import Following
 
     x = np.linspace(0.0, 2.0, 2000)
     plan = Plan(np.column_stack([x, 0.02 * np.sin(x / 0.1), 0.0 * x]))
-    follower, clock = Follower(WeldTask(plan, Belief(40e-3), Following())), itertools.count()
+    follower, clock = Follower(WeldTask(plan, ModelPrior(40e-3), Following())), itertools.count()
 
     def turn() -> None:
         time = next(clock) * 2e-3
@@ -318,7 +318,7 @@ def cycle() -> tuple[Work, Work]:
         position = np.array([*(at.point + 2e-3 * at.normal), at.height - 1.5e-3])
         angle = float(np.arctan2(at.tangent[1], at.tangent[0]))
         if follower.phase == "probing":  # a sweep that found nothing wrong
-            follower._follow(Learned())
+            follower._follow(SweepFit())
         assert follower.phase in ("seeking", "following"), follower.reason
         bent = np.array([0, -2e-3, 1.5e-3]) if time > 0.5 else np.zeros(3)  # free at first
         follower.step(ToolPose(time, position, angle), [Touch(time, bent)])

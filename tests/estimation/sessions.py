@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from flangeye.estimation.answers import Answer, as_reported, as_true, expected_error, foreseen
 from flangeye.estimation.estimate import Estimate, estimate
 from flangeye.estimation.graph import Carrier, Problem, Sightings
-from flangeye.estimation.session import Asked, effects_of
+from flangeye.estimation.session import ModelOptions, effects_of
 from flangeye.estimation.work import work_of
 from flangeye.maths.kinematics import Arm
 from flangeye.models.cell import Frame
@@ -87,7 +87,7 @@ def estimated(s: foreign.Session, kind: str, told: bool = True) -> Estimate:
         problem = replace(problem, carriers=bare)
     truth = {"camera": s.camera, "target": s.target}
     start = problem.moved(truth, np.full(6 * len(problem.unknown), 0.01))
-    effects = effects_of(problem, None, Asked())
+    effects = effects_of(problem, None, ModelOptions())
     return estimate(problem, start, effects, np.ones(len(s.seen), dtype=bool))
 
 

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from flangeye.estimation.lifted import LiftedSightings, Side
+from flangeye.estimation.lifted import Factors, LiftedSightings
 from flangeye.types import Floats
 from flangeye.types.geometry import invert, rigid, rotation_exp, rotation_log
 
@@ -44,7 +44,10 @@ def of_two(sides: Any, turning: Floats, shifting: Floats) -> LiftedSightings:
     a, m, b, d = sides
     each = np.repeat(np.stack([turning, shifting], axis=1), 3, axis=1)
     first, still = np.zeros(len(a), dtype=np.intp), np.tile(np.eye(4), (len(a), 1, 1))
-    camera, target = Side(still, first + 2, a, first, m), Side(still, first + 2, b, first + 1, d)
+    camera, target = (
+        Factors(still, first + 2, a, first, m),
+        Factors(still, first + 2, b, first + 1, d),
+    )
     return LiftedSightings(camera, target, each[:, :, None] * np.eye(6), np.full(len(a), 6.0))
 
 
@@ -57,7 +60,10 @@ def of_three(noise: tuple[float, float], seed: int, n: int = 15) -> tuple[Lifted
     m[:, :3, :3] = rotation_exp(noise[0] * rng.standard_normal((n, 3))) @ m[:, :3, :3]
     m[:, :3, 3] += noise[1] * rng.standard_normal((n, 3))
     still, none = np.tile(np.eye(4), (n, 1, 1)), np.full(n, 3)
-    camera, target = Side(still, none, a, none - 3, m), Side(still, none - 2, b, none - 1, still)
+    camera, target = (
+        Factors(still, none, a, none - 3, m),
+        Factors(still, none - 2, b, none - 1, still),
+    )
     each = np.repeat(np.power(noise, -2.0), 3)
     weights = np.tile(np.diag(each), (n, 1, 1))
     return LiftedSightings(camera, target, weights, np.full(n, 6.0)), places

@@ -3,7 +3,7 @@
 import numpy as np
 
 from flangeye.estimation.arm_parameters import parameters_of
-from flangeye.estimation.session import Asked, Session
+from flangeye.estimation.session import ModelOptions, Session
 from flangeye.models.cell import cell_of
 from flangeye.models.configuration import DEFAULT
 from tests.estimation import foreign
@@ -16,7 +16,7 @@ def told_of(kind: str, seed: int) -> tuple[np.ndarray, np.ndarray]:
     session = foreign.session(kind, arm, 3e-3, 40, seed)
     found = estimated(session, kind)
     cell = cell_of(DEFAULT, robot(arm["name"])[0])
-    told = parameters_of(Session([], cell, None, Asked(), found))
+    told = parameters_of(Session([], cell, None, ModelOptions(), found))
     e = session.errors
     true = np.column_stack([e.zeros, e.a, e.d, e.alpha])
     return ((told.values - true) / told.deviations)[told.identified], told.identified

@@ -21,7 +21,7 @@ from flangeye.motion import watchdog as guard_module
 from flangeye.motion.arm import GUARD, WatchedArm, _alarmed, run_number, watched
 from flangeye.motion.route import Router
 from flangeye.motion.supervision import RememberedState
-from flangeye.motion.watchdog import Charge, Watchdog
+from flangeye.motion.watchdog import GuardConfig, Watchdog
 from tests.motion.stand_in import (
     LIMITS,
     MODEL,
@@ -84,7 +84,7 @@ def test_samples_are_told_once_their_interval_is_over(asked: int, cycle: int) ->
     wire: Any = Wire(robot, [(0, ("samples", wanted)), (60, ("close", None))])
     told: list[tuple[int, Any]] = []
     wire.send = lambda report: told.append((robot.cycles, report))
-    Watchdog(robot, wire, Charge(lambda: robot, MODEL, LIMITS)).run()
+    Watchdog(robot, wire, GuardConfig(lambda: robot, MODEL, LIMITS)).run()
     ((when, report),) = [each for each in told if each[1].what == "samples"]
     assert when <= cycle
     assert report.content[-1].time_ns >= wanted[1]
@@ -299,7 +299,7 @@ def test_the_operator_stops_it_within_one_cycle(
     joints = robot.arm.stance.joints
     way = Router(MODEL, LIMITS, joints).route(joints, turned(joints, j1=0.8))
     wire: Any = Wire(robot, [(0, ("go", way)), (2000, ("close", None))])
-    guard = Watchdog(robot, wire, Charge(lambda: robot, MODEL, LIMITS, **{key: reading}))
+    guard = Watchdog(robot, wire, GuardConfig(lambda: robot, MODEL, LIMITS, **{key: reading}))
     wait = robot.wait_cycle
 
     def presses():
@@ -343,7 +343,7 @@ def test_a_program_that_dies_stops_the_arm() -> None:
     joints = robot.arm.stance.joints
     way = Router(MODEL, LIMITS, joints).route(joints, turned(joints, j1=0.8))
     wire: Any = Wire(robot, [(0, ("go", way)), (200, None)])
-    guard_module.guard(wire, Charge(lambda: robot, MODEL, LIMITS))
+    guard_module.guard(wire, GuardConfig(lambda: robot, MODEL, LIMITS))
     assert robot.closed
     assert ("stop", 200) in robot.asked
 
@@ -436,7 +436,7 @@ def held(what, seconds, cycle=300):
     joints = robot.arm.stance.joints
     way = Router(MODEL, LIMITS, joints).route(joints, turned(joints, j1=0.8))
     wire: Any = Wire(robot, [(0, ("go", way)), (4000, ("close", None))])
-    guard = Watchdog(robot, wire, Charge(lambda: robot, MODEL, LIMITS, alarm=reading))
+    guard = Watchdog(robot, wire, GuardConfig(lambda: robot, MODEL, LIMITS, alarm=reading))
     wait, now = robot.wait_cycle, [0.0]
 
     def passes():
@@ -477,7 +477,7 @@ def test_what_was_asked_before_a_guard_was_held_is_not_done_after_it() -> None:
     joints = robot.arm.stance.joints
     way = Router(MODEL, LIMITS, joints).route(joints, turned(joints, j1=0.8))
     wire: Any = Wire(robot, [(0, ("close", None))])
-    guard = Watchdog(robot, wire, Charge(lambda: robot, MODEL, LIMITS, alarm=reading))
+    guard = Watchdog(robot, wire, GuardConfig(lambda: robot, MODEL, LIMITS, alarm=reading))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(time, "monotonic", lambda: now[0])
         guard._turned = guard._heard = 0.0

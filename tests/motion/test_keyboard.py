@@ -9,7 +9,7 @@ from multiprocessing.connection import Connection
 import pytest
 
 from flangeye.motion.arm import keys
-from flangeye.motion.watchdog import Charge, Watchdog
+from flangeye.motion.watchdog import GuardConfig, Watchdog
 from tests.motion.stand_in import LIMITS, MODEL, StandIn
 
 
@@ -18,7 +18,7 @@ def test_only_the_space_bar_counts(typed: bytes, stops: bool) -> None:
     reading, writing = os.pipe()
     os.write(writing, typed) if typed else None
     robot, wire = StandIn(), Connection(os.open(os.devnull, os.O_RDWR))
-    guard = Watchdog(robot, wire, Charge(lambda: robot, MODEL, LIMITS, keyboard=reading))
+    guard = Watchdog(robot, wire, GuardConfig(lambda: robot, MODEL, LIMITS, keyboard=reading))
     assert guard._operator() == ("the space bar" if stops else None)
     assert guard._operator() is None  # it was read
 

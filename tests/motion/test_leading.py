@@ -9,9 +9,9 @@ import pytest
 from flangeye.devices import DeviceError, RobotDriver
 from flangeye.errors import RunStopped
 from flangeye.motion.arm import WatchedArm
-from flangeye.motion.executor import LedArm, led
+from flangeye.motion.executor import ServoArm, led
 from flangeye.motion.route import Leg, Route
-from flangeye.motion.watchdog import Charge, Report, Watchdog
+from flangeye.motion.watchdog import GuardConfig, Report, Watchdog
 from flangeye.types import BASE, FLANGE, Transform
 from tests.motion.stand_in import LIMITS, MODEL, StandIn, driver_of, elsewhere
 from tests.motion.test_guard import Wire, outside, protected
@@ -22,7 +22,7 @@ SIDEWAYS = np.array([0.0, 0.02, 0.0, 0.0, 0.0, 0.0])
 def guarded(robot, requests):
     """Return what a guard reports while the program says this; each at its cycle."""
     wire: Any = Wire(robot, [*requests, (2000, ("close", None))])
-    Watchdog(robot, wire, Charge(lambda: robot, MODEL, LIMITS)).run()
+    Watchdog(robot, wire, GuardConfig(lambda: robot, MODEL, LIMITS)).run()
     return wire.heard
 
 
@@ -77,7 +77,7 @@ def test_a_guard_that_waits_for_a_word_misses_no_cycle() -> None:
         return poll(seconds)
 
     wire.poll = polled
-    Watchdog(robot, wire, Charge(lambda: robot, MODEL, LIMITS)).run()
+    Watchdog(robot, wire, GuardConfig(lambda: robot, MODEL, LIMITS)).run()
     assert waited[0] == 0  # nobody leads yet
     assert 0 < max(waited) < robot.period
     assert waited[-1] == 0
@@ -125,7 +125,7 @@ def led_arm(*reports):
     state = StandIn().state()
     for report in (Report("opened", ("ur5e", 2e-3, state)), *reports):
         theirs.send(report)
-    return LedArm(WatchedArm(ours, lambda _: None)), theirs, state
+    return ServoArm(WatchedArm(ours, lambda _: None)), theirs, state
 
 
 def test_it_is_a_robot_whose_words_go_to_the_guard() -> None:

@@ -246,7 +246,7 @@ def adjoint(pose: Floats) -> Floats:
 
 
 @dataclass(frozen=True, eq=False)
-class Foreseen:
+class PredictedWork:
     """Predicted sightings at new poses of the work, for F components of the mixture.
 
     Attributes:
@@ -264,7 +264,7 @@ class Foreseen:
     squares: Floats
 
 
-def foreseen(found: Estimate, work: Work) -> Foreseen:
+def foreseen(found: Estimate, work: Work) -> PredictedWork:
     """Return the prediction of sightings at new poses of the work.
 
     It covers what errors of held-out poses consist of: the calibration's error, the arm's non-rigid
@@ -284,11 +284,11 @@ def foreseen(found: Estimate, work: Work) -> Foreseen:
         drawn.append((root @ rng.standard_normal((8, len(rows), 3, 1)))[..., 0])
         squares.append(np.trace(covariance, axis1=1, axis2=2).mean())
     means = np.array([rows @ each.mean for each in known.fits])
-    return Foreseen(rows, known.chances, means, np.array(drawn), np.array(squares))
+    return PredictedWork(rows, known.chances, means, np.array(drawn), np.array(squares))
 
 
 def expected_error(
-    there: Foreseen, answer: Floats, put_right: Floats | float = 0.0
+    there: PredictedWork, answer: Floats, put_right: Floats | float = 0.0
 ) -> ExpectedError:
     """Return the predictive spread of an answer at new poses of the work.
 

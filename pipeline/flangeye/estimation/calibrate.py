@@ -27,7 +27,7 @@ from flangeye.estimation.estimate import Estimate, estimate
 from flangeye.estimation.graph import Places, Problem
 from flangeye.estimation.mixed import marginal
 from flangeye.estimation.observability import meaningless, unobservable
-from flangeye.estimation.session import Asked, Session, session_of
+from flangeye.estimation.session import ModelOptions, Session, session_of
 from flangeye.estimation.sightings import roll_note
 from flangeye.estimation.threads import on_one_thread
 from flangeye.estimation.work import Work, work_of
@@ -70,7 +70,7 @@ class Options:
     mark: bool = False
     certify: bool = False
     work: Box | None = None
-    asked: Asked = field(default_factory=Asked)
+    asked: ModelOptions = field(default_factory=ModelOptions)
 
 
 @on_one_thread

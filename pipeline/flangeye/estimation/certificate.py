@@ -29,7 +29,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flangeye.estimation.lifted import Family, LiftedSightings, Squares, squares_of
+from flangeye.estimation.lifted import LiftedSightings, Pattern, Quadratic, squares_of
 from flangeye.types import Floats, Indices
 from flangeye.types.geometry import nearest_rotation, rotation_exp
 
@@ -84,7 +84,7 @@ def _across(features: Floats) -> Floats:
     return np.asarray(np.eye(features.shape[1]) - along.T @ along)
 
 
-def _elsewhere(squares: Squares, lack: Floats, count: int) -> Floats:
+def _elsewhere(squares: Quadratic, lack: Floats, count: int) -> Floats:
     """Return the best places found from the eigenvectors of the dual matrix's negative part."""
     tried = []
     # The three directions that lack most
@@ -135,7 +135,7 @@ class _Dual(NamedTuple):
     bounded: Floats
 
     @classmethod
-    def of(cls, bare: Floats, families: Sequence[Family]) -> _Dual:
+    def of(cls, bare: Floats, families: Sequence[Pattern]) -> _Dual:
         """Return the matrices of a quadratic form over the features of some families."""
         bounded = np.ones(len(bare))
         for family in families:

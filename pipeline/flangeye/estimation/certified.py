@@ -16,7 +16,7 @@ import numpy as np
 
 from flangeye.estimation.certificate import Certificate, certify
 from flangeye.estimation.estimate import Estimate
-from flangeye.estimation.lifted import LiftedSightings, Side, families_of
+from flangeye.estimation.lifted import Factors, LiftedSightings, families_of
 from flangeye.models.cell import Frame, chain
 from flangeye.types import Floats, Indices
 from flangeye.types.geometry import invert, rotation_exp, rotation_log
@@ -241,8 +241,8 @@ def _sightings(answer: CertifiedAnswer, root: str) -> LiftedSightings:
     )
 
 
-def _joined(sides: Sequence[Side]) -> Side:
-    return Side(*(np.concatenate([getattr(s, f.name) for s in sides]) for f in fields(Side)))
+def _joined(sides: Sequence[Factors]) -> Factors:
+    return Factors(*(np.concatenate([getattr(s, f.name) for s in sides]) for f in fields(Factors)))
 
 
 def _of_pair(answer: CertifiedAnswer, ends: tuple[str, str], root: str) -> LiftedSightings:
@@ -259,7 +259,7 @@ def _of_pair(answer: CertifiedAnswer, ends: tuple[str, str], root: str) -> Lifte
     )
 
 
-def _side(answer: CertifiedAnswer, way: Sequence[PathStep], times: Indices) -> Side:
+def _side(answer: CertifiedAnswer, way: Sequence[PathStep], times: Indices) -> Factors:
     """Return a path as one side of the equations: it has at most two unknown places."""
     index = {name: i for i, name in enumerate(answer.places)}
     still = np.tile(np.eye(4), (len(times), 1, 1))
@@ -273,7 +273,7 @@ def _side(answer: CertifiedAnswer, way: Sequence[PathStep], times: Indices) -> S
     # The last is after the last unknown; what is not there is none of them, and nothing between.
     lacking = 2 - len(unknown)
     (u, v), (a, b, c) = [len(index)] * lacking + unknown, [still] * lacking + known
-    return Side(a, np.full(len(times), u), b, np.full(len(times), v), c)
+    return Factors(a, np.full(len(times), u), b, np.full(len(times), v), c)
 
 
 def _measured(predicted: Floats, errors: Floats) -> Floats:

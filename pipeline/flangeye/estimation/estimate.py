@@ -19,7 +19,7 @@ from flangeye.estimation.mixed import (
     Fit,
     LinearModel,
     Posterior,
-    Sizes,
+    SizePrior,
     fit,
     left_out,
     mode_of,
@@ -90,7 +90,7 @@ class Estimate:
 
 def prior_of(
     effects: Sequence[Effect], counts: Sequence[int], scaled: int, scatters: Sequence[Scatter]
-) -> Sizes:
+) -> SizePrior:
     """Return the prior of the sizes of effects and noise; those of one cause share its quality."""
     # By how many times features may be better or worse than their fits state, one sigma: turns
     # and shifts, of whole poses along the line of sight and across it apart, for there cameras
@@ -109,7 +109,7 @@ def prior_of(
         if cause:
             mix[k, len(sized) + causes.index(cause)] = np.log(QUALITY)
     centre = np.log([size for size, _, _ in sized])
-    return Sizes(centre, mix, np.repeat(np.arange(len(effects)), counts))
+    return SizePrior(centre, mix, np.repeat(np.arange(len(effects)), counts))
 
 
 def model_at(

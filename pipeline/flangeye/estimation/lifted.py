@@ -29,7 +29,7 @@ its own axis has a smaller one."""
 
 
 @dataclass(frozen=True, eq=False)
-class Side:
+class Factors:
     """One side of the N equations, ``A U B V C``; ``u`` is None if it has at most one unknown.
 
     Attributes:
@@ -46,10 +46,10 @@ class Side:
     v: Indices
     c: Floats
 
-    def about(self, places: Floats) -> Side:
+    def about(self, places: Floats) -> Factors:
         """Return the same side with its unknowns as changes from places (K, 4, 4)."""
         every = np.concatenate([places, np.eye(4)[None]])
-        return Side(self.a @ every[self.u], self.u, self.b @ every[self.v], self.v, self.c)
+        return Factors(self.a @ every[self.u], self.u, self.b @ every[self.v], self.v, self.c)
 
     def at(self, places: Floats) -> Floats:
         """Evaluate this side of the N equations, (N, 4, 4), at values (K, 4, 4) of the unknowns."""
@@ -61,9 +61,9 @@ class Side:
         """Return (N, 2) the indices of U and V."""
         return np.stack([self.u, self.v], axis=1)
 
-    def where(self, which: Mask) -> Side:
+    def where(self, which: Mask) -> Factors:
         """Return the side for a subset of the sightings."""
-        return Side(*(getattr(self, f.name)[which] for f in fields(self)))
+        return Factors(*(getattr(self, f.name)[which] for f in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,13 +78,13 @@ class LiftedSightings:
             (its z), 3 of a centre.
     """
 
-    camera: Side
-    target: Side
+    camera: Factors
+    target: Factors
     weights: Floats
     freedoms: Floats
 
 
-class Family(NamedTuple):
+class Pattern(NamedTuple):
     """An unknown, the unknowns multiplied with it, and the indices of their features.
 
     Attributes:
@@ -124,21 +124,21 @@ class Family(NamedTuple):
         return np.append(1.0, places[self.first, :3, :3]), np.concatenate([np.ones(1), *each])
 
 
-def families_of(pairs: Collection[tuple[int, int]], count: int) -> tuple[list[Family], int]:
+def families_of(pairs: Collection[tuple[int, int]], count: int) -> tuple[list[Pattern], int]:
     """Return the families of K unknowns by their multiplied pairs, and the number of features."""
     firsts = {v: u for u, v in pairs}
-    out, size, shifts = list[Family](), 1, 3 * (count - len(firsts))
+    out, size, shifts = list[Pattern](), 1, 3 * (count - len(firsts))
     for k in sorted({*range(count)} - firsts.keys()):
         after = tuple(sorted(v for v, u in firsts.items() if u == k))
         more = 10 * (1 + 12 * len(after)) - 1
         at = np.append(0, size + np.arange(more)).reshape(10, -1)
-        out.append(Family(k, after, at, 3 * len(out) - shifts + np.arange(3)))
+        out.append(Pattern(k, after, at, 3 * len(out) - shifts + np.arange(3)))
         size += more
     return out, size
 
 
 @dataclass(frozen=True, eq=False)
-class Squares:
+class Quadratic:
     """The sum of squared errors as a quadratic form of n features, about given places.
 
     Attributes:
@@ -149,7 +149,7 @@ class Squares:
 
     quadratic: Floats
     shifts: Floats
-    families: Sequence[Family]
+    families: Sequence[Pattern]
 
     def features(self, places: Floats) -> Floats:
         """Return the features (n,) of places (K, 4, 4)."""
@@ -234,7 +234,7 @@ def _moves(place: Floats) -> Floats:
 # --- the quadratic -------------------------------------------------------------------------------
 
 
-def squares_of(sightings: LiftedSightings, places: Floats) -> Squares:
+def squares_of(sightings: LiftedSightings, places: Floats) -> Quadratic:
     """Return the squared errors as a quadratic in the change from places (K, 4, 4)."""
     sides = [side.about(places) for side in (sightings.camera, sightings.target)]
     index = np.concatenate([side.unknowns for side in sides], axis=1)
@@ -248,10 +248,10 @@ def squares_of(sightings: LiftedSightings, places: Floats) -> Squares:
         rows, at = np.concatenate([left, -right], axis=2), np.concatenate(columns)
         told = np.einsum("nri,nrs,nsj->ij", rows, weights[of], rows, optimize=True)
         np.add.at(whole, np.ix_(at, at), told)
-    return Squares(*_without_shifts(whole, size), families)
+    return Quadratic(*_without_shifts(whole, size), families)
 
 
-def _linear(side: Side, families: Sequence[Family]) -> tuple[Floats, Indices]:
+def _linear(side: Factors, families: Sequence[Pattern]) -> tuple[Floats, Indices]:
     """Return (N, 12, m) entries of one side by m features or translations, and their indices."""
     u, v = (int(each) for each in side.unknowns[0])
     family = next((f for f in families if v in (f.first, *f.after)), None)

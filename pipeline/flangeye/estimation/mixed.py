@@ -35,7 +35,7 @@ TELLING = 150
 
 
 @dataclass(frozen=True, eq=False)
-class Sizes:
+class SizePrior:
     """Prior of the logarithms of all sizes: log s = centre + mix @ z, with z standard normal.
 
     Attributes:
@@ -81,7 +81,7 @@ class LinearModel:
     factors: Indices
     still: Floats
     projectors: Floats
-    sizes: Sizes
+    sizes: SizePrior
     shares: Floats
 
     def noise(self, sizes: Floats) -> Floats:
@@ -340,7 +340,7 @@ def shares(known: Posterior, rows: Floats) -> tuple[Floats, Floats]:
     return of_effects, np.asarray(whole - of_effects.sum(axis=0))
 
 
-class Mode(NamedTuple):
+class Peak(NamedTuple):
     """The most likely sizes.
 
     Attributes:
@@ -352,7 +352,7 @@ class Mode(NamedTuple):
     spread: Floats
 
 
-def mode_of(model: LinearModel, start: Floats | None = None) -> Mode:
+def mode_of(model: LinearModel, start: Floats | None = None) -> Peak:
     """Return the most likely sizes, searched from a start or from the prior medians."""
     prior, model = model.sizes, model.telling()
     z = np.zeros(prior.mix.shape[1]) if start is None else start
@@ -375,7 +375,7 @@ def mode_of(model: LinearModel, start: Floats | None = None) -> Mode:
         z, here = better
     # The symmetric root: eigenvectors have no sign of their own, and draws are to be the same for
     # sessions that differ by rounding
-    return Mode(z, np.asarray(vectors / np.sqrt(values) @ vectors.T))
+    return Peak(z, np.asarray(vectors / np.sqrt(values) @ vectors.T))
 
 
 def _better(model: LinearModel, z: Floats, here: Fit, step: Floats) -> tuple[Floats, Fit] | None:
@@ -388,7 +388,7 @@ def _better(model: LinearModel, z: Floats, here: Fit, step: Floats) -> tuple[Flo
     return None
 
 
-def posterior(model: LinearModel, mode: Mode, at_mode: Fit) -> Posterior:
+def posterior(model: LinearModel, mode: Peak, at_mode: Fit) -> Posterior:
     """Return the joint posterior, with the sizes marginalised by sampling about their mode."""
     (z, spread), some, prior = mode, model.telling(), model.sizes
     fits, logs = [], []

@@ -35,7 +35,7 @@ Move = tuple[str, tuple[float, ...]]
 
 
 @dataclass(frozen=True, eq=False)
-class WeakMoves:
+class WeakModes:
     """Moves of the unknowns that are known less well than they have to be, the weakest first.
 
     Attributes:
@@ -50,7 +50,7 @@ class WeakMoves:
         return bool(self.moves.size)
 
 
-def weak_moves(information: Floats, limits: Floats) -> WeakMoves:
+def weak_moves(information: Floats, limits: Floats) -> WeakModes:
     """Return the directions of P unknowns whose standard deviation exceeds its limit.
 
     Args:
@@ -61,12 +61,12 @@ def weak_moves(information: Floats, limits: Floats) -> WeakMoves:
     values, vectors = np.linalg.eigh(information * np.outer(limits, limits))
     weak = values < 1.0
     excess = 1.0 / np.sqrt(np.maximum(values[weak], 1e-12))
-    return WeakMoves(limits[:, None] * vectors[:, weak], excess)
+    return WeakModes(limits[:, None] * vectors[:, weak], excess)
 
 
 def telling(
     information: Floats, limits: Floats, further: Mapping[Motion, Floats]
-) -> tuple[list[Motion], WeakMoves]:
+) -> tuple[list[Motion], WeakModes]:
     """Return motions, chosen greedily, that make the weak moves observable, and what stays weak.
 
     Each step chooses the motion that determines the weak moves best.
@@ -89,7 +89,7 @@ def telling(
     return chosen, weak
 
 
-def _weakness(weak: WeakMoves) -> float:
+def _weakness(weak: WeakModes) -> float:
     # Known a thousand times worse than its limit is not known at all
     return float(np.log(np.minimum(weak.excess, 1e3)).sum())
 
@@ -350,7 +350,7 @@ def unobservable(
             f"{_of_what(problem, directions)}: {missing_motion(problem, places)}"
         )
     raise CalibrationRefused(
-        _refusal(problem, places, (information, scale), WeakMoves(moves, weak.excess), freedoms)
+        _refusal(problem, places, (information, scale), WeakModes(moves, weak.excess), freedoms)
     )
 
 
@@ -461,7 +461,7 @@ def _refusal(
     problem: Problem,
     places: Places,
     known: tuple[Floats, Floats],
-    weak: WeakMoves,
+    weak: WeakModes,
     freedoms: Mapping[str, Floats] | None,
 ) -> str:
     """Return which frames are not observable, and the motions or sightings that would help."""
@@ -481,7 +481,7 @@ def _refusal(
     )
 
 
-def _named(problem: Problem, weak: WeakMoves, scale: Floats) -> list[str]:
+def _named(problem: Problem, weak: WeakModes, scale: Floats) -> list[str]:
     share = np.abs(weak.moves / scale[:, None]).reshape(len(problem.unknown), -1).max(axis=1)
     return [name for name, most in zip(problem.unknown, share, strict=True) if most > NAMED]
 

@@ -23,7 +23,7 @@ from flangeye.estimation.estimate import Estimate, judged, model_at
 from flangeye.estimation.graph import Places, Problem
 from flangeye.estimation.mixed import Fit, LinearModel, fit, left_out, marginal
 from flangeye.estimation.observability import unobservable
-from flangeye.estimation.session import Asked, effects_of
+from flangeye.estimation.session import ModelOptions, effects_of
 from flangeye.estimation.sightings import problem_of
 from flangeye.estimation.start import agreeing, begin
 from flangeye.estimation.threads import on_one_thread
@@ -44,7 +44,7 @@ from flangeye.types.geometry import hat, invert, stack_rows
 
 
 @dataclass(frozen=True, eq=False)
-class Rough:
+class Preview:
     """A quick estimate with all sizes at their prior medians, for planning and diagnosis.
 
     Attributes:
@@ -77,7 +77,7 @@ class Rough:
 @on_one_thread
 def rough(
     problem: Problem, freedoms: Mapping[str, Floats] | None = None, search: bool = True
-) -> Rough:
+) -> Preview:
     """Return a quick estimate; see :func:`begin` for ``search``.
 
     Raises:
@@ -85,7 +85,7 @@ def rough(
             unobservable.
     """
     places, squares = begin(problem, search)
-    agree, effects = agreeing(problem, squares), effects_of(problem, None, Asked())
+    agree, effects = agreeing(problem, squares), effects_of(problem, None, ModelOptions())
     for _ in range(2):
         model = model_at(problem, places, effects, agree.astype(float))
         found = fit(model, model.sizes.at(np.zeros(model.sizes.mix.shape[1])))
@@ -96,17 +96,17 @@ def rough(
     unobservable(
         problem.where(agree), places, known, (float(np.radians(2)), 20e-3), False, freedoms
     )
-    return Rough(problem, places, effects, model, found, agree)
+    return Preview(problem, places, effects, model, found, agree)
 
 
-def so_far(observations: Sequence[Observation], cell: Cell) -> Rough | None:
+def so_far(observations: Sequence[Observation], cell: Cell) -> Preview | None:
     """Return the estimate from the sightings so far; None while an unknown is unobservable."""
     with suppress(FlangeyeError, np.linalg.LinAlgError):
         return rough(problem_of(observations, cell), cell.freedoms)
     return None
 
 
-def errors_at_work(found: Rough, cell: Cell, seen: Sequence[Observation]) -> dict[str, float]:
+def errors_at_work(found: Preview, cell: Cell, seen: Sequence[Observation]) -> dict[str, float]:
     """Return each unknown frame's 95 % bound of the error at its work [m]."""
     work = work_of_frames(found, cell, seen)
     return {
@@ -115,13 +115,13 @@ def errors_at_work(found: Rough, cell: Cell, seen: Sequence[Observation]) -> dic
     }
 
 
-def _blocks(found: Rough) -> list[Floats]:
+def _blocks(found: Preview) -> list[Floats]:
     """Return the (6, 6) covariance of each place."""
     covariance = found.covariance
     return [covariance[i : i + 6, i : i + 6] for i in range(0, len(covariance), 6)]
 
 
-def work_of_frames(found: Rough, cell: Cell, seen: Sequence[Observation]) -> Mapping[str, Floats]:
+def work_of_frames(found: Preview, cell: Cell, seen: Sequence[Observation]) -> Mapping[str, Floats]:
     """Return points (k, 3) at which each unknown frame must be accurate, in its parent [m].
 
     The points of a camera are where it saw targets; those of other frames are about the origin.
@@ -164,7 +164,7 @@ def most_telling(
 
 
 def best_next(
-    candidates: Sequence[Observation], found: Rough, cell: Cell, seen: Sequence[Observation]
+    candidates: Sequence[Observation], found: Preview, cell: Cell, seen: Sequence[Observation]
 ) -> int:
     """Return the candidate that is expected to reduce the error at the work most.
 
@@ -217,7 +217,7 @@ def _moved(like: Feature, pose: Floats) -> Feature:
 
 
 def whitened(
-    sightings: Sequence[Observation], found: Rough | Estimate, cell: Cell
+    sightings: Sequence[Observation], found: Preview | Estimate, cell: Cell
 ) -> tuple[Floats, Floats]:
     """Return the whitened (M, 6, P + K) rows of sightings and their (M, 6) errors."""
     problem = problem_of(sightings, cell)
@@ -227,7 +227,7 @@ def whitened(
     return roots @ model.design, (roots @ model.residuals[..., None])[..., 0]
 
 
-def _levers(found: Rough, cell: Cell, seen: Sequence[Observation]) -> Floats:
+def _levers(found: Preview, cell: Cell, seen: Sequence[Observation]) -> Floats:
     """Return (A, P + K) equally weighted derivatives of all frames' work points."""
     blocks, work = [], work_of_frames(found, cell, seen)
     for i, (name, points) in enumerate(work.items()):

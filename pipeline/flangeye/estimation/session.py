@@ -41,7 +41,7 @@ CONFIGURED = (
 
 
 @dataclass(frozen=True)
-class Asked:
+class ModelOptions:
     """Options of a solver that change the model.
 
     Attributes:
@@ -73,7 +73,7 @@ class Session:
     observations: Sequence[Observation]
     cell: Cell
     scanner: ScannerModel | None
-    asked: Asked
+    asked: ModelOptions
     found: Estimate
     notes: tuple[Note, ...] = ()
     tool_offset: Floats = field(default_factory=lambda: np.zeros(3))
@@ -109,7 +109,7 @@ def session_of(
     observations: Sequence[Observation],
     cell: Cell,
     scanner: ScannerModel | None,
-    asked: Asked = Asked(),
+    asked: ModelOptions = ModelOptions(),
 ) -> Session:
     """Return the estimate from a cell's observations.
 
@@ -137,7 +137,7 @@ def session_of(
     return _with_offset(_with_size(_on_one_clock(session), factor))
 
 
-def effects_of(problem: Problem, scanner: ScannerModel | None, asked: Asked) -> list[Effect]:
+def effects_of(problem: Problem, scanner: ScannerModel | None, asked: ModelOptions) -> list[Effect]:
     """Return all error sources of a cell."""
     arms = dict.fromkeys(carrier.arm for carrier in problem.carriers)
     return [
@@ -308,7 +308,7 @@ def _with_joints(problem: Problem, arm: str, joints: Floats | None) -> Problem:
 
 def _cost(problem: Problem, places: Places) -> float:
     """Return -2 log of the restricted likelihood at the prior medians of the sizes."""
-    effects = [effect for effect in effects_of(problem, None, Asked()) if effect.lasting]
+    effects = [effect for effect in effects_of(problem, None, ModelOptions()) if effect.lasting]
     model = model_at(problem, places, effects, np.ones(len(problem.seen)))
     return fit(model, model.sizes.at(np.zeros(model.sizes.mix.shape[1]))).cost
 

@@ -23,7 +23,7 @@ from flangeye.motion.supervision import RememberedState
 from flangeye.motion.watchdog import (
     BEAT,
     LEADING,
-    Charge,
+    GuardConfig,
     Report,
     guard,
     take_precedence,
@@ -170,7 +170,7 @@ def watched(
     Raises:
         DeviceError: The arm cannot be opened, or must not be moved.
     """
-    charge = Charge(driver.open, model, limits)
+    charge = GuardConfig(driver.open, model, limits)
     ours, theirs = multiprocessing.Pipe()
     start = _in_thread if driver.in_this_process else _in_process
     with ours, start(ours, theirs, charge):
@@ -183,7 +183,7 @@ def watched(
 
 
 @contextmanager
-def _in_thread(ours: Connection, theirs: Connection, charge: Charge) -> Iterator[None]:
+def _in_thread(ours: Connection, theirs: Connection, charge: GuardConfig) -> Iterator[None]:
     thread = threading.Thread(target=guard, args=(theirs, charge), name="guard", daemon=True)
     thread.start()
     try:
@@ -194,7 +194,7 @@ def _in_thread(ours: Connection, theirs: Connection, charge: Charge) -> Iterator
 
 
 @contextmanager
-def _in_process(ours: Connection, theirs: Connection, charge: Charge) -> Iterator[None]:
+def _in_process(ours: Connection, theirs: Connection, charge: GuardConfig) -> Iterator[None]:
     spawn = multiprocessing.get_context("spawn")
     heard, alarm = multiprocessing.Pipe(duplex=False)
     keep_current_folder_out()

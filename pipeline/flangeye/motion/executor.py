@@ -146,10 +146,10 @@ def led(driver: RobotDriver, model: RobotModel, limits: MotionLimits) -> Iterato
             yield robot
         return
     with watched(driver, model, limits) as arm:
-        yield LedArm(arm)
+        yield ServoArm(arm)
 
 
-class LedArm(Device):
+class ServoArm(Device):
     """A servoed arm, as the control loop sees it; see :class:`flangeye.devices.Robot`.
 
     A safety fault raises DeviceError where the next cycle is waited for, a stop by the operator

@@ -63,7 +63,7 @@ AT_REST = 1.0
 """Longest silence of program or guard while the arm stands, and of a program that led it [s]."""
 
 
-class Charge(NamedTuple):
+class GuardConfig(NamedTuple):
     """Configuration of a guard process.
 
     Attributes:
@@ -94,7 +94,7 @@ class Report(NamedTuple):
     content: Any = None
 
 
-def watchdog_process(wire: Connection, charge: Charge, alarm: Connection) -> None:
+def watchdog_process(wire: Connection, charge: GuardConfig, alarm: Connection) -> None:
     """Guard an arm until the program disconnects; main function of the guard process."""
     for told in STOPS:
         signal.signal(told, signal.SIG_IGN)  # the alarm pipe reports it sooner
@@ -105,7 +105,7 @@ def watchdog_process(wire: Connection, charge: Charge, alarm: Connection) -> Non
     guard(wire, charge._replace(alarm=alarm.fileno(), keyboard=keyboard))
 
 
-def guard(wire: Connection, charge: Charge) -> None:
+def guard(wire: Connection, charge: GuardConfig) -> None:
     """Open the arm and guard it until the program disconnects."""
     try:
         with charge.open() as robot:
@@ -121,7 +121,7 @@ def guard(wire: Connection, charge: Charge) -> None:
 class Watchdog:
     """Guards one arm."""
 
-    def __init__(self, robot: Robot, wire: Connection, charge: Charge) -> None:
+    def __init__(self, robot: Robot, wire: Connection, charge: GuardConfig) -> None:
         self._robot, self._wire, self._charge = robot, wire, charge
         self._supervisor = Supervisor(charge.model, charge.limits, isinstance(robot, MovedByHand))
         self._legs: list[Leg] = []

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import Field
 
 from flangeye.errors import StageError
-from flangeye.estimation.plan import Rough, best_next, foreseen, foreseen_poses, so_far
+from flangeye.estimation.plan import Preview, best_next, foreseen, foreseen_poses, so_far
 from flangeye.maths.kinematics import Arm
 from flangeye.models.cell import Axis, Cell, chain
 from flangeye.plugin.stage import PlaceParams
@@ -89,7 +89,7 @@ class NextBest:
         self._planned, self._left = planned, list(planned.scheduled)
         self._rng = np.random.default_rng(len(planned.scheduled))
         self._taken: set[int] = set()
-        self._found: Rough | None = None
+        self._found: Preview | None = None
 
     def sightings(self, seen: Callable[[], Sequence[Observation]]) -> Iterator[Sighting]:
         """Yield at most as many sightings as were scheduled."""
@@ -114,7 +114,7 @@ class NextBest:
         best = foreseen[best_next(foreseen, self._found, cell, seen)]
         return int(best.id), best.camera, best.target
 
-    def _in_view(self, like: Observation, found: Rough) -> list[Observation]:
+    def _in_view(self, like: Observation, found: Preview) -> list[Observation]:
         """Return random moments at which a pair is in view, by the present estimate."""
         moments = self._planned.moments
         # Moments that are compared for each camera and target

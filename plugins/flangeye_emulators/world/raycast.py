@@ -89,7 +89,7 @@ def pixels_of(scanner: ScannerModel, resolution: float = 1.0) -> Pixels:
     )
 
 
-class _Met(NamedTuple):
+class _Crossings(NamedTuple):
     """Intersections of an array of rays (...).
 
     Attributes:
@@ -165,11 +165,11 @@ class RaycastScene:
         slants.ravel()[between] = _dot(exact.normals, x, y, 1)
         return Hits(depth, body, slants, met.normals, between, exact.normals)
 
-    def _cast(self, rays: Any) -> _Met:
+    def _cast(self, rays: Any) -> _Crossings:
         found = self._scene.cast_rays(rays, nthreads=1)
         body = np.minimum(found["geometry_ids"].numpy(), len(self.materials)).astype(np.uint8)
         normals = np.moveaxis(found["primitive_normals"].numpy(), -1, 0)
-        return _Met(found["t_hit"].numpy(), body, np.ascontiguousarray(normals))
+        return _Crossings(found["t_hit"].numpy(), body, np.ascontiguousarray(normals))
 
     def hidden(self, light: Floats, pixels: Pixels, depth: Image, wanted: Mask) -> Mask:
         """Return the mask (H, W) of pixels whose points are in shadow; exact where ``wanted``.
@@ -262,7 +262,7 @@ def _beams(light: Floats, pixels: Pixels, depth: Image, at: Indices) -> Any:
     return _rays(light, *(c - np.float32(of) for c, of in zip((x, y, z), light, strict=True)))
 
 
-def _is_flat(met: _Met, away: Image) -> Mask:
+def _is_flat(met: _Crossings, away: Image) -> Mask:
     """Return the mask of samples that lie with their eight neighbours in one plane of one body.
 
     Args:

@@ -36,7 +36,7 @@ class OrientedPoints(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Met:
+class Crossings:
     """Intersections of rays with a body.
 
     Attributes:
@@ -115,7 +115,7 @@ class Shape:
         areas = np.abs(spread_directions(128) @ hull.face_normals.T) @ hull.area_faces / 2
         return float(areas.max())
 
-    def meet(self, origin: Floats, directions: Floats) -> Met:
+    def meet(self, origin: Floats, directions: Floats) -> Crossings:
         """Return the first intersections of rays from ``origin`` (3,) or (N, 3) along (N, 3)."""
         import open3d as o3d
 
@@ -125,7 +125,7 @@ class Shape:
         depth = found["t_hit"].numpy().astype(np.float64)
         facet = np.where(np.isfinite(depth), found["primitive_ids"].numpy(), 0)
         uv = found["primitive_uvs"].numpy().astype(np.float64)
-        return Met(self, directions, depth, facet, uv)
+        return Crossings(self, directions, depth, facet, uv)
 
     @property
     def facets(self) -> tuple[Floats, Indices]:

@@ -42,7 +42,7 @@ Later = Callable[[float], tuple[Floats, Mask]]
 """Gives an arm's poses after a delay [s], and the samples that have one."""
 
 
-class OtherOrder(NamedTuple):
+class Reordered(NamedTuple):
     """Poses of other moments: the session with them, and the samples that have one."""
 
     session: RecordedSession
@@ -92,7 +92,7 @@ def _gains(session: RecordedSession, by: int, starts: Indices) -> Floats:
     return np.asarray(found.likelihood - given.likelihood[against])
 
 
-def _shifted(session: RecordedSession, arms: Arms, by: int, start: int) -> OtherOrder:
+def _shifted(session: RecordedSession, arms: Arms, by: int, start: int) -> Reordered:
     where = {"shift_from": session.ids[start]} if start else {}
 
     def change(poses: Floats) -> tuple[Floats, Mask]:
@@ -101,7 +101,7 @@ def _shifted(session: RecordedSession, arms: Arms, by: int, start: int) -> Other
     return _at_other_times(session, change, arms, shift=by, **where)
 
 
-def _backwards(session: RecordedSession) -> OtherOrder:
+def _backwards(session: RecordedSession) -> Reordered:
     def change(poses: Floats) -> tuple[Floats, Mask]:
         return poses[::-1], np.ones(len(poses), dtype=bool)
 
@@ -110,7 +110,7 @@ def _backwards(session: RecordedSession) -> OtherOrder:
 
 def _at_other_times(
     session: RecordedSession, change: Change, arms: Arms, **correction: Any
-) -> OtherOrder:
+) -> Reordered:
     """Return the session with what the controllers said at other times, the links with it."""
     moved, known = change(session.poses)
 
@@ -120,7 +120,7 @@ def _at_other_times(
     read = session.corrected(alike, arms, **correction)
     if session.links is not None:
         read = replace(read, links=alike(session.links))
-    return OtherOrder(read, known, arms)
+    return Reordered(read, known, arms)
 
 
 @part("check.clock")
@@ -152,7 +152,7 @@ def clock(session: RecordedSession) -> Findings:
     yield finer.finding("time offset", what, corrected_session)
 
 
-def _delays(session: RecordedSession, delays: Floats, arms: Sequence[Arms]) -> list[OtherOrder]:
+def _delays(session: RecordedSession, delays: Floats, arms: Sequence[Arms]) -> list[Reordered]:
     made: dict[int, Later] = {}
 
     def later_of(poses: Floats) -> Later:
@@ -165,7 +165,7 @@ def _delays(session: RecordedSession, delays: Floats, arms: Sequence[Arms]) -> l
 
 def _delayed(
     session: RecordedSession, later_of: Callable[[Floats], Later], arms: Arms, delay: float
-) -> OtherOrder:
+) -> Reordered:
     def change(poses: Floats) -> tuple[Floats, Mask]:
         if session.motions is None or poses is not session.poses:
             return later_of(poses)(delay)
@@ -177,7 +177,7 @@ def _delayed(
 
 def _evidence(
     session: RecordedSession,
-    others: Sequence[OtherOrder],
+    others: Sequence[Reordered],
     further: int = 0,
     tried: int | None = None,
 ) -> Significance | None:
@@ -190,7 +190,7 @@ def _evidence(
 
 
 def _fits(
-    session: RecordedSession, others: Sequence[OtherOrder]
+    session: RecordedSession, others: Sequence[Reordered]
 ) -> tuple[VariantFits, VariantFits, Indices] | None:
     """Return fits as given, of the others, and which of the former has the samples of each."""
     known = np.array([other.known for other in others])

@@ -44,7 +44,7 @@ _WAYS: Mapping[str, tuple[Change, str]] = {
 }
 
 
-class Rereading(NamedTuple):
+class Reread(NamedTuple):
     """A session whose rotations were read again in another convention.
 
     Attributes:
@@ -72,7 +72,7 @@ def convention(session: RecordedSession) -> Findings:
         yield evidence.finding("pose convention", what, found.session)
 
 
-def _written_otherwise(session: RecordedSession) -> Iterator[Rereading]:
+def _written_otherwise(session: RecordedSession) -> Iterator[Reread]:
     """Yield the recordings read again, their written numbers taken in another convention."""
     if session.again is None:
         return
@@ -90,7 +90,7 @@ def _written_otherwise(session: RecordedSession) -> Iterator[Rereading]:
             with suppress(StageError):  # the numbers are not poses in it
                 read = session.again(changes if of_arm else {}, changes if of_target else {})
                 if read.ids == session.ids:
-                    yield Rereading(read, name, spelt(*said), spelt(*other))
+                    yield Reread(read, name, spelt(*said), spelt(*other))
 
 
 def _said(session: RecordedSession, of: str | None = None) -> RotationConvention | None:
@@ -109,14 +109,14 @@ def _params(session: RecordedSession, of: str | None = None) -> Mapping[str, Any
     return stated if isinstance(stated, Mapping) else {}
 
 
-def _of_arms(session: RecordedSession) -> Iterator[Rereading]:
+def _of_arms(session: RecordedSession) -> Iterator[Reread]:
     for arms in session.arms:
         whose = "the" if session.seconds is None else named(arms, session)
         for read_as, written_as in _readings(_stated(session)):
             reread_session = session.corrected(
                 _rereading(read_as, written_as), arms, robot={"rotation": [read_as, written_as]}
             )
-            yield Rereading(
+            yield Reread(
                 reread_session,
                 f"{whose} rotations",
                 spelt(read_as),
@@ -124,7 +124,7 @@ def _of_arms(session: RecordedSession) -> Iterator[Rereading]:
             )
 
 
-def _of_markers(session: RecordedSession) -> Iterator[Rereading]:
+def _of_markers(session: RecordedSession) -> Iterator[Reread]:
     """Yield other readings of ready-made markers' rotations, alone and with the arms'."""
     if not _has_ready_made_markers(session):
         return
@@ -133,11 +133,11 @@ def _of_markers(session: RecordedSession) -> Iterator[Rereading]:
         change = _rereading(read_as, written_as)
         told = {"rotation": [read_as, written_as]}
         alone = _with_markers(session, change).read_with(target=told)
-        yield Rereading(alone, "the markers' rotations", spelt(read_as), spelt(written_as))
+        yield Reread(alone, "the markers' rotations", spelt(read_as), spelt(written_as))
         if stated == _stated(session):
             both = _with_markers(session, change).corrected(change, "both", robot=told, target=told)
             whose = "the rotations of robot and markers"
-            yield Rereading(both, whose, spelt(read_as), spelt(written_as))
+            yield Reread(both, whose, spelt(read_as), spelt(written_as))
 
 
 def _has_ready_made_markers(session: RecordedSession) -> bool:

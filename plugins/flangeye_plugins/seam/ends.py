@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flangeye.types import Floats, Mask
-from flangeye_plugins.seam.sweep import Swept
+from flangeye_plugins.seam.sweep import Sweep
 from flangeye_plugins.seam.template import EDGES, Section
 
 FEWEST_LANES = 5
@@ -41,7 +41,7 @@ def last_in_lanes(lanes: Floats, way: Floats, pitch: float) -> tuple[NDArray[np.
 
 
 def face_ends(
-    swept: Swept, local: Floats, pitch: float, tolerance: float
+    swept: Sweep, local: Floats, pitch: float, tolerance: float
 ) -> tuple[Floats, NDArray[np.intp]]:
     """Return local points (K, 5) at the faces' ends at upright edges, and each one's edge (K,)."""
     joint, section = swept.section.joint, swept.section
@@ -203,7 +203,7 @@ def _directions(sight: Floats) -> tuple[Floats, Floats]:
     return sight / lengths[:, None], lengths
 
 
-def surfaces(swept: Swept, local: Floats, tolerance: float) -> dict[int, Mask]:
+def surfaces(swept: Sweep, local: Floats, tolerance: float) -> dict[int, Mask]:
     """Return the masks (N,) of points on each surface that must be visible, near the seam."""
     section = swept.section
     q = swept.in_section(local)

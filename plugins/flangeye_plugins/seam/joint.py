@@ -32,9 +32,9 @@ from flangeye_plugins.seam.planned import (
     refuse_outside,
 )
 from flangeye_plugins.seam.points import normals_of
-from flangeye_plugins.seam.rough import Course, JointPlace, Spline, course, rough_path
+from flangeye_plugins.seam.rough import Curve, JointPlace, Spline, course, rough_path
 from flangeye_plugins.seam.stitched import PlacedScan, seen_in_base
-from flangeye_plugins.seam.sweep import WIDE, Swept, fitted, swept_from
+from flangeye_plugins.seam.sweep import WIDE, Sweep, fitted, swept_from
 from flangeye_plugins.seam.template import EDGES, FACES, JOINTS, JointShape
 
 STAGE = "seam.joint"
@@ -72,8 +72,8 @@ class Found:
         deviations: Standard deviations of both ends [m]; infinite for an end that was not seen.
     """
 
-    course: Course
-    swept: Swept
+    course: Curve
+    swept: Sweep
     local: Floats
     pitch: float
     rays: Rays
@@ -154,7 +154,7 @@ def _refuse_apart(seen: PlacedScan) -> None:
         )
 
 
-def _rough(seen: PlacedScan, params: JointParams, seam: Seam | None) -> Course:
+def _rough(seen: PlacedScan, params: JointParams, seam: Seam | None) -> Curve:
     """Return frames along the rough line, in ``camera``."""
     if params.line is None and seam is None:
         raise StageError(f"{STAGE}: no rough seam line; write line:, or put a seam step before it")
@@ -175,7 +175,7 @@ def _rough(seen: PlacedScan, params: JointParams, seam: Seam | None) -> Course:
     return course(line, seen.eyes, params.closed, params.reach)
 
 
-def _found(seen: PlacedScan, rough: Course, params: JointParams) -> Found:
+def _found(seen: PlacedScan, rough: Curve, params: JointParams) -> Found:
     """Return the fitted joint with its ends."""
     box = params.reach + WIDE + 10e-3
     points = seen.points
@@ -220,7 +220,7 @@ def _solid(points: Floats) -> tuple[float, Floats]:
     return pitch, points[third <= 2.5 * pitch]
 
 
-def _placed(rough: Course, local: Floats, normals: Floats, params: JointParams) -> list[JointPlace]:
+def _placed(rough: Curve, local: Floats, normals: Floats, params: JointParams) -> list[JointPlace]:
     """Return the joint's positions along the rough line, one per slab."""
     joint = JOINTS[params.joint]
     joints: tuple[JointShape, ...] = (joint,)
@@ -309,7 +309,7 @@ def _line(found: Found) -> tuple[Floats, Floats, Floats]:
     return line, openings, covariance
 
 
-def _half_width(swept: Swept) -> float | None:
+def _half_width(swept: Sweep) -> float | None:
     """Return half the joint's width: the mean distance of the faces' ends from the opening [m]."""
     section = swept.section
     if section.joint.gap:

@@ -320,7 +320,7 @@ class Spline:
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
+class Curve:
     """Frames along a line.
 
     Attributes:
@@ -381,13 +381,13 @@ class Course:
         origin, axes = self.at(local[:, 0])
         return np.asarray(origin + np.einsum("ni,nij->nj", local[:, 1:], axes[:, 1:]))
 
-    def moved(self, y: Floats, z: Floats, roll: Floats) -> Course:
+    def moved(self, y: Floats, z: Floats, roll: Floats) -> Curve:
         """Return frames along this line, moved by y and z (K,) [m] and rolled (K,) [rad]."""
         points = self.points + y[:, None] * self.axes[:, 1] + z[:, None] * self.axes[:, 2]
         out = np.cos(roll)[:, None] * self.axes[:, 2] + np.sin(roll)[:, None] * self.axes[:, 1]
         return _with_openings(points, out, self.closed, self.eyes)
 
-    def through(self, places: Sequence[JointPlace]) -> Course:
+    def through(self, places: Sequence[JointPlace]) -> Curve:
         """Return frames along a smooth line through the places of a joint."""
         s = np.array([place.s for place in places])
         origin, axes = self.at(s)
@@ -400,7 +400,7 @@ class Course:
         return _with_openings(led[:, :3], led[:, 3:], self.closed, self.eyes)
 
 
-def course(line: Floats, eyes: Floats, closed: bool, beyond: float) -> Course:
+def course(line: Floats, eyes: Floats, closed: bool, beyond: float) -> Curve:
     """Return frames along a rough line (N, 3), extended straight by ``beyond`` at open ends [m].
 
     "Out of the work" is the direction to the nearest scanner position (P, 3), which sees the seam.
@@ -445,7 +445,7 @@ def _smoothed(points: Floats, cells: float, closed: bool) -> Floats:
     return np.asarray(chord + bent[len(points) - 1 : 2 * len(points) - 1])
 
 
-def _with_openings(points: Floats, openings: Floats, closed: bool, eyes: Floats) -> Course:
+def _with_openings(points: Floats, openings: Floats, closed: bool, eyes: Floats) -> Curve:
     """Return frames at even steps along a line with openings."""
     line = np.vstack([points, points[:1]]) if closed else points
     arc = arc_lengths(line)
@@ -460,7 +460,7 @@ def _with_openings(points: Floats, openings: Floats, closed: bool, eyes: Floats)
         along = np.gradient(even, axis=0)
     x = _unit(along)
     z = _unit(out - np.einsum("ni,ni->n", out, x)[:, None] * x)
-    return Course(even, np.stack([x, np.cross(z, x), z], axis=1), step, closed, eyes)
+    return Curve(even, np.stack([x, np.cross(z, x), z], axis=1), step, closed, eyes)
 
 
 def _unit(vectors: Floats) -> Floats:

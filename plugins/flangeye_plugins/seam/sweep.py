@@ -22,7 +22,7 @@ WIDE = 18e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Swept:
+class Sweep:
     """A cross-section, swept along a line.
 
     Attributes:
@@ -49,18 +49,18 @@ class Swept:
         return np.asarray(np.einsum("ni,aibj,nj->nab", basis, blocks, basis))
 
 
-def swept_from(places: list[JointPlace], length: float, closed: bool) -> Swept:
+def swept_from(places: list[JointPlace], length: float, closed: bool) -> Sweep:
     """Return the start of the fit from places along the line."""
     s = np.array([p.s for p in places])
     values = np.column_stack([[p.q for p in places], np.unwrap([p.roll for p in places])])
     shape = np.median([p.shape for p in places], axis=0)
     spline = Spline.through(length, closed, s, values)
-    return Swept(spline, Section(places[0].joint, shape), np.nan, np.zeros((0, 0)))
+    return Sweep(spline, Section(places[0].joint, shape), np.nan, np.zeros((0, 0)))
 
 
 def fitted(
-    start: Swept, local: Floats, pitch: float, tolerance: float, edges: tuple[Floats, Indices]
-) -> Swept:
+    start: Sweep, local: Floats, pitch: float, tolerance: float, edges: tuple[Floats, Indices]
+) -> Sweep:
     """Return the fitted cross-section and line.
 
     Args:
@@ -85,8 +85,8 @@ def fitted(
 
 
 def _step(
-    swept: Swept, points: Floats, edges: Any, basis: Any, pitch: float, sigma: float
-) -> tuple[Swept, float]:
+    swept: Sweep, points: Floats, edges: Any, basis: Any, pitch: float, sigma: float
+) -> tuple[Sweep, float]:
     """Return the result of one Gauss-Newton step, and the spread of points on the surface [m].
 
     The last points belong to the given edges, all others to the nearest surface.
@@ -128,7 +128,7 @@ def _usable(section: Section, q: Floats, pitch: float) -> Any:
     return far
 
 
-def _design(swept: Swept, basis: Any, line: Floats, q: Floats, which: Any) -> Any:
+def _design(swept: Sweep, basis: Any, line: Floats, q: Floats, which: Any) -> Any:
     """Return the sparse (N, 3m + k) derivatives of the signed distances."""
     from scipy import sparse
 
@@ -148,7 +148,7 @@ def _design(swept: Swept, basis: Any, line: Floats, q: Floats, which: Any) -> An
     )
 
 
-def _prior(swept: Swept) -> tuple[Floats, Floats]:
+def _prior(swept: Sweep) -> tuple[Floats, Floats]:
     """Return the priors' normal matrix, and their gradient at the present values."""
     joint, values = swept.section.joint, swept.spline.values
     bends = swept.spline.bends()
@@ -167,7 +167,7 @@ def _prior(swept: Swept) -> tuple[Floats, Floats]:
     return normal, normal @ present
 
 
-def _moved(swept: Swept, step: Floats) -> Swept:
+def _moved(swept: Sweep, step: Floats) -> Sweep:
     values, joint = swept.spline.values, swept.section.joint
     m = len(values)
     shape = swept.section.shape.copy()

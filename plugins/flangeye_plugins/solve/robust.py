@@ -102,14 +102,14 @@ def solve_cell(
 
 def _options(params: RobustParams, workspace: Box | None) -> Options:
     from flangeye.estimation.calibrate import Options
-    from flangeye.estimation.session import Asked
+    from flangeye.estimation.session import ModelOptions
 
     return Options(
         params.limits,
         params.unobservable == "mark",
         params.certify,
         workspace,
-        Asked(params.normals == "auto", params.target_size == "unknown", params.size_limit),
+        ModelOptions(params.normals == "auto", params.target_size == "unknown", params.size_limit),
     )
 
 

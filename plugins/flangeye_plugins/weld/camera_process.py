@@ -28,7 +28,7 @@ from flangeye_plugins.weld.finger_camera import (
 )
 
 
-class Seeing(NamedTuple):
+class OpenDevices(NamedTuple):
     """The devices that are open in the camera process.
 
     Attributes:
@@ -184,12 +184,12 @@ def camera_process(wire: Connection, job: CameraJob) -> None:
             wire.send(_device_error(name, error))
             return
         wire.send(None if look is None else look.behind)
-        seeing = Seeing(latest, reader, sensor, look)
+        seeing = OpenDevices(latest, reader, sensor, look)
         while True:
             wire.send(_answer(wire.recv(), seeing))
 
 
-def _answer(question: Any, seeing: Seeing) -> Any:
+def _answer(question: Any, seeing: OpenDevices) -> Any:
     """Return the answer to one request of the main process.
 
     The answer to the arm's state is the next measurement or bead profile, None if there is neither

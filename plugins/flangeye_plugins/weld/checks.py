@@ -11,7 +11,7 @@ from flangeye.models.finger import Finger
 from flangeye.motion.limits import MotionLimits
 from flangeye.plugin.stage import BoundPart
 from flangeye.types import Floats, Seam
-from flangeye_plugins.weld.following.belief import Belief
+from flangeye_plugins.weld.following.model_prior import ModelPrior
 from flangeye_plugins.weld.following.steering import Steering, Weave
 from flangeye_plugins.weld.frame import LeaningTool, WorkSurface
 from flangeye_plugins.weld.path import Path
@@ -57,40 +57,40 @@ def check_controller(mode: Mode, driver: RobotDriver) -> None:
         )
 
 
-def check_tool(body: LeaningTool, belief: Belief, settings: Following) -> None:
+def check_tool(body: LeaningTool, prior: ModelPrior, settings: Following) -> None:
     """Refuse a tool that cannot hold its tip in the joint, reach the seam or weave as configured.
 
     Raises:
         StageError: The message names the failed check and the remedy.
     """
-    check_seat(belief, settings)
-    check_body(body, belief, settings)
+    check_seat(prior, settings)
+    check_body(body, prior, settings)
     check_weave(body.distance, settings)
 
 
-def check_seat(belief: Belief, settings: Following) -> None:
+def check_seat(prior: ModelPrior, settings: Following) -> None:
     """Refuse settings with which the tip would not stay where the joint's two walls meet.
 
     Raises:
         StageError: The message says why, and which values would hold the tip.
     """
-    if settings.joint == "butt" and belief.joint is None:
+    if settings.joint == "butt" and prior.joint is None:
         raise StageError(
             "weld.tactile: a butt joint with square edges is felt by a ball that rests on both: "
-            f"set 'root_gap', less than {2e3 * belief.radius:.3g} mm for a ball of radius "
-            f"{1e3 * belief.radius:.3g} mm, or take a larger tip; a prepared one is joint: groove"
+            f"set 'root_gap', less than {2e3 * prior.radius:.3g} mm for a ball of radius "
+            f"{1e3 * prior.radius:.3g} mm, or take a larger tip; a prepared one is joint: groove"
         )
-    holding = belief.seating(settings)
+    holding = prior.seating(settings)
     if holding is not None and holding < SEATING:
-        deflection, preload = belief.remedy(settings, SEATING)
+        deflection, preload = prior.remedy(settings, SEATING)
         raise StageError(
             "weld.tactile: the tip would climb the wall: the preload holds it with "
             f"{holding:.2f} times the force of the deflection, and {SEATING} is needed; lower "
             f"'deflection' to {deflection * 1e3:.2f} mm or raise "
             f"'preload' to {preload * 1e3:.1f} mm"
         )
-    reaching = belief.reaching(settings)
-    if not belief.two_walls and reaching < SEATING:
+    reaching = prior.reaching(settings)
+    if not prior.two_walls and reaching < SEATING:
         raise StageError(
             "weld.tactile: friction may hold the tip off the wall: the deflection pushes "
             f"with {reaching:.2f} times the plate's friction, and {SEATING} is needed; raise "
@@ -98,13 +98,13 @@ def check_seat(belief: Belief, settings: Following) -> None:
         )
 
 
-def check_body(body: LeaningTool, belief: Belief, settings: Following) -> None:
+def check_body(body: LeaningTool, prior: ModelPrior, settings: Following) -> None:
     """Refuse a lean of the tool that puts the torch too far above or below the seam.
 
     Raises:
         StageError: The message gives the height and the remedy.
     """
-    above = float(body.torch[2]) + (belief.joint.seat(belief.radius)[1] if belief.joint else 0.0)
+    above = float(body.torch[2]) + (prior.joint.seat(prior.radius)[1] if prior.joint else 0.0)
     if abs(above) > settings.torch_height:
         raise StageError(
             f"weld.tactile: as the tool leans its torch is {above * 1e3:+.1f} mm above the seam, "

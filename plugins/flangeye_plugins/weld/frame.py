@@ -62,7 +62,7 @@ TOGETHER = 1e-3
 """A seam whose ends are closer together than this is a closed one [m]."""
 
 
-class Stand(NamedTuple):
+class SeamPlace(NamedTuple):
     """A place on the seam, in base and in the plane.
 
     Attributes:
@@ -135,7 +135,7 @@ class WorkSurface:
         axes = np.stack([ahead, left, np.cross(ahead, left)], axis=2)
         return row[:, :3] + beyond * ahead, axes
 
-    def at(self, s: float) -> Stand:
+    def at(self, s: float) -> SeamPlace:
         """Return the place on the seam at an arc length [m]."""
         x, y, z, tx, ty, tz, ux, uy, uz = self._at(s)
         nx, ny, nz = uy * tz - uz * ty, uz * tx - ux * tz, ux * ty - uy * tx
@@ -143,7 +143,7 @@ class WorkSurface:
         nx, ny, nz = nx / norm, ny / norm, nz / norm
         ux, uy, uz = ty * nz - tz * ny, tz * nx - tx * nz, tx * ny - ty * nx
         axes = np.array([[tx, nx, ux], [ty, ny, uy], [tz, nz, uz]])
-        return Stand(np.array([x, y, z]), axes, self.path.at(s))
+        return SeamPlace(np.array([x, y, z]), axes, self.path.at(s))
 
     def _at(self, s: float) -> list[float]:
         """Return point, unit tangent and opening (9,) in base at an arc length."""

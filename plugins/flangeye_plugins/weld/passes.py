@@ -20,11 +20,11 @@ import numpy as np
 from flangeye.motion.arc import OFF
 from flangeye.motion.seam_following import STILL, Command, Controller, Phase, ToolPose, Touch
 from flangeye.types import Floats
-from flangeye_plugins.weld.following.belief import BAND
 from flangeye_plugins.weld.following.bound import along
 from flangeye_plugins.weld.following.follower import Follower
+from flangeye_plugins.weld.following.model_prior import BAND
 from flangeye_plugins.weld.following.response import Response
-from flangeye_plugins.weld.following.steering import Striking, Weave, WeaveOffset
+from flangeye_plugins.weld.following.steering import ArcSequence, Weave, WeaveOffset
 from flangeye_plugins.weld.following.task import ResumePoint
 from flangeye_plugins.weld.following.tip import within
 from flangeye_plugins.weld.path import PATH_SPACING, Path, Place
@@ -34,7 +34,7 @@ GAIN = 2.0
 """Gain of a pass on errors of position and heading [1/s]."""
 
 
-class Traced:
+class RootPass:
     """Result of the root pass: the seam with its variance, and the tool's height.
 
     Attributes:
@@ -82,16 +82,16 @@ class Passes:
     ) -> None:
         """Start with the root pass, or with the pass in which a resumed weld stopped."""
         task, before = root.task, root.task.before
-        plan, belief, settings = task.plan, task.belief, task.settings
+        plan, prior, settings = task.plan, task.prior, task.settings
         self.root, self.number = root, 0
         self.mode, self.side = root.mode, root.side
-        self._belief, self._settings = belief, settings
-        self._sigmas = along(plan, belief, settings)
-        self._traced = Traced(root, plan, np.zeros((0, 3)) if before is None else before.traced)
+        self._prior, self._settings = prior, settings
+        self._sigmas = along(plan, prior, settings)
+        self._traced = RootPass(root, plan, np.zeros((0, 3)) if before is None else before.traced)
         self._response = Response()
         self._path = plan
         self._began: float | None = None
-        self._striking, self._now = Striking(belief.arc), 0.0
+        self._striking, self._now = ArcSequence(prior.arc), 0.0
         self._take_over()
         if before is not None and before.number:
             self._go_on(before)
@@ -170,12 +170,12 @@ class Passes:
             return
         self.number += 1
         self._path, self._began = self._traced.path(self._pass), None
-        self._striking = Striking(self._belief.arc)
+        self._striking = ArcSequence(self._prior.arc)
         self._weave = Weave(self._pass.weave_width, self._settings.weave_frequency)
         # Between two passes the tool is lifted by 15 mm.
         self._over = max(height, float(self._path.points[:, 2].max())) + 15e-3
         self._start = 0.0
-        self.phase, self.torch, self.tip = "returning", 0.0, self._belief.distance
+        self.phase, self.torch, self.tip = "returning", 0.0, self._prior.distance
         self.wanted = self.sigma = self.bound = self.band = 0.0
         self.aim = self._pass.across
 
@@ -186,7 +186,7 @@ class Passes:
         start = self._path.at(self._start)
         # Displacement of the end point that brings the torch to the start, with the tool along the
         # path
-        aside = start.point + self._belief.distance * start.tangent - pose.position[:2]
+        aside = start.point + self._prior.distance * start.tangent - pose.position[:2]
         turn = _nearest(_heading(start) - pose.angle)
         # A place is reached when the tool is within 0.1 mm and 0.2 deg of it.
         there = float(np.hypot(*aside)) < 0.1e-3 and abs(turn) < math.radians(0.2)
@@ -206,7 +206,7 @@ class Passes:
 
     def _weld(self, pose: ToolPose) -> Command:
         """Return the command that steers the torch along the pass's path."""
-        settings, distance = self._settings, self._belief.distance
+        settings, distance = self._settings, self._prior.distance
         ahead = np.array([math.cos(pose.angle), math.sin(pose.angle)])
         torch = pose.position[:2] - distance * ahead
         self.torch = self._path.advance(torch, self.torch, settings.speed * 0.1)

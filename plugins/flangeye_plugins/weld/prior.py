@@ -18,7 +18,7 @@ from flangeye.errors import StageError
 from flangeye.files.regular import write_whole
 from flangeye.models.model import Model, read_model
 from flangeye.units import Duration, Length, param
-from flangeye_plugins.weld.following.belief import Belief, Learned
+from flangeye_plugins.weld.following.model_prior import ModelPrior, SweepFit
 
 
 class WeldPrior(Model):
@@ -36,7 +36,7 @@ class WeldPrior(Model):
     stamp_sigma: Duration = param(gt=0)
 
 
-def with_prior(belief: Belief, path: Path | None, finger: str) -> Belief:
+def with_prior(prior: ModelPrior, path: Path | None, finger: str) -> ModelPrior:
     """Return a prior updated by the file of earlier welds; unchanged if there is no file yet.
 
     Raises:
@@ -44,20 +44,20 @@ def with_prior(belief: Belief, path: Path | None, finger: str) -> Belief:
         RecipeError: The file is not a valid prior.
     """
     if path is None or not path.exists():
-        return belief
-    prior = read_model(path, WeldPrior)
-    if prior.finger != finger:
+        return prior
+    stored = read_model(path, WeldPrior)
+    if stored.finger != finger:
         raise StageError(
-            f"weld.tactile: {path} is of finger {prior.finger}, this one is {finger}; delete the "
+            f"weld.tactile: {path} is of finger {stored.finger}, this one is {finger}; delete the "
             "file, or name another one (prior)"
         )
-    found = prior.model_dump(exclude={"finger"})
+    found = stored.model_dump(exclude={"finger"})
     # Half the information means twice the variance
     aged = {name: math.sqrt(2) * x for name, x in found.items() if name.endswith("_sigma")}
-    return replace(belief, **{**found, **aged})
+    return replace(prior, **{**found, **aged})
 
 
-def keep_posterior(path: Path, finger: str, learned: Learned) -> None:
+def keep_posterior(path: Path, finger: str, learned: SweepFit) -> None:
     """Write a weld's estimates to the file for the next weld.
 
     Raises:

@@ -20,10 +20,10 @@ from flangeye.plugin.registry import Lookup, load_registry
 from flangeye.plugin.stage import BoundPart
 from flangeye.types import Floats
 from flangeye.workflow.log.read import JournalEntry, read_notes
-from flangeye_plugins.weld.following.belief import Belief, Learned
 from flangeye_plugins.weld.following.follower import Follower
+from flangeye_plugins.weld.following.model_prior import ModelPrior, SweepFit
 from flangeye_plugins.weld.following.steering import SETTLING
-from flangeye_plugins.weld.following.task import ResumePoint, Start, WeldTask
+from flangeye_plugins.weld.following.task import Onset, ResumePoint, WeldTask
 from flangeye_plugins.weld.passes import Passes, follower_of
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following, Mode, WeldTactileParams
@@ -35,17 +35,17 @@ RUN_IN = 2 * SETTLING
 
 def controller_of(
     plan: Path,
-    belief: Belief,
+    prior: ModelPrior,
     settings: Following,
     mode: Mode,
     kept: ResumePoint | None = None,
-    start: Start | None = None,
+    start: Onset | None = None,
 ) -> Controller:
     """Return the controller for a mode; for the other arguments see :class:`WeldTask`."""
     if isinstance(mode, BoundPart):
-        controller: Controller = mode(task_of(plan, belief.distance, settings))
+        controller: Controller = mode(task_of(plan, prior.distance, settings))
         return controller
-    root = Follower(WeldTask(plan, belief, settings, mode == "tactile", kept, start))
+    root = Follower(WeldTask(plan, prior, settings, mode == "tactile", kept, start))
     if settings.passes and mode == "tactile":
         return Passes(root)
     return root
@@ -80,14 +80,14 @@ def take_looks(controller: Controller, looks: Sequence[WeldProfile]) -> None:
 
 def controller_from(start: Mapping[str, Any]) -> Controller:
     """Return the controller of a logged weld, in its initial state."""
-    tuples = {name: tuple(start["belief"][name]) for name in ("noise", "arc")}
-    belief = Belief(**{**start["belief"], **tuples})
+    tuples = {name: tuple(start["prior"][name]) for name in ("noise", "arc")}
+    prior = ModelPrior(**{**start["prior"], **tuples})
     settings = Following.model_validate(start["settings"])
     plan, kept = Path(np.array(start["points"]), start["wraps"]), start.get("kept")
     before = None if kept is None else _kept_from(kept)
     given = start.get("start")
-    at = None if given is None else Start(**given)
-    return controller_of(plan, belief, settings, _mode_of(start["mode"]), before, at)
+    at = None if given is None else Onset(**given)
+    return controller_of(plan, prior, settings, _mode_of(start["mode"]), before, at)
 
 
 def kept_value(kept: ResumePoint) -> dict[str, Any]:
@@ -97,7 +97,7 @@ def kept_value(kept: ResumePoint) -> dict[str, Any]:
 
 def _kept_from(value: Mapping[str, Any]) -> ResumePoint:
     samples, traced = np.array(value["samples"]), np.array(value["traced"]).reshape(-1, 3)
-    learned = Learned(**value["learned"])
+    learned = SweepFit(**value["learned"])
     return ResumePoint(samples, value["torch"], learned, traced, value["number"])
 
 
@@ -183,7 +183,7 @@ def _require_same(log: FilePath, points: Floats, before: Floats) -> None:
     )
 
 
-def set_back(params: WeldTactileParams, plan: Path, distance: float, kept: ResumePoint) -> Start:
+def set_back(params: WeldTactileParams, plan: Path, distance: float, kept: ResumePoint) -> Onset:
     """Return the start of a resumed weld, such that the torch overlaps the bead.
 
     The arc is struck at the start of the overlap; the tip is set down a run-in before that. A later
@@ -205,13 +205,13 @@ def set_back(params: WeldTactileParams, plan: Path, distance: float, kept: Resum
     return _standing(plan, distance, max(arc_from, 0.0), tip)
 
 
-def _standing(plan: Path, distance: float, arc_from: float, tip: float) -> Start:
+def _standing(plan: Path, distance: float, arc_from: float, tip: float) -> Onset:
     """Return the start with the tip and the torch on the plan, for an arc from ``arc_from`` [m]."""
     place = plan.at(tip)
     torch = plan.at(_away(plan, tip, -distance)).point
     heading = np.arctan2(*(place.point - torch)[::-1]) - np.arctan2(*place.tangent[::-1])
     angle = float((heading + np.pi) % (2 * np.pi) - np.pi)
-    return Start(tip, arc_from, angle)
+    return Onset(tip, arc_from, angle)
 
 
 def _away(plan: Path, s: float, distance: float) -> float:

@@ -24,10 +24,10 @@ from flangeye_plugins.weld.camera_process import CameraProcess
 from flangeye_plugins.weld.corners import leg_of
 from flangeye_plugins.weld.execution import Bounds, WeldCell, approach, follow, undisturbed
 from flangeye_plugins.weld.finger_camera import CameraJob, FingerCameraReader, SteppedReader
-from flangeye_plugins.weld.following.belief import Belief, belief_of, body_of
 from flangeye_plugins.weld.following.bound import check_bound
 from flangeye_plugins.weld.following.follower import Follower
-from flangeye_plugins.weld.following.task import ResumePoint, Start
+from flangeye_plugins.weld.following.model_prior import ModelPrior, body_of, model_prior_of
+from flangeye_plugins.weld.following.task import Onset, ResumePoint
 from flangeye_plugins.weld.frame import LeaningTool, Tool, WorkSurface
 from flangeye_plugins.weld.passes import follower_of
 from flangeye_plugins.weld.path import Path
@@ -62,11 +62,11 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
     allowed = limits.for_robot(model)
     planned = _planned(seam, driver, allowed, params)
     params, driver, plan = planned.params, planned.driver, planned.plan
-    aside = planned.belief.set_down(params)
+    aside = planned.prior.set_down(params)
     task = Task(model, allowed, planned.finger, planned.tool, plan, params, planned.start, aside)
     passage = SeamReach(task)
     checks.check_controller(params.mode, driver)
-    controller_of(plan, planned.belief, params, params.mode, planned.kept, planned.start)
+    controller_of(plan, planned.prior, params, params.mode, planned.kept, planned.start)
     if not (motion.allowed or driver.simulated):
         raise NothingMoved(_plan_text(plan, params))
     with ExitStack() as opened:
@@ -74,10 +74,10 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
         job = CameraJob(params.sensor, planned.finger, robot.state(), seed, params.look)
         reader: FingerCameraReader = SteppedReader(job) if driver.simulated else CameraProcess(job)
         eyes = opened.enter_context(reader)
-        belief = replace(planned.belief, behind=eyes.behind)
-        controller = controller_of(plan, belief, params, params.mode, planned.kept, planned.start)
+        prior = replace(planned.prior, behind=eyes.behind)
+        controller = controller_of(plan, prior, params, params.mode, planned.kept, planned.start)
         weld_log = opened.enter_context(WeldLog(stage_log, not driver.simulated))
-        weld_log.note("start", start_of(planned, belief))
+        weld_log.note("start", start_of(planned, prior))
         cell = WeldCell(
             Executor(robot, model, allowed, eyes.tell), eyes, planned.tool,
             Bounds(planned.finger, plan),
@@ -109,7 +109,7 @@ class Planned:
         finger: The finger on the arm.
         body: Tool in its orientation along the seam.
         tool: Converts between the flange's pose in base and the tool's pose in the plane.
-        belief: Prior knowledge of tool, finger and joint.
+        prior: Prior knowledge of tool, finger and joint.
         params: Parameters of the step.
         start: Start of the weld on its plan.
         driver: Driver of the arm, with the power source if there is one.
@@ -123,9 +123,9 @@ class Planned:
     finger: Finger
     body: LeaningTool
     tool: Tool
-    belief: Belief
+    prior: ModelPrior
     params: WeldTactileParams
-    start: Start
+    start: Onset
     driver: RobotDriver
     gas_after: float | None
     kept: ResumePoint | None
@@ -144,21 +144,21 @@ def _planned(
     surface = WorkSurface(seam.points_in_base, seam.openings_in_base)
     plan, body = surface.path, body_of(finger, params)
     checks.check_finger(finger, params)
-    belief = belief_of(finger, body, seam.half_angle, params)
-    belief = with_prior(belief, params.prior, finger.model)
+    prior = model_prior_of(finger, body, seam.half_angle, params)
+    prior = with_prior(prior, params.prior, finger.model)
     checks.check_seam(seam, surface, body.distance, params)
     checks.check_speeds(finger, params, allowed)
     kept = None if params.resume is None else resume_point_of(params.resume, surface.points)
-    start = Start(params.set_down)
+    start = Onset(params.set_down)
     if kept is not None:
         start = set_back(params, plan, body.distance, kept)
     driver, times = _with_power_source(driver, params)
     if times is not None:
-        belief = replace(belief, arc=(times.gas_before, times.ignition, times.crater))
-    checks.check_tool(body, belief, params)
-    check_bound(plan, belief, params)
+        prior = replace(prior, arc=(times.gas_before, times.ignition, times.crater))
+    checks.check_tool(body, prior, params)
+    check_bound(plan, prior, params)
     return Planned(
-        seam, surface, plan, finger, body, Tool(finger, surface, body), belief, params, start,
+        seam, surface, plan, finger, body, Tool(finger, surface, body), prior, params, start,
         driver, None if times is None else times.gas_after, kept,
     )  # fmt: skip
 
@@ -203,14 +203,14 @@ def _plan_text(plan: Path, params: WeldTactileParams) -> str:
     )
 
 
-def start_of(planned: Planned, belief: Belief) -> dict[str, Any]:
+def start_of(planned: Planned, prior: ModelPrior) -> dict[str, Any]:
     """Return all inputs of the controller other than measurements, for the log."""
     params, kept = planned.params, planned.kept
     return {
         "points": planned.surface.points.tolist(),
         "wraps": -planned.plan.first,
         "finger": planned.finger.model_dump(mode="json"),
-        "belief": asdict(belief),
+        "prior": asdict(prior),
         "mode": params.model_dump(mode="json", include={"mode"})["mode"],
         "kept": None if kept is None else kept_value(kept),
         "start": asdict(planned.start),

@@ -118,7 +118,7 @@ def test_a_wavy_seam_is_followed_as_far_as_it_is_felt() -> None:
 def test_a_tip_that_is_not_where_its_file_says_is_in_the_stated_bound() -> None:
     """In a curve the tool turns between the tip's and the torch's passing."""
     wrong = Condition(WeldTruth(tool=ToolTruth(tip=(1.5e-3, 0.0, 0.0), torch=(1.5e-3, 0.0))))
-    known = wrong._replace(belief={"tip_sigma": 0.8e-3}, settings={"max_error": "4 mm"})
+    known = wrong._replace(prior={"tip_sigma": 0.8e-3}, settings={"max_error": "4 mm"})
     found = try_condition(known, 0, period=16e-3)
     stated = found.column("bound")[found.beside]
     assert found.done

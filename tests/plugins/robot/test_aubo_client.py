@@ -11,7 +11,7 @@ import pytest
 
 from flangeye.devices import DeviceError
 from flangeye_plugins.robot.aubo import client
-from flangeye_plugins.robot.aubo.client import AuboClient, Ride
+from flangeye_plugins.robot.aubo.client import AuboClient, VelocityMove
 
 
 class LibraryError(Exception):
@@ -164,7 +164,7 @@ class Ridden:
 
     def __init__(self, clock: Clock) -> None:
         self.clock, self.commands = clock, list[Any]()
-        self.ride = Ride(
+        self.ride = VelocityMove(
             0.4, 2.0, lambda v: self.commands.append(v.tolist()),
             lambda: self.commands.append("stop"), lambda: self.commands.append("arrive"),
         )  # fmt: skip

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from flangeye.devices import SILENT
-from flangeye_plugins.robot.aubo.client import Ride
+from flangeye_plugins.robot.aubo.client import VelocityMove
 
 SPEED, ACCELERATION, TICK = 0.2, 1.0, 0.01
 
@@ -20,7 +20,7 @@ class Driven:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now, self.at, self.velocity, self.done = 100.0, 0.0, 0.0, list[str]()
         monkeypatch.setattr(time, "monotonic", lambda: self.now)
-        self.ride = Ride(SPEED, ACCELERATION, self._go, self._stop, self._arrive)
+        self.ride = VelocityMove(SPEED, ACCELERATION, self._go, self._stop, self._arrive)
 
     def look(self, after: float = TICK, fastest: float | None = None) -> None:
         """Let time pass, and renew the ride as a look at the arm does."""
@@ -97,7 +97,7 @@ def test_the_controllers_own_end_of_a_move_is_no_longer_than_a_piece() -> None:
 
 def test_it_heads_straight_for_the_goal(monkeypatch: pytest.MonkeyPatch) -> None:
     gone: list[Any] = []
-    ride = Ride(SPEED, ACCELERATION, gone.append, lambda: None, lambda: None)
+    ride = VelocityMove(SPEED, ACCELERATION, gone.append, lambda: None, lambda: None)
     later = time.monotonic() + 0.1
     monkeypatch.setattr(time, "monotonic", lambda: later)
     ride.renew(np.array([0.3, -0.4]), 0.5, 0.0)

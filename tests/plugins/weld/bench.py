@@ -6,8 +6,8 @@ import numpy as np
 
 from flangeye.motion.seam_following import ToolPose, Touch, turned
 from flangeye_emulators.weld_world.groove import Groove, GrooveSection, Tip, TipContact
-from flangeye_plugins.weld.following.belief import Belief
 from flangeye_plugins.weld.following.follower import Follower
+from flangeye_plugins.weld.following.model_prior import ModelPrior
 from flangeye_plugins.weld.following.task import WeldTask
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following
@@ -70,7 +70,7 @@ class Weld:
 
 
 def make(mode, plan, settings):
-    return Follower(WeldTask(Path(plan), Belief(DISTANCE), settings, mode == "tactile"))
+    return Follower(WeldTask(Path(plan), ModelPrior(DISTANCE), settings, mode == "tactile"))
 
 
 def weld(true, plan, mode="tactile", settings=None, **world):

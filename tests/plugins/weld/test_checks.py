@@ -26,7 +26,7 @@ from flangeye_plugins.weld.checks import (
     tool_angles,
 )
 from flangeye_plugins.weld.execution import Bounds
-from flangeye_plugins.weld.following.belief import Belief
+from flangeye_plugins.weld.following.model_prior import ModelPrior
 from flangeye_plugins.weld.frame import WorkSurface
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.reachability import _nearest, flange_speed
@@ -86,14 +86,14 @@ def test_the_preload_holds_the_tip_with_fourteen_tenths_of_the_push(
 ) -> None:
     asked = following()
     wall = np.arctan(2.0 * asked.preload / (share * asked.deflection))
-    belief = Belief(0.04, 1000.0, 2000.0, float(wall), torch_sigma=0.0)
+    prior = ModelPrior(0.04, 1000.0, 2000.0, float(wall), torch_sigma=0.0)
     if not told:
-        check_seat(belief, asked)
+        check_seat(prior, asked)
         return
     with pytest.raises(
         StageError, match=f"holds it with {share:.2f} times the force of the deflection"
     ):
-        check_seat(belief, asked)
+        check_seat(prior, asked)
 
 
 @pytest.mark.parametrize(
@@ -102,12 +102,12 @@ def test_the_preload_holds_the_tip_with_fourteen_tenths_of_the_push(
 def test_a_torch_is_within_its_height_of_the_seam(up: float, told: str | None) -> None:
     body: Any = SimpleNamespace(torch=np.array([-0.04, 0.0, up]))
     if told is None:
-        check_body(body, Belief(0.04), following())
+        check_body(body, ModelPrior(0.04), following())
         return
     with pytest.raises(StageError, match=f"its torch is {told} above the seam, limit 8 mm"):
-        check_body(body, Belief(0.04), following())
+        check_body(body, ModelPrior(0.04), following())
     # On a joint the ball's centre is above the seam by its seat.
-    seated = Belief(0.04, half_angle=0.5, radius=1e-3)
+    seated = ModelPrior(0.04, half_angle=0.5, radius=1e-3)
     assert seated.joint is not None
     body.torch[2] = 7.9e-3 - seated.joint.seat(1e-3)[1]
     check_body(body, seated, following())
@@ -286,27 +286,31 @@ def test_on_one_wall_the_deflection_outweighs_friction_by_fourteen_tenths(
 ) -> None:
     asked = following()
     axial = 1000.0 * asked.deflection / (share * asked.friction * asked.preload)
-    belief = Belief(0.04, 1000.0, axial, torch_sigma=0.0, two_walls=False)
+    prior = ModelPrior(0.04, 1000.0, axial, torch_sigma=0.0, two_walls=False)
     if not told:
-        check_seat(belief, asked)
+        check_seat(prior, asked)
     else:
         with pytest.raises(StageError, match=f"pushes with {share:.2f} times the plate.s friction"):
-            check_seat(belief, asked)
-    check_seat(Belief(0.04, 1000.0, axial, torch_sigma=0.0), asked)
-    two = Belief(0.04, torch_sigma=0.0)
+            check_seat(prior, asked)
+    check_seat(ModelPrior(0.04, 1000.0, axial, torch_sigma=0.0), asked)
+    two = ModelPrior(0.04, torch_sigma=0.0)
     with pytest.raises(StageError, match="set 'root_gap', less than 3 mm for a ball of radius 1.5"):
         check_seat(two, following(joint="butt"))
 
 
 def test_a_tool_that_cannot_hold_swing_or_stand_as_asked_is_refused() -> None:
     body: Any = SimpleNamespace(torch=np.array([-0.04, 0.0, 0.0]), distance=0.04)
-    check_tool(body, Belief(0.04), following())
-    for belief, asked, told in (
-        (Belief(0.04), following(weave_width="9 mm", weave_frequency=3), "a weave of 9 mm at 3 Hz"),
-        (Belief(0.04, half_angle=0.5, radius=20e-3), following(), "above the seam"),
+    check_tool(body, ModelPrior(0.04), following())
+    for prior, asked, told in (
+        (
+            ModelPrior(0.04),
+            following(weave_width="9 mm", weave_frequency=3),
+            "a weave of 9 mm at 3 Hz",
+        ),
+        (ModelPrior(0.04, half_angle=0.5, radius=20e-3), following(), "above the seam"),
     ):
         with pytest.raises(StageError, match=told):
-            check_tool(body, belief, asked)
+            check_tool(body, prior, asked)
 
 
 def test_a_controller_for_simulated_arms_is_refused_with_any_other() -> None:
@@ -352,9 +356,9 @@ def test_what_is_allowed_is_allowed_to_the_last_digit() -> None:
     fault = float(tube_radii(seam_of(line(0.1)))[0])
     certain = asked.model_copy(update={"reach": fault})
     check(seam_of(line(0.1)), certain)
-    belief = Belief(0.04)
+    prior = ModelPrior(0.04)
     body: Any = SimpleNamespace(torch=np.array([-0.04, 0.0, 8e-3]))
-    check_body(body, belief, asked)
+    check_body(body, prior, asked)
 
 
 @pytest.mark.parametrize(

@@ -156,11 +156,11 @@ def round_a_corner(turn, joint, shift, plan_turn=0.01, **given):
     surface = WorkSurface(leg.points_in_base, leg.openings_in_base)
     plan = Path(leg.points_in_base)
     body = built_for(asked)
-    section, belief = known(Condition(section=JOINTS[joint]), body, asked)
-    check_seam(misplanned, surface, belief.distance, asked)
+    section, prior = known(Condition(section=JOINTS[joint]), body, asked)
+    check_seam(misplanned, surface, prior.distance, asked)
     seam = Nominal(Path(true), section, Tip(), body.level_R_tool.T @ body.torch, body.level_R_tool)
-    controller = controller_of(plan, belief, asked, "tactile")
-    return run_trial(controller, seam, WeldTruth(), start_at(plan, belief, asked, 16e-3), 0)
+    controller = controller_of(plan, prior, asked, "tactile")
+    return run_trial(controller, seam, WeldTruth(), start_at(plan, prior, asked, 16e-3), 0)
 
 
 JOINTS = {"lap": LAP, "groove": None}

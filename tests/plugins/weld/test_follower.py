@@ -13,13 +13,13 @@ import pytest
 
 from flangeye.devices import WeldProfile
 from flangeye.motion.seam_following import STILL, Command, ToolPose, Touch
-from flangeye_plugins.weld.following.belief import Belief, Learned
 from flangeye_plugins.weld.following.bound import along
 from flangeye_plugins.weld.following.contact import Mode, only
 from flangeye_plugins.weld.following.follower import Follower
+from flangeye_plugins.weld.following.model_prior import ModelPrior, SweepFit
 from flangeye_plugins.weld.following.sensing import Located, SeamReading
 from flangeye_plugins.weld.following.steering import WeaveOffset
-from flangeye_plugins.weld.following.task import ResumePoint, Start, WeldTask
+from flangeye_plugins.weld.following.task import Onset, ResumePoint, WeldTask
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following
 from tests.plugins.weld.bench import straight
@@ -39,12 +39,12 @@ def circle(turns: float = 0.4) -> Any:
 
 
 def make(
-    phase: str = "following", plan: Any = None, touch: bool = True, belief: Any = None,
+    phase: str = "following", plan: Any = None, touch: bool = True, prior: Any = None,
     before: Any = None, start: Any = None, **given: Any,
 ) -> Any:  # fmt: skip
     """A follower of a straight plan along x, in a phase."""
     points = straight(LENGTH) if plan is None else plan
-    own = belief or Belief(DISTANCE)
+    own = prior or ModelPrior(DISTANCE)
     found: Any = Follower(WeldTask(Path(points), own, following(**given), touch, before, start))
     found.phase = phase
     if phase not in ("seeking", "probing"):
@@ -82,28 +82,28 @@ def felt_along(found: Any, offset: float, until: float = 0.1) -> None:
 
 def test_all_that_the_torch_s_place_is_uncertain_by_adds_up() -> None:
     found = make()
-    asked, belief = following(), Belief(DISTANCE)
+    asked, prior = following(), ModelPrior(DISTANCE)
     found.seam.refined = SimpleNamespace(variance=lambda s: 9e-10, angle=lambda s, a: 0.1)
-    found.sensing.learned = Learned(gain_sigma=0.03, width=0.02e-3, unexplained=0.03e-3)
+    found.sensing.learned = SweepFit(gain_sigma=0.03, width=0.02e-3, unexplained=0.03e-3)
     found.pressing.most = asked.deflection
     found.welding.begin(5.0)
     gain = 0.03 * asked.deflection
     play = (0.02e-3) ** 2 * (1 / 11 + 10 / 33 - 1 / 121)  # of 0.02 in 0.22 mm it stays pressed
-    always = belief.fixed_variance(asked) + gain**2 + play + (0.03e-3) ** 2 + 9e-10
+    always = prior.fixed_variance(asked) + gain**2 + play + (0.03e-3) ** 2 + 9e-10
     assert found.welding.variance(0.0, pose(0.0, angle=0.1, time=5.0)) == pytest.approx(always)
     # A tool that slants to the path is off across it by what its length is off by.
-    slanting = (0.4 * belief.along_sigma) ** 2
+    slanting = (0.4 * prior.along_sigma) ** 2
     assert found.welding.variance(0.4, pose(0.0, angle=0.1, time=5.0)) == pytest.approx(
         always + slanting
     )
     # What the tip is off by in the flange goes with the torch, but for what the tool has turned.
-    moved = (2 * math.sin(0.6 / 2) * belief.tip_sigma) ** 2
+    moved = (2 * math.sin(0.6 / 2) * prior.tip_sigma) ** 2
     assert found.welding.variance(0.0, pose(0.0, angle=0.7, time=5.0)) == pytest.approx(
         always + moved
     )
     # Where the sweep has told how far ahead the tip is, what it is aside by counts a little.
     found.sensing.learned = replace(found.sensing.learned, ahead_sigma=0.02e-3)
-    told = (0.02e-3 * math.sin(0.6)) ** 2 + (belief.tip_sigma * (1 - math.cos(0.6))) ** 2
+    told = (0.02e-3 * math.sin(0.6)) ** 2 + (prior.tip_sigma * (1 - math.cos(0.6))) ** 2
     assert found.welding.variance(0.0, pose(0.0, angle=0.7, time=5.0)) == pytest.approx(
         always + told
     )
@@ -125,7 +125,7 @@ def test_all_that_the_torch_s_place_is_uncertain_by_adds_up() -> None:
 
 def sure(found: Any) -> float:
     """How many sigmas hold along its whole plan."""
-    return along(found.task.plan, found.task.belief, found.task.settings)
+    return along(found.task.plan, found.task.prior, found.task.settings)
 
 
 @pytest.mark.parametrize("off", [0.3e-3, -0.3e-3])
@@ -158,8 +158,8 @@ def test_the_torch_is_lit_where_it_is_known_and_then_has_to_stay_so() -> None:
     assert doubtful(0.01, None, off=0.0).arc_from == 0.01
     assert doubtful(0.02, 0.01, off=0.0).arc_from == 0.01
     assert doubtful(-0.01, None, off=0.0).arc_from is None  # it is not on the seam yet
-    assert doubtful(0.01, None, off=0.0, start=Start(5e-3, 15e-3)).arc_from is None
-    assert doubtful(0.016, None, off=0.0, start=Start(5e-3, 15e-3)).arc_from == 0.016
+    assert doubtful(0.01, None, off=0.0, start=Onset(5e-3, 15e-3)).arc_from is None
+    assert doubtful(0.016, None, off=0.0, start=Onset(5e-3, 15e-3)).arc_from == 0.016
     assert doubtful(0.01, None, off=0.0, phase="probing").arc_from is None
     stopped = doubtful(0.02, 0.01)
     assert stopped.phase == "stopped" and stopped.arc_from == 0.01
@@ -173,8 +173,8 @@ def test_a_weld_that_cannot_begin_within_the_first_hundredth_of_the_seam_is_refu
     told = doubtful(0.0031, None, plan=long)
     assert told.phase == "stopped" and told.arc_from is None and told.welding.share == 0.0
     assert told.reason.startswith("not begun: the torch is known to 3.")
-    assert doubtful(0.0178, None, plan=long, start=Start(5e-3, 15e-3)).phase == "following"
-    assert doubtful(0.0179, None, plan=long, start=Start(5e-3, 15e-3)).phase == "stopped"
+    assert doubtful(0.0178, None, plan=long, start=Onset(5e-3, 15e-3)).phase == "following"
+    assert doubtful(0.0179, None, plan=long, start=Onset(5e-3, 15e-3)).phase == "stopped"
 
 
 def test_a_weld_is_not_begun_where_the_seam_ahead_is_not_known() -> None:
@@ -196,8 +196,8 @@ def test_a_weld_is_not_begun_where_the_seam_ahead_is_not_known() -> None:
 @pytest.mark.parametrize(("shape", "phase"), [(0.0, "following"), (0.3e-3, "stopped")])
 def test_a_weld_is_not_begun_where_the_felt_seam_is_too_crooked(shape: float, phase: str) -> None:
     """A tool that stands askew to a wave is off by what its length is; the plan is straight."""
-    belief = Belief(DISTANCE, along_sigma=0.6e-3)
-    found = make(plan=straight(0.3), belief=belief)
+    prior = ModelPrior(DISTANCE, along_sigma=0.6e-3)
+    found = make(plan=straight(0.3), prior=prior)
     for s in np.arange(0.005, 0.1, 2e-4).tolist():
         found.seam.refined.add(s, shape * math.sin(2.0 * math.pi * s / 5e-3), 0.0)
     found.seam.refined.renew(-DISTANCE, 100_000)
@@ -259,7 +259,7 @@ def test_the_tip_goes_back_slowly_where_it_is_seen_late() -> None:
 
 
 def test_the_share_that_was_welded_is_of_the_planned_seam() -> None:
-    found = doubtful(0.02, 0.01, off=0.0, plan=straight(0.21), start=Start(5e-3, 10e-3))
+    found = doubtful(0.02, 0.01, off=0.0, plan=straight(0.21), start=Onset(5e-3, 10e-3))
     assert found.welding.share == pytest.approx(0.05)
     found.progress.torch = 0.22  # the arc ends where the seam does
     assert found.welding.share == pytest.approx(1.0)
@@ -299,7 +299,7 @@ def test_the_wanted_deflection_goes_to_what_the_phase_asks_for_at_its_rate(
 
 
 def test_a_lost_wall_is_felt_for_as_far_aside_as_the_seam_is_unknown_at_the_tip() -> None:
-    found = make("bridging", belief=Belief(DISTANCE, two_walls=False))
+    found = make("bridging", prior=ModelPrior(DISTANCE, two_walls=False))
     probe = following().probe
     for i in range(120):
         found.seam.refined.add(3e-4 * i, 0.0, 0.0)
@@ -502,11 +502,11 @@ def test_a_displacement_is_freed_of_rest_play_and_gain(side: str) -> None:
     found.sensing.search.rest, true = rest, np.array([0.4e-3, 1.5e-3, 1.2e-3])
     sign = 1.0 if side == "left" else -1.0
     for gain, up in ((0.1, 1.1), (-0.1, 1.0)):  # a preload that is shown larger presses harder
-        found.sensing.learned = Learned(gain=gain, width=0.05e-3, reversal=1e3)
+        found.sensing.learned = SweepFit(gain=gain, width=0.05e-3, reversal=1e3)
         shown = rest + true * [1 + gain, 1 + gain, up] + [0.0, sign * 0.05e-3, 0.0]
         assert found.sensing._corrected(shown, found.phase) == pytest.approx(true)
     # Play that is gone through over less than the deflection wobbles by may be anywhere.
-    found.sensing.learned = Learned(width=0.05e-3, reversal=0.2e-3)
+    found.sensing.learned = SweepFit(width=0.05e-3, reversal=0.2e-3)
     assert found.sensing._corrected(rest, found.phase)[1] == pytest.approx(-sign * 0.025e-3)
 
 
@@ -538,10 +538,10 @@ def test_the_noisier_a_finger_the_longer_the_mean_that_is_followed(
 def test_the_seam_is_where_the_tip_is_beside_its_ball_and_the_deflection_what_it_lags(
     side: str, sign: float
 ) -> None:
-    belief = Belief(
+    prior = ModelPrior(
         DISTANCE, half_angle=math.pi / 4, lean=-sign * math.pi / 4, two_walls=False, radius=2e-3
     )
-    found = make(side=side, belief=belief)
+    found = make(side=side, prior=prior)
     found.progress.tip, turned_by = 0.05, 0.3
     c, s = math.cos(turned_by), math.sin(turned_by)
     moved = np.array([0.1e-3, -sign * 1.4e-3, 0.6e-3])  # of the tip, in the plane
@@ -559,7 +559,7 @@ def test_a_measurement_meets_the_pose_of_its_image_and_its_delay_is_learned() ->
     found = make("bridging")
     for i in range(101):
         found.sensing._track.add(pose(0.05 + 1e-3 * i, time=i * 0.01))
-    found.now, found.sensing.learned, found.sensing.latency = 1.0, Learned(stamp=0.05), 0.1
+    found.now, found.sensing.learned, found.sensing.latency = 1.0, SweepFit(stamp=0.05), 0.1
     at, _ = found.sensing.take(Touch(0.9, np.array([0.0, 0.0, 1e-3])), found.now)
     assert at.position[0] == pytest.approx(0.05 + 85e-3)
     assert found.sensing.latency == pytest.approx(0.1 + 0.05 * (0.15 - 0.1))
@@ -632,7 +632,7 @@ def test_phases_follow_from_what_was_felt() -> None:
     sought.pressing._turned = 0.02
     assert judged(sought, tip=0.0299) == "bridging" and sought.side == 1.0
     assert judged(sought, tip=0.0301) == "bridging" and sought.side == -1.0
-    alone = make(belief=Belief(DISTANCE, two_walls=False))
+    alone = make(prior=ModelPrior(DISTANCE, two_walls=False))
     alone.seam.contact.likely = only(Mode.FREE)
     assert judged(alone, tip=0.06) == "bridging" and alone.side == 1.0
     for seated, phase in ((False, "seeking"), (True, "probing")):
@@ -661,10 +661,10 @@ def test_what_was_felt_a_while_ago_by_a_tip_that_no_wall_lost_is_believed() -> N
     for i in range(40):
         felt_at(bridging, 0.033 * i, 0.02 + 2e-4 * i, 1e-3)
     assert bridging.sensing.felt is None and not bridging.seam.refined._sure
-    one_wall = Belief(DISTANCE, two_walls=False)
+    one_wall = ModelPrior(DISTANCE, two_walls=False)
     for ending, last in (
         (make("ending", ends="3 mm"), LENGTH + 3e-3),
-        (make("ending", ends="3 mm", belief=one_wall), LENGTH - 3e-3),
+        (make("ending", ends="3 mm", prior=one_wall), LENGTH - 3e-3),
         (make("ending"), LENGTH - 2e-3),
     ):
         for s, kept in ((last - 0.1e-3, True), (last + 0.1e-3, False)):
@@ -677,7 +677,7 @@ def test_what_was_felt_a_while_ago_by_a_tip_that_no_wall_lost_is_believed() -> N
 def swept(**given: Any) -> Any:
     """A follower whose sweep has just ended, pressed, with the tip at 5 mm."""
     found = make("probing", **given)
-    found.sensing.probing = SimpleNamespace(over=True, learned=lambda: Learned(swept=2.4e-3))
+    found.sensing.probing = SimpleNamespace(over=True, learned=lambda: SweepFit(swept=2.4e-3))
     down = np.array([0.0, -PRESS, 0.0])
     found.sensing._swept = [(pose(0.005, PRESS), Touch(0.1, down))] * 3
     found.sensing._track.add(pose(0.005, PRESS, -1.5e-3, time=0.1))
@@ -712,7 +712,7 @@ def test_the_tip_goes_back_no_farther_than_the_seam_may_begin() -> None:
     assert found.phase == "following" and found.seam.start is None
     felt = found.seam.refined.samples()
     assert felt[0, 0] < -2e-3 and felt[-1, 0] > 4.4e-3
-    past = 1e-3 + 2.0 * found.task.belief.along_sigma
+    past = 1e-3 + 2.0 * found.task.prior.along_sigma
     assert found.welding.begins == pytest.approx(-past)
     assert found.welding.ends == pytest.approx(LENGTH + past)
     last = told[-1][1]
@@ -725,7 +725,7 @@ def test_a_tip_that_falls_off_the_start_is_lifted_back_into_the_seam() -> None:
     found = swept(ends="3 mm")
     told = driven(found, 1e-3, lambda: found.phase == "following" and found.seam.start)
     assert found.seam.start == pytest.approx(1e-3, abs=0.2e-3)
-    back = 2.0 * found.task.belief.along_sigma
+    back = 2.0 * found.task.prior.along_sigma
     assert found.welding.begins == pytest.approx(found.seam.start - back)
     places = np.array([at for phase, at in told if phase == "entering"])
     outside = places[:, 0] < 1e-3
@@ -745,7 +745,7 @@ def test_what_is_felt_while_the_wall_is_in_doubt_waits_until_one_holds(
     found.pressing.wanted = found.pressing.most = PRESS
     found.pressing.firm = 0.0
     found.seam.contact.play, found.seam.contact.noise = 0.3e-3, (20e-6, 60e-6)
-    found.seam.begin(Learned(width=0.2e-3), 60e-6, [], 0.0)
+    found.seam.begin(SweepFit(width=0.2e-3), 60e-6, [], 0.0)
     for i in range(140):
         s, time = 5e-3 + 1e-4 * i, 0.02 * i
         shown = 0.35e-3 if s > 8e-3 and not (again and s > 12e-3) else PRESS
@@ -772,7 +772,7 @@ def test_a_tip_that_finds_no_way_back_into_the_seam_stops_the_weld() -> None:
 ])  # fmt: skip
 def test_the_seam_ends_where_the_tip_falls_off_it(compressed: float, at: float, ends: bool) -> None:
     """Not where a wall alone is missing, nor where the plan cannot end."""
-    found = make("ending", ends="3 mm", belief=Belief(DISTANCE, along_sigma=0.4e-3))
+    found = make("ending", ends="3 mm", prior=ModelPrior(DISTANCE, along_sigma=0.4e-3))
     found.now, found.seam.contact.fell = 1.0, None if compressed else at
     judged(found)
     assert found.seam.end == (at if ends else None)
@@ -857,7 +857,7 @@ def test_a_sweep_that_says_why_not_ends_the_weld_and_one_that_learned_begins_it(
     found.sensing.probing = SimpleNamespace(over=True, learned=lambda: "it is broken")
     assert judged(found) == "stopped" and found.reason == "it is broken"
     found = make("probing")
-    learned = Learned(dead_time=0.06, lag=0.1, noise=20e-6)
+    learned = SweepFit(dead_time=0.06, lag=0.1, noise=20e-6)
     found.sensing.probing = SimpleNamespace(over=True, learned=lambda: learned)
     found.sensing.search.sigma, found.now, found.sensing.seen = np.array([0, 35e-6, 0]), 4.0, 3.9
     down = np.array([0.0, -asked.deflection, 0.0])
@@ -954,7 +954,7 @@ def test_a_swing_begins_on_the_seam_and_is_commanded_as_early_as_the_arm_is_late
     assert found.lead.aim == pytest.approx(1e-3 + 2e-3 * math.sin(turn * 0.5))
     early = turn * 0.6
     assert now.aside == pytest.approx(2e-3 * (math.sin(early) + 0.05 * turn * math.cos(early)))
-    later = make(weave_width="4 mm", start=Start(5e-3, 10e-3))
+    later = make(weave_width="4 mm", start=Onset(5e-3, 10e-3))
     for coming, swings in ((9.9e-3, False), (10.1e-3, True)):
         swing(put(later, coming=coming), 1.0)
         assert (later.lead._swings is not None) == swings
@@ -1025,12 +1025,12 @@ def test_a_tool_s_length_before_the_seam_the_torch_is_led_to_where_the_plan_was_
 
 # --- what is seen behind the torch ----------------------------------------------------------------
 
-SEEING = Belief(DISTANCE, behind=9.5e-3)
+SEEING = ModelPrior(DISTANCE, behind=9.5e-3)
 
 
 def passing_by(**given: Any) -> Any:
     """A follower whose torch has gone 40 mm in four seconds, ever farther to the left."""
-    found = make(belief=SEEING, **given)
+    found = make(prior=SEEING, **given)
     for i in range(41):
         found.welding._trail.pass_by(1.0 + 0.1 * i, 1e-3 * i, 1e-5 * i, 1e-10 * i)
     return found
@@ -1053,7 +1053,7 @@ def test_a_look_is_held_against_where_the_torch_was_when_it_passed_that_place() 
 
 def test_a_look_at_what_no_torch_has_passed_says_nothing_nor_does_one_after_the_end() -> None:
     profile = WeldProfile(0.35e-3, 0.05e-3, 4_050_000_000)
-    for found in (passing_by(phase="done"), passing_by(phase="stopped"), make(belief=SEEING)):
+    for found in (passing_by(phase="done"), passing_by(phase="stopped"), make(prior=SEEING)):
         found.looked(profile)
         assert not found.welding.bias.looked
     early = passing_by()

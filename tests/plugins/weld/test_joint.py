@@ -10,7 +10,7 @@ from flangeye.models.finger import Finger
 from flangeye.types.geometry import rotation_from_rpy
 from flangeye_emulators.weld_world.groove import Groove, GrooveSection, Tip, TipContact
 from flangeye_plugins.weld.checks import check_body, check_seat
-from flangeye_plugins.weld.following.belief import belief_of, body_of
+from flangeye_plugins.weld.following.model_prior import body_of, model_prior_of
 from flangeye_plugins.weld.frame import body_from, leaning
 from flangeye_plugins.weld.joint import WeldJoint, edges_half_angle, joint_of
 from flangeye_plugins.weld.path import Path
@@ -31,7 +31,7 @@ def following(**given):
 def believed(**given):
     settings = following(**given)
     finger = Finger.model_validate(FINGER)
-    return belief_of(finger, body_of(finger, settings), None, settings), settings
+    return model_prior_of(finger, body_of(finger, settings), None, settings), settings
 
 
 @pytest.mark.parametrize("half_angle", [30.0, 45.0, 60.0])
@@ -122,18 +122,18 @@ def test_a_joint_that_would_not_hold_the_tip_is_refused(given, message: str) -> 
 
 def test_a_remedy_is_one_where_the_tool_leans_too() -> None:
     given = {"joint": "corner", "work_angle": "20 deg", "deflection": "3 mm"}
-    belief, settings = believed(**given)
-    deflection, preload = belief.remedy(settings, 1.4)
+    prior, settings = believed(**given)
+    deflection, preload = prior.remedy(settings, 1.4)
     for better in ({"deflection": f"{deflection} m"}, {"preload": f"{preload} m"}):
         again, told = believed(**{**given, **better})
         assert again.seating(told) == pytest.approx(1.4)
 
 
 def test_a_torch_lifted_off_the_seam_by_a_leaning_tool_is_refused() -> None:
-    belief, settings = believed(travel_angle="20 deg")
+    prior, settings = believed(travel_angle="20 deg")
     body = body_of(Finger.model_validate(FINGER), settings)
     with pytest.raises(StageError, match="torch is .13.7 mm above the seam.*torch_up"):
-        check_body(body, belief, settings)
+        check_body(body, prior, settings)
 
 
 def test_a_leaning_tool_on_an_arm_and_a_fillet_on_an_inclined_plate() -> None:
@@ -174,13 +174,13 @@ def test_a_finger_s_noise_is_that_across_and_along_it_and_a_plate_stands_on_the_
         "noise": ["0.01 mm", "0.02 mm", "0.06 mm"], "source": "a test",
     }  # fmt: skip
     finger = Finger.model_validate({**FINGER, "calibration": known})
-    belief = belief_of(finger, body_of(finger, settings), None, settings)
-    assert belief.noise == pytest.approx((0.02e-3, 0.06e-3))
+    prior = model_prior_of(finger, body_of(finger, settings), None, settings)
+    assert prior.noise == pytest.approx((0.02e-3, 0.06e-3))
     bare = Finger.model_validate({k: v for k, v in FINGER.items() if k != "calibration"})
-    unknown = belief_of(bare, body_of(bare, settings), None, settings)
+    unknown = model_prior_of(bare, body_of(bare, settings), None, settings)
     assert unknown.noise == (10e-6, 60e-6)
     assert (unknown.lateral, unknown.axial) == (1000.0, 2000.0)
     sign = 1.0 if side == "left" else -1.0
-    assert belief.joint is not None and not belief.two_walls
-    assert [belief.joint.left, belief.joint.right][:: int(sign)] == pytest.approx([0.0, np.pi / 2])
-    assert belief.flat(sign) == pytest.approx(np.tan(np.radians(1.0)))
+    assert prior.joint is not None and not prior.two_walls
+    assert [prior.joint.left, prior.joint.right][:: int(sign)] == pytest.approx([0.0, np.pi / 2])
+    assert prior.flat(sign) == pytest.approx(np.tan(np.radians(1.0)))

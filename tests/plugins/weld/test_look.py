@@ -56,7 +56,7 @@ def test_a_weld_is_led_by_what_is_seen_behind_its_torch(weld: Any) -> None:
     assert np.median(seen[:10]) == pytest.approx(0.3e-3, abs=0.05e-3)
     assert np.median(seen[-10:]) == pytest.approx(0.0, abs=0.12e-3)
     start = next(value for name, value in journal if name == "start")
-    assert start["belief"]["behind"] == 0.01
+    assert start["prior"]["behind"] == 0.01
 
 
 def test_every_decision_is_repeated_from_the_log(weld: Any, tmp_path: Path) -> None:

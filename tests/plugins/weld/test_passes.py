@@ -11,9 +11,9 @@ import pytest
 
 from flangeye.motion.seam_following import STILL, Command, ToolPose
 from flangeye.types import Floats
-from flangeye_plugins.weld.following.belief import Belief, Learned
-from flangeye_plugins.weld.following.task import ResumePoint, Start, WeldTask
-from flangeye_plugins.weld.passes import Passes, Traced, _nearest, _towards
+from flangeye_plugins.weld.following.model_prior import ModelPrior, SweepFit
+from flangeye_plugins.weld.following.task import Onset, ResumePoint, WeldTask
+from flangeye_plugins.weld.passes import Passes, RootPass, _nearest, _towards
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following
 from tests.plugins.weld.bench import straight
@@ -40,7 +40,7 @@ class Root:
         self.tip, self.torch, self.wanted, self.aim = DISTANCE, 0.0, 2e-3, 0.0
         self.sigma, self.bound, self.band = SIGMA, 0.0, 0.0
         self.welding = SimpleNamespace(arc_from=0.0)
-        self.sensing = SimpleNamespace(learned=Learned(dead_time=0.08, lag=0.05))
+        self.sensing = SimpleNamespace(learned=SweepFit(dead_time=0.08, lag=0.05))
         self.ends = False
 
     def step(self, pose: Any, touches: Any) -> Command:
@@ -62,7 +62,7 @@ def passes(
     settings = Following.model_validate({"passes": list(asked), **given})
     plan = Path(straight(LENGTH) if points is None else points)
     root: Any = Root(plan, aside)
-    root.task = WeldTask(plan, Belief(DISTANCE), settings, before=before, given=start)
+    root.task = WeldTask(plan, ModelPrior(DISTANCE), settings, before=before, given=start)
     return Passes(root)
 
 
@@ -100,7 +100,7 @@ def driven(found: Any, start: Any, until: str, longest: float = 90.0) -> list[tu
 def test_the_height_of_the_root_pass_is_kept_every_half_millimetre() -> None:
     plan = Path(straight(LENGTH))
     root: Any = Root(plan)
-    traced = Traced(root, plan, np.zeros((0, 3)))
+    traced = RootPass(root, plan, np.zeros((0, 3)))
     for s in np.arange(0.0, 10e-3, 0.1e-3).tolist():
         root.torch, root.sigma = s, SIGMA + s
         traced.note(2 * s)
@@ -108,7 +108,7 @@ def test_the_height_of_the_root_pass_is_kept_every_half_millimetre() -> None:
     assert np.diff(along) == pytest.approx(0.5e-3, abs=0.11e-3)
     assert along[0] == 0.0 and len(along) in range(16, 21)
     assert height == pytest.approx(2 * along) and sigma == pytest.approx(SIGMA + along)
-    later = Traced(root, plan, np.array(traced.rows))
+    later = RootPass(root, plan, np.array(traced.rows))
     assert later.rows == traced.rows and later.sigma(4e-3) == pytest.approx(SIGMA + 4e-3)
 
 
@@ -284,7 +284,7 @@ def test_a_later_pass_is_gone_on_with_where_it_was() -> None:
     kept = first.kept()
     assert kept.number == 1 and kept.torch == pytest.approx(0.03)
     assert kept.traced == pytest.approx(np.array(first._traced.rows))
-    again = passes({}, {"across": "1 mm"}, before=kept, start=Start(0.06, 25e-3))
+    again = passes({}, {"across": "1 mm"}, before=kept, start=Onset(0.06, 25e-3))
     assert again.number == 1 and again.phase == "returning"
     assert again.torch == again._start == pytest.approx(25e-3)
     assert again.root.sensing.learned == kept.learned and again.arc_from == 25e-3

@@ -19,7 +19,7 @@ from flangeye.workflow.recipe.find import find_recipe
 from flangeye.workflow.recipe.load import load_recipe
 from flangeye_emulators.robot import SimulatedRobot, SimulatedRobotParams
 from flangeye_plugins.guide import ATTITUDES, Pivoted, guide_tool, with_body
-from flangeye_plugins.weld.following.belief import belief_of, body_of
+from flangeye_plugins.weld.following.model_prior import body_of, model_prior_of
 from flangeye_plugins.weld.settings import Following
 from flangeye_plugins.weld.touch.pivot import Pivot, pivot
 from tests.plugins.weld.cell import HOME, MODEL
@@ -89,10 +89,10 @@ def test_the_covariance_goes_into_the_welds_bound() -> None:
     np.testing.assert_allclose(
         found.tip + found.flange_R_tool @ body.level_R_tool.T @ body.torch, TORCH, atol=1e-12
     )
-    belief = belief_of(found, body, None, settings)
-    assert belief.tip_sigma == pytest.approx(0.3e-3)
-    assert belief.torch_sigma == pytest.approx(np.hypot(0.2e-3, 0.1e-3), rel=0.02)
-    assert belief.fixed_variance(settings) > belief.torch_sigma**2
+    prior = model_prior_of(found, body, None, settings)
+    assert prior.tip_sigma == pytest.approx(0.3e-3)
+    assert prior.torch_sigma == pytest.approx(np.hypot(0.2e-3, 0.1e-3), rel=0.02)
+    assert prior.fixed_variance(settings) > prior.torch_sigma**2
 
 
 class Person(SimulatedRobot):

@@ -7,17 +7,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye_plugins.weld.following.belief import Belief, Learned
+from flangeye_plugins.weld.following.model_prior import ModelPrior, SweepFit
 from flangeye_plugins.weld.following.probing import SWEEP_MARGIN, Probing, _scatter
 from flangeye_plugins.weld.settings import Following
 
 SETTINGS = Following()
-BELIEF = Belief(40e-3, half_angle=math.radians(40.0))
+BELIEF = ModelPrior(40e-3, half_angle=math.radians(40.0))
 FLAT = math.tan(math.radians(40.0))
 PERIOD, IMAGES = 8e-3, 4
 
 
-def swept(held=2.0, noise=10e-6, pressed=1.2e-3, seed=0, ahead=0.0, belief=BELIEF):
+def swept(held=2.0, noise=10e-6, pressed=1.2e-3, seed=0, ahead=0.0, prior=BELIEF):
     """Sweep a tip; return what is learned, the probing, and the largest true deflection [m].
 
     Args:
@@ -26,9 +26,9 @@ def swept(held=2.0, noise=10e-6, pressed=1.2e-3, seed=0, ahead=0.0, belief=BELIE
         pressed: Deflection at which the sweep begins [m].
         seed: Of the noise.
         ahead: The tip is ahead of where its file has it by this [m].
-        belief: What is expected.
+        prior: What is expected.
     """
-    probing, rng = Probing(SETTINGS, belief, 1.0), np.random.default_rng(seed)
+    probing, rng = Probing(SETTINGS, prior, 1.0), np.random.default_rng(seed)
     probing.begin(noise)
     where, turned, hardest, cycle, found = pressed, 0.0, 0.0, 0, None
     while found is None:
@@ -52,13 +52,13 @@ def test_the_sweep_presses_as_hard_as_it_says_wherever_it_begins() -> None:
     for pressed in (1.2e-3, 2.0e-3):
         for noise in (10e-6, 0.15e-3):
             learned, hardest = swept(pressed=pressed, noise=noise)
-            assert isinstance(learned, Learned)
+            assert isinstance(learned, SweepFit)
             assert hardest == pytest.approx(SWEEP_MARGIN * SETTINGS.deflection, abs=0.15e-3)
 
 
 @pytest.mark.parametrize("noise", [10e-6, 60e-6, 0.15e-3])
 def test_a_seated_tip_is_believed_however_noisy_its_finger(noise: float) -> None:
-    believed = [isinstance(swept(noise=noise, seed=seed)[0], Learned) for seed in range(10)]
+    believed = [isinstance(swept(noise=noise, seed=seed)[0], SweepFit) for seed in range(10)]
     assert sum(believed) >= 9
 
 
@@ -66,7 +66,7 @@ def test_a_seated_tip_is_believed_however_noisy_its_finger(noise: float) -> None
 def test_a_tip_that_the_preload_hardly_holds_is_swept_again_by_half_as_much(noise: float) -> None:
     for seed in range(5):
         found, hardest = swept(held=0.6, noise=noise, seed=seed)
-        assert isinstance(found, Learned) and hardest > 1.2 * SETTINGS.deflection
+        assert isinstance(found, SweepFit) and hardest > 1.2 * SETTINGS.deflection
         assert found.swept == pytest.approx(SWEEP_MARGIN * SETTINGS.deflection / 2)
     never, _ = swept(held=0.0)
     assert "the tip climbs the wall" in str(never) and "lower 'deflection'" in str(never)
@@ -77,7 +77,7 @@ def test_how_far_ahead_the_tip_is_shows_where_the_tool_is_turned(ahead: float) -
     off = []
     for seed in range(8):
         found, _ = swept(noise=30e-6, seed=seed, ahead=ahead)
-        assert isinstance(found, Learned)
+        assert isinstance(found, SweepFit)
         known = BELIEF.tip_sigma**2 / (BELIEF.tip_sigma**2 + found.ahead_sigma**2)
         off.append((found.ahead - ahead * known) / found.ahead_sigma)
         assert found.ahead_sigma < BELIEF.tip_sigma
@@ -89,8 +89,10 @@ def test_how_far_ahead_the_tip_is_shows_where_the_tool_is_turned(ahead: float) -
 
 def going(two_walls: bool = True, side: float = 1.0, noise: float = 10e-6, **given: Any) -> Any:
     settings = Following.model_validate(given)
-    belief = Belief(40e-3, half_angle=math.radians(40.0), two_walls=two_walls, noise=(noise, 6e-5))
-    found: Any = Probing(settings, belief, side)
+    prior = ModelPrior(
+        40e-3, half_angle=math.radians(40.0), two_walls=two_walls, noise=(noise, 6e-5)
+    )
+    found: Any = Probing(settings, prior, side)
     return found
 
 
@@ -274,7 +276,7 @@ def test_a_tag_that_is_seen_less_than_fifteen_times_says_nothing() -> None:
     assert found.learned() == "the tag was seen too seldom while the finger was probed"
     full = fitted()
     full._felt = full._felt[::13][:15]
-    assert isinstance(full.learned(), Learned)
+    assert isinstance(full.learned(), SweepFit)
     full._felt.pop()
     assert "too seldom" in full.learned()
 
@@ -306,7 +308,7 @@ def test_where_in_its_play_a_finger_began_changes_nothing(
         speed += (told - speed) * PERIOD / 0.2
         where, cycle = where + speed * PERIOD, cycle + 1
     learned = found.learned()
-    assert isinstance(learned, Learned)
+    assert isinstance(learned, SweepFit)
     assert learned.width == pytest.approx((1.0 + gain) * half, abs=0.02e-3)
     assert learned.stamp == pytest.approx(late, abs=5e-3)
     assert learned.gain == pytest.approx(gain, abs=0.02)
@@ -326,7 +328,7 @@ def test_a_sweep_in_which_the_tag_is_hardly_seen_comes_to_its_end_and_says_so(im
 
 
 def test_a_finger_that_is_not_probed_is_taken_as_its_file_says_to_a_twentieth() -> None:
-    known = Learned()
+    known = SweepFit()
     assert known.gain_sigma == 0.05 and known.noise == 10e-6
     off = (known.gain, known.width, known.stamp, known.dead_time, known.lag, known.askew)
     assert off == (0.0,) * 6 and known.unexplained == 0.0
@@ -353,7 +355,7 @@ def test_a_finger_scatters_across_as_its_file_says_at_least() -> None:
 
 def test_play_is_as_uncertain_as_where_in_it_the_finger_is() -> None:
     """At the pressed side as often as it is kept there, else anywhere; the tip goes with both."""
-    known = Learned(gain=-0.2, width=0.3e-3, reversal=0.3e-3, noise=0.0)
+    known = SweepFit(gain=-0.2, width=0.3e-3, reversal=0.3e-3, noise=0.0)
     rng = np.random.default_rng(0)
     kept = rng.random(100_000) < known.kept
     at = np.where(kept, 1.0, rng.uniform(-1, 1, len(kept))) * 0.3e-3

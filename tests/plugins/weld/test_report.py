@@ -11,8 +11,8 @@ import pytest
 
 from flangeye.motion.seam_following import turned
 from flangeye.types import Floats, Seam
-from flangeye_plugins.weld.following.belief import Belief, Learned
 from flangeye_plugins.weld.following.follower import Follower
+from flangeye_plugins.weld.following.model_prior import ModelPrior, SweepFit
 from flangeye_plugins.weld.following.task import WeldTask
 from flangeye_plugins.weld.frame import WorkSurface, body_from
 from flangeye_plugins.weld.report import SAMPLES, _advice, learned_figures, report_of
@@ -63,7 +63,7 @@ def logged(count: int, images: int = 4, **more: Any) -> Any:
 def follower(side: str = "left") -> Any:
     _, surface = surface_of()
     found: Any = Follower(
-        WeldTask(surface.path, Belief(40e-3), Following.model_validate({"side": side}))
+        WeldTask(surface.path, ModelPrior(40e-3), Following.model_validate({"side": side}))
     )
     return found
 
@@ -134,7 +134,7 @@ def test_the_refined_seam_is_every_millimetre_as_it_was_felt() -> None:
 
 def test_what_the_sweep_found_is_among_the_figures() -> None:
     controller = follower()
-    controller.sensing.learned = Learned(0.1, 0.02, -0.03e-3, 0.1e-3, 0.04, 0.05, 0.06)
+    controller.sensing.learned = SweepFit(0.1, 0.02, -0.03e-3, 0.1e-3, 0.04, 0.05, 0.06)
     assert learned_figures(controller) == {
         "finger_gain_error": 0.1, "finger_play": 0.06e-3, "timestamps_late": 0.04,
         "arm_dead_time": 0.05, "arm_lag": 0.06, "arc_from": -1.0, "share_welded": 0.0,

@@ -11,8 +11,8 @@ from flangeye.plugin.registry import load_registry
 from flangeye.plugin.stage import BoundPart
 from flangeye.workflow.run.replay import replay_steps
 from flangeye_emulators.finger.sensor import SimulatedFingerParams, sensor_simulated_finger
-from flangeye_plugins.weld.following.belief import Belief
 from flangeye_plugins.weld.following.follower import Follower
+from flangeye_plugins.weld.following.model_prior import ModelPrior
 from flangeye_plugins.weld.following.task import ResumePoint, WeldTask
 from flangeye_plugins.weld.frame import WorkSurface
 from flangeye_plugins.weld.passes import Passes
@@ -123,7 +123,7 @@ def test_far_along_the_seam_the_torch_is_lit_where_the_overlap_begins() -> None:
     felt[:, 0], felt[:, 3] = np.linspace(0.11, 0.21, 200), 1.0
     kept = ResumePoint(felt, 0.17)
     start = set_back(PARAMS, plan, DISTANCE, kept)
-    task = WeldTask(plan, Belief(DISTANCE), PARAMS, before=kept, given=start)
+    task = WeldTask(plan, ModelPrior(DISTANCE), PARAMS, before=kept, given=start)
     follower = Follower(task)
     World(line, line, follower, PARAMS, start=start.tip).run()
     assert (follower.phase, follower.reason) == ("done", "")
@@ -173,5 +173,5 @@ def test_later_passes_follow_a_weld_by_touch_alone() -> None:
         ("tactile", settings, Passes), ("vision", settings, Follower), ("tactile", alone, Follower),
     ):  # fmt: skip
         given: Mode = mode
-        controller = controller_of(plan, Belief(DISTANCE), asked, given)
+        controller = controller_of(plan, ModelPrior(DISTANCE), asked, given)
         assert type(controller) is kind and controller.mode == mode

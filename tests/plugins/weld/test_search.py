@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from flangeye.types import Floats
-from flangeye_plugins.weld.following.belief import Belief
+from flangeye_plugins.weld.following.model_prior import ModelPrior
 from flangeye_plugins.weld.following.search import SweepSearch
 from flangeye_plugins.weld.settings import Following
 
 SETTINGS = Following()
 PRELOAD, REACH = SETTINGS.preload, SETTINGS.reach
-QUIET = Belief(40e-3, noise=(1e-9, 1e-9))
+QUIET = ModelPrior(40e-3, noise=(1e-9, 1e-9))
 
 
-def rested(belief: Belief = QUIET, rest: Any = (0.0, 0.0, 0.0)) -> SweepSearch:
+def rested(prior: ModelPrior = QUIET, rest: Any = (0.0, 0.0, 0.0)) -> SweepSearch:
     """Return a search whose tip was measured in the air."""
-    search = SweepSearch(SETTINGS, belief)
+    search = SweepSearch(SETTINGS, prior)
     for _ in range(10):
         assert search.resting
         search.feel(np.array(rest), 0.0, 0.0)
@@ -34,7 +34,7 @@ def fed(search: SweepSearch, count: int, deflection: float, compression: float) 
 
 def test_the_tip_is_measured_ten_times_in_the_air_and_its_middle_counts() -> None:
     search, rng = (
-        SweepSearch(SETTINGS, Belief(40e-3, noise=(10e-6, 60e-6))),
+        SweepSearch(SETTINGS, ModelPrior(40e-3, noise=(10e-6, 60e-6))),
         np.random.default_rng(0),
     )
     seen: Floats = rng.normal(0.0, [5e-6, 40e-6, 20e-6], (10, 3)) + [1e-4, -2e-4, 3e-4]
@@ -49,7 +49,7 @@ def test_the_tip_is_measured_ten_times_in_the_air_and_its_middle_counts() -> Non
 def test_a_tip_that_scatters_is_measured_longer_and_no_rest_is_taken_for_a_touch() -> None:
     scatter, false, counts = np.array([0.19e-3, 0.19e-3, 1.14e-3]), 0, []
     for seed in range(200):
-        search, rng = SweepSearch(SETTINGS, Belief(40e-3)), np.random.default_rng(seed)
+        search, rng = SweepSearch(SETTINGS, ModelPrior(40e-3)), np.random.default_rng(seed)
         counts.append(0)
         while search.resting:
             search.feel(scatter * rng.normal(size=3), 0.0, 0.0)
@@ -77,14 +77,14 @@ def test_a_tip_that_is_bent_aside_by_half_a_millimetre_touches_something(
 
 
 def test_a_tip_that_moves_about_in_the_air_is_not_free() -> None:
-    search = SweepSearch(SETTINGS, Belief(40e-3))
+    search = SweepSearch(SETTINGS, ModelPrior(40e-3))
     for i in range(10):
         search.feel(np.array([(-1) ** i * 0.6e-3, 0.0, 0.0]), 0.0, 0.0)
     assert np.linalg.norm(search.rest) < 0.5e-3 and search.bent
 
 
 def test_a_tag_that_is_misread_once_bends_nothing() -> None:
-    search = SweepSearch(SETTINGS, Belief(40e-3))
+    search = SweepSearch(SETTINGS, ModelPrior(40e-3))
     for i in range(10):
         search.feel(np.array([6e-3 * (i == 4), 0.0, 0.0]), 0.0, 0.0)
     assert not search.bent
@@ -102,7 +102,7 @@ def test_the_noisier_a_tip_is_the_more_measurements_are_taken_to_a_mean() -> Non
     """As many as make it four standard deviations of their mean; sixty at most."""
     for sigma, count in ((0.0, 3), (0.5, 4), (0.8, 11), (1.2, 24), (9.0, 60)):
         upright = max(sigma * PRELOAD / 2, 1e-9)
-        search = fed(rested(Belief(40e-3, noise=(1e-9, upright))), count - 1, 0.0, PRELOAD)
+        search = fed(rested(ModelPrior(40e-3, noise=(1e-9, upright))), count - 1, 0.0, PRELOAD)
         assert not search.down
         assert fed(search, 1, 0.0, PRELOAD).down
 
@@ -135,7 +135,7 @@ def test_the_sweep_goes_as_far_to_either_side_and_ends() -> None:
 @pytest.mark.parametrize(("side", "sign"), [("left", 1.0), ("right", -1.0)])
 def test_where_one_wall_alone_holds_the_tip_that_one_is_looked_for(side: str, sign: float) -> None:
     settings = Following.model_validate({"side": side})
-    search = SweepSearch(settings, Belief(40e-3, noise=(1e-9, 1e-9), two_walls=False))
+    search = SweepSearch(settings, ModelPrior(40e-3, noise=(1e-9, 1e-9), two_walls=False))
     fed(search, 10, 0.0, 0.0)
     fed(search, 3, 0.0, PRELOAD)
     assert search.step(0.0) == pytest.approx(sign * REACH)

@@ -16,10 +16,10 @@ from flangeye.plugin.stage import BoundPart
 from flangeye.types import Image, Seam
 from flangeye_emulators.finger.sensor import SimulatedFingerParams, sensor_simulated_finger
 from flangeye_plugins.weld.corners import corners_of, leg_of
-from flangeye_plugins.weld.following.belief import Belief, body_of
 from flangeye_plugins.weld.following.follower import Follower
+from flangeye_plugins.weld.following.model_prior import ModelPrior, body_of
 from flangeye_plugins.weld.following.sensing import Track
-from flangeye_plugins.weld.following.task import ResumePoint, Start
+from flangeye_plugins.weld.following.task import Onset, ResumePoint
 from flangeye_plugins.weld.joint import JointKind, WeldJoint, edges_half_angle, joint_of
 from flangeye_plugins.weld.passes import Passes
 from flangeye_plugins.weld.path import Path
@@ -43,7 +43,7 @@ def params(**given: Any) -> WeldTactileParams:
     return WeldTactileParams.model_validate({"sensor": SENSOR, **given})
 
 
-def again(torch: float, plan: Any = None, number: int = 0, **given: Any) -> Start:
+def again(torch: float, plan: Any = None, number: int = 0, **given: Any) -> Onset:
     path = Path(straight(0.3) if plan is None else plan)
     return set_back(
         params(**given), path, DISTANCE, ResumePoint(np.zeros((0, 5)), torch, number=number)
@@ -114,13 +114,13 @@ def test_a_plan_is_the_same_within_a_thousandth_of_a_millimetre() -> None:
 
 
 def test_the_controller_is_the_one_that_was_asked_for() -> None:
-    plan, belief = Path(straight(0.1)), Belief(DISTANCE)
+    plan, prior = Path(straight(0.1)), ModelPrior(DISTANCE)
     root, more = Following(), Following.model_validate({"passes": [{}]})
-    tactile, vision = (controller_of(plan, belief, root, mode) for mode in ("tactile", "vision"))
+    tactile, vision = (controller_of(plan, prior, root, mode) for mode in ("tactile", "vision"))
     assert isinstance(tactile, Follower) and tactile.mode == "tactile"
     assert isinstance(vision, Follower) and vision.mode == "vision"
-    assert isinstance(controller_of(plan, belief, more, "tactile"), Passes)
-    assert isinstance(controller_of(plan, belief, more, "vision"), Follower)
+    assert isinstance(controller_of(plan, prior, more, "tactile"), Passes)
+    assert isinstance(controller_of(plan, prior, more, "vision"), Follower)
     for side, sign in (("left", 1.0), ("right", -1.0)):
         task = task_of(plan, DISTANCE, Following.model_validate({"side": side}))
         assert task.side == sign and task.speed == root.speed

@@ -11,13 +11,13 @@ from pydantic import ValidationError
 from flangeye.motion.arc import BURN, GAS, OFF
 from flangeye.plugin.stage import BoundPart
 from flangeye_emulators.arc import SimulatedArc, SimulatedArcParams, arc_simulated
-from flangeye_plugins.weld.following.steering import Striking
+from flangeye_plugins.weld.following.steering import ArcSequence
 from flangeye_plugins.weld.weld_log import columns
 from tests.plugins.weld.cell import planned, run
 
 
 def test_the_arc_is_struck_once_gas_has_flowed_and_the_torch_stands_until_it_burns() -> None:
-    arc = Striking((0.5, 0.2, 0.3))
+    arc = ArcSequence((0.5, 0.2, 0.3))
     assert arc.level(1.0) == OFF and not arc.stands(1.0)
     arc.gas(1.0)
     arc.strike(1.1)
@@ -29,7 +29,7 @@ def test_the_arc_is_struck_once_gas_has_flowed_and_the_torch_stands_until_it_bur
 
 
 def test_without_a_power_source_nothing_waits() -> None:
-    arc = Striking((0.0, 0.0, 0.0))
+    arc = ArcSequence((0.0, 0.0, 0.0))
     arc.strike(1.0)
     assert not arc.stands(1.0) and arc.filled(9.0)
 

@@ -114,7 +114,7 @@ def test_passes_are_decided_again_from_what_a_log_holds() -> None:
     root = follower_of(found.controller)
     start = {
         "points": misplanned(curved(0.06), 0, *asked.planned).tolist(), "wraps": 0.0, "mode": "tactile",
-        "belief": asdict(root.task.belief), "settings": root.task.settings.model_dump(mode="json"),
+        "prior": asdict(root.task.prior), "settings": root.task.settings.model_dump(mode="json"),
     }  # fmt: skip
     again = controller_from(json.loads(json.dumps(start)))
     for pose, touches, command in given:

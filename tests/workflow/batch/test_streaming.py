@@ -11,7 +11,7 @@ from flangeye.workflow.batch import cluster
 from flangeye.workflow.batch.cluster import Pace
 from flangeye.workflow.batch.dataset import BLOCK
 from flangeye.workflow.batch.outcome import SessionOutcome, Status
-from flangeye.workflow.batch.work import Chunk, ChunkTold
+from flangeye.workflow.batch.work import Chunk, ChunkDone
 
 
 def trivial(job, chunk):
@@ -55,9 +55,9 @@ class Workers:
         return {"workers": dict.fromkeys(range(self.count))}
 
 
-def told(seconds: float, count: int = 10) -> ChunkTold:
+def told(seconds: float, count: int = 10) -> ChunkDone:
     counts: Counter[Status] = Counter({"verified": count})
-    return ChunkTold(counts, [], seconds * count)
+    return ChunkDone(counts, [], seconds * count)
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ from flangeye.files.processes import keep_current_folder_out, python_command
 from flangeye.workflow.batch.dataset import BLOCK
 from flangeye.workflow.batch.outcome import BatchError, SessionOutcome, Tls
 from flangeye.workflow.batch.plan import BatchSession
-from flangeye.workflow.batch.work import WORKER_DIED, Chunk, ChunkTold, Job, run_chunk, write_rows
+from flangeye.workflow.batch.work import WORKER_DIED, Chunk, ChunkDone, Job, run_chunk, write_rows
 
 if TYPE_CHECKING:
     from distributed import Client, Future, Security
@@ -287,7 +287,7 @@ class Pace:
                 self._left -= len(some)
                 yield Chunk(block, some)
 
-    def ended(self, told: ChunkTold) -> None:
+    def ended(self, told: ChunkDone) -> None:
         """Learn from a finished chunk how long a session takes."""
         self._ended += told.counts.total()
         self._seconds += told.seconds
@@ -295,7 +295,7 @@ class Pace:
 
 def run_all(
     client: Client, job: Job, sessions: Iterable[tuple[int, BatchSession]], count: int
-) -> Iterator[ChunkTold]:
+) -> Iterator[ChunkDone]:
     """Yield the outcome of each chunk as it ends.
 
     Chunks are submitted as others end, so the memory of client and scheduler does not grow with
@@ -348,13 +348,13 @@ def run_all(
         future.release()  # the scheduler forgets each result once it is read
 
 
-def _outcome(future: Future, job: Job, chunk: Chunk) -> ChunkTold | None:
+def _outcome(future: Future, job: Job, chunk: Chunk) -> ChunkDone | None:
     """Return a worker's result, or the reason for a failure; None for a chunk to be retried."""
     if future.cancelled():
         reason = "the connection to the scheduler was lost before it ended"
     else:
         try:
-            told: ChunkTold = future.result()
+            told: ChunkDone = future.result()
             return told
         except FlangeyeError:
             raise

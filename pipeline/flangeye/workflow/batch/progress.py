@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from rich.console import Console
 
-    from flangeye.workflow.batch.work import ChunkTold
+    from flangeye.workflow.batch.work import ChunkDone
 
 
 FIGURES = ("holdout_rms_m", "expected_p95_m", "true_rms_m")
@@ -32,7 +32,7 @@ Names = tuple[Any, ...]
 
 
 @dataclass(frozen=True)
-class VariantTold:
+class VariantSummary:
     """Summary of the sessions of one variant.
 
     Attributes:
@@ -118,7 +118,7 @@ class Tally:
         """Return the columns in which variants differ."""
         return [*(["archive"] if self._archives else []), *self.varied]
 
-    def variants(self) -> list[VariantTold]:
+    def variants(self) -> list[VariantSummary]:
         """Return a summary of each variant; none if nothing was repeated or there are many."""
         if len(self._variants) > self.most_listed or len(self._variants) == self.total:
             return []
@@ -127,7 +127,7 @@ class Tally:
         ends = np.flatnonzero(np.diff(np.sort(members))) + 1
         groups = np.split(np.argsort(members, kind="stable"), ends)
         return [
-            VariantTold(
+            VariantSummary(
                 names if self._archives else names[1:],
                 _counts(statuses[group]),
                 {n: _median(v[group]) for n, v in zip(FIGURES, figures, strict=True)},
@@ -226,7 +226,7 @@ class BatchProgress:
         """Print a line above the bar."""
         self._console.print(printable(line), markup=False, highlight=False, soft_wrap=True)
 
-    def ended(self, told: ChunkTold) -> None:
+    def ended(self, told: ChunkDone) -> None:
         """Count the sessions of a chunk, and print the first errors."""
         self._counts.update(told.counts)
         for session, outcome in told.bad:

@@ -88,7 +88,7 @@ class Chunk:
 
 
 @dataclass(frozen=True)
-class ChunkTold:
+class ChunkDone:
     """Summary of a chunk whose rows are written.
 
     Attributes:
@@ -102,7 +102,7 @@ class ChunkTold:
     seconds: float
 
 
-def run_chunk(job: Job, chunk: Chunk) -> ChunkTold:
+def run_chunk(job: Job, chunk: Chunk) -> ChunkDone:
     """Run sessions into their folders and write their rows.
 
     Raises:
@@ -114,7 +114,7 @@ def run_chunk(job: Job, chunk: Chunk) -> ChunkTold:
     return replace(write_rows(job, chunk, outcomes), seconds=time.perf_counter() - begun)
 
 
-def write_rows(job: Job, chunk: Chunk, outcomes: Sequence[SessionOutcome]) -> ChunkTold:
+def write_rows(job: Job, chunk: Chunk, outcomes: Sequence[SessionOutcome]) -> ChunkDone:
     """Write the rows of a chunk.
 
     Raises:
@@ -126,7 +126,7 @@ def write_rows(job: Job, chunk: Chunk, outcomes: Sequence[SessionOutcome]) -> Ch
     Dataset(job.place, job.columns).write_part(chunk.block, part, rows)
     bad = [(session.id, o) for session, o in pairs if o.status not in ACCEPTED]
     # The console names this many failed sessions of a chunk at once; the rows have all
-    return ChunkTold(Counter(o.status for o in outcomes), bad[:11], 0.0)
+    return ChunkDone(Counter(o.status for o in outcomes), bad[:11], 0.0)
 
 
 class Recipes:

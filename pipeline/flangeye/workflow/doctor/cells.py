@@ -206,7 +206,7 @@ def examine_cell(session: CellSession) -> Diagnosis:
 
 
 def _likeliest(
-    session: CellSession, before: Predicted, suspected: Iterable[Suspicion]
+    session: CellSession, before: CellPrediction, suspected: Iterable[Suspicion]
 ) -> list[Finding]:
     """Return the mistake whose cure predicts sightings best, if it does so far better."""
     tried = []
@@ -384,7 +384,7 @@ def _mispaired(session: CellSession) -> list[Finding]:
 
 
 @dataclass(frozen=True)
-class Predicted:
+class CellPrediction:
     """Prediction error of held-out observations.
 
     Attributes:
@@ -411,13 +411,13 @@ class Predicted:
         return self.size <= 1
 
 
-def predicted(session: CellSession, search: bool = True) -> Predicted:
+def predicted(session: CellSession, search: bool = True) -> CellPrediction:
     """Return each sighting's error as predicted by the others; infinite without a solution."""
     observations = session.observations
     try:
         found = rough(problem_of(observations, session.cell), session.cell.freedoms, search)
     except (FlangeyeError, np.linalg.LinAlgError):
-        return Predicted(Misfit(np.inf), np.inf)
+        return CellPrediction(Misfit(np.inf), np.inf)
     turns, places = (np.linalg.norm(found.errors[:, at], axis=1) for at in (slice(3), slice(3, 6)))
     centres = np.array([o.feature.centre for o in observations])
     of_pairs = []
@@ -425,7 +425,7 @@ def predicted(session: CellSession, search: bool = True) -> Predicted:
         # Medians: a few sightings beside wrong poses are not yet a mistake of the whole pair
         spread = max(float(np.linalg.norm(centres[of].std(axis=0))), 1e-12)
         place, turn = float(np.median(places[of])), float(np.median(turns[of]))
-        of_pairs.append(Predicted(Misfit(place, turn), place / spread))
+        of_pairs.append(CellPrediction(Misfit(place, turn), place / spread))
     return max(of_pairs, key=lambda pair: pair.size)
 
 

@@ -21,7 +21,7 @@ from flangeye.workflow.recipe.header import LimitsSection
 Complain = Callable[[Sequence[Hashable], str], None]
 
 
-class Offer(NamedTuple):
+class Given(NamedTuple):
     """Where in a recipe's header something comes from.
 
     Attributes:
@@ -35,55 +35,55 @@ class Offer(NamedTuple):
     example: str
 
 
-SECTIONS: Mapping[Any, Offer] = {
-    RobotModel: Offer(
+SECTIONS: Mapping[Any, Given] = {
+    RobotModel: Given(
         "the arm's kinematics",
         ("robot",),
         "robot: ur10e ('flangeye robots' lists them), or robot: {urdf: arm.urdf}",
     ),
-    ScannerData: Offer(
+    ScannerData: Given(
         "a scanner", ("scanner",), "scanner: {name: ACME 3000, range: [300 mm, 900 mm]}"
     ),
-    ScannerModel: Offer(
+    ScannerModel: Given(
         "the scanner's field of view and noise",
         ("scanner",),
         "scanner: phoxi-m ('flangeye scanners' lists them, 'flangeye new-scanner' writes one)",
     ),
-    Flange: Offer(
+    Flange: Given(
         "the plate to look for",
         ("robot", "feature"),
         "feature: {standard: ISO 9409-1-50-4-M6} ('flangeye standards' lists them), or a robot's "
         "model",
     ),
-    Sphere: Offer(
+    Sphere: Given(
         "a sphere",
         ("feature",),
         "feature: {sphere: {diameter: 38.1 mm, centre: [0 mm, 0 mm, 60 mm]}}",
     ),
-    TargetBody: Offer("a body to look for", ("target",), "target: {body: gripper.stl, at: flange}"),
-    t.Seed: Offer("a seed", ("seed",), "seed: 0"),
-    Configuration: Offer(
+    TargetBody: Given("a body to look for", ("target",), "target: {body: gripper.stl, at: flange}"),
+    t.Seed: Given("a seed", ("seed",), "seed: 0"),
+    Configuration: Given(
         "a configuration",
         ("configuration",),
         "configuration: {name: eye-in-hand, place: unknown}",
     ),
-    Cell: Offer(
+    Cell: Given(
         "a cell",
         ("cell",),
         "cell: {arms: {arm: ur5}, cameras: {left: base, right: base}, targets: {board: arm}}",
     ),
-    SecondRobot: Offer("the second arm", ("second_robot",), "second_robot: ur5"),
-    RobotDriver: Offer(
+    SecondRobot: Given("the second arm", ("second_robot",), "second_robot: ur5"),
+    RobotDriver: Given(
         "the arm's driver",
         ("robot",),
         "robot: {model: ur10e, driver: {ur_rtde: {host: 192.168.1.10}}, limits: …}",
     ),
-    LimitsSection: Offer(
+    LimitsSection: Given(
         "the arm's limits",
         ("robot",),
         "robot: {limits: {box: {centre: [500 mm, 0 mm, 400 mm], size: [800 mm, 800 mm, 800 mm]}}}",
     ),
-    ScannerDriver: Offer(
+    ScannerDriver: Given(
         "the scanner's driver",
         ("scanner",),
         "scanner: {model: phoxi-m, driver: {watched_folder: {path: …}}}",

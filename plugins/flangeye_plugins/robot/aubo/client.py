@@ -120,7 +120,7 @@ def _say_nothing(*_: object) -> None:
     """Discard the library's log lines, which would go to standard output."""
 
 
-class Ride:
+class VelocityMove:
     """One move, made of velocity commands that are renewed whenever the arm's state is read.
 
     The move starts at rest, goes straight to the goal with a trapezoidal speed profile, stops near

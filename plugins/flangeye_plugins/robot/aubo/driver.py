@@ -15,7 +15,7 @@ from flangeye.plugin.stage import part
 from flangeye.types import BASE, FLANGE, TOOL, Floats, Transform
 from flangeye.types.geometry import rotation_log
 from flangeye.types.pose_formats import CONVENTIONS
-from flangeye_plugins.robot.aubo.client import STANDING, AuboClient, Ride
+from flangeye_plugins.robot.aubo.client import STANDING, AuboClient, VelocityMove
 from flangeye_plugins.robot.tool_check import (
     ControllerParams,
     require_model,
@@ -110,7 +110,7 @@ class AuboRobot(Device):
         self.flange_T_tool: Transform | None = Transform(FLANGE, TOOL, self.offset)
         self._tool_T_flange = np.linalg.inv(self.offset)
         self._begins = self._velocity_until = -np.inf
-        self._ride: Ride | None = None
+        self._ride: VelocityMove | None = None
         self._rest = _in_joints(np.zeros(0))
         self._in_joints = False
         self._closed = False
@@ -193,7 +193,7 @@ class AuboRobot(Device):
         self, target: list[float], go: Any, end: Any, speed: float, acceleration: float
     ) -> None:
         """Start a move by speed commands that ends with the controller's own move, in one space."""
-        self._ride = Ride(
+        self._ride = VelocityMove(
             speed, acceleration,
             lambda speeds: self._client.command(
                 "speed", lambda: go(speeds.tolist(), acceleration, GRACE)
@@ -251,7 +251,7 @@ class AuboRobot(Device):
         self.stop()
         self._in_joints = in_joints
 
-    def _go_on(self, ride: Ride, state: RobotState) -> None:
+    def _go_on(self, ride: VelocityMove, state: RobotState) -> None:
         """Command the next piece of a move, unless it is over or a stop is active."""
         if state.message or ride.over:
             self._ride = None

@@ -20,7 +20,7 @@ from scipy.special import ndtr, ndtri
 
 from flangeye.errors import StageError
 from flangeye.types import Floats
-from flangeye_plugins.weld.following.belief import Belief, Learned
+from flangeye_plugins.weld.following.model_prior import ModelPrior, SweepFit
 from flangeye_plugins.weld.following.probing import PIVOTED, SOFTER
 from flangeye_plugins.weld.following.refined import SLOPE
 from flangeye_plugins.weld.following.steering import Weave
@@ -82,18 +82,18 @@ class Predicted(NamedTuple):
 
 
 def varying(
-    belief: Belief, settings: Following, learned: Learned, press: float, stance: Stance[Number]
+    prior: ModelPrior, settings: Following, learned: SweepFit, press: float, stance: Stance[Number]
 ) -> tuple[Number, Number, Number]:
     """Return the variances that vary along the seam: askew, tip and felt of :class:`Predicted`.
 
     Args:
-        belief: Tool, finger and joint as stated by their files.
+        prior: Tool, finger and joint as stated by their files.
         settings: Parameters of the follower.
         learned: Calibration from the sweep, or the expected one.
         press: Deflection of the tip [m].
         stance: Orientation of the tool.
     """
-    ahead = min(learned.ahead_sigma, belief.tip_sigma)
+    ahead = min(learned.ahead_sigma, prior.tip_sigma)
     gain = (learned.gain_sigma + settings.gain_drift * stance.minutes) * press
     weave = Weave(settings.weave_width, settings.weave_frequency)
     # An error e of the tip along the tool shifts the torch across the seam by e times the sine of
@@ -101,17 +101,17 @@ def varying(
     # tool, by e (1 - cos). For a chord c, sin^2 = c^2 (1 - c^2 / 4) and 1 - cos = c^2 / 2
     square = stance.turned**2
     return (
-        (belief.along_sigma * stance.sine) ** 2,
-        ahead**2 * square * (1.0 - square / 4.0) + (belief.tip_sigma * square / 2.0) ** 2,
+        (prior.along_sigma * stance.sine) ** 2,
+        ahead**2 * square * (1.0 - square / 4.0) + (prior.tip_sigma * square / 2.0) ** 2,
         gain**2 + learned.systematic + weave.variance,
     )
 
 
 def predicted(
     plan: Path,
-    belief: Belief,
+    prior: ModelPrior,
     settings: Following,
-    learned: Learned,
+    learned: SweepFit,
     press: float,
     offsets: Callable[[Floats], Floats] = np.zeros_like,
 ) -> Predicted:
@@ -119,7 +119,7 @@ def predicted(
 
     Args:
         plan: The planned seam.
-        belief: Tool, finger and joint as stated by their files.
+        prior: Tool, finger and joint as stated by their files.
         settings: Parameters of the follower.
         learned: Calibration from the sweep, or the expected one.
         press: Deflection of the tip [m].
@@ -127,43 +127,43 @@ def predicted(
     """
     s = np.arange(0.0, plan.length + 1e-3, 2e-3)  # every 2 mm
     lets_go = plan.length - settings.ending - settings.speed * press / settings.release
-    sine, free, turned = _stances(plan, s, belief.distance, settings.sign * press, offsets)
+    sine, free, turned = _stances(plan, s, prior.distance, settings.sign * press, offsets)
     # Near the end the tip is released, which turns the tool from the one angle to the other
     least = np.minimum(np.abs(sine), np.abs(free))
-    sine = np.where(s + belief.distance < lets_go, sine, least)
-    stance = Stance(sine, turned, (s + belief.distance) / settings.speed / 60.0)
-    fixed = np.full(len(s), belief.fixed_variance(settings))
-    return Predicted(s, fixed, *varying(belief, settings, learned, press, stance))
+    sine = np.where(s + prior.distance < lets_go, sine, least)
+    stance = Stance(sine, turned, (s + prior.distance) / settings.speed / 60.0)
+    fixed = np.full(len(s), prior.fixed_variance(settings))
+    return Predicted(s, fixed, *varying(prior, settings, learned, press, stance))
 
 
-def beforehand(belief: Belief, settings: Following) -> tuple[Learned, float]:
+def beforehand(prior: ModelPrior, settings: Following) -> tuple[SweepFit, float]:
     """Return the best calibration that the sweep can give, and the deflection of the tip [m]."""
     # Between two walls the sweep measures the tip's position along the tool.
-    ahead = min(belief.ahead_known, PIVOTED if belief.two_walls else math.inf)
-    press = settings.deflection / (SOFTER if belief.two_walls else 1.0)
-    return Learned(gain_sigma=0.0, ahead_sigma=ahead), press
+    ahead = min(prior.ahead_known, PIVOTED if prior.two_walls else math.inf)
+    press = settings.deflection / (SOFTER if prior.two_walls else 1.0)
+    return SweepFit(gain_sigma=0.0, ahead_sigma=ahead), press
 
 
-def along(plan: Path, belief: Belief, settings: Following) -> float:
+def along(plan: Path, prior: ModelPrior, settings: Following) -> float:
     """Return how many standard deviations contain the torch's error along a whole plan.
 
     They do so as surely as ``sigmas`` of them at a single place. Torch and tip are at one length
     of the tool from each other: the plan has about one independent error for each such length, and
     one more (Bonferroni's inequality).
     """
-    places = 1.0 + plan.length / belief.distance
+    places = 1.0 + plan.length / prior.distance
     return -float(ndtri(ndtr(-settings.sigmas) / places))
 
 
-def check_bound(plan: Path, belief: Belief, settings: Following) -> None:
+def check_bound(plan: Path, prior: ModelPrior, settings: Following) -> None:
     """Refuse a weld whose predicted error bound exceeds ``max_error`` anywhere on the plan.
 
     Raises:
         StageError: The message names the worst place, the largest part there and a remedy.
     """
-    found = predicted(plan, belief, settings, *beforehand(belief, settings))
+    found = predicted(plan, prior, settings, *beforehand(prior, settings))
     worst = int(np.argmax(found.variance))
-    sigmas = along(plan, belief, settings)
+    sigmas = along(plan, prior, settings)
     bound = sigmas * float(np.sqrt(found.variance[worst]))
     if bound <= settings.max_error:
         return

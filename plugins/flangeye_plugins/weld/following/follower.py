@@ -12,13 +12,13 @@ from flangeye.devices import WeldProfile
 from flangeye.motion.arc import OFF
 from flangeye.motion.seam_following import STILL, Command, Phase, ToolPose, Touch
 from flangeye.types import Floats
-from flangeye_plugins.weld.following.belief import Learned
 from flangeye_plugins.weld.following.contact import LOST, STRAINED, STRIDE
+from flangeye_plugins.weld.following.model_prior import SweepFit
 from flangeye_plugins.weld.following.response import Response
 from flangeye_plugins.weld.following.sensing import SeamEstimate, SeamReading, Sensing
 from flangeye_plugins.weld.following.steering import SLOWEST, TorchLead
 from flangeye_plugins.weld.following.task import ResumePoint, WeldTask
-from flangeye_plugins.weld.following.tip import Pressing, Progress, within
+from flangeye_plugins.weld.following.tip import Advance, Pressing, within
 from flangeye_plugins.weld.following.welding import Welding
 from flangeye_plugins.weld.settings import INSIDE
 
@@ -47,7 +47,7 @@ class Follower:
         """Prepare to follow a seam."""
         self.phase: Phase = "seeking" if task.touch else "following"
         self.reason, self.task = "", task
-        self.progress, self.pressing = Progress(task), Pressing(task)
+        self.progress, self.pressing = Advance(task), Pressing(task)
         self.sensing = Sensing(task, self.progress, self.pressing)
         self.seam, self.lead, self.arm = SeamEstimate(task), TorchLead(task), Response()
         self.welding = Welding(
@@ -255,7 +255,7 @@ class Follower:
             scatter = float(self.sensing.search.sigma[1])
             self._follow(replace(found, noise=max(found.noise, scatter)))
 
-    def _follow(self, found: Learned) -> None:
+    def _follow(self, found: SweepFit) -> None:
         """Start to follow with the sweep's calibration."""
         sensing, seam, task = self.sensing, self.seam, self.task
         sensing.learned = found
@@ -439,7 +439,7 @@ class Follower:
 
         The tip slows down where the seam turns away faster than the deflection servo follows.
         """
-        if self.phase == "bridging" and self.task.belief.two_walls:
+        if self.phase == "bridging" and self.task.prior.two_walls:
             return WAITING
         if self.phase not in ("following", "ending") or not self.task.touch:
             return 1.0

@@ -22,7 +22,7 @@ import math
 import numpy as np
 
 from flangeye.types import Floats
-from flangeye_plugins.weld.following.belief import Belief, Learned
+from flangeye_plugins.weld.following.model_prior import ModelPrior, SweepFit
 from flangeye_plugins.weld.following.response import identify
 from flangeye_plugins.weld.settings import Following
 
@@ -52,11 +52,11 @@ class Probing:
         over: Whether the sweep's motion is complete.
     """
 
-    def __init__(self, settings: Following, belief: Belief, side: float) -> None:
+    def __init__(self, settings: Following, prior: ModelPrior, side: float) -> None:
         self._rate, self._turn_rate = 4e-3, settings.turn_rate / 3.0
-        self._belief = belief
-        self._two_walls, self._settings = belief.two_walls, settings
-        self._side, self._noise = side, belief.noise
+        self._prior = prior
+        self._two_walls, self._settings = prior.two_walls, settings
+        self._side, self._noise = side, prior.noise
         self._turned = 0.0
         self._sweep(SWEEP_MARGIN * settings.deflection)
 
@@ -150,7 +150,7 @@ class Probing:
         """Store a measurement: displacement to the left and forwards, and the tip's height [m]."""
         self._felt.append((time, across, height, along))
 
-    def learned(self) -> Learned | str | None:
+    def learned(self) -> SweepFit | str | None:
         """Return the calibration, or the reason for not welding; None to repeat the sweep."""
         if len(self._felt) < 15:  # four unknowns, and as many again for what is unexplained
             return "the tag was seen too seldom while the finger was probed"
@@ -170,7 +170,7 @@ class Probing:
         self._sweep(half)
         return None
 
-    def _fit(self, felt: Floats, cycles: Floats) -> tuple[Learned, str]:
+    def _fit(self, felt: Floats, cycles: Floats) -> tuple[SweepFit, str]:
         """Return the calibration fitted to the sweep, and why it is rejected ("" if it is not)."""
         noise = max(_scatter(felt[:, 1]), self._noise[0])
         late = np.arange(-0.12, 0.121, 0.01)  # timestamps, or early, by up to 120 ms
@@ -180,11 +180,11 @@ class Probing:
             np.interp(felt[:, 0] - stamps[:, None], cycles[:, 0], cycles[:, i]) for i in (2, 3)
         )
         rms, solutions = _explained(at, slant, widths, felt[:, 1])
-        belief = self._belief
+        prior = self._prior
         # The scale is at least the best candidate's rms: model error counts like noise
         unlikely = len(felt) * (rms / max(noise, float(rms.min()))) ** 2
-        unlikely += ((stamps - belief.stamp) / belief.stamp_sigma) ** 2
-        unlikely += ((solutions[:, 2] + belief.play) / belief.play_sigma) ** 2
+        unlikely += ((stamps - prior.stamp) / prior.stamp_sigma) ** 2
+        unlikely += ((solutions[:, 2] + prior.play) / prior.play_sigma) ** 2
         best = int(np.argmin(unlikely))
         _, across, play, _, ahead = solutions[best].tolist()
         slid = felt[:, 3] - felt[:, 3].mean()
@@ -195,19 +195,19 @@ class Probing:
         gain = across * (1.0 + askew**2) - 1.0
         left = max(float(rms[best]), noise)
         bend, sigma, told = self._bent(felt, at[best], slant[best], float(widths[best]), left)
-        known = belief.ahead_known**2 / (belief.ahead_known**2 + told**2)
+        known = prior.ahead_known**2 / (prior.ahead_known**2 + told**2)
         # Walls that stand askew may be curved too: the correction is as uncertain as it is large.
         sigma = math.hypot(sigma, askew**2)
         dead, lag = identify(cycles[:, :3])
-        found = Learned(
+        found = SweepFit(
             gain, sigma, -play, float(widths[best]), float(stamps[best]), dead, lag,
             math.sqrt(max(float(rms[best]) ** 2 - noise**2, 0.0)), askew, noise, self._reach,
-            belief.ahead + known * ahead / across, math.sqrt(known) * told,
+            prior.ahead + known * ahead / across, math.sqrt(known) * told,
             *_spread(unlikely, stamps, solutions[:, 2], best),
         )  # fmt: skip
         # Play follows the model to 30 %, all else to 0.04 mm.
-        beyond = 4.0 * math.hypot(belief.ahead_known, told)
-        if belief.ahead_sigma is not None and abs(ahead / across) > beyond:
+        beyond = 4.0 * math.hypot(prior.ahead_known, told)
+        if prior.ahead_sigma is not None and abs(ahead / across) > beyond:
             return found, (
                 f"the tip is {ahead / across * 1e3:+.2f} mm ahead of where earlier welds found it, "
                 f"{beyond * 1e3:.2f} mm are allowed: it was bent or changed; delete the file that "

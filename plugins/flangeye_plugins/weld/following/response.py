@@ -20,7 +20,7 @@ GRID = 5e-3
 """Sampling period for comparing commands and motion [s]; dead times are multiples of it."""
 
 
-class _Told(NamedTuple):
+class _SentCommand(NamedTuple):
     """A command sent to the arm, and the displacement commanded before it.
 
     Attributes:
@@ -48,7 +48,7 @@ class Response:
 
     def __init__(self) -> None:
         self.dead_time = self.lag = 0.0
-        self._commands: deque[_Told] = deque()
+        self._commands: deque[_SentCommand] = deque()
         self._speed = np.zeros(4)
 
     @property
@@ -61,7 +61,7 @@ class Response:
         if not self.delay:
             return
         way = self._commands[-1].way_at(time) if self._commands else np.zeros(4)
-        self._commands.append(_Told(time, np.array([*command.velocity, command.turn]), way))
+        self._commands.append(_SentCommand(time, np.array([*command.velocity, command.turn]), way))
 
     def ahead(self, pose: ToolPose) -> ToolPose:
         """Return the pose that the tool will have once it has carried out all commands sent."""

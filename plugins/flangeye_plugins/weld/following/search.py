@@ -11,7 +11,7 @@ import numpy as np
 
 from flangeye.maths.statistics import SIGMA_OF_MAD
 from flangeye.types import Floats
-from flangeye_plugins.weld.following.belief import Belief
+from flangeye_plugins.weld.following.model_prior import ModelPrior
 from flangeye_plugins.weld.settings import Following
 
 MOST = 60
@@ -35,7 +35,7 @@ class SweepSearch:
         sigma: (3,) standard deviations of one measurement at rest [m].
     """
 
-    def __init__(self, settings: Following, belief: Belief) -> None:
+    def __init__(self, settings: Following, prior: ModelPrior) -> None:
         """Plan a sweep by ``reach`` to the left of the plan, then as far to the right.
 
         In a joint with only one wall that holds the tip, the sweep goes towards that wall only.
@@ -43,12 +43,12 @@ class SweepSearch:
         self.resting, self.bent = True, False
         self.down = self.found = self.seated = self.over = False
         self.rest = np.zeros(3)
-        self.sigma = np.array([belief.noise[0], belief.noise[0], belief.noise[1]])
+        self.sigma = np.array([prior.noise[0], prior.noise[0], prior.noise[1]])
         self._settings = settings
         # A wall deflects the tip by at least 10 % more than friction can.
-        self._wall = max(1.1 * belief.sliding(settings), settings.probe / 2)
+        self._wall = max(1.1 * prior.sliding(settings), settings.probe / 2)
         both = [settings.reach, -settings.reach]
-        self._turns = both if belief.two_walls else [settings.sign * settings.reach]
+        self._turns = both if prior.two_walls else [settings.sign * settings.reach]
         self._free: list[Floats] = []
         self._newest: deque[tuple[float, float]] = deque(maxlen=MOST)
 

@@ -13,13 +13,13 @@ import numpy as np
 
 from flangeye.motion.seam_following import Phase, ToolPose, Touch, turned
 from flangeye.types import Floats
-from flangeye_plugins.weld.following.belief import Learned
 from flangeye_plugins.weld.following.contact import LOST, Contact, Felt
+from flangeye_plugins.weld.following.model_prior import SweepFit
 from flangeye_plugins.weld.following.probing import SOFTER, SWEEP_MARGIN, Probing
 from flangeye_plugins.weld.following.refined import RefinedPath
 from flangeye_plugins.weld.following.search import SweepSearch
 from flangeye_plugins.weld.following.task import WeldTask
-from flangeye_plugins.weld.following.tip import Pressing, Progress
+from flangeye_plugins.weld.following.tip import Advance, Pressing
 from flangeye_plugins.weld.settings import INSIDE
 
 STEADY = 0.03e-3
@@ -70,15 +70,15 @@ class Sensing:
         latency: Running mean of the touches' latency [s].
     """
 
-    def __init__(self, task: WeldTask, progress: Progress, pressing: Pressing) -> None:
+    def __init__(self, task: WeldTask, progress: Advance, pressing: Pressing) -> None:
         self._task, self._progress, self._pressing = task, progress, pressing
-        belief = task.belief
-        self.search = SweepSearch(task.settings, belief)
-        self.probing = Probing(task.settings, belief, task.settings.sign)
-        self.learned = Learned(ahead=belief.ahead, ahead_sigma=belief.ahead_known)
+        prior = task.prior
+        self.search = SweepSearch(task.settings, prior)
+        self.probing = Probing(task.settings, prior, task.settings.sign)
+        self.learned = SweepFit(ahead=prior.ahead, ahead_sigma=prior.ahead_known)
         self.felt: SeamReading | None = None if task.touch else SeamReading(0.0, 0.0)
         self.seen = self.heard = self.latency = 0.0
-        self._level = np.array(belief.level_R_tool)
+        self._level = np.array(prior.level_R_tool)
         self._track = Track()
         self._swept: list[tuple[ToolPose, Touch]] = []
 
@@ -117,12 +117,12 @@ class Sensing:
 
     def locate(self, pose: ToolPose, touch: Touch, phase: Phase) -> Located:
         """Return the tip's position relative to the plan, and its deformation, at a touch."""
-        plan, belief = self._task.plan, self._task.belief
+        plan, prior = self._task.plan, self._task.prior
         corrected = self._corrected(touch.displacement, phase)
         tip = pose.position + turned(corrected, pose.angle)
         s = plan.foot(tip[:2], self._progress.tip)
         place = plan.at(s)
-        beside = float((tip[:2] - place.point) @ place.normal) - belief.beside
+        beside = float((tip[:2] - place.point) @ place.normal) - prior.beside
         felt = SeamReading(beside, float(tip[2]) - place.height)
         deflection = self._pressing.side * float((pose.position - tip)[:2] @ place.normal)
         return Located(s, felt, deflection, float(corrected[2]), pose.angle)
@@ -229,10 +229,10 @@ class SeamEstimate:
         self.start: float | None = None
         self.end: float | None = None
         self.lost: float | None = None
-        self._task, belief, settings = task, task.belief, task.settings
+        self._task, prior, settings = task, task.prior, task.settings
         self.contact = Contact(
-            belief.flat(settings.sign), belief.sliding(settings) / SOFTER, settings.preload,
-            belief.noise,
+            prior.flat(settings.sign), prior.sliding(settings) / SOFTER, settings.preload,
+            prior.noise,
         )  # fmt: skip
         self.refined = self._path()
         self._heights: deque[float] = deque(maxlen=20)
@@ -263,12 +263,12 @@ class SeamEstimate:
         if not self.backs:
             self.refined.renew(torch)
 
-    def stands(self, found: Learned) -> float:
+    def stands(self, found: SweepFit) -> float:
         """Return the largest deflection at which the tip stayed seated in the sweep [m]."""
         return min(found.swept, SWEEP_MARGIN * self._task.settings.deflection)
 
     def begin(
-        self, found: Learned, height_noise: float, swept: list[Located], torch: float
+        self, found: SweepFit, height_noise: float, swept: list[Located], torch: float
     ) -> None:
         """Start the path with the last touches of the sweep.
 
@@ -278,7 +278,7 @@ class SeamEstimate:
             swept: Last touches of the sweep.
             torch: Arc length of the torch [m].
         """
-        if self._task.belief.two_walls:
+        if self._task.prior.two_walls:
             self.contact.steady = self.stands(found) / self._task.settings.preload
         self.contact.noise = found.noise, height_noise
         self.contact.play = abs(found.width) * (1.0 + found.kept) / (1.0 + found.gain)
@@ -293,7 +293,7 @@ class SeamEstimate:
         """Return the time since the tip lost contact [s]; 0 in contact."""
         return 0.0 if self.lost is None else now - self.lost
 
-    def arrive(self, found: Learned, torch: float, lost: bool = False) -> None:
+    def arrive(self, found: SweepFit, torch: float, lost: bool = False) -> None:
         """Rebuild the path from the touches of the sweep and of the way back to the start.
 
         Args:
@@ -315,7 +315,7 @@ class SeamEstimate:
         task, at = self._task, self.contact.fell
         if self.end is not None or phase != "ending" or at is None:
             return
-        if not task.feels_ends or not task.belief.two_walls:
+        if not task.feels_ends or not task.prior.two_walls:
             return
         if abs(at - task.plan.length) <= task.beyond + INSIDE:
             self.end = at
@@ -325,7 +325,7 @@ class SeamEstimate:
         """Mean height above the plan of the last accepted, seated touches [m]."""
         return float(np.mean(self._heights or [0.0]))
 
-    def weigh(self, time: float, found: Located, learned: Learned, side: float) -> None:
+    def weigh(self, time: float, found: Located, learned: SweepFit, side: float) -> None:
         """Update the contact modes by a touch.
 
         Args:
@@ -365,7 +365,7 @@ class SeamEstimate:
         task = self._task
         end = task.plan.length - max(task.settings.ending / 4.0, task.beyond)
         # Between two walls a tip shows that it has fallen off the seam's end.
-        if task.feels_ends and task.belief.two_walls:
+        if task.feels_ends and task.prior.two_walls:
             end = task.plan.length + task.beyond
         for felt, doubt in self.contact.settled(until):
             sample = _Sample(felt.s, felt.offset, felt.angle, doubt)

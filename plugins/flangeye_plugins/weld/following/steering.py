@@ -72,7 +72,7 @@ Times = tuple[float, float, float]
 """Gas pre-flow, wait while the arc strikes, wait while the crater fills [s]."""
 
 
-class Striking:
+class ArcSequence:
     """Sequence of one arc: gas pre-flow, ignition, burning, crater fill, off."""
 
     def __init__(self, times: Times) -> None:
@@ -193,7 +193,7 @@ class TorchLead:
     def __init__(self, task: WeldTask) -> None:
         settings = task.settings
         gain = max(settings.cross_track_gain, settings.speed / SETTLING)
-        self.steering = Steering(task.belief.distance, gain, settings.turn_rate)
+        self.steering = Steering(task.prior.distance, gain, settings.turn_rate)
         self.weave = Weave(settings.weave_width, settings.weave_frequency)
         self.aim = self._beside = settings.offset_across
         self._from = max(task.start.torch, 0.0)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from flangeye.types import Floats
-from flangeye_plugins.weld.following.belief import BAND, Belief, Learned
+from flangeye_plugins.weld.following.model_prior import BAND, ModelPrior, SweepFit
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following
 
@@ -20,19 +20,19 @@ class ResumePoint:
         samples: (K, 5) touches; see :meth:`RefinedPath.samples`.
         torch: Arc length at which the torch stopped [m].
         learned: Calibration from the sweep.
-        traced: (K, 3) heights of the tool for later passes; see ``passes.Traced``.
+        traced: (K, 3) heights of the tool for later passes; see ``passes.RootPass``.
         number: Number of the stopped pass; 0 is the root pass.
     """
 
     samples: Floats
     torch: float
-    learned: Learned = field(default_factory=Learned)
+    learned: SweepFit = field(default_factory=SweepFit)
     traced: Floats = field(default_factory=lambda: np.zeros((0, 3)))
     number: int = 0
 
 
 @dataclass(frozen=True)
-class Start:
+class Onset:
     """Start of a weld on its plan.
 
     Attributes:
@@ -52,7 +52,7 @@ class WeldTask:
 
     Attributes:
         plan: The planned seam.
-        belief: Prior knowledge of tool, finger and joint.
+        prior: Prior knowledge of tool, finger and joint.
         settings: Gains and limits.
         touch: Follow by touch; otherwise the plan alone, for comparison.
         before: State of the earlier weld that is resumed; None for a new weld.
@@ -60,16 +60,16 @@ class WeldTask:
     """
 
     plan: Path
-    belief: Belief
+    prior: ModelPrior
     settings: Following
     touch: bool = True
     before: ResumePoint | None = None
-    given: Start | None = None
+    given: Onset | None = None
 
     @property
-    def start(self) -> Start:
+    def start(self) -> Onset:
         """Start of the weld: ``given``, or the default one."""
-        return Start(self.settings.set_down) if self.given is None else self.given
+        return Onset(self.settings.set_down) if self.given is None else self.given
 
     @property
     def feels_ends(self) -> bool:
@@ -97,9 +97,9 @@ class WeldTask:
     @property
     def lengthwise(self) -> float:
         """Bound of the torch's error along the seam, if the seam's ends matter [m]."""
-        return BAND * self.belief.along_sigma if self.feels_ends else 0.0
+        return BAND * self.prior.along_sigma if self.feels_ends else 0.0
 
     @property
     def margin(self) -> float:
         """Largest distance by which the tip runs beyond the plan [m]."""
-        return self.belief.distance + self.settings.ending + self.ends - self.plan.length
+        return self.prior.distance + self.settings.ending + self.ends - self.plan.length

@@ -6,12 +6,12 @@ import math
 
 from flangeye.motion.seam_following import Phase, ToolPose
 from flangeye.types import Floats
-from flangeye_plugins.weld.following.belief import BAND, Learned
+from flangeye_plugins.weld.following.model_prior import BAND, SweepFit
 from flangeye_plugins.weld.following.probing import SOFTER
 from flangeye_plugins.weld.following.task import WeldTask
 
 
-class Progress:
+class Advance:
     """Positions of tip and torch, as arc lengths of the plan.
 
     Attributes:
@@ -22,8 +22,8 @@ class Progress:
     """
 
     def __init__(self, task: WeldTask) -> None:
-        self._plan, self._distance = task.plan, task.belief.distance
-        self._beside = task.belief.beside
+        self._plan, self._distance = task.plan, task.prior.distance
+        self._beside = task.prior.beside
         # The search window for the foot point: farther than tip or torch move in one cycle
         self._reach = task.settings.speed * 0.1
         self.tip = task.start.tip
@@ -67,14 +67,14 @@ class Pressing:
     def __init__(self, task: WeldTask) -> None:
         self._task, settings = task, task.settings
         # Until the sweep shows at which deflection the tip stays seated
-        self.most = settings.deflection / (SOFTER if task.belief.two_walls else 1.0)
+        self.most = settings.deflection / (SOFTER if task.prior.two_walls else 1.0)
         self.wanted, self.side = 0.0, settings.sign
         self._lost = self._turned = 0.0
         self.firm = -math.inf
 
-    def learn(self, found: Learned, swept: float) -> None:
+    def learn(self, found: SweepFit, swept: float) -> None:
         """Limit ``most`` by the sweep, in which the tip stayed seated up to ``swept`` [m]."""
-        if self._task.belief.two_walls:
+        if self._task.prior.two_walls:
             softly = max(swept / SOFTER, found.least)
             self.most = min(softly, self._task.settings.deflection)
 
@@ -90,7 +90,7 @@ class Pressing:
         It grows with the standard deviation of the seam there (``variance`` [m^2]), but is limited
         so that the tip does not run head-on into the next piece of wall.
         """
-        probe = self.most if self._task.belief.two_walls else self._task.settings.probe
+        probe = self.most if self._task.prior.two_walls else self._task.settings.probe
         return probe + min(BAND * math.sqrt(variance), probe)
 
     def played(self, phase: Phase, reversal: float) -> float:
@@ -126,7 +126,7 @@ class Pressing:
             play: Deflection that a free tip shows [m].
             seen: Time of the newest touch [s].
         """
-        shown = abs(deflection) if self._task.belief.two_walls else deflection
+        shown = abs(deflection) if self._task.prior.two_walls else deflection
         # Half way from the play to the set point: in a curve a late arm presses less.
         if shown > play + (self.wanted - play) / 2.0:
             self.firm = seen
@@ -142,7 +142,7 @@ class Pressing:
     def turn_over(self, tip: float) -> None:
         """Press towards the other side, in a joint with two walls."""
         self._turned = tip
-        if self._task.belief.two_walls:
+        if self._task.prior.two_walls:
             self.side, self.wanted = -self.side, -self.wanted
 
     def since_lost(self, tip: float) -> float:

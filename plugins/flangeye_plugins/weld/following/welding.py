@@ -8,13 +8,13 @@ import numpy as np
 
 from flangeye.devices import WeldProfile
 from flangeye.motion.seam_following import ToolPose
-from flangeye_plugins.weld.following.belief import BAND
 from flangeye_plugins.weld.following.bias import Bias, Trail
 from flangeye_plugins.weld.following.bound import Stance, along, predicted, varying
+from flangeye_plugins.weld.following.model_prior import BAND
 from flangeye_plugins.weld.following.sensing import SeamEstimate, Sensing
-from flangeye_plugins.weld.following.steering import Striking, TorchLead
+from flangeye_plugins.weld.following.steering import ArcSequence, TorchLead
 from flangeye_plugins.weld.following.task import WeldTask
-from flangeye_plugins.weld.following.tip import Pressing, Progress
+from flangeye_plugins.weld.following.tip import Advance, Pressing
 
 SHORT = 0.01
 """Largest share of the planned seam that a complete weld may leave out."""
@@ -35,7 +35,7 @@ class Welding:
     def __init__(
         self,
         task: WeldTask,
-        progress: Progress,
+        progress: Advance,
         pressing: Pressing,
         sensing: Sensing,
         seam: SeamEstimate,
@@ -43,13 +43,13 @@ class Welding:
     ) -> None:
         self._task, self._progress, self._pressing = task, progress, pressing
         self._sensing, self._seam, self._lead = sensing, seam, lead
-        belief, settings = task.belief, task.settings
+        prior, settings = task.prior, task.settings
         # The arm's error is not part of the bias: no profile can reduce it.
-        prior = belief.fixed_variance(settings) - belief.arm_variance(settings)
-        self.bias = Bias(prior, settings.distortion, belief.distance)
-        self.striking = Striking(belief.arc)
+        variance = prior.fixed_variance(settings) - prior.arm_variance(settings)
+        self.bias = Bias(variance, settings.distortion, prior.distance)
+        self.striking = ArcSequence(prior.arc)
         self.sigma = self.bound = self.band = 0.0
-        self._sigmas = along(task.plan, belief, settings)
+        self._sigmas = along(task.plan, prior, settings)
         self.arc_from: float | None = None
         self._trail = Trail()
         self._swept: float | None = None
@@ -87,20 +87,20 @@ class Welding:
             slant: Sine of the angle between the tool and the path.
             pose: Pose of the tool.
         """
-        belief, settings, refined = self._task.belief, self._task.settings, self._seam.refined
+        prior, settings, refined = self._task.prior, self._task.settings, self._seam.refined
         torch = self._progress.torch
         minutes = 0.0 if self._swept is None else (pose.time - self._swept) / 60.0
         turned = 2.0 * math.sin((pose.angle - refined.angle(torch, pose.angle)) / 2.0)
         stance = Stance(slant, turned, minutes)
-        parts = varying(belief, settings, self._sensing.learned, self._pressing.most, stance)
+        parts = varying(prior, settings, self._sensing.learned, self._pressing.most, stance)
         return self._unseen() + sum(parts) + refined.variance(torch)
 
     def _unseen(self) -> float:
         """Return the part of the torch's variance that touch ahead of it cannot reduce [m^2]."""
-        belief, settings = self._task.belief, self._task.settings
+        prior, settings = self._task.prior, self._task.settings
         if not self.bias.looked:
-            return belief.fixed_variance(settings)
-        return belief.arm_variance(settings) + self.bias.variance(self._progress.torch)
+            return prior.fixed_variance(settings)
+        return prior.arm_variance(settings) + self.bias.variance(self._progress.torch)
 
     def look(self, profile: WeldProfile) -> str:
         """Process the bead's offset from the joint, measured behind the torch.
@@ -108,16 +108,16 @@ class Welding:
         Returns:
             The reason to stop the weld, or "".
         """
-        belief = self._task.belief
+        prior = self._task.prior
         torch = self._trail.place_at(profile.time_ns * 1e-9)
-        if belief.behind is None or torch is None:
+        if prior.behind is None or torch is None:
             return ""
-        place = torch - belief.behind
+        place = torch - prior.behind
         passed = self._trail.passing(place)
         if passed is None:
             return ""
         raw, felt = passed
-        others = felt + belief.arm_variance(self._task.settings)
+        others = felt + prior.arm_variance(self._task.settings)
         self.bias.look(place, profile.offset - raw, profile.sigma, others)
         return self.bias.doubt
 
@@ -184,7 +184,7 @@ class Welding:
         """
         task, torch = self._task, self._progress.torch
         # The gas pre-flow is over when the torch reaches the start of the weld
-        if self.begins - torch <= task.belief.arc[0] * task.settings.speed:
+        if self.begins - torch <= task.prior.arc[0] * task.settings.speed:
             self.striking.gas(now)
         # Past an end that the tip has felt there is no seam to miss.
         if not self.begins <= torch <= (self._seam.end or self.ends):
@@ -212,7 +212,7 @@ class Welding:
         """
         task, refined = self._task, self._seam.refined
         foreseen = predicted(
-            task.plan, task.belief, task.settings, self._sensing.learned, self._pressing.most,
+            task.plan, task.prior, task.settings, self._sensing.learned, self._pressing.most,
             refined.offsets,
         )  # fmt: skip
         rest = (self._progress.torch <= foreseen.s) & (foreseen.s <= self.ends)

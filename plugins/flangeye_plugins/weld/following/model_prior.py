@@ -18,7 +18,7 @@ BAND = 2.0
 
 
 @dataclass(frozen=True)
-class Belief:
+class ModelPrior:
     """Prior of tool, finger and joint: values from the files, each with its standard deviation.
 
     Attributes:
@@ -176,7 +176,7 @@ class Belief:
 
 
 @dataclass(frozen=True)
-class Learned:
+class SweepFit:
     """Calibration of finger, clock and arm, as estimated from the sweep.
 
     Attributes:
@@ -248,12 +248,12 @@ def body_of(finger: Finger, settings: Following) -> LeaningTool:
     return body_from(finger.torch_from_tip, work, settings.travel_angle)
 
 
-def belief_of(
+def model_prior_of(
     finger: Finger, body: LeaningTool, half_angle: float | None, settings: Following
-) -> Belief:
+) -> ModelPrior:
     """Return the prior from a finger's file, the tool's orientation and the plan."""
     known = finger.calibration
-    lateral, axial = Belief.lateral, Belief.axial
+    lateral, axial = ModelPrior.lateral, ModelPrior.axial
     if known is not None and known.lateral is not None and known.axial is not None:
         lateral, axial = known.lateral, known.axial
     noise = (10e-6, 60e-6) if known is None else (known.noise[1], known.noise[2])
@@ -261,7 +261,7 @@ def belief_of(
     joint = joint_of(settings.joint, half_angle, settings.sign, radius, settings.root_gap)
     # A wall that leans by more than 60 degrees does not hold a tip that is moved against it.
     other = None if joint is None else joint.right if settings.side == "left" else joint.left
-    return Belief(
+    return ModelPrior(
         body.distance, lateral, axial, None if joint is None else joint.half_angle, noise,
         finger.torch_sigma, finger.along_sigma, finger.tip_sigma,
         bool(other is None or other < math.radians(60.0)),
