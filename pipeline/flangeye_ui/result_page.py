@@ -158,7 +158,7 @@ def chosen_run(project: Project, run: str, address: str, bar: ActionBar, show: S
 
 
 async def _load(project: Project, run: Path, place: ui.column, bar: ActionBar, show: Show) -> None:
-    """Read the log aside, so that the page answers meanwhile, and show it."""
+    """Read the log in another thread, so that the page stays responsive, and show it."""
     with place:
         spinner = ui.spinner()
         try:

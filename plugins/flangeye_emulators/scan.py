@@ -23,7 +23,7 @@ def scan_simulated(look: Look | None, seed: Seed, params: SimulatedScanParams) -
     """
     if look is None:
         raise StageError(
-            "scan.simulated: looks with the scanner of a simulated cell, and the acquire step "
+            "scan.simulated: needs the scanner of a simulated cell, but the acquire step "
             "simulates none; use acquire.simulated, or scan.file"
         )
     workpiece = load_workpiece(params.workpiece)

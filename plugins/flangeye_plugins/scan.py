@@ -176,14 +176,14 @@ def routes_along(
 
 
 def _places(params: AlongParams) -> Floats:
-    """Return (P, 3) on the seam, amid equal pieces of it."""
+    """Return the points (P, 3) to scan: the middles of equal pieces of the seam."""
     start, end = np.asarray(params.start), np.asarray(params.end)
     count = max(1, int(np.ceil(np.linalg.norm(end - start) / params.step)))
     return np.asarray(start + (np.arange(count) + 0.5)[:, None] / count * (end - start))
 
 
 def _looking(place: Floats, params: AlongParams) -> list[Floats]:
-    """Return poses ``base_T_camera`` (4, 4) that look straight at a place, turned about that."""
+    """Return poses ``base_T_camera`` (4, 4) that look straight at a place, at several rolls."""
     z = -np.asarray(params.opening) / np.linalg.norm(params.opening)
     along = np.asarray(params.end) - np.asarray(params.start)
     x = along - (along @ z) * z
@@ -201,5 +201,6 @@ def _postures(
     """Return joint angles (n,) for any of the poses, the nearest to ``here`` first."""
     camera_T_flange = invert(flange_T_camera)
     found = [joints for pose in cameras for joints in arm.inverse(pose @ camera_T_flange)]
+    # Of equivalent angles the one nearest to the present posture, to keep cables from winding up
     turned = [joints + 2 * np.pi * np.round((here - joints) / (2 * np.pi)) for joints in found]
     return sorted(turned, key=lambda joints: float(np.abs(joints - here).max()))

@@ -158,7 +158,7 @@ def test_motions_of_half_a_turn_alone_are_refused() -> None:
         ),
         (
             "linear", "eye-in-hand, marker", "pose",
-            "solve.linear: takes circles, and there are whole poses: use solve.park_martin",
+            "solve.linear: takes circles, but the features are poses: use solve.park_martin",
         ),
     ],
 )  # fmt: skip

@@ -45,7 +45,7 @@ def wrapped(console: Console, text: str, indent: int = 2) -> str:
 
 
 def width(console: Console) -> int:
-    """Return how many columns a line may have."""
+    """Return the number of columns of a line of text."""
     # Columns of a line that goes to a file or another program, whose width is unknown
     return console.width if console.is_terminal else 100
 

@@ -132,7 +132,7 @@ def _answers(result: Result) -> list[str]:
 
 
 def _correction(found: CorrectionResult | None) -> str:
-    """Return a correction in a few words; calibration.yaml carries all of it."""
+    """Return a short text on the arm's correction; calibration.yaml has all of its numbers."""
     parts = []
     if found and found.joint_offsets:
         parts.append(f"joints {', '.join(f'{x * 1e3:.2f}' for x in found.joint_offsets)} mrad")

@@ -131,13 +131,13 @@ class RunProgress:
     """
 
     def __init__(self, console: Console, steps: Iterable[str], opening: bool = False) -> None:
-        """Make a bar.
+        """Create the bar, not shown yet.
 
         Args:
             console: Console to print on.
             steps: Labels of the recipe's steps.
-            opening: Whether to show it while recordings are opened; a cell that is opened may
-                ask its person something first.
+            opening: Whether to show it while recordings are opened; opening a live cell may
+                ask the operator something first.
         """
         from rich import progress
 

@@ -79,6 +79,8 @@ class Board:
         Every other row begins half a step, which is one ``square``, further to the right.
         """
         row, column = np.indices((self.rows, self.columns)).reshape(2, -1)
+        # OpenCV's asymmetric grid: circles of one row are two squares apart, and odd rows are
+        # shifted by one
         places = np.stack([2 * column + row % 2 + 1, row + 1], axis=1)
         return self.place(np.asarray(places * self.square))
 

@@ -120,7 +120,7 @@ class ArmBody(TargetBody):
 
 @lru_cache(maxsize=4)
 def _posed(body: ArmBody, joints: tuple[float, ...]) -> TargetBody:
-    # Links in the flange's frame, where a body on the flange is drawn too
+    # In the flange's frame, as for a body that the flange carries
     angles = np.array(joints)
     frames = invert(body.arm.flange(angles)) @ body.arm.frames(angles)
     return TargetBody(
@@ -142,7 +142,7 @@ def arm_body(robot: RobotModel | None, links: Mapping[int, str], near: Path) -> 
     if robot is None:
         raise RecipeError(f"body: {ARM} is the arm itself; name it, robot: {{urdf: arm.urdf}}")
     if unknown := [number for number in links if not 0 <= number <= len(robot.joints)]:
-        raise RecipeError(f"links: {robot.model} has links 0 to {len(robot.joints)}, no {unknown}")
+        raise RecipeError(f"links: {robot.model} has links 0 to {len(robot.joints)}, not {unknown}")
     parts = [(k, *_read(near / name)) for k, name in links.items()] or [
         (k, np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int32))
         for k, mesh in robot.meshes()
@@ -230,7 +230,7 @@ def _unit_of(path: Path, vertices: Floats, unit: LengthUnit | None) -> tuple[Len
         )
         other = f"it would be {in_each}" if fitting else "no unit makes it so"
         raise RecipeError(f"{path.name}: it is {has}, and {limits}; {other}")
-    # Inches are taken for what neither of the others explains.
+    # Inches are assumed only if neither metres nor millimetres fit.
     used = min(fitting, key=lambda each: each == "in")
     return used, (
         f"{path.name}: unit: {used} is assumed, by its size of {sizes[used] * 1e3:.0f} mm; state "

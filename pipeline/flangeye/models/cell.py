@@ -99,12 +99,12 @@ class Axis:
 
     @property
     def freedoms(self) -> Floats:
-        """(6, 1) the unit twist of its motion, rotation before translation."""
+        """Unit twist (6, 1) of the axis's motion, rotation before translation."""
         along, still = np.asarray(self.direction), np.zeros(3)
         return np.concatenate([along, still] if self.turns else [still, along])[:, None]
 
     def place(self, value: float) -> Floats:
-        """Return (4, 4) of carriage or plate in its base, at a value [rad or m]."""
+        """Return the pose (4, 4) of carriage or plate in its base, at a value [rad or m]."""
         moved = value * np.asarray(self.direction)
         if self.turns:
             return rigid(rotation_exp(moved), np.zeros(3))
@@ -125,7 +125,7 @@ class Link:
 
     @property
     def frame(self) -> str:
-        """Name of its frame."""
+        """Name of the link's frame."""
         return f"{self.arm}_link{self.number}"
 
 
@@ -166,7 +166,7 @@ class Cell:
 
     @property
     def freedoms(self) -> dict[str, Floats]:
-        """(6, k) unit twists in which each carrier can move, in its base; see ``solve_graph``."""
+        """Unit twists (6, k) in which each carrier can move, in its base; see ``solve_graph``."""
         able = {
             name: mover.freedoms if isinstance(mover, Axis) else _freedoms_of(mover)
             for name, mover in self.movers.items()
@@ -226,7 +226,7 @@ class Cell:
         )
 
     def name_of(self, frame: str) -> str:
-        """Return ``parent_T_frame``."""
+        """Return the name ``parent_T_frame`` of a frame's transform."""
         return f"{self.frames[frame].parent}_T_{frame}"
 
     def describe(self) -> str:
@@ -314,22 +314,23 @@ class Cell:
 
 
 def _freedoms_of(robot: RobotModel) -> Floats:
-    """Return (6, k) unit twists: those axes of ``base`` that it can turn about, and all shifts.
+    """Return unit twists (6, k): the axes of ``base`` that an arm can turn about, and all shifts.
 
     An arm of four joints turns about one.
     """
     from flangeye.maths.kinematics import Arm
 
     arm = Arm(robot)
-    # At zero, axes that a bent arm has apart may be parallel
+    # Not at zero, where axes may be parallel that are not so in general
     axes = arm.axes(np.linspace(0.3, 0.7, arm.n))[0][~arm.slides]
     return np.eye(6)[:, [*_spanned(axes), True, True, True]]
 
 
 def _freedoms_of_link(link: Link, arms: Mapping[str, RobotModel]) -> Floats:
-    """Return (6, k) unit twists: axes of ``base`` that it can turn about, or move along.
+    """Return unit twists (6, k): axes of ``base`` that a link can turn about, or move along.
 
-    By the joints before it, over some places of the arm: the first link only turns about one.
+    Only the joints before the link move it, so the first link just turns about one axis. The
+    Jacobians at several postures are combined, as one posture may be singular.
     """
     from flangeye.maths.kinematics import Arm
 
@@ -340,7 +341,7 @@ def _freedoms_of_link(link: Link, arms: Mapping[str, RobotModel]) -> Floats:
 
 
 def _spanned(directions: Floats) -> Mask:
-    """Return which of the three axes lie in the span of (N, 3) directions."""
+    """Return the mask (3,) of the coordinate axes that lie in the span of directions (N, 3)."""
     # An axis is in the span where least squares reproduce it
     reached = np.linalg.lstsq(directions.T, np.eye(3), rcond=1e-9)[0]
     return np.asarray(np.linalg.norm(directions.T @ reached - np.eye(3), axis=0) < 1e-6)
@@ -395,7 +396,7 @@ def cell_in(context: Mapping[Any, Any]) -> Cell:
 
 
 def _of_each(frames: Mapping[str, Frame], names: Sequence[str]) -> Floats:
-    """Return (N, 4, 4): of each observation the frame that it names."""
+    """Return the poses (N, 4, 4) in the root of the frame that each observation names."""
     count = len(names)
     poses = {n: np.broadcast_to(composed(frames, n), (count, 4, 4)) for n in set(names)}
     return np.array([poses[name][i] for i, name in enumerate(names)]).reshape(-1, 4, 4)

@@ -33,14 +33,14 @@ CARRIERS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 """By name of the configuration: the frames that may carry the camera, and the target."""
 
 EVERY = tuple(CARRIERS)
-"""What a stage declares that serves every configuration: ``@stage("solve.x", serves=EVERY)``."""
+"""All configurations, for stages that serve every one: ``@stage("solve.x", serves=EVERY)``."""
 CELL = "cell"
-"""And one that serves cells of many cameras and targets: ``serves=(CELL,)``."""
+"""Declared by stages that serve cells of many cameras and targets: ``serves=(CELL,)``."""
 
 
 Triple = tuple[float, float, float]
 ORIGIN: tuple[Triple, Triple] = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-"""Where the robot's own circles stand in the frame that carries them."""
+"""Pose of the flange's own circles in the frame that carries them: the identity."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ class Configuration:
 
     @cached_property
     def place(self) -> Floats | None:
-        """(4, 4) of the target in the frame that carries it; None if it is to be estimated."""
+        """Pose (4, 4) of the target in the frame that carries it; None if it is to be estimated."""
         if self.stands is None or self.stands == ORIGIN:
             return None if self.stands is None else np.eye(4)
         position, rpy = self.stands
@@ -70,7 +70,7 @@ class Configuration:
 
     @property
     def is_default(self) -> bool:
-        """Whether it is a camera beside the robot that looks at the flange's own circle."""
+        """Whether this is a camera beside the robot that looks at the flange's own circle."""
         return self.name == "eye-on-base" and self.stands == ORIGIN
 
     @property

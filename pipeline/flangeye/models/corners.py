@@ -1,10 +1,10 @@
 """The corners of a printed board in an image, to a fraction of a pixel.
 
-The corners of a dark square as the intersections of its sides.
+Corners of a dark square are found as the intersections of its sides.
 
 A corner's own neighbourhood is rounded by the lens, which draws the corner inwards by a quarter
-of a pixel; a straight side is blurred on both sides alike. Straight it is only without the lens's
-distortion: a side of 200 px away from the middle is bent by half a pixel.
+of a pixel; a straight side is blurred on both sides alike. Sides are straight only without the
+lens's distortion, which bends a side of 200 px away from the image's middle by half a pixel.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from flangeye.types import Floats, Image, Rejected
 Grey = NDArray[np.uint8]
 
 FEWEST_CHARUCO = 6
-"""Corners of a ChArUco board below which too little of it is seen."""
+"""Fewest corners of a ChArUco board from which its pose is estimated."""
 
 WIDTH = 640
-"""Of an image in which other families are looked for [px]: each tries every square in it."""
+"""Width to which an image is reduced before all families are tried [px], to save time."""
 
 
 ACROSS = 4.0
@@ -35,7 +35,7 @@ PROFILES = 60
 
 
 class Corners(NamedTuple):
-    """N corners.
+    """N corners of a board: where they are in the image and on the board.
 
     Attributes:
         pixels: (N, 2) in the image; the middle of the first pixel is (0, 0).
@@ -52,8 +52,8 @@ def find_corners(board: Board, image: Image, thorough: bool = True) -> Corners |
     Args:
         board: The board to find.
         image: The image to search.
-        thorough: Whether a checkerboard that is not found is looked for in every way; a large
-            image without one takes seconds then.
+        thorough: Whether to search again exhaustively for a checkerboard that is not found; on a
+            large image without one this takes seconds.
     """
     grey = _grey(image)
     if board.kind == "checkerboard":
@@ -156,7 +156,7 @@ def _charuco(board: Board, grey: Grey, _image: Image) -> Corners | Rejected:
 def _charuco_corners(
     board: Board, grey: Grey, outlines: Any = None, numbers: Any = None
 ) -> tuple[Floats, list[int], list[int]]:
-    """Return the corners (n, 2) [px], which of the board's they are, and the markers' ids.
+    """Return the corners (n, 2) [px], their indices on the board, and the ids of the markers.
 
     The markers are looked for, unless their outlines and numbers are given as OpenCV has them.
 
@@ -182,7 +182,7 @@ def _ids(found: Any) -> list[int]:
 
 
 def _of_other_size(board: Board, seen: Sequence[int]) -> str:
-    """Return which markers are seen where they are another board's; empty where too few are.
+    """Return which markers are seen, and which the board has; empty if too few are seen.
 
     The markers of a board are numbered row by row, so corners between them are found only with the
     columns and rows of the print.
@@ -197,7 +197,7 @@ def _of_other_size(board: Board, seen: Sequence[int]) -> str:
 
 
 def _of_other_families(grey: Grey) -> str:
-    """Return what to write where the image shows markers, and none of the board's family."""
+    """Return the dictionary to write if the image shows markers of another family; else empty."""
     if found := _family_in(grey):
         return f"; {len(found[1])} of {found[0]} are seen: write dictionary: {found[0]}"
     return ""
@@ -209,7 +209,7 @@ def _family_in(grey: Grey) -> tuple[str, list[int]] | None:
 
     by = min(1.0, WIDTH / grey.shape[1])
     small = cv2.resize(grey, None, fx=by, fy=by, interpolation=cv2.INTER_AREA)
-    # One of each kind: the first markers of 4X4_250 are those of 4X4_50, and few prints need more.
+    # One dictionary of each kind: 4X4_250 begins with the markers of 4X4_50.
     for name in DICTIONARIES:
         if name.endswith(("_50", "_100", "_1000")):
             continue
@@ -260,7 +260,10 @@ def _checkerboard(board: Board, grey: Grey, thorough: bool) -> Corners | Rejecte
 
 
 def _circles(board: Board, grey: Grey, _image: Image) -> Corners | Rejected:
-    """Find the middles of the discs' images; they lie a little beside the images of the centres."""
+    """Find the middles of the discs' images.
+
+    Under perspective they lie a little beside the images of the discs' centres.
+    """
     import cv2
 
     # Clustering, the other method, can take minutes for a grid that is cut off.
@@ -274,7 +277,7 @@ def _circles(board: Board, grey: Grey, _image: Image) -> Corners | Rejected:
 
 
 def _wrong_squares(corners: Corners, board: Board, grey: Grey) -> int:
-    """Return how many squares are not darker, or lighter, than those beside them as they should.
+    """Return the number of squares without the expected contrast to their neighbours.
 
     A grid that is found one square beside the board's own, where a part is covered, has the sheet
     about the board in the place of its outer squares.
@@ -292,7 +295,7 @@ def _wrong_squares(corners: Corners, board: Board, grey: Grey) -> int:
     beside = [around[:-2, 1:-1], around[2:, 1:-1], around[1:-1, :-2], around[1:-1, 2:]]
     contrast = float(np.ptp(np.percentile(values, [20, 80])))
     differs = sense * (values - np.nanmean(beside, axis=0))
-    # Between a square and those beside it, over that between black and white
+    # Least contrast of a square to its neighbours: 0.3 of that between black and white
     return int((differs < 0.3 * contrast).sum())
 
 
@@ -367,7 +370,7 @@ def _side(grey: NDArray[np.uint8], start: Floats, end: Floats, image: Image) -> 
     """Return the line (3,) of a side, homogeneous and undistorted; None with too few edges."""
     along = end - start
     length = float(np.linalg.norm(along))
-    # The same as a share of the side, at most: the border of a marker is a tenth of it
+    # A marker's border is a tenth of its side: longer profiles would reach its inner pattern
     reach = min(ACROSS, 0.07 * length)
     # Profiles shorter than this [px] are steep all along
     if reach < 1.5:
@@ -380,18 +383,18 @@ def _side(grey: NDArray[np.uint8], start: Floats, end: Floats, image: Image) -> 
         middle = edges.mean(axis=0)
         direction = np.linalg.svd(edges - middle)[2][0]
         normal = np.array([-direction[1], direction[0]])
-        # An edge further from its side's line than this is not that side's [px]
+        # Edges farther than this from the fitted line belong to something else [px]
         edges = edges[np.abs((edges - middle) @ normal) < 0.5]
     return np.array([*normal, -normal @ middle])
 
 
 def _edges(grey: NDArray[np.uint8], start: Floats, along: Floats, across: Floats) -> Floats:
-    """Return where profiles across a side are steepest (N, 2) [px]: the middle of their slope."""
+    """Return a side's edge points (N, 2) [px]: the middle of the slope of profiles across it."""
     import cv2
 
     ends = 0.12  # share of a side at each end that is left out: there the next side is near
     shares = np.linspace(ends, 1 - ends, PROFILES)
-    # Grey values along a profile
+    # Places along a profile at which grey values are sampled
     steps = np.linspace(-1.0, 1.0, 33)
     places = start + shares[:, None, None] * along + steps[None, :, None] * across
     x, y = (places[..., i].astype(np.float32) for i in (0, 1))

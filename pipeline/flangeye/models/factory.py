@@ -88,7 +88,7 @@ def _from_ros(robot: RobotModel, path: Path) -> RobotModel:
             f"{path}: not a kinematics file of the ROS driver: {error}; it has 'kinematics' with "
             f"{', '.join(LINKS)}, each with {', '.join(PLACE)}"
         ) from None
-    # The origins hold lengths and twists: the nominal ones go, limits and axes stay
+    # The file's origins replace the nominal lengths and twists; limits and axes stay
     joints = tuple(
         Joint.model_construct(
             **{
@@ -111,6 +111,7 @@ def _in_urdf_frame(volume: Volume, robot: RobotModel) -> Volume:
     if volume.link == 0:
         return volume
     joint = robot.joints[volume.link - 1]
+    # A standard DH link ends with Tx(a) Rx(alpha); the URDF's link frame is before these
     turn = rotation_from_rpy(joint.alpha, 0.0, 0.0)
     ends = {
         name: tuple(turn @ np.array(getattr(volume, name)) + [joint.a, 0.0, 0.0])

@@ -40,7 +40,7 @@ class Lens(Model):
 
     @property
     def matrix(self) -> Floats:
-        """(3, 3) pinhole matrix."""
+        """Pinhole camera matrix (3, 3)."""
         return np.array(
             [[self.focal[0], 0, self.centre[0]], [0, self.focal[1], self.centre[1]], [0, 0, 1]]
         )
@@ -86,14 +86,14 @@ class FingerGeometry(Model):
 
     @property
     def flange_R_tool(self) -> Floats:
-        """(3, 3) the tool's axes in the flange's: z out of the work is back to the robot."""
-        # The flange's z points at the work: the tool's z is turned over, and its y with it
+        """Tool's axes in the flange's (3, 3); the tool's z points back to the robot."""
+        # The flange's z points at the work, so the tool's z is opposite, and its y for handedness
         c, s = np.cos(self.direction), np.sin(self.direction)
         return np.array([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]])
 
     @property
     def torch_from_tip(self) -> Floats:
-        """(3,) from the tip to the torch, in the tool's axes [m]."""
+        """Vector (3,) from the tip to the torch, in the tool's axes [m]."""
         return np.array([-self.torch, self.torch_aside, self.torch_up])
 
 
@@ -113,7 +113,7 @@ class Finger(FingerGeometry):
     calibration: Calibration | None = None
 
     def force(self, displacement: Floats) -> float | None:
-        """Return the force of a tip displaced by (3,) in the tool's axes [N], if it is known."""
+        """Return the force [N] of a tip displaced by (3,) [m], tool's axes; None if unknown."""
         known = self.calibration
         if known is None or known.lateral is None or known.axial is None:
             return None

@@ -212,7 +212,7 @@ class RobotModel(Model):
 
     @property
     def link_T_flange(self) -> Floats:
-        """(4, 4) the flange in the frame of the last link."""
+        """Pose (4, 4) of the flange in the frame of the last link."""
         frame = self.flange_frame
         placed = rigid(rotation_from_rpy(*frame.rpy), np.asarray(frame.xyz))
         return placed @ rigid(np.eye(3), np.array([0.0, 0.0, self.flange_offset]))
@@ -241,7 +241,7 @@ def joints_in_order(names: Iterable[str]) -> tuple[str, ...]:
     ur = [next((n for n in named if joint in n), "") for joint in UR_JOINTS]
     if all(ur):
         return tuple(ur)
-    # A joint's own number stands last, behind that of an arm
+    # Names such as arm2_joint4: the joint's number is the last one
     numbers = {name: [int(n) for n in re.findall(r"\d+", name)] for name in named}
     numbered = sorted((n for n in named if numbers[n]), key=lambda n: numbers[n][::-1])
     return tuple(numbered) if len(numbered) in (6, 7) else ()

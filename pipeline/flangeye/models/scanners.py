@@ -33,7 +33,7 @@ class ScannerData(Model):
     @property
     def range(self) -> tuple[float, float]:
         """Nearest and farthest it sees [m]; any 3D scanner's, where its own is not known."""
-        # What the 3D scanners of work cells see at all [m]
+        # Range in which any 3D scanner of a work cell measures [m]
         near, far = (0.1, 10.0)
         return (near if self.near is None else self.near, far if self.far is None else self.far)
 
@@ -85,7 +85,7 @@ NAMES: Mapping[LengthUnit, str] = {"m": "metres", "mm": "millimetres", "in": "in
 def median_distance(cloud: PointCloud) -> float:
     """Return the median distance of the finite points from the scanner [m], NaN without any."""
     flat = cloud.xyz.reshape(-1, 3)
-    # A median of so many points is exact enough: it is compared by factors of five and more
+    # 50,000 points give the median well enough: it is compared by factors of five and more
     flat = flat[:: max(1, len(flat) // 50_000)]
     distances = np.linalg.norm(flat.astype(np.float64), axis=1)
     finite = distances[np.isfinite(distances)]
@@ -128,7 +128,7 @@ def check_unit(path: Path, distance: float, unit: LengthUnit, scanner: ScannerDa
 def detect_unit(path: Path, raw: float, scanner: ScannerData) -> LengthUnit:
     """Return the unit in which a median distance fits the scanner's range: metres or millimetres.
 
-    Inches are only between the two, and few record in them: they have to be stated.
+    Inches lie between the two and are rare, so they have to be stated.
 
     Args:
         path: The cloud's file.

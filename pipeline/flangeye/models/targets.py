@@ -74,7 +74,7 @@ def plate_of(robot: RobotModel) -> Flange:
 
 def flange_of(details: FlangeDetails, standard: FlangeStandard) -> Flange:
     """Return the circle of ``standard`` as seen on an arm."""
-    # What shows is the flat face: chamfers make its rim smaller than nominal, its holes larger
+    # A scan shows the flat face: chamfers make its rim smaller than nominal, and its holes larger
     n, pin = standard.threads, details.pin_angle
     # The pin hole lies on a bisector of the threads (ISO 9409-1, clause 4).
     holes = tuple((pin or 0.0) + pi / n + 2 * pi * i / n for i in range(n))
@@ -123,7 +123,7 @@ class Sphere(BaseModel):
 
     @property
     def radius(self) -> float:
-        """The radius [m].
+        """Radius of the sphere [m].
 
         Raises:
             StageError: It is not known.
@@ -182,7 +182,7 @@ def _designation_key(text: str) -> str:
 
 
 class StandardTable(Model):
-    """The file ``data/standards/iso9409-1.yaml``."""
+    """The content of ``data/standards/iso9409-1.yaml``."""
 
     title: str
     plates: tuple[FlangeStandard, ...]

@@ -97,7 +97,7 @@ def _of_arm(session: RecordedSession, arms: Arms, factor: float) -> RecordedSess
 
 
 def _ratios() -> Iterator[tuple[str, str, float]]:
-    """Yield (as read, as meant) of a unit, and the factor that corrects lengths."""
+    """Yield pairs of units (read as, probably meant), and the factor that corrects lengths."""
     given = {1.0}
     for said, meant in (
         *(("m", unit) for unit in METRES), *((unit, "m") for unit in METRES),

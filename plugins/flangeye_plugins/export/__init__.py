@@ -33,7 +33,7 @@ def _declared(
 
     export.__doc__ = meaning
     export.__annotations__["params"] = params
-    # Formats that carry every transform of a cell
+    # Only these formats can hold several transforms, as a cell has
     serves = (CELL,) if name in ("ros2_command", "ros2_launch", "urdf") else ()
     return stage(f"export.{name}", serves=serves)(export)
 

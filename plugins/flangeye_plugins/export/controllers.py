@@ -40,18 +40,18 @@ _PYTHON = _words(" ".join(keyword.kwlist))
 
 @dataclass(frozen=True)
 class ControllerFormat:
-    """One such format.
+    """A format made of a template and a convention.
 
     Attributes:
         meaning: First line of its documentation.
         file: Name of the file.
-        mark: What begins a comment line.
+        mark: Characters that begin a comment line.
         text: The template, behind the remarks.
         use: Where the file goes in the other program.
         convention: How the numbers are written.
         sort: ``{sort}`` of a camera beside the robot, and of one on the arm.
         params: ``NamedParams``, or ``NumberedParams`` for ``{number}``.
-        reserved: Words of the language, in small letters, that no pose may be called.
+        reserved: Reserved words of the language, in lower case, which cannot be names.
     """
 
     meaning: str
@@ -96,6 +96,7 @@ CONTROLLERS = {
         '{sort}_NAME[{number},]="{name}"\n',
         "the lines of {sort} {number} in R1/System/$config.dat",
         "kuka",
+        # A camera beside the robot is a fixed frame, one on the arm is a tool
         ("BASE", "TOOL"),
         NumberedParams,
     ),
@@ -183,7 +184,7 @@ CONTROLLERS = {
         "halcon",
     ),
 }
-"""By name."""
+"""Controllers' formats by name."""
 
 
 @stage("export.robot")
@@ -217,6 +218,7 @@ def with_correction(robot: RobotModel, correction: ArmCorrection) -> RobotModel:
     """Return the arm with joint zeros and lengths corrected."""
     n = len(robot.joints)
     zeros = np.zeros(n) if correction.joint_offsets is None else correction.joint_offsets
+    # Joint offsets add to the angles that the controller reports, as theta does
     lengths = np.zeros((n, 3)) if correction.lengths is None else correction.lengths
     joints = [
         joint.model_copy(

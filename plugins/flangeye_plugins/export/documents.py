@@ -64,7 +64,7 @@ def moveit(pose: CalibratedPose, params: FramesParams) -> ExportedFile:
 def _arguments(pose: CalibratedPose, params: FramesParams) -> list[str]:
     numbers = numbers_of("quaternion_xyzw", pose.transform.matrix)
     frames = ("--frame-id", params.carrier(pose), "--child-frame-id", params.carried(pose))
-    # Of `static_transform_publisher`, in the order of `quaternion_xyzw`
+    # Options of static_transform_publisher in the order of the numbers: x, y, z, then xyzw
     flags = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
     return [word for pair in zip(flags, numbers, strict=True) for word in pair] + [*frames]
 
@@ -138,6 +138,7 @@ def _yaml(document: Mapping[str, Any]) -> str:
 
 def opencv(pose: CalibratedPose, params: LengthParams) -> ExportedFile:
     """Write an OpenCV FileStorage (YAML) with the pose as a 4x4 matrix."""
+    # FileStorage writes a matrix as a mapping of rows, cols, dt ("d": double) and data, row by row
     key = pose.transform.name
     numbers = [number for row in params.matrix(pose) for number in row]
     document = {key: _Matrix(rows=4, cols=4, dt="d", data=numbers)}
@@ -201,7 +202,7 @@ class OpticalParams(Params):
 
 
 class UrdfParams(FramesParams):
-    """The frames, and how the camera's mount link and its optical frame lie to each other."""
+    """The frames, and the pose of the camera's optical frame in its mount link."""
 
     mount: str | None = Field(None, pattern=FRAME)
     """The camera's mount link; camera_link if not given."""
@@ -240,8 +241,9 @@ def _joints(pose: CalibratedPose, params: UrdfParams) -> list[ElementTree.Elemen
     carrier, found = params.carrier(pose), pose.transform.matrix
     if mount_T_optical is None:
         return _joint(carrier, optical, found)
+    # base_T_mount = base_T_optical inv(mount_T_optical), as a URDF attaches the mount link
     joints = _joint(carrier, mount, found @ np.linalg.inv(mount_T_optical))
-    if params.camera_urdf is None:  # which has the second joint itself
+    if params.camera_urdf is None:  # else the camera's own URDF has the second joint
         joints += _joint(mount, optical, mount_T_optical)
     return joints
 

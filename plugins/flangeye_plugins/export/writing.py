@@ -26,7 +26,7 @@ class NamedParams(Params):
     """Name of the pose in the other program, and of the file."""
 
     def require_unnamed(self, pose: CalibratedPose) -> None:
-        """Refuse names of two frames for the many of a cell.
+        """Refuse frame names that are given for one camera if there are several.
 
         Raises:
             StageError: Some are given.
@@ -88,7 +88,7 @@ def require_identifier(name: str, reserved: Iterable[str] = ()) -> str:
     """Return a name that is an identifier in a controller's language.
 
     Raises:
-        StageError: It is none, or a word of that language.
+        StageError: It is not an identifier, or a reserved word of that language.
     """
     if not re.fullmatch(NAME, name):
         raise StageError(f"--set name: {name!a} is not an identifier; allowed: {NAME}")
@@ -99,15 +99,16 @@ def require_identifier(name: str, reserved: Iterable[str] = ()) -> str:
 
 def rounded(number: float) -> float:
     """Return a number to nine places, zero without a sign."""
+    # Adding 0.0 turns -0.0 into 0.0. Nine places are a nanometre, or 1e-9 of a rotation's entry
     return round(float(number), 9) + 0.0
 
 
 def fixed(numbers: Iterable[float]) -> list[str]:
-    """Return numbers with nine places, without exponents: controllers do not know them all."""
+    """Return numbers with nine places and no exponent, which some controllers cannot read."""
     return [f"{rounded(number):.9f}" for number in numbers]
 
 
 def numbers_of(convention: str | PoseConvention, matrix: Floats) -> list[str]:
-    """Return a pose (4, 4) [m] as a maker writes it; a name is one of ``CONVENTIONS``."""
+    """Return a pose (4, 4) [m] as numbers in a convention, given itself or by its name."""
     chosen = CONVENTIONS[convention] if isinstance(convention, str) else convention
     return fixed(chosen.numbers(matrix))

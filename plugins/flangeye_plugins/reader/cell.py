@@ -294,7 +294,7 @@ def _by_time(
     """Pair measurements with the first arm's standstills, at which all others must be at rest."""
     first = next((each for each in moved if each.values.ndim == 3), None)
     if first is None or first.times is None:
-        raise StageError(f"{seen.text.file}: joining by time needs the table of an arm")
+        raise StageError(f"{seen.text.file}: to join by time, name the table of an arm too")
     kept = [i for i, value in enumerate(seen.values) if value is not None]
     events, values = np.asarray(seen.times)[kept], [seen.values[i] for i in kept]
     arm = first.times, first.values

@@ -131,7 +131,7 @@ def by_three(
 def linear(problem: Problem) -> Places:
     """Return the unknowns for circles by linear least squares."""
     if (problem.seen.ranks == 6).all():
-        raise StageError("takes circles, and there are whole poses: use solve.park_martin")
+        raise StageError("takes circles, but the features are poses: use solve.park_martin")
     return start_of_circles(problem)
 
 

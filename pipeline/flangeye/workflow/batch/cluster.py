@@ -122,7 +122,7 @@ def check_installed() -> None:
 
 
 def cores() -> int:
-    """Return how many cores this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -241,7 +241,7 @@ async def _kind_of_server(address: str, security: Security) -> str:
 
 
 def worker_count(client: Client) -> int:
-    """Return how many workers the client's scheduler has now."""
+    """Return the number of workers that the client's scheduler has now."""
     return len(client.scheduler_info(n_workers=-1)["workers"])
 
 

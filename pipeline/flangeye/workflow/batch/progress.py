@@ -37,7 +37,7 @@ class VariantSummary:
 
     Attributes:
         names: Its values, in the order of :meth:`Tally.by`.
-        counts: Status -> sessions.
+        counts: Number of sessions by status.
         medians: Figure -> median over the accepted sessions [m]; None without any.
     """
 

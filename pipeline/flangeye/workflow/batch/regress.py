@@ -180,7 +180,7 @@ class Expected(Model):
 
 
 class Manifest(Model):
-    """One recording."""
+    """A recorded session, how to read it, and its expected result."""
 
     title: str
     """One line shown in reports."""

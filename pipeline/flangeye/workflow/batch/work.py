@@ -92,7 +92,7 @@ class ChunkDone:
     """Summary of a chunk whose rows are written.
 
     Attributes:
-        counts: Status -> sessions.
+        counts: Number of sessions by status.
         bad: Some of those without a calibration: id and outcome.
         seconds: Duration on its worker [s].
     """

@@ -133,7 +133,9 @@ def body_of(target: TargetSection, robot: RobotModel | None, folder: Path) -> Ta
             )
         return load_body(target.body, target.unit, folder)
     if target.at != "flange":
-        raise RecipeError(f"body: {ARM} moves with every joint; leave out at: {target.at}")
+        raise RecipeError(
+            f"body: {ARM} is the whole arm, which no frame carries; remove at: {target.at}"
+        )
     return arm_body(robot, target.links, folder)
 
 

@@ -144,7 +144,7 @@ def _floor(corners: Floats) -> Iterable[_Line]:
 
 
 def rods(robot: RobotModel, joints: Floats) -> list[tuple[float, Floats]]:
-    """Return the arm's capsules: radius [m] and (2, 3) ends in the base [m]; its flange is one."""
+    """Return the arm's capsules, the flange's included: radius and ends (2, 3) in base [m]."""
     arm = Arm(robot)
     frames, flange = arm.frames(joints), arm.flange(joints)
     found = [

@@ -43,7 +43,7 @@ class Gathered(NamedTuple):
 
 
 class FromNothing:
-    """Every step is done."""
+    """A run from the start: every step is done."""
 
     @property
     def simulated(self) -> bool:
@@ -57,7 +57,7 @@ class FromNothing:
 
     @property
     def first(self) -> int:
-        """How many captures are taken before those of the earlier run are counted."""
+        """Number of captures to take before those of the earlier run are counted."""
         return 0
 
     def stream(self, acquire: Acquire) -> t.Captures | t.Observations:
@@ -209,7 +209,7 @@ class FromEarlierRun(FromNothing):
 
     @property
     def first(self) -> int:
-        """How many captures are taken again; before the rest, or a solver might have enough."""
+        """Number of captures to take again; they come first, or a solver might have enough."""
         return len(self.retaken)
 
     def stream(self, acquire: Acquire) -> t.Captures | t.Observations:

@@ -190,7 +190,7 @@ def _axis(name: str, axis: Axis) -> dict[str, Any]:
 
 
 def _noise(seen: Sequence[Observation]) -> dict[str, str]:
-    """Return how good the sightings are, as their covariances have it in the middle."""
+    """Return the noise of the sightings for the recipe: medians over their covariances."""
     shift = np.median([_deviation(o.feature.centre_covariance) for o in seen])
     turns = [o.feature.covariance for o in seen if isinstance(o.feature, PoseFeature)]
     if not turns:
